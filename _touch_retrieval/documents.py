@@ -54,7 +54,7 @@ def typed(
         _require_finite(document, name)
         return msgspec.convert(document, kind)
     except msgspec.ValidationError as refused:
-        raise error(_refusal(str(refused), document, name)) from refused
+        raise error(_error_message(str(refused), document, name)) from refused
     except ValueError as refused:
         raise error(str(refused)) from refused
 
@@ -119,7 +119,7 @@ def _require_finite(document: Any, name: str) -> None:
             _require_finite(value, name)
 
 
-def _refusal(said: str, document: Any, name: str) -> str:
+def _error_message(said: str, document: Any, name: str) -> str:
     place = _PLACE.search(said)
     reason = said[: place.start()] if place else said
     where = (name + place["place"].replace("[...]", "") if place else name).lstrip(".") or "it"

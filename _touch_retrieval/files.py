@@ -28,7 +28,7 @@ _UNFLUSHED = (errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP)
 
 
 @contextmanager
-def durable(path: Path) -> Iterator[BinaryIO]:
+def durable_file(path: Path) -> Iterator[BinaryIO]:
     """A new file to write; flushed to the disk when the block ends."""
     with path.open("wb") as handle:
         yield handle
@@ -53,18 +53,20 @@ def sync(path: Path) -> None:
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Write beside, flush to disk, rename: `path` holds all of `data`, or what it held before, whenever the power
-    fails. Where it is a link, the file that it leads to is written. Raises OSError that names `path`."""
-    with naming(path), replacing(path) as file:
+    fails. Where it is a link, the file that it leads to is written. Raises OSError that names `path`.
+    """
+    with named_write_errors(path), atomic_file(path) as file:
         file.write(data)
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[BinaryIO]:
+def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """A file to write what `path` shall hold, as `write_atomically` does it, piece by piece; where the block raises,
-    `path` stays as it was."""
+    `path` stays as it was.
+    """
     place = path.resolve() if path.is_symlink() else path
     _sweep(place)
-    with _beside(place) as (temporary, descriptor):
+    with _temporary_file(place) as (temporary, descriptor):
         with open(descriptor, "wb", closefd=False) as file:
             yield file
         os.fsync(descriptor)
@@ -77,7 +79,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def naming(path: Path) -> Iterator[None]:
+def named_write_errors(path: Path) -> Iterator[None]:
     """What the disk refuses, with the name of the file that was to be written: a write alone does not tell it."""
     try:
         yield
@@ -88,10 +90,10 @@ def naming(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _beside(path: Path) -> Iterator[tuple[Path, int]]:
+def _temporary_file(path: Path) -> Iterator[tuple[Path, int]]:
     """A new file beside `path`, locked as long as it is written; gone afterwards unless it was renamed."""
     while True:
-        name = path.with_name(f"{_beginning(path)}{secrets.token_hex(8)}{_ENDING}")
+        name = path.with_name(f"{_temporary_prefix(path)}{secrets.token_hex(8)}{_ENDING}")
         descriptor = os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
             with suppress(OSError):  # on a disk without locks nobody sweeps either
@@ -108,7 +110,9 @@ def _beside(path: Path) -> Iterator[tuple[Path, int]]:
 def _sweep(path: Path) -> None:
     """Delete what killed writers of `path` left beside it."""
     with suppress(OSError), os.scandir(path.parent) as entries:
-        left = [one.path for one in entries if one.name.startswith(_beginning(path)) and one.name.endswith(_ENDING)]
+        left = [
+            one.path for one in entries if one.name.startswith(_temporary_prefix(path)) and one.name.endswith(_ENDING)
+        ]
         for name in left:
             _delete_unless_locked(name)
 
@@ -120,7 +124,7 @@ def _delete_unless_locked(name: str) -> None:
             os.unlink(name)
 
 
-def _beginning(path: Path) -> str:
+def _temporary_prefix(path: Path) -> str:
     """Of the hidden names beside `path`, short enough for every disk."""
     return f".{os.fsdecode(os.fsencode(path.name)[:200])}."
 
@@ -148,9 +152,9 @@ def encoded(document: Any, *, indent: int | None = None) -> bytes:
         return json.dumps(document, allow_nan=False, indent=indent).encode()
 
 
-DEEPEST = 64
+MAX_DEPTH = 64
 """Levels of lists and objects inside one another; what reads or shows JSON by recursion ends somewhere beyond."""
-MOST_BYTES = 512 * 2**20
+MAX_FILE_BYTES = 512 * 2**20
 """Of what is read whole."""
 MAX_JSON_BYTES = 64 * 2**20
 """Of a JSON file whose reader states no tighter limit; parsed, it takes up to 25 times as much memory."""
@@ -175,28 +179,28 @@ def open_regular(path: str | Path) -> BufferedReader:
         raise
 
 
-def read_regular(path: str | Path, most: int = MOST_BYTES) -> bytes:
-    """The bytes of a regular file of at most `most` bytes. Raises OSError."""
+def read_regular(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """The bytes of a regular file of at most `max_bytes` bytes. Raises OSError."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        if size <= most:
-            data = file.read(most + 1)
+        if size <= max_bytes:
+            data = file.read(max_bytes + 1)
             size = max(size, len(data))
-    if size > most:
-        raise OSError(errno.EINVAL, f"has {size} bytes; at most {most} are read", str(path))
+    if size > max_bytes:
+        raise OSError(errno.EINVAL, f"has {size} bytes; at most {max_bytes} are read", str(path))
     return data
 
 
-def read_json(path: str | Path, most: int = MAX_JSON_BYTES) -> Any:
-    """Return the JSON document in a regular file of at most `most` bytes; a larger one is not read.
+def read_json(path: str | Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
+    """Return the JSON document in a regular file of at most `max_bytes` bytes; a larger one is not read.
 
     Raises OSError, and ValueError as `parse_json` does.
     """
-    return parse_json(read_regular(path, most))
+    return parse_json(read_regular(path, max_bytes))
 
 
 def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
-    """Return a JSON document. Raises ValueError for what is none, repeats a key, or is nested deeper than `DEEPEST`.
+    """Return a JSON document. Raises ValueError for what is none, repeats a key, or is nested deeper than `MAX_DEPTH`.
 
     finite: refuse numbers that are not finite too, which Python reads: NaN, Infinity and 1e999.
     """
@@ -204,16 +208,16 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
     try:
         document = json.loads(text, object_pairs_hook=_object, parse_constant=number, parse_float=number)
     except RecursionError as error:
-        raise ValueError(f"it is nested deeper than {DEEPEST} levels") from error
+        raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels") from error
     if is_deep(document):
-        raise ValueError(f"it is nested deeper than {DEEPEST} levels")
+        raise ValueError(f"it is nested deeper than {MAX_DEPTH} levels")
     return document
 
 
 def is_deep(document: Any) -> bool:
-    """Whether JSON has more than `DEEPEST` lists or objects inside one another."""
+    """Whether JSON has more than `MAX_DEPTH` lists or objects inside one another."""
     level = [document]
-    for _ in range(DEEPEST):
+    for _ in range(MAX_DEPTH):
         level = [inner for each in level if isinstance(each, dict | list | tuple) for inner in _inside(each)]
     return any(isinstance(each, dict | list | tuple) for each in level)
 

@@ -30,13 +30,13 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.common import Line
+from benchmarks.common import ResultLine
 from indexes import load_kind
 from indexes.store.folder import IndexStore
 from indexes.store.tables import Block
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.encode import encode_photos
-from retrieval.model.stored import fingerprint
 from retrieval.search.build.build_index import build_index
 from retrieval.search.build.operating import SearchRequirements
 from retrieval.search.defaults import shipped_model
@@ -45,7 +45,7 @@ PHOTOS, ROUNDS = 10_000, 3
 OLD_S = 3600
 
 
-def measure(photos: int = PHOTOS, rounds: int = ROUNDS) -> Iterator[Line]:
+def measure(photos: int = PHOTOS, rounds: int = ROUNDS) -> Iterator[ResultLine]:
     """One line: the first build over an index that noted no looks, then in turns builds of nothing and of one photo
     new, and one that reads all."""
     checkpoint = load_checkpoint(shipped_model())
@@ -80,7 +80,7 @@ def measure(photos: int = PHOTOS, rounds: int = ROUNDS) -> Iterator[Line]:
         f"{median['first_encoding']:.3f} s ({median['encoding']:.3f} s once it has been done), and what every command "
         f"takes, Python, its imports and the model, {median['started']:.2f} s"
     )
-    yield Line("again", checkpoint.config.matcher.tower, text, {"photos": photos, **median}, dict(told))
+    yield ResultLine("again", checkpoint.config.matcher.tower, text, {"photos": photos, **median}, dict(told))
 
 
 def build(catalogue: Path, index: Path, new: int, verify: bool) -> dict[str, float]:
@@ -147,19 +147,22 @@ def write_index(catalogue: Path, out: Path, checkpoint: Checkpoint) -> None:
         name = path.relative_to(catalogue).as_posix()
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         rows.append({"id": name, "object_id": path.parent.name, "path": name, "digest": digest, "metadata": {}})
-    halves, asked = rng.normal(size=(len(paths), matcher.half)).astype(np.float16), asdict(SearchRequirements())
-    measured = {"k": 100, "winner_recall": 1.0, "interval": [0.99, 1.0], "queries": 398, "ms": 1.0}
-    measured |= {"exhaustive_ms": 1.0, "kind": "flat", "parameters": {}, "asked": asked, "changed": 0}
+    partials, asked = (
+        rng.normal(size=(len(paths), matcher.partial_width)).astype(np.float16),
+        asdict(SearchRequirements()),
+    )
+    measured = {"k": 100, "top1_agreement": 1.0, "interval": [0.99, 1.0], "queries": 398, "ms": 1.0}
+    measured |= {"exhaustive_ms": 1.0, "kind": "flat", "parameters": {}, "requirements": asked, "changed": 0}
     IndexStore(out).write_blocks(
-        [Block(rows, embeddings, {"halves": halves})],
+        [Block(rows, embeddings, {"partials": partials})],
         {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {},
         fingerprint=fingerprint(checkpoint),
         about={
             "checkpoint": str(checkpoint.path.resolve()),
             "catalogue": str(catalogue.resolve()),
             "objects_from": "folder",
-            "asked": asked,
-            "half_error": 1e-3,
+            "requirements": asked,
+            "partial_error": 1e-3,
             "reason": "Drawn codes.",
             "candidates": measured | {"photos": len(rows)},
         },

@@ -232,7 +232,7 @@ def _is_open(connection: socket.socket) -> bool:
 
 
 @dataclass
-class Measured:
+class AttackResult:
     """What honest clients and the operator saw during one attack."""
 
     attack: str
@@ -271,9 +271,9 @@ HEAD = (
 )
 
 
-def measure(attack: Attack, index: Path, gels: tuple[bytes, ...]) -> Measured:
+def measure(attack: Attack, index: Path, gels: tuple[bytes, ...]) -> AttackResult:
     """Run one attack against a service of its own."""
-    measured = Measured(attack.__name__.replace("_", " "))
+    measured = AttackResult(attack.__name__.replace("_", " "))
     with tempfile.TemporaryDirectory() as folder, _service(index, Path(folder)) as (process, port):
         target = Target(port, gels)
         honest = _query(list(gels))
@@ -330,7 +330,7 @@ def _port(text: str) -> int | None:
     return int(digits) if digits and len(after) > len(digits) else None
 
 
-def _ask_health(port: int, measured: Measured, over: threading.Event) -> None:
+def _ask_health(port: int, measured: AttackResult, over: threading.Event) -> None:
     while not over.is_set():
         begun = time.monotonic()
         status = _honest(port, "GET", "/healthz", None)
@@ -341,7 +341,7 @@ def _ask_health(port: int, measured: Measured, over: threading.Event) -> None:
         time.sleep(0.05)
 
 
-def _ask_queries(port: int, body: bytes, measured: Measured, over: threading.Event) -> None:
+def _ask_queries(port: int, body: bytes, measured: AttackResult, over: threading.Event) -> None:
     """An honest client waits and asks again where it gets 429, for 10 s at most."""
     while not over.is_set():
         begun = time.monotonic()
@@ -367,7 +367,7 @@ def _honest(port: int, method: str, path: str, body: bytes | None) -> int:
         connection.close()
 
 
-def _watch_memory(pid: int, idle: float, measured: Measured, over: threading.Event) -> None:
+def _watch_memory(pid: int, idle: float, measured: AttackResult, over: threading.Event) -> None:
     while not over.wait(0.05):
         measured.memory_mb = max(measured.memory_mb, _memory_mb(pid) - idle)
 

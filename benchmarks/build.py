@@ -15,15 +15,15 @@ from typing import Any
 import cv2
 import torch
 
-from benchmarks.common import Line, Times, as_text, duration, in_turns, matcher_of
+from benchmarks.common import ResultLine, Times, as_text, duration, in_turns, matcher_of
 from retrieval.data.images import read_bytes
 from retrieval.data.resize import RgbImage
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.encode import batches, encode_photos, one_thread
-from retrieval.model.photo_encoder import fastest
+from retrieval.model.photo_encoder import fastest_photo_encoder
 from retrieval.search.build.build_index import build_index
-from retrieval.search.build.embed import BATCH, MANY, ahead
+from retrieval.search.build.embed import BATCH, MIN_PHOTOS_TO_TUNE, map_ahead
 from retrieval.search.defaults import shipped_model
 from tests import synthetic
 
@@ -31,7 +31,9 @@ PHOTOS = {"small": 256}
 DRAWN = 16
 
 
-def measure(config: Config, photos: int | None = None, photo_px: int = 512, repetitions: int = 3) -> Iterator[Line]:
+def measure(
+    config: Config, photos: int | None = None, photo_px: int = 512, repetitions: int = 3
+) -> Iterator[ResultLine]:
     """One line. Files: `photos` JPEG of `photo_px` x `photo_px` pixels, of `DRAWN` different pictures."""
     number = photos or PHOTOS.get(config.matcher.tower, 64)
     with tempfile.TemporaryDirectory() as name:
@@ -50,7 +52,7 @@ def measure(config: Config, photos: int | None = None, photo_px: int = 512, repe
         times = in_turns(arms, repetitions)
     ours, other, ratio = number / times.median("build"), number / times.median("bare"), times.ratio("bare", "build")
     again = times.ratio("build", "again")
-    yield Line(
+    yield ResultLine(
         "build",
         config.matcher.tower,
         f"{ours:.3g} photos per second end to end ({number} JPEG files of {photo_px} px), {other:.3g} through the bare "
@@ -60,41 +62,41 @@ def measure(config: Config, photos: int | None = None, photo_px: int = 512, repe
     )
 
 
-def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3) -> Iterator[Line]:
+def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3) -> Iterator[ResultLine]:
     """One line for the shipped model, with photos enough that a build looks for a faster encoder, which is told apart.
 
     Bare is that encoder alone, on as many threads, of images that lie ready; work is decoding, cutting out and
     encoding, without an index.
     """
     checkpoint = load_checkpoint(shipped_model())
-    photo_of = checkpoint.config.preprocessing.photo_of
+    photo_from_bytes = checkpoint.config.preprocessing.photo_from_bytes
 
     def see(path: Path) -> RgbImage:
-        return photo_of(read_bytes(path), path)
+        return photo_from_bytes(read_bytes(path), path)
 
     with tempfile.TemporaryDirectory() as name:
         images, build = _ready(Path(name), checkpoint, photos, photo_px)
         paths = sorted((Path(name) / "catalog").rglob("*.jpg"))
-        encode, threads = fastest(checkpoint), torch.get_num_threads()
+        encode, threads = fastest_photo_encoder(checkpoint), torch.get_num_threads()
 
         def on_threads(work: Callable[[Any], object], items: Iterable[Any]) -> None:
             with one_thread():
-                deque(ahead(work, batches(items, BATCH), threads, 2 * threads), maxlen=0)
+                deque(map_ahead(work, batches(items, BATCH), threads, 2 * threads), maxlen=0)
 
         arms = {
             "build": build,
             "bare": lambda: on_threads(encode, images),
             "work": lambda: on_threads(lambda some: encode([see(path) for path in some]), paths),
-            "looking": lambda: fastest(checkpoint),
+            "looking": lambda: fastest_photo_encoder(checkpoint),
         }
         taken = in_turns(arms, repetitions).seconds
-    if photos < MANY:
+    if photos < MIN_PHOTOS_TO_TUNE:
         taken["looking"] = [0.0] * repetitions
     beyond = [whole - looked for whole, looked in zip(taken["build"], taken["looking"], strict=True)]
     times = Times({**taken, "beyond": beyond})
     rate = {arm: photos / times.median(arm) for arm in ("beyond", "bare", "work", "build")}
     ratio, share = times.ratio("bare", "beyond"), times.ratio("work", "beyond")
-    yield Line(
+    yield ResultLine(
         "build",
         "shipped",
         f"{rate['beyond']:.3g} photos per second end to end ({photos} JPEG files of {photo_px} px) beyond looking for "

@@ -15,19 +15,19 @@ from unittest import mock
 import cv2
 import numpy as np
 
-from benchmarks.common import Line, duration
+from benchmarks.common import ResultLine, duration
 from robot.devices import TactileSensor, read_together
 from robot.drivers.gels.opencv import OpencvTactile
 from robot.drivers.replay import VideoSensor
-from robot.drivers.video.rectify import Rectifier, in_rgb
-from tests.fake_video import FakeCamera
+from robot.drivers.video.rectify import Rectifier, to_rgb
+from tests.fake_video import FakeVideoDevice
 
 SIZE = (640, 480)
 APART_S = 0.010
 QUICK: dict[str, Any] = {"warmup_s": 0.2, "timeout_s": 10.0}
 
 
-def measure(seconds: float = 3.0) -> Iterator[Line]:
+def measure(seconds: float = 3.0) -> Iterator[ResultLine]:
     """A line for each rate, for each way to match two fingers, for a film, and for the work on one picture."""
     for fps in (30.0, 60.0):
         yield _rate(fps, seconds)
@@ -42,11 +42,11 @@ class _Rig(ExitStack):
 
     def __init__(self) -> None:
         super().__init__()
-        self._cameras: dict[str, FakeCamera] = {}
+        self._cameras: dict[str, FakeVideoDevice] = {}
         self._folder = Path(self.enter_context(tempfile.TemporaryDirectory())).resolve()
         self.enter_context(mock.patch("cv2.VideoCapture", lambda path, backend: self._cameras[path].open(path)))
 
-    def gel(self, finger: str, camera: FakeCamera, keep: int = 4) -> OpencvTactile:
+    def gel(self, finger: str, camera: FakeVideoDevice, keep: int = 4) -> OpencvTactile:
         """A connected sensor of that camera."""
         path = self._folder / f"usb-{finger}"
         path.touch()
@@ -54,30 +54,30 @@ class _Rig(ExitStack):
         return self.enter_context(OpencvTactile(finger=finger, device=str(path), keep=keep, **QUICK))
 
 
-def _rate(fps: float, seconds: float) -> Line:
+def _rate(fps: float, seconds: float) -> ResultLine:
     """Pictures a second that arrive, and how old the newest is at random moments."""
     rng = np.random.default_rng(0)
     ages: list[float] = []
     with _Rig() as rig:
-        gel = rig.gel("a", FakeCamera(fps=fps, size=SIZE, stamps=True))
-        start, before = time.monotonic(), gel.frames_seen
+        gel = rig.gel("a", FakeVideoDevice(fps=fps, size=SIZE, stamps=True))
+        start, before = time.monotonic(), gel.frame_count
         while time.monotonic() - start < seconds:
             time.sleep(rng.uniform(0.0, 2 / fps))
             ages.append(time.monotonic() - gel.read().time_s)
-        rate = (gel.frames_seen - before) / (time.monotonic() - start)
+        rate = (gel.frame_count - before) / (time.monotonic() - start)
     median, late = float(np.median(ages)), float(np.quantile(ages, 0.99))
     text = f"{rate:.1f} of {fps:g} pictures a second; read at an age of {duration(median)}, .99: {duration(late)}"
     figures = {"per_s": rate, "age_s": median, "age_99_s": late}
-    return Line("cameras", f"{SIZE[0]} x {SIZE[1]} at {fps:g}", text, figures)
+    return ResultLine("cameras", f"{SIZE[0]} x {SIZE[1]} at {fps:g}", text, figures)
 
 
-def _skew(way: str, keep: int, seconds: float) -> Line:
+def _skew(way: str, keep: int, seconds: float) -> ResultLine:
     """Two cameras of 30 pictures a second, 10 ms apart, read at random moments."""
     rng = np.random.default_rng(1)
     skews: list[float] = []
     with _Rig() as rig:
         sensors: dict[str, TactileSensor] = {
-            finger: rig.gel(finger, FakeCamera(fps=30.0, size=SIZE, phase_s=phase, stamps=True), keep)
+            finger: rig.gel(finger, FakeVideoDevice(fps=30.0, size=SIZE, phase_s=phase, stamps=True), keep)
             for finger, phase in (("a", 0.0), ("b", APART_S))
         }
         start = time.monotonic()
@@ -86,10 +86,10 @@ def _skew(way: str, keep: int, seconds: float) -> Line:
             skews.append(read_together(sensors)[1])
     mean, most = float(np.mean(skews)), float(np.max(skews))
     text = f"two fingers 10 ms out of step: {duration(mean)} apart in the mean, {duration(most)} at most"
-    return Line("cameras", f"skew, {way}", text, {"mean_s": mean, "most_s": most})
+    return ResultLine("cameras", f"skew, {way}", text, {"mean_s": mean, "most_s": most})
 
 
-def _film(pictures: int = 120) -> Line:
+def _film(pictures: int = 120) -> ResultLine:
     """A film of 640 x 480 as a sensor, each picture asked for as soon as the last has come."""
     rng = np.random.default_rng(2)
     now = [0.0]
@@ -105,10 +105,12 @@ def _film(pictures: int = 120) -> Line:
                 now[0] = (number + 0.5) / 30.0
                 gel.read()
             each = (time.perf_counter() - start) / (pictures - 1)
-    return Line("cameras", "film, MJPG 640 x 480", f"{1 / each:.0f} pictures a second decoded", {"per_s": 1 / each})
+    return ResultLine(
+        "cameras", "film, MJPG 640 x 480", f"{1 / each:.0f} pictures a second decoded", {"per_s": 1 / each}
+    )
 
 
-def _work() -> Iterator[Line]:
+def _work() -> Iterator[ResultLine]:
     """What is done to one picture when it is read, one thread."""
     picture = np.random.default_rng(3).integers(0, 255, (960, 1280, 3), np.uint8)
     corners = ((100.0, 80.0), (1180.0, 95.0), (1170.0, 900.0), (120.0, 890.0))
@@ -122,7 +124,7 @@ def _work() -> Iterator[Line]:
     try:
         for name, way in ways.items():
             seconds = _seconds(way, picture)
-            yield Line("cameras", f"1280 x 960, {name}", f"{duration(seconds)} a picture", {"seconds": seconds})
+            yield ResultLine("cameras", f"1280 x 960, {name}", f"{duration(seconds)} a picture", {"seconds": seconds})
     finally:
         cv2.setNumThreads(threads)
 
@@ -132,7 +134,7 @@ def _seconds(way: Rectifier, picture: np.ndarray) -> float:
     best = math.inf
     for _ in range(10):
         start = time.perf_counter()
-        in_rgb(way.apply(picture))
+        to_rgb(way.apply(picture))
         best = min(best, time.perf_counter() - start)
     return best
 

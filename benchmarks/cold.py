@@ -12,11 +12,11 @@ from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from benchmarks.common import Line
+from benchmarks.common import ResultLine
 from benchmarks.query import STAGES, gel_images, write_index
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
-from retrieval.model.export import graph_of
-from retrieval.model.onnx_encoder import ENDING, sealed
+from retrieval.model.export import touch_encoder_to_onnx
+from retrieval.model.onnx_encoder import EXPORT_SUFFIX, with_checksum
 from retrieval.search.defaults import shipped_model
 
 PHOTOS = 1000
@@ -41,9 +41,9 @@ from pathlib import Path
 import retrieval.search.query.opening as opening
 import retrieval.search.query.searcher as search
 generation = step("open the index", lambda: opening.IndexStore(index).open(threads=1))
-stored = step("read the checkpoint", lambda: import_module("retrieval.model.stored").read_stored(Path(model)))
+stored = step("read the checkpoint", lambda: import_module("retrieval.model.checkpoint_info").read_checkpoint_info(Path(model)))
 encoder = step("make the encoder", lambda: search.exported(stored) or search.torch_encoder(stored))
-judge = step("read the head", lambda: search.read_judge(Path(model)))
+judge = step("read the head", lambda: search.read_scorer(Path(model)))
 shard = step("number objects", lambda: search.FolderShard(generation, judge, stored.config.has_embeddings))
 searcher = search.Searcher(Path(index), shard, stored, encoder, judge)
 result = searcher.query([touch])
@@ -57,7 +57,7 @@ print(json.dumps(ms | {{"CPU": 1e3 * time.process_time()}}), file=sys.stderr)
 """
 
 
-def measure(photos: int = PHOTOS, repetitions: int = REPETITIONS, model: Path | None = None) -> Iterator[Line]:
+def measure(photos: int = PHOTOS, repetitions: int = REPETITIONS, model: Path | None = None) -> Iterator[ResultLine]:
     """A line for `--help`, and one for each backend that is installed, with the shipped checkpoint."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -83,7 +83,7 @@ def _models(folder: Path, source: Path) -> dict[str, Path]:
         models[backend] = Path(shutil.copy(source, folder / backend / "model.safetensors"))
         if backend != "torch":
             path = models[backend]
-            path.with_suffix(ENDING).write_bytes(sealed(graph_of(load_checkpoint(path))))
+            path.with_suffix(EXPORT_SUFFIX).write_bytes(with_checksum(touch_encoder_to_onnx(load_checkpoint(path))))
     return models
 
 
@@ -97,13 +97,13 @@ def _steps(index: Path, model: Path, backend: str, touch: Sequence[Path]) -> dic
     return steps
 
 
-def _line(backend: str, checkpoint: Checkpoint, runs: Sequence[dict[str, float]], photos: int) -> Line:
+def _line(backend: str, checkpoint: Checkpoint, runs: Sequence[dict[str, float]], photos: int) -> ResultLine:
     cpu = [run.pop("CPU") for run in runs]
     ms = {step: statistics.median(run[step] for run in runs) for step in runs[0]}
     each = [sum(run.values()) for run in runs]
     total = statistics.median(each)
     shown = ", ".join(f"{step} {value:.0f}" for step, value in ms.items() if value >= 0.5)
-    return Line(
+    return ResultLine(
         "cold",
         checkpoint.config.matcher.tower,
         f"{backend}, {photos} photos: {total:.0f} ms a query from nothing, {statistics.median(cpu):.0f} of CPU time: "
@@ -113,11 +113,11 @@ def _line(backend: str, checkpoint: Checkpoint, runs: Sequence[dict[str, float]]
     )
 
 
-def _help(repetitions: int) -> Line:
+def _help(repetitions: int) -> ResultLine:
     seconds = []
     for _ in range(repetitions + 1):
         start = time.perf_counter()
         subprocess.run([sys.executable, "-m", "retrieval", "--help"], capture_output=True, check=True)
         seconds.append(time.perf_counter() - start)
     median = 1e3 * statistics.median(seconds[1:])
-    return Line("cold", "no tower", f"`retrieve --help` takes {median:.0f} ms", {"help_ms": median})
+    return ResultLine("cold", "no tower", f"`retrieve --help` takes {median:.0f} ms", {"help_ms": median})

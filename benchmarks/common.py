@@ -12,11 +12,11 @@ from retrieval.model.config import Config, load_config
 from retrieval.model.fusion import Matcher
 
 REPETITIONS = 5
-LEAST_S = 0.2
+MIN_SECONDS = 0.2
 
 
 @dataclass(frozen=True)
-class Line:
+class ResultLine:
     """One result: a sentence for people, and its figures. each: of arms what single repetitions took, for a spread."""
 
     benchmark: str
@@ -50,10 +50,10 @@ def in_turns(
 ) -> Times:
     """Run every arm once unmeasured, then all of them in turn, `repetitions` times.
 
-    A short arm is called again and again for about `LEAST_S` at its turn, and the mean of the calls is taken.
+    A short arm is called again and again for about `MIN_SECONDS` at its turn, and the mean of the calls is taken.
     clock: gives seconds; those of `time.process_time` are CPU time.
     """
-    calls = {name: max(1, int(LEAST_S / _seconds(arm, 1, clock))) for name, arm in arms.items()}
+    calls = {name: max(1, int(MIN_SECONDS / _seconds(arm, 1, clock))) for name, arm in arms.items()}
     seconds: dict[str, list[float]] = {name: [] for name in arms}
     for _ in range(repetitions):
         for name, arm in arms.items():

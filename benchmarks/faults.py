@@ -36,9 +36,9 @@ from indexes.store.folder import IndexStore
 from retrieval.errors import RetrievalError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.query.searcher import Searcher
-from retrieval.search.sharding.build_cluster import build_cluster
-from retrieval.search.sharding.object_store import folder_with, read_cluster
-from tests import on_ray, s3, serving, synthetic
+from retrieval.search.sharding.build_sharded import build_sharded
+from retrieval.search.sharding.object_store import local_folder, read_sharded_manifest
+from tests import ray_processes, s3, serving, synthetic
 
 PHOTOS, OBJECTS, SHARDS, BLOCKS = 240, 40, 4, 8
 ATOL = 2e-3
@@ -46,14 +46,14 @@ ATOL = 2e-3
 SHARD, WORKER = r"ray::ServeReplica:shard-", r"ray::MapWorker"
 
 
-class Wrong(Exception):
+class ExpectationFailed(Exception):
     """Something was lost, doubled, or answered wrongly."""
 
 
 def must(holds, what):
     """Raises Wrong."""
     if not holds:
-        raise Wrong(what)
+        raise ExpectationFailed(what)
 
 
 def write_photos(folder, photos=PHOTOS, objects=OBJECTS):
@@ -70,7 +70,7 @@ def _make(folder):
     train(recording, folder / "tiny.safetensors", TINY, quiet=True)
 
 
-class Bench:
+class FaultFixture:
     """The photos, the model, a cluster that nothing disturbed, and touches with what it answers."""
 
     def __init__(self, folder, seed=0):
@@ -92,7 +92,7 @@ class Bench:
 
     def build(self, photos, out, shards=SHARDS, **how):
         """Build in this process."""
-        return build_cluster(photos, load_checkpoint(self.model), out, shards, quiet=True, **how)
+        return build_sharded(photos, load_checkpoint(self.model), out, shards, quiet=True, **how)
 
     @staticmethod
     def forked(work):
@@ -104,21 +104,21 @@ class Bench:
     def codes_of(self, cluster):
         """{photo: (object, half)} of all shards; raises Wrong for a photo in two of them."""
         found = {}
-        for entry in read_cluster(cluster).shards:
-            store = IndexStore(folder_with(cluster, entry) / entry.folder)
+        for entry in read_sharded_manifest(cluster).shards:
+            store = IndexStore(local_folder(cluster, entry) / entry.folder)
             generation = store.open(name=entry.generation)
-            for row, half in zip(generation.rows, generation.arrays["halves"], strict=True):
+            for row, partial_activation in zip(generation.rows, generation.arrays["partials"], strict=True):
                 must(row["id"] not in found, f"{row['id']} is there twice")
-                found[row["id"]] = row["object_id"], half.astype(np.float32)
+                found[row["id"]] = row["object_id"], partial_activation.astype(np.float32)
         return found
 
     def check_codes(self, cluster):
         """All photos, once, with the codes of the undisturbed build."""
         found = self.codes_of(cluster)
         must(found.keys() == self.codes.keys(), f"{len(found)} photos of {len(self.codes)} are there")
-        for name, (owner, half) in found.items():
+        for name, (owner, partial_activation) in found.items():
             must(owner == self.codes[name][0], f"{name} is of {owner}")
-            must(np.allclose(half, self.codes[name][1], atol=ATOL), f"{name} has another code")
+            must(np.allclose(partial_activation, self.codes[name][1], atol=ATOL), f"{name} has another code")
 
     def check_answer(self, number, answer):
         """Whole, and that of the undisturbed cluster."""
@@ -152,7 +152,7 @@ def another_machine():
     shutil.rmtree(Path(os.environ["XDG_CACHE_HOME"]), ignore_errors=True)
 
 
-class Encoded:
+class EncodedPhotoCount:
     """How many photos the processes forked from this one encode, while it is used."""
 
     def __enter__(self):
@@ -190,7 +190,7 @@ class Encoded:
 def job(bench, times):
     """Killed when 40 to 60 % of the photos were encoded. What another machine repeats are blocks: one of 8 shards."""
     figures = {"killed": 0}
-    with s3.served(), Encoded() as encoded:
+    with s3.run_server(), EncodedPhotoCount() as encoded:
         for where in ("same", "other"):
             repeated, shares = [], []
             for turn in range(times):
@@ -206,7 +206,7 @@ def job(bench, times):
                 figures["killed"] += process.exitcode == -signal.SIGKILL
                 done = encoded.count
                 try:
-                    read_cluster(url)
+                    read_sharded_manifest(url)
                     must(process.exitcode == 0, "a build that was killed put a cluster")
                 except NoIndex:
                     pass
@@ -228,7 +228,7 @@ def job(bench, times):
 def disturbed(bench, times, kind, **faults):
     """Builds into a store with faults, and searches of it, until there were so many faults; a few builds at least."""
     builds = 0
-    with s3.served() as server:
+    with s3.run_server() as server:
         photos = bench.stored
         for name, every in faults.items():
             setattr(server, name, every)
@@ -257,20 +257,20 @@ def torn(bench, times):
 
 def worker(bench, times):
     """Killed whenever new codes were kept, at most four times a build."""
-    from retrieval.cluster.building import by_ray
+    from retrieval.cluster.building import ray_runner
 
     killed = builds = 0
     while killed < times:
         out, done = bench.folder / f"by-ray-{builds}", {}
 
         def work(out=out, done=done):
-            done["report"] = bench.build(bench.photos, out, run=by_ray(2, workers=1), bad_share=0)
+            done["report"] = bench.build(bench.photos, out, run=ray_runner(2, workers=1), max_unreadable=0)
 
         thread, known, own = threading.Thread(target=work), 0, 0
         thread.start()
         while thread.is_alive():
             kept = sum(path.stat().st_size for path in out.glob("shard-*/unfinished.sqlite"))
-            if kept > known and own < min(4, times - killed) and (workers := on_ray.called(WORKER)):
+            if kept > known and own < min(4, times - killed) and (workers := ray_processes.processes_named(WORKER)):
                 for process in workers:
                     os.kill(process, signal.SIGKILL)
                 own, known = own + 1, kept
@@ -303,7 +303,7 @@ def asked(bench, ask):
             except RetrievalError:  # said to whoever asks
                 told["errors"] += 1
                 time.sleep(0.05)
-            except Wrong as error:
+            except ExpectationFailed as error:
                 told["wrong"].append(str(error))
 
     thread = threading.Thread(target=go_on)
@@ -326,15 +326,15 @@ def grow(told, name="answers", by=1, limit_s=240):
 
 def shard(bench, times):
     """While queries go on, one after the other."""
-    from retrieval.cluster.serving import Deployments, Held
-    from retrieval.cluster.session import connected
+    from retrieval.cluster.serving import Deployments, ReplicaSettings
+    from retrieval.cluster.session import ray_session
 
-    with connected(2) as ray:
-        held = Deployments(ray, Held(cpus=0.1, wait_s=120.0))
+    with ray_session(2) as ray:
+        held = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=120.0))
         with Searcher.open(bench.cluster, shards=held.open) as searcher, asked(bench, searcher.query) as told:
             grow(told)
             for turn in range(times):
-                processes = on_ray.called(SHARD)
+                processes = ray_processes.processes_named(SHARD)
                 os.kill(processes[turn % len(processes)], signal.SIGKILL)
                 grow(told, by=3)
             return {"killed": times, "answers": told["answers"], "errors": told["errors"]}
@@ -368,12 +368,12 @@ def main():
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         os.environ["XDG_CACHE_HOME"], os.environ["XDG_STATE_HOME"] = f"{name}/cache", f"{name}/state"
-        bench, failed = Bench(Path(name), arguments.seed), 0
+        bench, failed = FaultFixture(Path(name), arguments.seed), 0
         for kind in arguments.only:
             start = time.monotonic()
             try:
                 figures = KINDS[kind](bench, arguments.times)
-            except Wrong as error:
+            except ExpectationFailed as error:
                 figures, failed = {"wrong": str(error)}, 1
             minutes = round((time.monotonic() - start) / 60, 1)
             print(json.dumps({"kind": kind, **figures, "minutes": minutes}), flush=True)

@@ -17,36 +17,36 @@ import numpy as np
 import torch
 
 from benchmarks import grasp
-from benchmarks.common import Line, as_text, config_of, duration, in_turns, matcher_of, random_images
+from benchmarks.common import ResultLine, as_text, config_of, duration, in_turns, matcher_of, random_images
 from benchmarks.step import pair_batch, shared_photos
 from retrieval.model.config import Config
 from retrieval.model.encode import default_device, encode_photos, encode_touches, to_batch, touch_batch
-from retrieval.model.fusion import Matcher, judge_of
+from retrieval.model.fusion import Matcher, scorer_of
 from retrieval.model.towers import TOWERS
 from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.train import set_training_mode
 
-PHOTOS, JUDGED, REPETITIONS = 64, 1000, 5
+PHOTOS, RERANKED, REPETITIONS = 64, 1000, 5
 
 
 def measure(
     config: Config, device: torch.device | str, photos: int = PHOTOS, repetitions: int = REPETITIONS
-) -> Iterator[Line]:
+) -> Iterator[ResultLine]:
     """A line each for building, asking and training; times wait for the device to be done."""
     matcher, pre, there = matcher_of(config), config.preprocessing, torch.device(device)
     arms = {"cpu": matcher, str(there): copy.deepcopy(matcher).to(there)}
     images = random_images(photos, pre.photo_px, seed=1)
     strips = [np.concatenate([image] * len(pre.views), axis=1) for image in images]
     touch = random_images(config.matcher.fingers, pre.touch_px, seed=2)
-    halves = np.random.default_rng(0).normal(size=(JUDGED, config.matcher.half)).astype(np.float16)
-    judge = judge_of(matcher.head)
+    partials = np.random.default_rng(0).normal(size=(RERANKED, config.matcher.partial_width)).astype(np.float16)
+    scorer = scorer_of(matcher.head)
 
     def ask(model: Matcher) -> object:
-        return judge.logits(encode_touches(model, [touch]).half.numpy(), halves)
+        return scorer.logits(encode_touches(model, [touch]).partial.numpy(), partials)
 
     works: dict[str, Callable[[Matcher], object]] = {
         f"build, {photos} photos in batches of 16": lambda model: encode_photos(model, strips),
-        f"ask, one touch, {JUDGED} photos judged": ask,
+        f"ask, one touch, {RERANKED} photos judged": ask,
     }
     for name, work in works.items():
         yield _line(
@@ -59,13 +59,13 @@ def measure(
     yield _line("train, a step of 6 touches x 8 photos", config, steps, repetitions)
 
 
-def _line(name: str, config: Config, arms: dict[str, Callable[[], object]], repetitions: int) -> Line:
+def _line(name: str, config: Config, arms: dict[str, Callable[[], object]], repetitions: int) -> ResultLine:
     times = in_turns(arms, repetitions)
     here, there = "cpu", list(arms)[-1]
     ratio = times.ratio(here, there)
     text = f"{name}: {duration(times.median(there))} on {there}, {duration(times.median(here))} on the processor"
     text += f": {as_text(ratio)}"
-    return Line(
+    return ResultLine(
         "gpu", config.matcher.tower, text, {f"{arm}_s": times.median(arm) for arm in arms} | {"ratio": ratio[0]}
     )
 

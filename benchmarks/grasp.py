@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.common import Line, duration
+from benchmarks.common import ResultLine, duration
 from robot.collection import CollectSettings, collect
 from robot.readings import Pose
 from robot.rig import load_rig
@@ -34,7 +34,7 @@ ARMS = {
 }
 
 
-def measure(objects: int = 26, grasps: int = 3, collected: int = 26) -> Iterator[Line]:
+def measure(objects: int = 26, grasps: int = 3, collected: int = 26) -> Iterator[ResultLine]:
     """A line an arm, each over the same scenes, one thread; then a line for one job and one for two."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
@@ -51,18 +51,18 @@ def measure(objects: int = 26, grasps: int = 3, collected: int = 26) -> Iterator
 def _scenes(objects: int, grasps: int) -> Iterator[Scene]:
     """Grips about the middle of the rig's objects, each round over all of them."""
     rig = SimRig(40_000)
-    held = {name: rig._find(name) for name in rig.object_ids(objects)}
+    held = {name: rig._find_object(name) for name in rig.object_ids(objects)}
     rng = np.random.default_rng(0)
     for number in range(grasps):
         for name, obj in held.items():
             rig.prepare(name, number)
-            scene = dataclasses.replace(rig.world.now(), obj=obj)
+            scene = dataclasses.replace(rig.sim_state.current_scene(), obj=obj)
             height = max(10.0, rng.uniform(0.3, 0.8) * float(obj.body.upper[2]))
             pose = Pose(scene.placement.x_mm, scene.placement.y_mm, height, rng.uniform(0, np.pi))
             yield dataclasses.replace(scene, grip=Grip(pose, rng.uniform(5, 25)))
 
 
-def _arms(scenes: list[Scene], warm: list[Scene]) -> Iterator[Line]:
+def _arms(scenes: list[Scene], warm: list[Scene]) -> Iterator[ResultLine]:
     """Arms in turns, scene by scene; `warm` bakes each object's relief and fills the caches."""
     for scene in warm:
         dataclasses.replace(scene, outputs=frozenset(EVERYTHING)).run()
@@ -74,7 +74,7 @@ def _arms(scenes: list[Scene], warm: list[Scene]) -> Iterator[Line]:
     for name, each in seconds.items():
         mean = float(np.mean(each))
         text = f"{duration(mean)} a grasp, {1 / mean:.1f} a second; {mean / whole:.0%} of everything"
-        yield Line("grasp", name, text, {"seconds": mean, "share": mean / whole})
+        yield ResultLine("grasp", name, text, {"seconds": mean, "share": mean / whole})
 
 
 def _arm(scene: Scene, name: str) -> Scene:
@@ -91,7 +91,7 @@ def _seconds(scene: Scene) -> float:
     return time.process_time() - start
 
 
-def _collected(objects: int, jobs: int) -> Line:
+def _collected(objects: int, jobs: int) -> ResultLine:
     """A whole collection, from starting processes to the last file on the disk."""
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
@@ -104,4 +104,4 @@ def _collected(objects: int, jobs: int) -> Line:
     accepted = sum(tally.accepted for tally in tallies)
     text = f"{attempts / seconds:.2f} attempts and {accepted / seconds:.2f} accepted grasps a second, all files written"
     figures = {"attempts_per_s": attempts / seconds, "accepted_per_s": accepted / seconds}
-    return Line("grasp", f"collect with {jobs} job{'s' * (jobs > 1)}", text, figures)
+    return ResultLine("grasp", f"collect with {jobs} job{'s' * (jobs > 1)}", text, figures)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from benchmarks.common import Line, duration
+from benchmarks.common import ResultLine, duration
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import Packet
 from robot.drivers.wsg50.commands import CommandId
@@ -18,7 +18,7 @@ PORTS = {"TCP": serve_tcp, "pty": serve_pty}
 SPEED_UP = 100.0
 
 
-def measure(trips: int = 1000, grasps: int = 20, seconds: float = 2.0) -> Iterator[Line]:
+def measure(trips: int = 1000, grasps: int = 20, seconds: float = 2.0) -> Iterator[ResultLine]:
     """For each kind of port: round trips of LOOP, readings of the state, grasps that take no time, updates of 1 ms.
 
     The emulator looks at its port at once when bytes come, and every millisecond at what it has to say unasked.
@@ -32,7 +32,7 @@ def measure(trips: int = 1000, grasps: int = 20, seconds: float = 2.0) -> Iterat
                     port, "round trip of a command", trips, lambda link=link: link.call(Packet(CommandId.LOOP, b"abcd"))
                 )
                 yield _updates(port, link, seconds)
-                link.tell(Packet(CommandId.DISCONNECT))
+                link.send(Packet(CommandId.DISCONNECT))
             finally:
                 link.close()
             with WSG50(port=address) as gripper:
@@ -45,7 +45,7 @@ def _cycle(gripper: WSG50) -> None:
     gripper.grasp(10.0, 400.0)
 
 
-def _times(port: str, what: str, count: int, call: Callable[[], object]) -> Line:
+def _times(port: str, what: str, count: int, call: Callable[[], object]) -> ResultLine:
     seconds = []
     for _ in range(count):
         start = time.perf_counter()
@@ -53,17 +53,17 @@ def _times(port: str, what: str, count: int, call: Callable[[], object]) -> Line
         seconds.append(time.perf_counter() - start)
     median, slow = (float(each) for each in np.quantile(seconds, [0.5, 0.99]))
     text = f"{what}: {duration(median)} median, {duration(slow)} in 1 of 100"
-    return Line("gripper", port, text, {"median_s": median, "quantile_99_s": slow})
+    return ResultLine("gripper", port, text, {"median_s": median, "quantile_99_s": slow})
 
 
-def _updates(port: str, link: Link, seconds: float) -> Line:
+def _updates(port: str, link: Link, seconds: float) -> ResultLine:
     """Count state updates asked for every millisecond."""
-    link.tell(commands.update(CommandId.SYSTEM_STATE, 1))
+    link.send(commands.update(CommandId.SYSTEM_STATE, 1))
     count, last, end = 0, None, time.monotonic() + seconds
     while time.monotonic() < end:
         link.pump(0.0005)
         now = link.updates[CommandId.SYSTEM_STATE][1]
         count, last = count + (now != last), now
-    link.tell(commands.ask(CommandId.SYSTEM_STATE))
+    link.send(commands.query(CommandId.SYSTEM_STATE))
     text = f"automatic updates asked for every millisecond: {count / seconds:.0f} a second"
-    return Line("gripper", port, text, {"updates_per_s": count / seconds})
+    return ResultLine("gripper", port, text, {"updates_per_s": count / seconds})

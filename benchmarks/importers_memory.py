@@ -5,7 +5,7 @@
 
 Rows are drawn in the layout of each data set, in folders as large as theirs, and lead by links to a few small pictures.
 An import runs in a process of its own; its peak is read before the recording is handed back and after, since what is
-handed back holds a line a grasp. Only names may grow with rows: MOST_KB.
+handed back holds a line a grasp. Only names may grow with rows: MAX_KB.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from typing import Any
 
 from tests.miniatures import encoded, picture
 
-MOST_KB = {"importing": 1.0, "in all": 3.0}
+MAX_KB = {"importing": 1.0, "in all": 3.0}
 """That a row may take: while it is imported, and once the recording was read back."""
 Options = dict[str, Any]
 
@@ -31,13 +31,13 @@ def main(words: Sequence[str]) -> int:
     parser.add_argument("--rows", nargs=2, type=int, default=(10_000, 100_000))
     asked = parser.parse_args(words)
     few, many = asked.rows
-    heads = (f"{what}, {few:,} rows, MB | {many:,} | kB a row" for what in MOST_KB)
-    print(f"| importer | {' | '.join(heads)} |\n|{'---|' * (1 + 3 * len(MOST_KB))}")
+    heads = (f"{what}, {few:,} rows, MB | {many:,} | kB a row" for what in MAX_KB)
+    print(f"| importer | {' | '.join(heads)} |\n|{'---|' * (1 + 3 * len(MAX_KB))}")
     good = True
     for name in asked.names or WIDE:
         peaks = {rows: peak_mb(name, rows) for rows in asked.rows}
         cells = []
-        for what, most in MOST_KB.items():
+        for what, most in MAX_KB.items():
             kb = growth_kb(peaks, what)
             good &= kb <= most
             cells.append(f"{peaks[few][what]:.0f} | {peaks[many][what]:.0f} | {kb:.2f}")

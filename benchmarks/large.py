@@ -17,19 +17,19 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.common import Line
+from benchmarks.common import ResultLine
 from benchmarks.frontier.large_photos import LOWER, PHOTOS, QUALITY, SIDE, as_jpeg, photographed
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import encode_photos, one_thread
-from retrieval.model.fusion import judge_of
+from retrieval.model.fusion import scorer_of
 from retrieval.search.defaults import shipped_model
 
 SIZES = ((1024, 1024), (2048, 2048), (4000, 3000))
 
 
-def measure(photos: int = PHOTOS, side: int = SIDE, sizes: tuple[tuple[int, int], ...] = SIZES) -> Iterator[Line]:
+def measure(photos: int = PHOTOS, side: int = SIDE, sizes: tuple[tuple[int, int], ...] = SIZES) -> Iterator[ResultLine]:
     """A line for each (width, height), and one for photos of the first side that were saved again."""
     checkpoint = load_checkpoint(shipped_model())
     tower, plain = checkpoint.config.matcher.tower, checkpoint.config.preprocessing
@@ -45,10 +45,10 @@ def measure(photos: int = PHOTOS, side: int = SIDE, sizes: tuple[tuple[int, int]
                 f"{size[0]} x {size[1]}: decoded and cut in {1e3 * whole_s:.0f} ms whole, in {1e3 * less_s:.0f} ms "
                 f"reduced ({ratio:.1f} times faster); {_said(moved)}"
             )
-            yield Line("large", tower, text, {"whole_s": whole_s, "reduced_s": less_s, "ratio": ratio, **moved})
+            yield ResultLine("large", tower, text, {"whole_s": whole_s, "reduced_s": less_s, "ratio": ratio, **moved})
         files = [[as_jpeg(picture, quality) for picture in pictures] for quality in (QUALITY, LOWER)]
         moved = _moved(checkpoint, *(_seen(each, plain)[0] for each in files))
-        yield Line("large", tower, f"{side} x {side}, saved again at quality {LOWER}: {_said(moved)}", moved)
+        yield ResultLine("large", tower, f"{side} x {side}, saved again at quality {LOWER}: {_said(moved)}", moved)
 
 
 def _seen(files: list[bytes], settings: Preprocessing) -> tuple[list[RgbImage], float]:
@@ -56,7 +56,7 @@ def _seen(files: list[bytes], settings: Preprocessing) -> tuple[list[RgbImage], 
     images, seconds = [], []
     for file in files:
         start = time.process_time()
-        images.append(settings.photo_of(file, "a photo"))
+        images.append(settings.photo_from_bytes(file, "a photo"))
         seconds.append(time.process_time() - start)
     return images, float(np.median(seconds))
 
@@ -64,9 +64,9 @@ def _seen(files: list[bytes], settings: Preprocessing) -> tuple[list[RgbImage], 
 def _moved(checkpoint: Checkpoint, before: list[RgbImage], after: list[RgbImage]) -> dict[str, float]:
     """How far grey levels, embeddings and match logits lie apart, and how often another photo is the best one."""
     assert checkpoint.queries is not None
-    judge, touches = judge_of(checkpoint.matcher.head), torch.from_numpy(checkpoint.queries).float().numpy()
+    scorer, touches = scorer_of(checkpoint.matcher.head), torch.from_numpy(checkpoint.queries).float().numpy()
     codes = [encode_photos(checkpoint.matcher, images) for images in (before, after)]
-    logits = [np.stack([judge.logits(touch[None], code.half.numpy()) for touch in touches]) for code in codes]
+    logits = [np.stack([scorer.logits(touch[None], code.partial.numpy()) for touch in touches]) for code in codes]
     apart = np.abs(logits[0] - logits[1])
     return {
         "grey_levels": float(255 * np.abs(np.array(before) - np.array(after)).mean()),
@@ -74,7 +74,7 @@ def _moved(checkpoint: Checkpoint, before: list[RgbImage], after: list[RgbImage]
         "logit": float(apart.mean()),
         "most_logit": float(apart.max()),
         "spread": float(logits[0].std()),
-        "same_winner": float((logits[0].argmax(1) == logits[1].argmax(1)).mean()),
+        "same_top1": float((logits[0].argmax(1) == logits[1].argmax(1)).mean()),
     }
 
 

@@ -22,10 +22,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from benchmarks.common import Line, as_text, in_turns
+from benchmarks.common import ResultLine, as_text, in_turns
 from benchmarks.training import matching
 from retrieval.data.dataset import Grasp, load_grasps
-from retrieval.data.loading import in_order, worker_count
+from retrieval.data.loading import map_in_order, worker_count
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.config import Config, load_config
 from robot.recording.folder import RecordingWriter
@@ -53,7 +53,9 @@ def _frames(grasp: Grasp) -> list[tuple[Path, Path]]:
     return list(zip(grasp.touches, grasp.backgrounds or grasp.touches, strict=True))
 
 
-def decoding(grasps: Sequence[Grasp], config: Config, counts: Sequence[int]) -> tuple[dict[str, float], list[Line]]:
+def decoding(
+    grasps: Sequence[Grasp], config: Config, counts: Sequence[int]
+) -> tuple[dict[str, float], list[ResultLine]]:
     """Images a second of each kind and number of workers."""
     settings, spawn = config.preprocessing, multiprocessing.get_context("spawn")
     files = files_of(grasps, settings)
@@ -71,28 +73,28 @@ def decoding(grasps: Sequence[Grasp], config: Config, counts: Sequence[int]) -> 
         for name in (f"{count} {kind}" for count in counts):
             ratio = times.ratio(first, name)
             text = f"{rates[name]:.0f} images/s, {as_text(ratio)} the rate of {first}"
-            lines.append(Line("decode", name, text, {"images_s": rates[name], "ratio": ratio[0]}))
+            lines.append(ResultLine("decode", name, text, {"images_s": rates[name], "ratio": ratio[0]}))
     return rates, lines
 
 
 def _all(pool: Executor, settings: Preprocessing, files: Sequence[tuple[bool, tuple[Path, ...]]]) -> None:
-    for _ in in_order(pool, partial(load, settings), files, 32):
+    for _ in map_in_order(pool, partial(load, settings), files, 32):
         pass
 
 
-def lines(recording: Path, config: Config, counts: Sequence[int]) -> Iterator[Line]:
+def lines(recording: Path, config: Config, counts: Sequence[int]) -> Iterator[ResultLine]:
     """Measure the loader and the towers, and give the lines to print."""
     rates, found = decoding(load_grasps(recording), config, counts)
     yield from found
     if config.training.freeze_towers:
         return
     with tempfile.TemporaryDirectory() as name, matching(config, recording, Path(name)) as (_, works):
-        times = in_turns({"towers": partial(works["kept"].steps, STEPS)}, 3)
-    towers = STEPS * works["kept"].images / times.median("towers")
+        times = in_turns({"towers": partial(works["cached"].steps, STEPS)}, 3)
+    towers = STEPS * works["cached"].images / times.median("towers")
     count = min(counts, key=lambda count: abs(count - worker_count()))
     ratio = rates[f"{count} thread(s)"] / towers
     text = f"the towers take {towers:.0f} images/s; {count} thread(s) decode {ratio:.2g} times as many"
-    yield Line("ratio", config.matcher.tower, text, {"towers_images_s": towers, "ratio": ratio})
+    yield ResultLine("ratio", config.matcher.tower, text, {"towers_images_s": towers, "ratio": ratio})
 
 
 def drawn(folder: Path, grasps: int = 48) -> Path:
@@ -119,7 +121,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="one JSON document a line")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    config = load_config(arguments.config).without_pruner()
+    config = load_config(arguments.config).without_candidate_encoder()
     config = dataclasses.replace(config, training=dataclasses.replace(config.training, init="random"))
     with tempfile.TemporaryDirectory() as name:
         recording = arguments.recording or drawn(Path(name, "drawn"))

@@ -2,7 +2,7 @@
 
 How many candidates hold the winners, against the number of photos. Catalogues are drawn as `benchmarks.scale`
 draws them, block by block, each the beginning of the next, and no block is kept: what grows is time alone. First every
-touch's winner is found, the photo that the classifier ranks first of all; then its place by the pruner. As there, half
+touch's winner is found, the photo that the classifier ranks first of all; then its place by the candidate_encoder. As there, half
 of the touches that the checkpoint keeps choose, `MARGIN` times as many candidates are taken as hold 99 % of their
 winners, and the other touches judge.
 
@@ -23,23 +23,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.scale import HELD_OUT, MARGIN, TARGET, Crowd, collected, crowd_of
+from benchmarks.scale import HELD_OUT, MARGIN, TARGET, BlendedPhotos, blended_photos, collected
 from retrieval.console.progress import Bar
-from retrieval.metrics.guesses import binomial_interval
-from retrieval.model.judge import Judge
+from retrieval.metrics.k_way import binomial_interval
+from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.search.defaults import shipped_model
 
 SAFE = 2.0
 
 
-class Coarse:
+class CoarseScorer:
     """The classifier's layers in bfloat16."""
 
-    def __init__(self, judge: Judge) -> None:
-        self._width = len(judge.out)
-        layers = (judge.second, judge.second_bias, judge.out)
+    def __init__(self, scorer: FusionScorer) -> None:
+        self._width = len(scorer.out)
+        layers = (scorer.second, scorer.second_bias, scorer.out)
         self._second, self._bias, self._out = (torch.from_numpy(layer).bfloat16() for layer in layers)
-        self._constant = float(judge.out_bias[0])
+        self._constant = float(scorer.out_bias[0])
 
     @torch.inference_mode()
     def logits(self, touches: NDArray[np.float32], photos: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
@@ -52,20 +52,22 @@ class Coarse:
             yield (second @ self._out).float().numpy() + more
 
 
-def winners(crowd: Crowd, touches: NDArray[np.float32], sizes: Sequence[int]) -> tuple[NDArray[Any], float]:
-    """The pruner's cosine (sizes, touches) of each touch with its winner among so many photos, and the share of pairs
+def exhaustive_top1(
+    crowd: BlendedPhotos, touches: NDArray[np.float32], sizes: Sequence[int]
+) -> tuple[NDArray[Any], float]:
+    """The candidate_encoder's cosine (sizes, touches) of each touch with its winner among so many photos, and the share of pairs
     that were judged in float32 too."""
-    coarse, judge, queries = Coarse(crowd.judge), crowd.judge, crowd.embeddings(touches, "touch")
+    coarse, scorer, queries = CoarseScorer(crowd.scorer), crowd.scorer, crowd.embeddings(touches, "touch")
     best, cosines = np.full(len(touches), -np.inf, np.float32), np.empty(len(touches), np.float32)
     margin, twice = np.inf, 0
     found = []
-    for photos, embeddings, ends in _blocks(crowd, sizes, "winners"):
+    for photos, embeddings, ends in _blocks(crowd, sizes, "exhaustive_top1"):
         error = 0.0
         for number, logits in enumerate(coarse.logits(touches, photos)):
             near = np.flatnonzero(logits > best[number] - margin)
             if not len(near):
                 continue
-            exact = judge.logits(touches[[number]], photos, near)
+            exact = scorer.logits(touches[[number]], photos, near)
             twice += len(near)
             error = max(error, float(np.abs(exact - logits[near]).max()))
             if exact.max() > best[number]:
@@ -77,8 +79,10 @@ def winners(crowd: Crowd, touches: NDArray[np.float32], sizes: Sequence[int]) ->
     return np.array(found), twice / (sizes[-1] * len(touches))
 
 
-def places(crowd: Crowd, touches: NDArray[np.float32], sizes: Sequence[int], cosines: NDArray[Any]) -> NDArray[Any]:
-    """At which place, from 1, the pruner puts each winner: (sizes, touches)."""
+def places(
+    crowd: BlendedPhotos, touches: NDArray[np.float32], sizes: Sequence[int], cosines: NDArray[Any]
+) -> NDArray[Any]:
+    """At which place, from 1, the candidate_encoder puts each winner: (sizes, touches)."""
     queries, before = crowd.embeddings(touches, "touch"), np.zeros(cosines.shape, np.int64)
     at = 0
     for _, embeddings, ends in _blocks(crowd, sizes, "places"):
@@ -89,14 +93,14 @@ def places(crowd: Crowd, touches: NDArray[np.float32], sizes: Sequence[int], cos
     return before + 1
 
 
-def _blocks(crowd: Crowd, sizes: Sequence[int], name: str) -> Iterator[tuple[Any, Any, bool]]:
-    """Halves and embeddings of photos in blocks, and whether one of the sizes ends with the block."""
+def _blocks(crowd: BlendedPhotos, sizes: Sequence[int], name: str) -> Iterator[tuple[Any, Any, bool]]:
+    """Partials and embeddings of photos in blocks, and whether one of the sizes ends with the block."""
     start = 0
     with Bar(name, sizes[-1], "photos") as bar:
         for size in sizes:
             for block in crowd.blocks(start, size, 0):
                 start += len(block.rows)
-                yield block.arrays["halves"].astype(np.float32), block.embeddings, start == size
+                yield block.arrays["partials"].astype(np.float32), block.embeddings, start == size
                 bar.advance(len(block.rows))
 
 
@@ -128,10 +132,10 @@ def main() -> None:
     arguments = parser.parse_args()
     sizes = sorted(int(size) for size in arguments.sizes)
     with tempfile.TemporaryDirectory() as made:
-        crowd = crowd_of(arguments.model, arguments.recording or collected(Path(made)), arguments.features)
+        crowd = blended_photos(arguments.model, arguments.recording or collected(Path(made)), arguments.features)
     touches = np.concatenate([crowd.touches, crowd.held_out[: arguments.held_out]])
     start = time.perf_counter()
-    cosines, twice = winners(crowd, touches, sizes)
+    cosines, twice = exhaustive_top1(crowd, touches, sizes)
     table = list(lines(sizes, places(crowd, touches, sizes, cosines), len(crowd.touches)))
     for line in table:
         shown = {name: value if isinstance(value, int) else round(value, 4) for name, value in line.items()}

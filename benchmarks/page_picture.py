@@ -14,11 +14,11 @@ from pathlib import Path
 
 from PIL import Image
 
-from retrieval.commands.demo import PHOTOS, example
+from retrieval.commands.demo import PHOTOS, example_object
 from retrieval.data.dataset import load_grasps
-from retrieval.serve.rig import of_index
+from retrieval.serve.rig import simulated_live_rig
 from tests.browser import address, ask, chromium, page
-from tests.serving import keeping
+from tests.serving import with_history
 
 OUT = Path(__file__).parents[1] / "docs" / "images" / "page.jpg"
 SIZE = {"width": 1280, "height": 960}
@@ -34,11 +34,11 @@ def main():
     for grasp in load_grasps(folder / "recording"):
         queries[grasp.object_id].append(grasp)
     queries = {name: grasps[PHOTOS:] for name, grasps in queries.items()}
-    files = [path for grasp in queries[example(queries)][:GRASPS] for path in grasp.touches]
+    files = [path for grasp in queries[example_object(queries)][:GRASPS] for path in grasp.touches]
     index = folder / "index"
     with (
         tempfile.TemporaryDirectory() as history,
-        keeping(index, Path(history), folder / "recording", of_index(index), address) as url,
+        with_history(index, Path(history), folder / "recording", simulated_live_rig(index), address) as url,
         chromium() as browser,
         page(browser, url) as opened,
     ):

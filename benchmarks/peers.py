@@ -21,8 +21,8 @@ from itertools import chain, takewhile
 import numpy as np
 
 import indexes
-from benchmarks.common import Line, as_text, in_turns
-from indexes.kinds.faiss_index import faiss, guarded
+from benchmarks.common import ResultLine, as_text, in_turns
+from indexes.kinds.faiss_index import faiss, faiss_call
 from indexes.kinds.measure import sample_queries
 from indexes.kinds.scores import Floats, Slots, scan
 
@@ -40,7 +40,7 @@ Search = Callable[[Floats, int], Slots]
 
 
 @dataclass(frozen=True)
-class Built:
+class GraphIndex:
     """An engine over vectors: how to search it, and what widths there are (one where it is exact)."""
 
     search: Search
@@ -57,35 +57,35 @@ def drawn(count: int, of_a_centre: int, seed: int = 0) -> Floats:
     return unit
 
 
-def ours(kind: str) -> Callable[[Floats], Built]:
+def ours(kind: str) -> Callable[[Floats], GraphIndex]:
     """One of `indexes.KINDS`."""
 
-    def build(vectors: Floats) -> Built:
+    def build(vectors: Floats) -> GraphIndex:
         index = indexes.load_kind(kind).build(vectors, threads=1)
         setting, widths = index.search_ladder or ("", (0,))
-        tuned = {width: index.tuned(**{setting: width}) if setting else index for width in widths}
-        return Built(lambda query, width: tuned[width].search(query, BEST)[1][0], widths)
+        with_settings = {width: index.with_settings(**{setting: width}) if setting else index for width in widths}
+        return GraphIndex(lambda query, width: with_settings[width].search(query, BEST)[1][0], widths)
 
     return build
 
 
-def bare_flat(vectors: Floats) -> Built:
+def bare_flat(vectors: Floats) -> GraphIndex:
     """FAISS's exact search."""
     index = faiss.IndexFlatIP(DIM)
     index.add(vectors)
-    return Built(lambda query, _: index.search(query, BEST)[1][0], (0,))
+    return GraphIndex(lambda query, _: index.search(query, BEST)[1][0], (0,))
 
 
-def bare_graph(vectors: Floats) -> Built:
+def bare_graph(vectors: Floats) -> GraphIndex:
     """FAISS's graph."""
     index = faiss.IndexHNSWFlat(DIM, LINKS, faiss.METRIC_INNER_PRODUCT)
     index.hnsw.efConstruction = BREADTH
     index.add(vectors)
     settings = {width: faiss.SearchParametersHNSW(efSearch=width) for width in WIDTHS}
-    return Built(lambda query, width: index.search(query, BEST, params=settings[width])[1][0], WIDTHS)
+    return GraphIndex(lambda query, width: index.search(query, BEST, params=settings[width])[1][0], WIDTHS)
 
 
-def bare_lists(vectors: Floats) -> Built:
+def bare_lists(vectors: Floats) -> GraphIndex:
     """FAISS's inverted lists with eight bits a number, as many lists as ours."""
     lists = max(round(len(vectors) ** 0.5), 1)
     index = faiss.index_factory(DIM, f"IVF{lists},SQ8", faiss.METRIC_INNER_PRODUCT)
@@ -93,10 +93,10 @@ def bare_lists(vectors: Floats) -> Built:
     index.add(vectors)
     widths = tuple(takewhile(lambda probes: probes <= lists, (4, 8, 16, 32, 64, 128, 256, 512)))
     settings = {width: faiss.SearchParametersIVF(nprobe=width) for width in widths}
-    return Built(lambda query, width: index.search(query, BEST, params=settings[width])[1][0], widths)
+    return GraphIndex(lambda query, width: index.search(query, BEST, params=settings[width])[1][0], widths)
 
 
-def hnswlib(vectors: Floats) -> Built:
+def hnswlib(vectors: Floats) -> GraphIndex:
     """The graph by those who described it."""
     index = import_module("hnswlib").Index("ip", DIM)
     index.init_index(len(vectors), ef_construction=BREADTH, M=LINKS, random_seed=0)
@@ -107,10 +107,10 @@ def hnswlib(vectors: Floats) -> Built:
         slots: Slots = index.knn_query(query, BEST, num_threads=1)[0][0].astype(np.int64)
         return slots
 
-    return Built(search, WIDTHS)
+    return GraphIndex(search, WIDTHS)
 
 
-def usearch(vectors: Floats) -> Built:
+def usearch(vectors: Floats) -> GraphIndex:
     """A graph by others."""
     index = import_module("usearch.index").Index(
         ndim=DIM, metric="ip", dtype="f32", connectivity=LINKS, expansion_add=BREADTH
@@ -122,10 +122,10 @@ def usearch(vectors: Floats) -> Built:
         slots: Slots = index.search(query[0], BEST, threads=1).keys.astype(np.int64)
         return slots
 
-    return Built(search, WIDTHS)
+    return GraphIndex(search, WIDTHS)
 
 
-ENGINES: Mapping[str, Callable[[Floats], Built]] = {
+ENGINES: Mapping[str, Callable[[Floats], GraphIndex]] = {
     "flat (ours)": ours("flat"),
     "FAISS flat": bare_flat,
     "ivf_sq8 (ours)": ours("ivf_sq8"),
@@ -136,15 +136,15 @@ ENGINES: Mapping[str, Callable[[Floats], Built]] = {
 }
 
 
-def measure(photos: int = 100_000, queries: int = QUERIES) -> Iterator[Line]:
+def measure(photos: int = 100_000, queries: int = QUERIES) -> Iterator[ResultLine]:
     """A line for each engine and each way to draw vectors."""
-    with guarded("being measured", 1):
+    with faiss_call("being measured", 1):
         for what, of_a_centre in DRAWN.items():
             vectors = drawn(photos, of_a_centre)
-            yield from compared(vectors, sample_queries(vectors, queries), f"{photos:,} vectors {what}")
+            yield from compare_engines(vectors, sample_queries(vectors, queries), f"{photos:,} vectors {what}")
 
 
-def compared(vectors: Floats, queries: Floats, what: str) -> Iterator[Line]:
+def compare_engines(vectors: Floats, queries: Floats, what: str) -> Iterator[ResultLine]:
     """A line for each engine over the same vectors; half of the queries choose widths, half are timed."""
     choosing, timed = queries[::2], queries[1::2]
     engines, widths, took = {}, {}, {}
@@ -153,7 +153,7 @@ def compared(vectors: Floats, queries: Floats, what: str) -> Iterator[Line]:
         engines[name] = build(vectors)
         took[name] = time.process_time() - start
         widths[name] = least_width(engines[name], vectors, choosing)
-    times = in_turns({name: partial(found, one, widths[name], timed) for name, one in engines.items()}, 5)
+    times = in_turns({name: partial(found_at, one, widths[name], timed) for name, one in engines.items()}, 5)
     for name, one in engines.items():
         figures = {
             "width": widths[name],
@@ -166,12 +166,12 @@ def compared(vectors: Floats, queries: Floats, what: str) -> Iterator[Line]:
             f"{figures['recall']:.3f}; built in {took[name]:.2f} s of CPU time"
         )
         each = [1e6 * seconds / len(timed) for seconds in times.seconds[name]]
-        yield Line("peers", name, text, figures, {"query_us": each})
+        yield ResultLine("peers", name, text, figures, {"query_us": each})
 
 
-def named(photos: int = 100_000, queries: int = QUERIES, repetitions: int = 7) -> Iterator[Line]:
+def named(photos: int = 100_000, queries: int = QUERIES, repetitions: int = 7) -> Iterator[ResultLine]:
     """A line for each kind and each of `NAMED`: naming candidates, beside FAISS's own call for as many, in turns."""
-    with guarded("being measured", 1):
+    with faiss_call("being measured", 1):
         vectors = drawn(photos, 0)
         asked, bare = sample_queries(vectors, queries), faiss.IndexFlatIP(DIM)
         bare.add(vectors)
@@ -197,22 +197,22 @@ def named(photos: int = 100_000, queries: int = QUERIES, repetitions: int = 7) -
                 ratio = times.ratio("ours", "bare")
                 took = np.median(each["ours"])
                 text = f"the best {k} of {photos:,} named in {took:.0f} us: {as_text(ratio)} the bare call"
-                yield Line("named", kind, text, {"k": k, "ratio": ratio[0]}, each)
+                yield ResultLine("named", kind, text, {"k": k, "ratio": ratio[0]}, each)
 
 
-def least_width(built: Built, vectors: Floats, queries: Floats) -> int:
+def least_width(built: GraphIndex, vectors: Floats, queries: Floats) -> int:
     """The first of its widths that reaches `RECALL`, or the last."""
     return next((width for width in built.widths if recall(built, width, vectors, queries) >= RECALL), built.widths[-1])
 
 
-def recall(built: Built, width: int, vectors: Floats, queries: Floats) -> float:
+def recall(built: GraphIndex, width: int, vectors: Floats, queries: Floats) -> float:
     """Mean share of the best `BEST` that are found."""
     best = scan(vectors, queries, BEST)[1]
-    shares = [np.isin(true, some).mean() for some, true in zip(found(built, width, queries), best, strict=True)]
+    shares = [np.isin(true, some).mean() for some, true in zip(found_at(built, width, queries), best, strict=True)]
     return float(np.mean(shares))
 
 
-def found(built: Built, width: int, queries: Floats) -> list[Slots]:
+def found_at(built: GraphIndex, width: int, queries: Floats) -> list[Slots]:
     """The slots of each query, asked one by one."""
     return [built.search(queries[row : row + 1], width) for row in range(len(queries))]
 

@@ -11,17 +11,17 @@ import numpy as np
 import torch
 from PIL import Image
 
-from benchmarks.common import REPETITIONS, Line, as_text, duration, in_turns, matcher_of
+from benchmarks.common import REPETITIONS, ResultLine, as_text, duration, in_turns, matcher_of
 from indexes.store.folder import IndexStore
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from retrieval.model.checkpoint_info import fingerprint, read_scorer
 from retrieval.model.config import Config
 from retrieval.model.encode import TorchEncoder, touch_batch
-from retrieval.model.export import graph_of
+from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.fusion import Matcher
-from retrieval.model.onnx_encoder import OnnxEncoder, sealed
+from retrieval.model.onnx_encoder import OnnxEncoder, with_checksum
 from retrieval.model.posterior import Posterior
-from retrieval.model.stored import fingerprint, read_judge
-from retrieval.model.touches import Encoder
+from retrieval.model.touches import TouchEncoder
 from retrieval.search.defaults import shipped_model
 from retrieval.search.query.searcher import Searcher
 from retrieval.search.query.shard import FolderShard
@@ -32,20 +32,20 @@ GEL_PX = (240, 320)
 STAGES = ("decode", "encode", "candidates", "rerank")
 
 
-def measure(config: Config, photos: int = PHOTOS, repetitions: int = REPETITIONS) -> Iterator[Line]:
+def measure(config: Config, photos: int = PHOTOS, repetitions: int = REPETITIONS) -> Iterator[ResultLine]:
     """One line for each backend that is installed, for a model with random weights."""
     with tempfile.TemporaryDirectory() as name:
         yield from _lines(Path(name), stored_checkpoint(Path(name), matcher_of(config), config), photos, repetitions)
 
 
-def measure_shipped(photos: int = PHOTOS, repetitions: int = REPETITIONS) -> Iterator[Line]:
+def measure_shipped(photos: int = PHOTOS, repetitions: int = REPETITIONS) -> Iterator[ResultLine]:
     """The same for the shipped checkpoint, and the time that `Searcher.open` takes once everything is imported."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         checkpoint = load_checkpoint(Path(shutil.copy(shipped_model(), folder / "model.safetensors")))
         yield from _lines(folder, checkpoint, photos, repetitions)
         times = in_turns({"open": lambda: Searcher.open(folder / "index")}, repetitions)
-        yield Line(
+        yield ResultLine(
             "query",
             checkpoint.config.matcher.tower,
             f"an index of {photos} photos is opened and verified in {duration(times.median('open'))}",
@@ -53,14 +53,16 @@ def measure_shipped(photos: int = PHOTOS, repetitions: int = REPETITIONS) -> Ite
         )
 
 
-def _lines(folder: Path, checkpoint: Checkpoint, photos: int, repetitions: int) -> Iterator[Line]:
+def _lines(folder: Path, checkpoint: Checkpoint, photos: int, repetitions: int) -> Iterator[ResultLine]:
     write_index(folder / "index", checkpoint, photos)
     touch = gel_images(folder, checkpoint.config.matcher.fingers)
     for encoder in encoders(folder, checkpoint):
         yield _line(folder / "index", checkpoint, encoder, touch, repetitions)
 
 
-def _line(index: Path, checkpoint: Checkpoint, encoder: Encoder, touch: list[Path], repetitions: int) -> Line:
+def _line(
+    index: Path, checkpoint: Checkpoint, encoder: TouchEncoder, touch: list[Path], repetitions: int
+) -> ResultLine:
     searcher = searcher_of(index, checkpoint, encoder)
     images = [checkpoint.config.preprocessing.load_touch(path) for path in touch]
     told: list[dict[str, float]] = []
@@ -72,23 +74,23 @@ def _line(index: Path, checkpoint: Checkpoint, encoder: Encoder, touch: list[Pat
     ratio = times.ratio("query", "bare")
     stages = {stage: statistics.median(each[stage] for each in told) for stage in STAGES}
     shown = ", ".join(f"{stage} {ms:.3g}" for stage, ms in stages.items())
-    return Line(
+    return ResultLine(
         "query",
         checkpoint.config.matcher.tower,
-        f"{encoder.name}, {searcher.described.photos} photos, {CANDIDATES} judged: {duration(times.median('query'))} "
+        f"{encoder.name}, {searcher.info.photos} photos, {CANDIDATES} judged: {duration(times.median('query'))} "
         f"({shown} ms), {duration(times.median('bare'))} the bare tower on the same images: {as_text(ratio)}",
-        {"photos": searcher.described.photos, "ratio": ratio[0], **{f"{stage}_ms": ms for stage, ms in stages.items()}},
+        {"photos": searcher.info.photos, "ratio": ratio[0], **{f"{stage}_ms": ms for stage, ms in stages.items()}},
     )
 
 
-def searcher_of(index: Path, checkpoint: Checkpoint, encoder: Encoder) -> Searcher:
+def searcher_of(index: Path, checkpoint: Checkpoint, encoder: TouchEncoder) -> Searcher:
     """One that encodes touches by this encoder."""
-    judge = read_judge(checkpoint.path)
-    shard = FolderShard(IndexStore(index).open(threads=1), judge, checkpoint.config.has_embeddings)
-    return Searcher(index, shard, checkpoint, encoder, judge)
+    scorer = read_scorer(checkpoint.path)
+    shard = FolderShard(IndexStore(index).open(threads=1), scorer, checkpoint.config.has_embeddings)
+    return Searcher(index, shard, checkpoint, encoder, scorer)
 
 
-def _bare(matcher: Matcher, encoder: Encoder, images: list[np.ndarray]):
+def _bare(matcher: Matcher, encoder: TouchEncoder, images: list[np.ndarray]):
     """The forward pass alone, of images that lie ready; in PyTorch folded as a query's is."""
     if isinstance(encoder, OnnxEncoder):
         return lambda: encoder.encode([images])
@@ -101,12 +103,12 @@ def _bare(matcher: Matcher, encoder: Encoder, images: list[np.ndarray]):
     return forward
 
 
-def encoders(folder: Path, checkpoint: Checkpoint) -> Iterator[Encoder]:
+def encoders(folder: Path, checkpoint: Checkpoint) -> Iterator[TouchEncoder]:
     """PyTorch, and ONNX Runtime where it is installed."""
     yield TorchEncoder(checkpoint.matcher)
     if find_spec("onnx") and find_spec("onnxruntime"):
         path = folder / "exported.onnx"
-        path.write_bytes(sealed(graph_of(checkpoint)))
+        path.write_bytes(with_checksum(touch_encoder_to_onnx(checkpoint)))
         yield OnnxEncoder(path, checkpoint.digest)
 
 
@@ -121,7 +123,7 @@ def stored_checkpoint(folder: Path, matcher: Matcher, config: Config) -> Checkpo
 def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
     """An index of made-up photos, three of each object: random halves and unit embeddings."""
     rng, matcher = np.random.default_rng(0), checkpoint.config.matcher
-    halves = rng.normal(size=(photos, matcher.half)).astype(np.float16)
+    partials = rng.normal(size=(photos, matcher.partial_width)).astype(np.float16)
     embeddings = rng.normal(size=(photos, matcher.embedding_dim)).astype(np.float32)
     embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
     names = [f"object-{number // 3:06d}/{number % 3}.jpg" for number in range(photos)]
@@ -131,7 +133,7 @@ def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
             for number, name in enumerate(names)
         ],
         embeddings,
-        {"halves": halves},
+        {"partials": partials},
         {"calibration": Posterior().to_dict()},
         fingerprint=fingerprint(checkpoint),
         about={"catalogue": str(out), "checkpoint": str(checkpoint.path), "candidates": {"k": CANDIDATES}},

@@ -32,12 +32,12 @@ CODES = 64 * 4 + 256 * 2
 PLANS = {1e6: (1, 8), 1e7: (1, 10, 40), 1e8: (20, 100), 1e9: (100, 1000)}
 """Photos -> numbers of shards."""
 REQUESTS, SLOWER = 4000, 3.0
-BUSY, LEAST_REPLICAS = 0.5, 2
+BUSY, MIN_REPLICAS = 0.5, 2
 """Share of its time that a replica works; with one alone, a shard that is lost is gone until it has started again."""
 
 
 @dataclass(frozen=True)
-class Service:
+class ServiceTimes:
     """The time of one shard: log-normal with this median and this 99th percentile, in seconds."""
 
     p50: float
@@ -54,7 +54,7 @@ class Service:
         return self.p50 * math.exp(spread**2 / 2)
 
 
-def service_of(photos: float, measured: Sequence[Mapping[str, Any]]) -> Service:
+def service_of(photos: float, measured: Sequence[Mapping[str, Any]]) -> ServiceTimes:
     """The time of a shard of so many photos: measured ones, those of whole folders too, between and beyond them by a
     power law."""
     points = {one["photos"] / one["shards"]: one["slowest_p50_s"] for one in measured}
@@ -69,11 +69,11 @@ def service_of(photos: float, measured: Sequence[Mapping[str, Any]]) -> Service:
         slope = np.diff(medians[near])[0] / np.diff(sizes[near])[0]
         end = -1 if at > sizes[-1] else 0
         p50 = math.exp(medians[end] + slope * (at - sizes[end]))
-    return Service(p50, p50 * tail)
+    return ServiceTimes(p50, p50 * tail)
 
 
 def answers(
-    shards: int, replicas: int, service: Service, rate: float, seed: int = 0, slow: int = 0, lost: int = 0
+    shards: int, replicas: int, service: ServiceTimes, rate: float, seed: int = 0, slow: int = 0, lost: int = 0
 ) -> np.ndarray:
     """Seconds from the arrival of each of `REQUESTS` touches to its answer.
 
@@ -125,7 +125,7 @@ def tables(measured: Sequence[Mapping[str, Any]], rate: float) -> Iterator[str]:
     for photos, divisions in PLANS.items():
         for shards in divisions:
             service = service_of(photos / shards, measured)
-            replicas = max(LEAST_REPLICAS, math.ceil(rate * service.mean / BUSY))
+            replicas = max(MIN_REPLICAS, math.ceil(rate * service.mean / BUSY))
             plain = answers(shards, replicas, service, rate)
             slow = answers(shards, replicas, service, rate, slow=1)
             lost = answers(shards, replicas, service, rate, lost=1)

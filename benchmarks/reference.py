@@ -28,7 +28,7 @@ COMMANDS = PAGE.with_name("commands.md")
 DATA_SETS = PAGE.with_name("datasets.md")
 MADE_BY_HAND = (
     retrieval.Client,
-    retrieval.Setting,
+    retrieval.MethodSettings,
     robot.Frame,
     robot.Grip,
     robot.Pose,

@@ -91,7 +91,7 @@ class Cue:
     def prepare(self, object_id, number):
         own = [place for place, grasp in enumerate(self.grasps) if grasp.object_id == object_id]
         self.number = own[number % len(own)]
-        self.rig.camera.show(self.number)
+        self.rig.camera.seek(self.number)
         grasp = self.grasps[self.number]
         self.emulator.object_mm = grasp.opening_mm if grasp.outcome == "held" else None
         self.lifted_from = None

@@ -5,24 +5,24 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from benchmarks.common import REPETITIONS, Line, as_text, duration, in_turns, matcher_of, random_images
+from benchmarks.common import REPETITIONS, ResultLine, as_text, duration, in_turns, matcher_of, random_images
 from retrieval.model.config import Config
 from retrieval.model.encode import encode_photos, encode_touches, to_batch, touch_batch
-from retrieval.model.fusion import judge_of
+from retrieval.model.fusion import scorer_of
 
 BATCH = 16
 
 
 def measure(
     config: Config, candidates: tuple[int, ...] = (100, 1000), sample: int = BATCH, repetitions: int = REPETITIONS
-) -> Iterator[Line]:
+) -> Iterator[ResultLine]:
     """One line for each number of candidates. The whole network runs on `sample` pairs, and its time is scaled; the
     matrix product is that of the head's second layer for all candidates, in the library that numpy uses."""
     matcher, pre = matcher_of(config), config.preprocessing
     touch = random_images(config.matcher.fingers, pre.touch_px, seed=1)
     photos = random_images(sample, pre.photo_px, seed=2)
-    half, judge = encode_touches(matcher, [touch]).half.numpy(), judge_of(matcher.head)
-    halves = encode_photos(matcher, photos).half.numpy().astype(np.float16)
+    partial, scorer = encode_touches(matcher, [touch]).partial.numpy(), scorer_of(matcher.head)
+    partials = encode_photos(matcher, photos).partial.numpy().astype(np.float16)
     one_touch, stacked = touch_batch([touch]), to_batch(photos)
 
     @torch.inference_mode()
@@ -31,18 +31,18 @@ def measure(
         return torch.cat([matcher(one_touch.expand(len(part), -1, -1, -1, -1), part) for part in parts])
 
     reference = whole_network().numpy()
-    error = float(np.abs(judge.logits(half, halves) - reference).max())
+    error = float(np.abs(scorer.logits(partial, partials) - reference).max())
     assert error <= 0.02 * max(1.0, float(np.abs(reference).max())), "the two arms must give the same logits"
-    stored = {count: np.resize(halves, (count, halves.shape[1])) for count in candidates}
+    stored = {count: np.resize(partials, (count, partials.shape[1])) for count in candidates}
     floats = {count: stored[count].astype(np.float32) for count in candidates}
-    arms = {str(count): (lambda count=count: judge.logits(half, stored[count])) for count in candidates}
-    arms |= {f"product {count}": (lambda count=count: floats[count] @ judge.second.T) for count in candidates}
+    arms = {str(count): (lambda count=count: scorer.logits(partial, stored[count])) for count in candidates}
+    arms |= {f"product {count}": (lambda count=count: floats[count] @ scorer.second.T) for count in candidates}
     times = in_turns({**arms, "touch": lambda: encode_touches(matcher, [touch]), "whole": whole_network}, repetitions)
     for count in candidates:
         scale = count / sample
         ratio, share = times.ratio("whole", str(count), scale), times.ratio(f"product {count}", str(count))
         ours, encoded, other = times.median(str(count)), times.median("touch"), scale * times.median("whole")
-        yield Line(
+        yield ResultLine(
             "rerank",
             config.matcher.tower,
             f"{count} candidates take {duration(ours)} from halves and {duration(other)} by the whole network on each "
@@ -51,11 +51,11 @@ def measure(
             f"({config.matcher.hidden} units); largest difference of a logit {error:.2g}",
             {
                 "candidates": count,
-                "halves_s": ours,
+                "partials_s": ours,
                 "encode_s": encoded,
                 "whole_s": other,
                 "ratio": ratio[0],
                 "share_of_product": share[0],
             },
-            {"halves": times.seconds[str(count)], "product": times.seconds[f"product {count}"]},
+            {"partials": times.seconds[str(count)], "product": times.seconds[f"product {count}"]},
         )

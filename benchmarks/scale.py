@@ -1,7 +1,7 @@
 """`python -m benchmarks.scale [--sizes 1e3 1e4 1e5] [--recording R --features F] [--json]`: time against N.
 
 Catalogues of N photos are drawn from the trained model's own distribution: halves of recorded photos, each blended of
-two (w A + (1 - w) B, w uniform in 1/2..1), with the embeddings that the checkpoint's pruner gives them (`--by
+two (w A + (1 - w) B, w uniform in 1/2..1), with the embeddings that the checkpoint's candidate_encoder gives them (`--by
 contrastive`: with those whose cosine is in the halves). The touches are those of validation objects that the checkpoint
 keeps. The winner is the photo that the classifier ranks first of all. Settings, and how many candidates hold 99 % of
 the winners, are chosen with every other touch; `MARGIN` times as many are taken, for a hundred touches hardly tell the
@@ -45,26 +45,26 @@ from benchmarks.common import duration
 from indexes.errors import ParameterError
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
-from indexes.store.manifest import FileSeal
+from indexes.store.manifest import FileChecksum
 from indexes.store.tables import Block
 from retrieval.commands.main import main as retrieve
 from retrieval.data.dataset import load_grasps
-from retrieval.metrics.guesses import binomial_interval
+from retrieval.metrics.k_way import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
-from retrieval.model.fusion import judge_of
-from retrieval.model.judge import Judge
+from retrieval.model.fusion import scorer_of
+from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.search.defaults import shipped_model
 from retrieval.training.features import encode_recording
 
 KINDS = ("flat", "ivf_sq8", "ivf_pq", "hnsw")
 BLOCK = 8192
-MOST_CANDIDATES = 16_000
+MAX_CANDIDATES = 16_000
 TARGET, MARGIN = 0.99, 4
 ADDED = 1000
 TIMED = 40
 QUERIES, HELD_OUT = 200, 1000
 """Touches that choose how many candidates there are, and others that judge it."""
-JUDGED = 3e13
+RERANKED = 3e13
 """Most flops to spend on finding winners: fewer touches are asked of larger catalogues, but never below 60."""
 
 PROBE = """
@@ -95,27 +95,27 @@ class Size:
 
 
 @dataclass(frozen=True)
-class Crowd:
+class BlendedPhotos:
     """A model, halves (n, h) of recorded photos to blend catalogues from, halves (Q, h) of touches to choose candidates
     with, and (J, h) of others.
 
-    by: which embeddings name the candidates, "pruner" or, where their cosine is in the halves, "contrastive".
+    by: which embeddings name the candidates, "candidate_encoder" or, where their cosine is in the halves, "contrastive".
     """
 
     checkpoint: Checkpoint
-    judge: Judge
+    scorer: FusionScorer
     photos: np.ndarray
     touches: np.ndarray
     held_out: np.ndarray
-    by: str = "pruner"
+    by: str = "candidate_encoder"
 
     @torch.inference_mode()
-    def embeddings(self, halves: np.ndarray, what: str) -> np.ndarray:
+    def embeddings(self, partials: np.ndarray, what: str) -> np.ndarray:
         """Unit embeddings (n, d) of "touch" or "photo" halves."""
         if self.by == "contrastive":
-            scaled = halves[:, self.checkpoint.config.matcher.hidden :]
+            scaled = partials[:, self.checkpoint.config.matcher.hidden :]
             return scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
-        return getattr(self.checkpoint.matcher.pruner, what)(torch.from_numpy(halves)).numpy()
+        return getattr(self.checkpoint.matcher.candidate_encoder, what)(torch.from_numpy(partials)).numpy()
 
     def blocks(self, start: int, stop: int, seed: int) -> Iterator[Block]:
         """Photos `start` to `stop` - 1 of a catalogue, block by block."""
@@ -124,39 +124,39 @@ class Crowd:
             count = min(BLOCK, stop - first)
             one, other = rng.integers(len(self.photos), size=(2, count))
             share = rng.uniform(0.5, 1, size=(count, 1)).astype(np.float32)
-            halves = share * self.photos[one] + (1 - share) * self.photos[other]
+            partials = share * self.photos[one] + (1 - share) * self.photos[other]
             rows = [_row(number) for number in range(first, first + count)]
-            yield Block(rows, self.embeddings(halves, "photo"), {"halves": halves.astype(np.float16)})
+            yield Block(rows, self.embeddings(partials, "photo"), {"partials": partials.astype(np.float16)})
 
 
-def crowd_of(model: Path, recording: Path, features: Path | None, by: str = "pruner") -> Crowd:
+def blended_photos(model: Path, recording: Path, features: Path | None, by: str = "candidate_encoder") -> BlendedPhotos:
     """The crowd that a recording's photos make; `features` keeps what was encoded."""
     checkpoint = load_checkpoint(model)
-    if checkpoint.queries is None or checkpoint.matcher.pruner is None:
-        raise SystemExit(f"{model} keeps no touches to ask with, or has no pruner; train it again")
+    if checkpoint.queries is None or checkpoint.matcher.candidate_encoder is None:
+        raise SystemExit(f"{model} keeps no touches to ask with, or has no candidate_encoder; train it again")
     if by == "contrastive" and not checkpoint.config.matcher.cosine:
         raise SystemExit(f"the halves of {model} hold no contrastive embedding; its configuration has cosine = false")
     found = encode_recording(load_grasps(recording), checkpoint.matcher, checkpoint.config, features)
     with torch.inference_mode():
-        photos = checkpoint.matcher.photo_code(torch.from_numpy(found.photo)).half.numpy()
-        felt = checkpoint.matcher.touch_code(torch.from_numpy(found.touch).flatten(1)).half.numpy()
+        photos = checkpoint.matcher.photo_encoding(torch.from_numpy(found.photo)).partial.numpy()
+        felt = checkpoint.matcher.touch_encoding(torch.from_numpy(found.touch).flatten(1)).partial.numpy()
     rng, queries = np.random.default_rng(0), checkpoint.queries.astype(np.float32)
-    half = len(queries) // 2
-    held_out = rng.permutation(np.concatenate([queries[half:], felt]))
-    judge = judge_of(checkpoint.matcher.head)
-    return Crowd(checkpoint, judge, np.unique(photos, axis=0), queries[:half], held_out, by)
+    partial = len(queries) // 2
+    held_out = rng.permutation(np.concatenate([queries[partial:], felt]))
+    scorer = scorer_of(checkpoint.matcher.head)
+    return BlendedPhotos(checkpoint, scorer, np.unique(photos, axis=0), queries[:partial], held_out, by)
 
 
-def measure(crowd: Crowd, photos: int, kinds: Sequence[str], folder: Path, queries: int = QUERIES) -> Size:
+def measure(crowd: BlendedPhotos, photos: int, kinds: Sequence[str], folder: Path, queries: int = QUERIES) -> Size:
     """Build, search and grow an index of so many photos of each kind in `folder`."""
-    most = max(60, int(JUDGED / (2 * crowd.photos.shape[1] ** 2 * photos)))
+    most = max(60, int(RERANKED / (2 * crowd.photos.shape[1] ** 2 * photos)))
     asked = min(queries, len(crowd.touches), most // 3)
     judged = min(HELD_OUT, len(crowd.held_out), most - asked)
     size, store = Size(photos, asked, judged), IndexStore(folder)
     generation = _build(crowd, store, size)
-    halves = generation.arrays["halves"]
+    partials = generation.arrays["partials"]
     touches = np.concatenate([crowd.touches[:asked], crowd.held_out[:judged]])
-    winners, size.figures["exhaustive_s"] = _winners(crowd.judge, touches, halves)
+    exhaustive_top1, size.figures["exhaustive_s"] = _top1(crowd.scorer, touches, partials)
     for kind in kinds:
         start = time.perf_counter()
         how = {
@@ -172,7 +172,7 @@ def measure(crowd: Crowd, photos: int, kinds: Sequence[str], folder: Path, queri
             size.kinds[kind] = {"refused": str(error)}
             continue
         figures = {"structure_s": time.perf_counter() - start} | opened(folder) | on_disk(made)
-        size.kinds[kind] = figures | _operating_point(crowd, made, touches, winners, asked)
+        size.kinds[kind] = figures | _operating_point(crowd, made, touches, exhaustive_top1, asked)
         size.kinds[kind] |= _growth(crowd, store, made, size.photos)
         point = size.kinds[kind]
         point["gain"] = size.figures["exhaustive_s"] / (point["search_s"] + point["rerank_s"])
@@ -190,7 +190,7 @@ def _row(number: int) -> dict[str, Any]:
     return {"id": path, "object_id": name, "path": path, "digest": f"{number:064x}", "metadata": {}}
 
 
-def _build(crowd: Crowd, store: IndexStore, size: Size) -> Generation:
+def _build(crowd: BlendedPhotos, store: IndexStore, size: Size) -> Generation:
     """Stream the catalogue to the disk; the time to make it up is not counted."""
     made, most, before = 0.0, 0.0, anonymous_mb()
 
@@ -212,36 +212,39 @@ def _build(crowd: Crowd, store: IndexStore, size: Size) -> Generation:
     return generation
 
 
-def _winners(judge: Judge, touches: np.ndarray, halves: Any) -> tuple[np.ndarray, float]:
+def _top1(scorer: FusionScorer, touches: np.ndarray, partials: Any) -> tuple[np.ndarray, float]:
     """The winner of each touch, and the median seconds that it takes to judge all photos."""
-    winners, seconds = [], []
+    exhaustive_top1, seconds = [], []
     for touch in touches:
         start = time.perf_counter()
-        winners.append(int(judge.logits(touch[None], halves).argmax()))
+        exhaustive_top1.append(int(scorer.logits(touch[None], partials).argmax()))
         seconds.append(time.perf_counter() - start)
-    return np.array(winners), float(np.median(seconds))
+    return np.array(exhaustive_top1), float(np.median(seconds))
 
 
 def _operating_point(
-    crowd: Crowd, made: Generation, touches: np.ndarray, winners: np.ndarray, asked: int
+    crowd: BlendedPhotos, made: Generation, touches: np.ndarray, exhaustive_top1: np.ndarray, asked: int
 ) -> dict[str, Any]:
     """The fastest setting whose candidates hold the target share of winners; where none does, the most complete.
 
     Chosen with the first `asked` touches, judged by the others.
     """
-    queries, halves, points = crowd.embeddings(touches, "touch"), made.arrays["halves"], []
+    queries, partials, points = crowd.embeddings(touches, "touch"), made.arrays["partials"], []
     timed, built = range(min(TIMED, len(touches))), made.index
-    needed = _needed(made, queries, winners)
-    for index in built.along_ladder():
+    needed = _needed(made, queries, exhaustive_top1)
+    for index in built.search_variants():
         made.index = index
-        k = _candidates(made, queries[:asked], winners[:asked])
+        k = _candidates(made, queries[:asked], exhaustive_top1[:asked])
         held = np.array(
-            [winner in made.search(query[None], k)[0][0] for query, winner in zip(queries, winners, strict=True)]
+            [
+                winner in made.search(query[None], k)[0][0]
+                for query, winner in zip(queries, exhaustive_top1, strict=True)
+            ]
         )
         judged = held[asked:]
         search = _median(lambda n, k=k: made.search(queries[n : n + 1], k), timed)
         found = [made.search(queries[n : n + 1], k)[0][0] for n in timed]
-        rerank = _median(lambda n, found=found: crowd.judge.logits(touches[n : n + 1], halves, found[n]), timed)
+        rerank = _median(lambda n, found=found: crowd.scorer.logits(touches[n : n + 1], partials, found[n]), timed)
         low, high = binomial_interval(int(judged.sum()), len(judged))
         point = {"k": k, "recall": float(judged.mean()), "low": low, "high": high}
         point |= {"search_s": search, "rerank_s": rerank, "settings": index.settings()}
@@ -255,21 +258,21 @@ def _operating_point(
     return max(points, key=lambda each: each[0])[1]
 
 
-def _candidates(made: Generation, queries: np.ndarray, winners: np.ndarray) -> int:
+def _candidates(made: Generation, queries: np.ndarray, exhaustive_top1: np.ndarray) -> int:
     """`MARGIN` times as many as these touches need."""
-    return min(MARGIN * _needed(made, queries, winners), MOST_CANDIDATES, made.count)
+    return min(MARGIN * _needed(made, queries, exhaustive_top1), MAX_CANDIDATES, made.count)
 
 
-def _needed(made: Generation, queries: np.ndarray, winners: np.ndarray) -> int:
+def _needed(made: Generation, queries: np.ndarray, exhaustive_top1: np.ndarray) -> int:
     """The least number of candidates that hold the target share of winners, as far as the index names them at all."""
-    most = min(MOST_CANDIDATES, made.count)
+    most = min(MAX_CANDIDATES, made.count)
     found = (made.search(query[None], most)[0][0] for query in queries)
-    places = [np.flatnonzero(rows == winner) for rows, winner in zip(found, winners, strict=True)]
+    places = [np.flatnonzero(rows == winner) for rows, winner in zip(found, exhaustive_top1, strict=True)]
     needed = np.sort([int(place[0]) + 1 if len(place) else most for place in places])
     return int(needed[int(np.ceil(TARGET * len(needed))) - 1])
 
 
-def _growth(crowd: Crowd, store: IndexStore, made: Generation, photos: int) -> dict[str, float]:
+def _growth(crowd: BlendedPhotos, store: IndexStore, made: Generation, photos: int) -> dict[str, float]:
     """Seconds that it takes to add `ADDED` photos."""
     fresh = list(crowd.blocks(photos, photos + ADDED, 1))
     how = {
@@ -292,7 +295,7 @@ def opened(folder: Path) -> dict[str, float]:
 
 
 def on_disk(made: Generation) -> dict[str, float]:
-    structure = made.manifest.files.get("vectors.faiss", FileSeal(0, "")).bytes
+    structure = made.manifest.files.get("vectors.faiss", FileChecksum(0, "")).bytes
     return {
         "disk_mb": sum(seal.bytes for seal in made.manifest.files.values()) / 2**20,
         "structure_mb": structure / 2**20,
@@ -366,12 +369,19 @@ def main() -> None:
     parser.add_argument("--recording", type=Path, help="whose photos are blended; a small one is collected where None")
     parser.add_argument("--features", type=Path, help="where encoded features are kept")
     parser.add_argument("--queries", type=int, default=QUERIES)
-    parser.add_argument("--by", choices=("pruner", "contrastive"), default="pruner", help="embedding of the candidates")
+    parser.add_argument(
+        "--by",
+        choices=("candidate_encoder", "contrastive"),
+        default="candidate_encoder",
+        help="embedding of the candidates",
+    )
     parser.add_argument("--json", action="store_true", help="one JSON document a line")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        crowd = crowd_of(arguments.model, arguments.recording or collected(folder), arguments.features, arguments.by)
+        crowd = blended_photos(
+            arguments.model, arguments.recording or collected(folder), arguments.features, arguments.by
+        )
         sizes = []
         for number in arguments.sizes:
             sizes.append(measure(crowd, int(number), arguments.kinds, folder / "index", arguments.queries))

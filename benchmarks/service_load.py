@@ -36,7 +36,7 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
 from retrieval.serve.app import create_app
-from retrieval.serve.run import Server, configured
+from retrieval.serve.server import Server, uvicorn_config
 from retrieval.serve.settings import ServiceSettings
 from retrieval.training.train import train
 from robot.recording.folder import RecordingWriter
@@ -51,7 +51,7 @@ SEED = 20_000
 QUEUE = 8
 
 
-class Bench:
+class LoadFixture:
     """A catalogue of simulated objects, its index, and the body of a query for it."""
 
     def __init__(self, folder, objects=12):
@@ -72,7 +72,9 @@ class Bench:
         (self.catalogue / name).mkdir(parents=True)
         for number in range(photos):
             rig.prepare(name, number)
-            (self.catalogue / name / f"{number}.jpg").write_bytes(encoded(".jpg", rig.world.now().image("photo")))
+            (self.catalogue / name / f"{number}.jpg").write_bytes(
+                encoded(".jpg", rig.sim_state.current_scene().image("photo"))
+            )
 
     def next_generation(self, index):
         """One object more, or less, in turn."""
@@ -83,7 +85,7 @@ class Bench:
         build_index(self.catalogue, self.model, index, quiet=True)
 
 
-class Drawn:
+class DrawnQuery:
     """A catalogue of drawn objects and a model that knows nothing but answers at once; its index, a body of a query."""
 
     def __init__(self, folder):
@@ -245,7 +247,7 @@ def reloads(bench, share):
     wanted, own = of(share, 100, 5), bench.folder / "reloaded"
     shutil.copytree(bench.index, own)
     objects, answers, failures, ended = {}, Counter(), [], threading.Event()
-    with listening(own, poll_s=0.1) as (url, parts), ThreadPoolExecutor(3) as askers:
+    with listening(own, poll_s=0.1) as (url, parts), ThreadPoolExecutor(3) as client_threads:
 
         def ask():
             with httpx.Client(base_url=url, timeout=60) as client:
@@ -260,7 +262,7 @@ def reloads(bench, share):
                     if told["results"] and len(told["results"]) != told["index"]["objects"]:
                         failures.append(told)
 
-        asking = [askers.submit(ask) for _ in range(3)]
+        asking = [client_threads.submit(ask) for _ in range(3)]
         for _ in range(wanted):
             bench.next_generation(own)
             name = (own / "CURRENT").read_text().strip()
@@ -284,10 +286,10 @@ def ends(bench, share):
     rounds, lost, answered = of(share, 20, 3), [], 0
     for _ in range(rounds):
         options = ("--index", bench.index, "--port", "0", "--no-history", "--queue", "32")
-        with command(*options) as (process, url, _), ThreadPoolExecutor(8) as askers:
+        with command(*options) as (process, url, _), ThreadPoolExecutor(8) as client_threads:
             httpx.post(f"{url}/v1/query", json=bench.body, timeout=60)
             sent = threading.Semaphore(0)
-            flying = [askers.submit(_raw_query, url, bench.body, sent) for _ in range(8)]
+            flying = [client_threads.submit(_raw_query, url, bench.body, sent) for _ in range(8)]
             for _ in flying:
                 sent.acquire(timeout=30)
             time.sleep(0.05)  # of the eight, some wait and one is in work
@@ -395,10 +397,10 @@ def _attack(url, kind, draw):
 def _serve(settings, folder, writer):
     """In a fork: serve, tell the address through the pipe, and never return."""
     try:
-        recorder = folder and RecordingWriter(folder / "recording", {"source": "said", "sensor": "simulated"})
+        recorder = folder and RecordingWriter(folder / "recording", {"source": "feedback", "sensor": "simulated"})
         app = create_app(settings, None, recorder)
         port = lambda bound: os.write(writer, f"http://127.0.0.1:{bound}".encode())  # noqa: E731
-        Server(configured(app), app.state.service, port).run()
+        Server(uvicorn_config(app), app.state.service, port).run()
     finally:
         os._exit(0)
 
@@ -421,17 +423,17 @@ def kills(bench, share):
                 query = client.post("/v1/query", json=bench.body).headers["x-query-id"]
                 if not number:
                     killer.start()
-                word = {"query": query, "said": "object", "object_id": bench.names[0]}
+                word = {"query": query, "feedback": "object", "object_id": bench.names[0]}
                 if client.post("/v1/feedback", json=word).status_code == 201:
                     acknowledged.append(query)
         killer.join()
         os.waitpid(child, 0)
     with (
-        RecordingWriter(folder / "recording", {"source": "said", "sensor": "simulated"}) as recorder,
+        RecordingWriter(folder / "recording", {"source": "feedback", "sensor": "simulated"}) as recorder,
         listening(bench.index, None, recorder, history=folder) as (url, parts),
     ):
         httpx.get(f"{url}/v1/history", timeout=60)
-        kept = Counter(name for name, _ in parts.keeping.store.recordable())
+        kept = Counter(name for name, _ in parts.history_writer.store.recordable())
     recorded = Counter(grasp.sequence_id for grasp in load_grasps(folder / "recording"))
     lost = [name for name in acknowledged if kept[name] != 1 or recorded[name] != 1]
     say(
@@ -454,7 +456,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         benches = {}
         for name in asked.only:
-            kind = Drawn if name == kills.__name__ else Bench
+            kind = DrawnQuery if name == kills.__name__ else LoadFixture
             if kind not in benches:
                 benches[kind] = kind(Path(folder) / kind.__name__)
             PARTS[name](benches[kind], asked.share)

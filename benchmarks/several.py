@@ -1,7 +1,7 @@
 """`python -m benchmarks.several [--sizes 1e4 1e5] [--grasps 2 4 8] [--recording R --features F] [--json]`.
 
-Candidates of several grasps of one object: the k photos nearest to all of them together, as search takes them, beside
-the k nearest of each put together. Catalogues are drawn as `benchmarks.scale` draws them. Every touch of the
+Candidates of several grasps of one object: the k photos nearest to all of them combined_embedding, as search takes them, beside
+the k nearest of each put combined_embedding. Catalogues are drawn as `benchmarks.scale` draws them. Every touch of the
 recording begins a set with the next ones of its object. A set's winner is the photo of the greatest sum of match
 logits; it is looked for among the `LOOKED` nearest of either way, whose ends winners stay far away from (the worst
 place is told). Places are those of exact cosines; naming by the index of `--kind` and judging are timed on one thread,
@@ -19,16 +19,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.scale import TARGET, TIMED, Crowd, collected, crowd_of
+from benchmarks.scale import TARGET, TIMED, BlendedPhotos, blended_photos, collected
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from retrieval.data.dataset import load_grasps
-from retrieval.methods.selection import neighbours
-from retrieval.metrics.guesses import binomial_interval
-from retrieval.search.build.measuring import FIRST
+from retrieval.methods.selection import next_rows_of_object
+from retrieval.metrics.k_way import binomial_interval
+from retrieval.search.build.measuring import EXHAUSTIVE_LIMIT
 from retrieval.search.defaults import shipped_model
-from retrieval.search.query.shard import together
-from retrieval.training.distil import feature_halves
+from retrieval.search.query.shard import combined_embedding
+from retrieval.training.distil import feature_partials
 from retrieval.training.features import encode_recording
 
 LOOKED = 4096
@@ -39,18 +39,18 @@ Way = Callable[[np.ndarray], Rows]
 def ways(made: Generation, k: int) -> dict[str, Way]:
     """From embeddings (G, d) of grasps to the rows of the candidates, sorted."""
     return {
-        "together": lambda embeddings: np.sort(made.candidates(together(embeddings), k)[0]),
+        "together": lambda embeddings: np.sort(made.candidates(combined_embedding(embeddings), k)[0]),
         "each": lambda embeddings: np.unique(np.concatenate(made.candidates(embeddings, k))),
     }
 
 
-def places(queries: np.ndarray, photos: np.ndarray, judge: Callable[[Rows], np.ndarray]) -> dict[str, int]:
+def places(queries: np.ndarray, photos: np.ndarray, scorer: Callable[[Rows], np.ndarray]) -> dict[str, int]:
     """At which place, from 1, each way puts the winner of grasps (G, d) among photos (N, d)."""
     cosines = queries @ photos.T
     scores = {"together": cosines.sum(0, keepdims=True), "each": cosines}
     near = [_nearest(each, LOOKED // len(score)) for score in scores.values() for each in score]
     rows = np.unique(np.concatenate(near))
-    winner = rows[judge(rows).argmax()]
+    winner = rows[scorer(rows).argmax()]
     return {name: 1 + int((score > score[:, [winner]]).sum(1).min()) for name, score in scores.items()}
 
 
@@ -58,17 +58,19 @@ def _nearest(scores: np.ndarray, count: int) -> Rows:
     return np.arange(len(scores)) if count >= len(scores) else np.argpartition(-scores, count)[:count]
 
 
-def measure(crowd: Crowd, made: Generation, halves: np.ndarray, sets: Rows, k: int) -> Iterator[dict[str, Any]]:
+def measure(
+    crowd: BlendedPhotos, made: Generation, partials: np.ndarray, sets: Rows, k: int
+) -> Iterator[dict[str, Any]]:
     """For each way a line of figures: sets (S, G) are of rows of touch halves (T, half)."""
-    queries, photos = crowd.embeddings(halves, "touch"), made.embeddings[made.slots]
-    stored, found = made.arrays["halves"], []
+    queries, photos = crowd.embeddings(partials, "touch"), made.embeddings[made.slots]
+    stored, found = made.arrays["partials"], []
     for chosen in sets:
         found.append(
             places(
-                queries[chosen], photos, lambda rows, chosen=chosen: crowd.judge.logits(halves[chosen], stored, rows)
+                queries[chosen], photos, lambda rows, chosen=chosen: crowd.scorer.logits(partials[chosen], stored, rows)
             )
         )
-    named, seconds = _timed(crowd, made, halves, queries, sets, k)
+    named, seconds = _timed(crowd, made, partials, queries, sets, k)
     for way in named:
         order = np.sort([place[way] for place in found])
         held = int((order <= k).sum())
@@ -84,14 +86,14 @@ def measure(crowd: Crowd, made: Generation, halves: np.ndarray, sets: Rows, k: i
             "found": held / len(order),
             "low": low,
             "high": high,
-            "judged": float(np.mean(named[way])),
+            "reranked": float(np.mean(named[way])),
             "name_ms": 1e3 * float(np.median([naming for naming, _ in seconds[way]])),
-            "judge_ms": 1e3 * float(np.median([judging for _, judging in seconds[way]])),
+            "rerank_ms": 1e3 * float(np.median([judging for _, judging in seconds[way]])),
         }
 
 
 def _timed(
-    crowd: Crowd, made: Generation, halves: np.ndarray, queries: np.ndarray, sets: Rows, k: int
+    crowd: BlendedPhotos, made: Generation, partials: np.ndarray, queries: np.ndarray, sets: Rows, k: int
 ) -> tuple[dict[str, list[int]], dict[str, list[tuple[float, float]]]]:
     """By way, of the first `TIMED` sets: how many photos are judged, and seconds to name and to judge them."""
     counts: dict[str, list[int]] = {name: [] for name in ways(made, k)}
@@ -101,7 +103,7 @@ def _timed(
             start = time.perf_counter()
             rows = way(queries[chosen])
             between = time.perf_counter()
-            crowd.judge.logits(halves[chosen], made.arrays["halves"], rows)
+            crowd.scorer.logits(partials[chosen], made.arrays["partials"], rows)
             seconds[name].append((between - start, time.perf_counter() - between))
             counts[name].append(len(rows))
     return counts, seconds
@@ -110,7 +112,7 @@ def _timed(
 def sets_of(owner: Rows, grasps: int, most: int) -> Rows:
     """(S, grasps) rows of one object each, at most so many sets, of objects with grasps enough."""
     enough = np.flatnonzero(np.bincount(owner)[owner] >= grasps)
-    return np.random.default_rng(0).permutation(enough[neighbours(owner[enough], grasps)])[:most]
+    return np.random.default_rng(0).permutation(enough[next_rows_of_object(owner[enough], grasps)])[:most]
 
 
 def line(figures: dict[str, Any]) -> str:
@@ -118,7 +120,7 @@ def line(figures: dict[str, Any]) -> str:
     return (
         "{photos:,} photos, {grasps} grasps, nearest to {way}: 99 % of {sets} winners within the first {needed} "
         "(worst {worst}); of k = {k} found {found:.1%} [{low:.1%}, {high:.1%}], {judged:.0f} judged, "
-        "named in {name_ms:.3g} ms, judged in {judge_ms:.3g} ms"
+        "named in {name_ms:.3g} ms, judged in {rerank_ms:.3g} ms"
     ).format(**figures)
 
 
@@ -128,7 +130,9 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", type=float, default=[1e4, 1e5])
     parser.add_argument("--grasps", nargs="+", type=int, default=[2, 4, 8], help="of objects with so many")
     parser.add_argument("--sets", type=int, default=1000, help="at most so many of one number of grasps")
-    parser.add_argument("--candidates", type=int, default=FIRST, help="k (default: as many as a build tries first)")
+    parser.add_argument(
+        "--candidates", type=int, default=EXHAUSTIVE_LIMIT, help="k (default: as many as a build tries first)"
+    )
     parser.add_argument("--kind", default="flat", help="of the index")
     parser.add_argument("--model", type=Path, default=shipped_model())
     parser.add_argument("--recording", type=Path, help="whose photos are blended; one is collected where None")
@@ -139,16 +143,16 @@ def main() -> None:
         folder = Path(name)
         recording = arguments.recording or collected(folder)
         features = arguments.features or folder / "features"
-        crowd, grasps = crowd_of(arguments.model, recording, features), load_grasps(recording)
+        crowd, grasps = blended_photos(arguments.model, recording, features), load_grasps(recording)
         matcher, config = crowd.checkpoint.matcher, crowd.checkpoint.config
-        halves = feature_halves(matcher, encode_recording(grasps, matcher, config, features))[0].numpy()
+        partials = feature_partials(matcher, encode_recording(grasps, matcher, config, features))[0].numpy()
         owner = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)[1]
         for size in map(int, arguments.sizes):
             store = IndexStore(folder / f"index-{size}")
             made = store.write_blocks(crowd.blocks(0, size, 0), fingerprint={}, kind=arguments.kind, threads=1)
             for count in (count for count in arguments.grasps if count <= np.bincount(owner).max()):
                 sets = sets_of(owner, count, arguments.sets)
-                for figures in measure(crowd, made, halves, sets, min(arguments.candidates, size)):
+                for figures in measure(crowd, made, partials, sets, min(arguments.candidates, size)):
                     print(json.dumps(figures) if arguments.json else line(figures), flush=True)
 
 

@@ -23,28 +23,28 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from benchmarks.scale import Crowd
-from indexes.store.cluster import (
-    ClusterManifest,
-    ShardEntry,
-    cluster_name,
-    entry_of,
-    open_shard,
-    read_cluster,
-    shard_folder,
-    shard_of,
-    write_cluster,
-)
+from benchmarks.scale import BlendedPhotos
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
+from indexes.store.sharded import (
+    ShardedManifest,
+    ShardEntry,
+    open_shard,
+    read_sharded_manifest,
+    shard_entry,
+    shard_folder,
+    shard_number,
+    sharded_generation_name,
+    write_sharded_manifest,
+)
 from indexes.store.tables import Block
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
-from retrieval.model.fusion import judge_of
-from retrieval.model.stored import fingerprint, read_stored
+from retrieval.model.checkpoint_info import fingerprint, read_checkpoint_info
+from retrieval.model.fusion import scorer_of
 from retrieval.search.defaults import shipped_model
 from retrieval.search.embeddings import embed_photos
-from retrieval.search.query.opening import folder_shard, open_cluster
-from retrieval.search.query.shard import Felt, FolderShard, Shard
+from retrieval.search.query.opening import folder_shard, open_sharded_index
+from retrieval.search.query.shard import FolderShard, Shard, ShardQuery
 from tests import synthetic
 
 TOUCHES, OPENINGS = 200, 21
@@ -54,13 +54,13 @@ CANDIDATES = 5300
 OPENED = """
 import sys, time
 from pathlib import Path
-from indexes.store.cluster import read_cluster
-from retrieval.model.stored import read_stored
-from retrieval.search.query.opening import described_cluster
+from indexes.store.sharded import read_sharded_manifest
+from retrieval.model.checkpoint_info import read_checkpoint_info
+from retrieval.search.query.opening import sharded_index_info
 start = time.process_time()
-manifest = read_cluster(Path(sys.argv[1]))
-described = described_cluster(manifest)
-read_stored(Path(sys.argv[2]))
+manifest = read_sharded_manifest(Path(sys.argv[1]))
+described = sharded_index_info(manifest)
+read_checkpoint_info(Path(sys.argv[2]))
 print(time.process_time() - start, described.photos)
 """
 HELD = """
@@ -72,10 +72,10 @@ def anonymous():
 searcher = Searcher.open(sys.argv[1], verify=False)
 searcher.encoder = searcher.reader = None
 import numpy as np, gc
-from retrieval.search.query.shard import Felt
+from retrieval.search.query.shard import ShardQuery
 codes = np.load(sys.argv[2])
 before = anonymous()
-searcher.shard.ask(Felt(codes["embeddings"][:1], codes["halves"][:1]), 10, None, searcher.posterior)
+searcher.shard.ask(ShardQuery(codes["embeddings"][:1], codes["halves"][:1]), 10, None, searcher.posterior)
 print(anonymous() / 1024, (anonymous() - before) / 1024)
 """
 
@@ -85,16 +85,16 @@ def candidates_of(photos: int) -> int:
     return max(100, round(CANDIDATES * (photos / 1e6) ** 0.8))
 
 
-def drawn_crowd(checkpoint: Checkpoint, objects: int = 60) -> Crowd:
+def drawn_photos(checkpoint: Checkpoint, objects: int = 60) -> BlendedPhotos:
     """Codes of pictures of made-up objects, to blend photos from."""
     with tempfile.TemporaryDirectory() as name:
         folder = synthetic.write_catalogue(Path(name) / "catalog", synthetic.make_objects(objects))
         codes = embed_photos(sorted(folder.rglob("*.jpg")), model=checkpoint)
     touches = checkpoint.queries.astype(np.float32)
-    return Crowd(checkpoint, judge_of(checkpoint.matcher.head), codes.halves, touches, held_out=touches[:0])
+    return BlendedPhotos(checkpoint, scorer_of(checkpoint.matcher.head), codes.partials, touches, held_out=touches[:0])
 
 
-def write(crowd: Crowd, photos: int, shards: int, out: Path) -> dict[str, float]:
+def write(crowd: BlendedPhotos, photos: int, shards: int, out: Path) -> dict[str, float]:
     """The drawn catalogue as one folder, `out`/index, and as a cluster, `out`/cluster; seconds and bytes."""
     model = crowd.checkpoint
     about = {"checkpoint": str(model.path.resolve()), "catalogue": "/drawn"}
@@ -108,86 +108,96 @@ def write(crowd: Crowd, photos: int, shards: int, out: Path) -> dict[str, float]
     folder_s = time.perf_counter() - start
     measured = {"candidates": {"k": candidates_of(photos // shards)}}
     entries, start = list[ShardEntry](), time.perf_counter()
-    places = np.array([shard_of(row["object_id"], shards) for row in whole.rows])
+    places = np.array([shard_number(row["object_id"], shards) for row in whole.rows])
     for number in range(shards):
         name = shard_folder(number, shards)
         blocks = _blocks_of(whole, np.flatnonzero(places == number))
         made = IndexStore(out / "cluster" / name).write_blocks(blocks, calibration, about=about | measured, **said)
-        entries.append(entry_of(out / "cluster", name, made, len(np.unique(made.codes("object_id")))))
-    manifest = ClusterManifest(
-        cluster_name(1), "", "", "flat", fingerprint(model), about, calibration.get("calibration"), shards, entries
+        entries.append(shard_entry(out / "cluster", name, made, len(np.unique(made.codes("object_id")))))
+    manifest = ShardedManifest(
+        sharded_generation_name(1),
+        "",
+        "",
+        "flat",
+        fingerprint(model),
+        about,
+        calibration.get("calibration"),
+        shards,
+        entries,
     )
-    write_cluster(out / "cluster", manifest)
+    write_sharded_manifest(out / "cluster", manifest)
     size = sum(seal.bytes for seal in whole.manifest.files.values())
     return {"folder_s": folder_s, "shards_s": time.perf_counter() - start, "bytes_per_photo": size / photos}
 
 
 def _blocks_of(whole: Generation, rows: NDArray[np.int64]) -> Iterator[Block]:
     for some in np.array_split(rows, -(-len(rows) // BLOCK)):
-        halves = whole.arrays["halves"][some]
-        yield Block([whole.rows[row] for row in some], whole.embeddings[whole.slots[some]], {"halves": halves})
+        partials = whole.arrays["partials"][some]
+        yield Block([whole.rows[row] for row in some], whole.embeddings[whole.slots[some]], {"partials": partials})
 
 
-def compare(crowd: Crowd, folder: Shard, cluster: Shard, touches: int, judged: int) -> dict[str, float]:
+def compare(crowd: BlendedPhotos, folder: Shard, cluster: Shard, touches: int, reranked: int) -> dict[str, float]:
     """Ask both in turns; how often the winners agree, with candidates and with all judged, and times."""
-    halves = crowd.touches[:touches]
-    embeddings = crowd.embeddings(halves, "touch")
-    posterior, photos = crowd.checkpoint.posterior, folder.described.photos
+    partials = crowd.touches[:touches]
+    embeddings = crowd.embeddings(partials, "touch")
+    posterior, photos = crowd.checkpoint.posterior, folder.info.photos
     same = better = 0
     times: dict[str, list[float]] = {"folder": [], "shards": [], "slowest": [], "search": [], "rerank": []}
-    for number in range(len(halves)):
-        felt, k = Felt(embeddings[number : number + 1], halves[number : number + 1]), candidates_of(photos)
+    for number in range(len(partials)):
+        query, k = ShardQuery(embeddings[number : number + 1], partials[number : number + 1]), candidates_of(photos)
         start = time.thread_time()
-        one = folder.ask(felt, 10, k, posterior)
+        one = folder.search(query, 10, k, posterior)
         middle = time.thread_time()
-        many = cluster.ask(felt, 10, k, posterior)
+        many = cluster.search(query, 10, k, posterior)
         times["folder"].append(middle - start)
         times["shards"].append(time.thread_time() - middle)
         single = cluster.shards[number % len(cluster.shards)]  # type: ignore[attr-defined]
         start = time.thread_time()
-        alone = single.ask(felt, 10, None, posterior)
+        alone = single.search(query, 10, None, posterior)
         times["slowest"].append(time.thread_time() - start)
         times["search"].append(alone.timing_ms["candidates"] / 1e3)
         times["rerank"].append(alone.timing_ms["rerank"] / 1e3)
         same += one.best[0].photo == many.best[0].photo
         better += many.best[0].logit >= one.best[0].logit - 1e-5
-    exact, winners, error, whole_s = 0, 0, 0.0, list[list[float]]()
-    for number in range(judged):
-        felt = Felt(embeddings[number : number + 1], halves[number : number + 1])
+    exact, exhaustive_top1, error, whole_s = 0, 0, 0.0, list[list[float]]()
+    for number in range(reranked):
+        query = ShardQuery(embeddings[number : number + 1], partials[number : number + 1])
         start = time.thread_time()
-        one = folder.ask(felt, 10, photos, posterior)
+        one = folder.search(query, 10, photos, posterior)
         middle = time.thread_time()
-        many = cluster.ask(felt, 10, photos, posterior)
+        many = cluster.search(query, 10, photos, posterior)
         whole_s.append([middle - start, time.thread_time() - middle])
-        winners += one.best[0].photo == many.best[0].photo
+        exhaustive_top1 += one.best[0].photo == many.best[0].photo
         exact += [each.photo for each in one.best] == [each.photo for each in many.best]
         error = max(error, *(abs(a.logit - b.logit) for a, b in zip(one.best, many.best, strict=True)))
         if posterior is not None and one.mass is not None and many.mass is not None:
-            ours, theirs = (posterior.share([each.logit for each in some.best], some.mass) for some in (one, many))
+            ours, theirs = (
+                posterior.probabilities_given([each.logit for each in some.best], some.mass) for some in (one, many)
+            )
             error = max(error, float(np.abs(ours.objects - theirs.objects).max()), abs(ours.none - theirs.none))
     found = {f"{name}_p50_s": float(np.median(one)) for name, one in times.items()}
     found["shard_p99_s"] = float(np.percentile(times["slowest"], 99))
-    shares = {"same_winner": same / len(halves), "winner_no_worse": better / len(halves)}
+    shares = {"same_top1": same / len(partials), "top1_no_worse": better / len(partials)}
     folder_s, shards_s = np.median(whole_s, axis=0)
     return (
         found
         | shares
-        | {"all_judged": judged, "all_judged_winner": winners / judged, "all_judged_same": exact / judged}
+        | {"all_scored": reranked, "all_scored_top1": exhaustive_top1 / reranked, "all_scored_same": exact / reranked}
         | {"all_judged_error": error, "all_judged_folder_s": float(folder_s), "all_judged_shards_s": float(shards_s)}
     )
 
 
-def measure(crowd: Crowd, photos: int, shards: int, touches: int, judged: int, out: Path) -> dict[str, float]:
+def measure(crowd: BlendedPhotos, photos: int, shards: int, touches: int, reranked: int, out: Path) -> dict[str, float]:
     """Everything at one number of photos. judged: touches for which all photos are."""
     figures: dict[str, float] = {"photos": photos, "shards": shards} | write(crowd, photos, shards, out)
-    stored = read_stored(crowd.checkpoint.path)
+    stored = read_checkpoint_info(crowd.checkpoint.path)
     start = time.perf_counter()
     folder = folder_shard(IndexStore(out / "index").open(verify=False, threads=1), stored)
     figures["folder_open_s"] = time.perf_counter() - start
-    manifest = read_cluster(out / "cluster")
-    cluster = open_cluster(out / "cluster", manifest, stored, verify=False)
-    figures |= compare(crowd, folder, cluster, touches, judged)
-    np.savez(out / "codes.npz", halves=crowd.touches, embeddings=crowd.embeddings(crowd.touches, "touch"))
+    manifest = read_sharded_manifest(out / "cluster")
+    cluster = open_sharded_index(out / "cluster", manifest, stored, verify=False)
+    figures |= compare(crowd, folder, cluster, touches, reranked)
+    np.savez(out / "codes.npz", partials=crowd.touches, embeddings=crowd.embeddings(crowd.touches, "touch"))
     figures["folder_mb"] = _probe(HELD, out / "index", out / "codes.npz")[0]
     figures["shard_mb"] = _probe(HELD, out / "cluster" / manifest.shards[0].folder, out / "codes.npz")[0]
     return figures
@@ -208,27 +218,27 @@ def _probe(program: str, *words: Any) -> list[float]:
     return [float(word) for word in done.stdout.split()]
 
 
-def on_ray(crowd: Crowd, photos: int, touches: int, out: Path) -> dict[str, float]:
+def on_ray(crowd: BlendedPhotos, photos: int, touches: int, out: Path) -> dict[str, float]:
     """A cluster of one shard on Ray against the folder, in turns: seconds by the clock on the wall."""
-    from retrieval.cluster.serving import Deployments, Held
-    from retrieval.cluster.session import connected
+    from retrieval.cluster.serving import Deployments, ReplicaSettings
+    from retrieval.cluster.session import ray_session
 
     write(crowd, photos, 1, out)
-    stored = read_stored(crowd.checkpoint.path)
-    manifest = read_cluster(out / "cluster")
+    stored = read_checkpoint_info(crowd.checkpoint.path)
+    manifest = read_sharded_manifest(out / "cluster")
     generation: Generation = open_shard(out / "cluster", manifest.shards[0], manifest.fingerprint, threads=1)
     folder: FolderShard = folder_shard(generation, stored)
-    halves = crowd.touches[:touches]
-    embeddings, posterior = crowd.embeddings(halves, "touch"), crowd.checkpoint.posterior
+    partials = crowd.touches[:touches]
+    embeddings, posterior = crowd.embeddings(partials, "touch"), crowd.checkpoint.posterior
     times: dict[str, list[float]] = {"folder": [], "ray": []}
-    with connected(2) as ray, threadpool_limits(1, "blas"):  # as the service: its threads spin between two queries
-        far = Deployments(ray, Held(cpus=0.5, wait_s=60.0)).open(out / "cluster", manifest, stored)
+    with ray_session(2) as ray, threadpool_limits(1, "blas"):  # as the service: its threads spin between two queries
+        far = Deployments(ray, ReplicaSettings(cpus=0.5, wait_s=60.0)).open(out / "cluster", manifest, stored)
         arms = {"folder": folder, "ray": far}
-        for turn in range(-5, len(halves)):
-            felt = Felt(embeddings[[turn]], halves[[turn]])
+        for turn in range(-5, len(partials)):
+            query = ShardQuery(embeddings[[turn]], partials[[turn]])
             for name, shard in arms.items():
                 start = time.perf_counter()
-                shard.ask(felt, 10, None, posterior)
+                shard.search(query, 10, None, posterior)
                 if turn >= 0:
                     times[name].append(time.perf_counter() - start)
     return {
@@ -248,11 +258,11 @@ def main() -> None:
     parser.add_argument("--ray", action="store_true", help="the way over Ray too, with the first of the sizes")
     parser.add_argument("--json", action="store_true", help="one JSON document a line")
     arguments = parser.parse_args()
-    crowd = drawn_crowd(load_checkpoint(arguments.model))
+    crowd = drawn_photos(load_checkpoint(arguments.model))
     with tempfile.TemporaryDirectory() as name:
         places = {f"{size:.0e}": Path(name) / str(int(size)) for size in arguments.sizes}
         for size, place in zip(arguments.sizes, places.values(), strict=True):
-            asked = arguments.shards, arguments.touches, arguments.judged
+            asked = arguments.shards, arguments.touches, arguments.reranked
             _show(measure(crowd, int(size), *asked, place), arguments.json)
         _show(opened(places, arguments.model), arguments.json)
     if arguments.ray:

@@ -55,7 +55,7 @@ def _scenes(objects: int, grasps: int) -> Iterator[Scene]:
     for name in rig.object_ids(objects):
         for number in range(grasps):
             rig.prepare(name, number)
-            scene = rig.world.now()
+            scene = rig.sim_state.current_scene()
             scene.obj.body.normals(np.zeros((1, 3)))
             height = max(10.0, rng.uniform(0.3, 0.8) * float(scene.obj.body.upper[2]))
             pose = Pose(scene.placement.x_mm, scene.placement.y_mm, height, rng.uniform(0, np.pi))
@@ -73,7 +73,7 @@ def _outputs(scene: Scene, spent: dict[str, list[float]]) -> None:
     timed("depth", lambda: scene.image("depth"))
     large = replace(scene, camera=LARGE)
     timed("photo of 512 px, as a file", lambda: file_content("photo", large.image("photo")))
-    if timed("where it rests, its walls", lambda: scene.pinch.missed):
+    if timed("where it rests, its walls", lambda: scene.pinch.miss_reason):
         return
     timed("two contacts", lambda: [scene.pinch.contact(finger) for finger in scene.sensors])
     timed("two gels", lambda: [scene.image(f"touch_{finger}") for finger in scene.sensors])

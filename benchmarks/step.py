@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.common import Line, as_text, duration, in_turns, matcher_of, random_images
+from benchmarks.common import ResultLine, as_text, duration, in_turns, matcher_of, random_images
 from retrieval.data.dataset import PairBatch
 from retrieval.model.config import Config
 from retrieval.model.encode import to_batch, touch_batch
@@ -25,7 +25,7 @@ from retrieval.training.train import set_training_mode
 Index = np.ndarray
 
 
-def measure(config: Config, touches: int = 6, photos_each: int = 8, repetitions: int = 3) -> Iterator[Line]:
+def measure(config: Config, touches: int = 6, photos_each: int = 8, repetitions: int = 3) -> Iterator[ResultLine]:
     """One line. Half of a touch's photos are of its object, and as many are its own."""
     matcher, pre, pairs = matcher_of(config), config.preprocessing, touches * photos_each
     set_training_mode(matcher, config.training)
@@ -64,7 +64,7 @@ def measure(config: Config, touches: int = 6, photos_each: int = 8, repetitions:
     labels = (alone % photos_each < photos_each // 2).astype(np.float32)
     times = in_turns({name: lambda passes=passes: step(passes) for name, passes in arms.items()}, repetitions)
     ratios = {arm: times.ratio(arm, "ours") for arm in ("one", "batch", "touches")}
-    yield Line(
+    yield ResultLine(
         "step",
         config.matcher.tower,
         f"{touches} touches x {photos_each} photos take {duration(times.median('ours'))} with shared images; pair by "

@@ -60,14 +60,14 @@ def folders() -> dict[str, Counter[str]]:
     return dict(sorted(rows.items()))
 
 
-class Way:
+class CallRecorder:
     """Modules that are called from another module, told by the interpreter while `with` lasts, on any thread."""
 
     def __init__(self) -> None:
         self.entered: list[str] = []
         self._stacks: dict[int, list[str]] = {}
 
-    def __enter__(self) -> "Way":
+    def __enter__(self) -> "CallRecorder":
         threading.setprofile(self._told)
         sys.setprofile(self._told)
         return self
@@ -101,12 +101,12 @@ class Way:
         ]
 
 
-def follow(folder: Path) -> dict[str, Way]:
+def follow(folder: Path) -> dict[str, CallRecorder]:
     """The ways, on things drawn into `folder`; what is set up once has been set up before."""
     import retrieval
     from retrieval.model.export import export
     from tests import synthetic
-    from tests.wsg50_bench import bench
+    from tests.wsg50_bench import gripper_with_emulator
 
     drawn = synthetic.make_objects(4, seed=1)
     synthetic.write_catalogue(folder / "catalog", drawn)
@@ -114,7 +114,7 @@ def follow(folder: Path) -> dict[str, Way]:
     model = Path(shutil.copy(retrieval.shipped_model(), folder / "model.safetensors"))
     checkpoint = retrieval.load_checkpoint(model)
     names = ("a catalogue's photo", "a query's images, PyTorch", "a query's images, exported", "a grasp's force")
-    ways = {name: Way() for name in names}
+    ways = {name: CallRecorder() for name in names}
     with ways["a catalogue's photo"]:
         retrieval.build_index(folder / "catalog", checkpoint, folder / "index", quiet=True)
     for encoder in ("PyTorch", "exported"):
@@ -125,7 +125,7 @@ def follow(folder: Path) -> dict[str, Way]:
             searcher.query(touch)
             with ways[f"a query's images, {encoder}"]:
                 searcher.query(touch)
-    with bench() as (gripper, _), ways["a grasp's force"]:
+    with gripper_with_emulator() as (gripper, _), ways["a grasp's force"]:
         gripper.grasp(20.0)
     return ways
 

@@ -26,7 +26,7 @@ HEADER = "| what | ours | against | theirs | ours / theirs |\n|---|---|---|---|-
 
 
 @dataclass(frozen=True)
-class Row:
+class TableRow:
     """A line: figures of single repetitions, of ours and of what it is held against, where there is something."""
 
     what: str
@@ -50,37 +50,39 @@ def spread(figures: Sequence[float], unit: str) -> str:
     return f"{middle} ({least} to {most}) {unit}"
 
 
-def building() -> Iterator[Row]:
+def building() -> Iterator[TableRow]:
     """Photos a second from files to a searchable index."""
     for line in build.measure_shipped():
         arms = ("beyond", "bare", "work")
         ours, bare, work = ([line.figures["photos"] / seconds for seconds in line.each[arm]] for arm in arms)
         what = "`build-index`, shipped model, JPEG of 512 px"
-        yield Row(what, "photos/s", ours, "its encoder alone, images ready", bare)
-        yield Row(what, "photos/s", ours, "decoding, cutting out and encoding alone", work)
-        yield Row("looking for the faster encoder, once a build of 256 photos or more", "s", line.each["looking"])
+        yield TableRow(what, "photos/s", ours, "its encoder alone, images ready", bare)
+        yield TableRow(what, "photos/s", ours, "decoding, cutting out and encoding alone", work)
+        yield TableRow("looking for the faster encoder, once a build of 256 photos or more", "s", line.each["looking"])
 
 
-def query() -> Iterator[Row]:
+def query() -> Iterator[TableRow]:
     """`retrieve query` in a fresh process."""
     for line in cold.measure():
         if line.each:
             backend = line.text.partition(",")[0]
             what = f"a query from nothing, 1,000 photos, {backend}"
-            yield Row(f"{what}: CPU time, interpreter included", "ms", line.each["cpu_ms"])
-            yield Row(what, "ms", line.each["total_ms"])
+            yield TableRow(f"{what}: CPU time, interpreter included", "ms", line.each["cpu_ms"])
+            yield TableRow(what, "ms", line.each["total_ms"])
 
 
-def candidates() -> Iterator[Row]:
+def candidates() -> Iterator[TableRow]:
     """Naming candidates, and the best ten at equal recall."""
     for line in peers.named(PHOTOS):
         what = f"{line.figures['k']:,} candidates of {PHOTOS:,} x {peers.DIM} named, `{line.tower}`"
-        yield Row(what, "us", line.each["ours"], "the bare FAISS call", line.each["bare"])
+        yield TableRow(what, "us", line.each["ours"], "the bare FAISS call", line.each["bare"])
     vectors = peers.drawn(PHOTOS, 0)
     with peers.guarded("being measured", 1):
         found = {
             line.tower: line
-            for line in peers.compared(vectors, peers.sample_queries(vectors, peers.QUERIES), f"{PHOTOS:,} vectors")
+            for line in peers.compare_engines(
+                vectors, peers.sample_queries(vectors, peers.QUERIES), f"{PHOTOS:,} vectors"
+            )
         }
     pairs = {"flat": ["FAISS flat"], "ivf_sq8": ["FAISS IVF, SQ8"], "hnsw": ["FAISS HNSW", "hnswlib", "usearch"]}
     for kind, others in pairs.items():
@@ -89,61 +91,65 @@ def candidates() -> Iterator[Row]:
             recalls = [line.figures["recall"] for line in (ours, theirs)]
             what = f"best {peers.BEST} of {PHOTOS:,}, `{kind}`, recall {recalls[0]:.3f}"
             against = f"{theirs.tower}, recall {recalls[1]:.3f}"
-            yield Row(what, "us", ours.each["query_us"], against, theirs.each["query_us"])
+            yield TableRow(what, "us", ours.each["query_us"], against, theirs.each["query_us"])
 
 
-def judging() -> Iterator[Row]:
+def reranking() -> Iterator[TableRow]:
     """Match logits from stored halves."""
     for line in rerank.measure(config_of("mobilenet_v2")):
-        ours, product = ([1e3 * seconds for seconds in line.each[arm]] for arm in ("halves", "product"))
-        yield Row(f"{line.figures['candidates']:,} candidates judged", "ms", ours, "the bare matrix product", product)
+        ours, product = ([1e3 * seconds for seconds in line.each[arm]] for arm in ("partials", "product"))
+        yield TableRow(
+            f"{line.figures['candidates']:,} candidates judged", "ms", ours, "the bare matrix product", product
+        )
 
 
-def rebuilding() -> Iterator[Row]:
+def rebuilding() -> Iterator[TableRow]:
     """Building again, in CPU time of one thread."""
     for line in again.measure(PHOTOS):
         looking, all_read = "`os.walk` and `os.stat` alone", "all read again"
         what = f"rebuild of {PHOTOS:,} photos"
-        yield Row(f"{what}, one new, beyond its encoding: CPU", "s", line.each["one"], looking, line.each["looking"])
-        yield Row(f"{what}, nothing new: CPU", "s", line.each["nothing"], all_read, line.each["verify"])
-        yield Row("encoding that one photo, the first of a process: CPU", "s", line.each["first_encoding"])
-        yield Row("Python, its imports and the model: CPU", "s", line.each["started"])
+        yield TableRow(
+            f"{what}, one new, beyond its encoding: CPU", "s", line.each["one"], looking, line.each["looking"]
+        )
+        yield TableRow(f"{what}, nothing new: CPU", "s", line.each["nothing"], all_read, line.each["verify"])
+        yield TableRow("encoding that one photo, the first of a process: CPU", "s", line.each["first_encoding"])
+        yield TableRow("Python, its imports and the model: CPU", "s", line.each["started"])
 
 
-def grasping() -> Iterator[Row]:
+def grasping() -> Iterator[TableRow]:
     """The parts of a simulated grasp, in CPU time of one thread."""
     for part, seconds in simulation.beside({"ours": simulation.ROOT}, 3, 13, 2)["ours"].items():
-        yield Row(f"simulated: {part}: CPU", "ms", [1e3 * each for each in seconds])
+        yield TableRow(f"simulated: {part}: CPU", "ms", [1e3 * each for each in seconds])
 
 
-def training() -> Iterator[Row]:
+def training() -> Iterator[TableRow]:
     """A training step on shared images."""
     lines = [line for _ in range(3) for line in step.measure(config_of("mobilenet_v2"), repetitions=1)]
     ours = [line.figures["ours_s"] for line in lines]
     for arm, against in (("batch", "one batch of 48 pairs"), ("one", "pair by pair")):
         theirs = [line.figures["ours_s"] * line.figures[f"ratio_{arm}"] for line in lines]
-        yield Row("training step, 6 touches x 8 photos, MobileNetV2", "s", ours, against, theirs)
+        yield TableRow("training step, 6 touches x 8 photos, MobileNetV2", "s", ours, against, theirs)
 
 
-SECTIONS: dict[str, tuple[Callable[[], Iterator[Row]], dict[str, str]]] = {
+SECTIONS: dict[str, tuple[Callable[[], Iterator[TableRow]], dict[str, str]]] = {
     "building": (building, {}),
     "query": (query, {}),
     "candidates": (candidates, ONE_THREAD),
-    "judging": (judging, ONE_THREAD),
+    "judging": (reranking, ONE_THREAD),
     "rebuilding": (rebuilding, ONE_THREAD),
     "grasping": (grasping, ONE_THREAD),
     "training": (training, {}),
 }
 
 
-def rows(section: str) -> Iterator[Row]:
+def rows(section: str) -> Iterator[TableRow]:
     """Those of a section, measured by a process with its environment."""
     command = [sys.executable, "-m", "benchmarks.table", "--section", section]
     environment = {**os.environ, **SECTIONS[section][1], "PYTHONPATH": os.pathsep.join(sys.path)}
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for text in process.stdout:
-            yield Row(**json.loads(text))
+            yield TableRow(**json.loads(text))
     if process.returncode:
         raise SystemExit(f"the section {section} ended with {process.returncode}")
 

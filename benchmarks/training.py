@@ -32,11 +32,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.common import Line, as_text, config_of, duration, in_turns
+from benchmarks.common import ResultLine, as_text, config_of, duration, in_turns
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import ImageCache, load_grasps, make_split
-from retrieval.data.labelled import load_labelled
-from retrieval.data.loading import ahead
+from retrieval.data.labelled_pictures import load_labelled
+from retrieval.data.loading import prefetch
 from retrieval.model.config import PRECISIONS, Config, load_config
 from retrieval.model.encode import has_fast_bfloat16
 from retrieval.model.towers import TOWERS
@@ -66,7 +66,7 @@ class Work:
         """So many steps, as a training takes them; nothing is validated."""
         plan = Plan(2 * count, 1e-6, "constant", 2 * count)
         with Bar("", count, "steps", quiet=True) as bar:
-            batches = ahead(map(self.prepare, range(count)), 1)
+            batches = prefetch(map(self.prepare, range(count)), 1)
             fit(self.optimizer, plan, batches, self.loss, bar=bar, before_step=self.before_step)
 
     def bare(self, batch: Any) -> None:
@@ -85,7 +85,7 @@ def matching(config: Config, recording: Path, folder: Path) -> Iterator[tuple[Tr
         TrainedFeatures(config, trainer.device, keep_bytes=0) as decoded,
         TrainedFeatures(config, trainer.device) as kept,
     ):
-        kept.keep(folder, grasps, quiet=True)
+        kept.cache_decoded(folder, grasps, quiet=True)
         trainer.features = kept
 
         def work(source: TrainedFeatures) -> Work:
@@ -102,24 +102,24 @@ def matching(config: Config, recording: Path, folder: Path) -> Iterator[tuple[Tr
                 lambda: distributed.average_gradients(trainer.matcher),
             )
 
-        yield trainer, {"kept": work(kept), "decoded": work(decoded)}
+        yield trainer, {"cached": work(kept), "decoded": work(decoded)}
 
 
 @contextmanager
 def relief(config: Config, pictures: Path, folder: Path) -> Iterator[dict[str, Work]]:
     """Both ways to train a tower to see relief."""
     made: dict[str, Work] = {}
-    with ThreadPoolExecutor(1) as ahead:
-        for name in ("kept", "decoded"):
+    with ThreadPoolExecutor(1) as prefetch:
+        for name in ("cached", "decoded"):
             training = ReliefTraining(*load_labelled(pictures), config, STEPS)
-            if name == "kept":
-                training.keep(folder, quiet=True)
+            if name == "cached":
+                training.cache_decoded(folder, quiet=True)
             else:
-                training._forms = ImageCache(training._load, 0)
+                training._variants = ImageCache(training._load, 0)
             batch = training._batch(0)
             made[name] = Work(
                 training.optimizer,
-                lambda step, training=training: ahead.submit(training._batch, step),
+                lambda step, training=training: prefetch.submit(training._batch, step),
                 training._loss,
                 len(batch[1]),
             )
@@ -128,18 +128,18 @@ def relief(config: Config, pictures: Path, folder: Path) -> Iterator[dict[str, W
 
 def rates(
     name: str, works: dict[str, Work], threads: int, steps: int = STEPS, repetitions: int = REPETITIONS
-) -> Iterator[Line]:
+) -> Iterator[ResultLine]:
     """Images a second of each arm, and the parts of a step where there is one thread."""
     with running_on(threads):
-        ready = works["kept"].prepare(0).result()
+        ready = works["cached"].prepare(0).result()
         arms = {name: lambda work=work: work.steps(steps) for name, work in works.items()}
-        arms["bare"] = lambda: [works["kept"].bare(ready) for _ in range(steps)]
+        arms["bare"] = lambda: [works["cached"].bare(ready) for _ in range(steps)]
         clock = time.process_time if threads == 1 else time.perf_counter
         times = in_turns(arms, repetitions, clock)
-        images = steps * works["kept"].images
+        images = steps * works["cached"].images
         rate = {arm: images / times.median(arm) for arm in arms}
         ratio = {arm: times.ratio("bare", arm) for arm in works}
-        yield Line(
+        yield ResultLine(
             "training",
             name,
             f"{threads} thread{'s' * (threads > 1)}: {rate['kept']:.3g} images a second from kept files, "
@@ -151,7 +151,7 @@ def rates(
             yield parts(name, works, steps)
 
 
-def parts(name: str, works: dict[str, Work], steps: int) -> Line:
+def parts(name: str, works: dict[str, Work], steps: int) -> ResultLine:
     """CPU time of what a step is made of."""
     seconds: dict[str, list[float]] = {}
 
@@ -161,7 +161,7 @@ def parts(name: str, works: dict[str, Work], steps: int) -> Line:
         seconds.setdefault(part, []).append(time.process_time() - start)
         return made
 
-    kept = works["kept"]
+    kept = works["cached"]
     for step in range(steps):
         timed("draw and decode", lambda step=step: works["decoded"].prepare(step).result())
         batch = timed("draw and map", lambda step=step: kept.prepare(step).result())
@@ -171,20 +171,20 @@ def parts(name: str, works: dict[str, Work], steps: int) -> Line:
         timed("optimiser", kept.optimizer.step)
     medians = {part: float(np.median(each)) for part, each in seconds.items()}
     said = ", ".join(f"{part} {duration(value)}" for part, value in medians.items())
-    return Line("parts", name, said, {f"{part}_s": value for part, value in medians.items()})
+    return ResultLine("parts", name, said, {f"{part}_s": value for part, value in medians.items()})
 
 
-def validation(name: str, trainer: Trainer) -> Line:
+def validation(name: str, trainer: Trainer) -> ResultLine:
     """What a validation costs for each step after which there is none, in CPU time of one thread."""
     start = time.process_time()
     with running_on(1):
         trainer.validate()
     spent, every = time.process_time() - start, trainer.config.training.validate_every
     text = f"validation {duration(spent)}, {duration(spent / every)} for each of the {every} steps between two"
-    return Line("parts", name, text, {"validation_s": spent, "validation_per_step_s": spent / every})
+    return ResultLine("parts", name, text, {"validation_s": spent, "validation_per_step_s": spent / every})
 
 
-def rounding(name: str, trainer: Trainer, work: Work) -> Line:
+def rounding(name: str, trainer: Trainer, work: Work) -> ResultLine:
     """How far the gradients in bfloat16 lie from those in float32, at the first weights."""
     ready = work.prepare(0).result()
 
@@ -199,7 +199,7 @@ def rounding(name: str, trainer: Trainer, work: Work) -> Line:
     apart = float((rounded - exact).norm() / exact.norm())
     cosine = float(torch.nn.functional.cosine_similarity(rounded, exact, dim=0))
     text = f"gradients in bfloat16 lie {apart:.2g} of their length from those in float32, cosine {cosine:.4f}"
-    return Line("rounding", name, text, {"apart": apart, "cosine": cosine})
+    return ResultLine("rounding", name, text, {"apart": apart, "cosine": cosine})
 
 
 @contextmanager
@@ -216,7 +216,7 @@ def running_on(threads: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def ranks(towers: Sequence[str], recording: Path, precision: str, rounds: int = ROUNDS) -> Iterator[Line]:
+def ranks(towers: Sequence[str], recording: Path, precision: str, rounds: int = ROUNDS) -> Iterator[ResultLine]:
     """Two processes of one thread against one of two, and one of one, started in turns; each tells the medians of its
     steps. By the clock where nothing else runs; while other programs run, teams of threads wait for one another, and
     CPU time tells the most that two can reach, who wait for each other besides."""
@@ -235,7 +235,7 @@ def ranks(towers: Sequence[str], recording: Path, precision: str, rounds: int = 
         ratio, by_cpu = _times(clock["one"], clock["two"]), _times(cpu["alone"], cpu["two"])
         seconds = {name: float(np.median(each)) for name, each in clock.items()}
         spent = {name: float(np.median(each)) for name, each in cpu.items()}
-        yield Line(
+        yield ResultLine(
             "ranks",
             tower,
             f"a step takes {duration(seconds['two'])} on two processes of one thread, {duration(seconds['one'])} on "
@@ -260,7 +260,7 @@ def as_rank(config: Config, recording: Path, steps: int = STEPS, repetitions: in
     with tempfile.TemporaryDirectory() as name, matching(config, recording, Path(name)) as (_, works):
         for _ in range(1 + repetitions):  # the first is not counted
             start = time.perf_counter(), time.process_time()
-            works["kept"].steps(steps)
+            works["cached"].steps(steps)
             taken.append([time.perf_counter() - start[0], time.process_time() - start[1]])
         if not distributed.rank():
             print(*np.median(taken[1:], axis=0) / steps)
@@ -269,7 +269,7 @@ def as_rank(config: Config, recording: Path, steps: int = STEPS, repetitions: in
 
 def configured(tower: str, precision: str, init: str = "random") -> Config:
     """`config_of` in this precision, with these first weights."""
-    config = config_of(tower).without_pruner()
+    config = config_of(tower).without_candidate_encoder()
     training = dataclasses.replace(config.training, precision=precision, init=init)
     return dataclasses.replace(config, training=training)
 
@@ -299,7 +299,7 @@ def main() -> None:
             print(json.dumps(dataclasses.asdict(line)) if arguments.json else line, flush=True)
 
 
-def lines(arguments: argparse.Namespace, recording: Path, folder: Path) -> Iterator[Line]:
+def lines(arguments: argparse.Namespace, recording: Path, folder: Path) -> Iterator[ResultLine]:
     """What was asked for."""
     if arguments.ranks:
         yield from ranks(arguments.tower, recording, arguments.precision)
@@ -310,7 +310,7 @@ def lines(arguments: argparse.Namespace, recording: Path, folder: Path) -> Itera
                 yield from rates(tower, works, threads)
             yield validation(tower, trainer)
             if has_fast_bfloat16(trainer.device):
-                yield rounding(tower, trainer, works["kept"])
+                yield rounding(tower, trainer, works["cached"])
     if arguments.pictures:
         config = load_config("relief")
         training = dataclasses.replace(config.training, init="random", precision=arguments.precision)

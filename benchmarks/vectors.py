@@ -2,7 +2,7 @@
 
 Build, memory, opening and candidates of an index that holds rows and embeddings alone, no halves: what `indexes` takes
 by itself, where `benchmarks.scale` measures it beside the judging of what it names. Photos are drawn as there,
-and the 64 numbers are those of the checkpoint's pruner. Touches ask for `--candidates`; the share of them that is among
+and the 64 numbers are those of the checkpoint's candidate_encoder. Touches ask for `--candidates`; the share of them that is among
 the exact best is told for each setting of a kind's ladder. CPU time is told beside the clock's, as other programs may
 run; memory is what the process holds beside mapped files. Ten million photos take 11 GB on the disk and 25 minutes.
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common import duration
-from benchmarks.scale import Crowd, anonymous_mb, collected, crowd_of, on_disk, opened, rows_of
+from benchmarks.scale import BlendedPhotos, anonymous_mb, blended_photos, collected, on_disk, opened, rows_of
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.tables import Block
@@ -51,7 +51,7 @@ def timed(what: str) -> Iterator[None]:
     print(f"{what}: {duration(wall)}, CPU {duration(cpu)}, at most {most:,.0f} MB of memory", flush=True)
 
 
-def bare(crowd: Crowd, photos: int) -> Iterator[Block]:
+def bare(crowd: BlendedPhotos, photos: int) -> Iterator[Block]:
     """The crowd's photos without their halves."""
     return (Block(block.rows, block.embeddings) for block in crowd.blocks(0, photos, 0))
 
@@ -59,7 +59,7 @@ def bare(crowd: Crowd, photos: int) -> Iterator[Block]:
 def ask(made: Generation, queries: np.ndarray, k: int, exact: list[np.ndarray]) -> None:
     """Print what candidates take, and how many of the exact ones are among them, along the ladder of the kind."""
     built = made.index
-    for index in built.along_ladder():
+    for index in built.search_variants():
         made.index = index
         found, seconds = [], []
         for query in queries:
@@ -85,7 +85,7 @@ def main() -> None:
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
         folder, count = Path(made), int(asked.photos)
-        crowd = crowd_of(shipped_model(), asked.recording or collected(folder), asked.features)
+        crowd = blended_photos(shipped_model(), asked.recording or collected(folder), asked.features)
         store = IndexStore(folder / "index")
         with timed(f"{count:,} photos drawn and written"):
             generation = store.write_blocks(bare(crowd, count), fingerprint={}, kind="flat", self_check=64)

@@ -3,7 +3,7 @@
 Importing this package needs only numpy; FAISS is imported when one of its kinds is used.
 
     indexes.store.folder     `IndexStore`, the folder of generations
-    indexes.kinds.base       `VectorIndex`, what every kind of index is and says of itself
+    indexes.kinds.vector_index       `VectorIndex`, what every kind of index is and says of itself
     indexes.kinds.measure    recall against the exact search
     indexes.errors           every error
 
@@ -23,8 +23,8 @@ from indexes.errors import ParameterError
 
 if TYPE_CHECKING:
     from indexes.errors import IndexesError as IndexesError
-    from indexes.kinds.base import VectorIndex as VectorIndex
     from indexes.kinds.measure import recall_against_exact as recall_against_exact
+    from indexes.kinds.vector_index import VectorIndex as VectorIndex
     from indexes.store.folder import IndexStore as IndexStore
     from indexes.store.generation import Generation as Generation
 
@@ -40,7 +40,7 @@ KINDS: "Registry[type[VectorIndex]]" = Registry(
         "hnsw": "indexes.kinds.hnsw:HNSWIndex",
     },
     error=ParameterError,
-    base="indexes.kinds.base:VectorIndex",
+    base="indexes.kinds.vector_index:VectorIndex",
 )
 """Names of the kinds of index, the quickest to build first. What others need to know of a kind, its class says
 (`indexes.VectorIndex`)."""
@@ -82,24 +82,24 @@ def open(folder: str | Path, *, verify: bool = True) -> "Generation":
     return IndexStore(Path(folder)).open(verify=verify)
 
 
-_PLACES = {
+_MODULES = {
     "Generation": "store.generation",
     "IndexStore": "store.folder",
     "IndexesError": "errors",
-    "VectorIndex": "kinds.base",
+    "VectorIndex": "kinds.vector_index",
     "recall_against_exact": "kinds.measure",
 }
 """Public name -> its module in this package, imported when it is used."""
 
-__all__ = ["KINDS", "load_kind", "open", *_PLACES]
+__all__ = ["KINDS", "load_kind", "open", *_MODULES]
 
 if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
 
     def __getattr__(name: str) -> Any:
-        if name not in _PLACES:
+        if name not in _MODULES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+        return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_PLACES})
+    return sorted({*globals(), *_MODULES})

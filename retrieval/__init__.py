@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from retrieval.evaluation.real.benchmark import benchmark as benchmark
     from retrieval.evaluation.real.protocol import Protocol as Protocol
     from retrieval.frontier.measure import measure_frontier as measure_frontier
-    from retrieval.methods.base import Method as Method
-    from retrieval.methods.base import Setting as Setting
+    from retrieval.methods.method import Method as Method
+    from retrieval.methods.method import MethodSettings as MethodSettings
     from retrieval.model.checkpoint import Checkpoint as Checkpoint
     from retrieval.model.checkpoint import load_checkpoint as load_checkpoint
     from retrieval.model.config import Config as Config
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from retrieval.model.encode import encode_photos as encode_photos
     from retrieval.model.encode import encode_touches as encode_touches
     from retrieval.model.losses.loss import Loss as Loss
-    from retrieval.model.touches import Encoded as Encoded
-    from retrieval.model.towers.base import Tower as Tower
+    from retrieval.model.touches import EncodedTouches as EncodedTouches
+    from retrieval.model.towers.tower import Tower as Tower
     from retrieval.report.evaluation import write_report as write_report
     from retrieval.search.build.build_index import build_index as build_index
     from retrieval.search.build.build_report import BuildReport as BuildReport
@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 
     open = Searcher.open
 
-_PLACES = {
+_MODULES = {
     "Adaptation": "adaptation.recipe:Adaptation",
     "Agreement": "search.query.agreement:Agreement",
     "BadInput": "errors:BadInput",
@@ -64,17 +64,17 @@ _PLACES = {
     "Checkpoint": "model.checkpoint:Checkpoint",
     "Client": "serve.client:Client",
     "Config": "model.config:Config",
-    "Encoded": "model.touches:Encoded",
+    "EncodedTouches": "model.touches:EncodedTouches",
     "Loss": "model.losses.loss:Loss",
     "Match": "search.query.answer:Match",
-    "Method": "methods.base:Method",
+    "Method": "methods.method:Method",
     "Neighbour": "search.query.neighbours:Neighbour",
     "Protocol": "evaluation.real.protocol:Protocol",
     "QueryResult": "search.query.answer:QueryResult",
     "RetrievalError": "errors:RetrievalError",
     "Searcher": "search.query.searcher:Searcher",
-    "Setting": "methods.base:Setting",
-    "Tower": "model.towers.base:Tower",
+    "MethodSettings": "methods.method:MethodSettings",
+    "Tower": "model.towers.tower:Tower",
     "adapt": "adaptation.recipe:adapt",
     "agreement": "search.query.agreement:agreement",
     "benchmark": "evaluation.real.benchmark:benchmark",
@@ -97,16 +97,16 @@ _PLACES = {
 }
 """Public name -> where it stands in this package."""
 
-__all__ = list(_PLACES)
+__all__ = list(_MODULES)
 
 if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
 
     def __getattr__(name: str) -> Any:
-        if name not in _PLACES:
+        if name not in _MODULES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        module, _, attribute = _PLACES[name].partition(":")
+        module, _, attribute = _MODULES[name].partition(":")
         return attrgetter(attribute)(import_module(f"{__name__}.{module}"))
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_PLACES})
+    return sorted({*globals(), *_MODULES})

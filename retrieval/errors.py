@@ -5,14 +5,14 @@ leaves with `exit_code`; anything that is not one of these errors is a bug.
 
     RetrievalError             the job ran and failed (exit code 1)
     +-- NumericalError         a NaN or infinite value where a number must be
-    +-- TooManyBad             more photos cannot be read than the user allows
+    +-- TooManyUnreadable             more photos cannot be read than the user allows
     +-- StorageError           a storage behind a URL goes on refusing, or does not hold what it was given
-    +-- Unanswered             shards did not answer, and more of the catalogue was asked for
-    +-- Interrupted            the user stopped the job; what was made is kept
+    +-- IncompleteSearch             shards did not answer, and more of the catalogue was asked for
+    +-- JobInterrupted            the user stopped the job; what was made is kept
     +-- BadInput               wrong use or bad input (exit code 2)
         +-- ImageError         a file is not a readable image
         +-- DatasetError       a recording or catalogue is not usable
-        |   +-- NoPhoto        none of a catalogue's photos can be read
+        |   +-- NoReadablePhoto        none of a catalogue's photos can be read
         +-- CheckpointError    a checkpoint is missing, damaged or of another kind
         +-- ConfigError        a setting is unknown or out of range
 """
@@ -39,19 +39,19 @@ class NumericalError(RetrievalError):
     """A NaN or infinite value stands where a number must be."""
 
 
-class TooManyBad(RetrievalError):
+class TooManyUnreadable(RetrievalError):
     """More of a catalogue's photos cannot be read than the user allows; the index stays as it was."""
 
 
-class StorageError(RetrievalError):
+class RemoteStorageError(RetrievalError):
     """A storage behind a URL goes on refusing, or does not hold what it was given; the job can go on later."""
 
 
-class Unanswered(RetrievalError):
+class IncompleteSearch(RetrievalError):
     """Shards of a cluster did not answer, and less of the catalogue was searched than the user asked for."""
 
 
-class Interrupted(RetrievalError):
+class JobInterrupted(RetrievalError):
     """The user stopped the job; what was made so far is kept."""
 
 
@@ -82,7 +82,7 @@ class DatasetError(BadInput):
     """A recording or a catalogue is not usable."""
 
 
-class NoPhoto(DatasetError):
+class NoReadablePhoto(DatasetError):
     """None of a catalogue's photos can be read. `skipped` says of each why."""
 
     def __init__(self, message: str, skipped: Sequence[Any] = ()) -> None:

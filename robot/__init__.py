@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from robot.readings import Pose as Pose
     from robot.recording.folder import Recording as Recording
     from robot.recording.folder import RecordingWriter as RecordingWriter
-    from robot.recording.folder import Shared as Shared
+    from robot.recording.folder import SharedImage as SharedImage
     from robot.recording.folder import read_recording as read_recording
     from robot.recording.grasp import RecordedGrasp as RecordedGrasp
     from robot.rig import Rig as Rig
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from robot.sim.pinch import Grip as Grip
     from robot.sim.scene import Scene as Scene
 
-_PLACES = {
+_MODULES = {
     "Arm": "devices",
     "Camera": "devices",
     "CollectSettings": "collection",
@@ -52,7 +52,7 @@ _PLACES = {
     "Rig": "rig",
     "RobotError": "errors",
     "Scene": "sim.scene",
-    "Shared": "recording.folder",
+    "SharedImage": "recording.folder",
     "TactileSensor": "devices",
     "collect": "collection",
     "draw_object": "sim.objects.draw",
@@ -63,15 +63,15 @@ _PLACES = {
 }
 """Public name -> its module in this package."""
 
-__all__ = list(_PLACES)
+__all__ = list(_MODULES)
 
 if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
 
     def __getattr__(name: str) -> Any:
-        if name not in _PLACES:
+        if name not in _MODULES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        return getattr(import_module(f"{__name__}.{_PLACES[name]}"), name)
+        return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_PLACES})
+    return sorted({*globals(), *_MODULES})

@@ -27,21 +27,21 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import RecordingError, RobotConfigError
-from robot.grasping.attempt import Attempter, GraspAttempt
-from robot.grasping.gates import ContactAreaGate, Gate, GraspFrames, judge
+from robot.grasping.attempt import AttemptRunner, GraspAttempt
+from robot.grasping.gates import ContactAreaGate, Gate, GraspFrames, apply_gate
 from robot.grasping.settings import AttemptSettings
 from robot.recording.attempt_log import UNGRASPABLE, AttemptLog, LoggedAttempt, Tally, tally
 from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, software_version
 from robot.recording.grasp import check_name
 from robot.rig import Rig
-from robot.storage import decoded
-from robot.workers import Jobs, Work
+from robot.storage import decode_picture
+from robot.workers import Work, WorkerPool
 
 RigMaker = Callable[[], Rig]
 """Builds a rig, unconnected; for several jobs picklable, as functools.partial(load_rig, "sim", seed=0) is."""
 
 _ATTEMPTS_PER_GRASP, _SPARE_ATTEMPTS = 4, 10
-_NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9._-]")
+_UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]")
 _TOUCH = re.compile(r"touch_([a-z])")
 
 
@@ -77,8 +77,8 @@ class Progress:
 
     objects: int
     objects_done: int
-    wanted: int
-    settled: int
+    grasps_wanted: int
+    grasps_done: int
     accepted: int
     attempts: int
     seconds_left: float | None
@@ -149,27 +149,27 @@ def collect(
         check_name("an object's name", name)
     with rig:
         attempt = settings.attempt or rig.attempt
-        info = _info(rig, seed, replace(settings, attempt=attempt), gate_name or repr(gate))
-        _check_goes_on(Path(out), info, strict=rig.can_run_jobs)
-        attempter = Attempter(rig, seed, attempt)
+        info = _recording_info(rig, seed, replace(settings, attempt=attempt), gate_name or repr(gate))
+        _check_can_continue(Path(out), info, strict=rig.can_run_jobs)
+        attempter = AttemptRunner(rig, seed, attempt)
         with RecordingWriter(out, info) as writer, AttemptLog(Path(out), writer.grasp_ids) as log:
             collection = _Collection(writer, log, names, settings, gate, progress)
-            with Jobs(jobs, attempter.run, functools.partial(_in_a_worker, make_rig, seed, attempt)) as workers:
+            with WorkerPool(jobs, attempter.run, functools.partial(_make_work, make_rig, seed, attempt)) as workers:
                 collection.run(workers)
     return [collection.tallies[name] for name in names]
 
 
-def _in_a_worker(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> Work[GraspAttempt]:
+def _make_work(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> Work[GraspAttempt]:
     rig = make_rig()
     rig.connect()
     atexit.register(rig.close)
-    return Attempter(rig, seed, settings).run
+    return AttemptRunner(rig, seed, settings).run
 
 
 # What the recording says of its collection ------------------------------------------------------------------
 
 
-def _info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dict[str, Any]:
+def _recording_info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dict[str, Any]:
     """recording.json: the rig's own, and all that a collection depends on."""
     info = {
         **rig.info,
@@ -184,7 +184,7 @@ def _info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dic
         raise RobotConfigError(f"what the rig says of itself must be plain JSON: {error}") from error
 
 
-def _check_goes_on(folder: Path, wanted: Mapping[str, Any], strict: bool) -> None:
+def _check_can_continue(folder: Path, grasps_wanted: Mapping[str, Any], strict: bool) -> None:
     """Raise RecordingError where a recording that exists was collected otherwise.
 
     strict: simulated attempts depend on the software and on what their devices say. Those of a real rig go on after it
@@ -196,13 +196,13 @@ def _check_goes_on(folder: Path, wanted: Mapping[str, Any], strict: bool) -> Non
     if "collection" not in found:
         raise RecordingError(f"{folder} holds a recording that was not collected by a rig; give another folder")
     if strict:
-        wanted = {**wanted, "software_version": software_version()}
+        grasps_wanted = {**grasps_wanted, "software_version": software_version()}
     else:
-        wanted = {name: value for name, value in wanted.items() if name != "devices"}
+        grasps_wanted = {name: value for name, value in grasps_wanted.items() if name != "devices"}
     if "gels" not in found:  # older software did not say them
-        wanted = {name: value for name, value in wanted.items() if name != "gels"}
-    for name, value in _flat(wanted).items():
-        old = _flat(found).get(name)
+        grasps_wanted = {name: value for name, value in grasps_wanted.items() if name != "gels"}
+    for name, value in _flatten(grasps_wanted).items():
+        old = _flatten(found).get(name)
         if old != value:
             what = name.replace("collection.", "").replace("_", " ")
             raise RecordingError(
@@ -210,11 +210,11 @@ def _check_goes_on(folder: Path, wanted: Mapping[str, Any], strict: bool) -> Non
             )
 
 
-def _flat(info: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flatten(info: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """Nested keys joined by dots."""
     flat: dict[str, Any] = {}
     for key, value in info.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+        flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return flat
 
 
@@ -239,30 +239,30 @@ class _Collection:
         self._seconds = log.attempts[-1].ended_s if log.attempts else 0.0
         self._pending: dict[str, deque[Callable[[], GraspAttempt]]] = defaultdict(deque)
         self._progress = progress
-        self._start, self._settled_before = time.monotonic(), self._settled()
+        self._start, self._done_at_start = time.monotonic(), self._count_done()
 
-    def run(self, workers: Jobs[GraspAttempt]) -> None:
+    def run(self, workers: WorkerPool[GraspAttempt]) -> None:
         """Attempts are recorded object by object; workers may be ahead, but never make one that is not wanted."""
-        self._say_skipped()  # a crash may have come between a line of the log and this
+        self._record_skipped_objects()  # a crash may have come between a line of the log and this
         self._report()
         for name in self.names:
-            while self._wants(name):
+            while self._needs_attempt(name):
                 self._submit_ahead(workers, name)
                 self._record(self._pending[name].popleft()())
                 self._report()
             self._pending.pop(name, None)  # of an object that turned out to be ungraspable
 
-    def _submit_ahead(self, workers: Jobs[GraspAttempt], name: str) -> None:
+    def _submit_ahead(self, workers: WorkerPool[GraspAttempt], name: str) -> None:
         """Give out the attempts that are wanted next, this object's first."""
         later = self.names[self.names.index(name) :]
         for each in later:
-            while self._wants(each, ahead=True):
+            while self._needs_attempt(each, ahead=True):
                 if sum(map(len, self._pending.values())) >= workers.window and self._pending[name]:
                     return
                 number = self.tallies[each].attempts + len(self._pending[each])
                 self._pending[each].append(workers.submit(each, number))
 
-    def _wants(self, name: str, ahead: bool = False) -> bool:
+    def _needs_attempt(self, name: str, ahead: bool = False) -> bool:
         """Whether another attempt is needed, if all that are under way are going to be accepted."""
         under_way, so_far = len(self._pending[name]) if ahead else 0, self.tallies[name]
         if so_far.skipped is not None:
@@ -271,8 +271,8 @@ class _Collection:
 
     def _record(self, attempt: GraspAttempt) -> None:
         """Ask the gate, write the attempt's line and then its grasp."""
-        began, self._seconds = self._seconds, round(self._seconds + attempt.lasted_s, 3)
-        logged = self._judged(attempt)
+        began, self._seconds = self._seconds, round(self._seconds + attempt.duration_s, 3)
+        logged = self._log_entry(attempt)
         self.log.append(logged)
         if logged.grasp_id is not None:
             self.writer.append(
@@ -283,44 +283,44 @@ class _Collection:
                 grasped=logged.accepted,
                 outcome=attempt.outcome,
                 sequence_id=logged.grasp_id,
-                time_s=round(began + attempt.at_s, 3),
+                time_s=round(began + attempt.touch_time_s, 3),
             )
         self.tallies[attempt.object_id].add(logged)
         if attempt.outcome == UNGRASPABLE:
-            self._say_skipped()
+            self._record_skipped_objects()
 
-    def _say_skipped(self) -> None:
+    def _record_skipped_objects(self) -> None:
         """Have recording.json name the objects that cannot be grasped, where there are any."""
         if skipped := {name: why for name in self.names if (why := self.tallies[name].skipped) is not None}:
-            self.writer.tell(skipped_objects=skipped)
+            self.writer.update_info(skipped_objects=skipped)
 
-    def _judged(self, attempt: GraspAttempt) -> LoggedAttempt:
+    def _log_entry(self, attempt: GraspAttempt) -> LoggedAttempt:
         logged = functools.partial(
             LoggedAttempt, attempt.object_id, attempt.number, attempt.outcome, ended_s=self._seconds
         )
         if attempt.outcome in ("no_plan", UNGRASPABLE):
             return logged(accepted=False, reason=attempt.reason)
-        accepted, score = judge(self.gate, RecordedTouches(attempt.images))
-        grasp_id = name_of(attempt.object_id, attempt.number)
+        accepted, score = apply_gate(self.gate, RecordedTouches(attempt.images))
+        grasp_id = grasp_id_of(attempt.object_id, attempt.number)
         return logged(accepted=accepted, grasp_id=grasp_id, score=score, fit=attempt.fit)
 
-    def _settled(self) -> int:
-        wanted = self.settings.grasps
-        return sum(self.tallies[name].accepted if self._wants(name) else wanted for name in self.names)
+    def _count_done(self) -> int:
+        grasps_wanted = self.settings.grasps
+        return sum(self.tallies[name].accepted if self._needs_attempt(name) else grasps_wanted for name in self.names)
 
     def _report(self) -> None:
         if self._progress is None:
             return
         tallies = [self.tallies[name] for name in self.names]
-        wanted, settled = len(tallies) * self.settings.grasps, self._settled()
-        fresh = settled - self._settled_before
-        left = (wanted - settled) * (time.monotonic() - self._start) / fresh if fresh else None
+        grasps_wanted, grasps_done = len(tallies) * self.settings.grasps, self._count_done()
+        fresh = grasps_done - self._done_at_start
+        left = (grasps_wanted - grasps_done) * (time.monotonic() - self._start) / fresh if fresh else None
         self._progress(
             Progress(
                 objects=len(tallies),
-                objects_done=sum(not self._wants(name) for name in self.names),
-                wanted=wanted,
-                settled=settled,
+                objects_done=sum(not self._needs_attempt(name) for name in self.names),
+                grasps_wanted=grasps_wanted,
+                grasps_done=grasps_done,
                 accepted=sum(each.accepted for each in tallies),
                 attempts=sum(each.attempts for each in tallies),
                 seconds_left=left,
@@ -340,9 +340,9 @@ def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str]) -
         )
 
 
-def name_of(object_id: str, number: int) -> str:
+def grasp_id_of(object_id: str, number: int) -> str:
     """The grasp's id: object and number of the attempt, in characters that file names may have."""
-    plain = _NOT_IN_A_NAME.sub("_", object_id)[:100]
+    plain = _UNSAFE_CHARACTERS.sub("_", object_id)[:100]
     if plain != object_id or not plain[0].isalnum():
         plain = f"x{zlib.crc32(object_id.encode()):08x}_{plain}"
     return f"{plain}-{number:04}"
@@ -356,15 +356,15 @@ class RecordedTouches(Mapping[str, GraspFrames]):
         self._fingers = [match[1] for column in images if (match := _TOUCH.fullmatch(column))]
 
     def __getitem__(self, finger: str) -> GraspFrames:
-        before, during, after = (self._decoded(f"touch_{finger}{moment}") for moment in ("_before", "", "_after"))
+        before, during, after = (self._decode(f"touch_{finger}{moment}") for moment in ("_before", "", "_after"))
         if during is None:
             raise KeyError(finger)
         return GraspFrames(before, during, after)
 
-    def _decoded(self, column: str) -> npt.NDArray[np.uint8] | None:
+    def _decode(self, column: str) -> npt.NDArray[np.uint8] | None:
         if column not in self._images:
             return None
-        pixels = decoded(self._images[column])
+        pixels = decode_picture(self._images[column])
         assert pixels is not None, "it was encoded by robot.grasping.attempt"
         return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
 

@@ -192,7 +192,7 @@ class Arm(Actuator):
     True
     """
 
-    by_hand: ClassVar[bool] = False
+    is_manual: ClassVar[bool] = False
     can_tilt: bool = False
 
     def __init__(
@@ -210,14 +210,14 @@ class Arm(Actuator):
             raise DeviceError(f"{self.name} keeps the fingers pointing straight down: tilt must be 0, got {pose}")
         self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot move"):
-            return self._reached(self._move_to(pose, speed_mm_s))
+            return self._check_reported(self._move_to(pose, speed_mm_s))
 
     def pose(self) -> Pose:
         """Where the arm is now. Raises DeviceError."""
         with self._use("cannot say where it is"):
-            return self._reached(self._pose())
+            return self._check_reported(self._pose())
 
-    def _reached(self, pose: Pose) -> Pose:
+    def _check_reported(self, pose: Pose) -> Pose:
         if not all(map(math.isfinite, pose.as_tuple())):
             raise DeviceError(f"{self.name}: the pose that an arm reports must be finite, got {pose}")
         return pose
@@ -350,7 +350,7 @@ class Camera(Device):
 
     def __init__(self, name: str, extrinsics: npt.ArrayLike, *, clock: Clock = time.monotonic) -> None:
         super().__init__(name, clock=clock)
-        self.extrinsics = _rigid(extrinsics)
+        self.extrinsics = _check_rigid(extrinsics)
 
     def read(self, depth: bool = True, max_age_s: float = MAX_AGE_S) -> RGBD:
         """The newest picture; without `depth` none is computed or returned. Raises DeviceError, also when stale."""
@@ -383,7 +383,7 @@ def _check_depth(name: str, image: RGBD) -> None:
         raise DeviceError(f"{name}: a picture with depth must come with its intrinsics")
 
 
-def _rigid(matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def _check_rigid(matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Check a rotation and translation; 1e-6 is what a rotation typed with seven digits is off."""
     found = np.asarray(matrix, dtype=np.float64)
     if found.shape != (4, 4) or not np.isfinite(found).all() or not np.array_equal(found[3], [0, 0, 0, 1]):

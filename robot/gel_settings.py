@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from robot.errors import RobotConfigError
-from robot.settings import TypedSettings, build, limited
+from robot.settings import TypedSettings, bounded, build
 
 UNKNOWN = "unknown"
 
@@ -19,20 +19,20 @@ UNKNOWN = "unknown"
 class GelSettings(TypedSettings):
     """One finger's gel: thickness, Young's modulus, Poisson's ratio; None: not known, and drawn where simulated."""
 
-    thickness_mm: float | None = limited(0.01, 100.0, None)
-    modulus_mpa: float | None = limited(1e-4, 1e3, None)
-    poisson: float | None = limited(0.0, 0.5, None)
+    thickness_mm: float | None = bounded(0.01, 100.0, None)
+    modulus_mpa: float | None = bounded(1e-4, 1e3, None)
+    poisson: float | None = bounded(0.0, 0.5, None)
 
     def known(self) -> dict[str, float]:
         """What was said, by name."""
         return {name: float(value) for name, value in asdict(self).items() if value is not None}
 
-    def as_recorded(self) -> dict[str, float | str]:
+    def to_dict(self) -> dict[str, float | str]:
         """As in recording.json, where what is not known is "unknown"."""
         return {**dict.fromkeys(asdict(self), UNKNOWN), **self.known()}
 
 
-def gels_of(tables: Mapping[str, Any], fingers: Iterable[str]) -> dict[str, GelSettings]:
+def parse_gel_settings(tables: Mapping[str, Any], fingers: Iterable[str]) -> dict[str, GelSettings]:
     """The gel of each finger, from the tables [gel.a] and [gel.b] of a rig's file. Raises RobotConfigError."""
     found = {finger: GelSettings() for finger in sorted(fingers)}
     for finger, table in tables.items():

@@ -1,5 +1,6 @@
 """What devices say: poses, pictures, states. Lengths in mm, forces in N, angles in rad, times in s; frames as in
-robot.devices."""
+robot.devices.
+"""
 
 import math
 from dataclasses import dataclass
@@ -10,9 +11,9 @@ import numpy.typing as npt
 
 from robot.errors import DeviceError, RobotConfigError
 
-Status = Literal["idle", "moving", "holding", "no_part", "part_lost"]
-_MOST_PX = 1e6
-STATUSES: tuple[Status, ...] = ("idle", "moving", "holding", "no_part", "part_lost")
+GripperStatus = Literal["idle", "moving", "holding", "no_part", "part_lost"]
+_MAX_PX = 1e6
+GRIPPER_STATUSES: tuple[GripperStatus, ...] = ("idle", "moving", "holding", "no_part", "part_lost")
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ class Intrinsics:
     def __post_init__(self) -> None:
         """Raises DeviceError for focal lengths that are not above 0, or numbers that no camera has."""
         numbers = (self.fx, self.fy, self.cx, self.cy)
-        if not (min(self.fx, self.fy) > 0 and all(abs(each) <= _MOST_PX for each in numbers)):  # also refuses NaN
+        if not (min(self.fx, self.fy) > 0 and all(abs(each) <= _MAX_PX for each in numbers)):  # also refuses NaN
             raise DeviceError(
                 f"intrinsics must be finite, up to a million pixels, with focal lengths above 0, got {self}"
             )
@@ -116,11 +117,11 @@ class GripperState:
 
     opening_mm: float
     force_n: float
-    status: Status
+    status: GripperStatus
 
     def __post_init__(self) -> None:
         """Raises DeviceError for a status that is not of the contract, or numbers that are not finite."""
-        if self.status not in STATUSES:
-            raise DeviceError(f"a gripper's status must be one of {', '.join(STATUSES)}, got {self.status!r}")
+        if self.status not in GRIPPER_STATUSES:
+            raise DeviceError(f"a gripper's status must be one of {', '.join(GRIPPER_STATUSES)}, got {self.status!r}")
         if not (math.isfinite(self.opening_mm) and math.isfinite(self.force_n)):
             raise DeviceError(f"a gripper must report finite numbers, got {self.opening_mm} mm, {self.force_n} N")

@@ -55,12 +55,12 @@ from _touch_retrieval.documents import typed
 from _touch_retrieval.registry import Registry
 from robot.devices import Camera, Device, TactileSensor
 from robot.errors import RobotConfigError, UnknownName
-from robot.gel_settings import gels_of
+from robot.gel_settings import parse_gel_settings
 from robot.grasping.planner import load_planner
-from robot.grasping.settings import AttemptSettings, GraspSettings, attempt_of
+from robot.grasping.settings import AttemptSettings, GraspSettings, parse_attempt_settings
 from robot.readings import Region
 from robot.rig import Rig, ask_on_terminal
-from robot.settings import TypedSettings, build, build_named, limited
+from robot.settings import TypedSettings, bounded, build, build_named
 from robot.sight import hand_eye
 from robot.sight.cylinder import CylinderFit
 
@@ -82,7 +82,7 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
         digit="robot.drivers.gels.opencv:Digit",
         uvc="robot.drivers.gels.opencv:OpencvTactile",
         video="robot.drivers.replay:VideoSensor",
-        images="robot.drivers.replay:ImagesSensor",
+        images="robot.drivers.replay:ImageFolderSensor",
     ),
     "camera": _drivers(
         "camera",
@@ -97,10 +97,10 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
 whose keywords are the keys of its table. An installed package names drivers of every role in one group of entry
 points."""
 
-HAND_EYE_DAYS = 30.0
+MAX_HAND_EYE_AGE_DAYS = 30.0
 """A calibration older than this is refused unless the camera's table says `hand_eye_days`: things get moved."""
 
-LEAST_WAIT_S = 0.1
+MIN_WAIT_S = 0.1
 """Between a motion and the picture of what came of it: three frames of a gel at 30 a second."""
 
 
@@ -110,21 +110,21 @@ class Limits(TypedSettings):
 
     workspace_lower_mm: tuple[float, float, float]
     workspace_upper_mm: tuple[float, float, float]
-    arm_speed_mm_s: float = limited(1e-3, 1e6, 200.0)
-    force_n: float = limited(1e-3, 1e6, 25.0)
-    jaw_speed_mm_s: float = limited(1e-3, 1e6, 80.0)
-    state_age_s: float = limited(1e-3, 1e6, 0.5)
+    arm_speed_mm_s: float = bounded(1e-3, 1e6, 200.0)
+    force_n: float = bounded(1e-3, 1e6, 25.0)
+    jaw_speed_mm_s: float = bounded(1e-3, 1e6, 80.0)
+    state_age_s: float = bounded(1e-3, 1e6, 0.5)
 
 
 @dataclass(frozen=True)
-class GivenObject(TypedSettings):
+class ObjectSettings(TypedSettings):
     """Where every object is put and how large it is (mm), for a rig that cannot see it; error_mm: of the place."""
 
     x_mm: float
     y_mm: float
-    height_mm: float = limited(1e-3, 1e6)
-    radius_mm: float = limited(1e-3, 1e6)
-    error_mm: float = limited(0, 1e6, 5.0)
+    height_mm: float = bounded(1e-3, 1e6)
+    radius_mm: float = bounded(1e-3, 1e6)
+    error_mm: float = bounded(0, 1e6, 5.0)
 
     def fit(self) -> CylinderFit:
         """As what a camera would have found."""
@@ -162,7 +162,7 @@ class RealRig(Rig):
             "ask": ask_on_terminal,
         }
         closing = {"max_force_n": ceilings.force_n, "max_speed_mm_s": ceilings.jaw_speed_mm_s}
-        gels = gels_of(gel, sensors)
+        gels = parse_gel_settings(gel, sensors)
         super().__init__(
             load_driver("arm", arm, "[arm]", **moving, **state_age),
             load_driver("gripper", gripper, "[gripper]", **closing, **state_age),
@@ -171,10 +171,10 @@ class RealRig(Rig):
             info={
                 "source": source,
                 "sensor": sensor,
-                "gels": [{finger: gels[finger].as_recorded() for finger in gels}],
+                "gels": [{finger: gels[finger].to_dict() for finger in gels}],
             },
             attempt=_attempt(attempt, grasp, ceilings),
-            given=build(GivenObject, object, where="[object]").fit() if object else None,
+            object_fit=build(ObjectSettings, object, where="[object]").fit() if object else None,
             planner=load_planner(planner),
         )
 
@@ -188,9 +188,9 @@ class RealRig(Rig):
             raise
 
 
-def load_driver(role: str, table: Mapping[str, Any], where: str, **given: Any) -> Any:
+def load_driver(role: str, table: Mapping[str, Any], where: str, **object_fit: Any) -> Any:
     """The device, unconnected, that `table` of a file describes. Raises RobotConfigError, UnknownName."""
-    return build_named(DRIVERS[role], table, "driver", where=where, clock=time.monotonic, **given)
+    return build_named(DRIVERS[role], table, "driver", where=where, clock=time.monotonic, **object_fit)
 
 
 def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
@@ -206,10 +206,10 @@ def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
 
 def _camera(table: Mapping[str, Any]) -> Camera:
     settings = dict(table)
-    file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", HAND_EYE_DAYS)
+    file, days = settings.pop("hand_eye", None), settings.pop("hand_eye_days", MAX_HAND_EYE_AGE_DAYS)
     typed(file, str | None, "[camera]: hand_eye", error=RobotConfigError)  # type: ignore[arg-type]  # mypy: a union
     typed(days, float, "[camera]: hand_eye_days", error=RobotConfigError)
-    extrinsics = np.eye(4) if file is None else hand_eye.load(Path(file), max_age_days=days).rigid
+    extrinsics = np.eye(4) if file is None else hand_eye.load_hand_eye(Path(file), max_age_days=days).rigid
     camera: Camera = load_driver("camera", settings, "[camera]", extrinsics=extrinsics)
     if camera.has_depth and file is None:
         raise RobotConfigError(
@@ -227,7 +227,7 @@ def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limit
         "approach_mm_s": min(AttemptSettings.approach_mm_s, limits.arm_speed_mm_s),
         "closing_mm_s": min(AttemptSettings.closing_mm_s, limits.jaw_speed_mm_s),
     }
-    settings = attempt_of({**capped, **attempt}, {"force_n": force_n, **grasp})
+    settings = parse_attempt_settings({**capped, **attempt}, {"force_n": force_n, **grasp})
     asked = {
         "[grasp]: force_n": (settings.grasp.force_n[1], limits.force_n, "force_n"),
         "[attempt]: travel_mm_s": (settings.travel_mm_s, limits.arm_speed_mm_s, "arm_speed_mm_s"),
@@ -238,8 +238,6 @@ def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limit
         if value > ceiling:
             raise RobotConfigError(f"{name} must be at most {limit} = {ceiling:g} of [limits], got {value:g}")
     for name in ("settle_s", "hold_s"):
-        if getattr(settings, name) < LEAST_WAIT_S:
-            raise RobotConfigError(
-                f"[attempt]: {name} must be at least {LEAST_WAIT_S:g} s, for gels to see what is then"
-            )
+        if getattr(settings, name) < MIN_WAIT_S:
+            raise RobotConfigError(f"[attempt]: {name} must be at least {MIN_WAIT_S:g} s, for gels to see what is then")
     return settings

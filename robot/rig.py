@@ -15,7 +15,7 @@ from robot.grasping.settings import AttemptSettings
 from robot.readings import Pose
 from robot.settings import build
 from robot.sight.cylinder import CylinderFit
-from robot.storage import content_of
+from robot.storage import read_content
 
 RIGS: "Registry[type[Rig]]" = Registry(
     "rig, where it is not a .toml file,",
@@ -38,7 +38,7 @@ class Rig:
 
     `info` goes into recording.json: source and sensor at least. `clock` and `sleep` keep the rig's time, in which
     frames are stamped; a simulated rig gives its own. `ask` shows a person a sentence and returns when it is done.
-    `attempt`: how attempts are made with this rig unless said otherwise. `given`: where every object stands and how
+    `attempt`: how attempts are made with this rig unless said otherwise. `object_fit`: where every object stands and how
     large it is, for a rig whose camera cannot tell. `planner`: where its jaws close.
 
     >>> with robot.load_rig("sim", seed=0) as rig:
@@ -63,17 +63,17 @@ class Rig:
         sleep: Callable[[float], None] = time.sleep,
         ask: Callable[[str], object] = ask_on_terminal,
         attempt: AttemptSettings | None = None,
-        given: CylinderFit | None = None,
+        object_fit: CylinderFit | None = None,
         planner: GraspPlanner | None = None,
     ) -> None:
         self.arm, self.gripper, self.camera = arm, gripper, camera
         self.sensors = dict(sorted(sensors.items()))
         self.info = dict(info)
         self.clock, self.sleep, self.ask = clock, sleep, ask
-        self.attempt, self.given = attempt or AttemptSettings(), given
+        self.attempt, self.object_fit = attempt or AttemptSettings(), object_fit
         self.planner = planner or CylinderPlanner()
         self.planner.check(self)
-        self._on_table: str | None = None
+        self._object_on_table: str | None = None
 
     @property
     def devices(self) -> tuple[Device, ...]:
@@ -96,13 +96,17 @@ class Rig:
 
         Raises RobotConfigError where nobody can answer.
         """
-        if object_id != self._on_table or self.given is not None:
-            place = "on the table" if self.given is None else f"at x {self.given.x_mm:g}, y {self.given.y_mm:g} mm"
+        if object_id != self._object_on_table or self.object_fit is not None:
+            place = (
+                "on the table"
+                if self.object_fit is None
+                else f"at x {self.object_fit.x_mm:g}, y {self.object_fit.y_mm:g} mm"
+            )
             try:
                 self.ask(f"Put {object_id} {place}, alone, and press Enter.")
             except EOFError as error:
                 raise RobotConfigError("a person must change the objects of this rig: run it in a terminal") from error
-            self._on_table = object_id
+            self._object_on_table = object_id
 
     def settings(self) -> dict[str, dict[str, Any]]:
         """What each device reports of its settings, by its name. Raises DeviceError."""
@@ -184,7 +188,7 @@ def check_seed(seed: int) -> None:
 def _read_toml(path: Path, over: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
     """Name of the rig and its settings."""
     try:
-        document = tomllib.loads(content_of(path, RobotConfigError).decode())
+        document = tomllib.loads(read_content(path, RobotConfigError).decode())
     except ValueError as error:
         raise RobotConfigError(f"{path} is not TOML: {error}") from error
     name = document.pop("rig", None)

@@ -20,16 +20,16 @@ from robot.readings import RGBD, Frame
 from robot.rig import Rig
 
 JAW_MM, ARM_MM, ARM_MM_S = 5.0, 10.0, 20.0
-WATCHED_S = 2.0
+MEASURE_S = 2.0
 """How long frames are counted."""
 
 _POLL_S = 0.002
-_ASKED = 20
+_REPEATS = 20
 """How often a state is asked for, and both gels are read, to measure how long that takes and how far apart they are."""
 
 
 @dataclass(frozen=True)
-class Checked:
+class DeviceReport:
     """What came of one device: measured figures with their units in words, settings it refused, or the failure."""
 
     device: str
@@ -45,7 +45,7 @@ class Checked:
         return f"{'ok  ' if self.failure is None else 'FAIL'}  {self.role:9} {self.device}: {result}{refused}"
 
 
-def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[Checked]:
+def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[DeviceReport]:
     """Check every device, each as soon as it is asked for, then how far apart in time the fingers are seen.
 
     `motion`: whether arm and jaws may move a little. Raises nothing of a device: its failure is a row.
@@ -53,17 +53,17 @@ def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[Checked]:
     rig.arm.may_move = rig.gripper.may_move = motion
     if rig.can_run_jobs:  # simulated: an object can be had for nothing, and without one its gels see nothing
         rig.prepare(rig.object_ids(1)[0], 0)
-    yield _checked([rig.arm], "arm", lambda: _check_arm(rig, motion))
-    yield _checked([rig.gripper], "gripper", lambda: _check_gripper(rig, motion))
+    yield _check_device([rig.arm], "arm", lambda: _check_arm(rig, motion))
+    yield _check_device([rig.gripper], "gripper", lambda: _check_gripper(rig, motion))
     for sensor in rig.sensors.values():
-        yield _checked([sensor], "gel", partial(_check_sensor, rig, sensor))
-    yield _checked([rig.camera], "camera", lambda: _check_camera(rig))
+        yield _check_device([sensor], "gel", partial(_check_sensor, rig, sensor))
+    yield _check_device([rig.camera], "camera", lambda: _check_camera(rig))
     if len(rig.sensors) > 1:
-        yield _checked(list(rig.sensors.values()), "skew", lambda: _check_skew(rig))
+        yield _check_device(list(rig.sensors.values()), "skew", lambda: _check_skew(rig))
 
 
-def _checked(devices: Sequence[Device], role: str, check: Callable[[], dict[str, str]]) -> Checked:
-    row = Checked(" and ".join(device.name for device in devices), role)
+def _check_device(devices: Sequence[Device], role: str, check: Callable[[], dict[str, str]]) -> DeviceReport:
+    row = DeviceReport(" and ".join(device.name for device in devices), role)
     try:
         with contextlib.ExitStack() as connected:
             for device in devices:
@@ -78,7 +78,7 @@ def _checked(devices: Sequence[Device], role: str, check: Callable[[], dict[str,
 def _check_arm(rig: Rig, motion: bool) -> dict[str, str]:
     """Up a little and back."""
     arm = rig.arm
-    if arm.by_hand:
+    if arm.is_manual:
         return {"moved": "by a person"}
     if not motion:
         return {"moved": "not"} | _round_trip(rig, arm.pose)
@@ -110,7 +110,7 @@ def _check_gripper(rig: Rig, motion: bool) -> dict[str, str]:
 
 def _round_trip(rig: Rig, ask: Callable[[], Any]) -> dict[str, str]:
     times = []
-    for _ in range(_ASKED):
+    for _ in range(_REPEATS):
         began = rig.clock()
         ask()
         times.append(rig.clock() - began)
@@ -118,13 +118,13 @@ def _round_trip(rig: Rig, ask: Callable[[], Any]) -> dict[str, str]:
 
 
 def _check_sensor(rig: Rig, sensor: TactileSensor) -> dict[str, str]:
-    frame, measured = _watched(rig, sensor.read)
+    frame, measured = _measure_frames(rig, sensor.read)
     return measured | _size(frame.pixels)
 
 
 def _check_camera(rig: Rig) -> dict[str, str]:
     camera = rig.camera
-    image, measured = _watched(rig, lambda: camera.read(depth=camera.has_depth))
+    image, measured = _measure_frames(rig, lambda: camera.read(depth=camera.has_depth))
     measured |= _size(image.colour)
     if image.depth_m is not None:
         known = np.isfinite(image.depth_m)
@@ -137,20 +137,20 @@ def _size(pixels: npt.NDArray[np.uint8]) -> dict[str, str]:
     return {"size": f"{pixels.shape[1]} x {pixels.shape[0]}", "mean grey level": f"{pixels.mean():.0f}"}
 
 
-_Seen = TypeVar("_Seen", Frame, RGBD)
+_Picture = TypeVar("_Picture", Frame, RGBD)
 
 
-def _watched(rig: Rig, read: Callable[[], _Seen]) -> tuple[_Seen, dict[str, str]]:
-    """The last frame of `WATCHED_S`, how many different ones there were, and how old they were when they were read."""
+def _measure_frames(rig: Rig, read: Callable[[], _Picture]) -> tuple[_Picture, dict[str, str]]:
+    """The last frame of `MEASURE_S`, how many different ones there were, and how old they were when they were read."""
     times, ages, began = set(), [], rig.clock()
     while True:
         frame = read()
         times.add(frame.time_s)
         ages.append(rig.clock() - frame.time_s)
-        if rig.clock() - began >= WATCHED_S:
+        if rig.clock() - began >= MEASURE_S:
             break
         rig.sleep(_POLL_S)
-    rate = f"{len(times)} frame(s) in {WATCHED_S:g} s"
+    rate = f"{len(times)} frame(s) in {MEASURE_S:g} s"
     if len(times) > 1:  # from the first to the last, so that where the watch began and ended does not count
         rate = f"{(len(times) - 1) / (max(times) - min(times)):.1f} frames/s"
     return frame, {"rate": rate, "age": f"{1000 * median(ages):.0f} ms"}
@@ -159,7 +159,7 @@ def _watched(rig: Rig, read: Callable[[], _Seen]) -> tuple[_Seen, dict[str, str]
 def _check_skew(rig: Rig) -> dict[str, str]:
     """All gels at once, as the collector reads them."""
     skews = []
-    for _ in range(_ASKED):
+    for _ in range(_REPEATS):
         skews.append(read_together(rig.sensors)[1])
         rig.sleep(0.05)
     return {"apart": f"{1000 * median(skews):.1f} ms (most {1000 * max(skews):.1f})"}

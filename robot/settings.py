@@ -18,9 +18,9 @@ from robot.errors import RobotConfigError, UnknownName
 _T = TypeVar("_T")
 
 
-def limited(least: float, most: float, default: Any = MISSING, *, unit: str = "") -> Any:
-    """A field of `TypedSettings` that must be from `least` to `most`; without a default it must be said."""
-    return field(default=default, metadata={"range": (least, most, unit)})
+def bounded(lowest: float, highest: float, default: Any = MISSING, *, unit: str = "") -> Any:
+    """A field of `TypedSettings` that must be from `lowest` to `highest`; without a default it must be said."""
+    return field(default=default, metadata={"range": (lowest, highest, unit)})
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **give
     the table of a file. Raises RobotConfigError for an unknown setting, a missing one, or one of another type than is
     annotated; the class itself checks ranges.
     """
-    taken = _keywords(cls)  # type: ignore[arg-type]  # a class is hashable
-    keywords = {name: each for name, each in taken.items() if name not in given}
+    accepted = _keywords(cls)  # type: ignore[arg-type]  # a class is hashable
+    keywords = {name: each for name, each in accepted.items() if name not in given}
     known = ", ".join(sorted(keywords))
     if unknown := sorted(set(settings) - set(keywords)):
         raise RobotConfigError(f"{where or cls.__name__} has no setting {unknown[0]!r}; it knows {known}")
@@ -54,7 +54,7 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **give
         checked = {
             name: typed(value, keywords[name][0], name, error=RobotConfigError) for name, value in settings.items()
         }
-        return cls(**checked, **{name: value for name, value in given.items() if name in taken})
+        return cls(**checked, **{name: value for name, value in given.items() if name in accepted})
     except RobotConfigError as error:
         raise RobotConfigError(f"{where}: {error}" if where else str(error)) from error
 
@@ -103,7 +103,7 @@ def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
     return found
 
 
-def check_range(name: str, value: float, least: float, most: float, unit: str = "") -> None:
-    """Raise RobotConfigError unless a setting is a finite number from `least` to `most`."""
-    if not least <= value <= most or math.isinf(value):  # also refuses NaN
-        raise RobotConfigError(f"{name} must be from {least:g} to {most:g}{unit and ' '}{unit}, got {value!r}")
+def check_range(name: str, value: float, lowest: float, highest: float, unit: str = "") -> None:
+    """Raise RobotConfigError unless a setting is a finite number from `lowest` to `highest`."""
+    if not lowest <= value <= highest or math.isinf(value):  # also refuses NaN
+        raise RobotConfigError(f"{name} must be from {lowest:g} to {highest:g}{unit and ' '}{unit}, got {value!r}")

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from _touch_retrieval.files import open_regular
 from robot.errors import RecordingError, RobotError, StorageError
 
-PART = ".part"
+PART_SUFFIX = ".part"
 ImageSource = npt.NDArray[Any] | bytes | str | Path
 """Pixels, or the content or path of a PNG or JPEG file. Pixels: (H, W, 3) uint8 RGB; depth: (H, W) uint16."""
 
@@ -39,7 +39,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
 
     The disk is asked to keep them when all are written: it takes fewer turns for it than file by file.
     """
-    parts = {path: path.with_name(path.name + PART) for path in contents}
+    parts = {path: path.with_name(path.name + PART_SUFFIX) for path in contents}
     path: Path | None = None
     try:
         with contextlib.ExitStack() as files:
@@ -86,7 +86,7 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
             f"{type(source).__name__}"
         )
     try:
-        data = source if isinstance(source, bytes) else content_of(source, RecordingError)
+        data = source if isinstance(source, bytes) else read_content(source, RecordingError)
     except RecordingError as error:
         raise RecordingError(f"{column}: {error}") from error
     for magic, suffix in _SUFFIXES.items():
@@ -95,43 +95,44 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
     raise RecordingError(f"{column} must be a PNG or JPEG file; its first bytes are {data[:4]!r}")
 
 
-def decoded(data: bytes, way: int | None = None) -> npt.NDArray[Any] | None:
+def decode_picture(data: bytes, flags: int | None = None) -> npt.NDArray[Any] | None:
     """The pixels of a picture file's content, colours blue first; None for what is no picture. way: as cv2.imdecode
-    takes it, colours with 8 bits each where it is left out."""
+    takes it, colours with 8 bits each where it is left out.
+    """
     import cv2
 
     pixels: npt.NDArray[Any] | None = None
     with contextlib.suppress(cv2.error):  # of no bytes at all, and of a header that claims too many pixels
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR if way is None else way)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR if flags is None else flags)
     return pixels
 
 
-def content_of(path: str | Path, refusal: type[RobotError]) -> bytes:
-    """The bytes of a regular file. Raises `refusal`, which names it and what keeps it from being read."""
+def read_content(path: str | Path, error_type: type[RobotError]) -> bytes:
+    """The bytes of a regular file. Raises `error_type`, which names it and what keeps it from being read."""
     try:
         with open_regular(path) as file:
             return file.read()
     except (OSError, ValueError) as error:  # ValueError of a name that holds a zero
-        raise refusal(f"{path!s} cannot be read: {getattr(error, 'strerror', error)}") from error
+        raise error_type(f"{path!s} cannot be read: {getattr(error, 'strerror', error)}") from error
 
 
-def object_of(text: bytes, refusal: type[RobotError]) -> dict[str, Any]:
-    """The JSON object of a line or file. Raises `refusal` for anything else, NaN and infinity too."""
+def parse_object(text: bytes, error_type: type[RobotError]) -> dict[str, Any]:
+    """The JSON object of a line or file. Raises `error_type` for anything else, NaN and infinity too."""
     try:
         return msgspec.json.decode(text, type=dict[str, Any])
     except msgspec.ValidationError as error:
-        raise refusal(f"must be one JSON object in braces, of finite numbers: {error}") from error
+        raise error_type(f"must be one JSON object in braces, of finite numbers: {error}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise refusal(f"must be JSON in UTF-8, without NaN and Infinity: {error}") from error
+        raise error_type(f"must be JSON in UTF-8, without NaN and Infinity: {error}") from error
 
 
-def document_of(path: str | Path, refusal: type[RobotError]) -> dict[str, Any]:
-    """The JSON object that a file holds. Raises `refusal`, which names the file."""
-    data = content_of(path, refusal)
+def read_json_object(path: str | Path, error_type: type[RobotError]) -> dict[str, Any]:
+    """The JSON object that a file holds. Raises `error_type`, which names the file."""
+    data = read_content(path, error_type)
     try:
-        return object_of(data, refusal)
+        return parse_object(data, error_type)
     except RobotError as error:
-        raise refusal(f"{path}: {error}") from error
+        raise error_type(f"{path}: {error}") from error
 
 
 def _png(column: str, pixels: npt.NDArray[Any]) -> bytes:

@@ -23,8 +23,8 @@ Work = Callable[[str, int], T]
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-class Jobs(Generic[T]):
-    """Does work: here and now with one job, by `here`; else in processes that are started afresh ("spawn"), by what
+class WorkerPool(Generic[T]):
+    """Does work: here and now with one job, by `local_work`; else in processes that are started afresh ("spawn"), by what
     the picklable `make` gives each of them.
 
     A forked copy of a process with OpenCV's or BLAS's threads may hang, a spawned one does not. `window` pieces of work
@@ -32,8 +32,8 @@ class Jobs(Generic[T]):
     filters give other last digits in several, and a recording must be the same whatever the jobs.
     """
 
-    def __init__(self, jobs: int, here: Work[T], make: Callable[[], Work[T]]) -> None:
-        self._here, self._pool = here, None
+    def __init__(self, jobs: int, local_work: Work[T], make: Callable[[], Work[T]]) -> None:
+        self._local_work, self._pool = local_work, None
         self.window = 1 if jobs == 1 else 2 * jobs
         self._environment: dict[str, str | None] = {}
         self._threads = cv2.getNumThreads()
@@ -43,20 +43,21 @@ class Jobs(Generic[T]):
             self._pool = ProcessPoolExecutor(
                 jobs,
                 mp_context=multiprocessing.get_context("spawn"),
-                initializer=_begin,
+                initializer=_start_worker,
                 initargs=(make,),
             )
 
     def submit(self, object_id: str, number: int) -> Callable[[], T]:
         """Begin a piece of work; the callable waits for it. It raises the work's own RobotError, and a RobotError for
-        any other failure in another process."""
+        any other failure in another process.
+        """
         if self._pool is None:
-            return functools.partial(self._here, object_id, number)
+            return functools.partial(self._local_work, object_id, number)
         os.environ.update(dict.fromkeys(_THREADS, "1"))  # read by the processes that a submission may start
         try:
-            future = self._pool.submit(_run, object_id, number)
+            future = self._pool.submit(_run_work, object_id, number)
         except BrokenProcessPool as error:
-            raise _died() from error
+            raise _worker_died() from error
         finally:
             _restore(self._environment)
         return functools.partial(_result, future, object_id, number)
@@ -69,10 +70,10 @@ class Jobs(Generic[T]):
         """Waits for the work that has begun; the other is not done."""
         cv2.setNumThreads(self._threads)
         if self._pool is not None:
-            _end(self._pool, set(multiprocessing.active_children()) - self._before)
+            _shut_down(self._pool, set(multiprocessing.active_children()) - self._before)
 
 
-def _end(pool: ProcessPoolExecutor, workers: Iterable[BaseProcess]) -> None:
+def _shut_down(pool: ProcessPoolExecutor, workers: Iterable[BaseProcess]) -> None:
     """Tell the workers to leave and wait until they have; Ctrl-C does not break that off, but is raised afterwards.
 
     A pool whose shutdown(wait=True) is broken off hangs when Python ends: the interrupted join of its thread makes that
@@ -105,13 +106,13 @@ def _result(future: Future[T], object_id: str, number: int) -> T:
     except RobotError:
         raise
     except BrokenProcessPool as error:
-        raise _died() from error
+        raise _worker_died() from error
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         raise RobotError(f"attempt {number} at {object_id} broke off in a worker process: {reason}") from error
 
 
-def _died() -> RobotError:
+def _worker_died() -> RobotError:
     return RobotError(
         "a worker process died: it was killed, or memory ran out. What was recorded is whole; start again to go on, "
         "with fewer jobs if memory is short"
@@ -120,19 +121,19 @@ def _died() -> RobotError:
 
 # In the worker ----------------------------------------------------------------------------------------------
 
-_made: list[Work[Any]] = []
-_make: list[Callable[[], Work[Any]]] = []
+_work: list[Work[Any]] = []
+_make_work: list[Callable[[], Work[Any]]] = []
 
 
-def _begin(make: Callable[[], Work[Any]]) -> None:
+def _start_worker(make: Callable[[], Work[Any]]) -> None:
     """Runs first. Nothing here may fail: a pool does not say why. Ctrl-C is the parent's business."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
-    _make.append(make)
+    _make_work.append(make)
 
 
-def _leave_with_parent() -> None:
+def _exit_with_parent() -> None:
     """A parent that is killed cannot end its workers, which would wait for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -140,7 +141,7 @@ def _leave_with_parent() -> None:
     os._exit(1)
 
 
-def _run(object_id: str, number: int) -> Any:
-    if not _made:
-        _made.append(_make[0]())
-    return _made[0](object_id, number)
+def _run_work(object_id: str, number: int) -> Any:
+    if not _work:
+        _work.append(_make_work[0]())
+    return _work[0](object_id, number)

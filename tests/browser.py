@@ -11,9 +11,9 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Error, sync_playwright
 
 from retrieval.serve.app import create_app
-from retrieval.serve.run import Server
+from retrieval.serve.server import Server
 from retrieval.serve.settings import ServiceSettings
-from tests.waiting import until
+from tests.waiting import wait_until
 
 NAMES = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome")
 CAMERA = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
@@ -48,7 +48,7 @@ def address(index, *beside, **settings):
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     try:
-        until(lambda: ports or not thread.is_alive(), 120.0)
+        wait_until(lambda: ports or not thread.is_alive(), 120.0)
         yield f"http://127.0.0.1:{ports[0]}/"
     finally:
         server.handle_exit(signal.SIGTERM, None)

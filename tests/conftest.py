@@ -82,7 +82,7 @@ def _own_state(_state_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator
 
 
 @pytest.fixture
-def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_fsync(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests that write thousands of small files, and try no crash."""
     monkeypatch.setattr("os.fsync", lambda descriptor: None)
 
@@ -102,7 +102,7 @@ def catalogue(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def own(catalogue: Path, tmp_path: Path) -> Path:
+def catalogue_copy(catalogue: Path, tmp_path: Path) -> Path:
     """A copy of the catalogue, to change."""
     return shutil.copytree(catalogue, tmp_path / "catalog")
 
@@ -114,15 +114,15 @@ def touches(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[Pa
 
 
 @pytest.fixture
-def touched(own: Path, touches: dict[str, list[tuple[Path, ...]]]) -> Path:
+def catalogue_with_touches(catalogue_copy: Path, touches: dict[str, list[tuple[Path, ...]]]) -> Path:
     """The catalogue with two touches of each of its first four objects, the third of which has no photo."""
     names = sorted(touches)[:4]
     for name in names:
         for number, files in enumerate(touches[name][:2]):
-            synthetic.put_touch(own, name, number, files)
-    for photo in (own / names[2]).glob("*.jpg"):
+            synthetic.put_touch(catalogue_copy, name, number, files)
+    for photo in (catalogue_copy / names[2]).glob("*.jpg"):
         photo.unlink()
-    return own
+    return catalogue_copy
 
 
 @pytest.fixture(scope="session")
@@ -172,10 +172,10 @@ def grasps(tmp_path_factory: pytest.TempPathFactory) -> list[list[tuple[Path, ..
 def cluster(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The catalogue in four shards. Not to be changed."""
     from retrieval.model.checkpoint import load_checkpoint
-    from retrieval.search.sharding.build_cluster import build_cluster
+    from retrieval.search.sharding.build_sharded import build_sharded
 
     out = tmp_path_factory.mktemp("cluster") / "cluster"
-    build_cluster(catalogue, load_checkpoint(model), out, 4, quiet=True)
+    build_sharded(catalogue, load_checkpoint(model), out, 4, quiet=True)
     return out
 
 
@@ -206,9 +206,9 @@ def embedded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.fixture(scope="module")
-def s3_server() -> Iterator[s3.Faults]:
+def s3_server() -> Iterator[s3.S3Faults]:
     """A server that speaks S3, without faults until told otherwise; the environment names it."""
-    with s3.served() as faults:
+    with s3.run_server() as faults:
         yield faults
 
 

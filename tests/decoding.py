@@ -17,10 +17,10 @@ read_gel_image = decode_process.read_gel_image
 def die_of_large():
     """The process is ended by a large picture, as by the system."""
 
-    def read(data, name, px, compares, most):
-        if most == MAX_PIXELS:
+    def read(data, name, px, compares_contact, max_pixels):
+        if max_pixels == MAX_PIXELS:
             os.kill(os.getpid(), signal.SIGKILL)
-        return read_gel_image(data, name, px, compares, most)
+        return read_gel_image(data, name, px, compares_contact, max_pixels)
 
     decode_process.read_gel_image = read
     decode_process.serve_pictures()
@@ -29,11 +29,11 @@ def die_of_large():
 def hang_on_large():
     """A large picture, whose name is a file to write the process's id to, is decoded for ever."""
 
-    def read(data, name, px, compares, most):
-        if most == MAX_PIXELS:
+    def read(data, name, px, compares_contact, max_pixels):
+        if max_pixels == MAX_PIXELS:
             Path(name).write_text(str(os.getpid()))
             time.sleep(600)
-        return read_gel_image(data, name, px, compares, most)
+        return read_gel_image(data, name, px, compares_contact, max_pixels)
 
     decode_process.read_gel_image = read
     decode_process.serve_pictures()

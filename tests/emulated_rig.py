@@ -37,7 +37,7 @@ from tests.emulators.sawyer import server as rosbridge_emulator
 from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.emulators.wsg50.server import serve_pty, serve_tcp
-from tests.fake_video import FakeCamera
+from tests.fake_video import FakeVideoDevice
 
 WORKSPACE = Region((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0))
 LENS, PX = Intrinsics(120.0, 120.0, 63.5, 53.5), (108, 128)
@@ -53,7 +53,7 @@ QUICK = AttemptSettings(
 SERVERS = {"tcp": serve_tcp, "pty": serve_pty}
 
 
-class World:
+class EmulatedRigState:
     """What all devices share. rate: how often an operation of arm, camera or a gel's stream meets a fault."""
 
     def __init__(self, seed, rate=0.0):
@@ -204,7 +204,7 @@ class EmulatedCamera(Camera):
         return RGBD(image.colour, depth_m if depth else None, LENS, time.monotonic() - 5 * (kind == "stale"))
 
 
-class EmulatedGel(FakeCamera):
+class EmulatedGel(FakeVideoDevice):
     """A gel with a blob where it touches. A trouble lasts a while from when it begins."""
 
     LASTS_S = 0.3
@@ -263,7 +263,7 @@ class EmulatedRig(Rig):
         rng = np.random.default_rng([2, world.seed, name, number])
         radius, height = np.random.default_rng([1, name]).uniform((18, 60), (40, 140))
         x, y = rng.uniform(-20, 20, 2)
-        world.solid = views.Upright(float(radius), float(height), float(x), float(y))
+        world.solid = views.UprightCylinder(float(radius), float(height), float(x), float(y))
         world.slips, world.noise = bool(rng.uniform() < 0.1), int(rng.integers(2**31))
         world.hand_at(world.pose)
         for gel in self.gels.values():
@@ -278,7 +278,7 @@ def gel_path(finger):
 @contextlib.contextmanager
 def emulated_rig(seed=0, *, port="tcp", arm="at once", rate=0.0, **gripper):
     """An EmulatedRig, not connected, whose devices are there as long as this is open."""
-    world = World(seed, rate)
+    world = EmulatedRigState(seed, rate)
     gels = {finger: EmulatedGel(world, finger) for finger in "ab"}
     by_path = {gel_path(finger): gel for finger, gel in gels.items()}
     with (

@@ -20,7 +20,7 @@ LENS, PX = Intrinsics(120.0, 120.0, 63.5, 53.5), (108, 128)
 STROKE_MM, FORCE_N = 110.0, (5.0, 80.0)
 
 
-class World:
+class FakeRigState:
     """What the devices share."""
 
     def __init__(self, seed):
@@ -63,7 +63,7 @@ class FakeRig(Rig):
     can_run_jobs = True
 
     def __init__(self, seed=0, *, fingers=("a", "b"), faults=None):
-        self.world = World(seed)
+        self.world = FakeRigState(seed)
         self.world.faults = {} if faults is None else faults
         super().__init__(
             FakeArm(self.world),
@@ -84,7 +84,7 @@ class FakeRig(Rig):
         radius = {"round": look.uniform(18, 40), "wide": 70.0, "thin": 9.0, "none": 1e-3}[kind]
         rng = np.random.default_rng([2, world.seed, zlib.crc32(object_id.encode()), number])
         x, y = rng.uniform(-20, 20, 2)
-        world.solid = views.Upright(radius, look.uniform(60, 140), float(x), float(y))
+        world.solid = views.UprightCylinder(radius, look.uniform(60, 140), float(x), float(y))
         world.slips, world.noise = bool(rng.uniform() < 0.2), int(rng.integers(2**31))
         world.force, world.now_s = None, 100.0 * number
 

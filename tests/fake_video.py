@@ -13,7 +13,7 @@ from tests import views
 MISSING = -1.0
 
 
-class FakeCamera:
+class FakeVideoDevice:
     """A USB camera. It counts its pictures; `captures` are opened of it by `open`, which stands for cv2.VideoCapture.
 
     fps: pictures a second, from `phase_s` on a common clock on. lacks: settings that it does not have. stubborn:

@@ -24,7 +24,7 @@ class HardCase:
     naive_holds: bool
 
 
-def refused(work: Callable[[], object], *words: str) -> tuple[str, bool]:
+def error_of(work: Callable[[], object], *words: str) -> tuple[str, bool]:
     """What an error of ours says, and whether it holds all the words; what came out where nothing was refused."""
     try:
         result = work()

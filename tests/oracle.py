@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from indexes.kinds.scores import grid_scores, on_grid
+from indexes.kinds.scores import grid_scores, to_grid
 
 
 def disagreements(vectors, queries, scores, slots, tolerance: float) -> list[str]:
@@ -11,7 +11,7 @@ def disagreements(vectors, queries, scores, slots, tolerance: float) -> list[str
     Each score must be the exact score of its slot, the scores must be the best k exact scores (so that a tie
     partner may stand for another), and no slot may come twice; scores are compared within `tolerance`.
     """
-    table = grid_scores(on_grid(queries), on_grid(vectors))
+    table = grid_scores(to_grid(queries), to_grid(vectors))
     best = -np.sort(-table, axis=1)[:, : slots.shape[1]]
     if scores.shape != slots.shape or best.shape != slots.shape:
         return [f"results must be of shape {best.shape}; got scores {scores.shape} and slots {slots.shape}"]

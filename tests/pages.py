@@ -3,7 +3,7 @@
 from html.parser import HTMLParser
 
 
-class Page(HTMLParser):
+class HtmlPage(HTMLParser):
     """Tags with their attributes, and the text outside `style` and `script`."""
 
     def __init__(self, page):

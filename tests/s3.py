@@ -7,11 +7,11 @@ from contextlib import contextmanager
 import pytest
 
 CREDENTIALS = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_DEFAULT_REGION": "us-east-1"}
-LEAST = 200
+MIN_TORN_BYTES = 200
 """Bytes of an upload that may be torn."""
 
 
-class Faults:
+class S3Faults:
     """In front of the server's application. refuse: every so many-th request; tear: every so many-th upload, of which
     all but the last half arrives, as if the sender had died. None: none. refused, torn: how many were.
 
@@ -31,7 +31,7 @@ class Faults:
             refused = bool(self.refuse) and self.requests % self.refuse == 0
             self.refused += refused
             size = int(environ.get("CONTENT_LENGTH") or 0)
-            is_upload = environ["REQUEST_METHOD"] == "PUT" and size > LEAST and not refused
+            is_upload = environ["REQUEST_METHOD"] == "PUT" and size > MIN_TORN_BYTES and not refused
             self.uploads += is_upload
             torn = bool(self.tear) and is_upload and self.uploads % self.tear == 0
             self.torn += torn
@@ -60,7 +60,7 @@ CONDITIONS = {"HTTP_IF_MATCH", "HTTP_IF_NONE_MATCH"}
 
 
 @contextmanager
-def served():
+def run_server():
     """The server's faults, while it runs; the environment names it to whoever speaks S3."""
     pytest.importorskip("moto.server", reason="needs moto[server]")
     pytest.importorskip("s3fs", reason="needs s3fs")
@@ -72,7 +72,7 @@ def served():
         def log(self, *_):
             pass
 
-    faults = Faults(DomainDispatcherApplication(create_backend_app))
+    faults = S3Faults(DomainDispatcherApplication(create_backend_app))
     server = make_server("127.0.0.1", 0, faults, threaded=True, request_handler=Quiet)
     thread = threading.Thread(target=server.serve_forever, daemon=True)
     thread.start()

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from fastapi.testclient import TestClient
 
 from retrieval.serve.app import create_app
-from retrieval.serve.run import Server, configured
+from retrieval.serve.server import Server, uvicorn_config
 from retrieval.serve.settings import ServiceSettings
 from robot.recording.folder import RecordingWriter
-from tests.waiting import running
+from tests.waiting import run_process
 
 INFO = {"source": "what people said of queries", "sensor": "drawn gel"}
 """Of the recording of what people said."""
@@ -28,7 +28,7 @@ def service(index, rig=None, recorder=None, trials=None, **settings):
 
 
 @contextmanager
-def keeping(index, folder, trials=None, rig=None, serve=service, info=INFO):
+def with_history(index, folder, trials=None, rig=None, serve=service, info=INFO):
     """What `serve` gives (`service`, `listening` or `browser.address`), of a service that stores its history in a
     folder."""
     with (
@@ -43,7 +43,7 @@ def listening(index, rig=None, recorder=None, trials=None, **settings):
     """Address of the application on a port of its own, served by a thread, and its parts."""
     app = create_app(ServiceSettings(index=index, port=0, **settings), rig, recorder, trials)
     ports = queue.Queue()
-    server = Server(configured(app), app.state.service, ports.put)
+    server = Server(uvicorn_config(app), app.state.service, ports.put)
     thread = threading.Thread(target=server.run)
     thread.start()
     try:
@@ -58,7 +58,7 @@ def listening(index, rig=None, recorder=None, trials=None, **settings):
 def command(*options, **popen):
     """`retrieve serve` as a process, its address, and what it says on stderr, a growing list."""
     line = [sys.executable, "-m", "retrieval", "serve", *map(str, options)]
-    with running(line, **popen) as process:
+    with run_process(line, **popen) as process:
         said, listening = [], threading.Event()
 
         def listen():

@@ -18,7 +18,7 @@ TABLE_COLOUR, OBJECT_COLOUR = (150, 140, 120), (60, 110, 200)
 
 
 @dataclass(frozen=True)
-class Upright:
+class UprightCylinder:
     """A cylinder that stands."""
 
     radius: float
@@ -40,7 +40,7 @@ class Upright:
 
 
 @dataclass(frozen=True)
-class Lying:
+class LyingCylinder:
     """A cylinder on its side, its axis turned by `yaw` from x."""
 
     radius: float
@@ -64,7 +64,7 @@ class Lying:
 
 
 @dataclass(frozen=True)
-class Block:
+class DepthBlock:
     """A box, its first side turned by `yaw` from x."""
 
     length: float
@@ -85,7 +85,7 @@ class Block:
 
 
 @dataclass(frozen=True)
-class Ball:
+class DepthBall:
     """A sphere that lies on the table."""
 
     radius: float

@@ -10,7 +10,7 @@ STARTED_IDS = ("from a terminal", "ignoring Ctrl-C")
 """What stands before a command: nothing, or what has it ignore Ctrl-C as nohup and `&` in a script do."""
 
 
-def until(holds, limit_s=10.0):
+def wait_until(holds, limit_s=10.0):
     """Wait until something has happened; a failure where it has not within about `limit_s`.
 
     Not by the clock or time.sleep, which tests replace.
@@ -24,7 +24,7 @@ def until(holds, limit_s=10.0):
 
 
 @contextmanager
-def running(command, **options):
+def run_process(command, **options):
     """A process with its output at hand; killed at the latest when this is left, which would else wait for its end."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options) as process:
         try:

@@ -21,7 +21,7 @@ HOME, MOVE, STOP, FAST_STOP, ACK, GRASP, RELEASE, TARE = 0x20, 0x21, 0x22, 0x23,
 PORTS = pytest.mark.parametrize("port", SERVE)
 
 
-class Script(LineFaults):
+class ScriptedFaults(LineFaults):
     """Does to the packets named by (id, number of the packet with this id) what it is told: the counting starts when
     told. Commands and replies count together: 1 the command, 2 its first reply. "after a result": a SUCCESS that is
     none comes before it."""
@@ -52,7 +52,7 @@ def quick_close():
 
 
 @contextlib.contextmanager
-def bench(port="tcp", faults=None, connect=True, emulator=None, **settings):
+def gripper_with_emulator(port="tcp", faults=None, connect=True, emulator=None, **settings):
     """A driver, connected or not, and its emulated gripper."""
     emulator = emulator or EmulatedWSG50(referenced=True, speed_up=20.0)
     with SERVE[port](emulator, faults) as address, quick_close():

@@ -10,12 +10,12 @@ APPROXIMATIONS = {
     "cca_solver": "benchmarks.frontier.correlation:cca_solver",
     "cca_components": "benchmarks.frontier.correlation:cca_components",
     "rays": "benchmarks.frontier.rays:rays",
-    "hidden_sky": "benchmarks.frontier.light:sky",
+    "sky_occlusion": "benchmarks.frontier.light:sky",
     "contact": "benchmarks.frontier.contact:contact",
     "contact_products": "benchmarks.frontier.contact:contact_products",
     "gel_optics": "benchmarks.frontier.optics:gel_optics",
 }
 """Name -> the function that measures it, as in `retrieval.frontier`."""
 
-NEED_NO_MODEL = frozenset({"cca_solver", "rays", "hidden_sky", "contact", "contact_products", "gel_optics"})
+NEED_NO_MODEL = frozenset({"cca_solver", "rays", "sky_occlusion", "contact", "contact_products", "gel_optics"})
 """Measured without a model and without a recording."""

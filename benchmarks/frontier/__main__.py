@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from benchmarks.frontier import APPROXIMATIONS, NEED_NO_MODEL
-from retrieval.commands.frontier import report
+from retrieval.commands.frontier import run_frontier
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -16,14 +16,14 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--model", help="a checkpoint (default: as of `retrieve frontier`)")
     parser.add_argument("--quick", action="store_true", help="smallest sizes, to see that it runs")
     of = parser.parse_args(argv)
-    report(
+    run_frontier(
         of.out,
         model=of.model,
         recording=of.recording,
         only=of.only,
         quick=of.quick,
         table=APPROXIMATIONS,
-        need_no_model=NEED_NO_MODEL,
+        model_free=NEED_NO_MODEL,
     )
 
 

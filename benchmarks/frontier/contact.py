@@ -7,12 +7,12 @@ from functools import partial
 import numpy as np
 
 from benchmarks.frontier.closed_forms import BALL_MM, HALF_SPACE, Grid, hertz, percent, pressed_ball
-from retrieval.frontier.clock import timed
-from retrieval.frontier.points import Panel, Row, Tradeoff, smallest
+from retrieval.frontier.clock import time_points
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
 from retrieval.frontier.sample import Sample
 from robot.sim.contact.kernels import Floats
-from robot.sim.contact.layer import SINGLE_FROM, Contact, Layer, press
-from robot.sim.contact.scaled_problem import ElasticSurface, Task
+from robot.sim.contact.layer import SINGLE_PRECISION_TOLERANCE, Contact, Layer, press
+from robot.sim.contact.scaled_problem import ElasticSurface, ScaledProblem
 from robot.sim.gel.optics import LedOptics
 from robot.sim.gel.surface import Field, Surface
 from robot.sim.pinch import Hand
@@ -24,7 +24,7 @@ CAMERA_NOISE = 0.8
 # Contact ---------------------------------------------------------------------------------------------------
 
 
-def contact(sample: Sample) -> Row:
+def contact(sample: Sample) -> ApproximationResult:
     """Grid and tolerance of the gel's contact. Under a minute."""
     text = (
         "A ball pressed into the gel: on a half-space against Hertz's closed form, on a layer, which the simulated "
@@ -34,7 +34,7 @@ def contact(sample: Sample) -> Row:
     )
     repeats = sample.scale.repeats
     panels = contact_panels(repeats, (30, 120), (1e-1, 1e-2), 240) if sample.scale.quick else contact_panels(repeats)
-    return Row("Contact of the gel: grid and tolerance", text, panels)
+    return ApproximationResult("Contact of the gel: grid and tolerance", text, panels)
 
 
 def contact_panels(
@@ -108,8 +108,8 @@ def _panel(
     works: Sequence[Callable[[], object]],
     repeats: int,
 ) -> Panel:
-    title, made = f"contact grid and tolerance, {surface}", timed(points, works, repeats)
-    return Panel(title, "one contact", unit, reference, tolerance, made, smallest(made))
+    title, made = f"contact grid and tolerance, {surface}", time_points(points, works, repeats)
+    return Panel(title, "one contact", unit, reference, tolerance, made, smallest_error(made))
 
 
 def _pressed_ridges(grid: Grid, tolerance: float) -> Contact:
@@ -141,16 +141,16 @@ def _at_centres(fine: Floats, factor: int) -> Floats:
 # Products ---------------------------------------------------------------------------------------------------
 
 
-def contact_products(sample: Sample) -> Row:
+def contact_products(sample: Sample) -> ApproximationResult:
     """float32 in the products of the gel's contact."""
     text = (
         "A ball with ridges pressed into a layer on the rig's grid: the products of pressure and influence by FFT in "
         "float32 or in float64, and the solver's tolerance. The rig's contacts, at a tolerance of "
-        f"{SINGLE_FROM:g} or more, take float32."
+        f"{SINGLE_PRECISION_TOLERANCE:g} or more, take float32."
     )
     repeats = sample.scale.repeats
     panel = products_panel(repeats, rows=48) if sample.scale.quick else products_panel(repeats)
-    return Row("Contact of the gel: float32", text, (panel,))
+    return ApproximationResult("Contact of the gel: float32", text, (panel,))
 
 
 def products_panel(repeats: int, rows: int | None = None, tolerances: Sequence[float] = (1e-1, 1e-2, 1e-3)) -> Panel:
@@ -162,21 +162,21 @@ def products_panel(repeats: int, rows: int | None = None, tolerances: Sequence[f
     gap = (y[:, None] ** 2 + x**2) / 30.0 + 0.1 * (1.0 - np.cos(2.0 * math.pi * x / 1.5))
     exact = _pressed(gap, pixel_mm, 1e-8, False)
     points, works = list[Tradeoff](), []
-    for single in (False, True):
+    for single_precision in (False, True):
         for tolerance in tolerances:
-            works.append(partial(_pressed, gap, pixel_mm, tolerance, single))
+            works.append(partial(_pressed, gap, pixel_mm, tolerance, single_precision))
             error = 1e3 * math.sqrt(float(np.mean((works[-1]() - exact) ** 2)))
-            is_default = (tolerance, single) == (hand.tolerance, True)
-            series = "float32" if single else "float64"
+            is_default = (tolerance, single_precision) == (hand.tolerance, True)
+            series = "float32" if single_precision else "float64"
             points.append(Tradeoff(series, f"tolerance {tolerance:g}", error, is_default=is_default))
-    made = timed(points, works, repeats)
+    made = time_points(points, works, repeats)
     reference = "float64, tolerance 1e-08"
-    return Panel("precision of contact", "one contact", "um rms of surface", reference, 0.1, made, smallest(made))
+    return Panel("precision of contact", "one contact", "um rms of surface", reference, 0.1, made, smallest_error(made))
 
 
-def _pressed(gap: Floats, pixel_mm: float, tolerance: float, single: bool, force_n: float = 3.0) -> Floats:
+def _pressed(gap: Floats, pixel_mm: float, tolerance: float, single_precision: bool, force_n: float = 3.0) -> Floats:
     """(rows, cols) mm of displacement by so much force."""
     scale = force_n / LAYER.plane_modulus_mpa / pixel_mm**2
-    surface = ElasticSurface(LAYER.thickness_mm / pixel_mm, LAYER.poisson, 0.0, False, single)
-    solution = Task(surface, gap / pixel_mm / scale, 1.0, 1.0, tolerance, 1000).solve()
+    surface = ElasticSurface(LAYER.thickness_mm / pixel_mm, LAYER.poisson, 0.0, False, single_precision)
+    solution = ScaledProblem(surface, gap / pixel_mm / scale, 1.0, 1.0, tolerance, 1000).solve()
     return np.asarray(solution.displacement * scale * pixel_mm)

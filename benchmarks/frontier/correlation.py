@@ -7,23 +7,23 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.frontier.clock import timed
+from retrieval.frontier.clock import time_points
 from retrieval.frontier.pixels import SLACK
-from retrieval.frontier.points import Panel, Row, Tradeoff, missed, smallest
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point, smallest_error
 from retrieval.frontier.sample import Sample
-from retrieval.methods.base import Setting
-from retrieval.methods.cca import Cca, admissible, canonical, cosine, decompose, unit_rows
+from retrieval.methods.cca import Cca, canonical_correlations, component_counts, cosine, decompose, unit_rows
+from retrieval.methods.method import MethodSettings
 
 Matrix = NDArray[np.float64]
-Solver = Callable[["Problem"], Matrix]
+Solver = Callable[["CcaProblem"], Matrix]
 OURS = "SVD of the data, float64 (ours)"
 SIZES = (4, 8, 16, 32, 64, 128, 256)
-FEWEST = 8
+MIN_ROWS = 8
 """Objects: half of them are fitted on, a quarter chosen on, a quarter judged."""
 
 
 @dataclass(frozen=True, eq=False)
-class Problem:
+class CcaProblem:
     """Two views (n, d) whose canonical correlations are known: mixed sources, `rho` (d,) falling."""
 
     x: Matrix
@@ -31,7 +31,7 @@ class Problem:
     rho: Matrix
 
 
-def known_problem(rows: int, width: int, spread: float, seed: int = 0) -> Problem:
+def known_problem(rows: int, width: int, spread: float, seed: int = 0) -> CcaProblem:
     """Orthonormal sources U and V with U'V = diag(rho), each mixed by a matrix whose singular values span `spread`."""
     rng = np.random.default_rng([seed, 3])
     drawn = rng.normal(size=(rows, 2 * width))
@@ -39,7 +39,7 @@ def known_problem(rows: int, width: int, spread: float, seed: int = 0) -> Proble
     rho = np.linspace(0.95, 0.05, width)
     left = sources[:, :width]
     right = left * rho + sources[:, width:] * np.sqrt(1 - rho**2)
-    return Problem(left @ _mixing(width, spread, rng), right @ _mixing(width, spread, rng), rho)
+    return CcaProblem(left @ _mixing(width, spread, rng), right @ _mixing(width, spread, rng), rho)
 
 
 def _mixing(width: int, spread: float, rng: np.random.Generator) -> Matrix:
@@ -47,7 +47,7 @@ def _mixing(width: int, spread: float, rng: np.random.Generator) -> Matrix:
     return np.asarray(turns[0] * np.geomspace(1.0, 1.0 / spread, width) @ turns[1])
 
 
-def cca_solver(sample: Sample) -> Row:
+def cca_solver(sample: Sample) -> ApproximationResult:
     """Ours against the textbook's and scikit-learn's, where the answer is known."""
     size = (200, 12) if sample.scale.quick else (2000, 64)
     problem = known_problem(*size, spread=1e6)
@@ -57,7 +57,7 @@ def cca_solver(sample: Sample) -> Row:
         "eigenvalues of X'X, float32": partial(_by_covariance, np.float32),
         "scikit-learn's NIPALS, first 8": _by_sklearn,
     }
-    points = timed(
+    points = time_points(
         [_point(problem, name, solve) for name, solve in solvers.items()],
         [partial(solve, problem) for solve in solvers.values()],
         sample.scale.repeats,
@@ -69,9 +69,9 @@ def cca_solver(sample: Sample) -> Row:
         reference="correlations known by construction",
         tolerance=1e-6,
         points=points,
-        resolution=smallest(points),
+        resolution=smallest_error(points),
     )
-    return Row(
+    return ApproximationResult(
         "CCA: solver",
         "X'X squares the condition number of the data; the singular value decomposition of X does not. scikit-learn's "
         "CCA iterates one component after the other (NIPALS), here its first eight.",
@@ -79,17 +79,17 @@ def cca_solver(sample: Sample) -> Row:
     )
 
 
-def _point(problem: Problem, name: str, solve: Solver) -> Tradeoff:
+def _point(problem: CcaProblem, name: str, solve: Solver) -> Tradeoff:
     found = solve(problem)
     return Tradeoff(name, "", float(np.abs(found - problem.rho[: len(found)]).max()), is_default=name == OURS)
 
 
-def _by_svd(problem: Problem) -> Matrix:
+def _by_svd(problem: CcaProblem) -> Matrix:
     views = decompose(problem.x), decompose(problem.y)
-    return _padded(canonical(*views, np.arange(len(problem.x))).correlations, len(problem.rho))
+    return _padded(canonical_correlations(*views, np.arange(len(problem.x))).correlations, len(problem.rho))
 
 
-def _by_covariance(kind: type[np.floating], problem: Problem) -> Matrix:
+def _by_covariance(kind: type[np.floating], problem: CcaProblem) -> Matrix:
     """Whiten by eigenvalues of the covariance, as textbooks print it; only here, to be compared."""
     x, y = (one.astype(kind) - one.astype(kind).mean(0) for one in (problem.x, problem.y))
     whitened = [one @ _root(one.T @ one) for one in (x, y)]
@@ -108,7 +108,7 @@ def _padded(found: Matrix, count: int) -> Matrix:
     return np.pad(found[:count], (0, max(0, count - len(found))))
 
 
-def _by_sklearn(problem: Problem) -> Matrix:
+def _by_sklearn(problem: CcaProblem) -> Matrix:
     """Its first eight components; not all of them, for it takes seconds a component."""
     from sklearn.cross_decomposition import CCA
 
@@ -119,32 +119,34 @@ def _by_sklearn(problem: Problem) -> Matrix:
 # Components ------------------------------------------------------------------------------------------------
 
 
-def cca_components(sample: Sample) -> Row:
+def cca_components(sample: Sample) -> ApproximationResult:
     """Wrong first guesses by number of canonical components, fitted on half of the sample's objects."""
     title = "CCA: components"
     names = [str(name) for name in np.unique(sample.features.object_ids)]
-    if len(names) < FEWEST:
-        return Row(title, "", skipped=f"it needs {FEWEST} objects or more; the recording has {len(names)}")
+    if len(names) < MIN_ROWS:
+        return ApproximationResult(
+            title, "", skipped=f"it needs {MIN_ROWS} objects or more; the recording has {len(names)}"
+        )
     order = np.random.default_rng([sample.seed, 4]).permutation(names)
     parts = np.split(order, [len(names) // 2, len(names) * 3 // 4])
     train, validation, test = (sample.features.of_objects(part) for part in parts)
-    method = Cca(Setting(sample.checkpoint.config))
+    method = Cca(MethodSettings(sample.checkpoint.config))
     method.fit(train, validation)
     views = decompose(train.touch), decompose(train.photo)
-    found = canonical(*views, train.owner, method.chosen["ridge"])
-    weights = found.correlations ** method.chosen["power"]
+    found = canonical_correlations(*views, train.owner, method.best_params["ridge"])
+    weights = found.correlations ** method.best_params["power"]
     touch = views[0].standardise(test.touch) @ found.touch_weights * weights
     photo = views[1].standardise(test.photo) @ found.photo_weights * weights
     points, works = list[Tradeoff](), list[Callable[[], object]]()
     many = np.tile(photo, (1 + sample.scale.photos // len(photo), 1))[: sample.scale.photos]
-    for count in sorted({*admissible(SIZES, len(weights)), method.chosen["components"]}):
+    for count in sorted({*component_counts(SIZES, len(weights)), method.best_params["components"]}):
         codes = unit_rows(touch[:, :count]), unit_rows(photo[:, :count])
         scores = cosine(*codes)
         np.fill_diagonal(scores, -np.inf)  # the photo of the touch's own grasp
         wrong = test.owner[scores.argmax(1)] != test.owner
-        points.append(missed("", f"{count} components", wrong, count == method.chosen["components"]))
+        points.append(miss_rate_point("", f"{count} components", wrong, count == method.best_params["components"]))
         works.append(partial(cosine, codes[0][:1], unit_rows(many[:, :count])))
-    points = list(timed(points, works, sample.scale.repeats))
+    points = list(time_points(points, works, sample.scale.repeats))
     panel = Panel(
         title="wrong first guesses by number of canonical components",
         time=f"scores of one touch with {sample.scale.photos:,} photos, one thread",
@@ -158,4 +160,4 @@ def cca_components(sample: Sample) -> Row:
         f"Fitted on {len(parts[0])} objects, ridge, power and the default number of components chosen on "
         f"{len(parts[1])} others, judged on {len(parts[2])} that neither has seen."
     )
-    return Row(title, text, (panel,))
+    return ApproximationResult(title, text, (panel,))

@@ -12,9 +12,9 @@ from PIL import Image
 from retrieval.data.images import decode, picture_size
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import RgbImage
-from retrieval.data.views import strip
-from retrieval.frontier.clock import timed
-from retrieval.frontier.points import Panel, Row, Tradeoff, missed, smallest
+from retrieval.data.views import tile_views
+from retrieval.frontier.clock import time_points
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point, smallest_error
 from retrieval.frontier.sample import Array, Sample
 from retrieval.model.encode import encode_photos
 from robot.sim.camera import PinholeCamera
@@ -30,7 +30,7 @@ _NAME = "a drawn photo"
 See = Callable[[bytes], RgbImage]
 
 
-def reduced(sample: Sample) -> Row:
+def reduced(sample: Sample) -> ApproximationResult:
     """How far views, logits and answers move, and the time of one photo."""
     count, side, size = (3, 256, (1600, 1200)) if sample.scale.quick else (PHOTOS, SIDE, SIZE)
     settings = sample.checkpoint.config.preprocessing
@@ -38,8 +38,8 @@ def reduced(sample: Sample) -> Row:
     files, again = ([as_jpeg(picture, quality) for picture in pictures] for quality in (QUALITY, LOWER))
     points, ways = zip(*decoders(settings), strict=True)
     views = [[see(file) for file in files] for see in ways]
-    points = timed(points, [_seeing(see, files) for see in ways], sample.scale.repeats)
-    return Row(
+    points = time_points(points, [_seeing(see, files) for see in ways], sample.scale.repeats)
+    return ApproximationResult(
         "Large photos: size at which they are decoded",
         f"{count} drawn photos, JPEG files of {size[0]:,} x {size[1]:,} pixels. A JPEG file can be decoded at 1/2, 1/4 "
         "or 1/8 of its size by its own cosine transform. With `reduced` among its preprocessing, as presets for new "
@@ -56,14 +56,17 @@ def decoders(settings: Preprocessing) -> Iterator[tuple[Tradeoff, See]]:
 
     def at(fraction: int, data: bytes) -> RgbImage:
         image = decode(data, _NAME, min(picture_size(data, _NAME)) // fraction)
-        return strip(image, settings.views, settings.photo_px)
+        return tile_views(image, settings.views, settings.photo_px)
 
     fixed = "a fixed fraction"
-    yield Tradeoff(fixed, "whole", 0.0, is_default=not settings.reduced), lambda data: plain.photo_of(data, _NAME)
+    yield (
+        Tradeoff(fixed, "whole", 0.0, is_default=not settings.reduced),
+        lambda data: plain.photo_from_bytes(data, _NAME),
+    )
     for fraction in FRACTIONS:
         yield Tradeoff(fixed, f"1/{fraction}", 0.0), partial(at, fraction)
     chosen = Tradeoff("reduced", "what the views need", 0.0, is_default=settings.reduced)
-    yield chosen, lambda data: needed.photo_of(data, _NAME)
+    yield chosen, lambda data: needed.photo_from_bytes(data, _NAME)
 
 
 def _panels(
@@ -81,9 +84,11 @@ def _panels(
         ("how far match logits move", "nats, mean", moved),
     ):
         made = tuple(dataclasses.replace(point, error=error) for point, error in zip(points, errors[:-1], strict=True))
-        yield Panel(title, time, unit, reference, float(f"{errors[-1]:.2g}"), made, smallest(made))
+        yield Panel(title, time, unit, reference, float(f"{errors[-1]:.2g}"), made, smallest_error(made))
     flips = tuple(
-        dataclasses.replace(missed(point.series, point.setting, wrong, point.is_default), seconds=point.seconds)
+        dataclasses.replace(
+            miss_rate_point(point.series, point.setting, wrong, point.is_default), seconds=point.seconds
+        )
         for point, wrong in zip(points, first[:-1], strict=True)
     )
     most = round(100 * float(first[-1].mean()), 2)
@@ -92,8 +97,8 @@ def _panels(
 
 def _logits(sample: Sample, views: Sequence[RgbImage]) -> Array:
     """(touches, photos)."""
-    halves = encode_photos(sample.checkpoint.matcher, views).half.numpy()
-    return np.array([sample.logits(touch, halves) for touch in sample.queries["half"]])
+    partials = encode_photos(sample.checkpoint.matcher, views).partial.numpy()
+    return np.array([sample.logits(touch, partials) for touch in sample.queries["partial"]])
 
 
 def _seeing(see: See, files: Sequence[bytes]) -> Callable[[], RgbImage]:

@@ -7,11 +7,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.frontier.clock import timed
-from retrieval.frontier.points import Panel, Row, Tradeoff, smallest
+from retrieval.frontier.clock import time_points
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
 from retrieval.frontier.sample import Sample
-from robot.sim.camera import NOISE, SKY_STEPS, Lighting, PinholeCamera, Placement, hidden_sky, lit, look
-from robot.sim.light import GAMMA, Lamps, Surfaces, developed, radiance
+from robot.sim.camera import (
+    NOISE,
+    SKY_STEPS,
+    Lighting,
+    PinholeCamera,
+    Placement,
+    cast_camera_rays,
+    shading_inputs,
+    sky_occlusion,
+)
+from robot.sim.light import GAMMA, GBuffer, Lamps, develop, radiance
 from robot.sim.objects.draw import draw_object
 
 Array = NDArray[np.float64]
@@ -21,27 +30,33 @@ _SKY_SHARE = 0.45 * 0.25 / 0.5
 # Sky -------------------------------------------------------------------------------------------------------
 
 
-def sky(sample: Sample) -> Row:
+def sky(sample: Sample) -> ApproximationResult:
     """The grid on which the sky is blurred that an object hides from the table."""
     text = (
         "Beside an object the table sees less of the sky: the object's mask, blurred, on a coarse grid of so many "
         "points over the blur's width, in a photo of 512 px. The error is the largest of the table's light."
     )
-    return Row("Sky that an object hides: grid", text, (sky_panel(sample.scale.repeats),))
+    return ApproximationResult("Sky that an object hides: grid", text, (sky_panel(sample.scale.repeats),))
 
 
 def sky_panel(repeats: int, px: int = 512, steps: Sequence[int] = (1, 2, 4, 8)) -> Panel:
     """A point for each number of steps: the largest error of the table's light in per cent."""
-    view = look(draw_object(0, 3), Placement(), PinholeCamera(px=px, focal_px=860 * px / 256))
+    view = cast_camera_rays(draw_object(0, 3), Placement(), PinholeCamera(px=px, focal_px=860 * px / 256))
     mask = view.is_object.reshape(px, px)
     exact = cv2.GaussianBlur(mask.astype(np.float64), (0, 0), 0.03 * px)
-    points, works = list[Tradeoff](), [partial(hidden_sky, mask, count) for count in steps]
+    points, works = list[Tradeoff](), [partial(sky_occlusion, mask, count) for count in steps]
     for count, work in zip(steps, works, strict=True):
         error = 100.0 * _SKY_SHARE * float(np.abs(work() - exact)[~mask].max())
         points.append(Tradeoff("", f"{count} steps", error, is_default=count == SKY_STEPS))
-    made = timed(points, works, repeats)
+    made = time_points(points, works, repeats)
     return Panel(
-        "sky that an object hides", f"a photo of {px} px", "% of light", "the full grid", 1.0, made, smallest(made)
+        "sky that an object hides",
+        f"a photo of {px} px",
+        "% of light",
+        "the full grid",
+        1.0,
+        made,
+        smallest_error(made),
     )
 
 
@@ -62,22 +77,22 @@ def light_panel(repeats: int, objects: int = 8, px: int = 256) -> Panel:
         Tradeoff(name, "", float(np.abs(work().astype(np.int64) - exact).max()), is_default=place == 0)
         for place, (name, work) in enumerate(zip(names, works, strict=True))
     ]
-    made = timed(points, works, repeats)
+    made = time_points(points, works, repeats)
     time, reference = f"shading and developing {objects} photos of {px} px", "float64, array by array"
-    return Panel("arithmetic of light", time, "grey levels at most", reference, 1.0, made, smallest(made))
+    return Panel("arithmetic of light", time, "grey levels at most", reference, 1.0, made, smallest_error(made))
 
 
-def _lit(number: int, px: int) -> tuple[Surfaces, Lamps]:
+def _lit(number: int, px: int) -> tuple[GBuffer, Lamps]:
     camera = PinholeCamera(px=px, focal_px=PinholeCamera.focal_px * px / PinholeCamera.px)
-    view = look(draw_object(0, number), Placement(), camera)
-    return lit(view, Lighting.draw(np.random.default_rng(number)))
+    view = cast_camera_rays(draw_object(0, number), Placement(), camera)
+    return shading_inputs(view, Lighting.draw(np.random.default_rng(number)))
 
 
-def _compiled(scenes: Sequence[tuple[Surfaces, Lamps]], noise: Array) -> NDArray[np.uint8]:
-    return np.array([developed(radiance(*scene).reshape(noise.shape), noise) for scene in scenes])
+def _compiled(scenes: Sequence[tuple[GBuffer, Lamps]], noise: Array) -> NDArray[np.uint8]:
+    return np.array([develop(radiance(*scene).reshape(noise.shape), noise) for scene in scenes])
 
 
-def _by_arrays(scenes: Sequence[tuple[Surfaces, Lamps]], noise: Array, kind: type[np.floating]) -> NDArray[np.uint8]:
+def _by_arrays(scenes: Sequence[tuple[GBuffer, Lamps]], noise: Array, kind: type[np.floating]) -> NDArray[np.uint8]:
     pictures = []
     for scene in scenes:
         linear = np.clip(shaded(*scene, kind), 0, 1).reshape(noise.shape)
@@ -86,13 +101,13 @@ def _by_arrays(scenes: Sequence[tuple[Surfaces, Lamps]], noise: Array, kind: typ
     return np.array(pictures)
 
 
-def shaded(surfaces: Surfaces, lamps: Lamps, kind: type[np.floating] = np.float64) -> NDArray[np.floating]:
+def shaded(surfaces: GBuffer, lamps: Lamps, kind: type[np.floating] = np.float64) -> NDArray[np.floating]:
     """Radiance (n, 3) as `robot.sim.light.radiance` gives it, by the same formulas in numpy, in this type."""
-    rays, normals, is_object, seen, hidden, colour = (np.asarray(part, kind) for part in surfaces)
+    rays, normals, is_object, seen, occlusion, colour = (np.asarray(part, kind) for part in surfaces)
     direction, lamp, sky_colour = (part.astype(kind) for part in (lamps.direction, lamps.lamp, lamps.sky))
     is_object = is_object > 0
     lit_share = np.maximum(normals @ direction, 0) * seen
-    sky_share = (kind(0.6) + kind(0.4) * normals[:, 2]) * np.where(is_object, 1, 1 - kind(0.45) * hidden)
+    sky_share = (kind(0.6) + kind(0.4) * normals[:, 2]) * np.where(is_object, 1, 1 - kind(0.45) * occlusion)
     half = direction - rays
     half /= np.linalg.norm(half, axis=1, keepdims=True)
     cosine = np.maximum(np.einsum("ij,ij->i", normals, half), 0)

@@ -7,19 +7,19 @@ from functools import partial
 import numpy as np
 
 from benchmarks.optics.photometric import DEGREES, by_degree
-from retrieval.frontier.clock import timed
-from retrieval.frontier.points import Panel, Row, Tradeoff, smallest
+from retrieval.frontier.clock import time_points
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
 from retrieval.frontier.sample import Sample
 from robot.sim.gel.fitted_optics import FittedOptics, feature_count, fitted_document, load_fitted
 from robot.sim.gel.surface import Field, Surface
 
 
-def gel_optics(sample: Sample) -> Row:
+def gel_optics(sample: Sample) -> ApproximationResult:
     """Degree of the fitted gel optics, against real presses."""
     text = (
         "Pictures of real balls pressed into a real gel that were left out of the fit, and what the model says of them."
     )
-    return Row("Gel optics: degree of the fitted model", text, (optics_panel(sample.scale.repeats),))
+    return ApproximationResult("Gel optics: degree of the fitted model", text, (optics_panel(sample.scale.repeats),))
 
 
 def optics_panel(repeats: int, name: str = "gelsight") -> Panel:
@@ -40,7 +40,7 @@ def optics_panel(repeats: int, name: str = "gelsight") -> Panel:
         for degree in DEGREES
     ]
     works = [partial(_of_degree(shipped, degree).colours, surface, surface.slopes) for degree in DEGREES]
-    made = timed(points, works, repeats)
+    made = time_points(points, works, repeats)
     return Panel(
         title="gel optics",
         time="one picture of 240 x 320 pixels",
@@ -48,7 +48,7 @@ def optics_panel(repeats: int, name: str = "gelsight") -> Panel:
         reference="real presses held out",
         tolerance=3.5,
         points=made,
-        resolution=smallest(made),
+        resolution=smallest_error(made),
     )
 
 

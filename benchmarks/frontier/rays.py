@@ -10,15 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.frontier.light import light_panel
-from retrieval.frontier.clock import timed
-from retrieval.frontier.points import Panel, Row, Tradeoff, smallest
+from retrieval.frontier.clock import time_points
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
 from retrieval.frontier.sample import Sample
 from robot.readings import Pose
 from robot.sim.camera import NOISE, PinholeCamera
 from robot.sim.objects.body import GEL_STEP_MM, ClippedRays, SdfBody, Vectors
-from robot.sim.objects.boxes import clipped
+from robot.sim.objects.boxes import clip_to_box
 from robot.sim.objects.draw import draw_object
-from robot.sim.objects.packets import MOST_STEPS, first_hits, hits
+from robot.sim.objects.packets import MAX_STEPS, first_hits, hits
 from robot.sim.pinch import Grip
 from robot.sim.scene import Scene
 
@@ -30,7 +30,7 @@ _UNBOUNDED = 100_000
 """Steps that no ray needs."""
 
 
-def rays(sample: Sample) -> Row:
+def rays(sample: Sample) -> ApproximationResult:
     """Steps of the rays of gels and photos, how many a ray may take, and float32 where light is worked out."""
     text = (
         "Rays to a solid that wears relief: no step is shorter than half the detail that is asked for, and where f "
@@ -48,17 +48,17 @@ def rays(sample: Sample) -> Row:
         limit_panel(repeats, objects, px),
         light_panel(repeats, objects, px),
     )
-    return Row("Rays and light of the simulated rig", text, panels)
+    return ApproximationResult("Rays and light of the simulated rig", text, panels)
 
 
-class Marched(SdfBody):
-    """The solid of a body, met by steps `stride` times as long, at most `most_steps`; `asked` are the casts so far,
+class RayMarcher(SdfBody):
+    """The solid of a body, met by steps `stride` times as long, at most `max_steps`; `asked` are the casts so far,
     to be made again."""
 
-    def __init__(self, body: SdfBody, stride: float = 1.0, most_steps: int = MOST_STEPS) -> None:
+    def __init__(self, body: SdfBody, stride: float = 1.0, max_steps: int = MAX_STEPS) -> None:
         super().__init__(body.shape, body.relief)
         self.wall = body.wall
-        self.stride, self.most_steps = stride, most_steps
+        self.stride, self.max_steps = stride, max_steps
         self.asked: list[Callable[[], NDArray[Any]]] = []
 
     def _cast(self, rays: ClippedRays) -> Vectors:
@@ -72,10 +72,10 @@ class Marched(SdfBody):
         return cast()
 
     def _by(self, met: Callable[..., NDArray[Any]], rays: ClippedRays) -> NDArray[Any]:
-        return met(self.worn(rays.step_mm), rays.ways, self.stride * rays.step_mm, self.most_steps)
+        return met(self.displaced_solid(rays.step_mm), rays.arrays, self.stride * rays.step_mm, self.max_steps)
 
 
-class SteppedThrough(Marched):
+class EqualStepMarcher(RayMarcher):
     """The same in equal steps of plain numpy, `stride` times the detail that is asked for, as many as it takes."""
 
     def _by(self, met: Callable[..., NDArray[Any]], rays: ClippedRays) -> NDArray[Any]:
@@ -113,9 +113,9 @@ def gel_panel(repeats: int, rows: int = 48, steps_mm: Sequence[float] = (1.6, 0.
         both = met & np.isfinite(found)
         error = 1e3 * math.sqrt(float(np.mean((found[both] - exact[both]) ** 2)))
         points.append(Tradeoff("", f"{step:g} mm", error, is_default=step == GEL_STEP_MM))
-    made = timed(points, works, repeats)
+    made = time_points(points, works, repeats)
     reference, time = "equal steps of 0.01 mm", f"{len(exact):,} rays"
-    return Panel("step of a gel's rays", time, "um rms of depth", reference, 2.0, made, smallest(made))
+    return Panel("step of a gel's rays", time, "um rms of depth", reference, 2.0, made, smallest_error(made))
 
 
 def _wall(relief: str) -> SdfBody:
@@ -134,7 +134,7 @@ def _rays_onto(body: SdfBody, rows: int) -> tuple[Vectors, Vectors]:
 
 
 def _exact_depth(body: SdfBody, origins: Vectors, directions: Vectors) -> Vectors:
-    near, far = clipped(origins, directions, body.lower, body.upper)
+    near, far = clip_to_box(origins, directions, body.lower, body.upper)
     return by_equal_steps(body, ClippedRays(origins, directions, near, far, GEL_STEP_MM), 0.01)
 
 
@@ -149,8 +149,8 @@ def photo_panel(
     repeats: int, objects: int = _OBJECTS, px: int = _PX, strides: Sequence[float] = (16, 8, 4, 2, 1, 0.5, 0.25)
 ) -> Panel:
     """A point for each step: the rms error of photos of so many objects, and the time of all of their rays."""
-    ways = [("as the rig casts", Marched, stride) for stride in strides]
-    ways += [("equal steps, plain numpy", SteppedThrough, stride) for stride in (1, 0.25, _EXACT)]
+    ways = [("as the rig casts", RayMarcher, stride) for stride in strides]
+    ways += [("equal steps, plain numpy", EqualStepMarcher, stride) for stride in (1, 0.25, _EXACT)]
     taken = [_photos(way, stride, objects, px) for _, way, stride in ways]
     exact = taken[-1][0]
     points = [
@@ -158,16 +158,16 @@ def photo_panel(
             series,
             f"{stride:g} px",
             math.sqrt(float(np.mean((pictures - exact) ** 2))),
-            is_default=way is Marched and stride == 1,
+            is_default=way is RayMarcher and stride == 1,
         )
         for (series, way, stride), (pictures, _) in zip(ways, taken, strict=True)
     ]
-    made = timed(points, [casts for _, casts in taken], repeats)
+    made = time_points(points, [casts for _, casts in taken], repeats)
     time, reference = f"rays of {objects} photos of {px} px, shadows included", f"equal steps of {_EXACT:g} px"
-    return Panel("step of a photo's rays", time, "grey levels rms", reference, NOISE, made, smallest(made))
+    return Panel("step of a photo's rays", time, "grey levels rms", reference, NOISE, made, smallest_error(made))
 
 
-def _photos(way: type[Marched], stride: float, objects: int, px: int) -> tuple[Vectors, Callable[[], object]]:
+def _photos(way: type[RayMarcher], stride: float, objects: int, px: int) -> tuple[Vectors, Callable[[], object]]:
     """(objects, px, px, 3) grey levels, and what casts all of their rays once more."""
     scenes = [_scene(way, stride, number, px) for number in range(objects)]
     pictures = np.array([scene.run()["photo"] for scene, _ in scenes], np.float64)
@@ -175,7 +175,7 @@ def _photos(way: type[Marched], stride: float, objects: int, px: int) -> tuple[V
     return pictures, lambda: [again() for again in asked]
 
 
-def _scene(way: type[Marched], stride: float, number: int, px: int) -> tuple[Scene, Marched]:
+def _scene(way: type[RayMarcher], stride: float, number: int, px: int) -> tuple[Scene, RayMarcher]:
     """An object with its body, before a camera that sees as much as the rig's; two bare fingers can close on it."""
     obj = draw_object(0, number)
     assert isinstance(obj.body, SdfBody)
@@ -192,29 +192,29 @@ def limit_panel(
     repeats: int,
     objects: int = _OBJECTS,
     px: int = _PX,
-    limits: Sequence[int] = (25, 50, 100, 200, 300, MOST_STEPS, 2 * MOST_STEPS),
+    limits: Sequence[int] = (25, 50, 100, 200, 300, MAX_STEPS, 2 * MAX_STEPS),
 ) -> Panel:
     """A point for each limit: how many rays miss by it, of photos and of fingers that find where an object rests."""
     bodies = []
     for number in range(objects):
-        scene, body = _scene(Marched, 1.0, number, px)
+        scene, body = _scene(RayMarcher, 1.0, number, px)
         scene.run()
-        assert scene.pinch.turned  # its rays graze the object's sides
+        assert scene.pinch.final_placement  # its rays graze the object's sides
         bodies.append(body)
     exact = _met(bodies, _UNBOUNDED)
     points, works = list[Tradeoff](), [partial(_met, bodies, limit) for limit in limits]
     for limit, work in zip(limits, works, strict=True):
         lost = 100.0 * float(np.mean(work() != exact))
-        points.append(Tradeoff("", f"{limit:,} steps", lost, is_default=limit == MOST_STEPS))
-    made = timed(points, works, repeats)
+        points.append(Tradeoff("", f"{limit:,} steps", lost, is_default=limit == MAX_STEPS))
+    made = time_points(points, works, repeats)
     time = f"{len(exact):,} rays of photos and fingers"
     return Panel("most steps of a ray", time, "% of rays lost", "no limit", 0.01, made, 100.0 / len(exact))
 
 
-def _met(bodies: Sequence[Marched], most_steps: int) -> NDArray[np.bool_]:
+def _met(bodies: Sequence[RayMarcher], max_steps: int) -> NDArray[np.bool_]:
     """Which of all the rays that were asked of the bodies meet them within so many steps."""
     met = []
     for body in bodies:
-        body.most_steps = most_steps
+        body.max_steps = max_steps
         met += [again() for again in body.asked]
     return np.concatenate([found if found.dtype == bool else np.isfinite(found) for found in met])

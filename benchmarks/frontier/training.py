@@ -9,9 +9,9 @@ import torch
 from torch import Tensor, nn
 
 from retrieval.data.dataset import PairBatch, PairSampler
-from retrieval.frontier.clock import timed
+from retrieval.frontier.clock import time_points
 from retrieval.frontier.pixels import load_touch
-from retrieval.frontier.points import Panel, Row, Tradeoff, smallest
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error
 from retrieval.frontier.sample import Sample
 from retrieval.model.encode import autocast, has_fast_bfloat16, to_batch, touch_batch
 from retrieval.model.fusion import Matcher
@@ -23,27 +23,27 @@ TOLERANCE = 0.1
 _CPU = torch.device("cpu")
 
 
-def training_formats(sample: Sample) -> Row:
+def training_formats(sample: Sample) -> ApproximationResult:
     """float32, and bfloat16 where the processor multiplies it, at the model's weights."""
     step, other = (_Step(sample, 2 if sample.scale.quick else 4, number) for number in range(2))
     fast = has_fast_bfloat16(_CPU)
     points, works = zip(*_formats(sample, step, fast), strict=True)
     gradients = [work() for work in works]
     turned = [0.0, *(1 - _cosine(gradient, gradients[0]) for gradient in gradients[1:])]
-    made = timed(
+    made = time_points(
         [dataclasses.replace(point, error=error) for point, error in zip(points, turned, strict=True)],
         works,
         sample.scale.repeats,
     )
     between = _cosine(other(_trained(sample, step), "float32"), gradients[0])
     time = f"a step of {len(step.touches)} touches and {len(step.photos)} photos, forward and back, one thread"
-    return Row(
+    return ApproximationResult(
         "Number format of training",
         "The gradient of all weights by one batch, at the model's own weights, against that in float32; those of two "
         f"batches have a cosine of {between:.2f} with each other. Gels differ by a few grey levels, which bfloat16 "
         "rounds away from an image: a training keeps the first layers of some towers in float32."
         + ("" if fast else " Left out here: this processor multiplies no bfloat16, and trains in float32."),
-        (Panel("turn of the gradient", time, "1 - cosine", "float32", TOLERANCE, made, smallest(made)),),
+        (Panel("turn of the gradient", time, "1 - cosine", "float32", TOLERANCE, made, smallest_error(made)),),
     )
 
 
@@ -87,7 +87,7 @@ def _trained(sample: Sample, step: _Step) -> Matcher:
     return matcher
 
 
-class _Rounded(nn.Module):
+class _RoundedLinear(nn.Module):
     """A layer in bfloat16, wherever it stands."""
 
     def __init__(self, layer: nn.Module) -> None:
@@ -107,7 +107,7 @@ def _with_no_layer_spared(matcher: Matcher) -> Matcher:
         for module in list(tower.modules()):
             for name, child in list(module.named_children()):
                 if isinstance(child, nn.Conv2d):
-                    setattr(module, name, _Rounded(child))
+                    setattr(module, name, _RoundedLinear(child))
     return made
 
 

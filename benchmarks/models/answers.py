@@ -26,7 +26,7 @@ from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
 from retrieval.search.query.answer import is_clear
 from retrieval.search.query.searcher import Searcher
-from retrieval.search.query.shard import Felt
+from retrieval.search.query.shard import ShardQuery
 
 OBJECTS = 30
 BINS = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
@@ -94,7 +94,9 @@ def asked(recording, photos, references, touches):
 
 def logits_of(searcher, codes, rows, count):
     """Logit of each object after these grasps."""
-    found = searcher.shard.ask(Felt(codes.embeddings[rows], codes.halves[rows]), count, None, searcher.posterior)
+    found = searcher.shard.search(
+        ShardQuery(codes.embeddings[rows], codes.partials[rows]), count, None, searcher.posterior
+    )
     return {one.photo.object_id: one.logit for one in found.best}
 
 
@@ -121,7 +123,7 @@ def answer(posterior, numbered, catalogue, name):
     """The answer from a catalogue of some objects, by their logits after so many grasps."""
     grasps, logits = numbered
     own = np.array([logits[one] for one in catalogue])
-    belief, best = posterior.believe(own, grasps), int(own.argmax())
+    belief, best = posterior.probabilities(own, grasps), int(own.argmax())
     match, if_present = bool(belief.objects[best] > belief.none), float(belief.objects_if_present[best])
     more = None if match or not is_clear(if_present) else posterior.more_grasps(own[best], len(own), grasps)
     return Answer(catalogue[best] == name, match, if_present, more)

@@ -26,7 +26,7 @@ from retrieval.search.query.searcher import Searcher
 SIZES, GRASPS, DRAWS = (20, 100), (1, 2, 3), 8
 
 
-def judged(folder, recording, photos):
+def score_touches(folder, recording, photos):
     """Match logits (T, N) of touches with photos, whose they are (T,), (N,), and the posterior."""
     grasps = defaultdict(list)
     for grasp in load_grasps(recording):
@@ -38,13 +38,13 @@ def judged(folder, recording, photos):
             (folder / "catalog" / name / f"{number}{grasp.photo.suffix}").symlink_to(grasp.photo.resolve())
     build_index(folder / "catalog", load_checkpoint(shipped_model()), folder / "index", quiet=True)
     with Searcher.open(folder / "index") as searcher:
-        halves = searcher.generation.arrays["halves"]
+        partials = searcher.generation.arrays["partials"]
         shown = [names.index(row["object_id"]) for row in searcher.generation.rows]
         logits, owners = [], []
         for number, name in enumerate(names):
             codes = searcher.encode([[str(path) for path in grasp.touches] for grasp in grasps[name][photos:]])
-            logits += [searcher.judge.logits(half[None], halves) for half in codes.halves]
-            owners += [number] * len(codes.halves)
+            logits += [searcher.scorer.logits(partial[None], partials) for partial in codes.partials]
+            owners += [number] * len(codes.partials)
         return np.array(logits, dtype=np.float64), np.array(owners), np.array(shown), searcher.posterior
 
 
@@ -53,7 +53,7 @@ def answer(posterior, logits, shown, catalogue, grasps):
     here = np.isin(shown, catalogue)
     owner = np.searchsorted(catalogue, shown[here])
     objects = posterior.object_logits(logits[here], owner, np.bincount(owner), grasps)
-    belief = posterior.believe(objects, grasps)
+    belief = posterior.probabilities(objects, grasps)
     told = information(
         posterior, grasps, belief.none, belief.objects.tolist(), objects=len(catalogue), none_prior=NONE_PRIOR
     )
@@ -84,7 +84,7 @@ def main():
     parser.add_argument("--photos", type=int, default=2, help="grasps of each object whose photos are the catalogue")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        material = judged(Path(folder), asked.recording, asked.photos)
+        material = score_touches(Path(folder), asked.recording, asked.photos)
     for size in SIZES:
         for grasps in GRASPS:
             found = measured(*material, size, grasps, np.random.default_rng([size, grasps]))

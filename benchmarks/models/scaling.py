@@ -27,10 +27,10 @@ from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.evaluate import DRAWS
 from retrieval.evaluation.scoring import summaries
 from retrieval.methods import METHODS
-from retrieval.methods.base import Method, Setting
 from retrieval.methods.late_fusion import frozen_matcher
+from retrieval.methods.method import Method, MethodSettings
 from retrieval.metrics.measure import Measure
-from retrieval.metrics.registry import Scored, take
+from retrieval.metrics.registry import MethodScoreTables, compute
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.config import Config, load_config
 from retrieval.training.features import Features, encode_recording
@@ -40,9 +40,9 @@ from robot.recording.folder import read_recording
 LINES = ("-", "--", "-.")
 KNOWN = {"shape": slice(0, 1), "relief": slice(1, 2), "both": slice(0, 2)}
 """Words of a simulated object's name ("mug-ribs-0-00001") that say what it is."""
-NONE_FELT = 8
+PHOTO_ONLY = 8
 """Added to numbers of felt objects where they are plotted, so that none has a place on a logarithmic axis."""
-SHOWN = {"pair_accuracy": "pair accuracy", "guesses_k5": "K = 5, first guess", "guesses_k10": "K = 10, first guess"}
+SHOWN = {"pair_accuracy": "pair accuracy", "topn_k5": "K = 5, first guess", "topn_k10": "K = 10, first guess"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -103,16 +103,16 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         if not count and not photographed:
             continue
         felt, paired = first_grasps(seen.of_objects(pool[:count]), grasps), pairs.of_objects(liked[:photographed])
-        train = felt.joined(paired) if count and photographed else felt if count else paired
+        train = felt.concatenate(paired) if count and photographed else felt if count else paired
         folder = arguments.out / f"{count}-objects-{grasps}-grasps-{photographed}-photographed"
         for name in arguments.methods:
             seeds = range(arguments.seeds if METHODS.load(name).is_seeded else 1)
-            trained = [METHODS.load(name)(Setting(config, seed, folder)) for seed in seeds]
+            trained = [METHODS.load(name)(MethodSettings(config, seed, folder)) for seed in seeds]
             for method in trained:
                 method.fit(train, validation)
             size = {"method": name, "objects": count, "grasps": grasps, "photographed": photographed}
             size |= {"touches": len(train), "pairs": len(paired), "seeds": len(seeds)}
-            points.append(size | judge(trained, validation, unseen, arguments.known))
+            points.append(size | score_methods(trained, validation, unseen, arguments.known))
             print(table(points[-1:]).splitlines()[-1], flush=True)
     return {
         "preset": arguments.preset,
@@ -131,7 +131,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 def _config(arguments: argparse.Namespace) -> Config:
     config = load_config(arguments.preset)
     training = dataclasses.replace(
-        config.training.of_steps(arguments.iterations),
+        config.training.with_iterations(arguments.iterations),
         init=arguments.init,
         init_photo=arguments.init_photo,
         init_touch=arguments.init_touch,
@@ -173,17 +173,19 @@ def first_grasps(features: Features, most: int) -> Features:
     return features.select(np.flatnonzero(np.array(place) < most))
 
 
-def judge(trained: Sequence[Method], validation: Features, unseen: Features, known: str | None) -> dict[str, Any]:
+def score_methods(
+    trained: Sequence[Method], validation: Features, unseen: Features, known: str | None
+) -> dict[str, Any]:
     """Summaries of the measures on unseen objects, by name: means over trainings, and under "together" the same of
     the trainings' mean scores."""
-    judged = [tuple(scores_of(method, part, known) for part in (validation, unseen)) for method in trained]
-    alone = summaries([_measures(*tables) for tables in judged], DRAWS, seed=0)
-    together = (mean_scores(tables) for tables in zip(*judged, strict=True))
+    scored = [tuple(scores_of(method, part, known) for part in (validation, unseen)) for method in trained]
+    alone = summaries([_measures(*tables) for tables in scored], DRAWS, seed=0)
+    together = (mean_scores(tables) for tables in zip(*scored, strict=True))
     return alone | {"together": summaries([_measures(*together)], DRAWS, seed=0)}
 
 
 def _measures(validation: ScoreTable, unseen: ScoreTable) -> dict[str, Measure]:
-    return take(Scored(unseen, unseen, {}, calibrate_pairs(validation, seed=0), seed=0), SHOWN)
+    return compute(MethodScoreTables(unseen, unseen, {}, calibrate_pairs(validation, seed=0), seed=0), SHOWN)
 
 
 def mean_scores(tables: Sequence[ScoreTable]) -> ScoreTable:
@@ -240,14 +242,14 @@ def plot_photographed(points: Sequence[dict[str, Any]]) -> Figure:
             own = [point for point in points if point["photographed"] == count]
             own.sort(key=lambda point: int(point["objects"]))
             value, low, high = (np.array([each[name][part][0] for each in own]) for part in ("value", "low", "high"))
-            x = np.array([each["objects"] for each in own]) + NONE_FELT
+            x = np.array([each["objects"] for each in own]) + PHOTO_ONLY
             colour = colormaps["viridis"](0.9 * number / max(len(counts) - 1, 1))
             bars = [list(value - low), list(high - value)]
             axes.errorbar(x, value, bars, marker="o", capsize=3, color=colour, label=f"{count:,} photographed")
         axes.axhline(points[0][name]["chance"][0], color="black", linestyle=":", linewidth=1)
         ticks = sorted({point["objects"] for point in points})
         axes.set(xscale="log", xlabel="felt objects", title=label, ylim=(0, 1))
-        axes.set_xticks([tick + NONE_FELT for tick in ticks], [f"{tick:,}" for tick in ticks])
+        axes.set_xticks([tick + PHOTO_ONLY for tick in ticks], [f"{tick:,}" for tick in ticks])
         axes.minorticks_off()
         axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize="small", facecolor="white", edgecolor="none", framealpha=1)

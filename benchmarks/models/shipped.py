@@ -5,7 +5,7 @@
         the matcher, and store it as float16 in FOLDER/simulated-mobilenet.safetensors; with --fingers 1 one for touches
         of one gel image, of the same grasps
     python -m benchmarks.models.shipped distil FOLDER
-        teach the pruner of the shipped checkpoint again, from the recording, pictures and features that `make` left in
+        teach the candidate_encoder of the shipped checkpoint again, from the recording, pictures and features that `make` left in
         FOLDER; with --fingers 1 that of the one for one finger
     python -m benchmarks.models.shipped verdicts FOLDER
         fit the posterior and the gel check of the shipped checkpoint again, on its validation objects and as many
@@ -33,19 +33,19 @@ import numpy as np
 import robot
 from retrieval.commands.main import main as run_command
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps, recording_source
-from retrieval.methods.base import Setting
 from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
+from retrieval.methods.method import MethodSettings
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
+from retrieval.model.checkpoint_info import PARTIALS_FROM
 from retrieval.model.config import load_config
 from retrieval.model.encode import default_device, one_thread
-from retrieval.model.references import fit_references
-from retrieval.model.stored import HALVES_OF
+from retrieval.model.reference_calibration import fit_reference_calibration
 from retrieval.search import defaults
 from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures, recorded_features
-from retrieval.training.features import Features, by_image, encode_recording
-from retrieval.training.judgement import asked_touches, with_verdicts
+from retrieval.training.features import Features, encode_recording, features_by_image
 from retrieval.training.train import labelled_pairs
+from retrieval.training.verdicts import posterior_touches, with_verdicts
 
 # Worlds of the simulated rig. The demo has one of its own (retrieval.commands.demo.SEED), the benchmark has 0.
 SEED_TRAINED, SEED_SCORED = 10_000, 30_000
@@ -59,7 +59,7 @@ VERDICT_GRASPS, REFERENCE_GRASPS = 4, 8
 FOREIGN = 8000
 """Pictures that are no gels, from which its check of touches learns: more than a training's own."""
 DISTIL_STEPS = 4000
-"""Steps of teaching its pruner, more than the preset's: it is taught once and used by everyone."""
+"""Steps of teaching its candidate_encoder, more than the preset's: it is taught once and used by everyone."""
 FITTED = 10
 """Scored objects on which calibration and, as training objects, whatever else is fitted; the others are judged."""
 
@@ -77,9 +77,11 @@ def main(argv: list[str] | None = None) -> int:
     make.add_argument("--touches", type=int, default=9_361, help="objects that are only pressed")
     make.add_argument("--steps", type=int, default=2500, help="of teaching each tower relief")
     make.add_argument("--iterations", type=int, default=2500, help="of training the head")
-    pruner = jobs.add_parser("distil", help="teach the pruner of the shipped checkpoint again, and nothing else of it")
-    pruner.add_argument("folder", type=Path)
-    pruner.add_argument("--steps", type=int, default=DISTIL_STEPS)
+    candidate_encoder = jobs.add_parser(
+        "distil", help="teach the candidate_encoder of the shipped checkpoint again, and nothing else of it"
+    )
+    candidate_encoder.add_argument("folder", type=Path)
+    candidate_encoder.add_argument("--steps", type=int, default=DISTIL_STEPS)
     verdicts = jobs.add_parser("verdicts", help="fit its posterior and its gel check again, and nothing else of it")
     verdicts.add_argument("folder", type=Path)
     worth = jobs.add_parser("references", help="fit what reference touches are worth, and nothing else of it")
@@ -89,7 +91,7 @@ def main(argv: list[str] | None = None) -> int:
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
-    for job in (make, pruner, worth, score):
+    for job in (make, candidate_encoder, worth, score):
         job.add_argument(
             "--fingers", type=int, choices=tuple(defaults.SHIPPED), default=2, help="gel images of a touch"
         )
@@ -99,8 +101,8 @@ def main(argv: list[str] | None = None) -> int:
     run = {
         "make": make_shipped,
         "distil": distil_shipped,
-        "verdicts": judge_shipped,
-        "references": tell_shipped,
+        "verdicts": calibrate_shipped,
+        "references": calibrate_posterior,
         "score": score_shipped,
     }
     return run[arguments.job](arguments)
@@ -110,12 +112,12 @@ def make_shipped(arguments: argparse.Namespace) -> int:
     """Collect, encode and train; what is there already is gone on with."""
     folder = arguments.folder
     recording = folder / "recording"
-    code = collect(recording, arguments, SEED_TRAINED) or teach_towers(arguments)
+    code = collect(recording, arguments, SEED_TRAINED) or pretrain_towers(arguments)
     if code:
         return code
     config = load_config(PRESET)
     training = dataclasses.replace(
-        config.training.of_steps(arguments.iterations),
+        config.training.with_iterations(arguments.iterations),
         init=str(arguments.init),
         init_photo=str(folder / "photo-tower.safetensors"),
         init_touch=str(folder / "touch-tower.safetensors"),
@@ -131,14 +133,14 @@ def make_shipped(arguments: argparse.Namespace) -> int:
         encode_recording(part, towers, config, folder / "features") for part in (grasps, labelled_pairs(config))
     )
     split = draw_split(grasps, train=None, validation=VALIDATION)
-    train, validation = features.of_objects(split.train).joined(pairs), features.of_objects(split.validation)
+    train, validation = features.of_objects(split.train).concatenate(pairs), features.of_objects(split.validation)
     trained = folder / f"{arguments.fingers}-fingers"
-    made = trained_checkpoint(Setting(config, folder=trained, quiet=False), train, validation)
+    made = trained_checkpoint(MethodSettings(config, folder=trained, quiet=False), train, validation)
     about = {"source": recording_source(recording), "data_digest": data_digest(grasps), "pairs": len(pairs)}
     # The split names whom a recording may not be judged on; no recording holds the pairs.
     made = dataclasses.replace(made, provenance=made.provenance | about, split=split)
-    made = taught(made, train, validation, DISTIL_STEPS)
-    store(judging(made, grasps, features), folder / defaults.SHIPPED[arguments.fingers])
+    made = distilled(made, train, validation, DISTIL_STEPS)
+    store(fit_calibration(made, grasps, features), folder / defaults.SHIPPED[arguments.fingers])
     return 0
 
 
@@ -155,7 +157,7 @@ def each_finger(grasp: Grasp) -> list[Grasp]:
     ]
 
 
-def teach_towers(arguments: argparse.Namespace) -> int:
+def pretrain_towers(arguments: argparse.Namespace) -> int:
     """Photograph and press objects of two other worlds, and teach each tower what it sees there."""
     for side, pictures, seed, rig in (
         ("photo", "photos", SEED_PHOTOS, "sim"),
@@ -172,18 +174,18 @@ def teach_towers(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def judge_shipped(arguments: argparse.Namespace) -> int:
+def calibrate_shipped(arguments: argparse.Namespace) -> int:
     """All weights stay; of the recording that `make` would collect only the objects that are looked at are made."""
     shipped = load_checkpoint(defaults.shipped_model())
     assert shipped.split is not None
     names = sorted({*shipped.split.validation, *shipped.split.train[:: len(shipped.split.train) // VALIDATION]})
     grasps = collect_of(arguments.folder / "verdicts", names, VERDICT_GRASPS, arguments.jobs)
     features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
-    store(judging(shipped, grasps, features), arguments.folder / defaults.SHIPPED[2])
+    store(fit_calibration(shipped, grasps, features), arguments.folder / defaults.SHIPPED[2])
     return 0
 
 
-def tell_shipped(arguments: argparse.Namespace) -> int:
+def calibrate_posterior(arguments: argparse.Namespace) -> int:
     """All weights and the posterior stay."""
     shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
     assert shipped.split is not None
@@ -193,11 +195,11 @@ def tell_shipped(arguments: argparse.Namespace) -> int:
         grasps = [each_finger(grasp)[0] for grasp in grasps]
     features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
     device = default_device()
-    with FrozenFeatures(shipped.config, device, by_image(grasps, features, device)) as source:
+    with FrozenFeatures(shipped.config, device, features_by_image(grasps, features, device)) as source:
         found = recorded_features(shipped.matcher, source, grasps, what="references", quiet=False)
-    asked = asked_touches(shipped.matcher, grasps, *found)
+    asked = posterior_touches(shipped.matcher, grasps, *found)
     assert asked is not None
-    made = same_codes(dataclasses.replace(shipped, references=fit_references(asked)), shipped)
+    made = same_codes(dataclasses.replace(shipped, references=fit_reference_calibration(asked)), shipped)
     store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
     return 0
 
@@ -217,21 +219,21 @@ def collect_of(recording: Path, names: Sequence[str], grasps: int, jobs: int) ->
 
 def same_codes(made: Checkpoint, before: Checkpoint) -> Checkpoint:
     """A checkpoint with the towers and the head of the one before: an index of that one keeps its halves."""
-    halves_of = [*before.provenance.get(HALVES_OF, []), before.digest]
-    return dataclasses.replace(made, provenance=made.provenance | {HALVES_OF: halves_of})
+    halves_of = [*before.provenance.get(PARTIALS_FROM, []), before.digest]
+    return dataclasses.replace(made, provenance=made.provenance | {PARTIALS_FROM: halves_of})
 
 
-def judging(made: Checkpoint, grasps: list[Grasp], features: Features) -> Checkpoint:
+def fit_calibration(made: Checkpoint, grasps: list[Grasp], features: Features) -> Checkpoint:
     """A checkpoint with its posterior and its gel check."""
     assert made.split is not None
     device = default_device()
-    with FrozenFeatures(made.config, device, by_image(grasps, features, device)) as source:
+    with FrozenFeatures(made.config, device, features_by_image(grasps, features, device)) as source:
         parts = (made.split.select(grasps, part) for part in ("train", "validation"))
         return with_verdicts(made, source, *parts, foreign=FOREIGN)
 
 
 def distil_shipped(arguments: argparse.Namespace) -> int:
-    """Towers, head, calibration and split stay; the pruner reads the weights that are shipped, rounded as they are."""
+    """Towers, head, calibration and split stay; the candidate_encoder reads the weights that are shipped, rounded as they are."""
     shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
     grasps = load_grasps(arguments.folder / "recording")
     if arguments.fingers == 1:
@@ -242,19 +244,19 @@ def distil_shipped(arguments: argparse.Namespace) -> int:
     paths = {"photos": str(arguments.folder / "photos"), "touches": str(arguments.folder / "touches")}
     training = dataclasses.replace(shipped.config.training, **paths)
     pairs = labelled_pairs(dataclasses.replace(shipped.config, training=training))
-    train = train.joined(encode_recording(pairs, shipped.matcher, shipped.config, arguments.folder / "features"))
-    made = same_codes(taught(shipped, train, validation, arguments.steps), shipped)
+    train = train.concatenate(encode_recording(pairs, shipped.matcher, shipped.config, arguments.folder / "features"))
+    made = same_codes(distilled(shipped, train, validation, arguments.steps), shipped)
     store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
     return 0
 
 
-def taught(made: Checkpoint, train: Features, validation: Features, steps: int) -> Checkpoint:
-    """A checkpoint with the preset's pruner."""
+def distilled(made: Checkpoint, train: Features, validation: Features, steps: int) -> Checkpoint:
+    """A checkpoint with the preset's candidate_encoder."""
     training = dataclasses.replace(made.config.training, distil_steps=steps)
-    config = dataclasses.replace(made.config.with_pruner_of(load_config(PRESET)), training=training)
+    config = dataclasses.replace(made.config.with_candidate_encoder_of(load_config(PRESET)), training=training)
     with one_thread():  # as training on features that stand still
-        halves = (distil.feature_halves(made.matcher, part) for part in (train, validation))
-        return distil.with_pruner(made, config, *halves)
+        partials = (distil.feature_partials(made.matcher, part) for part in (train, validation))
+        return distil.with_candidate_encoder(made, config, *partials)
 
 
 def store(made: Checkpoint, out: Path) -> None:
@@ -274,7 +276,7 @@ def score_shipped(arguments: argparse.Namespace) -> int:
     split = recording.with_name("split.json")
     split.write_text(json.dumps(draw_split(load_grasps(recording), FITTED, FITTED).to_dict(), indent=1) + "\n")
     model = arguments.model or defaults.shipped_model(arguments.fingers)
-    methods = "late_fusion,prune_rerank,chance"
+    methods = "late_fusion,retrieve_rerank,chance"
     out = arguments.folder / "report"
     if arguments.fingers == 1:
         recording, out = first_finger(recording), arguments.folder / "report-one-finger"

@@ -31,15 +31,15 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.data.resize import RgbImage
-from retrieval.metrics.guesses import binomial_interval
+from retrieval.metrics.k_way import binomial_interval
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import for_inference, photo_features, touch_batch
-from retrieval.model.fusion import judge_of
-from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL
-from retrieval.model.posterior import JudgedTouches, Questions
+from retrieval.model.fusion import scorer_of
+from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
+from retrieval.model.posterior import IdentificationTrials, ScoredTouches
 from retrieval.search.defaults import shipped_model
 from retrieval.training.features import encode_recording
-from retrieval.training.foreign import draw_foreign
+from retrieval.training.foreign_images import draw_foreign
 from robot.collection import CollectSettings, collect
 from robot.rig import load_rig
 from robot.sim.objects.draw import draw_object
@@ -64,8 +64,8 @@ def main(argv: list[str] | None = None) -> int:
     if code := shipped.collect(folder / "recording", collected, shipped.SEED_SCORED):
         return code
     photograph(folder / "photographed")
-    catalogues, curves = judge_catalogues(made, folder)
-    inputs = list(judge_inputs(made, folder, arguments.jobs))
+    catalogues, curves = evaluate_catalogues(made, folder)
+    inputs = list(evaluate_inputs(made, folder, arguments.jobs))
     document = {"model": made.digest, "catalogues": catalogues, "inputs": inputs, "risk": curves}
     (folder / "verdicts.json").write_text(json.dumps(document, indent=1) + "\n", "utf-8")
     (folder / "verdicts.md").write_text("\n".join(as_markdown(document)) + "\n", "utf-8")
@@ -92,7 +92,7 @@ def photograph(folder: Path) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class OpenSetRatios:
     """Log likelihood ratios (T, K) of catalogues with the object, which stands first, and without; whose (T,)."""
 
     present: NDArray[np.float64]
@@ -100,18 +100,18 @@ class Asked:
     owner: NDArray[np.int64]
 
 
-def judge_catalogues(made: Checkpoint, folder: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def evaluate_catalogues(made: Checkpoint, folder: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """A row for each size of catalogue and number of grasps, and the curves of risk against coverage."""
-    judged = judge_photos(made, folder)
+    scored = score_photos(made, folder)
     rows, curves = [], {}
     for grasps in SET_SIZES:
-        for size, asked in questions(made, judged, grasps):
+        for size, asked in questions(made, scored, grasps):
             rows.append({"objects": size, "grasps": grasps, "questions": len(asked.owner)} | measured(asked))
             curves[f"{size} objects, {grasps} grasp{'s' * (grasps > 1)}"] = risk_against_coverage(asked)
     return rows, curves
 
 
-def judge_photos(made: Checkpoint, folder: Path) -> JudgedTouches:
+def score_photos(made: Checkpoint, folder: Path) -> ScoredTouches:
     """Match logits of the touches of the felt objects with photos of all."""
     grasps = load_grasps(folder / "recording")
     features = encode_recording(grasps, made.matcher, made.config, folder / "features")
@@ -119,39 +119,41 @@ def judge_photos(made: Checkpoint, folder: Path) -> JudgedTouches:
     images: Iterator[RgbImage] = map(made.config.preprocessing.load_photo, files)
     with torch.inference_mode():
         photos = torch.cat([torch.from_numpy(features.photo), photo_features(made.matcher, images)])
-        touches = made.matcher.touch_code(torch.from_numpy(features.touch).flatten(1)).half.numpy()
-        halves = made.matcher.photo_code(photos).half.numpy()
-    judge = judge_of(made.matcher.head)
+        touches = made.matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1)).partial.numpy()
+        partials = made.matcher.photo_encoding(photos).partial.numpy()
+    judge = scorer_of(made.matcher.head)
     felt = features.owner
     owner = np.concatenate([felt, felt.max() + 1 + np.arange(len(files))])
     own = np.zeros((len(felt), len(owner)), dtype=bool)
     own[np.arange(len(felt)), np.arange(len(felt))] = True
-    return JudgedTouches(np.stack([judge.logits(half[None], halves) for half in touches]), felt, owner, own)
+    return ScoredTouches(
+        np.stack([judge.logits(partial_activation[None], partials) for partial_activation in touches]), felt, owner, own
+    )
 
 
-def questions(made: Checkpoint, judged: JudgedTouches, grasps: int) -> Iterator[tuple[int, Asked]]:
+def questions(made: Checkpoint, scored: ScoredTouches, grasps: int) -> Iterator[tuple[int, OpenSetRatios]]:
     """Of sets of so many grasps, for every size of catalogue; rivals drawn by a seed."""
     assert made.posterior is not None
     rng = np.random.default_rng([7, grasps])
     sets = []
-    for name in np.unique(judged.touch_owner):
-        mine = np.flatnonzero(judged.touch_owner == name)
+    for name in np.unique(scored.touch_owner):
+        mine = np.flatnonzero(scored.touch_owner == name)
         if len(mine) > grasps:
             sets += [[row] for row in mine] if grasps == 1 else [rng.permutation(mine)[:grasps] for _ in range(SETS)]
     rows = np.array(sets)
-    ratios = Questions.of(judged, rows).log_ratios(made.posterior)
-    owner = judged.touch_owner[rows[:, 0]]
+    ratios = IdentificationTrials.of(scored, rows).log_ratios(made.posterior)
+    owner = scored.touch_owner[rows[:, 0]]
     keys = rng.random(ratios.shape)
     keys[np.arange(len(rows)), owner] = -1
     ranked = np.take_along_axis(ratios, np.argsort(keys, axis=1), 1)
     for size in SIZES:
         count = min(size, ranked.shape[1] - 1)
-        yield size, Asked(ranked[:, :count], ranked[:, 1 : count + 1], owner)
+        yield size, OpenSetRatios(ranked[:, :count], ranked[:, 1 : count + 1], owner)
 
 
-def measured(asked: Asked) -> dict[str, Any]:
+def measured(asked: OpenSetRatios) -> dict[str, Any]:
     """Shares, each with its 95 % interval over objects, drawn again with all their questions."""
-    present, absent = (beliefs(part) for part in (asked.present, asked.absent))
+    present, absent = (posterior_probabilities(part) for part in (asked.present, asked.absent))
     first_right = asked.present.argmax(1) == 0
     accepted, accepted_absent = (part[:, 1:].max(1) > part[:, 0] for part in (present, absent))
     known, unknown = -present[:, 0], -absent[:, 0]
@@ -172,7 +174,7 @@ def measured(asked: Asked) -> dict[str, Any]:
     return {**values, "calibration_error": calibration_error(said, true)}
 
 
-def beliefs(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
+def posterior_probabilities(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
     """(T, 1 + K) probabilities of "none of these" and of each object, at even odds: what `Posterior.believe` gives."""
     terms = np.column_stack([np.zeros(len(ratios)), ratios - np.log(ratios.shape[1])])
     shares = np.exp(terms - terms.max(1, keepdims=True))
@@ -205,10 +207,10 @@ def calibration_error(said: NDArray[np.float64], true: NDArray[np.bool_]) -> flo
     return float(np.abs(np.bincount(bins, weights=said - true, minlength=10)).sum() / len(said))
 
 
-def risk_against_coverage(asked: Asked) -> dict[str, list[float]]:
+def risk_against_coverage(asked: OpenSetRatios) -> dict[str, list[float]]:
     """Answers by the probability of their first guess: share answered, and share of these that is wrong; half of the
     questions are without the object, and every answer to these is wrong."""
-    parts = [beliefs(part)[:, 1:] for part in (asked.present, asked.absent)]
+    parts = [posterior_probabilities(part)[:, 1:] for part in (asked.present, asked.absent)]
     said = np.concatenate([part.max(1) for part in parts])
     wrong = np.concatenate([parts[0].argmax(1) != 0, np.ones(len(parts[1]), dtype=bool)])
     order = np.argsort(-said, kind="stable")
@@ -221,7 +223,7 @@ def risk_against_coverage(asked: Asked) -> dict[str, list[float]]:
 # What is no touch ------------------------------------------------------------------------------------------
 
 
-def judge_inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[dict[str, Any]]:
+def evaluate_inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[dict[str, Any]]:
     """A row for each kind of input: how many, and what they were called."""
     assert made.gel_check is not None
     fast = for_inference(made.matcher, ["touch_tower"])
@@ -233,7 +235,7 @@ def judge_inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[dict[str
                 reading = fast.gel_readings(features)
                 assert reading is not None
                 readings.append(reading.numpy())
-        called = made.gel_check.judge(np.concatenate(readings))
+        called = made.gel_check.classify(np.concatenate(readings))
         right = called.count(wanted)
         yield {
             "input": name,

@@ -63,7 +63,7 @@ def change(presses: Presses, index: int, stride: int = STRIDE) -> Matrix:
     """(pixels, 3): the pressed less the unpressed picture over the crop."""
     rows, cols = presses.crop(index)
     pressed = presses.pictures[index][rows, cols][::stride, ::stride].astype(np.float64)
-    return np.reshape(pressed - presses.untouched[rows, cols][::stride, ::stride], (-1, 3))
+    return np.reshape(pressed - presses.no_contact[rows, cols][::stride, ::stride], (-1, 3))
 
 
 def features(presses: Presses, index: int, pose: Matrix, setting: OpticsSetting, stride: int = STRIDE) -> Matrix:
@@ -76,7 +76,7 @@ def features(presses: Presses, index: int, pose: Matrix, setting: OpticsSetting,
     upright = -1 / np.sqrt(1 + slope_x**2 + slope_y**2)
     found = normal_features(slope_x * upright, slope_y * upright, setting.degree)
     found += [part for one in smoothed for part in one]
-    height, width = presses.untouched.shape[:2]
+    height, width = presses.no_contact.shape[:2]
     unit = (2 * x - width + 1) / width, (2 * y - height + 1) / height
     places = place_terms(*unit, setting.places)
     return np.stack([(one * place).ravel() for one in found for place in places], axis=-1)

@@ -70,7 +70,7 @@ def fit(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, *, alig
     fitted = Fit(setting, weights, poses, align)
     changes = {one: _change(presses, one, poses[one], fitted) for one in chosen[::3]}
     losses = [
-        (float(np.mean([judged(presses, one, change, blur).mse for one, change in changes.items()])), blur)
+        (float(np.mean([picture_error(presses, one, change, blur).mse for one, change in changes.items()])), blur)
         for blur in _BLURS_PX
     ]
     return replace(fitted, blur_px=min(losses)[1])
@@ -126,7 +126,7 @@ def _inner_loss(
 def to_optics(presses: Presses, fitted: Fit) -> FittedOptics:
     """The fit as optics that a sensor can use, with the limits of what was seen."""
     setting = fitted.setting
-    flat = _tuples(flat_weights(presses.untouched))
+    flat = _tuples(flat_weights(presses.no_contact))
     weights, limits = _tuples(fitted.weights), _limits(presses, fitted)
     return FittedOptics(setting.degree, setting.places, setting.reaches_mm, weights, _FLAT_DEGREE, flat, limits)
 
@@ -135,7 +135,7 @@ def _limits(presses: Presses, fitted: Fit) -> FittedLimits:
     """Tilts that half of the presses reached, the crops' places, and what the neighbourhoods were."""
     smoothed = np.concatenate([_neighbourhood(presses, one, pose, fitted) for one, pose in enumerate(fitted.poses)])
     rows, cols = zip(*(presses.crop(index) for index in range(len(presses))), strict=True)
-    height, width = presses.untouched.shape[:2]
+    height, width = presses.no_contact.shape[:2]
     return FittedLimits(
         steepest=float(np.median(fitted.poses[:, 2]) / fitted.setting.ball_mm),
         left=2 * min(one.start for one in cols) / width - 1,
@@ -154,13 +154,13 @@ def _neighbourhood(presses: Presses, index: int, pose: Matrix, fitted: Fit) -> M
     return plain[:, plain.shape[1] - count :]
 
 
-def flat_weights(untouched: NDArray[np.uint8]) -> Matrix:
+def flat_weights(no_contact: NDArray[np.uint8]) -> Matrix:
     """(terms, 3): the unpressed picture as a polynomial in x and y (-1 to 1), by least squares."""
-    height, width = untouched.shape[:2]
+    height, width = no_contact.shape[:2]
     y, x = np.mgrid[0:height:4, 0:width:4]
     x, y = (2 * x.ravel() - width + 1) / width, (2 * y.ravel() - height + 1) / height
     terms = np.stack([x**i * y**j for i, j in place_powers(_FLAT_DEGREE)], axis=-1)
-    return np.asarray(np.linalg.lstsq(terms, untouched[::4, ::4].reshape(-1, 3).astype(np.float64), rcond=None)[0])
+    return np.asarray(np.linalg.lstsq(terms, no_contact[::4, ::4].reshape(-1, 3).astype(np.float64), rcond=None)[0])
 
 
 def _tuples(values: Matrix) -> tuple[tuple[float, ...], ...]:
@@ -174,12 +174,12 @@ def held_out_error(presses: Presses, index: int, model: Fit) -> PictureError:
         pose = aligned(presses, index, start, model.weights, model.setting, _ALIGN_STEPS)
     else:
         pose = labelled_poses(presses, model.setting)[index]
-    return judged(presses, index, _change(presses, index, pose, model), model.blur_px)
+    return picture_error(presses, index, _change(presses, index, pose, model), model.blur_px)
 
 
-def judged(presses: Presses, index: int, change: Any, blur_px: float = 0.0) -> PictureError:
+def picture_error(presses: Presses, index: int, change: Any, blur_px: float = 0.0) -> PictureError:
     """Errors of untouched + change on the crop of a press."""
     rows, cols = presses.crop(index)
     return compare(
-        presses.smooth_untouched(blur_px)[rows, cols] + np.asarray(change), presses.pictures[index][rows, cols]
+        presses.smooth_no_contact(blur_px)[rows, cols] + np.asarray(change), presses.pictures[index][rows, cols]
     )

@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks.optics.image_error import PictureError
 from benchmarks.optics.least_squares import Matrix
-from benchmarks.optics.model_choice import SAME_PLACE, Fit, fit, held_out_error, judged, select, to_optics
+from benchmarks.optics.model_choice import SAME_PLACE, Fit, fit, held_out_error, picture_error, select, to_optics
 from benchmarks.optics.real_presses import BALLS_MM, Presses, find_presses, read_presses, taxim_change
 from robot.errors import BadRobotInput, RobotError
 from robot.sim.gel.fitted_optics import FORMAT, optics_to_json
@@ -84,10 +84,10 @@ def evaluate(presses: Presses, *, number: int = SPLITS, taxim_table: Any = None)
     for chosen, held_out in splits(len(presses), FIT_COUNT[presses.name], number):
         models = _models(presses, chosen)
         for index in held_out:
-            out.setdefault("background only", Scores()).add(index, judged(presses, index, 0.0))
+            out.setdefault("background only", Scores()).add(index, picture_error(presses, index, 0.0))
             if taxim_table is not None:
                 change = taxim_change(presses, index, taxim_table)
-                out.setdefault(THEIRS, Scores()).add(index, judged(presses, index, change))
+                out.setdefault(THEIRS, Scores()).add(index, picture_error(presses, index, change))
             for name, model in models.items():
                 out.setdefault(name, Scores()).add(index, held_out_error(presses, index, model))
     if groups := SAME_PLACE.get(presses.name):

@@ -39,10 +39,10 @@ TAXIM_BALL_MM = 2.0  # with this radius Taxim's tables do best, on either sensor
 
 @dataclass(frozen=True, eq=False)
 class Presses:
-    """`untouched` (rows, cols, 3), `pictures` (count, rows, cols, 3), both uint8; labels in pixels."""
+    """`no_contact` (rows, cols, 3), `pictures` (count, rows, cols, 3), both uint8; labels in pixels."""
 
     name: str
-    untouched: NDArray[np.uint8]
+    no_contact: NDArray[np.uint8]
     pictures: NDArray[np.uint8]
     centres: Matrix
     radii: Matrix
@@ -50,7 +50,7 @@ class Presses:
     def __len__(self) -> int:
         return len(self.pictures)
 
-    def smooth_untouched(self, blur_px: float) -> Matrix:
+    def smooth_no_contact(self, blur_px: float) -> Matrix:
         """(rows, cols, 3): the untouched gel, its noise blurred away (standard deviation; 0 leaves it alone)."""
         return _blurred(self, blur_px)
 
@@ -58,14 +58,14 @@ class Presses:
         """Rows and columns of 200 x 200 pixels round the labelled centre, moved inside the picture."""
         starts = [
             min(max(round(float(middle)) - CROP // 2, 0), size - CROP)
-            for middle, size in zip(self.centres[index][::-1], self.untouched.shape[:2], strict=True)
+            for middle, size in zip(self.centres[index][::-1], self.no_contact.shape[:2], strict=True)
         ]
         return slice(starts[0], starts[0] + CROP), slice(starts[1], starts[1] + CROP)
 
 
 @lru_cache(maxsize=16)
 def _blurred(presses: Presses, blur_px: float) -> Matrix:
-    image = presses.untouched.astype(np.float64)
+    image = presses.no_contact.astype(np.float64)
     return np.asarray(cv2.GaussianBlur(image, (0, 0), blur_px)) if blur_px > 0 else image
 
 
@@ -92,20 +92,20 @@ def read_presses(folder: str | Path, name: str) -> Presses:
         raise BadRobotInput(
             f"{path} must hold f0, imgs, touch_center and touch_radius as plain arrays: {error}"
         ) from error
-    untouched, pictures, centres, radii = found
+    no_contact, pictures, centres, radii = found
     good = (
-        untouched.dtype == pictures.dtype == np.uint8 and pictures.ndim == 4 and pictures.shape[1:] == untouched.shape
+        no_contact.dtype == pictures.dtype == np.uint8 and pictures.ndim == 4 and pictures.shape[1:] == no_contact.shape
     )
     if (
         not good
-        or min(untouched.shape[:2]) < CROP
+        or min(no_contact.shape[:2]) < CROP
         or centres.shape != (len(pictures), 2)
         or radii.shape != (len(pictures),)
     ):
         shapes = [array.shape for array in found]
         raise BadRobotInput(f"{path} must hold uint8 pictures of one size, {CROP} pixels or more, got {shapes}")
     _check_labels(path, np.c_[centres, radii].astype(np.float64))
-    return Presses(name, untouched, pictures, centres.astype(np.float64), radii.astype(np.float64))
+    return Presses(name, no_contact, pictures, centres.astype(np.float64), radii.astype(np.float64))
 
 
 def _check_labels(path: Path, labels: Matrix) -> None:
@@ -121,7 +121,7 @@ def _check_labels(path: Path, labels: Matrix) -> None:
 def seen_centre(presses: Presses, index: int, threshold: float = 25) -> tuple[float, float]:
     """x, y of the middle of what changed in the crop (pixels of the picture): a start that needs no label."""
     rows, cols = presses.crop(index)
-    change = np.abs(presses.pictures[index][rows, cols].astype(np.float32) - presses.untouched[rows, cols]).sum(axis=2)
+    change = np.abs(presses.pictures[index][rows, cols].astype(np.float32) - presses.no_contact[rows, cols]).sum(axis=2)
     change = cv2.GaussianBlur(change, (0, 0), 3)
     change[change < threshold] = 0
     total = float(change.sum())
@@ -210,7 +210,7 @@ def taxim_change(presses: Presses, index: int, table: Any) -> Matrix:
     `table`: grad_r, grad_g, grad_b (125, 125, 6). Without their shadows and the curve of their gel pad.
     """
     rows, cols = presses.crop(index)
-    height, width = presses.untouched.shape[:2]
+    height, width = presses.no_contact.shape[:2]
     x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     heights = _pyramid(presses, index, x, y)
     down, right = np.gradient(heights / PIXEL_MM)

@@ -42,12 +42,13 @@ def check_k(k: int) -> int:
     return int(k)
 
 
-def check_slots(found: Slots, count: int, least: int = 0) -> Slots:
-    """Return the slots (Q, n) that a search found, or raise `CorruptIndex`: each lies from `least` to count - 1, and no
-    query has one twice. `least` -1 admits the -1 of FAISS, its word for nothing."""
+def check_slots(found: Slots, count: int, minimum: int = 0) -> Slots:
+    """Return the slots (Q, n) that a search found, or raise `CorruptIndex`: each lies from `minimum` to count - 1, and no
+    query has one twice. `minimum` -1 admits the -1 of FAISS, its word for nothing.
+    """
     if found.size:
-        if found.min() < least or found.max() >= count:
-            odd = found[(found < least) | (found >= count)][0]
+        if found.min() < minimum or found.max() >= count:
+            odd = found[(found < minimum) | (found >= count)][0]
             raise CorruptIndex(f"a search found slot {odd}, the index has {count}: its structure is damaged; {AGAIN}")
         ranked = np.sort(found, axis=1)
         if ((ranked[:, 1:] == ranked[:, :-1]) & (ranked[:, 1:] >= 0)).any():

@@ -5,8 +5,8 @@ It scores in float64 and reads all vectors for each search; `flat` gives the sam
 
 from typing import ClassVar
 
-from indexes.kinds.base import VectorIndex
 from indexes.kinds.scores import Floats, Mask, Slots, scan
+from indexes.kinds.vector_index import VectorIndex
 
 
 class ExactIndex(VectorIndex):

@@ -22,7 +22,7 @@ class FlatIndex(FaissIndex):
     def _build(self) -> None:
         """Nothing: no vector is in a structure, and so all are scanned."""
 
-    def _grown(self) -> None:
+    def _extend_structure(self) -> None:
         """Nothing, as for `_build`."""
 
     def _first_fetch(self, k: int) -> int:

@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from indexes.kinds import base
+from indexes.kinds import vector_index
 from indexes.kinds.faiss_index import FaissIndex, faiss
 from indexes.kinds.scores import Floats, Slots
 
 
 @dataclass(frozen=True)
-class HNSWParameters(base.Parameters):
+class HNSWParameters(vector_index.Parameters):
     """Links per node (`neighbours`, M in the paper); breadth of the search when building and asking."""
 
     neighbours: int = 32
@@ -17,8 +17,8 @@ class HNSWParameters(base.Parameters):
     ef_search: int = 64
 
     def __post_init__(self) -> None:
-        self.check("neighbours", least=2, most=base.MOST)  # with one FAISS ends the process
-        self.check("ef_construction", "ef_search", most=base.MOST)
+        self.check("neighbours", minimum=2, maximum=vector_index.MAX_COUNT)  # with one FAISS ends the process
+        self.check("ef_construction", "ef_search", maximum=vector_index.MAX_COUNT)
 
 
 class HNSWIndex(FaissIndex):
@@ -30,10 +30,10 @@ class HNSWIndex(FaissIndex):
     kind: ClassVar[str] = "hnsw"
     structure_type: ClassVar[str] = "IndexHNSWFlat"
     build_threads: ClassVar[int | None] = 1
-    tried: ClassVar[bool] = True
+    auto_try: ClassVar[bool] = True
     search_settings: ClassVar[frozenset[str]] = frozenset({"ef_search"})
-    search_ladder: ClassVar[base.Ladder | None] = ("ef_search", (16, 32, 64, 128, 256, 512, 1000, 2000))
-    parameters_type: ClassVar[type[base.Parameters]] = HNSWParameters
+    search_ladder: ClassVar[vector_index.Ladder | None] = ("ef_search", (16, 32, 64, 128, 256, 512, 1000, 2000))
+    parameters_type: ClassVar[type[vector_index.Parameters]] = HNSWParameters
     parameters: HNSWParameters
 
     def _make(self) -> Any:

@@ -7,28 +7,28 @@ from typing import Any, ClassVar
 import numpy as np
 
 from indexes.errors import ParameterError
-from indexes.kinds import base
+from indexes.kinds import vector_index
 from indexes.kinds.faiss_index import FaissIndex, faiss
 from indexes.kinds.scores import Floats, Slots
 
 POINTS_PER_CENTRE = 39
 """Fewest training points for each centre that FAISS accepts without a warning."""
 
-MOST_POINTS_PER_CENTRE = 64
+MAX_POINTS_PER_CENTRE = 64
 """Training points for each centre beyond which the centres gain nothing worth the time."""
 
-FEWEST_CODED = 16 * POINTS_PER_CENTRE
+MIN_CODED_VECTORS = 16 * POINTS_PER_CENTRE
 """Vectors that codes need for their training: enough for the smallest codebook, and for the range of each component."""
 
 SPARE_CODES = 64
 """Candidates beyond k that are scored exactly: with a byte for each component, near-copies change places."""
 
-FEWEST_REFINED = 64
+MIN_REFINED = 64
 """Compressed scores are too coarse to trust their very first: a smaller k refines as many as this one."""
 
 
 @dataclass(frozen=True)
-class IVFParameters(base.Parameters):
+class IVFParameters(vector_index.Parameters):
     """Number of lists and of lists visited.
 
     `lists` None takes sqrt(N); any number is lowered to N / 39, what N points can train. Training and adding cost
@@ -64,13 +64,13 @@ class IVFFlatIndex(FaissIndex):
     structure_type: ClassVar[str] = "IndexIVFFlat"
     retrain_growth: ClassVar[float | None] = 2.0
     search_settings: ClassVar[frozenset[str]] = frozenset({"probes"})
-    search_ladder: ClassVar[base.Ladder | None] = ("probes", (1, 2, 4, 8, 16, 32, 64, 128, 256))
-    parameters_type: ClassVar[type[base.Parameters]] = IVFParameters
+    search_ladder: ClassVar[vector_index.Ladder | None] = ("probes", (1, 2, 4, 8, 16, 32, 64, 128, 256))
+    parameters_type: ClassVar[type[vector_index.Parameters]] = IVFParameters
     parameters: IVFParameters
 
     @classmethod
-    def resolved(cls, asked: Any, count: int, dim: int) -> Any:
-        asked = super().resolved(asked, count, dim)
+    def resolve_parameters(cls, asked: Any, count: int, dim: int) -> Any:
+        asked = super().resolve_parameters(asked, count, dim)
         most = max(1, count // POINTS_PER_CENTRE)
         lists = min(most, asked.lists or round(math.sqrt(count)))
         probes = min(lists, asked.probes or max(8, math.ceil(lists / 8)))
@@ -81,7 +81,7 @@ class IVFFlatIndex(FaissIndex):
         return self._prepared(structure)
 
     def _training(self) -> Floats:
-        most = MOST_POINTS_PER_CENTRE * self._lists
+        most = MAX_POINTS_PER_CENTRE * self._lists
         if self.count <= most:
             return super()._training()
         drawn = np.random.default_rng(self.seed).choice(self.count, most, replace=False)
@@ -111,8 +111,8 @@ class IVFSQ8Index(IVFFlatIndex):
 
     kind: ClassVar[str] = "ivf_sq8"
     structure_type: ClassVar[str] = "IndexIVFScalarQuantizer"
-    tried: ClassVar[bool] = True
-    fewest: ClassVar[int] = FEWEST_CODED
+    auto_try: ClassVar[bool] = True
+    min_vectors: ClassVar[int] = MIN_CODED_VECTORS
 
     def _make(self) -> Any:
         quantizer, metric = faiss.ScalarQuantizer.QT_8bit, faiss.METRIC_INNER_PRODUCT
@@ -131,17 +131,19 @@ class IVFPQIndex(IVFFlatIndex):
 
     kind: ClassVar[str] = "ivf_pq"
     structure_type: ClassVar[str] = "IndexIVFPQ"
-    fewest: ClassVar[int] = FEWEST_CODED
+    min_vectors: ClassVar[int] = MIN_CODED_VECTORS
     search_settings: ClassVar[frozenset[str]] = frozenset({"probes", "refine"})
-    build_ladder: ClassVar[base.Ladder | None] = ("code_bytes", (8, 16, 32))
-    parameters_type: ClassVar[type[base.Parameters]] = IVFPQParameters
+    build_ladder: ClassVar[vector_index.Ladder | None] = ("code_bytes", (8, 16, 32))
+    parameters_type: ClassVar[type[vector_index.Parameters]] = IVFPQParameters
     parameters: IVFPQParameters
 
     @classmethod
-    def resolved(cls, asked: Any, count: int, dim: int) -> Any:
+    def resolve_parameters(cls, asked: Any, count: int, dim: int) -> Any:
         if asked.code_bytes is not None and dim % asked.code_bytes:
             raise ParameterError(f"code_bytes must divide the vector size {dim}; got {asked.code_bytes}")
-        return replace(super().resolved(asked, count, dim), code_bytes=asked.code_bytes or _default_bytes(dim))
+        return replace(
+            super().resolve_parameters(asked, count, dim), code_bytes=asked.code_bytes or _default_bytes(dim)
+        )
 
     def _make(self) -> Any:
         bits = min(8, int(math.log2(self.count / POINTS_PER_CENTRE)))
@@ -152,7 +154,7 @@ class IVFPQIndex(IVFFlatIndex):
         return self._prepared(structure)
 
     def _first_fetch(self, k: int) -> int:
-        return max(k, FEWEST_REFINED) * self.parameters.refine
+        return max(k, MIN_REFINED) * self.parameters.refine
 
 
 def _default_bytes(dim: int) -> int:

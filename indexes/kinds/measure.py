@@ -7,9 +7,9 @@ from statistics import median
 import numpy as np
 
 from indexes.errors import ParameterError
-from indexes.kinds.base import VectorIndex
 from indexes.kinds.checks import check_k, check_unit
 from indexes.kinds.scores import Floats, scan
+from indexes.kinds.vector_index import VectorIndex
 
 Clock = Callable[[], float]
 """Seconds from some start."""

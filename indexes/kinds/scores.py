@@ -27,7 +27,7 @@ BLOCK_NUMBERS = 1 << 22
 """Numbers held at once by the blocked loops (32 MiB of float64)."""
 
 
-def on_grid(vectors: Floats) -> Doubles:
+def to_grid(vectors: Floats) -> Doubles:
     """The components (..., d) as whole multiples of 2^-26, counted (float64 integers)."""
     counted: Doubles = np.rint(vectors.astype(np.float64) * GRID)
     return counted
@@ -39,7 +39,7 @@ def grid_scores(queries: Doubles, vectors: Doubles) -> Floats:
     return scores
 
 
-def slack(dim: int) -> float:
+def error_bound(dim: int) -> float:
     """How far a float32 inner product of any order may lie from `grid_scores`, for norms up to 1.001.
 
     The classical bound (d + 2) u |x| |y| with u = 2^-24, plus the grid's bound, plus a rounding to float32.
@@ -48,7 +48,7 @@ def slack(dim: int) -> float:
     return 1.01 * ((dim + 2) * unit + math.sqrt(dim) * 2.0**-26 + unit)
 
 
-def best(scores: Floats, slots: Slots, k: int) -> tuple[Floats, Slots]:
+def top_k(scores: Floats, slots: Slots, k: int) -> tuple[Floats, Slots]:
     """The k best of (n,) scores and their slots, ordered by (-score, slot)."""
     if len(scores) > k:
         reach = scores >= np.partition(scores, len(scores) - k)[len(scores) - k]  # the last place's ties too
@@ -63,15 +63,15 @@ def scan(vectors: Floats, queries: Floats, k: int, live: Mask | None = None) -> 
     The vectors (M, d) are read block by block. k must not exceed the number of live slots. This is the reference that
     every kind is measured against.
     """
-    gridded = on_grid(queries)
+    gridded = to_grid(queries)
     found = [(np.empty(0, np.float32), np.empty(0, np.int64))] * len(queries)
     step = max(1, BLOCK_NUMBERS // max(1, len(queries), vectors.shape[1]))
     for start in range(0, len(vectors), step):
-        table = grid_scores(gridded, on_grid(vectors[start : start + step]))
+        table = grid_scores(gridded, to_grid(vectors[start : start + step]))
         slots = np.arange(start, start + table.shape[1])
         if live is not None:
             slots = slots[live[slots]]
         for query, (scores, before) in enumerate(found):
             row = table[query, slots - start]
-            found[query] = best(np.concatenate([scores, row]), np.concatenate([before, slots]), k)
+            found[query] = top_k(np.concatenate([scores, row]), np.concatenate([before, slots]), k)
     return np.stack([scores for scores, _ in found]), np.stack([slots for _, slots in found])

@@ -51,7 +51,7 @@ def write_array(path: Path, dtype: Any, row_shape: tuple[int, ...], blocks: Iter
         file.abandon()
 
 
-def mapped(path: Path) -> NDArray[Any]:
+def open_array(path: Path) -> NDArray[Any]:
     """The array in a file, memory-mapped."""
     array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
     return array

@@ -5,17 +5,17 @@ import numpy as np
 from indexes.kinds.checks import BLOCK_ROWS
 from indexes.kinds.scores import Floats, Slots
 
-BEGINNING = 16
+COMPARED_COMPONENTS = 16
 """Components that are compared at first: they tell embeddings apart."""
 
 
-def first_of_equals(vectors: Floats) -> Slots:
+def first_equal_rows(vectors: Floats) -> Slots:
     """Return for each vector (M,) the first one of the same bytes. The vectors (M, d) are read block by block."""
-    drawn = np.random.default_rng(0).integers(2**63, size=min(vectors.shape[1], BEGINNING), dtype=np.uint64)
+    drawn = np.random.default_rng(0).integers(2**63, size=min(vectors.shape[1], COMPARED_COMPONENTS), dtype=np.uint64)
     factors = drawn * np.uint64(2) + np.uint64(1)
     hashes = np.empty(len(vectors), np.uint64)
     for start in range(0, len(vectors), BLOCK_ROWS):
-        words = np.ascontiguousarray(vectors[start : start + BLOCK_ROWS, :BEGINNING]).view(np.uint32)
+        words = np.ascontiguousarray(vectors[start : start + BLOCK_ROWS, :COMPARED_COMPONENTS]).view(np.uint32)
         hashes[start : start + BLOCK_ROWS] = (words * factors).sum(axis=1, dtype=np.uint64)
     result: Slots = np.arange(len(vectors))
     ranked = np.sort(hashes)

@@ -33,16 +33,16 @@ from _touch_retrieval import files
 from _touch_retrieval.files import read_regular
 from indexes import load_kind
 from indexes.errors import AGAIN, CorruptIndex, NoIndex, ParameterError, RowError, WriteFailed
-from indexes.kinds.base import MOST, Parameters, check_seed, check_threads, is_whole
 from indexes.kinds.scores import Floats
+from indexes.kinds.vector_index import MAX_COUNT, Parameters, check_seed, check_threads, is_whole
 from indexes.store.generation import Generation, read_generation
 from indexes.store.locking import WriterLock
 from indexes.store.rows import json_of
 from indexes.store.tables import Block, check_documents
-from indexes.store.writing import Job, Settle, write_generation
+from indexes.store.writing import KindChooser, WriteJob, write_generation
 
 GENERATION = re.compile(r"gen-(\d{6,})")
-LEFT = re.compile(r"gen-\d{6,}\.tmp-\d+")
+UNFINISHED_FOLDER = re.compile(r"gen-\d{6,}\.tmp-\d+")
 """What killed writers leave: unfinished and half-deleted generations."""
 
 
@@ -136,7 +136,7 @@ class IndexStore:
         software: str = "",
         seed: int = 0,
         threads: int | None = None,
-        settle: Settle | None = None,
+        choose_kind: KindChooser | None = None,
         queries: Floats | None = None,
         self_check: int = 256,
         keep: int = 2,
@@ -158,26 +158,26 @@ class IndexStore:
         while another writer works, `SelfRetrievalFailed`, and then the index is as it was; `WriteFailed` when
         the disk refuses, and then it is the old one or the new one, whole.
         """
-        job = Job(
+        job = WriteJob(
             documents=check_documents(documents or {}),
             fingerprint=dict(fingerprint),
             about=dict(about or {}),
             kind=load_kind(kind),
-            asked=load_kind(kind).asked(parameters),
+            requested=load_kind(kind).check_parameters(parameters),
             parent=parent,
             software=software,
             seed=check_seed(seed),
             threads=check_threads(threads),
-            settle=settle,
+            choose_kind=choose_kind,
             queries=queries,
         )
         json_of(job.about, "about")
         if odd := [key for key, value in fingerprint.items() if not isinstance(key, str) or not isinstance(value, str)]:
             raise RowError(f"the fingerprint must map text to text; {odd[0]!r} does not")
         for what, number in (("self_check", self_check), ("keep", keep)):
-            if not is_whole(number, 0, MOST):
+            if not is_whole(number, 0, MAX_COUNT):
                 raise ParameterError(f"{what} must be a whole number of at least 0; got {number!r}")
-        self._require_ours()
+        self._require_index_folder()
         try:
             with self._lock:
                 self._sweep()
@@ -187,7 +187,7 @@ class IndexStore:
             where = error.filename or self.path
             raise WriteFailed(f"{where}: the disk refused ({error.strerror or error}); write again") from error
 
-    def _require_ours(self) -> None:
+    def _require_index_folder(self) -> None:
         """A file called CURRENT in a folder without a generation is not of an index, and would be replaced."""
         path = self.path / "CURRENT"
         try:
@@ -198,7 +198,9 @@ class IndexStore:
         except OSError as error:
             raise NoIndex(f"{path} cannot be read ({error.strerror}); give another folder for the index") from error
 
-    def _publish(self, name: str, blocks: Iterable[Block | range], job: Job, self_check: int, keep: int) -> Generation:
+    def _publish(
+        self, name: str, blocks: Iterable[Block | range], job: WriteJob, self_check: int, keep: int
+    ) -> Generation:
         folder = self.path / f"{name}.tmp-{getpid()}"
         try:
             folder.mkdir()
@@ -240,7 +242,7 @@ class IndexStore:
 
     def _sweep(self) -> None:
         """Delete what killed writers left, and nothing else."""
-        for path in [path for path in self.path.iterdir() if LEFT.fullmatch(path.name)]:
+        for path in [path for path in self.path.iterdir() if UNFINISHED_FOLDER.fullmatch(path.name)]:
             if path.is_dir() and not path.is_symlink():
                 files.remove_folder(path)
 

@@ -19,10 +19,10 @@ from indexes.errors import (
     SelfRetrievalFailed,
     UnsupportedFormat,
 )
-from indexes.kinds.base import VectorIndex
 from indexes.kinds.checks import NORM_TOLERANCE, check_k, row_norms
-from indexes.kinds.scores import Floats, Mask, Slots, grid_scores, on_grid
-from indexes.store.arrays import mapped
+from indexes.kinds.scores import Floats, Mask, Slots, grid_scores, to_grid
+from indexes.kinds.vector_index import VectorIndex
+from indexes.store.arrays import open_array
 from indexes.store.manifest import Manifest, check_files, read_manifest
 from indexes.store.rows import RECORD, Rows, are_distinct, keys_of
 
@@ -30,8 +30,8 @@ ROWS, TABLE, EMBEDDINGS, STRUCTURE = "rows.jsonl", "table.npy", "embeddings.npy"
 DOCUMENT_BYTES, DOCUMENT_BYTES_PER_ROW = 2**18, 2**12
 """Of the JSON of a document: of any, and for each row or touch that it may speak of."""
 SHOWN_IDS = 5
-CHECKED = 1000
-FEWER_OLD = 16
+MAX_CHECKED_RESULTS = 1000
+OLD_SAMPLE_DIVISOR = 16
 """How many times fewer rows are checked where a parent's rows were."""
 
 
@@ -93,7 +93,7 @@ class Generation:
 
     def require(self, expect: Mapping[str, str]) -> None:
         """Check that the fingerprint has these values. Raises `MismatchedIndex` naming what differs."""
-        require_made_by(self.folder.parent, self.fingerprint, expect)
+        check_fingerprint(self.folder.parent, self.fingerprint, expect)
 
     def row_number(self, row_id: str) -> int:
         """The number of the row with that id; KeyError where there is none."""
@@ -124,19 +124,21 @@ class Generation:
 
     def candidates(self, queries: Floats, k: int) -> list[Slots]:
         """For each unit query (Q, d) the rows (n,) of the best k slots, in no order: those of `search`, but for slots
-        that tie for the last place, and of an approximate kind perhaps more."""
+        that tie for the last place, and of an approximate kind perhaps more.
+        """
         return [self._rows_of(slots)[1] for slots in self.index.candidates(queries, k, self._live)]
 
-    def matching(self, ids: NDArray[np.bytes_], digests: NDArray[np.bytes_]) -> Slots:
+    def match_rows(self, ids: NDArray[np.bytes_], digests: NDArray[np.bytes_]) -> Slots:
         """For the keys of each id and digest (`indexes.store.rows.keys_of`) the row (n,) that has both; -1 where there
-        is none, or no digest."""
+        is none, or no digest.
+        """
         numbers = self.rows.by_id.find(ids)
         same = (digests != b"") & (digests == self.rows.by_digest.keys[numbers])
         return np.where((numbers >= 0) & same, numbers, -1)
 
     def reusable(self, wanted: Mapping[str, str | None]) -> dict[str, int]:
         """Of the wanted {id: digest}, those that this generation holds with that digest: {id: row number}."""
-        numbers = self.matching(keys_of(wanted), keys_of(wanted.values())).tolist()
+        numbers = self.match_rows(keys_of(wanted), keys_of(wanted.values())).tolist()
         return {row_id: number for row_id, number in zip(wanted, numbers, strict=True) if number >= 0}
 
     def self_check(self, sample: int = 256, seed: int = 0, *, since: int = 0) -> None:
@@ -150,10 +152,10 @@ class Generation:
         """
         mixed = np.random.default_rng(seed).permutation(self.count)
         new = self.slots[mixed] >= since
-        drawn = np.concatenate([mixed[new][:sample], mixed[~new][: sample // FEWER_OLD]])
+        drawn = np.concatenate([mixed[new][:sample], mixed[~new][: sample // OLD_SAMPLE_DIVISOR]])
         searched = len(drawn)
-        for k in sorted({1, max(1, min(CHECKED, self.count // 100))}):
-            drawn = self._lost(drawn, k)
+        for k in sorted({1, max(1, min(MAX_CHECKED_RESULTS, self.count // 100))}):
+            drawn = self._rows_not_found(drawn, k)
         lost = sorted(self.rows.ids(drawn))
         if lost:
             shown = ", ".join(lost[:SHOWN_IDS]) + (", ..." if len(lost) > SHOWN_IDS else "")
@@ -163,13 +165,13 @@ class Generation:
                 lost,
             )
 
-    def _lost(self, numbers: Slots, k: int) -> Slots:
+    def _rows_not_found(self, numbers: Slots, k: int) -> Slots:
         """Those of the rows for whose vectors a search for k slots puts a worse one first."""
         if not len(numbers):
             return numbers
         own = np.ascontiguousarray(self.embeddings[self.slots[numbers]])
         top = self.index.search(own, k, self._live)[0][:, 0]
-        must = np.array([grid_scores(vector, vector[None])[0] for vector in on_grid(own)])
+        must = np.array([grid_scores(vector, vector[None])[0] for vector in to_grid(own)])
         return numbers[top < must]
 
     def _best_rows(self, query: Floats, scores: Floats, slots: Slots, k: int) -> tuple[Slots, Floats]:
@@ -180,8 +182,8 @@ class Generation:
             found_scores, found = self.index.search(query[None], wanted + 1, self._live)
             scores, slots = found_scores[0], found[0]
         if wanted == k:
-            return self._expanded(scores[:k], slots[:k])
-        rows, spread = self._expanded(scores, slots)
+            return self._rows_and_scores(scores[:k], slots[:k])
+        rows, spread = self._rows_and_scores(scores, slots)
         _, first = np.unique(self.slots[rows], return_index=True)
         stay = np.isin(self.slots[rows], self.slots[rows[np.sort(first)[:k]]])
         return rows[stay], spread[stay]
@@ -192,7 +194,7 @@ class Generation:
         inside = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         return counts, self._by_slot[np.repeat(self._starts[slots], counts) + inside]
 
-    def _expanded(self, scores: Floats, slots: Slots) -> tuple[Slots, Floats]:
+    def _rows_and_scores(self, scores: Floats, slots: Slots) -> tuple[Slots, Floats]:
         """All rows of slots in the order of their scores, and their scores; equal scores in the order of ids."""
         counts, rows = self._rows_of(slots)
         spread = np.repeat(scores, counts)
@@ -205,7 +207,7 @@ class Generation:
         return rows, spread
 
 
-def require_made_by(where: str | Path, fingerprint: Mapping[str, str], expect: Mapping[str, str]) -> None:
+def check_fingerprint(where: str | Path, fingerprint: Mapping[str, str], expect: Mapping[str, str]) -> None:
     """Check that a fingerprint has these values. Raises `MismatchedIndex` naming what differs."""
     for key, value in expect.items():
         got = fingerprint.get(key)
@@ -224,9 +226,11 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
     try:
         rows, arrays, embeddings = _tables(folder, manifest)
         files, names = manifest.files, manifest.documents
-        documents: dict[str, Any] = {name: mapped(folder / f"{name}.npy") for name in names if f"{name}.npy" in files}
-        most = max_document_bytes(manifest.counts.rows, documents.values())
-        documents |= {name: read_json(folder / f"{name}.json", most) for name in names if name not in documents}
+        documents: dict[str, Any] = {
+            name: open_array(folder / f"{name}.npy") for name in names if f"{name}.npy" in files
+        }
+        max_bytes = max_document_bytes(manifest.counts.rows, documents.values())
+        documents |= {name: read_json(folder / f"{name}.json", max_bytes) for name in names if name not in documents}
         counts, slots = manifest.counts, rows.table["slot"]
         if slots.min() < 0 or slots.max() >= counts.slots:
             raise CorruptIndex(f"{folder}: slots must be below {counts.slots}, are not; {AGAIN}")
@@ -268,8 +272,8 @@ def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[A
     if lacking := sorted(files - set(manifest.files)):
         raise CorruptIndex(f"{folder}: the manifest must list {lacking[0]}, and does not; {AGAIN}")
     # Plain arrays over the mapped files: taking one record out of a `np.memmap` costs several times more.
-    text, table = np.asarray(np.memmap(folder / ROWS, np.uint8, "r")), np.asarray(mapped(folder / TABLE))
-    arrays = {name: mapped(folder / f"{name}.npy") for name in manifest.arrays}
+    text, table = np.asarray(np.memmap(folder / ROWS, np.uint8, "r")), np.asarray(open_array(folder / TABLE))
+    arrays = {name: open_array(folder / f"{name}.npy") for name in manifest.arrays}
     must = {"fields": RECORD} | dict.fromkeys(arrays, len(table))
     got = {"fields": table.dtype} | {name: len(array) for name, array in arrays.items()}
     if got != must:
@@ -277,4 +281,4 @@ def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[A
     stops = table["stop"]
     if not (np.diff(stops, prepend=0) > 0).all() or stops[-1] != len(text):
         raise CorruptIndex(f"{folder}: the lines of {ROWS} must make up its text, and do not; {AGAIN}")
-    return Rows(text, table), arrays, mapped(folder / EMBEDDINGS)
+    return Rows(text, table), arrays, open_array(folder / EMBEDDINGS)

@@ -39,7 +39,7 @@ class WriterLock:
 
     def _take(self) -> int:
         try:
-            descriptor = _opened(self.path)
+            descriptor = _open_lock_file(self.path)
         except OSError as error:
             raise WriteFailed(f"{self.path}: the lock file cannot be opened; {error.strerror}") from error
         try:
@@ -68,16 +68,16 @@ class WriterLock:
         return descriptor
 
 
-def _opened(path: Path) -> int:
+def _open_lock_file(path: Path) -> int:
     """A lock file, made where there is none; a link is refused, and a pipe blocks nobody. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
 
 
 @contextmanager
-def one_at_a_time(path: Path) -> Iterator[None]:
+def exclusive_lock(path: Path) -> Iterator[None]:
     """The block runs when no other one does that was given the same lock file, in whatever process. Raises OSError."""
-    descriptor = _opened(path)
+    descriptor = _open_lock_file(path)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         yield

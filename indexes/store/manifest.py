@@ -11,10 +11,10 @@ from typing import Annotated, Any, TypeVar
 from msgspec import Meta
 
 from _touch_retrieval.documents import typed
-from _touch_retrieval.files import durable, encoded, file_digest, open_regular, read_json
+from _touch_retrieval.files import durable_file, encoded, file_digest, open_regular, read_json
 from indexes.errors import AGAIN, CorruptIndex, RowError, UnsupportedFormat
 
-FORMAT = 4
+FORMAT = 5
 NAME = "manifest.json"
 MAX_BYTES = 4 * 2**20
 """Of a manifest: of 4096 shards with their names and digests it has 1 MiB."""
@@ -36,7 +36,7 @@ class Counts:
 
 
 @dataclass(frozen=True)
-class FileSeal:
+class FileChecksum:
     """Size and SHA-256 of a file."""
 
     bytes: int
@@ -45,7 +45,7 @@ class FileSeal:
 
 @dataclass(frozen=True)
 class Manifest:
-    """The fields of the file, in its order. `asked` are the parameters before None was filled in."""
+    """The fields of the file, in its order. `requested` are the parameters before None was filled in."""
 
     generation: str
     parent: str | None
@@ -57,21 +57,21 @@ class Manifest:
     metric: str
     kind: str
     parameters: dict[str, Any]
-    asked: dict[str, Any]
+    requested: dict[str, Any]
     seed: int
     recall: dict[str, Any]
     counts: Counts
     arrays: list[Word]
     documents: list[Word]
-    files: dict[FileName, FileSeal]
+    files: dict[FileName, FileChecksum]
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Write the file, with a digest of its own content at the end."""
-    text = document_of(manifest, FORMAT)
+    text = encode_document(manifest, FORMAT)
     if len(text) > MAX_BYTES:
         raise RowError(f"a manifest must have at most {MAX_BYTES} bytes, has {len(text)}; shorten `about`")
-    with durable(folder / NAME) as handle:
+    with durable_file(folder / NAME) as handle:
         handle.write(text)
 
 
@@ -84,14 +84,14 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
-def document_of(content: Any, version: int) -> bytes:
+def encode_document(content: Any, version: int) -> bytes:
     """Return the JSON of a dataclass, with its format's version first and the digest of all that last."""
     document = {"format": version} | asdict(content)
-    return encoded(document | {"sha256": own_digest(document)}, indent=2) + b"\n"
+    return encoded(document | {"sha256": content_digest(document)}, indent=2) + b"\n"
 
 
 def read_document(path: Path, version: int, kind: type[T]) -> T:
-    """Return what `document_of` wrote of a dataclass. Raises `CorruptIndex` or `UnsupportedFormat`."""
+    """Return what `encode_document` wrote of a dataclass. Raises `CorruptIndex` or `UnsupportedFormat`."""
     try:
         content = read_json(path, MAX_BYTES)
     except OSError as error:
@@ -106,7 +106,7 @@ def read_document(path: Path, version: int, kind: type[T]) -> T:
     if found != version:
         age, remedy = ("newer", f"update the software, or {AGAIN}") if found > version else ("older", AGAIN)
         raise UnsupportedFormat(f"{path}: has the {age} format {found}, this software reads {version}; {remedy}")
-    if content.pop("sha256", None) != own_digest(content):
+    if content.pop("sha256", None) != content_digest(content):
         raise CorruptIndex(f"{path}: the content does not fit its own SHA-256, it was altered; {AGAIN}")
     del content["format"]
     try:  # all of it: software that alters the file can write the digest that fits
@@ -115,9 +115,9 @@ def read_document(path: Path, version: int, kind: type[T]) -> T:
         raise CorruptIndex(f"{path}: the file was altered ({error}); {AGAIN}") from error
 
 
-def sealed(folder: Path) -> dict[str, FileSeal]:
+def file_checksums(folder: Path) -> dict[str, FileChecksum]:
     """Return size and SHA-256 of every file in the folder."""
-    return {path.name: FileSeal(path.stat().st_size, file_digest(path)) for path in sorted(folder.iterdir())}
+    return {path.name: FileChecksum(path.stat().st_size, file_digest(path)) for path in sorted(folder.iterdir())}
 
 
 def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
@@ -135,6 +135,6 @@ def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
             raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
 
 
-def own_digest(content: Mapping[str, Any]) -> str:
+def content_digest(content: Mapping[str, Any]) -> str:
     """What a document says of itself under "sha256": the digest of all else in it."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -23,7 +23,7 @@ KEYS = ("id", "digest", "object_id")
 RECORD = np.dtype([("slot", "<i8"), ("stop", "<i8"), *((name, "S16") for name in KEYS)])
 """What the table holds of a row: its slot, where its line ends in the text (and the next one begins), and its keys."""
 
-FEW = 8
+MAX_LINEAR_KEYS = 8
 """Keys that are looked for one by one: sorting all, to find many of them, takes as long."""
 
 MAX_LINE_BYTES = 2**20
@@ -69,7 +69,7 @@ class KeyIndex:
         return np.concatenate([np.arange(head), self._search(between), np.arange(last, len(self.keys))])
 
     def _search(self, wanted: NDArray[np.bytes_]) -> Slots:
-        if len(wanted) <= FEW:
+        if len(wanted) <= MAX_LINEAR_KEYS:
             return np.array([self._first(key) for key in wanted], np.int64)
         order, ranked = self._sorted
         beginnings = _beginnings(wanted)
@@ -85,7 +85,8 @@ class KeyIndex:
     @cached_property
     def _sorted(self) -> tuple[Slots, NDArray[np.uint64]]:
         """The order (N,) in which the beginnings of the keys grow, and these (N,): numbers are sorted and searched in
-        a tenth of the time of bytes."""
+        a tenth of the time of bytes.
+        """
         beginnings = _beginnings(self.keys)
         order = np.argsort(beginnings, kind="stable")
         return order, beginnings[order]
@@ -128,7 +129,7 @@ class Rows(Sequence[dict[str, Any]]):
 
     def __getitem__(self, index: int | slice) -> dict[str, Any] | list[dict[str, Any]]:
         numbers = range(len(self))[index]
-        return self._parsed(numbers) if isinstance(numbers, int) else [self._parsed(number) for number in numbers]
+        return self._parse_row(numbers) if isinstance(numbers, int) else [self._parse_row(number) for number in numbers]
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Sequence):
@@ -145,7 +146,7 @@ class Rows(Sequence[dict[str, Any]]):
         """The JSON of a row as it was written, without the end of its line."""
         return self.text[self.start(number) : int(self.table["stop"][number]) - 1].tobytes()
 
-    def ending(self, text: bytes) -> NDArray[np.bool_]:
+    def lines_end_with(self, text: bytes) -> NDArray[np.bool_]:
         """Whether each row's line (N,), without the end of the line, ends with this text; nothing is parsed."""
         stops = self.table["stop"] - 1
         same: NDArray[np.bool_] = np.diff(stops, prepend=-1) > len(text)
@@ -175,7 +176,7 @@ class Rows(Sequence[dict[str, Any]]):
         """Finds rows by the keys of their contents' digests."""
         return KeyIndex(self.keys("digest"))
 
-    def _parsed(self, number: int) -> dict[str, Any]:
+    def _parse_row(self, number: int) -> dict[str, Any]:
         line = self.line(number)
         if len(line) >= MAX_LINE_BYTES:
             raise CorruptIndex(f"row {number} of the index must have {MAX_LINE_BYTES} bytes or less; {AGAIN}")
@@ -198,7 +199,7 @@ def json_of(document: Any, what: str, row: str | None = None, checked: bytes = b
         if text == checked:
             return text
         if files.is_deep(document):
-            raise RowError(f"{what} must not be nested deeper than {files.DEEPEST} levels", row)
+            raise RowError(f"{what} must not be nested deeper than {files.MAX_DEPTH} levels", row)
         same = json.loads(text) == document
     except (ValueError, TypeError) as error:
         raise RowError(f"{what} must be JSON of finite numbers; {error}", row) from error

@@ -24,7 +24,7 @@ from _touch_retrieval import files
 from indexes.store.rows import KeyIndex
 
 FILES, FOLDERS = "files.stat", "folders.stat"
-SETTLED_NS = 2 * 10**9
+MIN_AGE_NS = 2 * 10**9
 """An entry must have been left alone for so long: the coarsest clock of a common disk, FAT's, ticks every two
 seconds."""
 STATUS = ("bytes", "mtime_ns", "ctime_ns", "inode")
@@ -47,7 +47,8 @@ class StatRecords:
 
     def digests(self, ids: Keys, statuses: Statuses) -> Keys:
         """For each file, by its row's id and its status (N, 4), the key of its content's digest; b"" where the status
-        is another one than it was, or unknown."""
+        is another one than it was, or unknown.
+        """
         found = np.zeros(len(ids), "S16")
         if len(self.records):
             number = KeyIndex(np.ascontiguousarray(self.records["id"])).find(ids)
@@ -71,7 +72,7 @@ class FolderCache:
     """
 
     def __init__(self, index: Path, known: bool = True) -> None:
-        self._path, self._settled = index / FOLDERS, time.time_ns() - SETTLED_NS
+        self._path, self._settled = index / FOLDERS, time.time_ns() - MIN_AGE_NS
         try:
             self._before = msgspec.msgpack.decode(_read(self._path), type=dict[str, tuple[FolderStatus, str]])
         except msgspec.DecodeError:
@@ -97,7 +98,8 @@ class FolderCache:
 
     def note(self, path: str, status: FolderStatus | None, names: Sequence[str]) -> None:
         """Keep the names in a folder, which are neither folders nor links, and valid UTF-8. A folder that has changed
-        just now may do so again within a tick of its clock, and gets no entry."""
+        just now may do so again within a tick of its clock, and gets no entry.
+        """
         if sys.platform == "linux" and status is not None:
             if os.major(status[3]) and max(status[:2]) < self._settled:
                 self._now[path] = status, "/".join(names)

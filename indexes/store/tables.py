@@ -15,12 +15,12 @@ from _touch_retrieval.files import finish
 from indexes.errors import MismatchedIndex, RowError, VectorError
 from indexes.kinds.checks import BLOCK_ROWS, check_unit
 from indexes.kinds.scores import Floats, Slots
-from indexes.store.arrays import ArrayFile, mapped, write_array
-from indexes.store.equal import first_of_equals
+from indexes.store.arrays import ArrayFile, open_array, write_array
+from indexes.store.equal import first_equal_rows
 from indexes.store.generation import EMBEDDINGS, ROWS, TABLE, Generation
 from indexes.store.rows import KEYS, MAX_LINE_BYTES, RECORD, are_distinct, json_of, keys_of
 
-MOST_TOMBSTONES = 0.10
+MAX_TOMBSTONE_FRACTION = 0.10
 """Share of slots without a row beyond which slots are numbered anew, and a structure over them is built anew."""
 
 RESERVED = {"rows", "table", "embeddings", "vectors", "manifest"}
@@ -56,7 +56,7 @@ class Tables:
 
 
 class TableWriter:
-    """Takes blocks with `add` and the parent's rows with `keep`, writes them to files in `folder`, and maps what was
+    """Takes blocks with `add` and the parent's rows with `add_parent_rows`, writes them to files in `folder`, and maps what was
     written with `close`.
 
     What comes is written once and in order. Embeddings are the parent's, then the new ones; where some of these are
@@ -93,7 +93,7 @@ class TableWriter:
             raise RowError(f"every row needs a text id; row {ids.index(odd[0])} has {odd[0]!r}")
         numbers = np.full(len(ids), -1)  # of the parent's rows, to take vectors and arrays from
         if self.parent is not None:
-            numbers = self.parent.matching(keys_of(ids), keys_of(row.get("digest") for row in block.rows))
+            numbers = self.parent.match_rows(keys_of(ids), keys_of(row.get("digest") for row in block.rows))
         known = numbers >= 0
         if self.parent is not None and known.any():
             self._require_fit(self.parent)
@@ -113,9 +113,10 @@ class TableWriter:
         self._add_arrays(block.arrays, numbers, fresh_ids)
         self._add_lines(block.rows, ids, numbers, records)
 
-    def keep(self, numbers: range) -> None:
+    def add_parent_rows(self, numbers: range) -> None:
         """Take the parent's rows of these numbers (a step of 1) next, as they are. Raises `RowError` without a parent,
-        or `MismatchedIndex`."""
+        or `MismatchedIndex`.
+        """
         parent = self.parent
         if parent is None or not numbers:
             raise RowError("rows can be kept of a parent alone, and one at least")
@@ -141,10 +142,10 @@ class TableWriter:
         self._check_distinct(table)
         renumbered = self._number_slots(table)
         write_array(self.folder / TABLE, RECORD, (), [table])
-        arrays = {name: mapped(file.path) for name, file in (self._arrays or {}).items()}
+        arrays = {name: open_array(file.path) for name, file in (self._arrays or {}).items()}
         parent = self.parent if self._used else None
         slots, objects = (np.ascontiguousarray(table[name]) for name in ("slot", "object_id"))
-        return Tables(mapped(self._vectors.path), slots, objects, arrays, parent, renumbered)
+        return Tables(open_array(self._vectors.path), slots, objects, arrays, parent, renumbered)
 
     def _array_files(self) -> list[ArrayFile]:
         return [*([self._vectors] if self._vectors else ()), *(self._arrays or {}).values()]
@@ -228,20 +229,20 @@ class TableWriter:
     def _number_slots(self, table: NDArray[Any]) -> bool:
         """Give equal vectors one slot, in the table and in the file; whether the parent's slots have other numbers.
 
-        The parent's slots stay, without rows too, until these are `MOST_TOMBSTONES` of all: a structure cannot forget.
+        The parent's slots stay, without rows too, until these are `MAX_TOMBSTONE_FRACTION` of all: a structure cannot forget.
         Slots that are numbered anew are in the order of the rows.
         """
         if self._vectors is None:
             return False
-        vectors = mapped(self._vectors.path)
-        slots = first_of_equals(vectors)[table["slot"]]
+        vectors = open_array(self._vectors.path)
+        slots = first_equal_rows(vectors)[table["slot"]]
         stay = np.zeros(len(vectors), bool)
         stay[slots] = True
         used = np.count_nonzero(stay)
         if self.parent is not None and self._fits:
             stay[: len(self.parent.embeddings)] = True
         slots_kept = np.flatnonzero(stay)
-        renumbered = not self._used or len(slots_kept) - int(used) > MOST_TOMBSTONES * len(slots_kept)
+        renumbered = not self._used or len(slots_kept) - int(used) > MAX_TOMBSTONE_FRACTION * len(slots_kept)
         if renumbered:
             distinct, first = np.unique(slots, return_index=True)
             slots_kept = distinct[np.argsort(first)]

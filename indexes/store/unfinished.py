@@ -28,7 +28,7 @@ _TABLE = """CREATE TABLE IF NOT EXISTS records (
     maker TEXT, digest TEXT, arrays BLOB, checksum INTEGER, PRIMARY KEY (maker, digest)) WITHOUT ROWID"""
 
 
-class Unfinished:
+class UnfinishedBuild:
     """Records by digest, in the folder `index`; use it under the index's lock. Threads may share it.
 
     layouts: name of an array -> dtype and shape of one record's, as in `indexes.store.tables`.
@@ -60,7 +60,8 @@ class Unfinished:
 
     def find(self, digests: Iterable[str]) -> dict[str, Any]:
         """Of these digests, those of which an earlier build left a whole record: {digest: record}, which gives its
-        arrays by their names."""
+        arrays by their names.
+        """
         if self._connection is None:
             return {}
         found = {}
@@ -73,7 +74,7 @@ class Unfinished:
                 found[digest] = np.frombuffer(row[0], self._record)[0]
         return found
 
-    def keep(self, digests: Sequence[str], arrays: Mapping[str, NDArray[Any]]) -> None:
+    def add(self, digests: Sequence[str], arrays: Mapping[str, NDArray[Any]]) -> None:
         """Write records of these digests: arrays (n, ...) by name. Those that are not finite are left out.
 
         Raises `WriteFailed` where the disk refuses.

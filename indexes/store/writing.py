@@ -11,12 +11,12 @@ import numpy as np
 from _touch_retrieval import files
 from indexes import load_kind
 from indexes.errors import RowError
-from indexes.kinds.base import Parameters, VectorIndex
 from indexes.kinds.measure import recall_against_exact, sample_queries
 from indexes.kinds.scores import Floats
+from indexes.kinds.vector_index import Parameters, VectorIndex
 from indexes.store.arrays import write_array
 from indexes.store.generation import STRUCTURE, Generation, max_document_bytes
-from indexes.store.manifest import Counts, Manifest, sealed, write_manifest
+from indexes.store.manifest import Counts, Manifest, file_checksums, write_manifest
 from indexes.store.rows import json_of
 from indexes.store.tables import Block, Tables, TableWriter
 
@@ -25,7 +25,7 @@ RECALL_QUERIES = 100
 
 
 @dataclass(frozen=True)
-class Chosen:
+class KindChoice:
     """A kind, its parameters, and what the manifest shall say of the choice."""
 
     kind: str
@@ -33,34 +33,35 @@ class Chosen:
     about: Mapping[str, Any]
 
 
-Settle = Callable[[Tables], Chosen]
+KindChooser = Callable[[Tables], KindChoice]
 """Chooses the kind of an index by what it will hold."""
 
 
 @dataclass(frozen=True)
-class Job:
+class WriteJob:
     """What a generation is to be, but for its rows; see `indexes.store.folder.IndexStore.write_blocks`."""
 
     documents: dict[str, Any]
     fingerprint: dict[str, str]
     about: dict[str, Any]
     kind: type[VectorIndex]
-    asked: Parameters
+    requested: Parameters
     parent: Generation | None
     software: str
     seed: int
     threads: int | None
-    settle: Settle | None = None
+    choose_kind: KindChooser | None = None
     queries: Floats | None = None
 
 
-def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], job: Job) -> int:
+def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], job: WriteJob) -> int:
     """Fill the empty `folder` with the generation of that name. Returns how many slots, the first ones, are the
-    parent's in the parent's structure."""
+    parent's in the parent's structure.
+    """
     with TableWriter(folder, job.parent, job.fingerprint) as writer:
         for block in blocks:
             if isinstance(block, range):
-                writer.keep(block)
+                writer.add_parent_rows(block)
             else:
                 writer.add(block)
         tables = writer.close()
@@ -68,22 +69,24 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
     if clash:
         raise RowError(f"an array and a document cannot share a name; got {', '.join(clash)}")
     arrays = {document: content for document, content in job.documents.items() if isinstance(content, np.ndarray)}
-    most = max_document_bytes(len(tables.slots), arrays.values())
+    max_bytes = max_document_bytes(len(tables.slots), arrays.values())
     for document, content in job.documents.items():
         if document in arrays:
             write_array(folder / f"{document}.npy", content.dtype, content.shape[1:], [content])
             continue
         text = files.encoded(content, indent=2) + b"\n"
-        if len(text) > most:
-            raise RowError(f"document {document!r} must have at most {most} bytes of JSON, has {len(text)}")
-        with files.durable(folder / f"{document}.json") as handle:
+        if len(text) > max_bytes:
+            raise RowError(f"document {document!r} must have at most {max_bytes} bytes of JSON, has {len(text)}")
+        with files.durable_file(folder / f"{document}.json") as handle:
             handle.write(text)
-    if job.settle is not None:
-        chosen = job.settle(tables)
+    if job.choose_kind is not None:
+        chosen = job.choose_kind(tables)
         kind = load_kind(chosen.kind)
         json_of(dict(chosen.about), "about")
-        job = replace(job, kind=kind, asked=kind.asked(chosen.parameters), about={**job.about, **chosen.about})
-    index, built_slots, kept = _index(tables, job)
+        job = replace(
+            job, kind=kind, requested=kind.check_parameters(chosen.parameters), about={**job.about, **chosen.about}
+        )
+    index, built_slots, kept = _build_or_grow(tables, job)
     if index.save(folder / STRUCTURE):
         files.sync(folder / STRUCTURE)
     slots = len(tables.vectors)
@@ -99,40 +102,45 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
         metric="inner_product",
         kind=index.kind,
         parameters=index.settings(),
-        asked=asdict(job.asked),
+        requested=asdict(job.requested),
         seed=job.seed,
         recall=_recall(index, job),
         counts=Counts(len(tables.slots), slots, tombstones, built_slots),
         arrays=sorted(tables.arrays),
         documents=sorted(job.documents),
-        files=sealed(folder),
+        files=file_checksums(folder),
     )
     write_manifest(folder, manifest)
     files.sync(folder)
     return kept
 
 
-def _index(tables: Tables, job: Job) -> tuple[VectorIndex, int, int]:
+def _build_or_grow(tables: Tables, job: WriteJob) -> tuple[VectorIndex, int, int]:
     """The index over the vectors, how many there were when its structure was trained, and how many the parent had in
-    it."""
+    it.
+    """
     vectors, parent = tables.vectors, tables.parent
-    if parent is None or tables.renumbered or not _serves(parent, len(vectors), job):
-        return job.kind.over(vectors, job.asked, seed=job.seed, threads=job.threads), len(vectors), 0
+    if parent is None or tables.renumbered or not _can_reuse_structure(parent, len(vectors), job):
+        return job.kind.build_checked(vectors, job.requested, seed=job.seed, threads=job.threads), len(vectors), 0
     index = parent.index.copy()
     index.threads = job.threads
     index.grow(vectors)
     return index, parent.manifest.counts.built_slots, len(parent.embeddings)
 
 
-def _serves(parent: Generation, slots: int, job: Job) -> bool:
+def _can_reuse_structure(parent: Generation, slots: int, job: WriteJob) -> bool:
     """Whether the parent's structure can be kept for that many slots."""
     manifest, kind = parent.manifest, job.kind
-    if manifest.kind != kind.kind or kind.parameters_from(manifest.asked) != job.asked or manifest.seed != job.seed:
+    if (
+        manifest.kind != kind.kind
+        or kind.parameters_from(manifest.requested) != job.requested
+        or manifest.seed != job.seed
+    ):
         return False
     return kind.retrain_growth is None or slots <= kind.retrain_growth * manifest.counts.built_slots
 
 
-def _recall(index: VectorIndex, job: Job) -> dict[str, Any]:
+def _recall(index: VectorIndex, job: WriteJob) -> dict[str, Any]:
     if index.exact:
         return {"value": 1.0, "at": RECALL_AT, "queries": 0, "how": "exact by construction"}
     queries = sample_queries(index.vectors, RECALL_QUERIES, seed=job.seed) if job.queries is None else job.queries

@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from _touch_retrieval.files import write_atomically
-from retrieval.adaptation.folds import Fold, draw_folds, first_guesses, measure
-from retrieval.adaptation.material import Material
-from retrieval.adaptation.start import AsItIs
-from retrieval.console.files import MARKED
+from retrieval.adaptation.baseline import UnadaptedBaseline
+from retrieval.adaptation.data import AdaptationData
+from retrieval.adaptation.folds import Fold, draw_folds, fold_accuracy, measure
+from retrieval.console.files import GENERATOR_COMMENT
 from retrieval.console.progress import Bar
-from retrieval.methods.cca_towers import Blocks, CcaSettings, fit_codes
+from retrieval.methods.cca_towers import CcaSettings, TowerWidths, fit_projections
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import one_thread
-from retrieval.model.towers.side_by_side import SideBySide, widths_of
-from retrieval.report.canvas import FAINT, Figure, canvas, draw, percent_axis
+from retrieval.model.towers.concatenated import ConcatenatedTowers, feature_counts_of
+from retrieval.report.canvas import MUTED_COLOUR, Figure, canvas, draw, percent_axis
 from retrieval.training.features import Features
 from retrieval.version import __version__
 
@@ -28,8 +28,8 @@ OBJECTS, TOUCHES = (5, 10, 20, 1000), (5, 20, 100)
 """What is tried: so many own objects, of which all outside the fold at most, and so many touches of each."""
 SETTINGS = CcaSettings()
 """Of every fit on the curve: few objects leave none to choose by."""
-BOTH, TAUGHT, PUBLISHED = "adapted", "towers of the model alone", "published towers alone"
-BLURRED, AS_IT_IS = "adapted, touches blurred", "the model as it is"
+ADAPTED, START_TOWERS, PUBLISHED_TOWERS = "adapted", "towers of the model alone", "published towers alone"
+LOW_PASS, UNADAPTED = "adapted, touches blurred", "the model as it is"
 COLOURS = ("#9ecae1", "#56b4e9", "#0072b2", "#08306b")
 
 
@@ -37,21 +37,22 @@ Interval = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Point:
+class CurvePoint:
     """One place on the curve: a fit on so many touches of each of so many objects, and its first guesses and pair
-    accuracy on those left out, each with the ends of its interval by object."""
+    accuracy on those left out, each with the ends of its interval by object.
+    """
 
-    what: str
+    label: str
     objects: int
     touches: int
-    first: Interval
-    pairs: Interval
+    top1: Interval
+    pair_accuracy: Interval
     chance: float
 
     @classmethod
-    def of(cls, what: str, objects: int, touches: int, first: Measure, pairs: Measure) -> "Point":
+    def of(cls, label: str, objects: int, touches: int, top1: Measure, pair_accuracy: Measure) -> "CurvePoint":
         """A place on the curve, from measures over the objects left out."""
-        return cls(what, objects, touches, interval_of(first), interval_of(pairs), float(first.chance[0]))
+        return cls(label, objects, touches, interval_of(top1), interval_of(pair_accuracy), float(top1.chance[0]))
 
 
 def interval_of(measure: Measure) -> Interval:
@@ -62,39 +63,46 @@ def interval_of(measure: Measure) -> Interval:
 
 @one_thread()
 def learning_curve(
-    material: Material, start: Checkpoint, *, cache: Path | None = None, seed: int = 0, quiet: bool = False
-) -> list[Point]:
+    data: AdaptationData, start: Checkpoint, *, cache: Path | None = None, seed: int = 0, quiet: bool = False
+) -> list[CurvePoint]:
     """Fits on fewer touches of fewer objects; beside them, with all that a fit here takes: the towers of each side
     alone, the blurred control, and the model that one started from, as it is.
 
     cache: where the features of that last one are kept. Raises BadInput for fewer than six objects.
     """
-    folds = draw_folds(material.grasps, seed)
-    features, blocks = material.features, material.blocks
+    folds = draw_folds(data.grasps, seed)
+    features, blocks = data.features, data.blocks
     most = min(len(set(features.object_ids)) - len(fold) for fold in folds)
     held = int(np.bincount(features.owner).min())
     objects, touches = (
         sorted({min(count, end) for count in counts}) for counts, end in ((OBJECTS, most), (TOUCHES, held))
     )
-    tried = [(BOTH, features, blocks, count, each) for count in objects for each in touches]
-    tried.append((BLURRED, material.blurred, blocks, objects[-1], touches[-1]))
-    if isinstance(material.matcher.touch_tower, SideBySide):
-        for place, name in enumerate((TAUGHT, PUBLISHED)):
-            tried.append((name, *one_tower(material, place), objects[-1], touches[-1]))
-    known = AsItIs.of(start, material.grasps, cache, quiet).told(folds)
-    points = [Point.of(AS_IT_IS, 0, 0, measure(known, "first"), measure(known, "below"))]
+    tried = [(ADAPTED, features, blocks, count, each) for count in objects for each in touches]
+    tried.append((LOW_PASS, data.low_pass, blocks, objects[-1], touches[-1]))
+    if isinstance(data.matcher.touch_tower, ConcatenatedTowers):
+        for place, name in enumerate((START_TOWERS, PUBLISHED_TOWERS)):
+            tried.append((name, *one_tower(data, place), objects[-1], touches[-1]))
+    baseline = UnadaptedBaseline.of(start, data.grasps, cache, quiet).fold_accuracies(folds)
+    points = [CurvePoint.of(UNADAPTED, 0, 0, measure(baseline, "top1"), measure(baseline, "pair_accuracy"))]
     with Bar("learning curve", len(tried), "fits", quiet=quiet) as bar:
-        for what, shown, widths, count, each in tried:
-            points.append(_point(what, shown, widths, folds, count, each, seed))
+        for label, shown, widths, count, each in tried:
+            points.append(_point(label, shown, widths, folds, count, each, seed))
             bar.advance()
     return points
 
 
 def _point(
-    what: str, features: Features, blocks: Blocks, folds: Sequence[Sequence[str]], objects: int, touches: int, seed: int
-) -> Point:
+    label: str,
+    features: Features,
+    blocks: TowerWidths,
+    folds: Sequence[Sequence[str]],
+    objects: int,
+    touches: int,
+    seed: int,
+) -> CurvePoint:
     """A place on the curve: for every fold a fit on objects and touches drawn from those outside it, judged on the
-    fold."""
+    fold.
+    """
     rng = np.random.default_rng([seed, objects, touches])
     everyone = {name for fold in folds for name in fold}
     number_of = {name: number for number, name in enumerate(sorted(set(features.object_ids)))}
@@ -104,27 +112,27 @@ def _point(
         rows = [rng.permutation(np.flatnonzero(features.owner == number_of[name]))[:touches] for name in chosen]
         learned = features.select(np.sort(np.concatenate(rows)))
         touch = learned.touch.reshape(len(learned), -1)
-        codes = dict(fit_codes(touch, learned.photo, learned.owner, blocks, [SETTINGS]))[SETTINGS]
-        parts.append(first_guesses(Fold(features.of_objects(fold), codes, SETTINGS)))
-    return Point.of(what, objects, touches, measure(parts, "first"), measure(parts, "below"))
+        projections = dict(fit_projections(touch, learned.photo, learned.owner, blocks, [SETTINGS]))[SETTINGS]
+        parts.append(fold_accuracy(Fold(features.of_objects(fold), projections, SETTINGS)))
+    return CurvePoint.of(label, objects, touches, measure(parts, "top1"), measure(parts, "pair_accuracy"))
 
 
-def one_tower(material: Material, place: int) -> tuple[Features, Blocks]:
+def one_tower(data: AdaptationData, place: int) -> tuple[Features, TowerWidths]:
     """What one of the towers that stand side by side makes of the grasps alone."""
 
     def part(x: NDArray[np.float32], widths: Sequence[int], images: int) -> NDArray[np.float32]:
         its = np.split(x.reshape(len(x), images, -1), np.cumsum(widths)[:-1], axis=2)[place]
         return np.ascontiguousarray(its)
 
-    matcher, features = material.matcher, material.features
-    felt, seen = widths_of(matcher.touch_tower), widths_of(matcher.photo_tower)
+    matcher, features = data.matcher, data.features
+    felt, seen = feature_counts_of(matcher.touch_tower), feature_counts_of(matcher.photo_tower)
     fingers = matcher.config.fingers
     touch, photo = part(features.touch, felt, fingers), part(features.photo, seen, matcher.views)
     alone = replace(features, touch=touch, photo=photo.reshape(len(photo), -1))
     return alone, ([felt[place]] * fingers, [seen[place]] * matcher.views)
 
 
-def write_curve(folder: Path, points: Sequence[Point]) -> Path:
+def write_curve(folder: Path, points: Sequence[CurvePoint]) -> Path:
     """curve.json, curve.png and curve.md in `folder`; returns the last."""
     folder.mkdir(parents=True, exist_ok=True)
     document = {"software": __version__, "points": [asdict(point) for point in points]}
@@ -135,39 +143,39 @@ def write_curve(folder: Path, points: Sequence[Point]) -> Path:
     return path
 
 
-def _text(points: Sequence[Point]) -> Iterator[str]:
-    yield from (MARKED, "# How many touches of how many own objects?", "")
+def _text(points: Sequence[CurvePoint]) -> Iterator[str]:
+    yield from (GENERATOR_COMMENT, "# How many touches of how many own objects?", "")
     yield "First guess and pair accuracy of one touch on objects that were left out of the fit; intervals by object,"
     yield f"chance {points[0].chance:.3f} and .500.\n"
     yield "| what | objects | touches of each | first guess | pair accuracy |\n|---|---|---|---|---|"
     for point in points:
         yield (
-            f"| {point.what} | {point.objects} | {point.touches} | {{:.3f}} [{{:.3f}}, {{:.3f}}] ".format(*point.first)
-            + "| {:.3f} [{:.3f}, {:.3f}] |".format(*point.pairs)
+            f"| {point.label} | {point.objects} | {point.touches} | {{:.3f}} [{{:.3f}}, {{:.3f}}] ".format(*point.top1)
+            + "| {:.3f} [{:.3f}, {:.3f}] |".format(*point.pair_accuracy)
         )
     yield "\n![learning curve](curve.png)\n"
 
 
-def _figure(points: Sequence[Point]) -> Figure:
+def _figure(points: Sequence[CurvePoint]) -> Figure:
     figure = canvas(6.4, 3.8)
     panel = figure.add_subplot()
-    fitted = [point for point in points if point.what == BOTH]
+    fitted = [point for point in points if point.label == ADAPTED]
     for objects, colour in zip(sorted({point.objects for point in fitted}), COLOURS, strict=False):
         line = [point for point in fitted if point.objects == objects]
         across = [point.touches for point in line]
         panel.fill_between(
             across,
-            [100 * p.first[1] for p in line],
-            [100 * p.first[2] for p in line],
+            [100 * p.top1[1] for p in line],
+            [100 * p.top1[2] for p in line],
             color=colour,
             alpha=0.12,
             lw=0,
         )
-        panel.plot(across, [100 * p.first[0] for p in line], "o-", color=colour, label=f"{objects} own objects")
-    for what, dashes in ((AS_IT_IS, ":"), (BLURRED, "--")):
-        level = next(100 * point.first[0] for point in points if point.what == what)
-        panel.axhline(level, color=FAINT, ls=dashes, lw=1.2, label=what)
-    panel.axhline(100 * points[0].chance, color=FAINT, lw=0.8, label="chance")
+        panel.plot(across, [100 * p.top1[0] for p in line], "o-", color=colour, label=f"{objects} own objects")
+    for label, dashes in ((UNADAPTED, ":"), (LOW_PASS, "--")):
+        level = next(100 * point.top1[0] for point in points if point.label == label)
+        panel.axhline(level, color=MUTED_COLOUR, ls=dashes, lw=1.2, label=label)
+    panel.axhline(100 * points[0].chance, color=MUTED_COLOUR, lw=0.8, label="chance")
     panel.set_xscale("log")
     ticks = sorted({point.touches for point in fitted})
     panel.set_xticks(ticks, [str(tick) for tick in ticks])

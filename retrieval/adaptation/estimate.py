@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from retrieval.adaptation.folds import Fold, choose_settings, draw_folds, first_guesses, fit_folds, measure
-from retrieval.adaptation.material import Material
-from retrieval.adaptation.start import AsItIs
+from retrieval.adaptation.baseline import UnadaptedBaseline
+from retrieval.adaptation.data import AdaptationData
+from retrieval.adaptation.folds import Fold, choose_settings, draw_folds, fit_folds, fold_accuracy, measure
 from retrieval.console.output import say
 from retrieval.errors import BadInput
-from retrieval.methods.cca_towers import Choice
+from retrieval.methods.cca_towers import CcaSelection
 from retrieval.metrics.intervals import compare, summarise
 from retrieval.metrics.measure import Measure
 from retrieval.model.checkpoint import Checkpoint
@@ -26,27 +26,31 @@ class Estimate:
     known: the model that one starts from, with nothing fitted; known_first, known_below: what it is worth.
     """
 
-    choice: Choice
+    choice: CcaSelection
     folds: list[Fold]
-    known: AsItIs
-    first: Measure
-    below: Measure
-    blurred_first: Measure
-    blurred_below: Measure
-    known_first: Measure
-    known_below: Measure
+    baseline: UnadaptedBaseline
+    top1: Measure
+    pair_accuracy: Measure
+    low_pass_top1: Measure
+    low_pass_pair_accuracy: Measure
+    baseline_top1: Measure
+    baseline_pair_accuracy: Measure
 
     @property
-    def keeps_the_model(self) -> bool:
+    def is_baseline_better(self) -> bool:
         """Whether the model as it is tells these objects apart better than the fit does. One for another number of
-        fingers cannot be kept."""
-        fingers = self.known.start.config.matcher.fingers == self.folds[0].left_out.touch.shape[1]
-        return fingers and mean(self.known_below) >= mean(self.below)
+        fingers cannot be kept.
+        """
+        fingers = self.baseline.start.config.matcher.fingers == self.folds[0].left_out.touch.shape[1]
+        return fingers and mean(self.baseline_pair_accuracy) >= mean(self.pair_accuracy)
 
     def lines(self) -> list[str]:
         """The estimate as lines for people."""
-        found = [("first guess", self.first, self.blurred_first), ("pair accuracy", self.below, self.blurred_below)]
-        lines = [f"objects left out once each, one touch, {self.first.gallery}:"]
+        found = [
+            ("first guess", self.top1, self.low_pass_top1),
+            ("pair accuracy", self.pair_accuracy, self.low_pass_pair_accuracy),
+        ]
+        lines = [f"objects left out once each, one touch, {self.top1.gallery}:"]
         for name, touched, control in found:
             mine, other, gain = summarise([touched]), summarise([control]), compare([touched], [control])
             lines.append(
@@ -54,16 +58,16 @@ class Estimate:
                 f"difference {gain['difference']:+.3f} [{gain['low']:+.3f}, {gain['high']:+.3f}]"
             )
         lines.append("  " + self.verdict)
-        known = [interval(summarise([each])) for each in (self.known_first, self.known_below)]
-        lines.append(f"the model as it is: first guess {known[0]}, pair accuracy {known[1]}")
-        if self.keeps_the_model:
+        baseline = [interval(summarise([each])) for each in (self.baseline_top1, self.baseline_pair_accuracy)]
+        lines.append(f"the model as it is: first guess {baseline[0]}, pair accuracy {baseline[1]}")
+        if self.is_baseline_better:
             lines.append("  it is kept: a fit to these objects knows less; its probabilities are fitted to them")
         return lines
 
     @property
     def verdict(self) -> str:
         """Whether the touch itself was felt, in words."""
-        gain = compare([self.first], [self.blurred_first])
+        gain = compare([self.top1], [self.low_pass_top1])
         if gain["low"] > 0:
             return "the touch tells more than its blur does: what was learnt is more than light and coarse shape"
         return "the touch tells no more than its blur does: this is not shown to be touch; record more objects"
@@ -71,13 +75,13 @@ class Estimate:
     def to_dict(self) -> dict[str, float]:
         """The numbers that a checkpoint keeps as its metrics."""
         return {
-            "left_out_first_guess": mean(self.first),
-            "left_out_first_guess_blurred": mean(self.blurred_first),
-            "left_out_first_guess_chance": float(self.first.chance[0]),
-            "left_out_pair_accuracy": mean(self.below),
-            "left_out_pair_accuracy_blurred": mean(self.blurred_below),
-            "as_it_is_first_guess": mean(self.known_first),
-            "as_it_is_pair_accuracy": mean(self.known_below),
+            "held_out_top1": mean(self.top1),
+            "held_out_top1_low_pass": mean(self.low_pass_top1),
+            "held_out_top1_chance": float(self.top1.chance[0]),
+            "held_out_pair_accuracy": mean(self.pair_accuracy),
+            "held_out_pair_accuracy_low_pass": mean(self.low_pass_pair_accuracy),
+            "baseline_top1": mean(self.baseline_top1),
+            "baseline_pair_accuracy": mean(self.baseline_pair_accuracy),
         }
 
 
@@ -92,21 +96,23 @@ def interval(summary: dict[str, Any]) -> str:
 
 
 @one_thread()
-def judge(material: Material, start: Checkpoint, *, cache: Path | None, seed: int, quiet: bool) -> Estimate | None:
+def estimate_accuracy(
+    data: AdaptationData, start: Checkpoint, *, cache: Path | None, seed: int, quiet: bool
+) -> Estimate | None:
     """The estimate from objects left out; None where there are too few of them."""
     try:
-        drawn = draw_folds(material.grasps, seed)
+        drawn = draw_folds(data.grasps, seed)
     except BadInput as error:
         if not quiet:
             say(f"nothing is known of how good this is: {error}")
         return None
-    folds, blurred = (
-        list(fit_folds(features, drawn, material, seed=seed, what=what, quiet=quiet))
-        for features, what in ((material.features, "touches"), (material.blurred, "blurred touches"))
+    folds, low_pass = (
+        list(fit_folds(features, drawn, data, seed=seed, label=label, quiet=quiet))
+        for features, label in ((data.features, "touches"), (data.low_pass, "blurred touches"))
     )
-    choice = choose_settings(material.features, material, seed)
-    told, control = list(map(first_guesses, folds)), list(map(first_guesses, blurred))
-    known = AsItIs.of(start, material.grasps, cache, quiet)
-    rows = (told, control, known.told(drawn))
-    measures = (measure(parts, column) for parts in rows for column in ("first", "below"))
-    return Estimate(choice, folds, known, *measures)
+    choice = choose_settings(data.features, data, seed)
+    fold_accuracies, control = list(map(fold_accuracy, folds)), list(map(fold_accuracy, low_pass))
+    baseline = UnadaptedBaseline.of(start, data.grasps, cache, quiet)
+    rows = (fold_accuracies, control, baseline.fold_accuracies(drawn))
+    measures = (measure(parts, column) for parts in rows for column in ("top1", "pair_accuracy"))
+    return Estimate(choice, folds, baseline, *measures)

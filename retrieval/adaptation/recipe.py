@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from retrieval.adaptation.curve import learning_curve, write_curve
-from retrieval.adaptation.estimate import Estimate, judge
-from retrieval.adaptation.fitting import fit_matcher, start_with_probabilities, with_probabilities
-from retrieval.adaptation.material import BESIDE, Material, encode
+from retrieval.adaptation.data import PUBLISHED_TOWER, AdaptationData, load_adaptation_data
+from retrieval.adaptation.estimate import Estimate, estimate_accuracy
+from retrieval.adaptation.fitting import calibrate_baseline, calibrate_fit, fit_matcher
 from retrieval.data.dataset import AnyRecording, Split, finger_count, folder_of, load_grasps
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable, store_checkpoint
 from retrieval.search.defaults import shipped_model
 
 if TYPE_CHECKING:
-    from retrieval.model.towers.base import Tower
+    from retrieval.model.towers.tower import Tower
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +33,12 @@ class Adaptation:
     >>> made = retrieval.adapt("lab", Path("own.safetensors"), "model.safetensors", init="none", quiet=True)
     >>> made.checkpoint.path.name, made.report
     ('own.safetensors', None)
-    >>> 0 <= made.estimate.to_dict()["left_out_first_guess"] <= 1
+    >>> 0 <= made.estimate.to_dict()["left_out_top1"] <= 1
     True
     """
 
     checkpoint: Checkpoint
-    material: Material
+    data: AdaptationData
     estimate: Estimate | None
     report: Path | None
 
@@ -47,7 +47,7 @@ class Adaptation:
         lines = self.estimate.lines() if self.estimate else []
         if self.report:
             lines.append(f"learning curve: {self.report}")
-        grasps = self.material.grasps
+        grasps = self.data.grasps
         objects = len({grasp.object_id for grasp in grasps})
         return [*lines, f"{self.checkpoint.path}: fitted to {objects} objects, {len(grasps)} touches"]
 
@@ -57,7 +57,7 @@ def adapt(
     out: Path,
     start: str | Path | Checkpoint | None = None,
     *,
-    tower: "str | type[Tower]" = BESIDE,
+    tower: "str | type[Tower]" = PUBLISHED_TOWER,
     init: str = "imagenet",
     split: Split | None = None,
     report: Path | None = None,
@@ -95,14 +95,16 @@ def adapt(
     recording = folder_of(recording)
     if not isinstance(start, Checkpoint):
         start = load_checkpoint(start or shipped_model(min(finger_count(load_grasps(recording)), 2)))
-    material = encode(recording, start, tower=tower, init=init, split=split, cache=cache, seed=seed, quiet=quiet)
-    estimate = judge(material, start, cache=cache, seed=seed, quiet=quiet)
-    if estimate and estimate.keeps_the_model:
-        made = start_with_probabilities(start, material, estimate, quiet=quiet)
+    data = load_adaptation_data(
+        recording, start, tower=tower, init=init, split=split, cache=cache, seed=seed, quiet=quiet
+    )
+    estimate = estimate_accuracy(data, start, cache=cache, seed=seed, quiet=quiet)
+    if estimate and estimate.is_baseline_better:
+        made = calibrate_baseline(start, data, estimate, quiet=quiet)
     else:
-        made = with_probabilities(fit_matcher(material, estimate, out), material, estimate, quiet=quiet)
+        made = calibrate_fit(fit_matcher(data, estimate, out), data, estimate, quiet=quiet)
     store_checkpoint(made, out)
     page = None
     if report and estimate:
-        page = write_curve(report, learning_curve(material, start, cache=cache, seed=seed, quiet=quiet))
-    return Adaptation(load_checkpoint(out), material, estimate, page)
+        page = write_curve(report, learning_curve(data, start, cache=cache, seed=seed, quiet=quiet))
+    return Adaptation(load_checkpoint(out), data, estimate, page)

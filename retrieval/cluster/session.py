@@ -21,13 +21,13 @@ _SETTINGS = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_ENABLE_AUTO_CONNECT": "0",
 }
-"""Quiet, and started by `connected` alone: a thread of Ray's own that outlives it would start another Ray."""
+"""Quiet, and started by `ray_session` alone: a thread of Ray's own that outlives it would start another Ray."""
 _LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 """Ray's own switch for a cluster of this machine alone, which then listens on 127.0.0.1."""
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _without_ray_warnings() -> Iterator[None]:
     """Without the warnings of Ray's own making, most of which are about Ray."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"(ray|pydantic|google)(\.|$)")
@@ -35,7 +35,7 @@ def _quiet() -> Iterator[None]:
 
 
 @contextmanager
-def connected(cpus: int | None = None) -> Iterator[Any]:
+def ray_session(cpus: int | None = None) -> Iterator[Any]:
     """Ray with its parts `data` and `serve`, connected to the cluster that the variable RAY_ADDRESS names ("auto": one
     of this machine), else to one that is started here, on 127.0.0.1 alone, and ends with the block. Where this process
     is connected already, it stays so.
@@ -47,7 +47,7 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
     if not joined:
         os.environ.update(_LOOPBACK)
     try:
-        with _quiet():
+        with _without_ray_warnings():
             import ray
             import ray.data
             import ray.serve
@@ -63,7 +63,7 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
         }
     ours = not ray.is_initialized()
     try:
-        with _quiet():
+        with _without_ray_warnings():
             ray.init(address=joined, **said)
     except (ConnectionError, OSError, RuntimeError, ValueError) as error:
         what = f"the Ray cluster at {joined} cannot be joined" if joined else "Ray cannot be started here"
@@ -76,7 +76,7 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
                 f"Ray would listen on {address}, for this process had imported it already: "
                 f"set {', '.join(_LOOPBACK)}=0 before that, or start Ray yourself and name it in RAY_ADDRESS"
             )
-        with _quiet():
+        with _without_ray_warnings():
             yield ray
     finally:
         if ours:
@@ -88,7 +88,8 @@ def connected(cpus: int | None = None) -> Iterator[Any]:
 
 def on_loopback() -> None:
     """In each process of a Ray that is started here: replicas of Ray Serve listen on 127.0.0.1 too, for which Ray has
-    no setting."""
+    no setting.
+    """
     try:
         from ray.serve._private import replica
     except ImportError:

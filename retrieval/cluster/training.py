@@ -8,20 +8,20 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from retrieval.cluster.session import connected
+from retrieval.cluster.session import ray_session
 from retrieval.console.output import say
 from retrieval.data.dataset import Split
-from retrieval.errors import BadInput, Interrupted, RetrievalError
+from retrieval.errors import BadInput, JobInterrupted, RetrievalError
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
 from retrieval.model.config import Config
-from retrieval.training.state import require_fresh, state_path
+from retrieval.training.state import require_no_unfinished_state, state_path
 from retrieval.training.train import train
 
-LOST = 3
+MAX_RESTARTS = 3
 """How often a training without a step of progress is begun again."""
 
 
-def train_by_ray(
+def train_on_ray(
     recording: Path,
     out: Path,
     config: Config,
@@ -41,7 +41,7 @@ def train_by_ray(
         raise BadInput(f"workers must be 1 or more; got {workers}")
     require_writable(out)
     if not resume:
-        require_fresh(out)
+        require_no_unfinished_state(out)
     asked = {
         "recording": recording.resolve(),
         "out": out.resolve(),
@@ -50,7 +50,7 @@ def train_by_ray(
         "resume": resume,
         "cache": cache and cache.resolve(),
     }
-    with connected(cpus) as ray, tempfile.TemporaryDirectory() as notes:
+    with ray_session(cpus) as ray, tempfile.TemporaryDirectory() as notes:
         from ray.train import RunConfig, ScalingConfig, TrainingFailedError
         from ray.train.torch import TorchTrainer
 
@@ -66,14 +66,14 @@ def train_by_ray(
                 trainer.fit()
                 return load_checkpoint(out)
             except KeyboardInterrupt as error:
-                raise Interrupted(f"stopped; --resume goes on from {state_path(out)}, where it is") from error
+                raise JobInterrupted(f"stopped; --resume goes on from {state_path(out)}, where it is") from error
             except TrainingFailedError as error:
-                if (ours := _ours(error)) is not None:
+                if (ours := _error_of_rank(error)) is not None:
                     raise ours from error
-                state = _written(out)
+                state = _state_mtime(out)
                 failures = failures + 1 if state == known else 1
                 known = state
-                if failures > LOST:
+                if failures > MAX_RESTARTS:
                     raise RetrievalError(f"ranks were lost {failures} times without progress: {error}") from error
                 say("a rank was lost; all begin again" + (" from the last state" if state else ""))
 
@@ -84,7 +84,7 @@ def _rank(asked: dict[str, Any]) -> None:
     train(asked["recording"], asked["out"], asked["config"], split=asked["split"], resume=resume, cache=asked["cache"])
 
 
-def _ours(error: BaseException) -> RetrievalError | None:
+def _error_of_rank(error: BaseException) -> RetrievalError | None:
     """What a rank says is wrong with what it was given; another try would say it again."""
     for failure in getattr(error, "worker_failures", {}).values():
         cause = failure
@@ -95,7 +95,7 @@ def _ours(error: BaseException) -> RetrievalError | None:
     return None
 
 
-def _written(out: Path) -> float | None:
+def _state_mtime(out: Path) -> float | None:
     """When the state was written last; None without one."""
     try:
         return state_path(out).stat().st_mtime

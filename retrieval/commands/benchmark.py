@@ -14,23 +14,23 @@ from retrieval.commands.options import (
     Init,
     Iterations,
     Json,
+    OptionValues,
     ReportOut,
-    Values,
-    resumable,
+    announce_resume,
     training_config,
 )
 from retrieval.console.files import PAGE, RESULTS, TEXT, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
 from retrieval.evaluation.real import PROTOCOLS
-from retrieval.search.defaults import NAMED, shipped_model
+from retrieval.search.defaults import SHIPPED_NAMES, shipped_model
 
-HELP = "Judge methods on public data sets of real touches, with controls."
+HELP = "FusionScorer methods on public data sets of real touches, with controls."
 PRESET = "real"
 METHODS = "cca_towers,cca_pca,cca,late_fusion,chance"
-METHODS_OF = {"adapt": "cca_towers,chance"}
+PRESET_METHODS = {"adapt": "cca_towers,chance"}
 """Of presets that are made for one of the methods."""
-WRITTEN = {"results.json": RESULTS, "report.md": TEXT, "report.html": PAGE}
+OUTPUT_FILES = {"results.json": RESULTS, "report.md": TEXT, "report.html": PAGE}
 
 app = typer.Typer(name="benchmark", help=HELP, short_help=HELP, subcommand_metavar="DATA_KIND [ARGS]...")
 
@@ -57,15 +57,17 @@ def real(
     methods: Annotated[
         str | None,
         typer.Option(
-            help=f"methods to fit, with commas between (default: {METHODS}; of preset adapt {METHODS_OF['adapt']})"
+            help=f"methods to fit, with commas between (default: {METHODS}; of preset adapt {PRESET_METHODS['adapt']})"
         ),
     ] = None,
     preset: Annotated[str, typer.Option(help="towers and heads: preset or TOML file")] = PRESET,
     init: Init = None,
     iterations: Iterations = None,
     model: Annotated[
-        Values | None,
-        typer.Option(parser=Values.read, metavar="NAME=FILE...", help="checkpoints to ask as they are, a row each"),
+        OptionValues | None,
+        typer.Option(
+            parser=OptionValues.parse, metavar="NAME=FILE...", help="checkpoints to ask as they are, a row each"
+        ),
     ] = None,
     seeds: Annotated[int, typer.Option(parser=COUNT, help="how often folds are drawn and methods fitted")] = 3,
     cache: Annotated[
@@ -77,18 +79,18 @@ def real(
     from retrieval.evaluation.real.benchmark import benchmark
     from retrieval.report.real import print_verdicts, write_report
 
-    for name, kind in WRITTEN.items():
+    for name, kind in OUTPUT_FILES.items():
         require_ours(out / name, kind)
     asked = list(dict.fromkeys(protocols.split(","))) if protocols else PROTOCOLS.names()
     data_set_of = {name: PROTOCOLS.resolve(name).data_set for name in asked}
     config = training_config(preset, iterations, init=init)
     cache = cache or out / "cache"
-    with resumable(f"what was made is kept in {cache}"):
+    with announce_resume(f"what was made is kept in {cache}"):
         recordings, missing = _recordings(data, data_set_of.values(), cache / "recordings")
         skipped = {name: missing[of] for name, of in data_set_of.items() if of in missing}
         if protocols or len(skipped) < len(asked):
             for name, why in skipped.items():
-                say(f"{name}: left out, {why}; with it: {_command(data, out, name, data_set_of[name])}")
+                say(f"{name}: left out, {why}; with it: {_command_with_data(data, out, name, data_set_of[name])}")
         if len(skipped) == len(asked):
             raise BadInput(f"{data} must hold data of a protocol; {'; '.join(dict.fromkeys(missing.values()))}")
         results = benchmark(
@@ -97,8 +99,8 @@ def real(
             config=config,
             preset=Path(preset).stem,
             protocols=[name for name in asked if name not in skipped],
-            methods=[name for name in (methods or METHODS_OF.get(preset, METHODS)).split(",") if name],
-            models=_models(model or ()),
+            methods=[name for name in (methods or PRESET_METHODS.get(preset, METHODS)).split(",") if name],
+            models=_parse_models(model or ()),
             seeds=seeds,
             skipped=skipped,
             cache=cache,
@@ -133,17 +135,17 @@ def _recordings(data: Path, names: Iterable[str], made: Path) -> tuple[dict[str,
     return found, missing
 
 
-def _models(given: Iterable[str]) -> Mapping[str, Path]:
+def _parse_models(given: Iterable[str]) -> Mapping[str, Path]:
     models: dict[str, Path] = {}
     for word in given:
         name, equals, file = word.partition("=")
         if not equals or not name or "/" in name:
             raise BadInput(f"a model is given as NAME=FILE, got {word!r}")
-        models[name] = shipped_model(NAMED[file]) if file in NAMED else Path(file)
+        models[name] = shipped_model(SHIPPED_NAMES[file]) if file in SHIPPED_NAMES else Path(file)
     return models
 
 
-def _command(data: Path, out: Path, protocol: str, data_set: str) -> str:
+def _command_with_data(data: Path, out: Path, protocol: str, data_set: str) -> str:
     """What to run who has the data."""
     run = f"retrieve benchmark real {shlex.quote(str(data))} --out {shlex.quote(str(out))} --protocols {protocol}"
     if data_set != "rct":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from indexes import KINDS
-from retrieval.commands.options import COUNT, SHARE, Json, Model, Number, resumable
+from retrieval.commands.options import COUNT, SHARE, Json, Model, NumberParser, announce_resume
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import print_json, say
 from retrieval.data.storage import is_url
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from retrieval.model.checkpoint import Checkpoint
     from retrieval.search.build.build_report import BuildReport
 
-PREVIEWED = 16
+PREVIEW_PHOTOS = 16
 """Photos of the catalogue, evenly chosen, that a preview shows."""
 
 
@@ -49,7 +49,8 @@ def build_index(
     max_ms: Annotated[
         float | None,
         typer.Option(
-            parser=Number(float, 0, 86_400_000), help="longest search in milliseconds: candidates and judging them"
+            parser=NumberParser(float, 0, 86_400_000),
+            help="longest search in milliseconds: candidates and judging them",
         ),
     ] = None,
     preview: Annotated[
@@ -62,7 +63,7 @@ def build_index(
             help="index folders to divide the catalogue over (default: as OUT has it, else one, undivided)",
         ),
     ] = None,
-    bad_share: Annotated[
+    max_unreadable: Annotated[
         float | None,
         typer.Option(
             metavar="SHARE", parser=SHARE, help="of shards: photos that may be unreadable (default: 0.05 of all)"
@@ -83,18 +84,18 @@ def build_index(
     json: Json = False,
 ) -> None:
     """Make a folder of photos searchable."""
-    from retrieval.data.catalogue import require_apart
+    from retrieval.data.catalogue import require_separate_folders
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export_to_cache
     from retrieval.search import defaults
     from retrieval.search.build import build_index as build
-    from retrieval.search.sharding import build_cluster
-    from retrieval.search.sharding.object_store import StoredCluster
+    from retrieval.search.sharding import build_sharded
+    from retrieval.search.sharding.object_store import RemoteShardedIndex
 
     if not is_url(out):
-        require_apart(catalogue, out)
-    sheet = _sheet(catalogue, out) if preview else None
-    shards = _shards(shards, out, of_shards=bad_share is not None or cluster)
+        require_separate_folders(catalogue, out)
+    sheet = _preview_path(catalogue, out) if preview else None
+    shards = _shard_count(shards, out, has_shard_options=max_unreadable is not None or cluster)
     path, why = defaults.find_model(model, out)
     say(f"model: {path} ({why})")
     checkpoint = load_checkpoint(path)
@@ -107,16 +108,16 @@ def build_index(
     }
     run = None
     if cluster:
-        from retrieval.cluster.building import by_ray
+        from retrieval.cluster.building import ray_runner
 
-        run = by_ray()
-    with resumable(f"what was embedded is kept in {StoredCluster(out).work if is_url(out) else out}"):
+        run = ray_runner()
+    with announce_resume(f"what was embedded is kept in {RemoteShardedIndex(out).work if is_url(out) else out}"):
         if shards is None:
             report = build.build_index(catalogue, checkpoint, Path(out), **asked)
         else:
-            allowed = build_cluster.BAD_SHARE if bad_share is None else bad_share
-            report = build_cluster.build_cluster(
-                catalogue, checkpoint, out, shards, bad_share=allowed, run=run, **asked
+            allowed = build_sharded.MAX_UNREADABLE if max_unreadable is None else max_unreadable
+            report = build_sharded.build_sharded(
+                catalogue, checkpoint, out, shards, max_unreadable=allowed, run=run, **asked
             )
     defaults.remember("index", out)
     if defaults.is_shipped(path) and (made := export_to_cache(checkpoint)):
@@ -132,35 +133,35 @@ def build_index(
         raise RetrievalError(f"the index is written, but {count} object(s) have no photo that can be read; see above")
 
 
-def _sheet(catalogue: str, out: str) -> Path:
+def _preview_path(catalogue: str, out: str) -> Path:
     """The picture that a preview is written to. Raises BadInput where it cannot be, before anything is built."""
-    from retrieval.data.sources import is_elsewhere
+    from retrieval.data.sources import is_url_or_archive
 
     folder = Path(out).resolve()
     sheet = folder.with_name(f"{folder.name}-views.png")
     require_ours(sheet, PREVIEW)
     if Path(catalogue).resolve() in sheet.parents:
         raise BadInput(f"{sheet} would be a photo of the catalogue {catalogue}; name an --out outside it for --preview")
-    for place, is_far in ((catalogue, is_elsewhere), (out, is_url)):
+    for place, is_far in ((catalogue, is_url_or_archive), (out, is_url)):
         if is_far(place):
             raise BadInput(f"--preview shows photos of a folder of this machine beside it; {place} is none")
     return sheet
 
 
-def _shards(asked: int | None, out: str, *, of_shards: bool) -> int | None:
+def _shard_count(asked: int | None, out: str, *, has_shard_options: bool) -> int | None:
     """How many shards to build: as many as asked for, else as many as `out` has; None for one index folder.
 
     of_shards: whether an option was given that shards alone have. Raises BadInput where there are none then.
     """
     from indexes.errors import NoIndex
-    from retrieval.search.sharding.object_store import is_cluster, read_cluster
+    from retrieval.search.sharding.object_store import is_sharded, read_sharded_manifest
 
-    if asked is None and is_cluster(out):
+    if asked is None and is_sharded(out):
         with suppress(NoIndex):
-            return read_cluster(out).of
+            return read_sharded_manifest(out).of
         return 1  # the first one behind a URL
-    if asked is None and of_shards:
-        raise BadInput("--bad-share and --cluster are for a catalogue in shards; give --shards too")
+    if asked is None and has_shard_options:
+        raise BadInput("--max-unreadable and --cluster are for a catalogue in shards; give --shards too")
     return asked
 
 
@@ -171,6 +172,6 @@ def _write_views(sheet: Path, catalogue: Path, index: Path, report: "BuildReport
 
     first = IndexStore(index / report.shards[0]["folder"] if report.shards else index)
     rows = first.open(verify=False).rows
-    chosen = sorted({place * len(rows) // PREVIEWED for place in range(PREVIEWED)})
+    chosen = sorted({place * len(rows) // PREVIEW_PHOTOS for place in range(PREVIEW_PHOTOS)})
     write_views([catalogue / rows[row]["path"] for row in chosen], checkpoint.config.preprocessing, sheet)
     say(f"views: {len(chosen)} photos in {sheet}")

@@ -19,7 +19,7 @@ def check(
     json: Json = False,
 ) -> None:
     """Lint a recording: broken files, duplicates, leakage, swapped folders."""
-    from retrieval.data.check.doubts import COMPARED
+    from retrieval.data.check.appearance_checks import COMPARED_COPIES
     from retrieval.data.check.recording import check_recording
 
     if split and model:
@@ -33,10 +33,10 @@ def check(
     if json:
         print_json({"findings": [dataclasses.asdict(finding) for finding in findings]})
     for finding in findings:
-        if finding.kind != COMPARED:
+        if finding.kind != COMPARED_COPIES:
             say(f"{finding.severity}: {finding.message}")
     errors, warnings = (sum(one.severity == severity for one in findings) for severity in ("error", "warning"))
-    compared = [finding.message for finding in findings if finding.kind == COMPARED]
+    compared = [finding.message for finding in findings if finding.kind == COMPARED_COPIES]
     say("; ".join([f"{recording}: {errors} error(s), {warnings} warning(s)", *compared]))
     if errors:
         raise RetrievalError(f"{recording} is not fit for training; see the errors above")

@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from retrieval.commands.options import COUNT, SEED, Jobs, Objects, refuse, resumable
+from retrieval.commands.options import COUNT, SEED, Jobs, Objects, announce_resume, refuse_options
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import say, show
 from retrieval.console.progress import CountedBar
@@ -40,8 +40,8 @@ def collect(
     """Collect a recording with a rig on its own; goes on where it was stopped."""
     if dry_run:
         ignored = {"gate": gate, "preview": preview, "photos_only": photos_only, "touches_only": touches_only}
-        refuse("is of a collection; --dry-run moves and records nothing", **ignored)
-        _rehearse(rig, objects, seed)
+        refuse_options("is of a collection; --dry-run moves and records nothing", **ignored)
+        _print_motions(rig, objects, seed)
         return
     if photos_only or touches_only:
         if (photos_only and touches_only) or gate or preview:
@@ -62,7 +62,7 @@ def collect(
         require_ours(sheet, PREVIEW)
     decide, gate_name = _load_gate(gate)
     settings = CollectSettings(grasps=grasps)
-    with resumable(f"what was collected is whole in {out}"), CountedBar("collect", "grasps") as bar:
+    with announce_resume(f"what was collected is whole in {out}"), CountedBar("collect", "grasps") as bar:
         tallies = collect_grasps(
             partial(load_rig, rig, seed=seed),
             out,
@@ -72,9 +72,9 @@ def collect(
             gate=decide,
             gate_name=gate_name,
             jobs=jobs,
-            progress=lambda now: bar(now.settled, now.wanted, str(now)),
+            progress=lambda now: bar(now.grasps_done, now.grasps_wanted, str(now)),
         )
-    for line in acceptance_table(tallies, wanted=settings.grasps).splitlines():
+    for line in acceptance_table(tallies, grasps_wanted=settings.grasps).splitlines():
         say(line)
     accepted = sum(each.accepted for each in tallies)
     if accepted == 0:
@@ -90,15 +90,15 @@ def collect(
         say(f"preview: {write_preview(out, sheet)}")
 
 
-def _rehearse(name: str, objects: int, seed: int) -> None:
+def _print_motions(name: str, objects: int, seed: int) -> None:
     """`--dry-run`: the motions of one attempt at each object, on stdout; nothing moves, nothing is recorded."""
-    from robot.grasping.attempt import Attempter
-    from robot.grasping.dry_run import without_motion
+    from robot.grasping.attempt import AttemptRunner
+    from robot.grasping.dry_run import make_dry_run
     from robot.rig import load_rig
 
-    rig = without_motion(load_rig(name, seed=seed), show)
+    rig = make_dry_run(load_rig(name, seed=seed), show)
     with rig:
-        attempter = Attempter(rig, seed, rig.attempt)
+        attempter = AttemptRunner(rig, seed, rig.attempt)
         for object_id in rig.object_ids(objects):
             attempt = attempter.run(object_id, 0)
             say(f"{object_id}: {attempt.reason or 'nothing was moved, nothing was recorded'}")
@@ -108,7 +108,7 @@ def _collect_pictures(kind: str, rig: str, objects: int, out: Path, seed: int, j
     """`--photos-only`, `--touches-only`."""
     from robot.sim.pictures import collect_pictures
 
-    with resumable(f"what was made is whole in {out}"), CountedBar("collect", "objects") as bar:
+    with announce_resume(f"what was made is whole in {out}"), CountedBar("collect", "objects") as bar:
         count = collect_pictures(kind, out, objects=objects, seed=seed, rig=rig, jobs=jobs, progress=bar)
     say(f"{out}: {count} pictures of {objects} objects")
 

@@ -17,7 +17,7 @@ import typer
 
 from retrieval.commands.build_index import build_index
 from retrieval.commands.collect import collect
-from retrieval.commands.options import Jobs, Objects, Values
+from retrieval.commands.options import Jobs, Objects, OptionValues
 from retrieval.commands.query import query
 from retrieval.commands.serve import serve as serve_index
 from retrieval.console.output import say
@@ -45,27 +45,27 @@ def demo(
     ours = {"recording", "recording-preview.png", "catalog", "index", "index-history", "state", "query.html"}
     if out.exists() and (others := {path.name for path in out.iterdir()} - ours):
         raise BadInput(f"{out} must be a new folder or an earlier demo's; it holds {sorted(others)[0]}")
-    with _own_state(out / "state"):
+    with _isolated_state(out / "state"):
         recording, catalogue, index = out / "recording", out / "catalog", out / "index"
         grasps = PHOTOS + TOUCHES
         _run(collect, rig="sim", objects=objects, grasps=grasps, seed=SEED, jobs=jobs, out=recording, preview=True)
         queries = _split(load_grasps(recording), catalogue)
-        in_hand = example(queries)
+        in_hand = example_object(queries)
         _run(build_index, catalogue, out=index)
-        gelsight = [Values(map(str, grasp.touches)) for grasp in queries[in_hand]]
+        gelsight = [OptionValues(map(str, grasp.touches)) for grasp in queries[in_hand]]
         _run(query, gelsight=gelsight, index=str(index), html=out / "query.html", top=8)
         say(
             f"in the hand: {in_hand}, which the model was never trained on; of the objects with {len(gelsight)} grasps "
             "to query with it is the first of the catalogue"
         )
-        say(f"{TOUCHES} grasps of each object: {_first_places(index, queries)}")
+        say(f"{TOUCHES} grasps of each object: {_accuracy_summary(index, queries)}")
         say(f"look at {out / 'query.html'} and {out / 'recording-preview.png'}")
         if serve:
             _run(serve_index, index=str(index), trials=recording, open_page=True)
 
 
 @contextmanager
-def _own_state(folder: Path) -> Iterator[None]:
+def _isolated_state(folder: Path) -> Iterator[None]:
     """The demo's model and index do not become the defaults of the user's own commands."""
     before = os.environ.get("XDG_STATE_HOME")
     os.environ["XDG_STATE_HOME"] = str(folder)
@@ -85,7 +85,7 @@ def _run(command: Callable[..., object], *arguments: Path, **options: object) ->
         for value in given if isinstance(given, list) else [given]:
             words.append(f"--{name.replace('_', '-')}")
             if value is not True:
-                words += value if isinstance(value, Values) else [str(value)]
+                words += value if isinstance(value, OptionValues) else [str(value)]
     say("$ retrieve " + shlex.join(words))
     command(*arguments, **options)
 
@@ -102,13 +102,14 @@ def _split(grasps: Sequence["Grasp"], catalogue: Path) -> "dict[str, list[Grasp]
     return {name: own[PHOTOS : PHOTOS + TOUCHES] for name, own in by_object.items() if len(own) > PHOTOS}
 
 
-def example(queries: "Mapping[str, Sequence[Grasp]]") -> str:
+def example_object(queries: "Mapping[str, Sequence[Grasp]]") -> str:
     """The object that the demo's page shows, chosen by name before anything is scored: of the objects with the most
-    grasps to query with, the first in catalogue order."""
+    grasps to query with, the first in catalogue order.
+    """
     return max(sorted(queries), key=lambda name: len(queries[name]))
 
 
-def _first_places(index: Path, queries: "dict[str, list[Grasp]]") -> str:
+def _accuracy_summary(index: Path, queries: "dict[str, list[Grasp]]") -> str:
     """How often the true object comes first, and among the first five; and what the verdicts were worth."""
     from retrieval.search.query.answer import MATCH
     from retrieval.search.query.searcher import Searcher

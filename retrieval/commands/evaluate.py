@@ -18,8 +18,8 @@ from retrieval.commands.options import (
     Recording,
     ReportOut,
     SplitFile,
+    announce_resume,
     read_split,
-    resumable,
     training_config,
 )
 from retrieval.console.files import PAGE, RESULTS, TEXT, TIMINGS, require_ours
@@ -27,7 +27,7 @@ from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
 from retrieval.methods import METHODS
 
-WRITTEN = {"results.json": RESULTS, "timings.json": TIMINGS, "report.md": TEXT, "report.html": PAGE}
+OUTPUT_FILES = {"results.json": RESULTS, "timings.json": TIMINGS, "report.md": TEXT, "report.html": PAGE}
 
 
 def evaluate(
@@ -65,9 +65,9 @@ def evaluate(
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch}
     if model and (preset or any(inits.values())):
         raise BadInput("a model has its towers and its settings; give --model, or --preset and --init")
-    for name, kind in WRITTEN.items():
+    for name, kind in OUTPUT_FILES.items():
         require_ours(out / name, kind)
-    with resumable(f"what was made is kept in {out}"):
+    with announce_resume(f"what was made is kept in {out}"):
         results = run(
             recording,
             out,

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from retrieval.commands.options import Json, Model, Values, resumable
+from retrieval.commands.options import Json, Model, OptionValues, announce_resume
 from retrieval.console.output import print_json, say
 from retrieval.frontier import APPROXIMATIONS
 
@@ -24,8 +24,8 @@ def frontier(
     ] = None,
     model: Model = None,
     only: Annotated[
-        Values | None,
-        typer.Option(parser=Values.read, metavar="NAME...", help=f"only some of {', '.join(APPROXIMATIONS)}"),
+        OptionValues | None,
+        typer.Option(parser=OptionValues.parse, metavar="NAME...", help=f"only some of {', '.join(APPROXIMATIONS)}"),
     ] = None,
     quick: Annotated[
         bool, typer.Option("--quick", help="smallest sizes, to see that it runs; concludes nothing")
@@ -33,12 +33,12 @@ def frontier(
     json: Json = False,
 ) -> None:
     """Error against run time of every approximation; goes on where it was stopped. Writes plots and a page."""
-    document = report(out, model=model, recording=recording, only=only or (), quick=quick)
+    document = run_frontier(out, model=model, recording=recording, only=only or (), quick=quick)
     if json:
         print_json(document)
 
 
-def report(
+def run_frontier(
     out: Path,
     *,
     model: str | None,
@@ -46,7 +46,7 @@ def report(
     only: Sequence[str] = (),
     quick: bool = False,
     table: Mapping[str, str] = APPROXIMATIONS,
-    need_no_model: Collection[str] = (),
+    model_free: Collection[str] = (),
 ) -> dict[str, Any]:
     """Measure and write frontier.json, frontier.html and figures/.
 
@@ -57,7 +57,7 @@ def report(
             needs them.
         only: Names of rows; all where empty.
         quick: Smallest sizes.
-        table: What can be measured, as `retrieval.measure_frontier` takes it; so `need_no_model`.
+        table: What can be measured, as `retrieval.measure_frontier` takes it; so `model_free`.
 
     Returns:
         The content of frontier.json.
@@ -68,8 +68,8 @@ def report(
     path, why = defaults.find_model(model)
     say(f"model: {path} ({why})")
     grasps = partial(_recording, recording, out, quick)
-    with resumable(f"what was measured is kept in {out}"):
-        document = measure_frontier(out, path, grasps, only=only, quick=quick, table=table, need_no_model=need_no_model)
+    with announce_resume(f"what was measured is kept in {out}"):
+        document = measure_frontier(out, path, grasps, only=only, quick=quick, table=table, model_free=model_free)
     say(f"page: {out / 'frontier.html'}")
     return document
 
@@ -92,6 +92,6 @@ def _recording(given: Path | None, out: Path, quick: bool) -> Path:
             seed=SEED,
             settings=CollectSettings(grasps=grasps),
             jobs=os.cpu_count() or 1,
-            progress=lambda now: bar(now.settled, now.wanted, str(now)),
+            progress=lambda now: bar(now.grasps_done, now.grasps_wanted, str(now)),
         )
     return folder

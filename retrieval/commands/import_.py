@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from retrieval.commands.options import Values
+from retrieval.commands.options import OptionValues
 from retrieval.console.output import say, show
 from retrieval.console.progress import CountedBar
 from retrieval.errors import BadInput
@@ -26,15 +26,17 @@ def import_(
     *,
     out: Annotated[Path | None, typer.Option(help="recording folder to write, or to go on with")] = None,
     option: Annotated[
-        Values | None,
-        typer.Option(parser=Values.read, metavar="NAME=VALUE...", help="options of the data set, as the list has them"),
+        OptionValues | None,
+        typer.Option(
+            parser=OptionValues.parse, metavar="NAME=VALUE...", help="options of the data set, as the list has them"
+        ),
     ] = None,
 ) -> None:
     """Turn a public data set, or pictures of your own, into a recording."""
     from robot.importers import IMPORTERS, read_options
 
     if name is None:
-        for line in _list():
+        for line in _list_importers():
             show(line)
         return
     options = read_options(IMPORTERS.resolve(name), option or ())
@@ -57,7 +59,7 @@ def run_importer(name: str, source: Path, out: Path, **options: Any) -> "Recordi
         return load_importer(name)(source, out, bar, **options)
 
 
-def _list() -> list[str]:
+def _list_importers() -> list[str]:
     """A line for each data set, and one with its options as they are where nothing is said."""
     from robot.importers import IMPORTERS, load_importer, options_of, title_of
 

@@ -28,14 +28,14 @@ from retrieval.commands.options import Command
 from retrieval.commands.query import query
 from retrieval.commands.serve import serve
 from retrieval.commands.train import train
-from retrieval.console.interruption import noticed_interrupts
-from retrieval.console.output import give_up_stdout, prepare_streams, printable, printing, say, show
+from retrieval.console.interruption import record_interrupts
+from retrieval.console.output import checked_stdout, discard_stdout, prepare_streams, printable, say, show
 from retrieval.version import __version__
 
-LONGEST, LAST = 500, 150
+MAX_MESSAGE, MESSAGE_TAIL = 500, 150
 """Characters of a message, and how many of these are its last: what to do mostly stands at its end. What stands in a
 hostile file may be of any length."""
-_WRONG_PATHS = {
+_BAD_PATH_ERRNOS = {
     *(errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS),
     *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST),
 }
@@ -81,13 +81,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     if os.environ.get("_RETRIEVE_COMPLETE"):  # set by a shell that asks what may follow
         program(prog_name="retrieve")
     context: Any = None
-    with noticed_interrupts() as interrupts:
+    with record_interrupts() as interrupts:
         # Not program.main(), which has its own ideas of Ctrl-C and of readers that left.
         try:
             context = program.make_context("retrieve", list(sys.argv[1:] if argv is None else argv))
             with context:
                 code = program.invoke(context)
-            with printing():
+            with checked_stdout():
                 sys.stdout.flush()
             return code or 0
         except typer.Exit as leaving:  # after --help or --version
@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except typer.TyperException as wrong:
             return _fail(context, f"{wrong.format_message().rstrip('.')}; see --help", wrong.exit_code)
         except BrokenPipeError:  # the reader of stdout has left, as `| head` does
-            give_up_stdout()
+            discard_stdout()
             return 1
         except (Exception, KeyboardInterrupt) as error:
             if isinstance(error, Exception) and context is not None and context.params["debug"]:
@@ -112,14 +112,14 @@ def _explain(context: Any, error: BaseException, interrupts: list[int]) -> int:
         return _fail(context, f"stopped by {'SIGTERM' if signal.SIGTERM in interrupts else 'Ctrl-C'}", 1)
     if isinstance(error, OSError):  # wrong use where another path would have done
         message = f"{error.filename or 'a file'}: {error.strerror or error}"
-        return _fail(context, message, 2 if error.errno in _WRONG_PATHS else 1)
+        return _fail(context, message, 2 if error.errno in _BAD_PATH_ERRNOS else 1)
     return _fail(context, f"unexpected {type(error).__name__}: {error} (run with --debug and report it)", 1)
 
 
 def _fail(context: Any, message: str, code: int) -> int:
     words = ["retrieve"] if context is None else ["retrieve", context.invoked_subcommand]
     message = printable(message)
-    if len(message) > LONGEST:
-        message = f"{message[: LONGEST - LAST]} ... {message[-LAST:]}"
+    if len(message) > MAX_MESSAGE:
+        message = f"{message[: MAX_MESSAGE - MESSAGE_TAIL]} ... {message[-MESSAGE_TAIL:]}"
     say(f"{' '.join(filter(None, words))}: {message}")
     return code

@@ -54,20 +54,20 @@ SplitFile = Annotated[Path | None, typer.Option(help=SPLIT)]
 CheckpointOut = Annotated[Path, typer.Option(help="checkpoint to write (.safetensors)")]
 ReportOut = Annotated[Path, typer.Option(help="folder for results.json, report.md and report.html")]
 
-_BETWEEN = "\0"  # which no word of a command line holds
+_SEPARATOR = "\0"  # which no word of a command line holds
 
 
-class Values(tuple[str, ...]):
+class OptionValues(tuple[str, ...]):
     """The values after one option that takes several, such as the gel images of one grasp."""
 
     @classmethod
-    def read(cls, joined: str) -> Self:
+    def parse(cls, joined: str) -> Self:
         """As `Command` hands them over."""
-        return cls(joined.split(_BETWEEN))
+        return cls(joined.split(_SEPARATOR))
 
 
 @dataclasses.dataclass(frozen=True)
-class Number:
+class NumberParser:
     """Read the number of an option, from `low` to `high`, so that no command begins with another one.
 
     kind: int or float. (A range of the library admits nan, and shows its limits in the help.)
@@ -93,8 +93,8 @@ class Number:
         return value
 
 
-COUNT, SEED, WORKERS = Number(int, 1, 10**9), Number(int, 0, 2**32 - 1), Number(int, 1, 1024)
-SHARE, SECONDS = Number(float, 0, 1), Number(float, 0, 86_400)
+COUNT, SEED, WORKERS = NumberParser(int, 1, 10**9), NumberParser(int, 0, 2**32 - 1), NumberParser(int, 1, 1024)
+SHARE, SECONDS = NumberParser(float, 0, 1), NumberParser(float, 0, 86_400)
 Iterations = Annotated[int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the preset's")]
 Jobs = Annotated[int, typer.Option(parser=WORKERS, help="simulated rigs that work at once")]
 Objects = Annotated[int, typer.Option(parser=COUNT, help="how many objects")]
@@ -111,7 +111,7 @@ class Command(TyperCommand):
         return self.help or ""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Join the values of such an option to one word; see `Values.read`."""
+        """Join the values of such an option to one word; see `OptionValues.parse`."""
         options = {name: each for each in self.params for name in each.opts if name.startswith("-")}
         joined: list[str] = []
         while args and args[0] != "--":
@@ -124,7 +124,7 @@ class Command(TyperCommand):
                 ctx.fail(f"{word} needs a value")
             if (option.metavar or "").endswith("..."):
                 values = list(takewhile(lambda value: not value.startswith("-"), args))
-                joined.append(_BETWEEN.join(values))
+                joined.append(_SEPARATOR.join(values))
                 args = args[len(values) :]
             else:
                 joined += args[:1]
@@ -132,16 +132,17 @@ class Command(TyperCommand):
         return super().parse_args(ctx, joined + args)
 
 
-def refuse(why: str, **given: object) -> None:
+def refuse_options(why: str, **given: object) -> None:
     """Raise BadInput for the first of these options that was given: it would be ignored, and `why` says so. An option
-    that was left out is None or False."""
+    that was left out is None or False.
+    """
     for name, value in given.items():
         if value is not None and value is not False:
             raise BadInput(f"--{name.replace('_', '-')} {why}")
 
 
 @contextmanager
-def resumable(what: str) -> Iterator[None]:
+def announce_resume(what: str) -> Iterator[None]:
     """Say on Ctrl-C what is stored, and that the same command continues from there."""
     try:
         yield
@@ -169,4 +170,4 @@ def training_config(preset: str | None, iterations: int | None, **instead: str |
     config = load_config(preset or DEFAULT_PRESET)
     changed: dict[str, Any] = {name: value for name, value in instead.items() if value is not None}
     steps = config.training.iterations if iterations is None else iterations
-    return dataclasses.replace(config, training=dataclasses.replace(config.training.of_steps(steps), **changed))
+    return dataclasses.replace(config, training=dataclasses.replace(config.training.with_iterations(steps), **changed))

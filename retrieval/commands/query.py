@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import COUNT, SHARE, Index, IndexModel, Json, NoVerify, Values
+from retrieval.commands.options import COUNT, SHARE, Index, IndexModel, Json, NoVerify, OptionValues
 from retrieval.console.files import PAGE, require_folder, require_ours, text_bytes, write_output
 from retrieval.console.output import print_json, say
 
@@ -13,17 +13,17 @@ from retrieval.console.output import print_json, say
 def query(
     *,
     gelsight: Annotated[
-        list[Values],
+        list[OptionValues],
         typer.Option(
-            parser=Values.read,
+            parser=OptionValues.parse,
             metavar="IMAGE...",
             help="gel images of one grasp, one per finger; again for more grasps of the same object",
         ),
     ],
     background: Annotated[
-        Values | None,
+        OptionValues | None,
         typer.Option(
-            parser=Values.read,
+            parser=OptionValues.parse,
             metavar="IMAGE...",
             help="no-contact frames, one per finger: some models subtract them, others see by them if there is a "
             "contact",
@@ -52,7 +52,7 @@ def query(
     path, why = defaults.find_index(index)
     if index is None:
         say(f"index: {path} ({why})")
-    from retrieval.search.query.answer import EXIT_CODES, in_words
+    from retrieval.search.query.answer import EXIT_CODES, verdict_sentence
     from retrieval.search.query.searcher import Searcher
 
     if html:
@@ -78,5 +78,5 @@ def query(
         from retrieval.report.terminal import print_table
 
         print_table(result)
-    say(in_words(result))
+    say(verdict_sentence(result))
     return EXIT_CODES[result.verdict]

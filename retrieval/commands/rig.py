@@ -66,7 +66,7 @@ def calibrate(
     found = fit_hand_eye(*read_pairs(points))
     for name, errors in (("rigid", found.rigid_errors), ("affine", found.affine_errors)):
         if errors is None:
-            say(f"{name}: {found.no_affine}")
+            say(f"{name}: {found.affine_problem}")
             continue
         say(
             f"{name}: points are {errors.mean_mm:.1f} mm off (at most {errors.max_mm:.1f}); each when left out "

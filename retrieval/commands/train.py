@@ -16,7 +16,7 @@ from retrieval.commands.options import (
     LabelledTouches,
     SplitFile,
     read_split,
-    refuse,
+    refuse_options,
     training_config,
 )
 from retrieval.console.output import say
@@ -68,7 +68,7 @@ def train(
         raise BadInput("--cluster trains matchers (--task match), and --workers says on how many ranks")
     if task == "grasp-success":
         others = {"config": config, "split": split, "resume": resume, "cache": cache, **inits}
-        refuse("is of matchers; --task grasp-success takes --iterations and --seed", **others)
+        refuse_options("is of matchers; --task grasp-success takes --iterations and --seed", **others)
         from retrieval.training.grasp_success import train_gate
 
         numbers = {"iterations": iterations, "seed": seed}
@@ -98,9 +98,9 @@ def train(
         settings = training_config(config, iterations, seed=seed, **inits)
         asked: dict[str, Any] = {"split": read_split(split), "resume": resume, "cache": cache}
         if cluster:
-            from retrieval.cluster.training import train_by_ray
+            from retrieval.cluster.training import train_on_ray
 
-            checkpoint = train_by_ray(recording, out, settings, workers=2 if workers is None else workers, **asked)
+            checkpoint = train_on_ray(recording, out, settings, workers=2 if workers is None else workers, **asked)
         else:
             checkpoint = train_matcher(recording, out, settings, **asked)
         if distributed.rank():

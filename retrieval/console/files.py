@@ -8,24 +8,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from _touch_retrieval.files import naming, open_regular, parse_json, write_atomically
+from _touch_retrieval.files import named_write_errors, open_regular, parse_json, write_atomically
 from retrieval.errors import BadInput
 
 GENERATOR = "touch-retrieval"
 """What our pages, texts and pictures say that they were made by."""
-MARKED = f"<!-- {GENERATOR} -->"
+GENERATOR_COMMENT = f"<!-- {GENERATOR} -->"
 """Stands on top of our reports in Markdown."""
 HEADER = "touch_retrieval"
 """Our entry among the metadata of a `.safetensors` file."""
 SEAL = b"touch_retrieval.sha256"
 """Stands near the end of our ONNX files."""
 _HEAD = 4096
-_MOST_HEADER = 100_000_000  # what safetensors itself reads
+_MAX_HEADER_BYTES = 100_000_000  # what safetensors itself reads
 
 
 def cache_folder() -> Path | None:
     """What may be made or fetched again is kept here: `$XDG_CACHE_HOME/touch-retrieval` (`~/.cache` where it is not
-    set). None where the user has no home."""
+    set). None where the user has no home.
+    """
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     except RuntimeError:
@@ -77,12 +78,12 @@ def _ends_with_seal(file: BinaryIO) -> bool:
 
 def _has_header(file: BinaryIO) -> bool:
     length = int.from_bytes(file.read(8), "little")
-    about = _parsed(file.read(length) if length <= _MOST_HEADER else b"").get("__metadata__")
+    about = _parsed(file.read(length) if length <= _MAX_HEADER_BYTES else b"").get("__metadata__")
     return isinstance(about, dict) and HEADER in about
 
 
 def _holds(*keys: str) -> Callable[[BinaryIO], bool]:
-    return lambda file: set(keys) <= set(_parsed(file.read(_MOST_HEADER)))
+    return lambda file: set(keys) <= set(_parsed(file.read(_MAX_HEADER_BYTES)))
 
 
 def _parsed(text: bytes) -> dict[str, Any]:
@@ -96,7 +97,7 @@ def _parsed(text: bytes) -> dict[str, Any]:
 
 PAGE = Kind("a page", _begins_with(f'content="{GENERATOR}"'))
 CARD = Kind("a model card", _begins_with("\n\nMatches touches of "))
-TEXT = Kind("a report", _begins_with(MARKED))
+TEXT = Kind("a report", _begins_with(GENERATOR_COMMENT))
 CHECKPOINT = Kind("a checkpoint", _has_header)
 EXPORT = Kind("an export", _ends_with_seal)
 RESULTS = Kind("results", _holds("software"))
@@ -107,7 +108,8 @@ PREVIEW = Kind("a preview", _begins_with(GENERATOR))
 
 def require_ours(path: Path, kind: Kind) -> None:
     """Raise BadInput unless nothing stands at `path`, or an empty file, or one of that kind: another one is of the
-    user, who gave the wrong name. Asked before the work whose result is to be written there."""
+    user, who gave the wrong name. Asked before the work whose result is to be written there.
+    """
     try:
         with open_regular(path) as file:
             if not os.fstat(file.fileno()).st_size or kind.is_ours(file):
@@ -132,12 +134,13 @@ def require_folder(path: Path) -> None:
 def write_output(path: Path, data: bytes, kind: Kind) -> None:
     """Write what a command was asked for, its folder too; see `require_ours` and `write_atomically`."""
     require_ours(path, kind)
-    with naming(path):
+    with named_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, data)
 
 
 def text_bytes(text: str) -> bytes:
     """The text of a page in UTF-8; characters that UTF-8 cannot hold (of names in unknown coding) become HTML's numeric
-    references."""
+    references.
+    """
     return text.encode("utf-8", "xmlcharrefreplace")

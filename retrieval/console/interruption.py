@@ -26,10 +26,11 @@ def interruption() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def noticed_interrupts() -> Iterator[list[int]]:
+def record_interrupts() -> Iterator[list[int]]:
     """The Ctrl-C and SIGTERM signals so far; each raises KeyboardInterrupt, so that a rig is closed with its jaws open
     and a recording is whole. One that breaks off an import may come out as
-    another error: numpy.linalg half loaded raises RecursionError."""
+    another error: numpy.linalg half loaded raises RecursionError.
+    """
     seen: list[int] = []
     if threading.current_thread() is not threading.main_thread():
         yield seen

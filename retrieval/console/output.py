@@ -18,29 +18,29 @@ from retrieval.errors import RetrievalError
 
 def print_json(document: Any) -> None:
     """One JSON document on stdout, in ASCII."""
-    with printing():
+    with checked_stdout():
         print(json.dumps(document, allow_nan=False))
 
 
 def show(text: str) -> None:
     """A line of results for a person, on stdout."""
-    with printing():
+    with checked_stdout():
         print(printable(text), flush=True)
 
 
 @contextlib.contextmanager
-def printing() -> Iterator[None]:
+def checked_stdout() -> Iterator[None]:
     """Raises RetrievalError where stdout takes nothing more, as on a full disk. A reader that left is no error."""
     try:
         yield
     except BrokenPipeError:
         raise
     except OSError as error:
-        give_up_stdout()
+        discard_stdout()
         raise RetrievalError(f"standard output cannot be written: {error.strerror or error}") from error
 
 
-def give_up_stdout() -> None:
+def discard_stdout() -> None:
     """Throw away what is still to be printed, so that the end of Python does not fail on it."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
@@ -61,7 +61,7 @@ def printable(text: str) -> str:
     )
 
 
-def some(names: Sequence[str], shown: int = 5) -> str:
+def abbreviate_list(names: Sequence[str], shown: int = 5) -> str:
     """The first of many names, and how many there are beside them."""
     more = f" and {len(names) - shown} more" if len(names) > shown else ""
     return ", ".join(names[:shown]) + more

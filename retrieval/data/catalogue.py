@@ -2,7 +2,7 @@
 
     catalog/<object_id>/<photo>     the first folder names the object, however deep the photo lies below it
     catalog/<object_id>.<ext>       or one photo per object, named by its file; other rules: retrieval.data.naming
-    catalog/<object_id>/touch_*     a gel image: a touch of the object (retrieval.data.touched)
+    catalog/<object_id>/touch_*     a gel image: a touch of the object (retrieval.data.catalogue_touches)
     catalog/metadata.jsonl          optional: one JSON object a line, with `file_name` (a photo's path in the
                                     catalogue) or `object_id` (all its photos) and any other keys; where both
                                     give a key, the photo's own wins
@@ -20,16 +20,16 @@ from typing import Any, Self, overload
 
 from _touch_retrieval.files import parse_json, read_regular
 from indexes.store.stat_cache import FolderCache
+from retrieval.data.catalogue_touches import CatalogueTouch, group_touches, touch_name
+from retrieval.data.folder_walk import FolderWalk, SkippedPhoto
 from retrieval.data.images import EXTENSIONS, decode_rgb, read_bytes
 from retrieval.data.naming import STEM, Naming
 from retrieval.data.resize import RgbImage
 from retrieval.data.text import require_utf8
-from retrieval.data.touched import CatalogueTouch, grouped, touch_name
-from retrieval.data.walking import SkippedPhoto, Walk
 from retrieval.errors import BadInput, DatasetError, ImageError
 
 METADATA_FILE = "metadata.jsonl"
-UNREAD = frozenset(
+UNSUPPORTED_EXTENSIONS = frozenset(
     {".arw", ".cr2", ".cr3", ".dng", ".gif", ".jfif", ".jp2", ".jxl", ".nef", ".orf", ".raf", ".rw2", ".svg", ".tga"}
 )
 """Endings of pictures that are not read: their objects may be left without a photo."""
@@ -45,7 +45,7 @@ class CataloguePhoto:
     metadata: dict[str, Any] = field(default_factory=dict, hash=False)
 
 
-class Photos(Sequence[CataloguePhoto]):
+class PhotoTable(Sequence[CataloguePhoto]):
     """Photos in columns, each made an object when it is asked for: a hundred thousand objects are looked through by the
     garbage collector again and again.
 
@@ -68,11 +68,11 @@ class Photos(Sequence[CataloguePhoto]):
     def __getitem__(self, index: int) -> CataloguePhoto: ...
 
     @overload
-    def __getitem__(self, index: slice) -> "Photos": ...
+    def __getitem__(self, index: slice) -> "PhotoTable": ...
 
-    def __getitem__(self, index: "int | slice") -> "CataloguePhoto | Photos":
+    def __getitem__(self, index: "int | slice") -> "CataloguePhoto | PhotoTable":
         if isinstance(index, slice):
-            return Photos(self.paths[index], self.objects[index], self.metadata)
+            return PhotoTable(self.paths[index], self.objects[index], self.metadata)
         path = self.paths[index]
         return CataloguePhoto(path, self.objects[index], self.metadata.get(path, {}))
 
@@ -86,11 +86,11 @@ class Catalogue:
     """
 
     folder: Path
-    photos: Photos
+    photos: PhotoTable
     ignored: tuple[str, ...] = ()
     skipped: tuple[SkippedPhoto, ...] = ()
     notes: tuple[str, ...] = ()
-    unread: tuple[str, ...] = ()
+    unsupported_objects: tuple[str, ...] = ()
     touches: tuple[CatalogueTouch, ...] = ()
 
     @property
@@ -105,10 +105,12 @@ class Catalogue:
     @property
     def object_ids(self) -> tuple[str, ...]:
         """The objects, sorted, each once; some may have no photo that can be read."""
-        return tuple(sorted({*self.photos.objects, *(touch.object_id for touch in self.touches), *self.unread}))
+        return tuple(
+            sorted({*self.photos.objects, *(touch.object_id for touch in self.touches), *self.unsupported_objects})
+        )
 
 
-def require_apart(catalogue: str | Path, index: str | Path) -> None:
+def require_separate_folders(catalogue: str | Path, index: str | Path) -> None:
     """Raise BadInput where an index folder is the folder of a catalogue, or one in it that holds photos.
 
     Another folder in the catalogue may be an index, as `./index` is of the catalogue `.`.
@@ -128,7 +130,9 @@ class PhotoBytes:
     digest: str
 
 
-def list_catalogue(folder: str | Path, naming: Naming | None = None, seen: FolderCache | None = None) -> Catalogue:
+def list_catalogue(
+    folder: str | Path, naming: Naming | None = None, folder_cache: FolderCache | None = None
+) -> Catalogue:
     """List the photos and touches below `folder`, by id. naming: which object each shows; by folder where None. seen:
     what earlier builds saw there, which takes down what this one sees.
 
@@ -138,7 +142,7 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None, seen: Folde
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    found = Walk(Path(os.path.realpath(root)), seen)
+    found = FolderWalk(Path(os.path.realpath(root)), folder_cache)
     found.walk(str(root), "")
     path = root / METADATA_FILE
     try:
@@ -147,34 +151,35 @@ def list_catalogue(folder: str | Path, naming: Naming | None = None, seen: Folde
         lines = b""
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    return catalogue_of(root, str(root), found.names, found.skipped, naming, lines)
+    return make_catalogue(root, str(root), found.names, found.skipped, naming, lines)
 
 
-def catalogue_of(
-    folder: Path, where: str, names: list[str], passed_over: list[SkippedPhoto], naming: Naming, metadata: bytes
+def make_catalogue(
+    folder: Path, where: str, names: list[str], skipped_before: list[SkippedPhoto], naming: Naming, metadata: bytes
 ) -> Catalogue:
     """The catalogue of files below `where`, by their relative names, and what was left out already. metadata: what
-    METADATA_FILE holds, perhaps nothing. Raises DatasetError as `list_catalogue` does."""
-    found = _sorted_out(names, naming)
-    found.skipped[:0] = passed_over
+    METADATA_FILE holds, perhaps nothing. Raises DatasetError as `list_catalogue` does.
+    """
+    found = _classify_files(names, naming)
+    found.skipped[:0] = skipped_before
     if not found.photos and not found.gels:
-        raise _no_photo(where, found, naming)
+        raise _no_photo_error(where, found, naming)
     by_object, by_photo = _read_metadata(f"{where}/{METADATA_FILE}", metadata, naming)
-    touches = grouped(found.gels, naming)
+    touches = group_touches(found.gels, naming)
     strange = sorted(by_photo.keys() - [*found.photos, *(path for path, _ in found.gels)])
     strange += sorted(by_object.keys() - [*found.objects, *(touch.object_id for touch in touches)])
-    told: _Table = {}
+    told: _MetadataTable = {}
     if by_object or by_photo:
         for path, name in zip(found.photos, found.objects, strict=True):
             if own := {**by_object.get(name, {}), **by_photo.get(path, {})}:
                 told[path] = own
     return Catalogue(
         folder,
-        Photos(found.photos, found.objects, told),
+        PhotoTable(found.photos, found.objects, told),
         tuple(found.ignored),
         tuple(found.skipped),
         tuple(f"{METADATA_FILE} speaks of {name}, which is not in the catalogue" for name in strange),
-        tuple(sorted(found.unread)),
+        tuple(sorted(found.unsupported_objects)),
         tuple(
             replace(touch, metadata={**by_object.get(touch.object_id, {}), **by_photo.get(touch.paths[0], {})})
             for touch in touches
@@ -183,10 +188,11 @@ def catalogue_of(
 
 
 @dataclass
-class _Names:
+class _FileGroups:
     """Files sorted out by their names. photos, and objects: theirs. gels: gel images, each with its object. ignored: no
     pictures. skipped: pictures that are left out, and why; unfit: those among them that do not fit the naming. unread:
-    objects of pictures of a kind that is not read."""
+    objects of pictures of a kind that is not read.
+    """
 
     photos: list[str] = field(default_factory=list)
     objects: list[str] = field(default_factory=list)
@@ -194,22 +200,22 @@ class _Names:
     ignored: list[str] = field(default_factory=list)
     skipped: list[SkippedPhoto] = field(default_factory=list)
     unfit: list[str] = field(default_factory=list)
-    unread: set[str] = field(default_factory=set)
+    unsupported_objects: set[str] = field(default_factory=set)
 
 
-def _sorted_out(names: Iterable[str], naming: Naming) -> _Names:
+def _classify_files(names: Iterable[str], naming: Naming) -> _FileGroups:
     """What each file is by its name and ending, in alphabetical order."""
-    found = _Names()
+    found = _FileGroups()
     for path in sorted(names):
         dot = path.rfind(".")
         ending = path[dot:].lower() if dot > path.rfind("/") + 1 else ""
-        if ending not in EXTENSIONS and ending not in UNREAD:
+        if ending not in EXTENSIONS and ending not in UNSUPPORTED_EXTENSIONS:
             found.ignored += [path] if path != METADATA_FILE else []
             continue
         name = naming.object_of(path)
-        if ending in UNREAD:
+        if ending in UNSUPPORTED_EXTENSIONS:
             found.skipped.append(SkippedPhoto(path, f"{ending} pictures are not read: save it as PNG or JPEG"))
-            found.unread |= {name} if name else set()
+            found.unsupported_objects |= {name} if name else set()
         elif name is None:
             why = ": a number alone" if naming.text == STEM else ""
             found.skipped.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
@@ -222,7 +228,7 @@ def _sorted_out(names: Iterable[str], naming: Naming) -> _Names:
     return found
 
 
-def _no_photo(where: str, found: _Names, naming: Naming) -> DatasetError:
+def _no_photo_error(where: str, found: _FileGroups, naming: Naming) -> DatasetError:
     """Why there is nothing to search in a catalogue without photos and touches."""
     if found.unfit:
         return DatasetError(
@@ -255,13 +261,13 @@ def decode_photo(file: PhotoBytes, decode: Callable[[bytes, str], RgbImage] = de
 # The user's own metadata -----------------------------------------------------------------------------------
 
 
-_Table = dict[str, dict[str, Any]]
+_MetadataTable = dict[str, dict[str, Any]]
 
 
-def _read_metadata(where: str, text: bytes, naming: Naming) -> tuple[_Table, _Table]:
+def _read_metadata(where: str, text: bytes, naming: Naming) -> tuple[_MetadataTable, _MetadataTable]:
     """The other keys by object_id, and by photo path. Raises DatasetError with the number of a bad line."""
-    by_object: _Table = {}
-    by_photo: _Table = {}
+    by_object: _MetadataTable = {}
+    by_photo: _MetadataTable = {}
     for number, line in enumerate(text.split(b"\n"), start=1):
         if not line.strip():
             continue

@@ -24,7 +24,8 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True)
 class Grasp:
     """One interaction, ready to be loaded: a photo, the touch (one file per finger, in order a, b), and the
-    no-contact frames of the same fingers where the recording has them (else empty)."""
+    no-contact frames of the same fingers where the recording has them (else empty).
+    """
 
     grasp_id: str
     object_id: str
@@ -52,11 +53,11 @@ def load_grasps(recording: AnyRecording) -> list[Grasp]:
     ['mug', 'mug', 'tin', 'tin']
     """
     folder = folder_of(recording)
-    return require_accepted(folder, load_all(folder))
+    return require_accepted(folder, load_all_attempts(folder))
 
 
 def require_accepted(folder: Path, attempts: Iterable["Attempt"]) -> list[Grasp]:
-    """The accepted grasps of a recording read by `load_all`. Raises DatasetError as `load_grasps` does."""
+    """The accepted grasps of a recording read by `load_all_attempts`. Raises DatasetError as `load_grasps` does."""
     grasps = [attempt.grasp for attempt in attempts if attempt.accepted]
     if not grasps:
         raise DatasetError(f"{folder} must hold successful grasps with a photo and a touch; it holds none")
@@ -84,7 +85,7 @@ class Attempt:
         return self.outcome == "held"
 
 
-def load_all(folder: Path) -> list[Attempt]:
+def load_all_attempts(folder: Path) -> list[Attempt]:
     """Read every line of a recording, in the order of collection. Raises DatasetError for an unreadable one."""
     try:
         recording = read_recording(folder)
@@ -120,7 +121,7 @@ def load_attempts(folder: Path) -> list[Attempt]:
     A grasp counts by its `outcome`, and where that was not recorded by `grasped`; left out are those with neither,
     and plans that never came to a grasp. Raises DatasetError as `load_grasps` does.
     """
-    attempts = [attempt for attempt in load_all(folder) if attempt.outcome not in ("unknown", "no_plan")]
+    attempts = [attempt for attempt in load_all_attempts(folder) if attempt.outcome not in ("unknown", "no_plan")]
     if not attempts:
         raise DatasetError(f"{folder} must say of its grasps whether they succeeded (grasped, outcome); none says so")
     finger_count([attempt.grasp for attempt in attempts])
@@ -212,7 +213,8 @@ def make_split(grasps: Sequence[Grasp], *, validation: float, test: float, seed:
 
 def _take(queue: list[list[str]], target: float) -> tuple[str, ...]:
     """Take off the queue each group that brings the count closer to the target; the smallest where these hold no two
-    objects."""
+    objects.
+    """
     taken: list[str] = []
     for group in list(queue):
         if abs(len(taken) + len(group) - target) < abs(len(taken) - target):
@@ -258,7 +260,7 @@ class PairBatch:
     photo_objects: NDArray[np.int64]
 
 
-_Drawn = tuple[int, Path, float]
+_PhotoDraw = tuple[int, Path, float]
 
 
 class PairSampler:
@@ -305,7 +307,7 @@ class PairSampler:
             [self._touch(step * touches + turn) for turn in range(touches)], (1, step), self.share_photos
         )
 
-    def every_touch(self) -> PairBatch:
+    def evaluation_pairs(self) -> PairBatch:
         """Every touch of the set with its positive and negative photos: the fixed pairs for evaluation."""
         touches = [(index, grasp) for index, part in enumerate(self.grasps) for grasp in part]
         return self._pairs(touches, stream=(2,))
@@ -322,7 +324,7 @@ class PairSampler:
         photos: dict[Path, int] = {}
         owners: dict[Path, int] = {}
         pairs: list[tuple[int, int, float]] = []
-        for row, drawn in enumerate(self._drawn([index for index, _ in touches], rng, share)):
+        for row, drawn in enumerate(self._draw_photos([index for index, _ in touches], rng, share)):
             for owner, photo, label in drawn:
                 owners[photo] = owner
                 pairs.append((row, photos.setdefault(photo, len(photos)), label))
@@ -337,10 +339,11 @@ class PairSampler:
             photo_objects=np.array([owners[photo] for photo in photos], dtype=np.int64),
         )
 
-    def _drawn(self, objects: list[int], rng: np.random.Generator, share: bool) -> Iterator[list[_Drawn]]:
-        """Photos to pair with the touch of each object: (object, photo, label). Shared negatives are of the batch's
+    def _draw_photos(self, objects: list[int], rng: np.random.Generator, share: bool) -> Iterator[list[_PhotoDraw]]:
+        """Photos to pair with the touch of each object: (object, photo, label). SharedImage negatives are of the batch's
         other objects, taken in turn in a random order, with one of the photos that the batch shows of each; where the
-        batch holds no other object they are drawn from all."""
+        batch holds no other object they are drawn from all.
+        """
         if not share:
             for index in objects:
                 matches = [(index, photo, 1.0) for photo in self._positives(index, rng)]
@@ -383,14 +386,14 @@ class ImageCache:
 
     def __init__(self, load: Callable[..., NDArray[Any]], limit_bytes: int = 4 << 30) -> None:
         self._load, self._limit = load, limit_bytes
-        self._kept: dict[tuple[Path | None, ...], NDArray[Any]] = {}
+        self._images: dict[tuple[Path | None, ...], NDArray[Any]] = {}
         self._used = 0
 
     def __call__(self, *paths: Path | None) -> NDArray[Any]:
         """The image that `load(*paths)` gives."""
-        if (image := self._kept.get(paths)) is None:
+        if (image := self._images.get(paths)) is None:
             image = self._load(*paths)
             if self._used + image.nbytes <= self._limit:
-                self._kept[paths] = image
+                self._images[paths] = image
                 self._used += image.nbytes
         return image

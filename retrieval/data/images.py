@@ -30,7 +30,7 @@ _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", 
 EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
 MAX_PIXELS = 20_000_000
 """Of a decoded picture, 240 MB in float32. A larger JPEG file is decoded at 1/2, 1/4 or 1/8 of its size."""
-MOST_REDUCED = 160_000_000
+MAX_DRAFT_PIXELS = 160_000_000
 """Pixels of such a file."""
 MAX_SIDE, MAX_ASPECT = 65_535, 200
 """Of a picture: pixels of a side, which is what JPEG can say, and of the longer side for each of the shorter."""
@@ -44,10 +44,11 @@ _STRIP = 1 << 20  # pixels
 _ORIENTATION, _BITS, _PHOTOMETRIC, _PLANAR, _EXTRA_SAMPLES = 274, 258, 262, 284, 338
 
 
-class _Quiet:
+class _SuppressedWarnings:
     """No warnings while any thread is inside. The filters belong to the whole process: `warnings.catch_warnings` in
     each thread would let them be put back in the wrong order, and a lock around it would decode one picture at a
-    time."""
+    time.
+    """
 
     def __init__(self) -> None:
         self._lock, self._inside, self._filters = threading.Lock(), 0, warnings.catch_warnings()
@@ -67,10 +68,10 @@ class _Quiet:
                 self._filters.__exit__(None, None, None)
 
 
-_quiet = _Quiet()
+_suppressed_warnings = _SuppressedWarnings()
 
 
-_SMALLER = (8, 4, 2)
+_DRAFT_SCALES = (8, 4, 2)
 
 
 def read_rgb(path: str | Path) -> RgbImage:
@@ -90,7 +91,7 @@ def read_bytes(path: str | Path) -> bytes:
         raise ImageError(path, f"cannot be read: {_reason(error)}") from error
 
 
-def decode_rgb(data: bytes, name: str | Path, least: int | None = None) -> RgbImage:
+def decode_rgb(data: bytes, name: str | Path, min_side: int | None = None) -> RgbImage:
     """Decode one picture to (H, W, 3) float32 RGB in 0..1; `name` stands for it in messages.
 
     least: a JPEG file is decoded at 1/8, 1/4 or 1/2 of its size, by its own cosine transform, where the shorter side
@@ -99,42 +100,43 @@ def decode_rgb(data: bytes, name: str | Path, least: int | None = None) -> RgbIm
     Grey becomes three equal channels, transparency is laid on white, the EXIF orientation is applied, and of
     several pages or frames the first is taken. Raises ImageError for whatever is wrong with the bytes.
     """
-    return to_unit(decode(data, name, least))
+    return to_unit(decode(data, name, min_side))
 
 
-def decode(data: bytes, name: str | Path, least: int | None = None) -> Samples:
+def decode(data: bytes, name: str | Path, min_side: int | None = None) -> Samples:
     """As `decode_rgb`, but in the 8 bits of the file, (H, W, 3) uint8, where it has no more bits and nothing was laid
-    on white."""
-    with _opened(data, name) as image:
-        _reduce(image, least)
+    on white.
+    """
+    with _open_image(data, name) as image:
+        _apply_draft_mode(image, min_side)
         check_pixels(image.size, name)
         image.load()
         orientation = _orientation(image)
         # Byte 24 of a PNG file is its bit depth.
         bits = data[24] if image.format == "PNG" else max(_tiff_tag(image, _BITS, (8,)))
         samples = _deep_rgb(image, data, name) if bits > 8 else _eight_bit_rgb(image, name)
-        return _upright(samples, orientation)
+        return _apply_orientation(samples, orientation)
 
 
 def picture_size(data: bytes, name: str | Path) -> tuple[int, int]:
     """(width, height) of a picture as its file says, and nothing is decoded. Raises ImageError as `decode_rgb` does."""
     if (size := _webp_size(data)) != (1, 1):
         return size
-    with _opened(data, name) as image:
+    with _open_image(data, name) as image:
         width, height = image.size
         return width, height
 
 
 @contextmanager
-def _opened(data: bytes, name: str | Path) -> Iterator[Image.Image]:
+def _open_image(data: bytes, name: str | Path) -> Iterator[Image.Image]:
     """A picture whose header was read; whatever is wrong with it, here and below `with`, is an ImageError."""
     if not data:
         raise ImageError(name, "the file is empty")
     try:
         check_pixels(_webp_size(data), name)
         check_structure(data, name)
-        decoder = _other_decoder(data, name)
-        with _quiet:
+        decoder = _register_decoder(data, name)
+        with _suppressed_warnings:
             try:
                 image = Image.open(io.BytesIO(data), formats=_FORMATS if decoder is None else (decoder,))
             except Image.DecompressionBombError:
@@ -162,7 +164,7 @@ def _reason(error: BaseException) -> str:
     return f"{' '.join(text.split())} ({type(error).__name__})"
 
 
-def _other_decoder(data: bytes, name: str | Path) -> str | None:
+def _register_decoder(data: bytes, name: str | Path) -> str | None:
     """Pillow's name of the decoder for these bytes, "HEIF" or "AVIF", made known to it; None for any other picture.
 
     Both files begin with a box of type "ftyp" that lists what its reader must know. Raises ImageError where the
@@ -186,16 +188,17 @@ def _other_decoder(data: bytes, name: str | Path) -> str | None:
     return "HEIF"
 
 
-def _reduce(image: Image.Image, least: int | None) -> None:
-    """Have a large JPEG file decoded smaller, which takes the memory of what comes out, and as few pixels as `least`
-    asks for. A progressive one keeps its size where nothing is asked: its decoder holds the whole."""
+def _apply_draft_mode(image: Image.Image, min_side: int | None) -> None:
+    """Have a large JPEG file decoded smaller, which takes the memory of what comes out, and as few pixels as `min_side`
+    asks for. A progressive one keeps its size where nothing is asked: its decoder holds the whole.
+    """
     width, height = image.size
-    if image.format != "JPEG" or width * height > MOST_REDUCED:
+    if image.format != "JPEG" or width * height > MAX_DRAFT_PIXELS:
         return
     progressive = bool(image.info.get("progressive"))
     if progressive and width * height > MAX_PIXELS:
         return
-    wanted = next((each for each in _SMALLER if least is not None and min(width, height) >= each * least), 1)
+    wanted = next((each for each in _DRAFT_SCALES if min_side is not None and min(width, height) >= each * min_side), 1)
     enough = next((each for each in (1, 2, 4, 8) if -(-width // each) * -(-height // each) <= MAX_PIXELS), None)
     if enough and (scale := max(wanted, enough)) > 1:
         image.draft(None, (width // scale, height // scale))
@@ -203,13 +206,14 @@ def _reduce(image: Image.Image, least: int | None) -> None:
 
 def pillow_rgb(image: Image.Image, name: str | Path) -> RgbImage:
     """An opened Pillow image as `decode_rgb` gives its file, but for samples beyond 8 bits, which Pillow has dropped
-    by then. Raises ImageError."""
+    by then. Raises ImageError.
+    """
     try:
         check_pixels(image.size, name)
-        with _quiet:
+        with _suppressed_warnings:
             image.load()
             rgb = _eight_bit_rgb(image, name)
-        return to_unit(_upright(rgb, _orientation(image)))
+        return to_unit(_apply_orientation(rgb, _orientation(image)))
     except ImageError:
         raise
     except Exception as error:  # a file behind it that is damaged, or closed by now
@@ -324,7 +328,7 @@ def _orientation(image: Image.Image) -> int:
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
-def _upright(image: Samples, orientation: int) -> Samples:
+def _apply_orientation(image: Samples, orientation: int) -> Samples:
     """Undo an EXIF orientation: 5..8 swap the axes, then rows (3, 4, 7, 8) and columns (2, 3, 6, 7) turn."""
     if orientation >= 5:
         image = image.swapaxes(0, 1)

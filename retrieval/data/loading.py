@@ -28,7 +28,7 @@ def worker_pool(workers: int | str = "auto") -> ThreadPoolExecutor:
     return ThreadPoolExecutor(worker_count(workers), thread_name_prefix="decode")
 
 
-def ahead(futures: Iterable[Future[Result]], depth: int) -> Iterator[Result]:
+def prefetch(futures: Iterable[Future[Result]], depth: int) -> Iterator[Result]:
     """Yield the results in order while up to `depth` later ones are prepared.
 
     Args:
@@ -44,12 +44,12 @@ def ahead(futures: Iterable[Future[Result]], depth: int) -> Iterator[Result]:
         yield waiting.popleft().result()
 
 
-def in_order(pool: Executor, load: Callable[[T], Result], items: Iterable[T], depth: int = 16) -> Iterator[Result]:
+def map_in_order(pool: Executor, load: Callable[[T], Result], items: Iterable[T], depth: int = 16) -> Iterator[Result]:
     """Yield `load(item)` of each item in order, computed by `pool` up to `depth` items ahead."""
-    return ahead((pool.submit(load, item) for item in items), depth)
+    return prefetch((pool.submit(load, item) for item in items), depth)
 
 
-class Timed:
+class TimedFunction:
     """A function that keeps the seconds of each of its calls; safe to call from several threads."""
 
     def __init__(self, function: Callable[..., Any]) -> None:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import PurePosixPath
 
-from retrieval.console.output import some
+from retrieval.console.output import abbreviate_list
 from retrieval.errors import BadInput
 
 FOLDER, STEM = "folder", "stem"
@@ -34,7 +34,7 @@ NOT_OBJECTS = frozenset(
 
 _FIELD = re.compile(r"\{(\w+)\}")
 _NUMBER = re.compile(r"[\s._#-]*\(?\d+\)?$")
-_SHOWN = 3
+_MAX_EXAMPLES = 3
 
 
 @dataclass(frozen=True)
@@ -90,12 +90,12 @@ def without_number(name: str) -> str:
     return _NUMBER.sub("", name)
 
 
-def doubts(photos: Mapping[str, int], naming: Naming) -> list[str]:
+def naming_warnings(photos: Mapping[str, int], naming: Naming) -> list[str]:
     """What looks wrong about objects with these numbers of photos: a sentence each."""
     names, found = sorted(photos), []
     if strange := [name for name in names if name.casefold() in NOT_OBJECTS]:
         found.append(
-            f"{some(strange, _SHOWN)} {'is' if len(strange) == 1 else 'are'} taken for the name of an object, with "
+            f"{abbreviate_list(strange, _MAX_EXAMPLES)} {'is' if len(strange) == 1 else 'are'} taken for the name of an object, with "
             f"{sum(photos[name] for name in strange)} photo(s): if the objects' folders lie below it, say "
             f"--objects-from '{{split}}/{{object}}/{{photo}}'"
         )
@@ -109,11 +109,11 @@ def doubts(photos: Mapping[str, int], naming: Naming) -> list[str]:
         what = "every object has one photo, and " if single else ""
         found.append(
             f"{what}{len(alike)} of {len(names)} objects have names that differ from another's by a number only: "
-            f"{some(alike, _SHOWN)}; if these show one object, say --objects-from stem, or a pattern"
+            f"{abbreviate_list(alike, _MAX_EXAMPLES)}; if these show one object, say --objects-from stem, or a pattern"
         )
     return found
 
 
-def per_object(counts: Sequence[int]) -> dict[str, float]:
+def count_summary(counts: Sequence[int]) -> dict[str, float]:
     """Least, median and largest number of photos of an object."""
     return {"min": min(counts), "median": statistics.median(counts), "max": max(counts)}

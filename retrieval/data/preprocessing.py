@@ -16,7 +16,7 @@ from msgspec import Meta
 from _touch_retrieval.documents import check_fields
 from retrieval.data.images import decode, picture_size, read_bytes, read_rgb
 from retrieval.data.resize import RgbImage, check_rgb, resize
-from retrieval.data.views import VIEWS, find_object, least_side, least_side_of_crop, strip
+from retrieval.data.views import VIEWS, find_object, min_photo_side, min_photo_side_for_crop, tile_views
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
@@ -69,7 +69,8 @@ Side = Annotated[int, Meta(ge=1, le=4096)]
 class Preprocessing:
     """How files become what the towers see: sides of the squares in pixels, one of BACKGROUNDS, which views of a
     photo stand side by side (`retrieval.data.views.VIEWS`), and whether a JPEG photo is decoded no larger than these
-    need (`reduced`)."""
+    need (`reduced`).
+    """
 
     touch_px: Side = 128
     photo_px: Side = 256
@@ -101,19 +102,19 @@ class Preprocessing:
     def photo(self, image: RgbImage) -> RgbImage:
         """(H, W, 3) in 0..1 to (photo_px, views * photo_px, 3). Raises BadInput, NumericalError."""
         check_rgb(image, "photo")
-        return strip(_finite(image, "photo"), self.views, self.photo_px)
+        return tile_views(_finite(image, "photo"), self.views, self.photo_px)
 
-    def photo_of(self, data: bytes, name: str | Path) -> RgbImage:
+    def photo_from_bytes(self, data: bytes, name: str | Path) -> RgbImage:
         """The bytes of a photo's file as `photo` gives the picture in them. Raises ImageError."""
         if not self.reduced:
-            return strip(decode(data, name), self.views, self.photo_px)
-        image = decode(data, name, least_side(self.views, self.photo_px))
+            return tile_views(decode(data, name), self.views, self.photo_px)
+        image = decode(data, name, min_photo_side(self.views, self.photo_px))
         short, box = min(image.shape[:2]), None
         if "crop" in self.views and short < min(picture_size(data, name)):
             box = find_object(image)
-            if (more := least_side_of_crop(box, short, self.photo_px)) > short:
+            if (more := min_photo_side_for_crop(box, short, self.photo_px)) > short:
                 image, box = decode(data, name, more), None
-        return strip(image, self.views, self.photo_px, box)
+        return tile_views(image, self.views, self.photo_px, box)
 
     def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
         """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.
@@ -129,7 +130,7 @@ class Preprocessing:
 
     def load_photo(self, path: str | Path) -> RgbImage:
         """Read a photo as (photo_px, views * photo_px, 3) float32. Raises ImageError."""
-        return self.photo_of(read_bytes(path), path)
+        return self.photo_from_bytes(read_bytes(path), path)
 
     def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
         """Read one finger's gel image as (touch_px, touch_px, 3) float32; "none" never opens the reference.

@@ -28,7 +28,7 @@ def resize(image: RgbImage, size: tuple[int, int]) -> RgbImage:
     check_rgb(image, "image")
     if min(size) < 1:
         raise BadInput(f"the new size must be at least 1 x 1 pixel, got {size[0]} x {size[1]}")
-    return resized(image, size)
+    return resize_unchecked(image, size)
 
 
 def to_unit(image: Samples) -> RgbImage:
@@ -37,7 +37,7 @@ def to_unit(image: Samples) -> RgbImage:
     return unit
 
 
-def resized(samples: Samples, size: tuple[int, int]) -> RgbImage:
+def resize_unchecked(samples: Samples, size: tuple[int, int]) -> RgbImage:
     """As `resize`, for pictures (H, W, C) of any number of channels, and without its checks."""
     image = samples
     for axis in sorted((0, 1), key=lambda axis: size[axis] / samples.shape[axis]):  # shrink before growing
@@ -59,7 +59,8 @@ def _shrink(image: Samples, axis: int, length: int) -> RgbImage:
 
 def _grow(image: Samples, axis: int, length: int) -> RgbImage:
     """Interpolate one axis. cv2.INTER_LINEAR rounds the places to float32 first: its pixels differ by up to 1e-7, and
-    partial activations, stored as float16, by up to 1e-3 of their value."""
+    partial activations, stored as float16, by up to 1e-3 of their value.
+    """
     unit, old = to_unit(image), image.shape[axis]
     position = np.clip((np.arange(length) + 0.5) * (old / length) - 0.5, 0, old - 1)
     left = np.minimum(position.astype(np.int64), max(old - 2, 0))

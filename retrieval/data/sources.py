@@ -28,20 +28,20 @@ from retrieval.data.catalogue import (
     METADATA_FILE,
     Catalogue,
     CataloguePhoto,
-    Photos,
-    catalogue_of,
+    PhotoTable,
     list_catalogue,
+    make_catalogue,
 )
+from retrieval.data.folder_walk import SkippedPhoto, skipped_non_utf8
 from retrieval.data.images import MAX_BYTES
 from retrieval.data.naming import Naming
-from retrieval.data.storage import FINAL, file_system, is_inside, is_url, tried
+from retrieval.data.storage import PERMANENT_ERRORS, file_system, is_inside, is_url, retry
 from retrieval.data.text import is_utf8, require_utf8
-from retrieval.data.walking import SkippedPhoto, not_utf8
 from retrieval.errors import BadInput, DatasetError, ImageError
 
 _PATHS, _PICTURES = ("path", "file_name"), ("image", "photo", "bytes")
 _RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
-_GROUPS = 4
+_MAX_CACHED_GROUPS = 4
 """Row groups of pictures that are held at once."""
 
 
@@ -53,7 +53,7 @@ class Source(Protocol):
 
 
 @dataclass(frozen=True)
-class Fetched(Catalogue):
+class RemoteCatalogue(Catalogue):
     """A catalogue of another place than a folder of this machine. url: what it is called."""
 
     source: Source | None = None
@@ -66,10 +66,11 @@ class Fetched(Catalogue):
 
     def read(self, path: str) -> bytes:
         """The bytes of a photo's file. Raises ImageError for one that is gone or too large, and StorageError where the
-        storage does not answer."""
+        storage does not answer.
+        """
         assert self.source is not None
         try:
-            data = tried(f"{self.url}: {path}", lambda: self.source.read(path))  # type: ignore[union-attr]
+            data = retry(f"{self.url}: {path}", lambda: self.source.read(path))  # type: ignore[union-attr]
         except FileNotFoundError:
             raise ImageError(path, "no such file") from None
         except (PermissionError, IsADirectoryError, ValueError) as error:
@@ -79,19 +80,19 @@ class Fetched(Catalogue):
         return data
 
 
-def is_elsewhere(where: str | Path) -> bool:
+def is_url_or_archive(where: str | Path) -> bool:
     """Whether this is read by `list_photos` alone, not as a folder."""
     return is_url(where) or str(where).endswith((".parquet", ".tar"))
 
 
 def list_photos(where: str | Path, naming: Naming | None = None, seen: FolderCache | None = None) -> Catalogue:
     """The photos of a folder, or of a URL as the text above says. Raises DatasetError as `list_catalogue` does."""
-    if not is_elsewhere(where):
+    if not is_url_or_archive(where):
         return list_catalogue(Path(where), naming, seen)
     url, naming = str(where), naming or Naming()
     if url.endswith(".parquet"):
-        return _parquet(url, naming)
-    return _archives(url, naming) if url.endswith(".tar") else _folder(url, naming)
+        return _list_parquet_files(url, naming)
+    return _list_archives(url, naming) if url.endswith(".tar") else _list_folder(url, naming)
 
 
 # A folder --------------------------------------------------------------------------------------------------
@@ -110,12 +111,12 @@ class FolderSource:
         return data
 
 
-def _folder(url: str, naming: Naming) -> Catalogue:
+def _list_folder(url: str, naming: Naming) -> Catalogue:
     system, root = file_system(url)
     below = root.rstrip("/") + "/"
     try:
-        names = tried(url, lambda: sorted(system.find(root)))
-    except FINAL as error:
+        names = retry(url, lambda: sorted(system.find(root)))
+    except PERMANENT_ERRORS as error:
         raise DatasetError(f"the catalogue {url} cannot be listed: {error}") from error
     files, skipped = [], list[SkippedPhoto]()
     for name in (name.removeprefix(below) for name in names if name.startswith(below)):
@@ -124,20 +125,22 @@ def _folder(url: str, naming: Naming) -> Catalogue:
         if is_utf8(name):
             files.append(name)
         else:
-            skipped.append(not_utf8(name))
+            skipped.append(skipped_non_utf8(name))
     source = FolderSource(url)
-    lines = tried(url, lambda: source.read(METADATA_FILE)) if METADATA_FILE in files else b""
-    listed = catalogue_of(Path(), url, files, skipped, naming, lines)
-    return Fetched(**{one.name: getattr(listed, one.name) for one in fields(listed)}, source=source, url=url)
+    lines = retry(url, lambda: source.read(METADATA_FILE)) if METADATA_FILE in files else b""
+    listed = make_catalogue(Path(), url, files, skipped, naming, lines)
+    return RemoteCatalogue(**{one.name: getattr(listed, one.name) for one in fields(listed)}, source=source, url=url)
 
 
-def _named(url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming: Naming, source: Source) -> Fetched:
+def _make_remote_catalogue(
+    url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming: Naming, source: Source
+) -> RemoteCatalogue:
     """A catalogue of photos, each with its object's name where the file gives one."""
     found, skipped, seen = list[CataloguePhoto](), list[SkippedPhoto](), set[str]()
     for photo, object_id in photos:
         name = object_id or naming.object_of(photo.path)
         if not is_utf8(photo.path):
-            skipped.append(not_utf8(photo.path))
+            skipped.append(skipped_non_utf8(photo.path))
         elif photo.path in seen:
             skipped.append(SkippedPhoto(photo.path, "comes twice"))
         elif not is_inside(photo.path):
@@ -150,8 +153,8 @@ def _named(url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming
     if not found:
         why = f"; {skipped[0].path}: {skipped[0].reason}" if skipped else ""
         raise DatasetError(f"no photo in the catalogue {url}{why}")
-    listed = Photos.of(sorted(found, key=lambda photo: photo.path))
-    return Fetched(Path(), listed, skipped=tuple(skipped), source=source, url=url)
+    listed = PhotoTable.of(sorted(found, key=lambda photo: photo.path))
+    return RemoteCatalogue(Path(), listed, skipped=tuple(skipped), source=source, url=url)
 
 
 # Parquet ---------------------------------------------------------------------------------------------------
@@ -173,15 +176,15 @@ class ParquetSource:
         return data
 
 
-_one_at_a_time = threading.Lock()
+_row_group_lock = threading.Lock()
 
 
 def _row_group(file: str, group: int, column: str) -> list[Any]:
-    with _one_at_a_time:  # else each thread reads a group anew
+    with _row_group_lock:  # else each thread reads a group anew
         return _read_group(file, group, column)
 
 
-@lru_cache(maxsize=_GROUPS)
+@lru_cache(maxsize=_MAX_CACHED_GROUPS)
 def _read_group(file: str, group: int, column: str) -> list[Any]:
     with _parquet_file(file) as table:
         values = table.read_row_group(group, columns=[column]).column(0).to_pylist()
@@ -197,31 +200,33 @@ def _parquet_file(url: str) -> Any:
     return ParquetFile(system.open(path, "rb"))
 
 
-def _matching(url: str) -> list[str]:
+def _expand_pattern(url: str) -> list[str]:
     """URLs of the files that a pattern names."""
     spread = _RANGE.search(url)
     if spread:
         low, high = spread.groups()
         numbers = (f"{number:0{len(low)}d}" for number in range(int(low), int(high) + 1))
-        return [one for number in numbers for one in _matching(url[: spread.start()] + number + url[spread.end() :])]
+        return [
+            one for number in numbers for one in _expand_pattern(url[: spread.start()] + number + url[spread.end() :])
+        ]
     system, path = file_system(url)
     try:
-        found = tried(url, lambda: sorted(system.glob(path)) if "*" in path else [path])
-    except FINAL as error:
+        found = retry(url, lambda: sorted(system.glob(path)) if "*" in path else [path])
+    except PERMANENT_ERRORS as error:
         raise DatasetError(f"{url} cannot be listed: {error}") from error
     if not found:
         raise DatasetError(f"{url} names no file")
     return [system.unstrip_protocol(one) for one in found]
 
 
-def _parquet(url: str, naming: Naming) -> Catalogue:
+def _list_parquet_files(url: str, naming: Naming) -> Catalogue:
     photos, places = list[tuple[CataloguePhoto, str | None]](), dict[str, tuple[str, int, int]]()
-    files = _matching(url)
+    files = _expand_pattern(url)
     column = None
     for file in files:
         try:
-            own, listed = tried(file, lambda file=file: _list_parquet(file))  # type: ignore[misc]
-        except FINAL as error:
+            own, listed = retry(file, lambda file=file: _list_parquet(file))  # type: ignore[misc]
+        except PERMANENT_ERRORS as error:
             raise DatasetError(f"{file} is not a readable Parquet file: {error}") from error
         if column not in (None, own):
             told = [f"{name} has {each or 'names of files'}" for name, each in ((files[0], column), (file, own))]
@@ -231,7 +236,7 @@ def _parquet(url: str, naming: Naming) -> Catalogue:
             photos.append((photo, object_id))
             places.setdefault(photo.path, place)  # of two of one name the first is taken
     source: Source = ParquetSource(column, places) if column else FolderSource(url.rpartition("/")[0] or ".")
-    return _named(url, photos, naming, source)
+    return _make_remote_catalogue(url, photos, naming, source)
 
 
 _Row = tuple[CataloguePhoto, str | None, tuple[str, int, int]]
@@ -239,7 +244,8 @@ _Row = tuple[CataloguePhoto, str | None, tuple[str, int, int]]
 
 def _list_parquet(file: str) -> tuple[str, list[_Row]]:
     """The column with pictures, "" where rows name their files; and of each row its photo, its object where it names
-    one, and its place: file, row group, row there."""
+    one, and its place: file, row group, row there.
+    """
     found = list[_Row]()
     with _parquet_file(file) as table:
         names = list(table.schema_arrow.names)
@@ -286,25 +292,25 @@ class ArchiveSource:
         return data
 
 
-def _archives(url: str, naming: Naming) -> Catalogue:
+def _list_archives(url: str, naming: Naming) -> Catalogue:
     photos, places = list[tuple[CataloguePhoto, str | None]](), dict[str, tuple[str, int, int]]()
-    for file in _matching(url):
+    for file in _expand_pattern(url):
         try:
-            members = tried(file, lambda file=file: list(_members(file)))  # type: ignore[misc]
-        except FINAL as error:
+            members = retry(file, lambda file=file: list(_members(file)))  # type: ignore[misc]
+        except PERMANENT_ERRORS as error:
             raise DatasetError(f"{file} is not a readable tar file: {error}") from error
         stem, about = PurePosixPath(file).stem, dict[str, dict[str, Any]]()
         for name, data, _, _ in members:
             if data is not None:
-                about[_key(name)] = _metadata(f"{file}, {name}", data)
+                about[_sample_key(name)] = _metadata(f"{file}, {name}", data)
         for name, data, start, end in members:
             if data is None:
-                own = dict(about.get(_key(name), {}))
+                own = dict(about.get(_sample_key(name), {}))
                 object_id = own.pop("object_id", None)
                 path = f"{stem}/{name}" if "/" not in name else name
                 photos.append((CataloguePhoto(path, "", own), None if object_id is None else str(object_id)))
                 places.setdefault(path, (file, start, end))
-    return _named(url, photos, naming, ArchiveSource(places))
+    return _make_remote_catalogue(url, photos, naming, ArchiveSource(places))
 
 
 def _members(url: str) -> Iterator[tuple[str, bytes | None, int, int]]:
@@ -325,7 +331,7 @@ def _members(url: str) -> Iterator[tuple[str, bytes | None, int, int]]:
                 yield name, opened.read() if opened else b"", 0, 0
 
 
-def _key(name: str) -> str:
+def _sample_key(name: str) -> str:
     """What members of one sample share: the name up to the first dot after the folders."""
     folder, _, last = name.rpartition("/")
     return f"{folder}/{last.partition('.')[0]}"

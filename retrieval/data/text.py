@@ -1,5 +1,6 @@
 """Text that UTF-8 can hold. JSON may name half of a surrogate pair, `"\\ud83d"`, as a cut-off emoji leaves it: Python
-reads it, and no file, terminal or HTTP answer can show it."""
+reads it, and no file, terminal or HTTP answer can show it.
+"""
 
 import json
 import re
@@ -23,7 +24,7 @@ def require_utf8(document: Any) -> None:
         raise ValueError("it holds half of a character (a lone surrogate such as \\ud83d); write the whole character")
 
 
-def utf8_of(document: Any) -> Any:
+def replace_surrogates(document: Any) -> Any:
     """A JSON document, in which U+FFFD stands for what UTF-8 cannot hold."""
     if is_utf8(document):
         return document

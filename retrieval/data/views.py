@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.data.resize import RgbImage, Samples, resized, to_unit
+from retrieval.data.resize import RgbImage, Samples, resize_unchecked, to_unit
 
 _CROP_MARGIN = 1.12
-_ZOOM_SHARE = 7 / 16
+_ZOOM_FRACTION = 7 / 16
 _SIDE = 128
 """The object is looked for in a photo of so many pixels a side."""
 _RING = 6
@@ -30,13 +30,13 @@ _SHADE_TINT = 0.22
 """By how much light of the sky alone may shift the ground's colour between red and blue."""
 _DARKEST_SHADE = -1.6
 """Logarithm of how dark a shadow makes the ground at most."""
-_DIFFERS = (4.0, 3.5)
+_DIFFERENCE_THRESHOLDS = (4.0, 3.5)
 """From how many deviations of the ground a colour, and a lightness, is another thing's."""
 
 Grey = NDArray[np.float32]
 
 
-class Box(NamedTuple):
+class PixelBox(NamedTuple):
     """A rectangle of a photo, in its pixels; right and bottom lie outside."""
 
     left: float
@@ -45,7 +45,7 @@ class Box(NamedTuple):
     bottom: float
 
 
-def find_object(image: Samples) -> Box:
+def find_object(image: Samples) -> PixelBox:
     """Where the one object of a photo (H, W, 3) lies that stands before a plain ground; the whole photo if none does.
 
     The ground is what the photo's border shows: planes of colour and lightness, fitted without what sticks out. An
@@ -53,33 +53,35 @@ def find_object(image: Samples) -> Box:
     and a tint between the lamp's and the sky's. Where depth was recorded it would say better; a catalogue has none.
     """
     height, width = image.shape[:2]
-    linear = np.clip(resized(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
+    linear = np.clip(resize_unchecked(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
     channels = np.ascontiguousarray(linear.transpose(2, 0, 1))  # a plane after the other: sums in a tenth of the time
-    lightness = _summed(channels) / 3
-    (red, green, blue, lighter), scatter = _off_the_ground(np.stack([*(channels / lightness), np.log(lightness)]))
+    lightness = _channel_sum(channels) / 3
+    (red, green, blue, lighter), scatter = _ground_residuals(np.stack([*(channels / lightness), np.log(lightness)]))
     tint = (red - blue) / np.float32(np.sqrt(2))
     free = np.float32(_SHADE_TINT) * np.clip((-lighter - np.float32(0.1)) / np.float32(0.3), 0, 1)
     shift = (np.copysign(np.maximum(np.abs(tint) - free, 0), tint) - tint) / np.float32(np.sqrt(2))
-    by_colour = np.sqrt(_summed(np.square([red + shift, green, blue - shift]))) / float(scatter[:3].mean() + 0.02)
+    by_colour = np.sqrt(_channel_sum(np.square([red + shift, green, blue - shift]))) / float(scatter[:3].mean() + 0.02)
     by_light = np.maximum(lighter, _DARKEST_SHADE - lighter) / float(scatter[3] + 0.05)
-    differs = np.maximum(by_colour / _DIFFERS[0], by_light / _DIFFERS[1])
-    found = _largest_thing(cv2.GaussianBlur(differs, (0, 0), 1.0) > 1)
+    differs = np.maximum(by_colour / _DIFFERENCE_THRESHOLDS[0], by_light / _DIFFERENCE_THRESHOLDS[1])
+    found = _largest_region(cv2.GaussianBlur(differs, (0, 0), 1.0) > 1)
     if found is None:
-        return Box(0, 0, width, height)
+        return PixelBox(0, 0, width, height)
     left, top, right, bottom = (side / _SIDE for side in found)
-    return Box(left * width, top * height, right * width, bottom * height)
+    return PixelBox(left * width, top * height, right * width, bottom * height)
 
 
-def _summed(channels: NDArray[np.float32]) -> Grey:
+def _channel_sum(channels: NDArray[np.float32]) -> Grey:
     """The sum of three channels, one added after the other as numpy's own sum over a pixel's numbers does, in a tenth
-    of its time."""
+    of its time.
+    """
     total: Grey = channels[0] + channels[1] + channels[2]
     return total
 
 
-def _off_the_ground(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+def _ground_residuals(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """How much each of n maps of values (n, S, S) lies above a plane through the values of its border, and how much
-    these scatter about that plane (n,)."""
+    these scatter about that plane (n,).
+    """
     ring, planes, products = _border()
     flat = values.reshape(len(values), -1)
     border, terms = flat[:, ring], planes[:, ring]
@@ -98,7 +100,8 @@ def _off_the_ground(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], N
 @lru_cache(maxsize=1)
 def _border() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """The places (R,) of the border's pixels; the planes 1, x and y of all pixels (3, S * S); and of the border's the
-    products of any two (R, 9)."""
+    products of any two (R, 9).
+    """
     inside = np.zeros((_SIDE, _SIDE), bool)
     inside[_RING:-_RING, _RING:-_RING] = True
     ring = np.flatnonzero(~inside)
@@ -116,7 +119,7 @@ def _medians(values: NDArray[np.float32], kept: NDArray[np.bool_]) -> NDArray[np
     return middle
 
 
-def _largest_thing(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
+def _largest_region(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
     """Sides of the box around the largest region near the middle, with those a tenth as large; None for too little."""
     mask = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
@@ -131,9 +134,10 @@ def _largest_thing(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | No
     return left.min(), top.min(), (left + width).max(), (top + height).max()
 
 
-def square(image: Samples, box: Box, side: float) -> Samples:
+def crop_square(image: Samples, box: PixelBox, side: float) -> Samples:
     """The square of `side` pixels about the middle of a box in the photo; beyond the photo's edge its last pixels go
-    on."""
+    on.
+    """
     size = max(round(side), 1)
     left, top = (round(middle - size / 2) for middle in ((box.left + box.right) / 2, (box.top + box.bottom) / 2))
     inside = image[max(top, 0) : top + size, max(left, 0) : left + size]
@@ -143,20 +147,20 @@ def square(image: Samples, box: Box, side: float) -> Samples:
     return whole
 
 
-def _crop(image: Samples, box: Box) -> Samples:
-    return square(image, box, _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top))
+def _crop(image: Samples, box: PixelBox) -> Samples:
+    return crop_square(image, box, _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top))
 
 
-def _zoom(image: Samples, box: Box) -> Samples:
-    return square(image, box, _ZOOM_SHARE * min(image.shape[:2]))
+def _zoom(image: Samples, box: PixelBox) -> Samples:
+    return crop_square(image, box, _ZOOM_FRACTION * min(image.shape[:2]))
 
 
-def _grey(image: Samples, box: Box) -> Samples:
-    grey: RgbImage = _summed(to_unit(_zoom(image, box)).transpose(2, 0, 1))[..., None] / np.float32(3)
+def _grey(image: Samples, box: PixelBox) -> Samples:
+    grey: RgbImage = _channel_sum(to_unit(_zoom(image, box)).transpose(2, 0, 1))[..., None] / np.float32(3)
     return grey
 
 
-VIEWS: dict[str, Callable[[Samples, Box], Samples]] = {
+VIEWS: dict[str, Callable[[Samples, PixelBox], Samples]] = {
     "whole": lambda image, box: image,
     "crop": _crop,
     "zoom": _zoom,
@@ -166,29 +170,30 @@ VIEWS: dict[str, Callable[[Samples, Box], Samples]] = {
 colour."""
 
 
-OVERSAMPLED = 2
+OVERSAMPLING = 2
 """Pixels of a reduced photo, along a side, for each that a tower sees."""
-_SHARES = {"whole": 1.0, "zoom": _ZOOM_SHARE, "grey": _ZOOM_SHARE}
+_VIEW_FRACTIONS = {"whole": 1.0, "zoom": _ZOOM_FRACTION, "grey": _ZOOM_FRACTION}
 
 
-def least_side(names: Sequence[str], px: int) -> int:
-    """How many pixels the shorter side of a photo must have so that these views of it hold OVERSAMPLED of its pixels
-    for each of theirs, whatever it shows, and its object can be looked for."""
-    wanted = [OVERSAMPLED * px / _SHARES[name] for name in names if name in _SHARES]
-    return math.ceil(max([_SIDE, OVERSAMPLED * px, *wanted]))
+def min_photo_side(names: Sequence[str], px: int) -> int:
+    """How many pixels the shorter side of a photo must have so that these views of it hold OVERSAMPLING of its pixels
+    for each of theirs, whatever it shows, and its object can be looked for.
+    """
+    wanted = [OVERSAMPLING * px / _VIEW_FRACTIONS[name] for name in names if name in _VIEW_FRACTIONS]
+    return math.ceil(max([_SIDE, OVERSAMPLING * px, *wanted]))
 
 
-def least_side_of_crop(box: Box, short: int, px: int) -> int:
+def min_photo_side_for_crop(box: PixelBox, short: int, px: int) -> int:
     """The same for the view that is cut to the object in `box`, of a photo whose shorter side has `short` pixels."""
     share = _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top, 1) / short
-    return math.ceil(OVERSAMPLED * px / float(share))
+    return math.ceil(OVERSAMPLING * px / float(share))
 
 
-def strip(image: Samples, names: Sequence[str], px: int, box: Box | None = None) -> RgbImage:
+def tile_views(image: Samples, names: Sequence[str], px: int, box: PixelBox | None = None) -> RgbImage:
     """(px, len(names) * px, 3): the views of a photo (H, W, 3), side by side. box: of its object; None looks for it."""
     if box is None:
-        box = Box(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)
+        box = PixelBox(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)
     found = np.empty((px, len(names) * px, 3), np.float32)
     for place, name in enumerate(names):
-        found[:, place * px : (place + 1) * px] = resized(VIEWS[name](image, box), (px, px))
+        found[:, place * px : (place + 1) * px] = resize_unchecked(VIEWS[name](image, box), (px, px))
     return found

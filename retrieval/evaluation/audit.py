@@ -1,7 +1,7 @@
 """Leakage audit of a split: what the parts share, and near copies of test frames among those fitted or chosen on.
 
 Byte-identical files are found by their digests, what was encoded again, lit otherwise, moved or flipped by shape: see
-`retrieval.data.check.copies`, which also says of how many test frames a copy could have been told.
+`retrieval.data.check.near_copies`, which also says of how many test frames a copy could have been told.
 """
 
 from collections import defaultdict
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.console.progress import Bar
-from retrieval.data.check.copies import PictureSet, Thumbnail, look_at
+from retrieval.data.check.near_copies import PictureSet, Thumbnail, load_thumbnail
 from retrieval.data.check.recording import check_split
 from retrieval.data.dataset import Grasp, Split, finger_count
 from retrieval.data.loading import worker_pool
@@ -23,7 +23,7 @@ from retrieval.data.loading import worker_pool
 QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5)
 UNIT = "1 less the correlation of shapes (0: a copy; about 1: unlike pictures)"
 _PARTS = ("train", "validation", "test")
-_SHOWN = 5
+_MAX_EXAMPLES = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ def audit(grasps: Sequence[Grasp], split: Split, *, quiet: bool = False) -> dict
     objects, grasps: counts by part; shared: sentences on objects and sequences that stand in two parts;
     identical: {"count": files of equal bytes in two parts, "examples": lists of "part: grasp_id kind"};
     frames: by kind {"test", "seen": counts, "to_seen", "within_object": distances at `quantiles`, or null where
-    there is nothing to compare, "checked": test frames of which a copy could be told, "close": those of them that have
+    there is nothing to compare, "checked": test frames of which a copy could be told, "near_copies": those of them that have
     one, "nearest": the nearest pairs of checked frames, one of each test object}, where seen means of training and
     validation objects; quantiles, unit; clean: whether nothing was found, verdict.
     Raises ImageError for an image that cannot be read.
@@ -87,7 +87,7 @@ def _read_frames(grasps: Sequence[Grasp], quiet: bool) -> Iterable[_Frames]:
     ):
         for kind, paths in files.items():
             seen: dict[Path, Thumbnail] = {}
-            for path, found in zip(dict.fromkeys(paths), pool.map(look_at, dict.fromkeys(paths)), strict=True):
+            for path, found in zip(dict.fromkeys(paths), pool.map(load_thumbnail, dict.fromkeys(paths)), strict=True):
                 seen[path] = found
                 bar.advance()
             frames = [seen[path] for path in paths]
@@ -101,7 +101,7 @@ def _identical(grasps: Sequence[Grasp], parts: NDArray[np.str_], kinds: Iterable
         for digest, grasp, part in zip(frames.digests, grasps, parts, strict=True):
             places[digest].setdefault(str(part), f"{part}: {grasp.grasp_id} {frames.kind}")
     across = [sorted(place.values()) for place in places.values() if len(place) > 1]
-    return {"count": len(across), "examples": sorted(across)[:_SHOWN]}
+    return {"count": len(across), "examples": sorted(across)[:_MAX_EXAMPLES]}
 
 
 # Nearness --------------------------------------------------------------------------------------------
@@ -114,15 +114,15 @@ def _nearness(frames: _Frames, grasps: Sequence[Grasp], parts: NDArray[np.str_])
     checked = [int(at) for at in np.argsort(found.distance, kind="stable") if found.checked[at]]
     return {
         "test": len(test),
-        "seen": len(seen),
-        "to_seen": _quantiles(found.distance),
-        "within_object": _quantiles(frames.pictures.within_objects(test)),
+        "train_validation": len(seen),
+        "to_train_validation": _quantiles(found.distance),
+        "within_object": _quantiles(frames.pictures.within_object_distances(test)),
         "checked": int(found.checked.sum()),
-        "close": int(found.copy.sum()),
+        "near_copies": int(found.copy.sum()),
         "nearest": [
             {
                 "test": grasps[test[at]].grasp_id,
-                "seen": grasps[int(found.row[at])].grasp_id,
+                "train_validation": grasps[int(found.row[at])].grasp_id,
                 "distance": round(float(found.distance[at]), 4),
             }
             for at in _first_of_each(checked, owners)
@@ -135,7 +135,7 @@ def _first_of_each(order: Sequence[int], owners: Sequence[str]) -> list[int]:
     first: dict[str, int] = {}
     for at in order:
         first.setdefault(owners[at], int(at))
-    return list(first.values())[:_SHOWN]
+    return list(first.values())[:_MAX_EXAMPLES]
 
 
 def _quantiles(distances: NDArray[np.float64]) -> list[float] | None:
@@ -148,22 +148,22 @@ def _verdict(result: dict[str, Any]) -> dict[str, Any]:
     if count := result["identical"]["count"]:
         found.append(f"{count} file(s) stand byte for byte in two parts")
     for kind, frames in result["frames"].items():
-        if frames["close"]:
+        if frames["near_copies"]:
             found.append(
-                f"{frames['close']} of {frames['test']} test frames ({kind}) are near copies of a frame of a training "
+                f"{frames['near_copies']} of {frames['test']} test frames ({kind}) are near copies of a frame of a training "
                 "or validation object"
             )
     start = f"Leakage is possible: {'; '.join(found)}" if found else "No object, sequence or file stands in two parts"
-    return {"clean": not found, "verdict": f"{start}; {_checked(result['frames'])}."}
+    return {"clean": not found, "verdict": f"{start}; {_describe_checked(result['frames'])}."}
 
 
-def _checked(kinds: dict[str, Any]) -> str:
+def _describe_checked(kinds: dict[str, Any]) -> str:
     """How many test frames could be checked for near copies."""
-    compared = {kind: frames for kind, frames in kinds.items() if frames["to_seen"]}
+    compared = {kind: frames for kind, frames in kinds.items() if frames["to_train_validation"]}
     if not compared:
         return "there are no frames of both sides to compare"
     shares = [f"{frames['checked']} of {frames['test']} ({kind})" for kind, frames in compared.items()]
-    copies = "" if any(frames["close"] for frames in compared.values()) else "; none has one"
+    copies = "" if any(frames["near_copies"] for frames in compared.values()) else "; none has one"
     rest = any(frames["checked"] < frames["test"] for frames in compared.values())
     why = ", and the others show too little to tell a copy by" if rest else ""
     return f"near copies could be looked for of these test frames: {', '.join(shares)}{copies}{why}"

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput
 from retrieval.metrics.pairs import Calibration, Threshold, fit_calibration, reliability_bins
 from retrieval.metrics.table import ScoreTable, object_scores
-from retrieval.model.posterior import LEAST_OBJECTS, JudgedTouches, Posterior, Questions, fit_questions
+from retrieval.model.posterior import (
+    MIN_OBJECTS,
+    IdentificationTrials,
+    Posterior,
+    ScoredTouches,
+    fit_posterior_to_trials,
+)
 
 MIN_THRESHOLD_OBJECTS = 10
 """Validation objects that a threshold of pairs is fitted on."""
@@ -58,16 +64,18 @@ class Calibrations:
 def calibrate(validation: Mapping[int, ScoreTable], *, seed: int = 0) -> Calibrations:
     """Fit on validation objects; `validation` holds a table for each number of grasps.
 
-    Of fewer than three objects there are no posteriors (`enough_objects`).
+    Of fewer than three objects there are no posteriors (`has_enough_objects`).
     """
     pairs = {grasps: calibrate_pairs(table, seed=seed) for grasps, table in validation.items()}
-    asked_of = {grasps: questions(table, seed) for grasps, table in validation.items() if enough_objects(table)}
-    return Calibrations(pairs, {grasps: fit_questions([one]) for grasps, one in asked_of.items()})
+    asked_of = {
+        grasps: posterior_questions(table, seed) for grasps, table in validation.items() if has_enough_objects(table)
+    }
+    return Calibrations(pairs, {grasps: fit_posterior_to_trials([one]) for grasps, one in asked_of.items()})
 
 
 def calibrate_pairs(validation: ScoreTable, *, seed: int = 0) -> Calibration:
     """Log-odds of a row of the table with a photo, fitted on drawn pairs."""
-    return fit_calibration(*drawn_pairs(validation, seed))
+    return fit_calibration(*draw_pairs(validation, seed))
 
 
 @dataclass(frozen=True)
@@ -79,51 +87,52 @@ class PairRule:
 
     rule: Calibration | Threshold | None
     source: str = ""
-    why_not: str = ""
+    reason: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """The "pair_threshold" of results.json: {"at", "from", "why_not"}; at: the score above which a pair matches."""
         at = -self.rule.intercept / self.rule.slope if isinstance(self.rule, Calibration) else None
         at = self.rule.at if isinstance(self.rule, Threshold) else at
-        return {"at": at, "from": self.source or None, "why_not": self.why_not or None}
+        return {"at": at, "from": self.source or None, "reason": self.reason or None}
 
 
 def pair_rule(chosen: Mapping[str, Any], validation: ScoreTable, *, seed: int = 0) -> PairRule:
     """The threshold that a checkpoint brings with it (`chosen["pair_threshold"]`), else one fitted on validation
-    objects, of which `MIN_THRESHOLD_OBJECTS` are needed: between fewer a threshold falls anywhere."""
+    objects, of which `MIN_THRESHOLD_OBJECTS` are needed: between fewer a threshold falls anywhere.
+    """
     if (own := chosen.get("pair_threshold")) is not None:
         return PairRule(Threshold(own), "the checkpoint")
-    if (count := len(validation.asked.objects)) < MIN_THRESHOLD_OBJECTS:
+    if (count := len(validation.with_targets.objects)) < MIN_THRESHOLD_OBJECTS:
         return PairRule(
             None,
-            why_not=f"pair accuracy needs a threshold: a checkpoint's own, or one fitted on {MIN_THRESHOLD_OBJECTS} "
+            reason=f"pair accuracy needs a threshold: a checkpoint's own, or one fitted on {MIN_THRESHOLD_OBJECTS} "
             f"validation objects; there are {count}",
         )
     return PairRule(calibrate_pairs(validation, seed=seed), "validation objects")
 
 
-def enough_objects(table: ScoreTable) -> bool:
+def has_enough_objects(table: ScoreTable) -> bool:
     """Whether "which object, or none" can be asked: of two catalogues of two objects, with the true one and without."""
-    return len(table.objects) >= LEAST_OBJECTS
+    return len(table.objects) >= MIN_OBJECTS
 
 
-def questions(table: ScoreTable, seed: int = 0) -> Questions:
+def posterior_questions(table: ScoreTable, seed: int = 0) -> IdentificationTrials:
     """ "Which object, or none?" for every row that has a photo to find; a row counts as one grasp.
 
-    Objects stand in the order of `table.objects`, rows in that of `table.asked`. Raises BadInput for fewer than
+    Objects stand in the order of `table.objects`, rows in that of `table.with_targets`. Raises BadInput for fewer than
     three objects.
     """
-    kept = table.asked
-    judged = JudgedTouches(kept.scores, kept.touch_owner, kept.photo_owner, kept.own)
-    return Questions.of(judged, np.arange(len(kept.touch_owner))[:, None], seed)
+    kept = table.with_targets
+    judged = ScoredTouches(kept.scores, kept.touch_owner, kept.photo_owner, kept.own)
+    return IdentificationTrials.of(judged, np.arange(len(kept.touch_owner))[:, None], seed)
 
 
-def drawn_pairs(table: ScoreTable, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def draw_pairs(table: ScoreTable, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Scores and labels (P,): up to 8 photos of each row's object (never its own), as many of other objects.
 
     The object of a false pair is drawn uniformly, then its photo, so that both kinds are even in every row.
     """
-    kept = table.asked
+    kept = table.with_targets
     rng = np.random.default_rng([seed, 1])
     keys = np.where(kept.relevant & ~kept.own, rng.random(kept.own.shape), np.inf)
     true = np.argsort(keys, axis=1)[:, :_PAIRS_OF_A_ROW]
@@ -145,7 +154,7 @@ def _other_photos(table: ScoreTable, count: int, rng: np.random.Generator) -> ND
     return np.asarray(order[start[other] + (rng.random(other.shape) * counts[other]).astype(np.int64)])
 
 
-def drawn_choices(
+def draw_k_way_tests(
     table: ScoreTable, choice: KWayTest, seed: int, posterior: Posterior | None = None
 ) -> NDArray[np.float64]:
     """Scores (Q, k) of candidates, the true one first; rivals drawn uniformly, 4 tests a row.
@@ -153,7 +162,7 @@ def drawn_choices(
     posterior: what makes one logit of a candidate's photos, in place of their mean. Raises BadInput for fewer than
     two objects; with fewer than k there are as many candidates as objects.
     """
-    kept = table.asked
+    kept = table.with_targets
     scores = object_scores(kept, choice.photos, _TESTS_OF_A_ROW, seed, posterior.object_logits if posterior else None)
     count = min(choice.k, len(kept.objects))
     if count < 2:
@@ -173,19 +182,20 @@ def reliability(
     guess where one candidate is known to be true (a prior of none of 0), and whether it was right (equals share it).
     A choice without a posterior, or among more candidates than there are test objects, is left out.
     """
-    scores, labels = drawn_pairs(test[1], seed)
+    scores, labels = draw_pairs(test[1], seed)
     found = {"pairs": reliability_bins(calibrations.pairs[1].probability(scores), labels)}
     for choice in choices:
         table, posterior = test.get(choice.grasps), calibrations.posteriors.get(choice.grasps)
         if table and posterior and len(table.objects) >= choice.k:
-            logits = drawn_choices(table, choice, seed, posterior)
-            found[choice.name] = reliability_bins(*stated_first_guesses(logits, posterior).T)
+            logits = draw_k_way_tests(table, choice, seed, posterior)
+            found[choice.name] = reliability_bins(*top1_confidences(logits, posterior).T)
     return found
 
 
-def stated_first_guesses(logits: NDArray[np.float64], posterior: Posterior) -> NDArray[np.float64]:
+def top1_confidences(logits: NDArray[np.float64], posterior: Posterior) -> NDArray[np.float64]:
     """(Q, 2): the stated probability of the first guess among candidates of which one is true, and whether it is right
-    (equals share it); logits (Q, k), the true candidate first."""
+    (equals share it); logits (Q, k), the true candidate first.
+    """
     tied = logits == logits.max(1, keepdims=True)
-    said = [posterior.believe(row, none_prior=0).objects.max() for row in logits]
+    said = [posterior.probabilities(row, none_prior=0).objects.max() for row in logits]
     return np.column_stack([said, tied[:, 0] / tied.sum(1)])

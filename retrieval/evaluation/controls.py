@@ -14,70 +14,70 @@ from typing import Any
 import numpy as np
 
 from retrieval.data.dataset import Grasp
+from retrieval.evaluation.data import EvaluationData
 from retrieval.evaluation.experiment import Experiment
-from retrieval.evaluation.material import Material
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import MethodScores, summaries
 from retrieval.training.features import encode_recording
 
 CONTROL_METHOD = "late_fusion"
-MEASURED = ("pair_accuracy", "guesses_k5", "guesses_k10")
+CONTROL_MEASURES = ("pair_accuracy", "topn_k5", "topn_k10")
 CONTROLS = {
     "shuffled": "touches are dealt to other objects before fitting, so that there is nothing to learn",
-    "before": "the frames taken before the contact stand in for the touch, in fitting and in judging",
-    "blurred": "each gel image is reduced to a blur of 8 x 6 pixels, in fitting and in judging",
+    "no_contact": "the frames taken before the contact stand in for the touch, in fitting and in judging",
+    "low_pass": "each gel image is reduced to a blur of 8 x 6 pixels, in fitting and in judging",
 }
 CEILING_METHOD = "cca"
 CEILINGS = {
     "touch_to_touch": "the touch of another grasp stands in for the photo: what can be felt twice",
     "photo_to_photo": "the photo of another grasp stands in for the touch: what can be seen twice",
 }
-MOST_GRASPS = 12
+MAX_GRASPS = 12
 """Grasps of an object whose other images are encoded for a control."""
-MOST_PAIRS = 2000
+MAX_PAIRS = 2000
 """Labelled pairs, of all, whose other images are encoded for a control."""
 
 
-def control_experiments(experiment: Experiment, material: Material, cache: Path, seed: int) -> dict[str, Experiment]:
+def control_experiments(experiment: Experiment, data: EvaluationData, cache: Path, seed: int) -> dict[str, Experiment]:
     """The experiment of each control; "before" is left out where the recording lacks frames from before the contact."""
     folder, unfitted = experiment.folder / "controls", dataclasses.replace(experiment, checkpoint=None)
     experiments = {
         "shuffled": dataclasses.replace(unfitted, folder=folder / "shuffled", shuffled=True, role="control: shuffled")
     }
-    grasps = thinned(material.grasps, MOST_GRASPS)
-    queries = draw_queries(grasps, material.split, seed)
-    pairs = material.pairs[:: len(material.pairs) // MOST_PAIRS + 1]
-    for variant in ("before", "blurred"):
-        if variant == "before" and not all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
+    grasps = thin_grasps(data.grasps, MAX_GRASPS)
+    queries = draw_queries(grasps, data.split, seed)
+    pairs = data.pairs[:: len(data.pairs) // MAX_PAIRS + 1]
+    for touch_variant in ("no_contact", "low_pass"):
+        if touch_variant == "no_contact" and not all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
             continue
-        towers = material.matcher, material.config
-        shown = partial(encode_recording, cache=cache, variant=variant, quiet=experiment.quiet)
-        experiments[variant] = dataclasses.replace(
+        towers = data.matcher, data.config
+        shown = partial(encode_recording, cache=cache, touch_variant=touch_variant, quiet=experiment.quiet)
+        experiments[touch_variant] = dataclasses.replace(
             unfitted,
-            folder=folder / variant,
-            features=shown(grasps, *towers, photos_of=experiment.features),
-            pairs=shown(pairs, *towers, photos_of=experiment.pairs) if pairs else None,
+            folder=folder / touch_variant,
+            features=shown(grasps, *towers, photo_features_from=experiment.features),
+            pairs=shown(pairs, *towers, photo_features_from=experiment.pairs) if pairs else None,
             queries=queries,
-            role=f"control: {variant}",
+            role=f"control: {touch_variant}",
         )
     return experiments
 
 
-def thinned(grasps: Sequence[Grasp], most: int) -> list[Grasp]:
+def thin_grasps(grasps: Sequence[Grasp], max_grasps: int) -> list[Grasp]:
     """At most so many grasps of each object, evenly spaced over its own."""
     rows_of: dict[str, list[int]] = defaultdict(list)
     for row, grasp in enumerate(grasps):
         rows_of[grasp.object_id].append(row)
     kept: set[int] = set()
     for rows in rows_of.values():
-        kept |= {rows[place] for place in np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(int)}
+        kept |= {rows[place] for place in np.linspace(0, len(rows) - 1, min(max_grasps, len(rows))).astype(int)}
     return [grasps[row] for row in sorted(kept)]
 
 
-def score_beside(what: str, method: str, experiment: Experiment, seed: int, *, draws: int) -> dict[str, Any]:
+def score_control(description: str, method: str, experiment: Experiment, seed: int, *, draws: int) -> dict[str, Any]:
     """The entry of results.json of a control or a ceiling."""
     judged = MethodScores(experiment.queries, experiment.run(method, seed), seed)
-    return {"what": what, "measures": summaries([judged.measures(MEASURED)], draws, seed)}
+    return {"description": description, "measures": summaries([judged.measures(CONTROL_MEASURES)], draws, seed)}
 
 
 def ceiling_experiments(experiment: Experiment) -> dict[str, Experiment]:

@@ -15,7 +15,7 @@ from retrieval.data.dataset import AnyRecording, Split, folder_of
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
 from retrieval.evaluation.audit import UNIT, audit
-from retrieval.evaluation.cache import kept_document, resumable, write_document
+from retrieval.evaluation.cache import cached_document, resumable, write_document
 from retrieval.evaluation.controls import (
     CEILING_METHOD,
     CEILINGS,
@@ -23,16 +23,16 @@ from retrieval.evaluation.controls import (
     CONTROLS,
     ceiling_experiments,
     control_experiments,
-    score_beside,
+    score_control,
 )
+from retrieval.evaluation.data import EvaluationData, prepare
 from retrieval.evaluation.experiment import Experiment
-from retrieval.evaluation.faint import faint_touches, score_faint
-from retrieval.evaluation.material import Material, prepare
+from retrieval.evaluation.low_contact import find_low_contact_touches, score_low_contact
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import draw_queries
 from retrieval.evaluation.scoring import Measures, score_method
 from retrieval.methods import METHODS
-from retrieval.methods.base import Method
+from retrieval.methods.method import Method
 from retrieval.metrics.intervals import compare
 from retrieval.model.config import Config, named_config
 from retrieval.model.encode import one_thread, photo_features, touch_features
@@ -43,7 +43,7 @@ from retrieval.version import __version__
 BySeed = Mapping[str, Sequence[Predictions]]
 """Predictions of each training seed, by method."""
 DRAWS = 10_000
-COMPARED = ("pair_accuracy", "guesses_k5")
+COMPARED_MEASURES = ("pair_accuracy", "topn_k5")
 """Measures by which the first method is compared with each of the others."""
 
 
@@ -85,12 +85,12 @@ def evaluate(
         ConfigError: A method is unknown.
         DatasetError: The recording cannot be evaluated.
         CheckpointError: `model` cannot be read.
-        Interrupted: After Ctrl-C.
+        JobInterrupted: After Ctrl-C.
 
     >>> import dataclasses
     >>> from pathlib import Path
     >>> config = retrieval.load_config("tiny")
-    >>> config = dataclasses.replace(config, training=config.training.of_steps(2))
+    >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))
     >>> results = retrieval.evaluate("lab", Path("report"), config=config, methods=["cca", "chance"], quiet=True)
     >>> list(results["methods"])
     ['cca', 'chance']
@@ -103,8 +103,8 @@ def evaluate(
     seed = config.training.seed
     wanted = list(range(seed, seed + seeds))
     with resumable(out):
-        material = prepare(folder_of(recording), out, config, model=model, split=split, quiet=quiet)
-        experiment, controls = _experiments(material, out, cache or out / "features", seed, quiet)
+        data = prepare(folder_of(recording), out, config, model=model, split=split, quiet=quiet)
+        experiment, controls = _experiments(data, out, cache or out / "features", seed, quiet)
         jobs = {name: experiment.seeds_of(name, wanted) for name in dict.fromkeys(names)}
         predictions = {name: [experiment.run(name, one) for one in some] for name, some in jobs.items()}
         sides = [
@@ -112,63 +112,67 @@ def evaluate(
             ("ceilings", CEILINGS, CEILING_METHOD, ceiling_experiments(experiment)),
         ]
         beside = {
-            side: {name: score_beside(words[name], method, one, seed, draws=DRAWS) for name, one in experiments.items()}
+            side: {
+                name: score_control(words[name], method, one, seed, draws=DRAWS) for name, one in experiments.items()
+            }
             for side, words, method, experiments in sides
         }
     asked = experiment.queries
-    tested = [material.grasps[row] for row in asked.touches[asked.of_part(asked.touch_owner, "test")]]
+    tested = [data.grasps[row] for row in asked.touches[asked.of_part(asked.touch_owner, "test")]]
     results = {
-        **_about(material, experiment, called, wanted),
-        "audit": kept_document(
+        **_about(data, experiment, called, wanted),
+        "audit": cached_document(
             out / "audit.json",
-            {"recording": material.digest, "split": material.split.to_dict(), "distance": UNIT},
-            lambda: audit(material.grasps, material.split, quiet=quiet),  # it reads every image
+            {"recording": data.digest, "split": data.split.to_dict(), "distance": UNIT},
+            lambda: audit(data.grasps, data.split, quiet=quiet),  # it reads every image
         ),
-        **_scored(experiment, predictions, seed, quiet),
-        "faint": score_faint(faint_touches(tested, quiet=quiet), asked, predictions, draws=DRAWS, seed=seed),
+        **_score_methods(experiment, predictions, seed, quiet),
+        "low_contact": score_low_contact(
+            find_low_contact_touches(tested, quiet=quiet), asked, predictions, draws=DRAWS, seed=seed
+        ),
         **beside,
     }
     write_document(out / "results.json", results)
-    write_document(out / "timings.json", _timings(material, predictions))
+    write_document(out / "timings.json", _timings(data, predictions))
     return results
 
 
 def _experiments(
-    material: Material, out: Path, cache: Path, seed: int, quiet: bool
+    data: EvaluationData, out: Path, cache: Path, seed: int, quiet: bool
 ) -> tuple[Experiment, dict[str, Experiment]]:
     """The experiment of the evaluation, and those of the controls."""
-    shown = partial(encode_recording, matcher=material.matcher, config=material.config, cache=cache, quiet=quiet)
+    shown = partial(encode_recording, matcher=data.matcher, config=data.config, cache=cache, quiet=quiet)
     experiment = Experiment(
         folder=out,
-        config=material.config,
-        split=material.split,
-        features=shown(material.grasps),
-        pairs=shown(material.pairs) if material.pairs else None,
-        queries=draw_queries(material.grasps, material.split, seed),
-        checkpoint=material.checkpoint,
+        config=data.config,
+        split=data.split,
+        features=shown(data.grasps),
+        pairs=shown(data.pairs) if data.pairs else None,
+        queries=draw_queries(data.grasps, data.split, seed),
+        checkpoint=data.checkpoint,
         shuffled=False,
         quiet=quiet,
     )
-    return experiment, control_experiments(experiment, material, cache, seed)
+    return experiment, control_experiments(experiment, data, cache, seed)
 
 
-def _about(material: Material, experiment: Experiment, preset: str, seeds: list[int]) -> dict[str, Any]:
+def _about(data: EvaluationData, experiment: Experiment, preset: str, seeds: list[int]) -> dict[str, Any]:
     features = experiment.features
     return {
         "schema_version": SCHEMA_VERSION,
         "software": __version__,
         "recording": {
-            "path_name": material.name,
-            "source": material.source,
-            "digest": material.digest,
+            "path_name": data.name,
+            "source": data.source,
+            "digest": data.digest,
             "objects": len(set(features.object_ids)),
             "grasps": len(features),
         },
-        "split": {**material.split.to_dict(), "from": material.split_from},
+        "split": {**data.split.to_dict(), "from": data.split_from},
         "setting": {
             "preset": preset,
-            "model": material.checkpoint.digest if material.checkpoint else None,
-            "config": material.config.without_paths(),
+            "model": data.checkpoint.digest if data.checkpoint else None,
+            "config": data.config.without_paths(),
             "seeds": seeds,
             "draws": DRAWS,
             "features": {
@@ -182,7 +186,7 @@ def _about(material: Material, experiment: Experiment, preset: str, seeds: list[
     }
 
 
-def _scored(experiment: Experiment, predictions: BySeed, seed: int, quiet: bool) -> dict[str, Any]:
+def _score_methods(experiment: Experiment, predictions: BySeed, seed: int, quiet: bool) -> dict[str, Any]:
     """ "methods" and "comparisons" of results.json."""
     entries: dict[str, Any] = {}
     measures: dict[str, list[Measures]] = {}
@@ -192,27 +196,27 @@ def _scored(experiment: Experiment, predictions: BySeed, seed: int, quiet: bool)
                 experiment.queries, experiment.features.grasp_ids, by_seed, draws=DRAWS, seed=seed
             )
             bar.advance(note=name)
-    return {"methods": entries, "comparisons": _compared(measures, seed)}
+    return {"methods": entries, "comparisons": _compare_methods(measures, seed)}
 
 
-def _compared(measures: Mapping[str, list[Measures]], seed: int) -> list[dict[str, Any]]:
+def _compare_methods(measures: Mapping[str, list[Measures]], seed: int) -> list[dict[str, Any]]:
     first, *others = measures
     return [
         {"a": first, "b": other, "measure": key}
         | compare([one[key] for one in measures[first]], [one[key] for one in measures[other]], draws=DRAWS, seed=seed)
-        for key in COMPARED
+        for key in COMPARED_MEASURES
         for other in others
         if key in measures[first][0] and key in measures[other][0]
     ]
 
 
-def _timings(material: Material, predictions: BySeed) -> dict[str, Any]:
+def _timings(data: EvaluationData, predictions: BySeed) -> dict[str, Any]:
     found = {name: _method_times([one.seconds for one in by_seed]) for name, by_seed in predictions.items()}
-    if {"late_fusion", "prune_rerank"} <= set(found):  # one training serves both
-        found["prune_rerank"]["fit_s"] = found["late_fusion"]["fit_s"]
+    if {"late_fusion", "retrieve_rerank"} <= set(found):  # one training serves both
+        found["retrieve_rerank"]["fit_s"] = found["late_fusion"]["fit_s"]
     return {
         "machine": {"cpus": os.cpu_count(), "threads": 1},
-        "encode": _tower_times(material),
+        "encode": _tower_times(data),
         "methods": found,
     }
 
@@ -230,17 +234,17 @@ def _method_times(by_seed: Sequence[Mapping[str, float]]) -> dict[str, float | N
 
 
 @one_thread()
-def _tower_times(material: Material, count: int = 4, repeats: int = 3) -> dict[str, Any]:
+def _tower_times(data: EvaluationData, count: int = 4, repeats: int = 3) -> dict[str, Any]:
     """Median time of the towers, on one thread, for one touch and for one photo; their files are read before."""
-    grasps = material.grasps[:count]
-    with BatchImages(material.config, torch.device("cpu"), keep_bytes=0) as images:
+    grasps = data.grasps[:count]
+    with BatchImages(data.config, torch.device("cpu"), keep_bytes=0) as images:
         touches, photos = [images.touch(grasp) for grasp in grasps], [images.photo(grasp.photo) for grasp in grasps]
     times: dict[str, list[float]] = {"touch_ms": [], "photo_ms": []}
     for touch, photo in zip(touches * repeats, photos * repeats, strict=True):
         start = time.perf_counter()
-        touch_features(material.matcher, [touch])
+        touch_features(data.matcher, [touch])
         middle = time.perf_counter()
-        photo_features(material.matcher, [photo])
+        photo_features(data.matcher, [photo])
         times["touch_ms"].append(1e3 * (middle - start))
         times["photo_ms"].append(1e3 * (time.perf_counter() - middle))
     return {**{name: float(np.median(found)) for name, found in times.items()}, "where": "towers"}

@@ -13,14 +13,14 @@ from retrieval.data.dataset import Split
 from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
 from retrieval.evaluation.queries import Queries
 from retrieval.methods import METHODS
-from retrieval.methods.base import Method, Setting
 from retrieval.methods.late_fusion import LateFusion
+from retrieval.methods.method import Method, MethodSettings
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.encode import one_thread
 from retrieval.model.losses import LOSSES
 from retrieval.training.features import Features
-from retrieval.training.state import code_of
+from retrieval.training.state import code_digest
 from retrieval.version import __version__
 
 
@@ -30,7 +30,7 @@ class Experiment:
 
     pairs: labelled pairs that train beside the split's training objects. checkpoint: a whole model, which late fusion
     and what shares its weights then are; None: they are fitted. shuffled: touches are permuted among the objects of
-    each part before fitting, so that nothing can be learned. all_teach, kind_of: as in `Setting`. role: what it is
+    each part before fitting, so that nothing can be learned. fit_on_validation, kind_of: as in `MethodSettings`. role: what it is
     beside the evaluation itself, such as "control: blurred", for people who watch.
     """
 
@@ -43,7 +43,7 @@ class Experiment:
     checkpoint: Checkpoint | None
     shuffled: bool
     quiet: bool
-    all_teach: bool = False
+    fit_on_validation: bool = False
     kind_of: Mapping[str, str] | None = None
     role: str = ""
 
@@ -55,17 +55,17 @@ class Experiment:
 
     def run(self, name: str, seed: int) -> Predictions:
         """Return the predictions of a method: those in the folder, else it is fitted and they are written there."""
-        path, made_by = self.folder / "predictions" / f"{name}-{seed}.safetensors", self.made_by(name, seed)
-        if (kept := read_predictions(path, made_by)) is not None:
+        path, cache_key = self.folder / "predictions" / f"{name}-{seed}.safetensors", self.cache_key(name, seed)
+        if (kept := read_predictions(path, cache_key)) is not None:
             return kept
         if not self.quiet:
             say(f"evaluate: {name}, seed {seed}" + (f" ({self.role})" if self.role else ""))
-        method, fit_s = self._fitted(name, seed)
+        method, fit_s = self._fit(name, seed)
         predictions = predict(method, self.features, self.queries, fit_s)
-        write_predictions(path, predictions, made_by)
+        write_predictions(path, predictions, cache_key)
         return predictions
 
-    def made_by(self, name: str, seed: int) -> dict[str, Any]:
+    def cache_key(self, name: str, seed: int) -> dict[str, Any]:
         """Return everything that decides the predictions of a method, in JSON types."""
         losses = [LOSSES.load(loss) for loss, weight in self.config.training.weights.items() if weight > 0]
         return {
@@ -78,29 +78,29 @@ class Experiment:
             "config": self.config.without_paths(),
             "model": self.checkpoint.digest if self.checkpoint else None,
             "shuffled": self.shuffled,
-            "all_teach": self.all_teach,
+            "fit_on_validation": self.fit_on_validation,
             "software": __version__,
-            **code_of(METHODS.load(name), *losses),
+            **code_digest(METHODS.load(name), *losses),
         }
 
-    def _fitted(self, name: str, seed: int) -> tuple[Method, float]:
-        config = self.config.without_pruner() if self.shuffled else self.config  # there is no order to learn
-        setting = Setting(config, seed, self.folder / "fits", self.quiet, self.all_teach, self.kind_of)
-        method = METHODS.load(name)(setting)
+    def _fit(self, name: str, seed: int) -> tuple[Method, float]:
+        config = self.config.without_candidate_encoder() if self.shuffled else self.config  # there is no order to learn
+        settings = MethodSettings(config, seed, self.folder / "fits", self.quiet, self.fit_on_validation, self.kind_of)
+        method = METHODS.load(name)(settings)
         if self.checkpoint is not None and isinstance(method, LateFusion):
-            return type(method).of_checkpoint(self.checkpoint, method.setting), 0.0
+            return type(method).of_checkpoint(self.checkpoint, method.settings), 0.0
         train, validation = (self.features.of_objects(part) for part in (self.split.train, self.split.validation))
         if self.pairs:
-            train = train.joined(self.pairs)
+            train = train.concatenate(self.pairs)
         if self.shuffled:
-            train, validation = _shuffled(train, seed), _shuffled(validation, seed)
+            train, validation = _permute_touches(train, seed), _permute_touches(validation, seed)
         start = time.perf_counter()
         with one_thread():  # heads are small, and times are then those of one core
             method.fit(train, validation)
         return method, time.perf_counter() - start
 
 
-def _shuffled(features: Features, seed: int) -> Features:
+def _permute_touches(features: Features, seed: int) -> Features:
     """Every touch with a grasp drawn at random; photos stay where they are."""
     order = np.random.default_rng([seed, 13]).permutation(len(features))
     return Features(features.grasp_ids, features.object_ids, features.touch[order], features.photo)

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from retrieval.evaluation.cache import MadeBy, read_kept, write_kept
+from retrieval.evaluation.cache import CacheKey, read_cached, write_cached
 from retrieval.evaluation.queries import Queries
-from retrieval.methods.base import Method, add_up
+from retrieval.methods.method import Method, sum_over_sets
 from retrieval.model.encode import one_thread
 from retrieval.training.features import Features
 
@@ -28,7 +28,7 @@ class Predictions:
 
     scores: Scores
     set_scores: dict[int, Scores]
-    chosen: dict[str, Any]
+    best_params: dict[str, Any]
     seconds: dict[str, float]
 
 
@@ -37,47 +37,47 @@ def predict(method: Method, features: Features, queries: Queries, fit_s: float) 
     """Scores of a fitted method, computed on one thread; `fit_s` is how long fitting took."""
     touch, photo = features.touch[queries.touches], features.photo[queries.photos]
     start = time.perf_counter()
-    touch_codes = method.encode_touch(touch)
+    touch_encodings = method.encode_touch(touch)
     touched = time.perf_counter()
-    photo_codes = method.encode_photo(photo)
+    photo_encodings = method.encode_photo(photo)
     encoded = time.perf_counter()
-    scores = method.score(touch_codes, photo_codes)
+    scores = method.score(touch_encodings, photo_encodings)
     scored = time.perf_counter()
     if type(method)._score_sets is Method._score_sets:  # it adds up scores of single touches: these are there
-        sets = {size: add_up(scores, rows) for size, rows in queries.sets.items()}
+        sets = {size: sum_over_sets(scores, rows) for size, rows in queries.sets.items()}
     else:
-        sets = {size: method.score_sets(touch_codes, photo_codes, rows) for size, rows in queries.sets.items()}
+        sets = {size: method.score_sets(touch_encodings, photo_encodings, rows) for size, rows in queries.sets.items()}
     seconds = {
         "fit": fit_s,
         "encode_touch": (touched - start) / len(touch),
         "encode_photo": (encoded - touched) / len(photo),
         "score": (scored - encoded) / scores.size,
-        "query": _query_s(method, touch[:1], photo_codes),
+        "query": _query_s(method, touch[:1], photo_encodings),
     }
-    return Predictions(scores, sets, method.chosen, seconds)
+    return Predictions(scores, sets, method.best_params, seconds)
 
 
-def _query_s(method: Method, touch: Scores, photo_codes: Scores, repeats: int = 5) -> float:
+def _query_s(method: Method, touch: Scores, photo_encodings: Scores, repeats: int = 5) -> float:
     """Median time of one touch against the whole gallery, its features given."""
     times = []
     for _ in range(repeats):
         start = time.perf_counter()
-        method.score(method.encode_touch(touch), photo_codes)
+        method.score(method.encode_touch(touch), photo_encodings)
         times.append(time.perf_counter() - start)
     return float(np.median(times))
 
 
-def write_predictions(path: Path, predictions: Predictions, made_by: MadeBy) -> None:
+def write_predictions(path: Path, predictions: Predictions, cache_key: CacheKey) -> None:
     """Write scores with what made them (method, seed, digests of features and queries, ...)."""
     tensors = {"scores": torch.from_numpy(predictions.scores)}
     tensors |= {f"sets_{size}": torch.from_numpy(scores) for size, scores in predictions.set_scores.items()}
-    write_kept(path, made_by, tensors, {"chosen": predictions.chosen, "seconds": predictions.seconds})
+    write_cached(path, cache_key, tensors, {"best_params": predictions.best_params, "seconds": predictions.seconds})
 
 
-def read_predictions(path: Path, made_by: MadeBy) -> Predictions | None:
+def read_predictions(path: Path, cache_key: CacheKey) -> Predictions | None:
     """Read what `write_predictions` wrote; None where it is missing, damaged, or made by something else."""
-    if (kept := read_kept(path, made_by)) is None:
+    if (kept := read_cached(path, cache_key)) is None:
         return None
     tensors, header = kept
     sets = {int(name.removeprefix("sets_")): tensors[name].numpy() for name in tensors if name != "scores"}
-    return Predictions(tensors["scores"].numpy(), dict(sorted(sets.items())), header["chosen"], header["seconds"])
+    return Predictions(tensors["scores"].numpy(), dict(sorted(sets.items())), header["best_params"], header["seconds"])

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
-from retrieval.metrics.registry import SET_SIZES, SHOWN_PHOTOS
+from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, SET_SIZES
 
 PARTS = ("train", "validation", "test")
-MOST_GRASPS = {"train": 8, "validation": 12}
-"""Judged grasps of an object; of a test object all are judged."""
+MAX_GRASPS = {"train": 8, "validation": 12}
+"""ShardResult grasps of an object; of a test object all are judged."""
 SETS_OF_AN_OBJECT = 20
 
 Rows = NDArray[np.int64]
@@ -54,11 +54,13 @@ class Queries:
         return digest.hexdigest()
 
 
-def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, most: Mapping[str, int] = MOST_GRASPS) -> Queries:
-    """Judge all grasps of test objects and some of the others, drawn by `seed`; most: grasps of an object, by part.
+def draw_queries(
+    grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: Mapping[str, int] = MAX_GRASPS
+) -> Queries:
+    """FusionScorer all grasps of test objects and some of the others, drawn by `seed`; most: grasps of an object, by part.
 
     Sets of each of `SET_SIZES` are drawn for test and validation objects, without replacement within a set, where
-    they leave the object `SHOWN_PHOTOS` photos of other grasps. Shown by fewer than its rivals are, the true object
+    they leave the object `PHOTOS_PER_CANDIDATE` photos of other grasps. Shown by fewer than its rivals are, the true object
     would come first more often than 1 in K by chance: the mean of fewer scores lies further out. Raises DatasetError
     where the objects of a part are fewer than two.
     """
@@ -72,7 +74,7 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, most: Mapping
                 "more objects, or give a split of your own"
             )
     rng = np.random.default_rng([seed, 11])
-    judged = [_judged(grasps, name, most.get(part_of[name]), rng) for name in objects]
+    judged = [_draw_touches(grasps, name, max_grasps.get(part_of[name]), rng) for name in objects]
     touches = np.concatenate(judged)
     owner = np.repeat(np.arange(len(objects)), [len(rows) for rows in judged])
     column: dict[Path, int] = {}
@@ -92,13 +94,15 @@ def draw_queries(grasps: Sequence[Grasp], split: Split, seed: int, most: Mapping
     )
 
 
-def _judged(grasps: Sequence[Grasp], name: str, most: int | None, rng: np.random.Generator) -> Rows:
+def _draw_touches(grasps: Sequence[Grasp], name: str, max_grasps: int | None, rng: np.random.Generator) -> Rows:
     rows = np.array([row for row, grasp in enumerate(grasps) if grasp.object_id == name])
-    return rows if most is None or len(rows) <= most else np.sort(rng.choice(rows, most, replace=False))
+    return (
+        rows if max_grasps is None or len(rows) <= max_grasps else np.sort(rng.choice(rows, max_grasps, replace=False))
+    )
 
 
 def _draw_sets(touches_of: Sequence[Rows], size: int, rng: np.random.Generator) -> Rows:
     """(S, size): sets of the touches of each object that has enough."""
-    enough = [places for places in touches_of if len(places) >= size + SHOWN_PHOTOS]
+    enough = [places for places in touches_of if len(places) >= size + PHOTOS_PER_CANDIDATE]
     drawn = [rng.choice(places, size, replace=False) for places in enough for _ in range(SETS_OF_AN_OBJECT)]
     return np.array(drawn, dtype=np.int64).reshape(-1, size)

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from retrieval.evaluation.calibrate import questions
+from retrieval.evaluation.calibrate import posterior_questions
 from retrieval.metrics.measure import Measure, object_weights, weight_below
 from retrieval.metrics.table import ScoreTable
 from retrieval.model.posterior import Posterior
 
 TRUE_ACCEPTS = 0.95
 _CURVE_POINTS = 200
-_AS_IT_IS = Posterior(slope=1.0, offset=0.0)
+_IDENTITY_POSTERIOR = Posterior(slope=1.0, offset=0.0)
 """Takes logs of likelihood ratios as logits."""
 
 Floats = NDArray[np.float64]
@@ -65,16 +65,16 @@ def statistic(gallery: Floats) -> Floats:
 
 
 def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejection:
-    """Judge a posterior on objects that it was not fitted on; at even prior of "none of these".
+    """FusionScorer a posterior on objects that it was not fitted on; at even prior of "none of these".
 
     auroc: chance that a row's statistic is higher with its object in the gallery than any row's without; equals count
     half, objects alike. balanced_accuracy: accepted where "one of these" is as likely as none, or likelier.
     false_accepts_at_95: share accepted without the object by the threshold that accepts 95 % with it. Chance is 1/2,
     1/2 and .95. Raises BadInput for fewer than three objects.
     """
-    kept = table.asked
+    kept = table.with_targets
     true = np.asarray(kept.touch_owner[:, None] == kept.objects)
-    shown = galleries(questions(kept, seed).log_ratios(posterior), true, seed)
+    shown = galleries(posterior_questions(kept, seed).log_ratios(posterior), true, seed)
     present, absent = map(statistic, shown)
     weights = object_weights(kept.touch_owner)
     words = f"{table.gallery}; each asked with its object and without, a rival dropped in its stead"
@@ -121,7 +121,8 @@ def _false_accepts(present: Floats, absent: Floats, owner: NDArray[np.int64]) ->
 
 def _false_accept_share(present: Floats, absent: Floats, weights: Floats) -> float:
     """The share of questions without the object that are accepted by the threshold that accepts 95 % of those with it;
-    of equals at the threshold so large a part that it is 95 % exactly."""
+    of equals at the threshold so large a part that it is 95 % exactly.
+    """
     order = np.argsort(-present, kind="stable")
     accepted = np.cumsum(weights[order])
     threshold = present[order][min(int(np.searchsorted(accepted, TRUE_ACCEPTS * accepted[-1])), len(order) - 1)]
@@ -136,7 +137,7 @@ def _roc(present: Floats, absent: Floats, weights: Floats) -> list[list[float]]:
         [float(weights[absent >= threshold].sum()), float(weights[present >= threshold].sum())]
         for threshold in thresholds
     ]
-    return _thinned([[0.0, 0.0], *points])
+    return _thin_points([[0.0, 0.0], *points])
 
 
 def _risk_coverage(shown: Galleries, true: Bools, weights: Floats) -> list[list[float]]:
@@ -146,14 +147,16 @@ def _risk_coverage(shown: Galleries, true: Bools, weights: Floats) -> list[list[
     """
     first = np.concatenate([gallery == gallery.max(1, keepdims=True) for gallery in shown])
     wrong = 1 - (first & np.tile(true, (2, 1))).sum(1) / first.sum(1)
-    sure = np.array([_AS_IT_IS.believe(row[np.isfinite(row)]).objects.max() for row in np.concatenate(shown)])
+    sure = np.array(
+        [_IDENTITY_POSTERIOR.probabilities(row[np.isfinite(row)]).objects.max() for row in np.concatenate(shown)]
+    )
     share = np.tile(weights, 2) / 2
     levels, place = np.unique(-sure, return_inverse=True)
     answered, failed = (np.cumsum(np.bincount(place, part, len(levels))) for part in (share, share * wrong))
-    return _thinned(np.stack([answered / answered[-1], failed / answered], axis=1).tolist())
+    return _thin_points(np.stack([answered / answered[-1], failed / answered], axis=1).tolist())
 
 
-def _thinned(points: list[list[float]]) -> list[list[float]]:
+def _thin_points(points: list[list[float]]) -> list[list[float]]:
     """At most 200 of the points, evenly spread over them."""
     chosen = np.unique(np.linspace(0, len(points) - 1, _CURVE_POINTS).round().astype(int))
     return [points[place] for place in chosen]

@@ -13,21 +13,21 @@ from retrieval.evaluation.calibrate import (
     KWayTest,
     PairRule,
     calibrate,
-    enough_objects,
+    has_enough_objects,
     pair_rule,
     reliability,
 )
+from retrieval.evaluation.example_grasps import ExampleGrasps
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import Queries
 from retrieval.evaluation.reject import Rejection, reject
-from retrieval.evaluation.shown import Shown
 from retrieval.metrics import protocols
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import Measure
-from retrieval.metrics.registry import SHOWN_PHOTOS, Scored, guesses, take
+from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, MethodScoreTables, compute, k_way_measure
 from retrieval.metrics.table import ScoreTable
 
-CHOICES = (KWayTest(5), KWayTest(10), KWayTest(5, 5, SHOWN_PHOTOS))
+CHOICES = (KWayTest(5), KWayTest(10), KWayTest(5, 5, PHOTOS_PER_CANDIDATE))
 _CONFUSIONS = 12
 _GUESSES = (5, 10)
 
@@ -56,9 +56,10 @@ class MethodScores:
 
     def sets(self, part: str) -> dict[int, ScoreTable]:
         """Scores of sets of grasps of a part with the photos of that part, by the number of grasps in a set; sizes that
-        can be asked."""
+        can be asked.
+        """
         tables = {size: self._sets(part, size) for size in self.queries.sets}
-        return {size: table for size, table in tables.items() if table is not None and table.askable.any()}
+        return {size: table for size, table in tables.items() if table is not None and table.has_target.any()}
 
     def _sets(self, part: str, size: int) -> ScoreTable | None:
         asked, sets = self.queries, self.queries.sets[size]
@@ -87,11 +88,11 @@ class MethodScores:
             [grasp_ids[row] for row in asked.photos[_of(asked, asked.photo_owner, part)]],
         )
 
-    def scored(self) -> Scored:
+    def score_tables(self) -> MethodScoreTables:
         """What metrics are taken of."""
-        return Scored(
+        return MethodScoreTables(
             test=self.touches("test", "test"),
-            among_all=self.touches("test", None),
+            all_objects=self.touches("test", None),
             sets=self.sets("test"),
             rule=self.pair_rule.rule,
             seed=self.seed,
@@ -99,12 +100,12 @@ class MethodScores:
 
     def measures(self, names: Iterable[str]) -> Measures:
         """The metrics of these names."""
-        return take(self.scored(), names)
+        return compute(self.score_tables(), names)
 
     @cached_property
     def pair_rule(self) -> PairRule:
         """Which pairs of a single touch and a photo are called matches."""
-        return pair_rule(self.predictions.chosen, self.touches("validation", "validation"), seed=self.seed)
+        return pair_rule(self.predictions.best_params, self.touches("validation", "validation"), seed=self.seed)
 
 
 def _of(queries: Queries, owner: NDArray[np.int64], part: str | None) -> NDArray[np.int64]:
@@ -125,11 +126,11 @@ def score_method(
     "reject" is None where validation or test objects are fewer than three.
     """
     judged = [MethodScores(queries, predictions, seed) for predictions in by_seed]
-    shown = Shown(judged[0].touches("test", "test"), queries.objects, *judged[0].ids(grasp_ids, "test"))
+    shown = ExampleGrasps(judged[0].touches("test", "test"), queries.objects, *judged[0].ids(grasp_ids, "test"))
     calibrations = [calibrate(one.by_grasps("validation"), seed=seed) for one in judged]
-    measures = [take(one.scored()) for one in judged]
+    measures = [compute(one.score_tables()) for one in judged]
     entry = {
-        "chosen": [predictions.chosen for predictions in by_seed],
+        "best_params": [predictions.best_params for predictions in by_seed],
         "pair_threshold": judged[0].pair_rule.to_dict(),
         "measures": summaries(measures, draws, seed),
         "per_object": _per_object(queries, judged, measures, seed),
@@ -138,7 +139,7 @@ def score_method(
         "reliability": reliability(calibrations[0], judged[0].by_grasps("test"), CHOICES, seed=seed),
         "reject": _reject(judged, calibrations, draws, seed),
         "examples": shown.examples(),
-        "guessed": {str(k): found for k in _GUESSES if (found := shown.guessed(k, seed))},
+        "examples_by_rank": {str(k): found for k in _GUESSES if (found := shown.guessed(k, seed))},
     }
     return entry, measures
 
@@ -147,9 +148,9 @@ def _per_object(
     queries: Queries, judged: Sequence[MethodScores], measures: Sequence[Measures], seed: int
 ) -> dict[str, dict[str, float]]:
     """Mean first guess at K = 5 of each object: among test objects, and of every object among all."""
-    every = [guesses(one.touches(None, None), 5, seed) for one in judged]
+    every = [k_way_measure(one.touches(None, None), 5, seed) for one in judged]
     shares = {
-        "test_candidates": [found["guesses_k5"] for found in measures if "guesses_k5" in found],
+        "test_candidates": [found["topn_k5"] for found in measures if "topn_k5" in found],
         "all_candidates": [measure for measure in every if measure],
     }
     return {name: _mean_by_name(queries, map(protocols.per_object, found)) for name, found in shares.items()}
@@ -163,7 +164,9 @@ def _mean_by_name(queries: Queries, by_seed: Iterable[Mapping[int, float]]) -> d
     return {name: float(np.mean(values)) for name, values in found.items()}
 
 
-def _confusions(queries: Queries, judged: Sequence[MethodScores], shown: Shown, seed: int) -> list[dict[str, Any]]:
+def _confusions(
+    queries: Queries, judged: Sequence[MethodScores], shown: ExampleGrasps, seed: int
+) -> list[dict[str, Any]]:
     """The largest shares of first guesses among all test objects that fell on a wrong one."""
     shares: dict[tuple[int, int], float] = {}
     for one in judged:
@@ -176,7 +179,7 @@ def _confusions(queries: Queries, judged: Sequence[MethodScores], shown: Shown, 
             "object_id": names[true],
             "mistaken_for": names[guessed],
             "share": share,
-            "grasps": shown.mistaken(true, guessed),
+            "grasps": shown.confusion_examples(true, guessed),
         }
         for (true, guessed), share in largest
     ]
@@ -186,7 +189,8 @@ def _reject(
     judged: Sequence[MethodScores], calibrations: Sequence[Calibrations], draws: int, seed: int
 ) -> dict[str, Any] | None:
     """The "reject" of results.json: everything about single grasps, and for each number of grasps how well objects of
-    the catalogue and others are told apart."""
+    the catalogue and others are told apart.
+    """
     found = [_rejections(one, fitted, seed) for one, fitted in zip(judged, calibrations, strict=True)]
     if not found[0]:
         return None
@@ -205,11 +209,12 @@ def _reject(
 
 def _rejections(judged: MethodScores, calibrations: Calibrations, seed: int) -> dict[int, Rejection]:
     """What "none of these" is worth, by number of grasps, where validation objects gave a posterior and enough test
-    objects can be left out."""
+    objects can be left out.
+    """
     tables = judged.by_grasps("test").items()
     fitted = calibrations.posteriors
     return {
         grasps: reject(fitted[grasps], table, seed=seed)
         for grasps, table in tables
-        if grasps in fitted and enough_objects(table)
+        if grasps in fitted and has_enough_objects(table)
     }

@@ -1,6 +1,6 @@
 """Error against run time of every approximation of a search, measured with one model on one recording.
 
-A new approximation is one function from a `Sample` to a `Row`, one row of `APPROXIMATIONS`, one test parameter. The
+A new approximation is one function from a `Sample` to a `ApproximationResult`, one row of `APPROXIMATIONS`, one test parameter. The
 kernels' own, which need no recording of the user's, stand in `benchmarks/frontier/` of the repository.
 """
 
@@ -11,21 +11,23 @@ from typing import TYPE_CHECKING
 from retrieval.errors import ConfigError
 
 if TYPE_CHECKING:
-    from retrieval.frontier.points import Row
+    from retrieval.frontier.points import ApproximationResult
     from retrieval.frontier.sample import Sample
 
 APPROXIMATIONS = {
     "candidates": "retrieval.frontier.candidates:candidates",
     "index_kinds": "retrieval.frontier.kinds:index_kinds",
     "towers": "retrieval.frontier.formats:towers",
-    "halves": "retrieval.frontier.formats:halves",
+    "partials": "retrieval.frontier.formats:partials",
     "image_size": "retrieval.frontier.pixels:image_size",
     "grasps": "retrieval.frontier.grasps:grasps",
 }
 """Name -> the function that measures it, imported when it is used."""
 
 
-def load_approximation(name: str, table: Mapping[str, str] = APPROXIMATIONS) -> "Callable[[Sample], Row]":
+def load_approximation(
+    name: str, table: Mapping[str, str] = APPROXIMATIONS
+) -> "Callable[[Sample], ApproximationResult]":
     """Return the function that measures `name`.
 
     Args:
@@ -38,5 +40,5 @@ def load_approximation(name: str, table: Mapping[str, str] = APPROXIMATIONS) -> 
     if name not in table:
         raise ConfigError(f"an approximation must be one of {', '.join(table)}; got {name!r}")
     module, function = table[name].split(":")
-    measure: Callable[[Sample], Row] = getattr(import_module(module), function)
+    measure: Callable[[Sample], ApproximationResult] = getattr(import_module(module), function)
     return measure

@@ -12,16 +12,18 @@ from statistics import median
 from retrieval.frontier.points import Tradeoff
 from retrieval.model.encode import one_thread
 
-LEAST_S = 0.005
+MIN_SECONDS = 0.005
 
 
-def timed(points: Sequence[Tradeoff], works: Sequence[Callable[[], object]], repeats: int) -> tuple[Tradeoff, ...]:
+def time_points(
+    points: Sequence[Tradeoff], works: Sequence[Callable[[], object]], repeats: int
+) -> tuple[Tradeoff, ...]:
     """The points, each with the median seconds of its work: all take turns, so that a busy moment slows all of them.
 
     Every work is run once before, which is not counted; short work is timed several runs together. All on one thread.
     """
     with _one_thread():
-        calls = [max(1, int(LEAST_S / max(_seconds(work, 1), 1e-9))) for work in works]
+        calls = [max(1, int(MIN_SECONDS / max(_seconds(work, 1), 1e-9))) for work in works]
         rounds = [[_seconds(work, count) for work, count in zip(works, calls, strict=True)] for _ in range(repeats)]
     return tuple(
         dataclasses.replace(point, seconds=median(taken))

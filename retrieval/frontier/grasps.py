@@ -5,30 +5,35 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.frontier.clock import timed
+from retrieval.frontier.clock import time_points
 from retrieval.frontier.pixels import SLACK, load_touch
-from retrieval.frontier.points import Panel, Row, missed
+from retrieval.frontier.points import ApproximationResult, Panel, miss_rate_point
 from retrieval.frontier.sample import Array, Sample
-from retrieval.methods.selection import neighbours
+from retrieval.methods.selection import next_rows_of_object
 from retrieval.model.encode import encode_touches
 
 COUNTS = (1, 2, 3, 4, 5, 8)
 
 
-def grasps(sample: Sample) -> Row:
+def grasps(sample: Sample) -> ApproximationResult:
     """Logits of several grasps add."""
     owner = sample.owner[sample.touch_rows]
     most = int(np.unique(owner, return_counts=True)[1].min())
-    codes = sample.touch_codes(sample.touch_rows)["half"]
-    table = np.array([sample.logits(half, sample.own["half"]) for half in codes])
+    codes = sample.touch_encodings(sample.touch_rows)["partial"]
+    table = np.array(
+        [sample.logits(partial_activation, sample.real_photo_codes["partial"]) for partial_activation in codes]
+    )
     counts = [count for count in COUNTS if count <= most]
     points = [
-        missed(
-            "", f"{count} grasp{'s' * (count > 1)}", _wrong(sample, table, neighbours(owner, count), owner), count == 1
+        miss_rate_point(
+            "",
+            f"{count} grasp{'s' * (count > 1)}",
+            _wrong(sample, table, next_rows_of_object(owner, count), owner),
+            count == 1,
         )
         for count in counts
     ]
-    points = list(timed(points, [partial(_query, sample, count) for count in counts], sample.scale.repeats))
+    points = list(time_points(points, [partial(_query, sample, count) for count in counts], sample.scale.repeats))
     panel = Panel(
         title="wrong first guesses by number of grasps",
         time="decoding and encoding the touches and judging every photo, one thread",
@@ -38,7 +43,7 @@ def grasps(sample: Sample) -> Row:
         points=tuple(points),
         resolution=100 / len(owner),
     )
-    return Row(
+    return ApproximationResult(
         "Grasps of one object",
         "Logits of several grasps of the object in the hand are added. Every touch starts one set with the next "
         "touches of its object. The time is that of the computer; the arm's is longer.",
@@ -55,4 +60,6 @@ def _wrong(sample: Sample, table: Array, sets: NDArray[np.int64], owner: NDArray
 def _query(sample: Sample, count: int) -> Array:
     settings = sample.checkpoint.config.preprocessing
     touches = [load_touch(settings, sample.grasps[row]) for row in sample.touch_rows[:count]]
-    return sample.logits(encode_touches(sample.checkpoint.matcher, touches).half.numpy(), sample.own["half"])
+    return sample.logits(
+        encode_touches(sample.checkpoint.matcher, touches).partial.numpy(), sample.real_photo_codes["partial"]
+    )

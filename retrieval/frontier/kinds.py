@@ -7,60 +7,60 @@ import numpy as np
 
 from indexes import KINDS, load_kind
 from indexes.errors import ParameterError
-from indexes.kinds.base import VectorIndex
+from indexes.kinds.vector_index import VectorIndex
 from retrieval.console.progress import Bar
 from retrieval.frontier.candidates import default_k, is_used
-from retrieval.frontier.clock import timed
-from retrieval.frontier.points import Panel, Row, Tradeoff, missed, smallest
+from retrieval.frontier.clock import time_points
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point, smallest_error
 from retrieval.frontier.sample import Array, Sample
 
 NEIGHBOURS = 10
 TOLERANCE = 1.0
 DEFAULT = "flat"
 """What `build-index` takes unless it is given a budget that exact search breaks."""
-Measured = tuple[Tradeoff, Callable[[], object]]
+TimedPoint = tuple[Tradeoff, Callable[[], object]]
 
 
-def index_kinds(sample: Sample) -> Row:
+def index_kinds(sample: Sample) -> ApproximationResult:
     """Every kind and its ladder on the blended catalogue, by the embedding in use."""
     used = [name for name in sample.catalogue.embeddings if is_used(sample, name)]
     if not used:
-        return Row("Kind of index", "", skipped="this model has no trained embeddings")
+        return ApproximationResult("Kind of index", "", skipped="this model has no trained embeddings")
     embeddings, queries = sample.catalogue.embeddings[used[0]], sample.queries[used[0]]
     k = min(default_k(sample), len(embeddings) // 4)
     truth = load_kind("flat").build(embeddings, threads=1).search(queries, NEIGHBOURS)[0]
-    near, far = list[Measured](), list[Measured]()
+    near, far = list[TimedPoint](), list[TimedPoint]()
     made = list(_structures(sample, embeddings))
     with Bar("kinds of index", len(made), "settings", quiet=sample.quiet) as bar:
         for series, setting, index in made:
             is_default = series == DEFAULT
-            if _matters(setting, k):
-                lost = ~(index.search(queries, k)[1] == sample.winners[:, None]).any(1)
-                far.append((missed(series, setting, lost, is_default), _asking(index, queries, k)))
+            if _is_comparable(setting, k):
+                lost = ~(index.search(queries, k)[1] == sample.exhaustive_top1[:, None]).any(1)
+                far.append((miss_rate_point(series, setting, lost, is_default), _query_work(index, queries, k)))
             lacking = 100 * float(np.mean(index.search(queries, NEIGHBOURS)[0] < truth[:, -1:]))
             near.append(
-                (Tradeoff(series, setting, lacking, is_default=is_default), _asking(index, queries, NEIGHBOURS))
+                (Tradeoff(series, setting, lacking, is_default=is_default), _query_work(index, queries, NEIGHBOURS))
             )
             bar.advance()
-    of_winners, of_neighbours = (_timed(sample, each) for each in (far, near))
-    return Row(
+    of_top1, of_neighbours = (_time_all(sample, each) for each in (far, near))
+    return ApproximationResult(
         "Kind of index",
         f"Search over {len(embeddings):,} blended photos by the {used[0]}. What counts for an answer is whether the "
         "classifier's winner is among the candidates; whether nearest neighbours are found is what such indexes are "
         "usually judged by, and another thing. Exact search is used unless `build-index` is given a bound: it needs no "
         "training, and what it finds does not hang on the catalogue.",
         (
+            _panel(f"missed winners among k = {k:,} candidates", k, "every photo judged", 100 / len(queries), of_top1),
             _panel(
-                f"missed winners among k = {k:,} candidates", k, "every photo judged", 100 / len(queries), of_winners
+                f"missed nearest {NEIGHBOURS}", NEIGHBOURS, "exact search", smallest_error(of_neighbours), of_neighbours
             ),
-            _panel(f"missed nearest {NEIGHBOURS}", NEIGHBOURS, "exact search", smallest(of_neighbours), of_neighbours),
         ),
     )
 
 
-def _timed(sample: Sample, measured: list[Measured]) -> tuple[Tradeoff, ...]:
+def _time_all(sample: Sample, measured: list[TimedPoint]) -> tuple[Tradeoff, ...]:
     points, works = zip(*measured, strict=True)
-    return timed(points, works, sample.scale.repeats)
+    return time_points(points, works, sample.scale.repeats)
 
 
 def _panel(title: str, k: int, reference: str, resolution: float, points: tuple[Tradeoff, ...]) -> Panel:
@@ -74,14 +74,14 @@ def _structures(sample: Sample, embeddings: Array) -> Iterator[tuple[str, str, V
     for kind in KINDS:
         if kind == "exact":  # the oracle of the others
             continue
-        for name, built in _built(kind, embeddings, sample.scale.quick):
-            ladder = list(built.along_ladder())
+        for name, built in _build_variants(kind, embeddings, sample.scale.quick):
+            ladder = list(built.search_variants())
             for index in ladder[::4] if sample.scale.quick else ladder:
-                tuned = built.search_ladder and built.search_ladder[0]
-                yield name, f"{tuned} = {index.settings()[tuned]}" if tuned else "", index
+                with_settings = built.search_ladder and built.search_ladder[0]
+                yield name, f"{with_settings} = {index.settings()[with_settings]}" if with_settings else "", index
 
 
-def _built(kind: str, embeddings: Array, quick: bool) -> Iterator[tuple[str, VectorIndex]]:
+def _build_variants(kind: str, embeddings: Array, quick: bool) -> Iterator[tuple[str, VectorIndex]]:
     """(series, index) of a kind, with each value of its `build_ladder` that these embeddings can have."""
     made = load_kind(kind)
     if made.build_ladder is None:
@@ -96,13 +96,13 @@ def _built(kind: str, embeddings: Array, quick: bool) -> Iterator[tuple[str, Vec
         yield f"{kind}, {setting} = {value}", index
 
 
-def _matters(setting: str, k: int) -> bool:
+def _is_comparable(setting: str, k: int) -> bool:
     """A graph is searched with a breadth of k at least."""
     name, _, value = setting.partition(" = ")
     return name != "ef_search" or int(value) >= k
 
 
-def _asking(index: VectorIndex, queries: Array, k: int) -> Callable[[], object]:
+def _query_work(index: VectorIndex, queries: Array, k: int) -> Callable[[], object]:
     """Search of one query after the other; a single one is searched on one thread."""
     asked = cycle(queries)
     return lambda: index.search(next(asked)[None], k)

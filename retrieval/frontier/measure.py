@@ -9,10 +9,10 @@ from _touch_retrieval.files import file_digest
 from retrieval.console.files import PAGE, RESULTS, require_ours
 from retrieval.console.output import say
 from retrieval.data.dataset import AnyRecording, folder_of
-from retrieval.evaluation.cache import kept_document, write_document
+from retrieval.evaluation.cache import cached_document, write_document
 from retrieval.frontier import APPROXIMATIONS, load_approximation
 from retrieval.frontier.clock import machine
-from retrieval.frontier.points import Row
+from retrieval.frontier.points import ApproximationResult
 from retrieval.frontier.report import write_frontier
 from retrieval.frontier.sample import QUICK, Sample, Scale
 from retrieval.search.defaults import shipped_model
@@ -32,7 +32,7 @@ def measure_frontier(
     repeats: int = Scale.repeats,
     quick: bool = False,
     table: Mapping[str, str] = APPROXIMATIONS,
-    need_no_model: Collection[str] = (),
+    model_free: Collection[str] = (),
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Measure error against run time of every approximation; write frontier.json, frontier.html and figures/.
@@ -50,7 +50,7 @@ def measure_frontier(
         repeats: Of each time, whose median is taken.
         quick: Smallest grids and sizes, to see that it runs.
         table: Name to "module:function" of what can be measured.
-        need_no_model: Names whose rows depend on neither the model nor the grasps.
+        model_free: Names whose rows depend on neither the model nor the grasps.
         quiet: No lines and bars on stderr.
 
     Returns:
@@ -60,9 +60,9 @@ def measure_frontier(
         ConfigError: A name is unknown. What the measurements raise passes through.
 
     >>> from pathlib import Path
-    >>> asked = {"only": ["halves"], "quick": True, "quiet": True}
+    >>> asked = {"only": ["partials"], "quick": True, "quiet": True}
     >>> document = retrieval.measure_frontier(Path("frontier"), "model.safetensors", "lab", **asked)
-    >>> document["rows"]["halves"]["title"]
+    >>> document["rows"]["partials"]["title"]
     'Number format of stored halves'
     """
     require_ours(out / "frontier.json", RESULTS)
@@ -72,7 +72,7 @@ def measure_frontier(
     scale = dataclasses.replace(QUICK, **smaller) if quick else Scale(photos, queries, repeats=repeats)
     grasps = recording if callable(recording) else lambda: folder_of(recording)
     sample = Sample(Path(model or shipped_model()), grasps, out / "features", scale, quiet)
-    document = measure(sample, out, only, table=table, need_no_model=need_no_model)
+    document = measure(sample, out, only, table=table, model_free=model_free)
     write_frontier(out, document)
     return document
 
@@ -83,7 +83,7 @@ def measure(
     only: Iterable[str] = (),
     *,
     table: Mapping[str, str] = APPROXIMATIONS,
-    need_no_model: Collection[str] = (),
+    model_free: Collection[str] = (),
 ) -> dict[str, Any]:
     """Measure approximations and write `out`/frontier.json.
 
@@ -95,7 +95,7 @@ def measure(
         out: Folder of the results.
         only: Names of `table`; all of them where empty.
         table: Name -> "module:function" of what can be measured.
-        need_no_model: Names whose rows depend on neither the model nor the grasps.
+        model_free: Names whose rows depend on neither the model nor the grasps.
 
     Returns:
         The content of frontier.json.
@@ -105,7 +105,7 @@ def measure(
     """
     asked = list(dict.fromkeys(only)) or list(table)
     works = {name: load_approximation(name, table) for name in asked}
-    rows = {name: _row(sample, out, name, work, name in need_no_model) for name, work in works.items()}
+    rows = {name: _row(sample, out, name, work, name in model_free) for name, work in works.items()}
     document = {
         "software": __version__,
         "machine": machine(),
@@ -117,18 +117,20 @@ def measure(
     return document
 
 
-def _row(sample: Sample, out: Path, name: str, work: Callable[[Sample], Row], by_itself: bool) -> Row:
-    made_by: dict[str, Any] = {"name": name, "format": FORMAT, "software": __version__, "machine": machine()}
-    made_by["scale"] = dataclasses.asdict(sample.scale)
-    if not by_itself:
-        made_by |= {"model": file_digest(sample.model), "grasps": sample.digest}
+def _row(
+    sample: Sample, out: Path, name: str, work: Callable[[Sample], ApproximationResult], is_model_free: bool
+) -> ApproximationResult:
+    cache_key: dict[str, Any] = {"name": name, "format": FORMAT, "software": __version__, "machine": machine()}
+    cache_key["scale"] = dataclasses.asdict(sample.scale)
+    if not is_model_free:
+        cache_key |= {"model": file_digest(sample.model), "grasps": sample.digest}
 
     def make() -> dict[str, Any]:
         if not sample.quiet:
             say(f"frontier: measuring {name}")
         return work(sample).to_dict()
 
-    row = Row.from_dict(kept_document(out / "parts" / f"{name}.json", made_by, make))
+    row = ApproximationResult.from_dict(cached_document(out / "parts" / f"{name}.json", cache_key, make))
     if not sample.quiet:
         for line in row.lines():
             say(f"{name}: {line}")

@@ -10,24 +10,24 @@ from numpy.typing import NDArray
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
 from retrieval.data.preprocessing import Preprocessing
-from retrieval.frontier.clock import timed
-from retrieval.frontier.points import Panel, Row, Tradeoff, missed
+from retrieval.frontier.clock import time_points
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, miss_rate_point
 from retrieval.frontier.sample import Array, Sample
 from retrieval.model.encode import encode_photos, encode_touches
 
-SHARES = (0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0, 1.25, 1.5)
+SIZE_RATIOS = (0.25, 0.375, 0.5, 0.625, 0.75, 0.875, 1.0, 1.25, 1.5)
 """Of the size that the model was trained with."""
 SLACK = 2.0
 """Percent of queries that may be lost against the trained size."""
 
 
-def image_size(sample: Sample) -> Row:
+def image_size(sample: Sample) -> ApproximationResult:
     """The towers take images of any size, and were trained with one."""
     settings, asked = sample.checkpoint.config.preprocessing, sample.touch_rows[: sample.scale.touches]
     felt, shown = ([sample.grasps[row] for row in rows] for rows in (asked, sample.photo_rows))
     touches, photos = partial(_encode_touches, sample), partial(_encode_photos, sample)
-    kept = sample.touch_codes(asked)["half"]
-    return Row(
+    kept = sample.touch_encodings(asked)["partial"]
+    return ApproximationResult(
         "Image size",
         "Gel images, and photos, made smaller or larger before the tower sees them; the other modality keeps the size "
         "that the model was trained with. One touch picks a photo of its object among those of all unseen objects.",
@@ -36,7 +36,7 @@ def image_size(sample: Sample) -> Row:
                 sample,
                 "gel images",
                 settings.touch_px,
-                lambda px: (touches(felt, px), sample.own["half"]),
+                lambda px: (touches(felt, px), sample.real_photo_codes["partial"]),
                 partial(touches, felt[:1]),
             ),
             _panel(
@@ -50,20 +50,20 @@ def _panel(
     sample: Sample,
     what: str,
     trained: int,
-    halves: Callable[[int], tuple[Array, Array]],
+    partials: Callable[[int], tuple[Array, Array]],
     encode_one: Callable[[int], object],
 ) -> Panel:
     sizes = sorted(
-        {16 * round(share * trained / 16) for share in ((0.5, 1.0) if sample.scale.quick else SHARES)} | {trained}
+        {16 * round(share * trained / 16) for share in ((0.5, 1.0) if sample.scale.quick else SIZE_RATIOS)} | {trained}
     )
     points, works = list[Tradeoff](), list[Callable[[], object]]()
     with Bar(f"sizes of {what}", len(sizes), "sizes", quiet=sample.quiet) as bar:
         for px in sizes:
-            touches, photos = halves(px)
-            points.append(missed("", f"{px} px", _wrong(sample, touches, photos), px == trained))
+            touches, photos = partials(px)
+            points.append(miss_rate_point("", f"{px} px", _wrong(sample, touches, photos), px == trained))
             works.append(partial(encode_one, px))
             bar.advance()
-    points = list(timed(points, works, sample.scale.repeats))
+    points = list(time_points(points, works, sample.scale.repeats))
     at_trained = next(point.error for point in points if point.is_default)
     return Panel(
         title=f"wrong first guesses by size of {what}",
@@ -77,14 +77,14 @@ def _panel(
 
 
 def _wrong(sample: Sample, touches: Array, photos: Array) -> NDArray[np.bool_]:
-    best = np.array([int(sample.logits(half, photos).argmax()) for half in touches])
+    best = np.array([int(sample.logits(partial_activation, photos).argmax()) for partial_activation in touches])
     return np.asarray(sample.owner[sample.photo_rows][best] != sample.owner[sample.touch_rows[: len(best)]])
 
 
 def _encode_touches(sample: Sample, grasps: Sequence[Grasp], px: int) -> Array:
     settings = dataclasses.replace(sample.checkpoint.config.preprocessing, touch_px=px)
     images = (load_touch(settings, grasp) for grasp in grasps)
-    return encode_touches(sample.checkpoint.matcher, images, 16).half.numpy()
+    return encode_touches(sample.checkpoint.matcher, images, 16).partial.numpy()
 
 
 def load_touch(settings: Preprocessing, grasp: Grasp) -> list[Array]:
@@ -97,4 +97,4 @@ def load_touch(settings: Preprocessing, grasp: Grasp) -> list[Array]:
 def _encode_photos(sample: Sample, grasps: Sequence[Grasp], px: int) -> Array:
     settings = dataclasses.replace(sample.checkpoint.config.preprocessing, photo_px=px)
     images = (settings.load_photo(grasp.photo) for grasp in grasps)
-    return encode_photos(sample.checkpoint.matcher, images).half.numpy()
+    return encode_photos(sample.checkpoint.matcher, images).partial.numpy()

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.metrics.guesses import binomial_interval
+from retrieval.metrics.k_way import binomial_interval
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Panel:
 
     def said(self, point: Tradeoff) -> str:
         """A point in words: its name, its error and its time."""
-        return f"{point.name}: {number(point.error)} {self.unit}, {duration(point.seconds)}"
+        return f"{point.name}: {format_number(point.error)} {self.unit}, {format_duration(point.seconds)}"
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: the fields, and which points are recommended, default and on the front."""
@@ -109,7 +109,7 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Row:
+class ApproximationResult:
     """One approximation, measured: its panels; text: what it is and how it was measured; skipped: why it was not."""
 
     title: str
@@ -126,33 +126,36 @@ class Row:
         return asdict(self) | {"panels": [panel.to_dict() for panel in self.panels], "lines": self.lines()}
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Row":
+    def from_dict(cls, data: Mapping[str, Any]) -> "ApproximationResult":
         """Inverse of `to_dict`."""
         panels = tuple(Panel.from_dict(panel) for panel in data["panels"])
         return cls(data["title"], data["text"], panels, data["skipped"])
 
 
-def missed(series: str, setting: str, wrong: Sequence[bool] | NDArray[np.bool_], is_default: bool = False) -> Tradeoff:
+def miss_rate_point(
+    series: str, setting: str, wrong: Sequence[bool] | NDArray[np.bool_], is_default: bool = False
+) -> Tradeoff:
     """A point whose error is the share of queries that went wrong, in percent, with its exact 95 % interval for
-    queries that are independent."""
+    queries that are independent.
+    """
     count, bad = len(wrong), int(np.count_nonzero(wrong))
     low, high = binomial_interval(bad, count)
     return Tradeoff(series, setting, 100 * bad / count, 100 * low, 100 * high, is_default)
 
 
-def smallest(points: Iterable[Tradeoff]) -> float:
+def smallest_error(points: Iterable[Tradeoff]) -> float:
     """The smallest error above 0, for a panel whose errors are no shares; 1 where all are 0."""
     return min((point.error for point in points if point.error > 0), default=1.0)
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Two or three digits, without an exponent where it is short."""
     if value == 0:
         return "0"
     return f"{value:.3g}" if 1e-3 <= abs(value) < 1e5 else f"{value:.1e}"
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Seconds, milliseconds or microseconds with three digits."""
     for unit, scale in (("s", 1.0), ("ms", 1e3)):
         if seconds * scale >= 1:

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from retrieval.console.files import PAGE, text_bytes, write_output
-from retrieval.frontier.points import Panel, Row, Tradeoff, duration, number
-from retrieval.report.canvas import FAINT, Axes, Figure, canvas, draw
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, format_duration, format_number
+from retrieval.report.canvas import MUTED_COLOUR, Axes, Figure, canvas, draw
 from retrieval.report.document import Block, Details, Document, Picture, Section, Table, Text, to_html
 from retrieval.report.plots import logarithmic
-from retrieval.report.results import at_start
+from retrieval.report.results import capitalized
 
 # Okabe and Ito's palette, and a marker each for who sees no colours.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6f4e37", "#222222", "#aa3377")
@@ -34,7 +34,7 @@ def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
 
     Raises RetrievalError where matplotlib is missing.
     """
-    rows = {name: Row.from_dict(row) for name, row in document["rows"].items()}
+    rows = {name: ApproximationResult.from_dict(row) for name, row in document["rows"].items()}
     figures = {out / "figures" / f"{name}.png": row.panels for name, row in rows.items() if row.panels}
     for path, panels in figures.items():
         draw(path, figure, panels)
@@ -45,7 +45,7 @@ def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
     return [page, *figures]
 
 
-def _lead(document: Mapping[str, Any], rows: Mapping[str, Row]) -> Iterator[Block]:
+def _lead(document: Mapping[str, Any], rows: Mapping[str, ApproximationResult]) -> Iterator[Block]:
     machine, scale = document["machine"], document["scale"]
     yield Text(
         "Every approximation has a reference that it approximates. Its error against that reference and its run time "
@@ -69,7 +69,7 @@ def _summary(title: str, panel: Panel) -> tuple[str, ...]:
     return (title, panel.title, panel.reference, f"{panel.tolerance:g} {panel.unit}", panel.said(best), default)
 
 
-def _section(name: str, row: Row) -> Iterator[Block]:
+def _section(name: str, row: ApproximationResult) -> Iterator[Block]:
     if row.text:
         yield Text(row.text)
     if row.skipped:
@@ -87,8 +87,8 @@ def _points(panel: Panel) -> Table:
     rows = tuple(
         (
             point.name,
-            duration(point.seconds),
-            number(point.error),
+            format_duration(point.seconds),
+            format_number(point.error),
             "" if point.low is None or point.high is None else f"{point.low:.3g} to {point.high:.3g}",
             ", ".join(word for word, holds in _marks(panel, point, front) if holds),
         )
@@ -127,7 +127,7 @@ def _draw(axes: Axes, panel: Panel) -> None:
         _series(axes, [point for point in panel.points if point.series == name], place, floor, name)
     _front(axes, panel, floor)
     axes.axhline(max(panel.tolerance, floor), color="#333333", ls="--", lw=1, zorder=0, label="tolerance")
-    axes.set_title(f"{at_start(panel.title)}, against {panel.reference}", fontsize=9.5, loc="left")
+    axes.set_title(f"{capitalized(panel.title)}, against {panel.reference}", fontsize=9.5, loc="left")
     axes.set_xlabel(f"{panel.time}, ms")
     axes.set_ylabel(panel.unit)
     for axis in (axes.xaxis, axes.yaxis):
@@ -152,7 +152,7 @@ def _series(axes: Axes, points: Sequence[Tradeoff], place: int, floor: float, na
 
 def _front(axes: Axes, panel: Panel, floor: float) -> None:
     front = [_place(point, floor) for point in panel.pareto()]
-    axes.plot(*zip(*front, strict=True), color=FAINT, lw=1.2, zorder=0)
+    axes.plot(*zip(*front, strict=True), color=MUTED_COLOUR, lw=1.2, zorder=0)
     if (used := panel.default) is not None:
         axes.plot(*_place(used, floor), "o", ms=14, mfc="none", mec="#222222", mew=1.3, clip_on=False, label="default")
     best = panel.recommended

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.errors import DatasetError
-from retrieval.evaluation.cache import kept_document
+from retrieval.evaluation.cache import cached_document
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
-from retrieval.model.fusion import Code, score_halves
+from retrieval.model.fusion import ImageEncoding, score_partials
 from retrieval.training.features import Features, encode_recording
 
 Array = NDArray[np.float32]
@@ -28,7 +28,8 @@ _BLOCK = 8192
 @dataclass(frozen=True)
 class Scale:
     """How much is measured. photos: of the blended catalogue; queries: touches asked there; touches: touches whose
-    images are encoded again in every setting; repeats: of every time, whose median is taken. quick: smallest grids."""
+    images are encoded again in every setting; repeats: of every time, whose median is taken. quick: smallest grids.
+    """
 
     photos: int = 100_000
     queries: int = 200
@@ -44,7 +45,7 @@ QUICK = Scale(photos=2000, queries=12, touches=12, repeats=2, quick=True)
 class BlendedCatalogue:
     """N photos. halves (N, half) float16, as an index keeps them. embeddings: name of what made them -> (N, d)."""
 
-    halves: NDArray[np.float16]
+    partials: NDArray[np.float16]
     embeddings: Mapping[str, Array]
 
 
@@ -120,31 +121,35 @@ class Sample:
 
     # Codes -------------------------------------------------------------------------------------------------
 
-    def touch_codes(self, rows: NDArray[np.int64]) -> dict[str, Array]:
+    def touch_encodings(self, rows: NDArray[np.int64]) -> dict[str, Array]:
         """ "half" (n, hidden), and embeddings by name, of the touches at these rows of `grasps`."""
         return self._codes(self.features.touch[rows].reshape(len(rows), -1), photo=False)
 
-    def photo_codes(self, rows: NDArray[np.int64]) -> dict[str, Array]:
-        """As `touch_codes`, of the photos at these rows."""
+    def photo_encodings(self, rows: NDArray[np.int64]) -> dict[str, Array]:
+        """As `touch_encodings`, of the photos at these rows."""
         return self._codes(self.features.photo[rows], photo=True)
 
     @torch.inference_mode()
     def _codes(self, features: Array, photo: bool) -> dict[str, Array]:
         matcher, config = self.checkpoint.matcher, self.checkpoint.config
         given = torch.from_numpy(features)
-        code: Code = matcher.photo_code(given) if photo else matcher.touch_code(given)
-        codes = {"half": code.half.numpy()}
-        if matcher.pruner is not None:
-            by_pruner = matcher.pruner.photo(code.half) if photo else matcher.pruner.touch(code.half)
-            codes["pruner"] = by_pruner.numpy()
+        code: ImageEncoding = matcher.photo_encoding(given) if photo else matcher.touch_encoding(given)
+        codes = {"partial": code.partial.numpy()}
+        if matcher.candidate_encoder is not None:
+            by_pruner = (
+                matcher.candidate_encoder.photo(code.partial)
+                if photo
+                else matcher.candidate_encoder.touch(code.partial)
+            )
+            codes["candidate encoder"] = by_pruner.numpy()
         if config.training.trains_embeddings:
             codes["contrastive embedding"] = code.embedding.numpy()
         return codes
 
     @cached_property
-    def own(self) -> dict[str, Array]:
+    def real_photo_codes(self) -> dict[str, Array]:
         """Codes of the photos of `photo_rows`."""
-        return self.photo_codes(self.photo_rows)
+        return self.photo_encodings(self.photo_rows)
 
     # Catalogue ---------------------------------------------------------------------------------------------
 
@@ -160,34 +165,39 @@ class Sample:
             blended = blend(self.features.photo, min(_BLOCK, self.scale.photos - start), rng)
             for name, part in self._codes(blended, photo=True).items():
                 blocks.setdefault(name, []).append(part)
-        halves = np.concatenate([part.astype(np.float16) for part in blocks.pop("half")])
-        return BlendedCatalogue(halves, {name: np.concatenate(parts) for name, parts in blocks.items()})
+        partials = np.concatenate([part.astype(np.float16) for part in blocks.pop("partial")])
+        return BlendedCatalogue(partials, {name: np.concatenate(parts) for name, parts in blocks.items()})
 
     @cached_property
     def queries(self) -> dict[str, Array]:
         """Codes of the touches that are asked on `catalogue`."""
-        return self.touch_codes(self.touch_rows[: self.scale.queries])
+        return self.touch_encodings(self.touch_rows[: self.scale.queries])
 
     @cached_property
-    def winners(self) -> NDArray[np.int64]:
+    def exhaustive_top1(self) -> NDArray[np.int64]:
         """For each of `queries` the photo of `catalogue` that the full classifier ranks first of all; kept in `folder`,
-        since it takes the longest."""
+        since it takes the longest.
+        """
         scale = self.scale
-        made_by = {"model": self.checkpoint.digest, "grasps": self.digest, "seed": self.seed, "photos": scale.photos}
-        path = self.folder / "winners.json"
-        return np.array(kept_document(path, made_by | {"queries": scale.queries}, self._find_winners), dtype=np.int64)
+        cache_key = {"model": self.checkpoint.digest, "grasps": self.digest, "seed": self.seed, "photos": scale.photos}
+        path = self.folder / "exhaustive_top1.json"
+        return np.array(
+            cached_document(path, cache_key | {"queries": scale.queries}, self._find_exhaustive_top1), dtype=np.int64
+        )
 
-    def _find_winners(self) -> list[int]:
-        halves, found = self.queries["half"], list[int]()
-        with Bar("exhaustive rerank", len(halves), "queries", quiet=self.quiet) as bar:
-            for half in halves:
-                found.append(int(self.logits(half, self.catalogue.halves).argmax()))
+    def _find_exhaustive_top1(self) -> list[int]:
+        partials, found = self.queries["partial"], list[int]()
+        with Bar("exhaustive rerank", len(partials), "queries", quiet=self.quiet) as bar:
+            for partial_activation in partials:
+                found.append(int(self.logits(partial_activation, self.catalogue.partials).argmax()))
                 bar.advance()
         return found
 
-    def logits(self, half: Array, photos: NDArray[Any], rows: NDArray[np.int64] | None = None) -> Array:
+    def logits(self, partial_activation: Array, photos: NDArray[Any], rows: NDArray[np.int64] | None = None) -> Array:
         """Match logits of one touch, or summed over touches (G, half), with photos (N, half), at `rows` or all."""
-        return score_halves(self.checkpoint.matcher.head, torch.from_numpy(np.atleast_2d(half)), photos, rows)
+        return score_partials(
+            self.checkpoint.matcher.head, torch.from_numpy(np.atleast_2d(partial_activation)), photos, rows
+        )
 
 
 def blend(features: Array, count: int, rng: np.random.Generator) -> Array:

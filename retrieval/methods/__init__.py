@@ -10,7 +10,7 @@ from _touch_retrieval.registry import Registry
 from retrieval.errors import ConfigError
 
 if TYPE_CHECKING:
-    from retrieval.methods.base import Method
+    from retrieval.methods.method import Method
 
 METHODS: "Registry[type[Method]]" = Registry(
     "method",
@@ -18,9 +18,9 @@ METHODS: "Registry[type[Method]]" = Registry(
     {
         "late_fusion": "retrieval.methods.late_fusion:LateFusion",
         "set_fusion": "retrieval.methods.set_fusion:SetFusion",
-        "prune_rerank": "retrieval.methods.prune_rerank:PruneRerank",
-        "contrastive": "retrieval.methods.contrastive:Contrastive",
-        "contrastive_sigmoid": "retrieval.methods.contrastive:ContrastiveSigmoid",
+        "retrieve_rerank": "retrieval.methods.retrieve_rerank:RetrieveRerank",
+        "contrastive": "retrieval.methods.contrastive:ContrastiveEmbedding",
+        "contrastive_sigmoid": "retrieval.methods.contrastive:SigmoidEmbedding",
         "cca": "retrieval.methods.cca:Cca",
         "cca_pca": "retrieval.methods.cca:CcaPca",
         "cca_towers": "retrieval.methods.cca_towers:CcaTowers",
@@ -29,8 +29,8 @@ METHODS: "Registry[type[Method]]" = Registry(
         "constant": "retrieval.methods.trivial:Constant",
     },
     error=ConfigError,
-    base="retrieval.methods.base:Method",
+    base="retrieval.methods.method:Method",
 )
 
-KNOW_NOTHING = frozenset({"chance", "constant"})
+TRIVIAL_BASELINES = frozenset({"chance", "constant"})
 """Methods that do not look at their input."""

@@ -15,7 +15,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.methods.base import Array, Method
+from retrieval.methods.method import Array, Method
 from retrieval.methods.selection import Validator
 from retrieval.methods.standardise import Standardiser
 
@@ -28,7 +28,7 @@ RANK_CUT = 1e-7
 """Directions thinner than this share of the widest are the rounding of float32 features."""
 LEADING_CUT = 1e-6
 """The same where singular values come from a squared matrix."""
-MOST_ROWS, LEADING = 2048, 512
+MAX_ROWS, MAX_DIRECTIONS = 2048, 512
 """From so many items on only so many directions are kept: all of them take minutes, and a ridge silences the others."""
 RIDGES = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2)
 COMPONENTS = (8, 16, 32, 64, 128, 256)
@@ -36,7 +36,7 @@ POWERS = (0, 1, 2, 4)
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class CcaView:
     """One modality of n items, standardised and decomposed: `left * singular @ right` of rank r.
 
     left (n, r), singular (r,) falling, right (r, F').
@@ -52,14 +52,14 @@ class View:
         """In how many directions the items vary."""
         return len(self.singular)
 
-    def damped(self, ridge: float) -> Matrix:
+    def regularised_deviations(self, ridge: float) -> Matrix:
         """(r,) standard deviations after a ridge of `ridge` times the mean variance of the features."""
         variance = self.singular**2 / len(self.left)
         return np.asarray(np.sqrt(variance + ridge * variance.sum() / self.right.shape[1]))
 
 
 @dataclass(frozen=True, eq=False)
-class Canonical:
+class CanonicalCorrelations:
     """correlations (k,) falling, within 0..1; touch_weights, photo_weights (F', k): standardised features to variates.
 
     In each column the weight of largest size, touch or photo, is positive.
@@ -70,15 +70,16 @@ class Canonical:
     photo_weights: Matrix
 
 
-def decompose(x: NDArray[Any], most: int | None = None) -> View:
+def decompose(x: NDArray[Any], most: int | None = None) -> CcaView:
     """View of items x (n, ...), of at most the `most` widest directions. Raises NumericalError unless finite, BadInput
-    unless something varies."""
+    unless something varies.
+    """
     if not np.isfinite(x).all():
         raise NumericalError("features must be finite to be correlated; got a NaN or infinite one")
-    return factored(x, Standardiser.fit(x), most)
+    return decompose_standardised(x, Standardiser.fit(x), most)
 
 
-def factored(x: NDArray[Any], standardise: Standardiser, most: int | None = None) -> View:
+def decompose_standardised(x: NDArray[Any], standardise: Standardiser, most: int | None = None) -> CcaView:
     """The same of finite items, standardised as is said.
 
     Equal items, such as a photo that several grasps share, are decomposed once, weighted by their number.
@@ -86,10 +87,10 @@ def factored(x: NDArray[Any], standardise: Standardiser, most: int | None = None
     first, place, counts = _distinct(x)
     weight = np.sqrt(counts)[:, None]
     shown = standardise(x[first]) * weight
-    whole = most is None and len(x) <= MOST_ROWS
-    left, singular, right = svd(shown) if whole else leading(shown, most or LEADING)
+    whole = most is None and len(x) <= MAX_ROWS
+    left, singular, right = svd(shown) if whole else leading_svd(shown, most or MAX_DIRECTIONS)
     rank = min(int((singular > (RANK_CUT if whole else LEADING_CUT) * singular[0]).sum()), most or len(singular))
-    return View(standardise, (left[:, :rank] / weight)[place], singular[:rank], right[:rank])
+    return CcaView(standardise, (left[:, :rank] / weight)[place], singular[:rank], right[:rank])
 
 
 def _distinct(x: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -100,9 +101,9 @@ def _distinct(x: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], ND
     return first, place, np.bincount(place)
 
 
-def canonical(
-    touch: View, photo: View, owner: NDArray[np.int64], ridge: float = 0.0, photo_ridge: float | None = None
-) -> Canonical:
+def canonical_correlations(
+    touch: CcaView, photo: CcaView, owner: NDArray[np.int64], ridge: float = 0.0, photo_ridge: float | None = None
+) -> CanonicalCorrelations:
     """Canonical correlations of touches with photos, each touch paired with every photo of its object.
 
     owner (n,): object of each row, from 0; `arange(n)` pairs row with row. A pair of an object with m grasps weighs
@@ -122,11 +123,11 @@ def canonical(
     left, rho, right = svd(touch_r @ photo_r.T)
     count = min(len(rho), len(np.unique(owner)) - 1)  # the means of centred data have one dimension less
     weights = (
-        touch.right.T @ ((touch_q @ left)[:, :count] / touch.damped(ridge)[:, None]),
-        photo.right.T @ ((photo_q @ right.T)[:, :count] / photo.damped(photo_ridge)[:, None]),
+        touch.right.T @ ((touch_q @ left)[:, :count] / touch.regularised_deviations(ridge)[:, None]),
+        photo.right.T @ ((photo_q @ right.T)[:, :count] / photo.regularised_deviations(photo_ridge)[:, None]),
     )
     signs = _signs(np.concatenate(weights))
-    return Canonical(np.clip(rho[:count], 0.0, 1.0), weights[0] * signs, weights[1] * signs)
+    return CanonicalCorrelations(np.clip(rho[:count], 0.0, 1.0), weights[0] * signs, weights[1] * signs)
 
 
 def svd(x: Matrix) -> tuple[Matrix, Matrix, Matrix]:
@@ -141,7 +142,7 @@ def svd(x: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     return left, singular, right
 
 
-def leading(x: Matrix, most: int = LEADING) -> tuple[Matrix, Matrix, Matrix]:
+def leading_svd(x: Matrix, most: int = MAX_DIRECTIONS) -> tuple[Matrix, Matrix, Matrix]:
     """The same for the `most` widest directions of many items, from the eigenvectors of X'X or, where that is smaller,
     of XX'.
 
@@ -149,7 +150,7 @@ def leading(x: Matrix, most: int = LEADING) -> tuple[Matrix, Matrix, Matrix]:
     """
     width = x.shape[1]
     if len(x) < width:
-        right, singular, left = leading(x.T, most)
+        right, singular, left = leading_svd(x.T, most)
         return left.T, singular, right.T
     values, vectors = scipy.linalg.eigh(x.T @ x, subset_by_index=(max(width - most, 0), width - 1))
     singular = np.sqrt(np.maximum(values[::-1], (RANK_CUT * RANK_CUT) * values[-1]))
@@ -157,11 +158,11 @@ def leading(x: Matrix, most: int = LEADING) -> tuple[Matrix, Matrix, Matrix]:
     return x @ right.T / singular, singular, right
 
 
-def _whitened_means(view: View, owner: NDArray[np.int64], ridge: float) -> Matrix:
+def _whitened_means(view: CcaView, owner: NDArray[np.int64], ridge: float) -> Matrix:
     """(r, objects): E times the whitened left vectors, turned over."""
     objects, place, counts = np.unique(owner, return_inverse=True, return_counts=True)
     sums = np.eye(len(objects))[:, place] @ view.left
-    shrink = view.singular / np.sqrt(len(view.left)) / view.damped(ridge)
+    shrink = view.singular / np.sqrt(len(view.left)) / view.regularised_deviations(ridge)
     return np.asarray((sums / np.sqrt(counts)[:, None] * shrink).T)
 
 
@@ -176,13 +177,13 @@ def unit_rows(x: Matrix) -> Array:
     return np.asarray(x / np.where(norms > 0, norms, 1.0), dtype=np.float32)
 
 
-def cosine(touch_codes: Array, photo_codes: Array) -> Array:
+def cosine(touch_encodings: Array, photo_encodings: Array) -> Array:
     """Cosines (T, N) of unit codes."""
-    return touch_codes @ photo_codes.T
+    return touch_encodings @ photo_encodings.T
 
 
 @dataclass(frozen=True)
-class CcaCell:
+class CcaGridPoint:
     """One cell of the grid, and how well it ranks photos of validation objects."""
 
     ridge: float
@@ -196,42 +197,44 @@ class Cca(Method):
 
     is_seeded = False
 
-    most_directions: int | None = None
+    max_directions: int | None = None
 
     def _fit(self, train: "Features", validation: "Features") -> None:
-        touch, photo = (decompose(part, self.most_directions) for part in (train.touch, train.photo))
+        touch, photo = (decompose(part, self.max_directions) for part in (train.touch, train.photo))
         self._standardise = touch.standardise, photo.standardise
         # The decompositions are made once; a ridge only damps them.
-        found = ((ridge, canonical(touch, photo, train.owner, ridge)) for ridge in RIDGES)
+        found = ((ridge, canonical_correlations(touch, photo, train.owner, ridge)) for ridge in RIDGES)
         cells = (cell for ridge, one in found for cell in self._cells(ridge, one, Validator.of(validation)))
         choice, found_by = max(cells, key=lambda cell: cell[0].auc)
-        if self.setting.all_teach:
-            known = train.joined(validation)
-            touch, photo = (decompose(part, self.most_directions) for part in (known.touch, known.photo))
+        if self.settings.fit_on_validation:
+            known = train.concatenate(validation)
+            touch, photo = (decompose(part, self.max_directions) for part in (known.touch, known.photo))
             self._standardise = touch.standardise, photo.standardise
-            found_by = canonical(touch, photo, known.owner, choice.ridge)
-        self._keep(choice, found_by)
-        self.chosen["rank"] = {"touch": touch.rank, "photo": photo.rank}
+            found_by = canonical_correlations(touch, photo, known.owner, choice.ridge)
+        self._store(choice, found_by)
+        self.best_params["rank"] = {"touch": touch.rank, "photo": photo.rank}
 
-    def _cells(self, ridge: float, found: Canonical, judged: Validator) -> Iterator[tuple[CcaCell, Canonical]]:
-        touch = self._standardise[0](judged.features.touch) @ found.touch_weights
-        photo = self._standardise[1](judged.features.photo) @ found.photo_weights
-        for components in admissible(COMPONENTS, len(found.correlations)):
+    def _cells(
+        self, ridge: float, found: CanonicalCorrelations, validator: Validator
+    ) -> Iterator[tuple[CcaGridPoint, CanonicalCorrelations]]:
+        touch = self._standardise[0](validator.features.touch) @ found.touch_weights
+        photo = self._standardise[1](validator.features.photo) @ found.photo_weights
+        for components in component_counts(COMPONENTS, len(found.correlations)):
             for power in POWERS:
                 weights = found.correlations[:components] ** power
-                codes = unit_rows(touch[:, :components] * weights), unit_rows(photo[:, :components] * weights)
-                yield CcaCell(ridge, components, power, judged.touches(cosine(*codes))), found
+                encodings = unit_rows(touch[:, :components] * weights), unit_rows(photo[:, :components] * weights)
+                yield CcaGridPoint(ridge, components, power, validator.touch_auc(cosine(*encodings))), found
 
-    def _keep(self, choice: CcaCell, found: Canonical) -> None:
+    def _store(self, choice: CcaGridPoint, found: CanonicalCorrelations) -> None:
         weights = found.correlations[: choice.components] ** choice.power
         self._maps = (
             found.touch_weights[:, : choice.components] * weights,
             found.photo_weights[:, : choice.components] * weights,
         )
-        self.chosen = {
+        self.best_params = {
             "ridge": choice.ridge,
             "components": choice.components,
-            "most_components": len(found.correlations),
+            "max_components": len(found.correlations),
             "power": choice.power,
             "validation_auc": choice.auc,
         }
@@ -242,21 +245,21 @@ class Cca(Method):
     def _encode_photo(self, photo: Array) -> Array:
         return unit_rows(self._standardise[1](photo) @ self._maps[1])
 
-    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
-        return cosine(touch_codes, photo_codes)
+    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
+        return cosine(touch_encodings, photo_encodings)
 
 
 class CcaPca(Cca):
-    """`Cca` after principal components, as many as `most_directions` of touch and of photo: for few objects.
+    """`Cca` after principal components, as many as `max_directions` of touch and of photo: for few objects.
 
     A few dozen objects do not say which of a thousand features correlate across touch and photo: the ridge of `Cca`
     damps the thin directions, this leaves them out. On 36 everyday objects of VT60 it is no better than `Cca`
     (docs/real.md), and takes less time, so the controls of the benchmark of real data use it.
     """
 
-    most_directions = 96
+    max_directions = 96
 
 
-def admissible(counts: tuple[int, ...], most: int) -> list[int]:
+def component_counts(counts: tuple[int, ...], most: int) -> list[int]:
     """The counts up to `most`, and `most` itself in place of larger ones."""
     return sorted({min(count, most) for count in counts})

@@ -8,20 +8,20 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from retrieval.console.progress import Bar
-from retrieval.methods.base import Array, Method
-from retrieval.methods.draws import ObjectDraws, seeded
+from retrieval.methods.method import Array, Method
+from retrieval.methods.object_sampler import ObjectSampler, seeded_generator
 from retrieval.methods.selection import Validator
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX, contrastive_loss
 from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT, SIGMOID_LOG_SCALE_INIT, sigmoid_loss
-from retrieval.training.fit import Best, Plan, fit_best
+from retrieval.training.fit import BestStep, Plan, fit_best
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features
 
-MOST_STEPS, JUDGE_EVERY = 800, 40
+MAX_STEPS, VALIDATE_EVERY = 800, 40
 LEARNING_RATE = 1e-3
-OBJECTS_PER_BATCH, EACH = 64, 2
+OBJECTS_PER_BATCH, IMAGES_PER_OBJECT = 64, 2
 """A batch holds each object at most once, with so many of its touches and as many of its photos."""
 REGULARISATIONS = ((0.5, 0.0), (0.8, 0.0), (0.9, 0.0), (0.8, 1.0))
 """Dropout of features and weight decay, to be chosen from."""
@@ -69,7 +69,7 @@ class SigmoidProjections(Projections):
         return sigmoid_loss(touch, photo, touch_objects, photo_objects, self.log_scale, self.bias)
 
 
-class Contrastive(Method):
+class ContrastiveEmbedding(Method):
     """Scaled cosine of embeddings trained with InfoNCE; regularisation and steps by ranking on validation objects."""
 
     name = "contrastive"
@@ -77,15 +77,15 @@ class Contrastive(Method):
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
-        judged = Validator.of(validation)
-        steps = min(self.setting.config.training.iterations, MOST_STEPS)
-        with Bar(f"fit {self.name}", steps * len(REGULARISATIONS), "steps", quiet=self.setting.quiet) as bar:
-            fits = [self._trained(train, judged, *cell, steps, bar) for cell in REGULARISATIONS]
+        validator = Validator.of(validation)
+        steps = min(self.settings.config.training.iterations, MAX_STEPS)
+        with Bar(f"fit {self.name}", steps * len(REGULARISATIONS), "steps", quiet=self.settings.quiet) as bar:
+            fits = [self._train(train, validator, *cell, steps, bar) for cell in REGULARISATIONS]
         best_of = [best.value for _, best in fits]
         place = best_of.index(max(best_of))
         self._module, best = fits[place]
         scale, bias = self._module.logit_map()
-        self.chosen = {
+        self.best_params = {
             "dropout": REGULARISATIONS[place][0],
             "weight_decay": REGULARISATIONS[place][1],
             "steps": best.step,
@@ -94,17 +94,26 @@ class Contrastive(Method):
             "bias": bias,
         }
 
-    def _trained(
-        self, train: "Features", judged: Validator, dropout: float, weight_decay: float, steps: int, bar: Bar
-    ) -> tuple[Projections, Best]:
+    def _train(
+        self, train: "Features", validator: Validator, dropout: float, weight_decay: float, steps: int, bar: Bar
+    ) -> tuple[Projections, BestStep]:
         """Projections trained with one regularisation, as they were at their best step."""
-        with seeded(self.setting.seed) as generator:
-            dim = self.setting.config.matcher.embedding_dim
-            module = self.projections(len(self._touch.kept), len(self._photo.kept), dim, dropout)
-            plan = Plan(steps, LEARNING_RATE, validate_every=JUDGE_EVERY)
-            loss, worth = self._training_loss(module, train, generator), self._worth(module, judged)
+        with seeded_generator(self.settings.seed) as generator:
+            dim = self.settings.config.matcher.embedding_dim
+            module = self.projections(len(self._touch.columns), len(self._photo.columns), dim, dropout)
+            plan = Plan(steps, LEARNING_RATE, validate_every=VALIDATE_EVERY)
+            loss, validation_auc = (
+                self._training_loss(module, train, generator),
+                self._validation_auc(module, validator),
+            )
             best = fit_best(
-                module, plan, loss, worth, bar=bar, weight_decay=weight_decay, after_step=lambda _: module.clamp_scale()
+                module,
+                plan,
+                loss,
+                validation_auc,
+                bar=bar,
+                weight_decay=weight_decay,
+                after_step=lambda _: module.clamp_scale(),
             )
         return module, best
 
@@ -112,20 +121,20 @@ class Contrastive(Method):
         self, module: Projections, train: "Features", generator: torch.Generator
     ) -> Callable[[int], Tensor]:
         touch, photo = self._touch.tensor(train.touch), self._photo.tensor(train.photo)
-        draws = ObjectDraws(torch.from_numpy(train.owner), generator)
+        draws = ObjectSampler(torch.from_numpy(train.owner), generator)
 
         def loss(_: int) -> Tensor:
-            objects = draws.distinct_objects(OBJECTS_PER_BATCH).repeat(EACH)
+            objects = draws.distinct_objects(OBJECTS_PER_BATCH).repeat(IMAGES_PER_OBJECT)
             touches = module(touch[draws.rows(objects)], module.touch)
             photos = module(photo[draws.rows(objects)], module.photo)
             return module.loss(touches, photos, objects, objects)
 
         return loss
 
-    def _worth(self, module: Projections, judged: Validator) -> Callable[[], float]:
-        touch = self._touch.tensor(judged.features.touch)
-        photo = self._photo.tensor(judged.features.photo)
-        return lambda: judged.touches((module(touch, module.touch) @ module(photo, module.photo).T).numpy())
+    def _validation_auc(self, module: Projections, validator: Validator) -> Callable[[], float]:
+        touch = self._touch.tensor(validator.features.touch)
+        photo = self._photo.tensor(validator.features.photo)
+        return lambda: validator.touch_auc((module(touch, module.touch) @ module(photo, module.photo).T).numpy())
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:
@@ -137,12 +146,12 @@ class Contrastive(Method):
         embeddings: Array = self._module(self._photo.tensor(photo), self._module.photo).numpy()
         return embeddings
 
-    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
+    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         scale, bias = self._module.logit_map()
-        return scale * (touch_codes @ photo_codes.T) + bias
+        return scale * (touch_encodings @ photo_encodings.T) + bias
 
 
-class ContrastiveSigmoid(Contrastive):
+class SigmoidEmbedding(ContrastiveEmbedding):
     """The same, trained with the sigmoid loss: its scores are log-odds of a match by themselves."""
 
     name = "contrastive_sigmoid"

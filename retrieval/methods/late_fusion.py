@@ -11,12 +11,12 @@ import torch
 
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import BadInput
-from retrieval.methods.base import Array, Method, Setting
+from retrieval.methods.method import Array, Method, MethodSettings
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
-from retrieval.model.fusion import Matcher, score_halves
+from retrieval.model.fusion import Matcher, score_partials
 from retrieval.training.features import Features
-from retrieval.training.state import finish, unfinished
+from retrieval.training.state import finish_training, unfinished_path
 from retrieval.training.train import Trainer, build_matcher
 
 SOURCE = "features of a recording"
@@ -27,80 +27,81 @@ class LateFusion(Method):
     """Match logits of a fusion head over frozen towers. A code is a half: a modality's share of the first layer."""
 
     @classmethod
-    def of_checkpoint(cls, checkpoint: Checkpoint, setting: Setting) -> Self:
+    def of_checkpoint(cls, checkpoint: Checkpoint, settings: MethodSettings) -> Self:
         """The method as a checkpoint has it; it is not fitted again."""
-        method = cls(setting)
-        method._take(checkpoint)
+        method = cls(settings)
+        method._use_checkpoint(checkpoint)
         if checkpoint.posterior is not None:  # where a photo's object is as likely as one that the catalogue lacks
-            method.chosen["pair_threshold"] = float(checkpoint.posterior.logit_of(np.zeros(1), 1)[0])
+            method.best_params["pair_threshold"] = float(checkpoint.posterior.logit_of(np.zeros(1), 1)[0])
         fingers, touch, photo = _feature_counts(checkpoint.matcher)
         method._shapes, method.fitted = ((fingers, touch), (photo,)), True
         return method
 
     def _fit(self, train: Features, validation: Features) -> None:
-        self._take(trained_checkpoint(self.setting, train, validation))
+        self._use_checkpoint(trained_checkpoint(self.settings, train, validation))
 
-    def _take(self, checkpoint: Checkpoint) -> None:
+    def _use_checkpoint(self, checkpoint: Checkpoint) -> None:
         self._matcher = checkpoint.matcher
-        self.chosen = {"step": checkpoint.provenance["step"], **checkpoint.provenance["metrics"]}
+        self.best_params = {"step": checkpoint.provenance["step"], **checkpoint.provenance["metrics"]}
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:
-        return np.asarray(self._matcher.touch_code(torch.from_numpy(touch).flatten(1)).half.numpy())
+        return np.asarray(self._matcher.touch_encoding(torch.from_numpy(touch).flatten(1)).partial.numpy())
 
     @torch.inference_mode()
     def _encode_photo(self, photo: Array) -> Array:
-        return np.asarray(self._matcher.photo_code(torch.from_numpy(photo)).half.numpy())
+        return np.asarray(self._matcher.photo_encoding(torch.from_numpy(photo)).partial.numpy())
 
-    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
-        touches = torch.from_numpy(touch_codes)
-        return np.array([score_halves(self._matcher.head, touch[None], photo_codes) for touch in touches])
+    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
+        touches = torch.from_numpy(touch_encodings)
+        return np.array([score_partials(self._matcher.head, touch[None], photo_encodings) for touch in touches])
 
 
-def trained_checkpoint(setting: Setting, train: Features, validation: Features) -> Checkpoint:
-    """Train on features and keep the checkpoint in `setting.folder`; one that is there from the same fit is taken as
-    it is, an unfinished one gone on with. It has no pruner: judging every photo needs none.
+def trained_checkpoint(settings: MethodSettings, train: Features, validation: Features) -> Checkpoint:
+    """Train on features and keep the checkpoint in `settings.folder`; one that is there from the same fit is taken as
+    it is, an unfinished one gone on with. It has no candidate_encoder: judging every photo needs none.
 
     The towers of the checkpoint are those of `frozen_matcher`: it serves as any other where they made the features.
-    Raises BadInput for features that no such towers make, Interrupted after Ctrl-C.
+    Raises BadInput for features that no such towers make, JobInterrupted after Ctrl-C.
     """
-    known = train.joined(validation)
+    known = train.concatenate(validation)
     # Grasps to draw pairs from; their files are names, which nobody opens.
     grasps = [
         Grasp(grasp_id, object_id, None, photo=Path(grasp_id), touches=(), backgrounds=())
         for grasp_id, object_id in zip(known.grasp_ids, known.object_ids, strict=True)
     ]
     objects = [tuple(sorted(set(part.object_ids))) for part in (train, validation)]
-    split = Split(setting.seed, train=objects[0], validation=objects[1], test=())
-    config = setting.config.without_pruner()
+    split = Split(settings.seed, train=objects[0], validation=objects[1], test=())
+    config = settings.config.without_candidate_encoder()
     config = dataclasses.replace(
         config,
         matcher=dataclasses.replace(config.matcher, fingers=train.touch.shape[1]),
         # Labelled pairs are among the features.
-        training=dataclasses.replace(config.training, seed=setting.seed, freeze_towers=True, photos="", touches=""),
+        training=dataclasses.replace(config.training, seed=settings.seed, freeze_towers=True, photos="", touches=""),
     )
-    with nullcontext(setting.folder) if setting.folder else tempfile.TemporaryDirectory() as folder:
-        done = Path(folder) / f"late_fusion-{setting.seed}.safetensors"
-        trainer = Trainer(config, split, grasps, unfinished(done), SOURCE, known)
+    with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
+        done = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
+        trainer = Trainer(config, split, grasps, unfinished_path(done), SOURCE, known)
         wanted, got = _feature_counts(trainer.matcher), (*known.touch.shape[1:], *known.photo.shape[1:])
         if wanted != got:
             raise BadInput(
                 f"late fusion takes features of its own towers, {wanted[1]} of a finger and {wanted[2]} of a photo "
                 f"({config.matcher.tower}, {config.matcher.tower_output}); got {got[1]} and {got[2]}; encode with these"
             )
-        towers = frozen_matcher(setting.config)
+        towers = frozen_matcher(settings.config)
         trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
         trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
-        return finish(trainer, done, setting.quiet)
+        return finish_training(trainer, done, settings.quiet)
 
 
 def frozen_matcher(config: Config) -> Matcher:
     """A matcher whose towers are to make features. What of them is random hangs on the configuration's own seed, not
-    on that of a head: one set of features serves heads of every seed."""
+    on that of a head: one set of features serves heads of every seed.
+    """
     torch.manual_seed(config.training.seed)
     return build_matcher(config).eval()
 
 
 def _feature_counts(matcher: Matcher) -> tuple[int, int, int]:
     """Fingers, features of one finger, features of a photo."""
-    return matcher.config.fingers, matcher.touch_tower.feature_count, matcher.head.photo_half.in_features
+    return matcher.config.fingers, matcher.touch_tower.feature_count, matcher.head.photo_partial.in_features

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from retrieval.methods.base import Array, Method
-from retrieval.methods.cca import Matrix, admissible, cosine, decompose, unit_rows
-from retrieval.methods.selection import Validator, neighbours
+from retrieval.methods.cca import Matrix, component_counts, cosine, decompose, unit_rows
+from retrieval.methods.method import Array, Method
+from retrieval.methods.selection import Validator, next_rows_of_object
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features
 
-REDUCED = 256
+MAX_PRINCIPAL_COMPONENTS = 256
 """Principal components kept of each modality. Every step of the power iteration passes over all features of all rows:
 with 2,560 + 1,280 of them 100 components would take minutes, and the directions left out vary least."""
 COMPONENTS = (4, 8, 16, 32, 64, 100)
@@ -29,21 +29,21 @@ class Plsca(Method):
     is_seeded = False
 
     def _fit(self, train: "Features", validation: "Features") -> None:
-        self._touch = _Reduced(train.touch)
-        self._photo = _Reduced(train.photo)
-        maps = _rotations(self._touch(train.touch), self._photo(train.photo)[neighbours(train.owner, 2)[:, 1]])
-        judged = Validator.of(validation)
-        touch, photo = self._touch(judged.features.touch) @ maps[0], self._photo(judged.features.photo) @ maps[1]
+        self._touch = _PrincipalComponents(train.touch)
+        self._photo = _PrincipalComponents(train.photo)
+        maps = _rotations(self._touch(train.touch), self._photo(train.photo)[next_rows_of_object(train.owner, 2)[:, 1]])
+        validator = Validator.of(validation)
+        touch, photo = self._touch(validator.features.touch) @ maps[0], self._photo(validator.features.photo) @ maps[1]
         # Components are found one after another, so those of a smaller number are the first of a larger one.
         aucs = {
-            count: judged.touches(cosine(unit_rows(touch[:, :count]), unit_rows(photo[:, :count])))
-            for count in admissible(COMPONENTS, maps[0].shape[1])
+            count: validator.touch_auc(cosine(unit_rows(touch[:, :count]), unit_rows(photo[:, :count])))
+            for count in component_counts(COMPONENTS, maps[0].shape[1])
         }
         count = max(aucs, key=aucs.__getitem__)
         self._maps = maps[0][:, :count], maps[1][:, :count]
-        self.chosen = {
+        self.best_params = {
             "components": count,
-            "most_components": maps[0].shape[1],
+            "max_components": maps[0].shape[1],
             "principal_components": {"touch": self._touch.count, "photo": self._photo.count},
             "validation_auc": aucs[count],
         }
@@ -54,16 +54,16 @@ class Plsca(Method):
     def _encode_photo(self, photo: Array) -> Array:
         return unit_rows(self._photo(photo) @ self._maps[1])
 
-    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
-        return cosine(touch_codes, photo_codes)
+    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
+        return cosine(touch_encodings, photo_encodings)
 
 
-class _Reduced:
-    """Standardised features in their principal directions, at most `REDUCED` and no more than vary."""
+class _PrincipalComponents:
+    """Standardised features in their principal directions, at most `MAX_PRINCIPAL_COMPONENTS` and no more than vary."""
 
     def __init__(self, x: Array) -> None:
         view = decompose(x)
-        self._standardise, self._directions = view.standardise, view.right[:REDUCED].T
+        self._standardise, self._directions = view.standardise, view.right[:MAX_PRINCIPAL_COMPONENTS].T
         self.count = self._directions.shape[1]
 
     def __call__(self, x: Array) -> Matrix:

@@ -11,10 +11,10 @@ from retrieval.errors import NumericalError
 from retrieval.metrics.measure import weight_below
 from retrieval.training.features import Features
 
-MOST_JUDGED = 512
+MAX_VALIDATION_ROWS = 512
 
 
-def judged_rows(validation: Features, most: int = MOST_JUDGED) -> NDArray[np.int64]:
+def validation_rows(validation: Features, most: int = MAX_VALIDATION_ROWS) -> NDArray[np.int64]:
     """Rows of the grasps to choose by: of each object as many, evenly spaced, about `most` in all (2 at least)."""
     each = max(most // (int(validation.owner.max()) + 1), 2)
     parts = [np.flatnonzero(validation.owner == owner) for owner in range(int(validation.owner.max()) + 1)]
@@ -54,13 +54,13 @@ class Validator:
     @classmethod
     def of(cls, validation: Features) -> "Validator":
         """A validator by as many of the validation grasps as are enough."""
-        return cls(validation.select(judged_rows(validation)))
+        return cls(validation.select(validation_rows(validation)))
 
-    def touches(self, scores: NDArray[np.floating[Any]]) -> float:
+    def touch_auc(self, scores: NDArray[np.floating[Any]]) -> float:
         """Worth of scores (n, n) of every touch with every photo."""
-        return self.sets(scores, np.arange(len(self.features))[:, None])
+        return self.set_auc(scores, np.arange(len(self.features))[:, None])
 
-    def sets(self, scores: NDArray[np.floating[Any]], sets: NDArray[np.int64]) -> float:
+    def set_auc(self, scores: NDArray[np.floating[Any]], sets: NDArray[np.int64]) -> float:
         """Worth of scores (S, n) of sets (S, G) of touches with every photo."""
         left_out = np.zeros(scores.shape, dtype=np.bool_)
         np.put_along_axis(left_out, sets, True, axis=1)
@@ -68,7 +68,7 @@ class Validator:
         return ranking_auc(scores, owner[sets[:, 0]], owner, left_out)
 
 
-def neighbours(owner: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+def next_rows_of_object(owner: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     """(n, most) for each row itself and the next rows of its object, round."""
     groups = np.empty((len(owner), most), dtype=np.int64)
     for name in np.unique(owner):
@@ -77,7 +77,7 @@ def neighbours(owner: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     return groups
 
 
-FEWEST_FOR_FOUR = 12
+MIN_OBJECTS_FOR_FOUR_FOLDS = 12
 """Objects that four folds need, three in each; fewer make two folds."""
 
 
@@ -93,26 +93,27 @@ def held_out_folds(
     of the objects of a kind are held out together, while the other half trains.
 
     kind_of: the kind of each object, where the recording names it; otherwise objects that look alike are of one kind
-    (`by_looks`). linked: objects that stay together, such as those of one sequence.
+    (`appearance_order`). linked: objects that stay together, such as those of one sequence.
     """
     names = sorted(set(features.object_ids))
     if kind_of is not None and all(name in kind_of for name in names):
         shuffled = [names[place] for place in np.random.default_rng([seed, 29]).permutation(len(names))]
         order = sorted(shuffled, key=lambda name: kind_of[name])
     else:
-        order = by_looks(features)
+        order = appearance_order(features)
     unit_of = {name: tuple(each for each in sorted(unit) if each in names) for unit in linked for name in unit}
     sides: list[list[str]] = [[], []]
     for unit in dict.fromkeys(unit_of.get(name, (name,)) for name in order):
         min(sides, key=len).extend(unit)
-    if len(names) < FEWEST_FOR_FOUR or any(len(unit) > 1 for unit in unit_of.values()):
+    if len(names) < MIN_OBJECTS_FOR_FOUR_FOLDS or any(len(unit) > 1 for unit in unit_of.values()):
         return [tuple(sorted(side)) for side in sides]
     return [tuple(sorted(part.tolist())) for side in sides for part in np.array_split(side, 2)]
 
 
-def by_looks(features: Features) -> list[str]:
+def appearance_order(features: Features) -> list[str]:
     """The objects in an order in which neighbours look alike: leaves of average linkage, in optimal order (Bar-Joseph,
-    Gifford and Jaakkola 2001), of the mean photo features of each object, standardised over the objects."""
+    Gifford and Jaakkola 2001), of the mean photo features of each object, standardised over the objects.
+    """
     from scipy.cluster.hierarchy import leaves_list, linkage  # slow to import
 
     names, owner = sorted(set(features.object_ids)), features.owner

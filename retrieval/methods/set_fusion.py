@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from retrieval.console.progress import Bar
-from retrieval.methods.base import Array, Method
-from retrieval.methods.draws import ObjectDraws, seeded
-from retrieval.methods.selection import Validator, neighbours
+from retrieval.methods.method import Array, Method
+from retrieval.methods.object_sampler import ObjectSampler, seeded_generator
+from retrieval.methods.selection import Validator, next_rows_of_object
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.fusion import FusionHead
 from retrieval.model.losses.match import match_loss
@@ -23,8 +23,8 @@ from retrieval.training.fit import Plan, fit_best
 if TYPE_CHECKING:
     from retrieval.training.features import Features
 
-MOST_GRASPS, JUDGED_GRASPS = 8, 5
-MOST_STEPS, JUDGE_EVERY = 1000, 50
+MAX_GRASPS, VALIDATION_GRASPS = 8, 5
+MAX_STEPS, VALIDATE_EVERY = 1000, 50
 OBJECTS_PER_BATCH, PHOTOS = 24, 4
 """Sets in a batch, and photos of its own object and of other objects that each is paired with."""
 PAIRS_PER_BLOCK = 16_384
@@ -46,14 +46,14 @@ class SetHead(FusionHead):
         for layer in (self.attended, self.largest):
             nn.init.zeros_(layer.weight)
 
-    def pool(self, halves: Tensor, held: Tensor) -> Tensor:
+    def pool(self, partials: Tensor, counted: Tensor) -> Tensor:
         """Pooled halves (S, hidden) of sets (S, G, hidden); held (S, G): which count, at least one of each set."""
-        outside = ~held[..., None]
-        count = held.sum(1, keepdim=True)
-        mean = halves.masked_fill(outside, 0.0).sum(1) / count
-        weights = self.attention(torch.relu(halves)).masked_fill(outside, -torch.inf).softmax(1)
-        attended = (weights * halves.masked_fill(outside, 0.0)).sum(1)
-        largest = halves.masked_fill(outside, -torch.inf).amax(1)
+        outside = ~counted[..., None]
+        count = counted.sum(1, keepdim=True)
+        mean = partials.masked_fill(outside, 0.0).sum(1) / count
+        weights = self.attention(torch.relu(partials)).masked_fill(outside, -torch.inf).softmax(1)
+        attended = (weights * partials.masked_fill(outside, 0.0)).sum(1)
+        largest = partials.masked_fill(outside, -torch.inf).amax(1)
         mixed: Tensor = mean + self.attended(attended - mean) + self.largest(largest - mean)
         return mixed + count.log() * self.size
 
@@ -63,62 +63,62 @@ class SetFusion(Method):
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
-        config = self.setting.config
-        steps = min(config.training.iterations, MOST_STEPS)
-        plan = Plan(steps, config.training.learning_rate, validate_every=JUDGE_EVERY)
-        with seeded(self.setting.seed) as generator:
-            features = len(self._touch.kept), len(self._photo.kept)
+        config = self.settings.config
+        steps = min(config.training.iterations, MAX_STEPS)
+        plan = Plan(steps, config.training.learning_rate, validate_every=VALIDATE_EVERY)
+        with seeded_generator(self.settings.seed) as generator:
+            features = len(self._touch.columns), len(self._photo.columns)
             self._head = SetHead(*features, config.matcher.hidden, config.matcher.dropout)
-            loss, worth = self._training_loss(train, generator), self._worth(validation)
-            with Bar("fit set_fusion", steps, "steps", quiet=self.setting.quiet) as bar:
-                best = fit_best(self._head, plan, loss, worth, bar=bar)
-        self.chosen = {"steps": best.step, "validation_auc": best.value}
+            loss, validation_auc = self._training_loss(train, generator), self._validation_auc(validation)
+            with Bar("fit set_fusion", steps, "steps", quiet=self.settings.quiet) as bar:
+                best = fit_best(self._head, plan, loss, validation_auc, bar=bar)
+        self.best_params = {"steps": best.step, "validation_auc": best.value}
 
     def _training_loss(self, train: "Features", generator: torch.Generator) -> Callable[[int], Tensor]:
         """The loss of a fresh batch: each set with as many photos of its own object as of others."""
         touch, photo = self._touch.tensor(train.touch), self._photo.tensor(train.photo)
-        draws = ObjectDraws(torch.from_numpy(train.owner), generator)
+        draws = ObjectSampler(torch.from_numpy(train.owner), generator)
 
         def loss(_: int) -> Tensor:
             objects = draws.distinct_objects(OBJECTS_PER_BATCH)
-            rows, held = draws.sets(objects, MOST_GRASPS)
-            pooled = self._head.pool(self._head.touch_half(touch[rows]), held)
+            rows, counted = draws.sets(objects, MAX_GRASPS)
+            pooled = self._head.pool(self._head.touch_partial(touch[rows]), counted)
             shown = torch.cat([objects[:, None].expand(-1, PHOTOS), draws.other_objects(objects, PHOTOS)], 1)
-            logits = self._head(pooled[:, None], self._head.photo_half(photo[draws.rows(shown)]))
+            logits = self._head(pooled[:, None], self._head.photo_partial(photo[draws.rows(shown)]))
             return match_loss(logits.flatten(), (shown == objects[:, None]).flatten())
 
         return loss
 
-    def _worth(self, validation: "Features") -> Callable[[], float]:
-        judged = Validator.of(validation)
-        groups = neighbours(judged.features.owner, JUDGED_GRASPS)
+    def _validation_auc(self, validation: "Features") -> Callable[[], float]:
+        validator = Validator.of(validation)
+        groups = next_rows_of_object(validator.features.owner, VALIDATION_GRASPS)
 
-        def worth() -> float:
-            touch, photo = self._encode_touch(judged.features.touch), self._encode_photo(judged.features.photo)
-            single = judged.touches(self._score(touch, photo))
-            return (single + judged.sets(self._score_sets(touch, photo, groups), groups)) / 2
+        def validation_auc() -> float:
+            touch, photo = self._encode_touch(validator.features.touch), self._encode_photo(validator.features.photo)
+            single = validator.touch_auc(self._score(touch, photo))
+            return (single + validator.set_auc(self._score_sets(touch, photo, groups), groups)) / 2
 
-        return worth
+        return validation_auc
 
     @torch.inference_mode()
     def _encode_touch(self, touch: Array) -> Array:
-        halves: Array = self._head.touch_half(self._touch.tensor(touch)).numpy()
-        return halves
+        partials: Array = self._head.touch_partial(self._touch.tensor(touch)).numpy()
+        return partials
 
     @torch.inference_mode()
     def _encode_photo(self, photo: Array) -> Array:
-        halves: Array = self._head.photo_half(self._photo.tensor(photo)).numpy()
-        return halves
+        partials: Array = self._head.photo_partial(self._photo.tensor(photo)).numpy()
+        return partials
 
-    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
-        return self._logits(torch.tensor(touch_codes), torch.tensor(photo_codes))
+    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
+        return self._logits(torch.tensor(touch_encodings), torch.tensor(photo_encodings))
 
     @torch.inference_mode()
-    def _score_sets(self, touch_codes: Array, photo_codes: Array, sets: NDArray[np.int64]) -> Array:
+    def _score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
         # In a fixed order: sums in another order round otherwise, and a set has none.
-        ordered = torch.tensor(touch_codes)[torch.from_numpy(np.sort(sets, axis=1))]
+        ordered = torch.tensor(touch_encodings)[torch.from_numpy(np.sort(sets, axis=1))]
         pooled = self._head.pool(ordered, torch.ones(sets.shape, dtype=torch.bool))
-        return self._logits(pooled, torch.tensor(photo_codes))
+        return self._logits(pooled, torch.tensor(photo_encodings))
 
     @torch.inference_mode()
     def _logits(self, touch: Tensor, photo: Tensor) -> Array:

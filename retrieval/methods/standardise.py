@@ -10,7 +10,7 @@ from torch import Tensor
 
 from retrieval.errors import BadInput
 
-CONSTANT = 1e-6
+MIN_RELATIVE_SPREAD = 1e-6
 """A feature whose spread is below this share of its size is constant to float32, and dropped."""
 
 
@@ -18,7 +18,7 @@ CONSTANT = 1e-6
 class Standardiser:
     """`(x - mean) / scale` of the features that vary. kept, mean, scale (F',): which, and their statistics."""
 
-    kept: NDArray[np.int64]
+    columns: NDArray[np.int64]
     mean: NDArray[np.float64]
     scale: NDArray[np.float64]
 
@@ -27,16 +27,16 @@ class Standardiser:
         """Statistics of x (n, ...), flattened to (n, F) and computed in float64. Raises BadInput where none varies."""
         x = _flat(x)
         mean, scale = x.mean(0), x.std(0)
-        kept = np.flatnonzero(scale > CONSTANT * np.abs(x).max(0))
-        if not len(kept):
+        columns = np.flatnonzero(scale > MIN_RELATIVE_SPREAD * np.abs(x).max(0))
+        if not len(columns):
             raise BadInput(
                 f"features must differ between grasps; all {x.shape[1]} are constant over {len(x)}; are the images?"
             )
-        return cls(kept, mean[kept], scale[kept])
+        return cls(columns, mean[columns], scale[columns])
 
     def __call__(self, x: NDArray[Any]) -> NDArray[np.float64]:
         """Standardised features (n, F') of x (n, ...)."""
-        return (_flat(x)[:, self.kept] - self.mean) / self.scale
+        return (_flat(x)[:, self.columns] - self.mean) / self.scale
 
     def tensor(self, x: NDArray[Any]) -> Tensor:
         """The same as a float32 tensor."""

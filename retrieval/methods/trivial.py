@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from retrieval.methods.base import Array, Method
+from retrieval.methods.method import Array, Method
 
 if TYPE_CHECKING:
     from retrieval.training.features import Features
@@ -28,14 +28,14 @@ class Chance(Method):
     def _encode_photo(self, photo: Array) -> Array:
         return self._directions(1, photo)
 
-    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
-        return touch_codes @ photo_codes.T
+    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
+        return touch_encodings @ photo_encodings.T
 
     def _directions(self, modality: int, items: Array) -> Array:
         drawn = np.empty((len(items), DIM), dtype=np.float32)
         for row, item in enumerate(items):
             content = int.from_bytes(blake2b(item.tobytes(), digest_size=8).digest())
-            drawn[row] = np.random.default_rng([self.setting.seed, modality, content]).standard_normal(DIM)
+            drawn[row] = np.random.default_rng([self.settings.seed, modality, content]).standard_normal(DIM)
         return np.asarray(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
 
 
@@ -53,5 +53,5 @@ class Constant(Method):
     def _encode_photo(self, photo: Array) -> Array:
         return np.zeros((len(photo), 1), dtype=np.float32)
 
-    def _score(self, touch_codes: Array, photo_codes: Array) -> Array:
-        return np.zeros((len(touch_codes), len(photo_codes)), dtype=np.float32)
+    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
+        return np.zeros((len(touch_encodings), len(photo_encodings)), dtype=np.float32)

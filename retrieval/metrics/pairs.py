@@ -39,7 +39,8 @@ class Calibration:
 
     def log_odds(self, logit: ArrayLike) -> NDArray[np.float64]:
         """Calibrated log-odds of match logits. Raises NumericalError for one that is not finite: it is above no
-        threshold, and would count as "no match"."""
+        threshold, and would count as "no match".
+        """
         z = np.asarray(logit, dtype=np.float64)
         if not np.isfinite(z).all():
             raise NumericalError(f"every logit must be finite to be calibrated; got {z[~np.isfinite(z)][0]}")
@@ -140,23 +141,23 @@ def pair_auc(logits: ArrayLike, labels: ArrayLike) -> float:
     return float(weight_below(true, false).sum() / (len(true) * len(false)))
 
 
-def reliability_bins(probability: ArrayLike, came_true: ArrayLike) -> dict[str, Any]:
+def reliability_bins(probability: ArrayLike, outcomes: ArrayLike) -> dict[str, Any]:
     """{"ece", "bins": [{"probability", "share", "count"}]}: means over 15 equal bins, empty ones left out.
 
     probability, came_true (P,): 1 or 0, or a share where equals were settled by a draw. Expected calibration error:
     the mean over all of |probability - share| of its bin.
     """
-    p, y = np.asarray(probability, dtype=np.float64), np.asarray(came_true, dtype=np.float64)
+    p, y = np.asarray(probability, dtype=np.float64), np.asarray(outcomes, dtype=np.float64)
     if p.shape != y.shape or p.ndim != 1 or not len(p) or not ((p >= 0) & (p <= 1)).all():
         raise BadInput(f"probabilities between 0 and 1 and as many outcomes are needed; got {p.shape} and {y.shape}")
     which = np.minimum((p * BINS).astype(int), BINS - 1)
     used, place, counts = np.unique(which, return_inverse=True, return_counts=True)
-    said, share = (np.bincount(place, weights=values) / counts for values in (p, y))
+    mean_probability, share = (np.bincount(place, weights=values) / counts for values in (p, y))
     bins = [
-        {"probability": float(said[row]), "share": float(share[row]), "count": int(counts[row])}
+        {"probability": float(mean_probability[row]), "frequency": float(share[row]), "count": int(counts[row])}
         for row in range(len(used))
     ]
-    return {"ece": float((np.abs(said - share) * counts).sum() / len(p)), "bins": bins}
+    return {"ece": float((np.abs(mean_probability - share) * counts).sum() / len(p)), "bins": bins}
 
 
 def _checked(logits: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

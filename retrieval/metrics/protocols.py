@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
 from retrieval.metrics import ranking
-from retrieval.metrics.guesses import guess_curves
+from retrieval.metrics.k_way import k_way_accuracies
 from retrieval.metrics.measure import Measure, object_means, object_weights, weight_below
 from retrieval.metrics.pairs import Calibration, Threshold
 from retrieval.metrics.table import ScoreTable, object_scores
@@ -24,9 +24,9 @@ def pair_accuracy(table: ScoreTable, rule: Calibration | Threshold) -> Measure:
     that over other photos (the object uniform, then its photo). rule: a calibration of rows like these, fitted on
     validation objects, or a threshold that comes with the scores. Chance is 1/2.
     """
-    kept = table.asked
-    odds = rule.log_odds(kept.scores)
-    own, others = _halves(kept, (np.sign(odds) + 1) / 2)
+    queries = table.with_targets
+    odds = rule.log_odds(queries.scores)
+    own, others = _own_and_other_means(queries, (np.sign(odds) + 1) / 2)
     return _measure(table, (own + 1 - others) / 2, 0.5)
 
 
@@ -35,14 +35,16 @@ def pair_auc(table: ScoreTable) -> Measure:
 
     The other object is drawn uniformly, then its photo. Needs no threshold and no calibration. Chance is 1/2.
     """
-    kept = table.asked
-    weights = _rival_weights(kept)
-    rows = zip(kept.scores, kept.relevant, kept.relevant & ~kept.own, weights, strict=True)
+    queries = table.with_targets
+    weights = _rival_weights(queries)
+    rows = zip(queries.scores, queries.relevant, queries.relevant & ~queries.own, weights, strict=True)
     values = [weight_below(row[mine], row[~same], weight[~same]).mean() for row, same, mine, weight in rows]
     return _measure(table, np.array(values), 0.5)
 
 
-def _halves(table: ScoreTable, values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _own_and_other_means(
+    table: ScoreTable, values: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Means (T,) of values (T, N) over a row's own object and over the others, its own photos left out."""
     mine = table.relevant & ~table.own
     return (values * mine).sum(1) / mine.sum(1), (values * _rival_weights(table)).sum(1)
@@ -62,17 +64,17 @@ def k_way(table: ScoreTable, k: int, *, photos: int = 1, draws: int = 16, seed: 
     """Guess curve (m = k): the object found within 1..k guesses among k candidates, itself and k - 1 others.
 
     Every candidate is shown by `photos` photos (`object_scores`) and scored by their mean. Photos are drawn `draws`
-    times for every row; over the rivals the mean is exact (`guess_curve`). Chance is 1/k, 2/k, ..., 1. Raises
+    times for every row; over the rivals the mean is exact (`k_way_accuracy`). Chance is 1/k, 2/k, ..., 1. Raises
     BadInput for fewer than k objects.
     """
-    kept = table.asked
-    scores = object_scores(kept, photos, draws, seed)
-    true = np.take_along_axis(scores, np.searchsorted(kept.objects, kept.touch_owner)[None, :, None], 2)
+    queries = table.with_targets
+    scores = object_scores(queries, photos, draws, seed)
+    true = np.take_along_axis(scores, np.searchsorted(queries.objects, queries.touch_owner)[None, :, None], 2)
     higher, equal = (scores > true).sum(2).ravel(), (scores == true).sum(2).ravel() - 1
-    curves = guess_curves(higher, equal, len(kept.objects) - 1, k).reshape(draws, -1, k).mean(0)
+    curves = k_way_accuracies(higher, equal, len(queries.objects) - 1, k).reshape(draws, -1, k).mean(0)
     shown = "a photo" if photos == 1 else f"{photos} photos (fewer where it has no more)"
     words = f"{k} of these objects, each shown by {shown}: {table.gallery}"
-    return Measure(curves, kept.touch_owner, np.arange(1, k + 1) / k, words)
+    return Measure(curves, queries.touch_owner, np.arange(1, k + 1) / k, words)
 
 
 def recall(table: ScoreTable, k: int) -> Measure:
@@ -80,15 +82,17 @@ def recall(table: ScoreTable, k: int) -> Measure:
 
     Photos ask for touches with `table.transposed()`.
     """
-    kept = table.asked
-    return _measure(table, ranking.recall_at(k, kept.first), ranking.chance_of_recall(k, kept.relevant, ~kept.own))
+    queries = table.with_targets
+    return _measure(
+        table, ranking.recall_at(k, queries.first), ranking.chance_of_recall(k, queries.relevant, ~queries.own)
+    )
 
 
 def reciprocal_rank(table: ScoreTable) -> Measure:
     """1 / rank of the first photo of the object in the whole gallery, own photos left out."""
-    kept = table.asked
-    chance = ranking.chance_of_reciprocal_rank(kept.relevant, ~kept.own)
-    return _measure(table, ranking.reciprocal_rank(kept.first), chance)
+    queries = table.with_targets
+    chance = ranking.chance_of_reciprocal_rank(queries.relevant, ~queries.own)
+    return _measure(table, ranking.reciprocal_rank(queries.first), chance)
 
 
 def average_precision(table: ScoreTable) -> Measure:
@@ -97,9 +101,9 @@ def average_precision(table: ScoreTable) -> Measure:
     The cross-sensory retrieval of the ObjectFolder benchmark is that of `table.with_own()`: its gallery holds every
     instance of the other modality, that of the query's own grasp included.
     """
-    kept = table.asked
-    values = ranking.average_precision(kept.scores, kept.relevant, ~kept.own)
-    return _measure(table, values, ranking.chance_of_average_precision(kept.relevant, ~kept.own))
+    queries = table.with_targets
+    values = ranking.average_precision(queries.scores, queries.relevant, ~queries.own)
+    return _measure(table, values, ranking.chance_of_average_precision(queries.relevant, ~queries.own))
 
 
 def paired(table: ScoreTable, k: int) -> Measure:
@@ -128,7 +132,7 @@ def is_paired(table: ScoreTable) -> bool:
 
 def _measure(table: ScoreTable, values: NDArray[np.float64], chance: NDArray[np.float64] | float) -> Measure:
     """One value for each row that is asked; the chance of queries is averaged as their values are."""
-    owner = table.asked.touch_owner
+    owner = table.with_targets.touch_owner
     level = np.sum(object_weights(owner) * chance)
     return Measure(values[:, None], owner, np.array([level]), table.gallery)
 
@@ -145,18 +149,18 @@ def confusions(table: ScoreTable, *, photos: int = 1, draws: int = 16, seed: int
     All objects of the gallery are candidates, each shown by `photos` photos drawn `draws` times; equals share the
     place. Right guesses are not listed, so an object's shares add up to 1 less its share of right ones.
     """
-    kept = table.asked
-    scores = object_scores(kept, photos, draws, seed)
+    queries = table.with_targets
+    scores = object_scores(queries, photos, draws, seed)
     first = scores == scores.max(2, keepdims=True)
     shares = (first / first.sum(2, keepdims=True)).mean(0)
-    objects, means = object_means(shares, kept.touch_owner)
-    names = kept.objects
+    objects, means = object_means(shares, queries.touch_owner)
+    names = queries.objects
     found = [(int(objects[row]), int(names[column]), float(means[row, column])) for row, column in np.argwhere(means)]
     return sorted((item for item in found if item[0] != item[1]), key=lambda item: (-item[2], *item[:2]))
 
 
 def true_ranks(table: ScoreTable) -> NDArray[np.float64]:
     """(T,) expected rank, from 1, of the first photo of a row's object, own photos left out; NaN where it has none."""
-    ranks = np.full(len(table.askable), np.nan)
-    ranks[table.askable] = ranking.first_rank(table.asked.first)
+    ranks = np.full(len(table.has_target), np.nan)
+    ranks[table.has_target] = ranking.first_rank(table.with_targets.first)
     return ranks

@@ -17,7 +17,8 @@ Mask = NDArray[np.bool_]
 
 class FirstRelevant(NamedTuple):
     """Where the first relevant item of each row (Q,) stands: `before` items score higher, and among the `tied` that
-    score the same (itself included) `right` are relevant. What scores higher is then never relevant."""
+    score the same (itself included) `right` are relevant. What scores higher is then never relevant.
+    """
 
     before: NDArray[np.int64]
     tied: NDArray[np.int64]

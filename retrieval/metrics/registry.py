@@ -14,23 +14,23 @@ from retrieval.metrics.table import ScoreTable
 
 SET_SIZES = (1, 2, 3, 5, 8, 12, 20)
 """Grasps in a set."""
-SHOWN_PHOTOS = 3
+PHOTOS_PER_CANDIDATE = 3
 """Photos of a candidate where sets of grasps are judged."""
 PHOTO_COUNTS = (1, 2, 3, 5, 10, 20)
 """Photos of a candidate where one grasp asks."""
 
 
 @dataclass(frozen=True, eq=False)
-class Scored:
+class MethodScoreTables:
     """What metrics are taken of: the scores of one method and seed, as tables.
 
-    test: touches with photos of test objects; among_all: the same touches with the photos of all objects; sets: by
+    test: touches with photos of test objects; all_objects: the same touches with the photos of all objects; sets: by
     number of grasps, sets of test touches with photos of test objects; rule: which pairs of a single touch and a photo
     are called matches, None where nothing says so; seed: of what is drawn.
     """
 
     test: ScoreTable
-    among_all: ScoreTable
+    all_objects: ScoreTable
     sets: dict[int, ScoreTable]
     rule: Calibration | Threshold | None
     seed: int
@@ -52,38 +52,40 @@ class Metric:
     label: str
     column: str
     section: str
-    take: Callable[[Scored], Measure | None]
+    compute: Callable[[MethodScoreTables], Measure | None]
 
 
-def of_grasps(count: int) -> str:
+def grasps_metric_name(count: int) -> str:
     """The metric of a query of so many grasps, three photos of each candidate."""
-    return f"guesses_k5_g{count}_p{SHOWN_PHOTOS}"
+    return f"topn_k5_g{count}_p{PHOTOS_PER_CANDIDATE}"
 
 
-def of_photos(count: int) -> str:
+def photos_metric_name(count: int) -> str:
     """The metric of a query of one grasp, so many photos of each candidate."""
-    return "guesses_k5" if count == 1 else f"guesses_k5_p{count}"
+    return "topn_k5" if count == 1 else f"topn_k5_p{count}"
 
 
-def guesses(table: ScoreTable | None, k: int, seed: int, photos: int = 1) -> Measure | None:
+def k_way_measure(table: ScoreTable | None, k: int, seed: int, photos: int = 1) -> Measure | None:
     """`protocols.k_way`, or None where there are fewer objects than candidates."""
     return protocols.k_way(table, k, photos=photos, seed=seed) if table and len(table.objects) >= k else None
 
 
 def _of_set(count: int) -> Metric:
     words = f"{count} grasp{'s' * (count > 1)}"
-    label = f"first guess of 5, {words}, {SHOWN_PHOTOS} photos"
-    return Metric(label, words, "grasps", lambda of: guesses(of.sets.get(count), 5, of.seed, SHOWN_PHOTOS))
+    label = f"first guess of 5, {words}, {PHOTOS_PER_CANDIDATE} photos"
+    return Metric(
+        label, words, "grasps", lambda of: k_way_measure(of.sets.get(count), 5, of.seed, PHOTOS_PER_CANDIDATE)
+    )
 
 
 def _of_photos(count: int) -> Metric:
     words = f"{count} photos"
-    return Metric(f"first guess of 5, {words}", words, "photos", lambda of: _shown_alike(of, count))
+    return Metric(f"first guess of 5, {words}", words, "photos", lambda of: _if_enough_photos(of, count))
 
 
-def _shown_alike(of: Scored, count: int) -> Measure | None:
+def _if_enough_photos(of: MethodScoreTables, count: int) -> Measure | None:
     """None where some candidate has fewer photos: the mean of fewer scores lies further out than its rivals'."""
-    return guesses(of.test, 5, of.seed, count) if of.test.fewest_photos >= count else None
+    return k_way_measure(of.test, 5, of.seed, count) if of.test.min_photos >= count else None
 
 
 def _paired(table: ScoreTable, k: int) -> Measure | None:
@@ -93,11 +95,11 @@ def _paired(table: ScoreTable, k: int) -> Measure | None:
 TOUCH_TO_PHOTO, PHOTO_TO_TOUCH = "touch to photo", "photo to touch"
 
 
-def _of_gallery(prefix: str, section: str, table: Callable[[Scored], ScoreTable]) -> dict[str, Metric]:
+def _of_gallery(prefix: str, section: str, table: Callable[[MethodScoreTables], ScoreTable]) -> dict[str, Metric]:
     """Measures of the whole gallery, in one direction."""
 
-    def metric(column: str, take: Callable[[ScoreTable], Measure]) -> Metric:
-        return Metric(f"{column}, {section}", column, section, lambda of: take(table(of)))
+    def metric(column: str, compute: Callable[[ScoreTable], Measure]) -> Metric:
+        return Metric(f"{column}, {section}", column, section, lambda of: compute(table(of)))
 
     return {
         **{f"{prefix}recall_{k}": metric(f"R@{k}", partial(protocols.recall, k=k)) for k in (1, 5, 10)},
@@ -114,16 +116,18 @@ METRICS: dict[str, Metric] = {
         lambda of: protocols.pair_accuracy(of.test, of.rule) if of.rule else None,
     ),
     "pair_auc": Metric("pair AUC", "pair AUC", "main", lambda of: protocols.pair_auc(of.test)),
-    "guesses_k5": Metric("first guess of 5", "first guess of 5", "main", lambda of: guesses(of.test, 5, of.seed)),
-    "guesses_k10": Metric("first guess of 10", "first guess of 10", "main", lambda of: guesses(of.test, 10, of.seed)),
-    "all_objects_k5": Metric(
+    "topn_k5": Metric("first guess of 5", "first guess of 5", "main", lambda of: k_way_measure(of.test, 5, of.seed)),
+    "topn_k10": Metric(
+        "first guess of 10", "first guess of 10", "main", lambda of: k_way_measure(of.test, 10, of.seed)
+    ),
+    "topn_k5_all_objects": Metric(
         "first guess of 5, all objects",
         "first guess of 5, all objects",
         "main",
-        lambda of: guesses(of.among_all, 5, of.seed),
+        lambda of: k_way_measure(of.all_objects, 5, of.seed),
     ),
-    **{of_grasps(count): _of_set(count) for count in SET_SIZES},
-    **{of_photos(count): _of_photos(count) for count in PHOTO_COUNTS if count > 1},
+    **{grasps_metric_name(count): _of_set(count) for count in SET_SIZES},
+    **{photos_metric_name(count): _of_photos(count) for count in PHOTO_COUNTS if count > 1},
     **_of_gallery("", TOUCH_TO_PHOTO, lambda of: of.test),
     **_of_gallery("photo_to_touch_", PHOTO_TO_TOUCH, lambda of: of.photos),
     "objectfolder_touch_to_photo": Metric(
@@ -144,7 +148,7 @@ METRICS: dict[str, Metric] = {
 """Name in results.json -> what it is, in the order of every table."""
 
 
-def take(scored: Scored, names: Iterable[str] = METRICS) -> dict[str, Measure]:
+def compute(scored: MethodScoreTables, names: Iterable[str] = METRICS) -> dict[str, Measure]:
     """The metrics of these names that can be asked of a method's scores."""
-    found = {name: METRICS[name].take(scored) for name in names}
+    found = {name: METRICS[name].compute(scored) for name in names}
     return {name: measure for name, measure in found.items() if measure is not None}

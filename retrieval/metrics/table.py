@@ -53,31 +53,31 @@ class ScoreTable:
         return np.asarray(self.touch_owner[:, None] == self.photo_owner[None])
 
     @cached_property
-    def askable(self) -> NDArray[np.bool_]:
+    def has_target(self) -> NDArray[np.bool_]:
         """(T,): the row has a photo of its object to find that is not its own."""
         return np.asarray((self.relevant & ~self.own).any(1))
 
     @cached_property
-    def asked(self) -> "ScoreTable":
-        """The table of the rows that are askable. Raises BadInput where none is."""
-        if not self.askable.any():
+    def with_targets(self) -> "ScoreTable":
+        """The table of the rows that are has_target. Raises BadInput where none is."""
+        if not self.has_target.any():
             raise BadInput(
                 f"to be asked, {self.row_words} need {self.column_words} of their object from another grasp; none has "
                 "any; record more grasps of each object"
             )
-        return self if self.askable.all() else self.select(self.askable, np.arange(len(self.photo_owner)))
+        return self if self.has_target.all() else self.select(self.has_target, np.arange(len(self.photo_owner)))
 
     @cached_property
     def gallery(self) -> str:
         """What was searched, as a reader is told it."""
         own = "those of the same grasp left out" if self.own.any() else "those of the same grasp included"
         words = f"{len(self.objects)} {self.object_words}, {len(self.photo_owner)} {self.column_words}; {own}"
-        missing = np.count_nonzero(~self.askable)
+        missing = np.count_nonzero(~self.has_target)
         return words + (f"; {missing} {self.row_words} not asked, which have no other" if missing else "")
 
     @cached_property
     def first(self) -> FirstRelevant:
-        """Where the first photo of each row's object stands among all, own photos left out; every row is askable."""
+        """Where the first photo of each row's object stands among all, own photos left out; every row is has_target."""
         return first_relevant(self.scores, self.relevant, ~self.own)
 
     @cached_property
@@ -86,10 +86,10 @@ class ScoreTable:
         return np.unique(self.photo_owner)
 
     @cached_property
-    def fewest_photos(self) -> int:
+    def min_photos(self) -> int:
         """The least number of photos that an asked row can be shown of any object, its own left out."""
-        owners = np.unique(self.asked.photo_owner, return_counts=True)[1]
-        return int(min(owners.min(), (self.asked.relevant & ~self.asked.own).sum(1).min()))
+        owners = np.unique(self.with_targets.photo_owner, return_counts=True)[1]
+        return int(min(owners.min(), (self.with_targets.relevant & ~self.with_targets.own).sum(1).min()))
 
     def select(
         self, rows: NDArray[np.int64] | NDArray[np.bool_], columns: NDArray[np.int64] | NDArray[np.bool_]
@@ -111,12 +111,12 @@ class ScoreTable:
         return replace(self, own=np.zeros_like(self.own))
 
 
-Pool = Callable[[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
+Pooling = Callable[[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
 """Scores of shown photos (P,), the row of each (P,) and their number by row (T,) to the rows' scores (T,)."""
 
 
 def object_scores(
-    table: ScoreTable, photos: int, draws: int, seed: int, pool: Pool | None = None
+    table: ScoreTable, photos: int, draws: int, seed: int, pool: Pooling | None = None
 ) -> NDArray[np.float64]:
     """Scores (draws, T, O) of rows with objects, each shown by `photos` photos drawn without replacement.
 
@@ -125,7 +125,7 @@ def object_scores(
     that it has. What is drawn hangs on the seed and on who owns what, never on scores, so that methods are asked the
     same. Raises BadInput where a row's own object has no photo left to show: leave such rows out first.
     """
-    if not (table.askable | ~table.relevant.any(1)).all():
+    if not (table.has_target | ~table.relevant.any(1)).all():
         raise BadInput("every row must leave its object a photo to show; one has none but its own: leave the row out")
     rng = np.random.default_rng([seed, photos])
     found = np.empty((draws, len(table.touch_owner), len(table.objects)))
@@ -138,11 +138,13 @@ def object_scores(
     return found
 
 
-Shown = tuple[NDArray[np.float64], NDArray[np.bool_]]
+ShownScores = tuple[NDArray[np.float64], NDArray[np.bool_]]
 """Scores (T, p) of rows with photos of one object, and which of these are shown to them."""
 
 
-def _window(scores: NDArray[np.float32], columns: NDArray[np.int64], photos: int, rng: np.random.Generator) -> Shown:
+def _window(
+    scores: NDArray[np.float32], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
+) -> ShownScores:
     """Every row sees a window of its own over the shuffled columns: without replacement, and cheap."""
     start = rng.integers(len(columns), size=len(scores))
     window = (start[:, None] + np.arange(min(photos, len(columns)))) % len(columns)
@@ -152,14 +154,14 @@ def _window(scores: NDArray[np.float32], columns: NDArray[np.int64], photos: int
 
 def _without_own(
     table: ScoreTable, mine: NDArray[np.int64], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
-) -> Shown:
+) -> ShownScores:
     """The object's own rows: a random order of the photos for each, its own ones last and never counted."""
     own, scores = table.own[mine][:, columns], table.scores[mine][:, columns].astype(np.float64)
     order = np.argsort(rng.random(own.shape) + own, axis=1)[:, :photos]
     return np.take_along_axis(scores, order, 1), ~np.take_along_axis(own, order, 1)
 
 
-def _of_photos(scores: NDArray[np.float64], shown: NDArray[np.bool_], pool: Pool | None) -> NDArray[np.float64]:
+def _of_photos(scores: NDArray[np.float64], shown: NDArray[np.bool_], pool: Pooling | None) -> NDArray[np.float64]:
     """(T,) from the photos that each row is shown."""
     if pool is None:
         return np.asarray((scores * shown).sum(1) / shown.sum(1))

@@ -22,22 +22,22 @@ from _touch_retrieval.files import write_atomically
 from retrieval.console.files import CARD, CHECKPOINT, HEADER, require_ours
 from retrieval.data.dataset import Split
 from retrieval.errors import BadInput, CheckpointError
-from retrieval.model.config import Config
-from retrieval.model.fusion import GelHead, Matcher
-from retrieval.model.judge import GelCheck
-from retrieval.model.posterior import Posterior
-from retrieval.model.references import ReferenceWorth
-from retrieval.model.stored import (
+from retrieval.model.checkpoint_info import (
     FORMAT,
-    Stored,
+    CheckpointInfo,
+    checkpoint_info,
     read_header,
-    stored_of,
     unreadable,
     unusable,
 )
+from retrieval.model.config import Config
+from retrieval.model.fusion import GelHead, Matcher
+from retrieval.model.fusion_scorer import GelCheck
+from retrieval.model.posterior import Posterior
+from retrieval.model.reference_calibration import ReferenceCalibration
 from retrieval.version import __version__
 
-_QUERIES = "queries.touch_halves"
+_QUERIES = "queries.touch_partials"
 _GEL_HEAD = "gel_head."
 _DTYPES = {
     torch.float16,
@@ -52,7 +52,7 @@ _DTYPES = {
 
 
 @dataclass(frozen=True)
-class Checkpoint(Stored):
+class Checkpoint(CheckpointInfo):
     """A matcher ready for use (in evaluation mode) and what its file says of it.
 
     * `config`: settings of towers, head and preprocessing. `provenance`: step, seed, data digest, metrics of its
@@ -71,7 +71,7 @@ class Checkpoint(Stored):
     split: Split | None
     posterior: Posterior | None = None
     queries: NDArray[np.float16] | None = None
-    references: ReferenceWorth | None = None
+    references: ReferenceCalibration | None = None
 
 
 def save_checkpoint(
@@ -84,7 +84,7 @@ def save_checkpoint(
     posterior: Posterior | None = None,
     gel_check: GelCheck | None = None,
     queries: NDArray[np.float16] | None = None,
-    references: ReferenceWorth | None = None,
+    references: ReferenceCalibration | None = None,
     float16: bool = False,
 ) -> None:
     """Write `path` and its model card (its name ends in .md) atomically. Raises CheckpointError where it cannot.
@@ -108,17 +108,17 @@ def save_checkpoint(
     if queries is not None:
         state[_QUERIES] = torch.from_numpy(queries)
     write_tensors(path, state, header)
-    write_atomically(beside(path, ".md"), _model_card(path.name, header).encode())
+    write_atomically(sibling_file(path, ".md"), _model_card(path.name, header).encode())
 
 
-CALIBRATED = ("split", "provenance", "posterior", "gel_check", "queries", "references")
+CHECKPOINT_FIELDS = ("split", "provenance", "posterior", "gel_check", "queries", "references")
 """What is stored of a checkpoint beside matcher and configuration."""
 
 
-def store_checkpoint(made: Checkpoint, path: Path, *, float16: bool = False) -> None:
+def store_checkpoint(checkpoint: Checkpoint, path: Path, *, float16: bool = False) -> None:
     """Write a checkpoint that is held to `path`, as `save_checkpoint` does."""
-    about = {name: getattr(made, name) for name in CALIBRATED}
-    save_checkpoint(path, made.matcher, made.config, **about, float16=float16)
+    about = {name: getattr(checkpoint, name) for name in CHECKPOINT_FIELDS}
+    save_checkpoint(path, checkpoint.matcher, checkpoint.config, **about, float16=float16)
 
 
 def require_writable(path: Path) -> None:
@@ -134,18 +134,18 @@ def require_writable(path: Path) -> None:
     except OSError as error:
         raise CheckpointError(f"{path} cannot be written ({error.strerror}); choose another place") from error
     require_ours(path, CHECKPOINT)
-    require_ours(beside(path, ".md"), CARD)
+    require_ours(sibling_file(path, ".md"), CARD)
 
 
-def beside(path: Path, ending: str) -> Path:
+def sibling_file(path: Path, ending: str) -> Path:
     """The file that goes with a checkpoint: `model.safetensors` and ".md" give `model.md`, `v1.2` gives `v1.2.md`."""
     return path.with_name(path.name.removesuffix(".safetensors") + ending)
 
 
-def load_checkpoint(path: str | Path, *, known: Stored | None = None) -> Checkpoint:
+def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> Checkpoint:
     """Read a checkpoint. Raises CheckpointError with what is wrong and what to do.
 
-    known: what `read_stored` said of this file, where its digest was found to be that of a whole one; then neither
+    known: what `read_checkpoint_info` said of this file, where its digest was found to be that of a whole one; then neither
     digest nor checksum is computed again.
 
     >>> retrieval.load_checkpoint("model.safetensors").config.matcher.fingers
@@ -155,25 +155,25 @@ def load_checkpoint(path: str | Path, *, known: Stored | None = None) -> Checkpo
     retrieval.errors.CheckpointError: there is no checkpoint at none.safetensors; `retrieve train` makes one
     """
     path = Path(path)
-    state, header = read_tensors(path, check=known is None)
-    about = known or stored_of(path, header)
+    state, header = read_tensors(path, check=info is None)
+    about = info or checkpoint_info(path, header)
     try:
         split = None if header["split"] is None else Split.from_dict(header["split"])
         posterior = None if header.get("posterior") is None else Posterior.from_dict(header["posterior"])
         references = header.get("references")
-        references = None if references is None else ReferenceWorth.from_dict(references)
+        references = None if references is None else ReferenceCalibration.from_dict(references)
         queries = state.pop(_QUERIES, None)
-        half = about.config.matcher.half
-        if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (half,)):
+        partial = about.config.matcher.partial_width
+        if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (partial,)):
             raise CheckpointError(
-                f"{_QUERIES} must be float16 (touches, {half}); got {queries.dtype} {tuple(queries.shape)}"
+                f"{_QUERIES} must be float16 (touches, {partial}); got {queries.dtype} {tuple(queries.shape)}"
             )
         try:
             with torch.device("meta"):  # shapes alone: a header may ask for more memory than there is
-                _require_fit(_unloaded(about.config, state), state)
+                _require_fit(_empty_matcher(about.config, state), state)
         except (RuntimeError, TypeError, ValueError, OverflowError) as error:
             raise CheckpointError("its configuration asks for weights that are too large to be counted") from error
-        matcher = _unloaded(about.config, state)
+        matcher = _empty_matcher(about.config, state)
         matcher.load_state_dict(state)
     except BadInput as error:
         raise unusable(path, error) from error
@@ -191,7 +191,7 @@ def load_checkpoint(path: str | Path, *, known: Stored | None = None) -> Checkpo
     )
 
 
-def _unloaded(config: Config, state: Mapping[str, Tensor]) -> Matcher:
+def _empty_matcher(config: Config, state: Mapping[str, Tensor]) -> Matcher:
     """A matcher as it is configured; its gel head is there where the file has one."""
     matcher = Matcher(config.matcher, len(config.preprocessing.views))
     if any(name.startswith(_GEL_HEAD) for name in state):
@@ -217,7 +217,8 @@ def _require_fit(module: nn.Module, state: Mapping[str, Tensor]) -> None:
 
 def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:
     """Write tensors, of any device and layout, and a JSON header as one safetensors file with a checksum over both,
-    atomically."""
+    atomically.
+    """
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
     content = {"format": FORMAT, "software": __version__, **header}
     # Over both, as the format itself takes a flipped bit in a weight or a setting for what it is.
@@ -265,7 +266,7 @@ def _model_card(name: str, header: Mapping[str, Any]) -> str:
         f"output `{matcher['tower_output']}`.",
         "",
         f"* Trained on: {provenance['source']} (data digest `{provenance['data_digest'][:16]}`)",
-        f"* Kept step: {provenance['step']} of {header['config']['training']['iterations']}, "
+        f"* Best step: {provenance['step']} of {header['config']['training']['iterations']}, "
         f"seed {header['config']['training']['seed']}",
     ]
     if split:
@@ -286,6 +287,6 @@ def _model_card(name: str, header: Mapping[str, Any]) -> str:
             "were left out"
         )
     if gel_check:
-        shares = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in gel_check["shares"].items()]
-        lines.append(f"* Check of gel images, on validation objects: {', '.join(shares)}")
+        rates = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in gel_check["rates"].items()]
+        lines.append(f"* Check of gel images, on validation objects: {', '.join(rates)}")
     return "\n".join(lines) + "\n"

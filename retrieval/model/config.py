@@ -16,12 +16,12 @@ from _touch_retrieval.documents import check_fields, typed
 from _touch_retrieval.files import read_regular
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
-from retrieval.model.losses import LOSSES, OF_LOGITS
-from retrieval.model.towers import TOGETHER, architectures_of, tower_name
+from retrieval.model.losses import LOGIT_LOSSES, LOSSES
+from retrieval.model.towers import TOWER_SEPARATOR, architectures_of, tower_name
 
 if TYPE_CHECKING:
     from retrieval.model.losses.loss import Loss
-    from retrieval.model.towers.base import Tower
+    from retrieval.model.towers.tower import Tower
 
 Count = Annotated[int, Meta(ge=1)]
 Share = Annotated[float, Meta(ge=0, lt=1)]
@@ -40,9 +40,9 @@ class MatcherConfig:
     "classes" (the paper: the 1000-way outputs are fused) or "pooled". fingers: gel images in one touch (training takes
     it from the recording). hidden: width of the fusion head. standardise: centre and scale the features by their
     statistics over the training batches, which lets towers trained from random weights leave the plateau at chance; the
-    paper does not. embedding_dim: length of the unit embeddings for candidate search. pruner_width: hidden units of the
-    networks that make these embeddings from halves after training (`retrieval.model.pruner`); 0: they are the
-    contrastive ones. pruner_linear: how many of the embedding_dim numbers are linear in the contrastive embedding,
+    paper does not. embedding_dim: length of the unit embeddings for candidate search. candidate_width: hidden units of the
+    networks that make these embeddings from halves after training (`retrieval.model.candidate_encoder`); 0: they are the
+    contrastive ones. candidate_linear: how many of the embedding_dim numbers are linear in the contrastive embedding,
     which needs cosine. cosine: add the scaled cosine of the contrastive embeddings to the match logit; the paper does
     not.
     """
@@ -54,13 +54,13 @@ class MatcherConfig:
     dropout: Share = 0.5
     standardise: bool = False
     embedding_dim: Count = 128
-    pruner_width: Annotated[int, Meta(ge=0)] = 0
-    pruner_linear: int = 0
+    candidate_width: Annotated[int, Meta(ge=0)] = 0
+    candidate_linear: int = 0
     cosine: bool = False
     architectures: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def half(self) -> int:
+    def partial_width(self) -> int:
         """Numbers in a half: the share of the head's first layer, and the scaled embedding where its cosine counts."""
         return self.hidden + (self.embedding_dim if self.cosine else 0)
 
@@ -68,9 +68,9 @@ class MatcherConfig:
         check_fields(self, "matcher", ConfigError)
         most = self.embedding_dim - 1 if self.cosine else 0
         _require(
-            0 <= self.pruner_linear <= most,
-            f"matcher.pruner_linear must be from 0 to {most} (below embedding_dim, and 0 without cosine), got "
-            f"{self.pruner_linear}",
+            0 <= self.candidate_linear <= most,
+            f"matcher.candidate_linear must be from 0 to {most} (below embedding_dim, and 0 without cosine), got "
+            f"{self.candidate_linear}",
         )
 
 
@@ -81,7 +81,7 @@ class TrainingConfig:
     init: "random", "imagenet", "shipped" or the path of a state dict. init_touch, init_photo: the same for one tower
     alone, where they are not empty (`retrieval.training.relief` makes such weights); of towers side by side the part
     "init" is what init says. photos, touches: folders of labelled pictures
-    whose objects are paired by their labels and trained on beside the recording's (`retrieval.data.labelled`);
+    whose objects are paired by their labels and trained on beside the recording's (`retrieval.data.labelled_pictures`);
     both or neither. iterations: optimiser steps. touches_per_batch times (positives_per_touch + negatives_per_touch)
     pairs make a batch. weights: of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`), in
     files `contrastive_weight` and so on; 0 for each is exactly the paper's loss, and without one on embeddings these
@@ -90,7 +90,7 @@ class TrainingConfig:
     paper; "batch" from the photos that stand in the batch anyway, half as many to encode (`PairSampler`); "auto" is
     "batch" where towers are trained. freeze_batch_norm: keep the batch statistics of the initial weights.
     freeze_towers: train only what comes after the towers; every image is then encoded once for the whole training.
-    distil_steps: steps of teaching the pruner after training, where the matcher has one (`retrieval.training.distil`).
+    distil_steps: steps of teaching the candidate_encoder after training, where the matcher has one (`retrieval.training.distil`).
     validation_fraction, test_fraction: shares of the objects.
 
     The loader has three settings that no result depends on, so that checkpoints and caches leave them out. workers:
@@ -128,7 +128,7 @@ class TrainingConfig:
         own = {name: self.weights[name] for name in sorted(self.weights) if name not in LOSSES}
         weights = {name: self.weights.get(name, 0.0) for name in LOSSES} | own
         for name, weight in weights.items():
-            weights[name] = typed(weight, Weight, f"training.{name}{WEIGHT}", error=ConfigError)
+            weights[name] = typed(weight, Weight, f"training.{name}{WEIGHT_SUFFIX}", error=ConfigError)
         object.__setattr__(self, "weights", weights)
         check_fields(self, "training", ConfigError)
         auto = not isinstance(self.workers, str) or self.workers == "auto"
@@ -145,45 +145,52 @@ class TrainingConfig:
             sum(held_out) < 1, f"validation_fraction and test_fraction must leave objects to train on; got {held_out}"
         )
 
-    def first_weights(self, of_one: str) -> str:
+    def tower_init(self, of_one: str) -> str:
         """First weights of one tower, from `init_touch` or `init_photo`."""
-        return TOGETHER.join(self.init if part == "init" else part for part in (of_one or "init").split(TOGETHER))
+        return TOWER_SEPARATOR.join(
+            self.init if part == "init" else part for part in (of_one or "init").split(TOWER_SEPARATOR)
+        )
 
     @property
     def trains_embeddings(self) -> bool:
         """Whether the contrastive projections learn anything."""
-        return any(weight > 0 for name, weight in self.weights.items() if name not in OF_LOGITS)
+        return any(weight > 0 for name, weight in self.weights.items() if name not in LOGIT_LOSSES)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary, as in a TOML file, without the settings of the loader: each weight is a setting of its own,
-        `<loss>_weight`."""
+        `<loss>_weight`.
+        """
         table: dict[str, Any] = {}
         for name, value in dataclasses.asdict(self).items():
-            if name in LOADER:
+            if name in LOADER_SETTINGS:
                 continue
             table |= (
-                {f"{loss}{WEIGHT}": weight for loss, weight in value.items()} if name == "weights" else {name: value}
+                {f"{loss}{WEIGHT_SUFFIX}": weight for loss, weight in value.items()}
+                if name == "weights"
+                else {name: value}
             )
         return table
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> "TrainingConfig":
         """Inverse of `to_dict`; a setting left out keeps its default. Raises ConfigError."""
-        weights = {name.removesuffix(WEIGHT): value for name, value in table.items() if name.endswith(WEIGHT)}
-        rest = {name: value for name, value in table.items() if not name.endswith(WEIGHT)}
-        known = {*cls().to_dict(), *LOADER}
+        weights = {
+            name.removesuffix(WEIGHT_SUFFIX): value for name, value in table.items() if name.endswith(WEIGHT_SUFFIX)
+        }
+        rest = {name: value for name, value in table.items() if not name.endswith(WEIGHT_SUFFIX)}
+        known = {*cls().to_dict(), *LOADER_SETTINGS}
         if unknown := [name for name in rest if name not in known]:
             raise ConfigError(f"training has no setting {unknown[0]!r}; it knows {', '.join(sorted(known))}")
         return cls(**rest, weights=weights)
 
-    def of_steps(self, iterations: int) -> "TrainingConfig":
-        """The same with so many optimiser steps, and at most as many to teach the pruner."""
+    def with_iterations(self, iterations: int) -> "TrainingConfig":
+        """The same with so many optimiser steps, and at most as many to teach the candidate_encoder."""
         return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
 
 
-LOADER = ("workers", "prefetch", "pinned_memory")
+LOADER_SETTINGS = ("workers", "prefetch", "pinned_memory")
 """Settings of the loader, which decide no result."""
-WEIGHT = "_weight"
+WEIGHT_SUFFIX = "_weight"
 """What ends the setting of a loss's weight."""
 SCHEDULES: dict[str, Callable[[int, int], float]] = {
     "constant": lambda step, steps: 1.0,
@@ -210,17 +217,19 @@ class Config:
     @property
     def has_embeddings(self) -> bool:
         """Whether embeddings are trained, so that candidates can be searched by them."""
-        return self.matcher.pruner_width > 0 or self.training.trains_embeddings
+        return self.matcher.candidate_width > 0 or self.training.trains_embeddings
 
-    def without_pruner(self) -> "Config":
-        """The same with no pruner to be taught."""
-        return dataclasses.replace(self, matcher=dataclasses.replace(self.matcher, pruner_width=0, pruner_linear=0))
+    def without_candidate_encoder(self) -> "Config":
+        """The same with no candidate_encoder to be taught."""
+        return dataclasses.replace(
+            self, matcher=dataclasses.replace(self.matcher, candidate_width=0, candidate_linear=0)
+        )
 
-    def with_pruner_of(self, other: "Config") -> "Config":
-        """The same with a pruner as `other` has it, as far as this logit has a cosine to be linear in."""
+    def with_candidate_encoder_of(self, other: "Config") -> "Config":
+        """The same with a candidate_encoder as `other` has it, as far as this logit has a cosine to be linear in."""
         wanted = other.matcher
-        linear = min(wanted.pruner_linear, self.matcher.embedding_dim - 1) if self.matcher.cosine else 0
-        matcher = dataclasses.replace(self.matcher, pruner_width=wanted.pruner_width, pruner_linear=linear)
+        linear = min(wanted.candidate_linear, self.matcher.embedding_dim - 1) if self.matcher.cosine else 0
+        matcher = dataclasses.replace(self.matcher, candidate_width=wanted.candidate_width, candidate_linear=linear)
         return dataclasses.replace(self, matcher=matcher)
 
     def using(
@@ -256,8 +265,8 @@ class Config:
         """As `to_dict`, of files and folders the names alone: where they lay on this machine concerns nobody."""
         tables = self.to_dict()
         for name in ("init", "init_photo", "init_touch", "photos", "touches"):
-            parts = tables["training"][name].split(TOGETHER)
-            tables["training"][name] = TOGETHER.join(Path(part).name for part in parts)
+            parts = tables["training"][name].split(TOWER_SEPARATOR)
+            tables["training"][name] = TOWER_SEPARATOR.join(Path(part).name for part in parts)
         matcher = tables["matcher"]
         for part in matcher["architectures"]:
             family, _, model = part.partition(":")

@@ -22,9 +22,9 @@ from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_weights
 
 from retrieval.errors import ConfigError
-from retrieval.model.fusion import Code, Matcher
-from retrieval.model.touches import TouchCodes
-from retrieval.model.towers.base import Tower
+from retrieval.model.fusion import ImageEncoding, Matcher
+from retrieval.model.touches import TouchEncodings
+from retrieval.model.towers.tower import Tower
 
 T = TypeVar("T")
 Image = NDArray[np.float32]
@@ -57,12 +57,12 @@ def for_inference(matcher: Matcher, towers: Sequence[str] = TOWERS) -> Matcher:
     fast = copy.copy(matcher)
     fast._modules = dict(matcher._modules)
     for name in towers:
-        fast.add_module(name, _prepared(matcher.get_submodule(name)))
+        fast.add_module(name, _inference_tower(matcher.get_submodule(name)))
     return fast
 
 
 @dataclass(frozen=True)
-class _Prepared:
+class _InferenceTower:
     """A tower as it runs fastest; made from `tensors`, kept so that no other takes their identity, at `versions`."""
 
     tensors: list[Tensor]
@@ -70,34 +70,35 @@ class _Prepared:
     tower: nn.Module
 
 
-_cache: WeakKeyDictionary[nn.Module, _Prepared] = WeakKeyDictionary()
+_cache: WeakKeyDictionary[nn.Module, _InferenceTower] = WeakKeyDictionary()
 
 
-def _prepared(tower: nn.Module) -> nn.Module:
+def _inference_tower(tower: nn.Module) -> nn.Module:
     if tower.training:
         return tower
     # `parameters()` and `buffers()` take three times as long, a twentieth of a forward pass.
     named = (group for module in tower.modules() for group in (module._parameters, module._buffers))
     tensors = [tensor for group in named for tensor in group.values() if tensor is not None]
     versions = [(tensor.data_ptr(), 0 if tensor.is_inference() else tensor._version) for tensor in tensors]
-    kept = _cache.get(tower)
-    if kept is None or kept.versions != versions or list(map(id, kept.tensors)) != list(map(id, tensors)):
-        kept = _cache[tower] = _Prepared(tensors, versions, _folded(tower))
-    return kept.tower
+    cached = _cache.get(tower)
+    if cached is None or cached.versions != versions or list(map(id, cached.tensors)) != list(map(id, tensors)):
+        cached = _cache[tower] = _InferenceTower(tensors, versions, _fold_batch_norm(tower))
+    return cached.tower
 
 
-def _folded(module: nn.Module) -> nn.Module:
+def _fold_batch_norm(module: nn.Module) -> nn.Module:
     """A twin that shares all tensors but those of convolutions, which have channels last and have taken in the batch
-    normalisation that is registered right after them. Copying everything takes ten times as long."""
-    if isinstance(module, Tower) and not module.folds:
+    normalisation that is registered right after them. Copying everything takes ten times as long.
+    """
+    if isinstance(module, Tower) and not module.can_fold_batch_norm:
         return module
-    twin = _twin(module)
+    twin = _shallow_copy(module)
     children = list(module.named_children())
     for name, child in children:
-        twin._modules[name] = _folded(child)
+        twin._modules[name] = _fold_batch_norm(child)
     for (name, child), (after, normalisation) in itertools.pairwise(children):
         if isinstance(child, nn.Conv2d) and isinstance(normalisation, nn.BatchNorm2d):
-            fused = _twin(child)
+            fused = _shallow_copy(child)
             weight, fused.bias = fuse_conv_bn_weights(
                 child.weight,
                 child.bias,
@@ -112,7 +113,7 @@ def _folded(module: nn.Module) -> nn.Module:
     return twin
 
 
-def _twin(module: nn.Module) -> nn.Module:
+def _shallow_copy(module: nn.Module) -> nn.Module:
     twin = copy.copy(module)
     twin._modules, twin._parameters = dict(module._modules), dict(module._parameters)
     if isinstance(twin, nn.Conv2d):
@@ -139,29 +140,29 @@ def photo_features(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -
 
 
 @torch.inference_mode()
-def encode_touches(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> Code:
-    """Halves and embeddings of touches, each a sequence of finger images (H, W, 3), on the CPU.
+def encode_touches(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> ImageEncoding:
+    """Partials and embeddings of touches, each a sequence of finger images (H, W, 3), on the CPU.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> gels = [checkpoint.config.preprocessing.load_touch(file) for file in ("a.png", "b.png")]
     >>> retrieval.encode_touches(checkpoint.matcher, [gels]).embedding.shape
     torch.Size([1, 16])
     """
-    code = matcher.touch_entry(touch_features(matcher, touches, batch))
-    return Code(code.half.cpu(), code.embedding.cpu())
+    code = matcher.touch_search_encoding(touch_features(matcher, touches, batch))
+    return ImageEncoding(code.partial.cpu(), code.embedding.cpu())
 
 
 @torch.inference_mode()
-def encode_photos(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -> Code:
-    """Halves and embeddings of photos (H, W, 3), on the CPU.
+def encode_photos(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -> ImageEncoding:
+    """Partials and embeddings of photos (H, W, 3), on the CPU.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> photo = checkpoint.config.preprocessing.load_photo("catalog/mug/1.jpg")
-    >>> retrieval.encode_photos(checkpoint.matcher, [photo]).half.shape
+    >>> retrieval.encode_photos(checkpoint.matcher, [photo]).partial.shape
     torch.Size([1, 32])
     """
-    code = matcher.photo_entry(photo_features(matcher, photos, batch))
-    return Code(code.half.cpu(), code.embedding.cpu())
+    code = matcher.photo_search_encoding(photo_features(matcher, photos, batch))
+    return ImageEncoding(code.partial.cpu(), code.embedding.cpu())
 
 
 class TorchEncoder:
@@ -176,13 +177,15 @@ class TorchEncoder:
         self._fast, self._threads = for_inference(matcher, ["touch_tower"]), threads
 
     @torch.inference_mode()
-    def encode(self, touches: Sequence[Sequence[Image]]) -> TouchCodes:
+    def encode(self, touches: Sequence[Sequence[Image]]) -> TouchEncodings:
         """The codes of grasps, each given as its fingers' images."""
         if self._threads is not None:
             torch.set_num_threads(self._threads)  # which holds for the calling thread
         features = self._fast.touch_features(touch_batch(touches))
-        code, readings = self._fast.touch_entry(features), self._fast.gel_readings(features)
-        return TouchCodes(code.half.numpy(), code.embedding.numpy(), None if readings is None else readings.numpy())
+        code, readings = self._fast.touch_search_encoding(features), self._fast.gel_readings(features)
+        return TouchEncodings(
+            code.partial.numpy(), code.embedding.numpy(), None if readings is None else readings.numpy()
+        )
 
 
 @torch.inference_mode()
@@ -205,7 +208,8 @@ def default_device() -> torch.device:
 @contextmanager
 def one_thread() -> Iterator[None]:
     """PyTorch computes on the calling thread alone. Its workers wait for each other many times a step, and where one
-    finds its core taken by another program all the others spin: milliseconds become hundreds."""
+    finds its core taken by another program all the others spin: milliseconds become hundreds.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

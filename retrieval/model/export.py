@@ -22,7 +22,14 @@ from retrieval.errors import BadInput, CheckpointError, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import TorchEncoder, for_inference
 from retrieval.model.fusion import Matcher, Standardise
-from retrieval.model.onnx_encoder import CHECKPOINT, ENDING, OnnxEncoder, cached, sealed, unsealed
+from retrieval.model.onnx_encoder import (
+    CHECKPOINT_KEY,
+    EXPORT_SUFFIX,
+    OnnxEncoder,
+    cached_export_path,
+    read_checked_export,
+    with_checksum,
+)
 
 log = logging.getLogger(__name__)
 ROUNDS = 9
@@ -31,25 +38,26 @@ TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Exported:
+class ExportReport:
     """What came of an export. Times are medians for one touch; differences are the largest, of halves relative to the
-    largest half."""
+    largest half.
+    """
 
     path: str
     torch_ms: float
     onnx_ms: float
-    half_difference: float
+    partial_difference: float
     embedding_difference: float
 
     def __str__(self) -> str:
         return (
             f"{self.path}: a touch is encoded in {self.onnx_ms:.1f} ms by ONNX Runtime, in {self.torch_ms:.1f} ms by "
-            f"PyTorch ({self.torch_ms / self.onnx_ms:.2f} times); halves differ by {self.half_difference:.1g} of the "
+            f"PyTorch ({self.torch_ms / self.onnx_ms:.2f} times); halves differ by {self.partial_difference:.1g} of the "
             f"largest, embeddings by {self.embedding_difference:.1g}"
         )
 
 
-def export(checkpoint: Checkpoint, out: Path | None = None) -> Exported:
+def export(checkpoint: Checkpoint, out: Path | None = None) -> ExportReport:
     """Write the touch encoder of a checkpoint as ONNX: beside the checkpoint, where `retrieve query` looks for it, or
     to `out`.
 
@@ -59,35 +67,35 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> Exported:
     lacking = [name for name in ("onnx", "onnxruntime") if find_spec(name) is None]
     if lacking:
         raise BadInput(f"export needs {lacking[0]}; install it with `pip install 'touch-retrieval[onnx]'`")
-    path = out or checkpoint.path.with_suffix(ENDING)
-    if path.suffix != ENDING:
-        raise BadInput(f"an export must be named *{ENDING}; got {path}")
+    path = out or checkpoint.path.with_suffix(EXPORT_SUFFIX)
+    if path.suffix != EXPORT_SUFFIX:
+        raise BadInput(f"an export must be named *{EXPORT_SUFFIX}; got {path}")
     require_ours(path, EXPORT)
     require_folder(path)
-    unsettled = path.with_name(f".{path.name}.unsettled")
+    unverified = path.with_name(f".{path.name}.unsettled")
     try:
-        write_atomically(unsettled, sealed(graph_of(checkpoint)))
-        unsettled.chmod(unsettled.stat().st_mode & ~(stat.S_IWGRP | stat.S_IWOTH))  # else no query takes it
-        result = compare(checkpoint, unsettled, path)
-        if not max(result.half_difference, result.embedding_difference) <= TOLERANCE:
+        write_atomically(unverified, with_checksum(touch_encoder_to_onnx(checkpoint)))
+        unverified.chmod(unverified.stat().st_mode & ~(stat.S_IWGRP | stat.S_IWOTH))  # else no query takes it
+        result = compare(checkpoint, unverified, path)
+        if not max(result.partial_difference, result.embedding_difference) <= TOLERANCE:
             raise RetrievalError(f"nothing is exported, as ONNX Runtime gives other numbers. {result}")
         if result.onnx_ms >= result.torch_ms:
             raise RetrievalError(f"nothing is exported, as PyTorch is as fast on this machine. {result}")
-        unsettled.replace(path)
+        unverified.replace(path)
     finally:
-        unsettled.unlink(missing_ok=True)
+        unverified.unlink(missing_ok=True)
     return result
 
 
-def export_to_cache(checkpoint: Checkpoint) -> Exported | None:
+def export_to_cache(checkpoint: Checkpoint) -> ExportReport | None:
     """Write the export of a checkpoint to the user's cache, where queries look for it too: once, and only where none
     lies beside the checkpoint. For a checkpoint in the folder of an installed package, which is not ours to write to.
 
     None where there is nothing to do, or nothing can be done: a query works without it. A folder that is open to other
     users is left alone, and a warning says so.
     """
-    path = cached(checkpoint.digest)
-    if path is None or checkpoint.path.with_suffix(ENDING).is_file():
+    path = cached_export_path(checkpoint.digest)
+    if path is None or checkpoint.path.with_suffix(EXPORT_SUFFIX).is_file():
         return None
     try:
         make_cache_folder(path.parent)
@@ -99,7 +107,7 @@ def export_to_cache(checkpoint: Checkpoint) -> Exported | None:
         log.info("no export for queries: %s", error)
         return None
     with suppress(CheckpointError):  # none yet, a damaged one, or one that others could write to
-        unsealed(path)
+        read_checked_export(path)
         return None
     try:
         path.unlink(missing_ok=True)  # of the cache everything is ours, whatever it holds by now
@@ -109,21 +117,21 @@ def export_to_cache(checkpoint: Checkpoint) -> Exported | None:
         return None
 
 
-def graph_of(checkpoint: Checkpoint) -> bytes:
+def touch_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
     """The touch encoder as an ONNX model that carries the checkpoint's digest; any number of touches at once."""
     side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
-    outputs = ["half", "embedding"] + (["readings"] if checkpoint.matcher.gel_head else [])
-    return _traced(_TouchEncoder(checkpoint.matcher), (fingers, side, side, 3), outputs, checkpoint.digest)
+    outputs = ["partial", "embedding"] + (["readings"] if checkpoint.matcher.gel_head else [])
+    return _trace(_TouchEncoder(checkpoint.matcher), (fingers, side, side, 3), outputs, checkpoint.digest)
 
 
-def photo_graph_of(checkpoint: Checkpoint) -> bytes:
+def photo_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
     """The same of the photo encoder: images (B, H, views * W, 3) to halves and embeddings."""
     side, views = checkpoint.config.preprocessing.photo_px, checkpoint.matcher.views
     encoder = _PhotoEncoder(checkpoint.matcher)
-    return _traced(encoder, (side, views * side, 3), ["half", "embedding"], checkpoint.digest)
+    return _trace(encoder, (side, views * side, 3), ["partial", "embedding"], checkpoint.digest)
 
 
-def _traced(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], digest: str) -> bytes:
+def _trace(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], digest: str) -> bytes:
     import onnx
 
     with TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
@@ -139,25 +147,26 @@ def _traced(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], dige
             dynamo=False,
         )
         model = onnx.load_model(str(Path(folder, "model.onnx")))
-    onnx.helper.set_model_props(model, {CHECKPOINT: digest})
+    onnx.helper.set_model_props(model, {CHECKPOINT_KEY: digest})
     return bytes(model.SerializeToString())
 
 
 class _TouchEncoder(nn.Module):
     """Images (B, fingers, H, W, 3) to halves, embeddings and what the gel head reads, where the matcher has one;
-    without the checks of values, which ONNX has not."""
+    without the checks of values, which ONNX has not.
+    """
 
     def __init__(self, matcher: Matcher) -> None:
         super().__init__()
-        self.matcher = _written_out(matcher, "touch")
+        self.matcher = _exportable_matcher(matcher, "touch")
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         tower = self.matcher.touch_tower
         pictures = images.permute(0, 1, 4, 2, 3).flatten(0, 1)
         features = tower._encode((pictures - tower.mean) / tower.std)
         features = features.reshape(-1, self.matcher.config.fingers * tower.feature_count)
-        code, readings = self.matcher.touch_entry(features), self.matcher.gel_readings(features)
-        return (code.half, code.embedding) if readings is None else (code.half, code.embedding, readings)
+        code, readings = self.matcher.touch_search_encoding(features), self.matcher.gel_readings(features)
+        return (code.partial, code.embedding) if readings is None else (code.partial, code.embedding, readings)
 
 
 class _PhotoEncoder(nn.Module):
@@ -165,27 +174,27 @@ class _PhotoEncoder(nn.Module):
 
     def __init__(self, matcher: Matcher) -> None:
         super().__init__()
-        self.matcher = _written_out(matcher, "photo")
+        self.matcher = _exportable_matcher(matcher, "photo")
 
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         tower, views = self.matcher.photo_tower, self.matcher.views
         side = images.shape[1]
         pictures = images.reshape(-1, side, views, side, 3).permute(0, 2, 4, 1, 3).flatten(0, 1)
         features = tower._encode((pictures - tower.mean) / tower.std)
-        code = self.matcher.photo_entry(features.reshape(-1, views * tower.feature_count))
-        return code.half, code.embedding
+        code = self.matcher.photo_search_encoding(features.reshape(-1, views * tower.feature_count))
+        return code.partial, code.embedding
 
 
-def _written_out(matcher: Matcher, side: str) -> Matcher:
+def _exportable_matcher(matcher: Matcher, side: str) -> Matcher:
     """A matcher whose tower is folded, and whose normalisation of features is plain arithmetic."""
     fast = for_inference(matcher, [f"{side}_tower"])
     norm = matcher.get_submodule(f"{side}_norm")
     if isinstance(norm, Standardise):
-        fast.add_module(f"{side}_norm", _FixedNorm(norm))
+        fast.add_module(f"{side}_norm", _FrozenNorm(norm))
     return fast
 
 
-class _FixedNorm(nn.Module):
+class _FrozenNorm(nn.Module):
     """Normalisation of features in evaluation mode: the exporter wants to know the width of its input."""
 
     def __init__(self, norm: Standardise) -> None:
@@ -196,16 +205,18 @@ class _FixedNorm(nn.Module):
         return (x - self.mean) * self.scale
 
 
-def compare(checkpoint: Checkpoint, written: Path, path: Path) -> Exported:
+def compare(checkpoint: Checkpoint, written: Path, path: Path) -> ExportReport:
     """Encode the same touch by both in turns; `path` is what `written` will be called."""
     ours, theirs = TorchEncoder(checkpoint.matcher), OnnxEncoder(written, checkpoint.digest)
     side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
     touch = list(np.random.default_rng(0).random((fingers, side, side, 3), dtype=np.float32))
-    (half, embedding, *_), (other_half, other_embedding, *_) = ours.encode([touch]), theirs.encode([touch])
+    (partial, embedding, *_), (other_partial, other_embedding, *_) = ours.encode([touch]), theirs.encode([touch])
     times = [(_ms(lambda: ours.encode([touch])), _ms(lambda: theirs.encode([touch]))) for _ in range(ROUNDS)]
     torch_ms, onnx_ms = (statistics.median(arm) for arm in zip(*times, strict=True))
-    half_difference = float(np.abs(half - other_half).max() / np.abs(half).max())
-    return Exported(str(path), torch_ms, onnx_ms, half_difference, float(np.abs(embedding - other_embedding).max()))
+    partial_difference = float(np.abs(partial - other_partial).max() / np.abs(partial).max())
+    return ExportReport(
+        str(path), torch_ms, onnx_ms, partial_difference, float(np.abs(embedding - other_embedding).max())
+    )
 
 
 def _ms(function: Callable[[], object]) -> float:

@@ -16,27 +16,27 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from retrieval.errors import BadInput
+from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.config import MatcherConfig
-from retrieval.model.judge import Judge
+from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX
-from retrieval.model.pruner import Pruner
 from retrieval.model.towers import build_tower
 
 COSINE_SCALE_INIT = 4.0
 """What a cosine of 1 adds to the logit before anything is learned."""
 
 
-class Code(NamedTuple):
+class ImageEncoding(NamedTuple):
     """What the matcher keeps of one image: its share of the head's first layer and its place in the metric space.
 
     half (B, half) and embedding (B, embedding_dim), float32; embeddings have norm 1.
     """
 
-    half: Tensor
+    partial: Tensor
     embedding: Tensor
 
 
-QUIET = 0.02
+MIN_RELATIVE_DEVIATION = 0.02
 """A feature that varies by less than this share of its mean is not scaled up to vary by 1."""
 
 
@@ -56,16 +56,16 @@ class Standardise(nn.BatchNorm1d):
         mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
         if self.training:
             variance, mean = torch.var_mean(features.detach(), dim=0, correction=0)
-        return scaled * ((variance + self.eps) / self._raised(mean, variance)).sqrt()
+        return scaled * ((variance + self.eps) / self._floored_variance(mean, variance)).sqrt()
 
     def mean_and_scale(self) -> tuple[Tensor, Tensor]:
-        """mean (F,) and scale (F,): in evaluation mode this is `(features - mean) * scale`."""
+        """Mean (F,) and scale (F,): in evaluation mode this is `(features - mean) * scale`."""
         mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
-        return mean, torch.rsqrt(self._raised(mean, variance))
+        return mean, torch.rsqrt(self._floored_variance(mean, variance))
 
-    def _raised(self, mean: Tensor, variance: Tensor) -> Tensor:
+    def _floored_variance(self, mean: Tensor, variance: Tensor) -> Tensor:
         """(F,) variances, those of quiet features raised."""
-        return torch.maximum(variance + self.eps, (QUIET * mean).square())
+        return torch.maximum(variance + self.eps, (MIN_RELATIVE_DEVIATION * mean).square())
 
 
 class FusionHead(nn.Module):
@@ -73,22 +73,22 @@ class FusionHead(nn.Module):
 
     def __init__(self, touch_features: int, photo_features: int, hidden: int, dropout: float) -> None:
         super().__init__()
-        self.touch_half = nn.Linear(touch_features, hidden)
-        self.photo_half = nn.Linear(photo_features, hidden, bias=False)
+        self.touch_partial = nn.Linear(touch_features, hidden)
+        self.photo_partial = nn.Linear(photo_features, hidden, bias=False)
         self.dropout = nn.Dropout(dropout)
         self.second = nn.Linear(hidden, hidden)
         self.out = nn.Linear(hidden, 1)
         # PyTorch's default for the concatenated layer: uniform within 1 / sqrt(all inputs).
-        bound = 1 / math.sqrt(self.touch_half.in_features + self.photo_half.in_features)
-        for parameter in (self.touch_half.weight, self.touch_half.bias, self.photo_half.weight):
+        bound = 1 / math.sqrt(self.touch_partial.in_features + self.photo_partial.in_features)
+        for parameter in (self.touch_partial.weight, self.touch_partial.bias, self.photo_partial.weight):
             nn.init.uniform_(parameter, -bound, bound)
 
-    def forward(self, touch_half: Tensor, photo_half: Tensor) -> Tensor:
+    def forward(self, touch_partial: Tensor, photo_partial: Tensor) -> Tensor:
         """Match logits (P,) of pairs of halves (P, half); either side broadcasts from (1, half)."""
         hidden = self.second.in_features
-        x = self.dropout(functional.relu(touch_half[..., :hidden] + photo_half[..., :hidden]))
+        x = self.dropout(functional.relu(touch_partial[..., :hidden] + photo_partial[..., :hidden]))
         x = functional.relu(self.second(x))
-        cosine = (touch_half[..., hidden:] * photo_half[..., hidden:]).sum(-1)
+        cosine = (touch_partial[..., hidden:] * photo_partial[..., hidden:]).sum(-1)
         return self.out(x).squeeze(-1) + cosine  # type: ignore[no-any-return]
 
 
@@ -114,8 +114,8 @@ class Matcher(nn.Module):
         self.touch_norm, self.photo_norm = norm(touch_features), norm(photo_features)
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
         self.cosine_scale = nn.Parameter(torch.tensor(COSINE_SCALE_INIT)) if config.cosine else None
-        self.pruner = pruner_of(config) if config.pruner_width else None
-        self.gel_head: GelHead | None = None  # fitted when the training is over (`retrieval.training.judgement`)
+        self.candidate_encoder = candidate_encoder_of(config) if config.candidate_width else None
+        self.gel_head: GelHead | None = None  # fitted when the training is over (`retrieval.training.verdicts`)
 
     def touch_features(self, touches: Tensor) -> Tensor:
         """Features (B, fingers * features) of touches (B, fingers, 3, H, W) in 0..1, fingers in order a, b.
@@ -139,25 +139,29 @@ class Matcher(nn.Module):
         features: Tensor = self.photo_tower(photos)
         return features.float().view(len(photos) // self.views, -1)
 
-    def touch_code(self, features: Tensor) -> Code:
+    def touch_encoding(self, features: Tensor) -> ImageEncoding:
         """Half of touch features, and their embedding by the contrastive projection."""
         features = self.touch_norm(features)
-        return self._code(self.head.touch_half(features), _unit(self.touch_projection(features)))
+        return self._encoding(self.head.touch_partial(features), _unit(self.touch_projection(features)))
 
-    def photo_code(self, features: Tensor) -> Code:
+    def photo_encoding(self, features: Tensor) -> ImageEncoding:
         """Half of photo features, and their embedding by the contrastive projection."""
         features = self.photo_norm(features)
-        return self._code(self.head.photo_half(features), _unit(self.photo_projection(features)))
+        return self._encoding(self.head.photo_partial(features), _unit(self.photo_projection(features)))
 
-    def _code(self, share: Tensor, embedding: Tensor) -> Code:
+    def _encoding(self, share: Tensor, embedding: Tensor) -> ImageEncoding:
         if self.cosine_scale is None:
-            return Code(share, embedding)
-        return Code(torch.cat([share, embedding * self.cosine_scale.clamp(min=0.0).sqrt()], dim=-1), embedding)
+            return ImageEncoding(share, embedding)
+        return ImageEncoding(torch.cat([share, embedding * self.cosine_scale.clamp(min=0.0).sqrt()], dim=-1), embedding)
 
-    def touch_entry(self, features: Tensor) -> Code:
+    def touch_search_encoding(self, features: Tensor) -> ImageEncoding:
         """Half and embedding for candidate search of touch features."""
-        code = self.touch_code(features)
-        return code if self.pruner is None else Code(code.half, self.pruner.touch(code.half))
+        code = self.touch_encoding(features)
+        return (
+            code
+            if self.candidate_encoder is None
+            else ImageEncoding(code.partial, self.candidate_encoder.touch(code.partial))
+        )
 
     def gel_readings(self, features: Tensor) -> Tensor | None:
         """(B, fingers, 2) what touch features say of each finger's image (`GelHead`); None without a check."""
@@ -166,16 +170,20 @@ class Matcher(nn.Module):
         readings: Tensor = self.gel_head(features.view(-1, self.config.fingers, self.touch_tower.feature_count))
         return readings
 
-    def photo_entry(self, features: Tensor) -> Code:
+    def photo_search_encoding(self, features: Tensor) -> ImageEncoding:
         """Half and embedding for candidate search of photo features: what an index keeps."""
-        code = self.photo_code(features)
-        return code if self.pruner is None else Code(code.half, self.pruner.photo(code.half))
+        code = self.photo_encoding(features)
+        return (
+            code
+            if self.candidate_encoder is None
+            else ImageEncoding(code.partial, self.candidate_encoder.photo(code.partial))
+        )
 
     def forward(self, touches: Tensor, photos: Tensor) -> Tensor:
         """Match logits (P,) of pairs: touches (P, fingers, 3, H, W) with photos (P, 3, H, W)."""
-        touch = self.touch_code(self.touch_features(touches))
-        photo = self.photo_code(self.photo_features(photos))
-        return self.head(touch.half, photo.half)  # type: ignore[no-any-return]
+        touch = self.touch_encoding(self.touch_features(touches))
+        photo = self.photo_encoding(self.photo_features(photos))
+        return self.head(touch.partial, photo.partial)  # type: ignore[no-any-return]
 
     @torch.no_grad()
     def clamp_scale(self) -> None:
@@ -183,33 +191,34 @@ class Matcher(nn.Module):
         self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
 
 
-def pruner_of(config: MatcherConfig) -> Pruner:
-    """An untaught pruner of a matcher."""
-    return Pruner(config.half, config.pruner_width, config.embedding_dim, config.pruner_linear)
+def candidate_encoder_of(config: MatcherConfig) -> CandidateEncoder:
+    """An untaught candidate_encoder of a matcher."""
+    return CandidateEncoder(config.partial_width, config.candidate_width, config.embedding_dim, config.candidate_linear)
 
 
 def _unit(x: Tensor) -> Tensor:
     return functional.normalize(x.float(), dim=-1, eps=1e-6)
 
 
-def judge_of(head: FusionHead) -> Judge:
+def scorer_of(head: FusionHead) -> FusionScorer:
     """What follows the halves of a head, dropout off whatever its mode; a view of its weights where they lie on the
-    CPU."""
+    CPU.
+    """
     parts = (head.second.weight, head.second.bias, head.out.weight[0], head.out.bias)
-    return Judge(*(part.detach().cpu().numpy() for part in parts))
+    return FusionScorer(*(part.detach().cpu().numpy() for part in parts))
 
 
-def score_halves(
+def score_partials(
     head: FusionHead,
-    touch_halves: Tensor,
-    photo_halves: NDArray[np.floating[Any]],
+    touch_partials: Tensor,
+    photo_partials: NDArray[np.floating[Any]],
     rows: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float32]:
-    """`Judge.logits` of a head in PyTorch and touch halves (G, half)."""
-    return judge_of(head).logits(touch_halves.detach().cpu().numpy(), photo_halves, rows)
+    """`FusionScorer.logits` of a head in PyTorch and touch halves (G, half)."""
+    return scorer_of(head).logits(touch_partials.detach().cpu().numpy(), photo_partials, rows)
 
 
-KINDS = ("contact", "untouched", "foreign")
+GEL_CLASSES = ("contact", "no_contact", "foreign")
 """What the gel head tells apart."""
 
 
@@ -218,11 +227,12 @@ class GelHead(nn.Module):
 
     def __init__(self, features: int) -> None:
         super().__init__()
-        self.kinds = nn.Linear(features, len(KINDS))
+        self.classifier = nn.Linear(features, len(GEL_CLASSES))
 
     def forward(self, features: Tensor) -> Tensor:
         """Readings (B, fingers, 2) of features (B, fingers, F): log-odds of "no gel image" against both others, and of
-        contact against an untouched gel."""
-        contact, untouched, foreign = self.kinds(features).unbind(-1)
-        gel = torch.logsumexp(torch.stack([contact, untouched], dim=-1), dim=-1)  # ONNX knows no logaddexp
-        return torch.stack([foreign - gel, contact - untouched], dim=-1)
+        contact against an untouched gel.
+        """
+        contact, no_contact, foreign = self.classifier(features).unbind(-1)
+        gel = torch.logsumexp(torch.stack([contact, no_contact], dim=-1), dim=-1)  # ONNX knows no logaddexp
+        return torch.stack([foreign - gel, contact - no_contact], dim=-1)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from retrieval.data.images import check_pixels, decode, picture_size
-from retrieval.data.resize import RgbImage, Samples, check_rgb, resized, to_unit
-from retrieval.model.judge import BLOCKS
+from retrieval.data.resize import RgbImage, Samples, check_rgb, resize_unchecked, to_unit
+from retrieval.model.fusion_scorer import BLOCKS
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,11 +21,11 @@ class GelImage:
     blocks: RgbImage | None
 
     @classmethod
-    def of(cls, samples: Samples, px: int, compares: bool, file_bytes: int = 0) -> "GelImage":
+    def of(cls, samples: Samples, px: int, compares_contact: bool, file_bytes: int = 0) -> "GelImage":
         """Resize a picture (H, W, 3). Raises BadInput."""
         check_rgb(to_unit(samples[:1, :1]), "touch")
-        blocks = resized(samples, (BLOCKS, BLOCKS)) if compares else None
-        return cls(file_bytes, resized(samples, (px, px)), blocks)
+        blocks = resize_unchecked(samples, (BLOCKS, BLOCKS)) if compares_contact else None
+        return cls(file_bytes, resize_unchecked(samples, (px, px)), blocks)
 
 
 class PictureSize(NamedTuple):
@@ -40,13 +40,13 @@ class PictureSize(NamedTuple):
         return self.width * self.height
 
 
-def read_gel_image(data: bytes, name: str, px: int, compares: bool, most: int) -> GelImage | PictureSize:
-    """Decode a picture of at most `most` pixels and resize it; of a larger one only the size is returned.
+def read_gel_image(data: bytes, name: str, px: int, compares_contact: bool, max_pixels: int) -> GelImage | PictureSize:
+    """Decode a picture of at most `max_pixels` pixels and resize it; of a larger one only the size is returned.
 
     `name` stands for it in messages. Raises ImageError.
     """
     size = PictureSize(*picture_size(data, name))
-    if size.pixels > most:
+    if size.pixels > max_pixels:
         return size
     check_pixels(size, name)
-    return GelImage.of(decode(data, name), px, compares, len(data))
+    return GelImage.of(decode(data, name), px, compares_contact, len(data))

@@ -23,53 +23,54 @@ TOLERANCE = 2e-4
 more."""
 
 
-class PhotoCodes(NamedTuple):
+class PhotoEncodings(NamedTuple):
     """What an index keeps of photos: halves (B, half) and embeddings (B, embedding_dim)."""
 
-    half: Floats
+    partial: Floats
     embedding: Floats
 
 
-PhotoEncoder = Callable[[Sequence[Image]], PhotoCodes]
+PhotoEncoder = Callable[[Sequence[Image]], PhotoEncodings]
 """Of images (H, views * W, 3); it computes on the thread that calls it, and several may call it at once."""
 
 
-def on_torch(checkpoint: Checkpoint) -> PhotoEncoder:
+def torch_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
     """An encoder by the checkpoint's own towers."""
 
-    def encode(images: Sequence[Image]) -> PhotoCodes:
+    def encode(images: Sequence[Image]) -> PhotoEncodings:
         with one_thread():
             code = encode_photos(checkpoint.matcher, images, len(images))
-        return PhotoCodes(code.half.numpy(), code.embedding.numpy())
+        return PhotoEncodings(code.partial.numpy(), code.embedding.numpy())
 
     return encode
 
 
-def on_onnx(checkpoint: Checkpoint) -> PhotoEncoder | None:
+def onnx_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder | None:
     """An encoder by ONNX Runtime; None where it or `onnx` is not installed, or cannot run these towers."""
     if any(find_spec(name) is None for name in ("onnx", "onnxruntime")):
         return None
-    from retrieval.model.export import photo_graph_of
+    from retrieval.model.export import photo_encoder_to_onnx
 
     try:
-        session = open_session(photo_graph_of(checkpoint), "the photo encoder", checkpoint.digest, threads=1)
+        session = open_session(photo_encoder_to_onnx(checkpoint), "the photo encoder", checkpoint.digest, threads=1)
     except CheckpointError as error:
         log.warning("%s; PyTorch encodes the photos", error)
         return None
-    return lambda images: PhotoCodes(*session.run(None, {"images": np.stack(images)}))
+    return lambda images: PhotoEncodings(*session.run(None, {"images": np.stack(images)}))
 
 
-def fastest(checkpoint: Checkpoint) -> PhotoEncoder:
+def fastest_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
     """The faster encoder of the two; PyTorch's unless the other one gives the same halves. Not to be called while other
-    threads encode: the export would record what they do, too."""
+    threads encode: the export would record what they do, too.
+    """
     settings = checkpoint.config.preprocessing
     shape = SAMPLE, settings.photo_px, len(settings.views) * settings.photo_px, 3
     images = list(np.random.default_rng(0).random(shape, dtype=np.float32))
-    torch, onnx = on_torch(checkpoint), on_onnx(checkpoint)
+    torch, onnx = torch_photo_encoder(checkpoint), onnx_photo_encoder(checkpoint)
     if onnx is None:
         return torch
-    half, other = torch(images).half, onnx(images).half
-    if not np.abs(half - other).max() <= TOLERANCE * np.abs(half).max():
+    partial, other = torch(images).partial, onnx(images).partial
+    if not np.abs(partial - other).max() <= TOLERANCE * np.abs(partial).max():
         log.warning("ONNX Runtime gives other halves than PyTorch, which encodes the photos")
         return torch
     times = [[_seconds(each, images) for each in (torch, onnx)] for _ in range(ROUNDS)]

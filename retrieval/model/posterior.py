@@ -24,7 +24,7 @@ from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 where P(n
 
 From a query to its probabilities, in four files:
 
-    judge.py                Judge.logits sums the match logits z of a photo over the grasps
+    judge.py                FusionScorer.logits sums the match logits z of a photo over the grasps
     search/query/objects.py Objects.judged gives each object the logit l(o) of its photos (Posterior.object_logits)
     search/query/shard.py   FolderShard.ask chooses the photos that are scored and samples the other objects (Mass)
     posterior.py            Mass.joined adds the shards; Posterior.share gives P(o), P(none) and the verdict's rule;
@@ -60,8 +60,8 @@ FORMULA = (
 
 
 @dataclass(frozen=True)
-class Belief:
-    """What is believed of one object in the hand; `none`, `objects` and `unjudged` add up to 1.
+class PosteriorProbabilities:
+    """What is believed of one object in the hand; `none`, `objects` and `unscored` add up to 1.
 
     none: that it is none of the catalogue's. objects (J,): that it is each of the judged ones, in the order given.
     unjudged: that it is one of those that were not judged. objects_if_present (J,): probabilities of the judged
@@ -70,7 +70,7 @@ class Belief:
 
     none: float
     objects: Floats
-    unjudged: float
+    unscored: float
     objects_if_present: Floats
 
     @property
@@ -80,37 +80,38 @@ class Belief:
 
 
 @dataclass(frozen=True)
-class Mass:
+class EvidenceMass:
     """What objects of a catalogue, or of a part of one, weigh together: logs of their sums of exp(w * logit - top).
 
     judged: of those that were judged; unjudged: of the others, as a sample of them says. objects: how many of both.
     top: the largest w * logit, told apart: in a sum with it the others' digits would be lost.
     """
 
-    judged: float
-    unjudged: float
+    scored: float
+    unscored: float
     objects: int
     top: float
 
     @classmethod
-    def joined(cls, masses: Sequence["Mass"]) -> "Mass":
+    def merged(cls, masses: Sequence["EvidenceMass"]) -> "EvidenceMass":
         """What several parts of a catalogue weigh together: one part at least, no object in two of them."""
         top = max(mass.top for mass in masses)
         return cls(
-            float(np.logaddexp.reduce([mass.judged + (mass.top - top) for mass in masses])),
-            float(np.logaddexp.reduce([mass.unjudged + (mass.top - top) for mass in masses])),
+            float(np.logaddexp.reduce([mass.scored + (mass.top - top) for mass in masses])),
+            float(np.logaddexp.reduce([mass.unscored + (mass.top - top) for mass in masses])),
             sum(mass.objects for mass in masses),
             top,
         )
 
-    def extended(self, objects: int) -> "Mass":
+    def extrapolated(self, objects: int) -> "EvidenceMass":
         """The same with so many more objects, of which nothing is known: each is taken to weigh what these do on
-        average."""
+        average.
+        """
         if not objects:
             return self
-        mean = float(np.logaddexp(self.judged, self.unjudged)) - math.log(self.objects)
-        unjudged = float(np.logaddexp(self.unjudged, math.log(objects) + mean))
-        return Mass(self.judged, unjudged, self.objects + objects, self.top)
+        mean = float(np.logaddexp(self.scored, self.unscored)) - math.log(self.objects)
+        unscored = float(np.logaddexp(self.unscored, math.log(objects) + mean))
+        return EvidenceMass(self.scored, unscored, self.objects + objects, self.top)
 
 
 @dataclass(frozen=True)
@@ -154,15 +155,15 @@ class Posterior:
         total = np.bincount(owner, np.exp(scaled - top[owner]), len(counts))
         return np.asarray((top + np.log(total / counts)) / weight)  # equal photos: exactly log 1, however many
 
-    def believe(
+    def probabilities(
         self,
         logits: ArrayLike,
         grasps: int = 1,
         *,
         none_prior: float = NONE_PRIOR,
-        unjudged: int = 0,
+        unscored: int = 0,
         sample: ArrayLike = (),
-    ) -> Belief:
+    ) -> PosteriorProbabilities:
         """The posterior over judged objects, those not judged, and none.
 
         logits (J,) of the judged objects, J >= 1 (`object_logits`). unjudged: how many objects were not judged.
@@ -170,24 +171,28 @@ class Posterior:
         NumericalError for a logit that is not finite.
         """
         require_prior(none_prior)
-        return self.share(logits, self.mass(logits, grasps, unjudged=unjudged, sample=sample), grasps, none_prior)
+        return self.probabilities_given(
+            logits, self.mass(logits, grasps, unscored=unscored, sample=sample), grasps, none_prior
+        )
 
-    def mass(self, logits: ArrayLike, grasps: int = 1, *, unjudged: int = 0, sample: ArrayLike = ()) -> Mass:
-        """What objects weigh, given as `believe` takes them; of several parts of a catalogue, `Mass.joined`."""
-        judged, drawn = _finite(logits, "every logit"), _finite(sample, "every logit of the sample")
-        if not len(judged) or unjudged < 0 or (unjudged and not len(drawn)):
+    def mass(self, logits: ArrayLike, grasps: int = 1, *, unscored: int = 0, sample: ArrayLike = ()) -> EvidenceMass:
+        """What objects weigh, given as `probabilities` takes them; of several parts of a catalogue, `EvidenceMass.merged`."""
+        scored, drawn = _finite(logits, "every logit"), _finite(sample, "every logit of the sample")
+        if not len(scored) or unscored < 0 or (unscored and not len(drawn)):
             raise BadInput(
                 "a posterior needs a judged object, and a sample where others were not judged; got "
-                f"{len(judged)} judged, {unjudged} not, and a sample of {len(drawn)}"
+                f"{len(scored)} judged, {unscored} not, and a sample of {len(drawn)}"
             )
-        weighed, others = self.weight(grasps) * judged, self.weight(grasps) * drawn
-        top = float(max(weighed.max(), others.max() if unjudged else -math.inf))
+        weighed, others = self.weight(grasps) * scored, self.weight(grasps) * drawn
+        top = float(max(weighed.max(), others.max() if unscored else -math.inf))
         rest = -math.inf
-        if unjudged:  # so many times the mean of the sample
-            rest = math.log(unjudged / len(drawn)) + float(np.logaddexp.reduce(others - top))
-        return Mass(float(np.logaddexp.reduce(weighed - top)), rest, len(judged) + unjudged, top)
+        if unscored:  # so many times the mean of the sample
+            rest = math.log(unscored / len(drawn)) + float(np.logaddexp.reduce(others - top))
+        return EvidenceMass(float(np.logaddexp.reduce(weighed - top)), rest, len(scored) + unscored, top)
 
-    def share(self, logits: ArrayLike, mass: Mass, grasps: int = 1, none_prior: float = NONE_PRIOR) -> Belief:
+    def probabilities_given(
+        self, logits: ArrayLike, mass: EvidenceMass, grasps: int = 1, none_prior: float = NONE_PRIOR
+    ) -> PosteriorProbabilities:
         """What is believed of some of the objects that `mass` stands for: `objects` (J,) are those of these logits."""
         some = _finite(logits, "every logit")
         each = math.log1p(-none_prior) - math.log(mass.objects) + self.offset
@@ -195,11 +200,11 @@ class Posterior:
         # In logarithms: exp of a logit of 1000 is infinite, and the share of the best one would be NaN. All are told
         # from the best one's.
         none -= each + mass.top
-        present = float(np.logaddexp(mass.unjudged, mass.judged))
+        present = float(np.logaddexp(mass.unscored, mass.scored))
         whole = float(np.logaddexp(none, present))
         logs = self.weight(grasps) * some - mass.top
         shares, if_present = (np.exp(np.minimum(logs - total, 0.0)) for total in (whole, present))
-        return Belief(math.exp(none - whole), shares, math.exp(mass.unjudged - whole), if_present)
+        return PosteriorProbabilities(math.exp(none - whole), shares, math.exp(mass.unscored - whole), if_present)
 
     def more_grasps(self, logit: float, objects: int, grasps: int, none_prior: float = NONE_PRIOR) -> int | None:
         """Estimate how many further grasps make the best object likelier than "none of these".
@@ -254,16 +259,17 @@ def _finite(values: ArrayLike, what: str) -> Floats:
 
 CATALOGUE_SIZES = (20, 1000)
 """Objects of the catalogues that the numbers are fitted on; at most all but one of the validation objects."""
-LEAST_OBJECTS = 3
+MIN_OBJECTS = 3
 """That a posterior is fitted on: a catalogue of two has one of two without the true object beside it."""
 _SETS = 4
 _SEARCH = {"xatol": 1e-4, "fatol": 1e-9, "maxiter": 2000}
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedTouches:
+class ScoredTouches:
     """Match logits (T, N) of touches with photos; whose they are (T,), (N,); own (T, N): photos that were taken in a
-    grasp of that very touch and are not shown to it."""
+    grasp of that very touch and are not shown to it.
+    """
 
     logits: NDArray[np.floating[Any]]
     touch_owner: Numbers
@@ -271,33 +277,34 @@ class JudgedTouches:
     own: NDArray[np.bool_]
 
 
-def fit_posterior(*parts: JudgedTouches, seed: int = 0) -> Posterior:
+def fit_posterior(*parts: ScoredTouches, seed: int = 0) -> Posterior:
     """Fit on single touches of validation objects and, where an object has more, on sets of up to 5 grasps of it.
 
     parts: of one matcher, or of several, such as those of folds, each with objects of its own. With one grasp of each
     object only nothing is known of the dependence, and it is 1. Raises BadInput for fewer than three objects, or where
     no touch has another photo of its object.
     """
-    return fit_questions([questions for judged in parts for questions in questions_of(judged, seed)])
+    return fit_posterior_to_trials([questions for scored in parts for questions in identification_trials(scored, seed)])
 
 
-def questions_of(judged: JudgedTouches, seed: int) -> Iterator["Questions"]:
-    """Questions asked by single touches, and then by sets of two grasps, three and so on, as far as objects have grasps
-    for them."""
+def identification_trials(scored: ScoredTouches, seed: int) -> Iterator["IdentificationTrials"]:
+    """IdentificationTrials asked by single touches, and then by sets of two grasps, three and so on, as far as objects have grasps
+    for them.
+    """
     for grasps in range(1, MAX_GRASPS + 1):
         rng = np.random.default_rng([seed, grasps])
         sets = []  # touches of one object each, which leave that object a photo; of one grasp every touch
-        for name in np.unique(judged.touch_owner):
-            mine = np.flatnonzero(judged.touch_owner == name)
+        for name in np.unique(scored.touch_owner):
+            mine = np.flatnonzero(scored.touch_owner == name)
             draws = mine[:, None] if grasps == 1 else [rng.permutation(mine)[:grasps] for _ in range(_SETS)]
-            photos = judged.photo_owner == name
-            sets += [rows for rows in draws if len(rows) == grasps and (photos & ~judged.own[rows].any(0)).any()]
+            photos = scored.photo_owner == name
+            sets += [rows for rows in draws if len(rows) == grasps and (photos & ~scored.own[rows].any(0)).any()]
         if sets or grasps == 1:
-            yield Questions.of(judged, np.array(sets, dtype=np.int64).reshape(-1, grasps), seed)
+            yield IdentificationTrials.of(scored, np.array(sets, dtype=np.int64).reshape(-1, grasps), seed)
 
 
 @dataclass(frozen=True, eq=False)
-class Questions:
+class IdentificationTrials:
     """Which object was it, or none? Asked of catalogues with the true object and without it.
 
     scores (T, N): summed match logits, photos sorted by object, -inf for one that is not shown; counts (T, O): photos
@@ -312,21 +319,22 @@ class Questions:
     catalogues: tuple[Numbers, ...]
 
     @classmethod
-    def of(cls, judged: JudgedTouches, sets: Numbers, seed: int = 0) -> "Questions":
-        """Questions asked by sets of G touches each, `sets` (S, G). Raises BadInput where there are none, or fewer than
-        three objects."""
-        objects, owner = np.unique(judged.photo_owner, return_inverse=True)
-        if len(objects) < LEAST_OBJECTS or not len(sets):
+    def of(cls, scored: ScoredTouches, sets: Numbers, seed: int = 0) -> "IdentificationTrials":
+        """IdentificationTrials asked by sets of G touches each, `sets` (S, G). Raises BadInput where there are none, or fewer than
+        three objects.
+        """
+        objects, owner = np.unique(scored.photo_owner, return_inverse=True)
+        if len(objects) < MIN_OBJECTS or not len(sets):
             raise BadInput(
                 "a posterior is fitted on three objects at least, and on touches that have another photo of theirs; "
                 f"got {len(objects)} objects and {len(sets)} such touches"
             )
         order = np.argsort(owner, kind="stable")
         starts = np.searchsorted(owner[order], np.arange(len(objects)))
-        shown = ~np.asarray(judged.own[sets].any(axis=1))[:, order]
-        scores = np.where(shown, judged.logits[:, order].astype(np.float64)[sets].sum(1), -np.inf)
+        shown = ~np.asarray(scored.own[sets].any(axis=1))[:, order]
+        scores = np.where(shown, scored.logits[:, order].astype(np.float64)[sets].sum(1), -np.inf)
         counts = np.add.reduceat(shown.astype(np.int64), starts, axis=1)
-        true = np.searchsorted(objects, judged.touch_owner[sets[:, 0]])
+        true = np.searchsorted(objects, scored.touch_owner[sets[:, 0]])
         keys = np.random.default_rng([seed, 100 + sets.shape[1]]).random(counts.shape)
         keys[np.arange(len(sets)), true] = -1
         ranked = np.argsort(keys, axis=1)
@@ -359,7 +367,7 @@ class Questions:
         return float(np.mean(losses))
 
 
-def fit_questions(asked: Sequence[Questions]) -> Posterior:
+def fit_posterior_to_trials(trials: Sequence[IdentificationTrials]) -> Posterior:
     """The likeliest posterior for the answers to all of these questions, each counting once.
 
     Targets are smoothed as Platt's are (1999, section 2.2), so that logits that never err have a finite optimum too,
@@ -367,9 +375,9 @@ def fit_questions(asked: Sequence[Questions]) -> Posterior:
     """
     from scipy.optimize import minimize  # slow to import, and no query needs it
 
-    count = sum(len(part.scores) for part in asked)
-    several = any(part.grasps > 1 for part in asked)
-    finite = np.concatenate([part.scores[np.isfinite(part.scores)] / part.grasps for part in asked])
+    count = sum(len(part.scores) for part in trials)
+    several = any(part.grasps > 1 for part in trials)
+    finite = np.concatenate([part.scores[np.isfinite(part.scores)] / part.grasps for part in trials])
     # Told from the middle of the logits, the offset does not hang on the slope, and the search finds both.
     middle, unit = float(np.median(finite)), float(np.std(finite))
     low, high = np.log(SLOPE_BOUNDS)
@@ -382,7 +390,7 @@ def fit_questions(asked: Sequence[Questions]) -> Posterior:
 
     def loss(parameters: Floats) -> float:
         posterior = made(parameters)
-        return sum(len(part.scores) * part.loss(posterior, 1 / (count + 2)) for part in asked) / count
+        return sum(len(part.scores) * part.loss(posterior, 1 / (count + 2)) for part in trials) / count
 
     searched = slice(3 if several else 2)
     bounds = [(low, high), (-1e6, 1e6), (0.0, 1.0)][searched]

@@ -25,10 +25,10 @@ from PIL import Image
 
 from retrieval.data.images import check_pixels, decode_rgb, pillow_rgb, read_rgb, to_float
 from retrieval.data.resize import RgbImage
-from retrieval.errors import BadInput, ImageError, NumericalError, Unanswered
+from retrieval.errors import BadInput, ImageError, IncompleteSearch, NumericalError
 from retrieval.model.config import Config
+from retrieval.model.fusion_scorer import contact_level
 from retrieval.model.gel_images import GelImage
-from retrieval.model.judge import contact_level
 
 AnyImage: TypeAlias = str | os.PathLike[str] | bytes | bytearray | memoryview | Image.Image | NDArray[Any] | GelImage
 """A path (text is one), the bytes of a file, a Pillow image, an array (H, W, 3) uint8, red first, or a gel image that
@@ -36,12 +36,12 @@ another process read."""
 AnyTouches: TypeAlias = AnyImage | Sequence[AnyImage] | Sequence[Sequence[AnyImage]]
 """One grasp or several, as the text above says. An array of 4 or 5 axes is a list of those below it."""
 
-_WANTED = "a path, the bytes of a file, a Pillow image or a uint8 array (height, width, 3)"
-_NESTED = "one grasp is a list with an image for each finger, several grasps are a list of such lists"
+_IMAGE_TYPES = "a path, the bytes of a file, a Pillow image or a uint8 array (height, width, 3)"
+_NESTING_HINT = "one grasp is a list with an image for each finger, several grasps are a list of such lists"
 
 
 @dataclass(frozen=True, eq=False)
-class GivenImage:
+class InputImage:
     """An image as it was given, not read yet. name: how answers and messages call it, a file by its path."""
 
     image: AnyImage
@@ -64,7 +64,7 @@ def read_image(image: AnyImage, name: str) -> RgbImage:
     if isinstance(image, Image.Image):
         return pillow_rgb(image, name)
     if not isinstance(image, np.ndarray):
-        raise ImageError(name, f"an image must be {_WANTED}, got {type(image).__name__}")
+        raise ImageError(name, f"an image must be {_IMAGE_TYPES}, got {type(image).__name__}")
     if image.dtype != np.uint8:
         raise ImageError(
             name,
@@ -81,7 +81,7 @@ def read_image(image: AnyImage, name: str) -> RgbImage:
     return np.ascontiguousarray(to_float(np.asarray(image)))
 
 
-def read_grasps(given: AnyTouches, fingers: int, *, what: str = "touch", of: str = "") -> list[list[GivenImage]]:
+def parse_grasps(given: AnyTouches, fingers: int, *, what: str = "touch", of: str = "") -> list[list[InputImage]]:
     """The grasps in what was given for one object, each with an image for each finger; no image is read.
 
     what: how one grasp is called in messages. of: what they begin with, such as "object 3, ". Raises BadInput where
@@ -93,24 +93,24 @@ def read_grasps(given: AnyTouches, fingers: int, *, what: str = "touch", of: str
         items = _items(given, of)
         images = [_is_image(item) for item in items]
         if any(images) and not all(images):
-            raise BadInput(f"{of}images and lists of images stand side by side; {_NESTED}")
+            raise BadInput(f"{of}images and lists of images stand side by side; {_NESTING_HINT}")
         grasps = [items] if any(images) else [_items(item, of) for item in items]
     if wrong := [image for grasp in grasps for image in grasp if not _is_image(image)]:
         raise BadInput(
-            f"{of}an image must be {_WANTED}, got {type(wrong[0]).__name__}; {_NESTED}; several objects go to "
+            f"{of}an image must be {_IMAGE_TYPES}, got {type(wrong[0]).__name__}; {_NESTING_HINT}; several objects go to "
             "query_many"
         )
     if not grasps:
-        raise BadInput(f"{of}give at least one {what}: {_NESTED}")
+        raise BadInput(f"{of}give at least one {what}: {_NESTING_HINT}")
     named = [
-        [GivenImage(image, _name(image, f"{of}grasp {g}, finger", f)) for f, image in enumerate(grasp)]
+        [InputImage(image, _name(image, f"{of}grasp {g}, finger", f)) for f, image in enumerate(grasp)]
         for g, grasp in enumerate(grasps, start=1)
     ]
     for grasp in named:
         if len(grasp) != fingers:
             raise BadInput(
                 f"{of}this model takes {fingers} gel image(s) for one {what}; got {len(grasp)}: "
-                f"{', '.join(image.name for image in grasp)} ({_NESTED}; on the command line each grasp has a "
+                f"{', '.join(image.name for image in grasp)} ({_NESTING_HINT}; on the command line each grasp has a "
                 "--gelsight of its own)"
             )
     return named
@@ -125,7 +125,7 @@ def _is_image(item: object) -> bool:
 def _items(given: object, of: str) -> list[Any]:
     if isinstance(given, Sequence | np.ndarray):
         return list(given)
-    raise BadInput(f"{of}an image must be {_WANTED}, got {type(given).__name__}; {_NESTED}")
+    raise BadInput(f"{of}an image must be {_IMAGE_TYPES}, got {type(given).__name__}; {_NESTING_HINT}")
 
 
 def _name(image: AnyImage, place: str, finger: int) -> str:
@@ -147,40 +147,41 @@ DECODERS = 2  # a touch has as many images
 Floats = NDArray[np.float32]
 
 
-class TouchCodes(NamedTuple):
+class TouchEncodings(NamedTuple):
     """What is made of G grasps, float32: halves (G, half), embeddings (G, embedding_dim), and what tells whether they
     are touches: readings (G, fingers, 2) of a model with a gel head, levels (G, fingers) of grey by which images differ
-    from their no-contact frames, where these were given (`retrieval.model.judge`)."""
+    from their no-contact frames, where these were given (`retrieval.model.fusion_scorer`).
+    """
 
-    halves: Floats
+    partials: Floats
     embeddings: Floats
     readings: Floats | None = None
     levels: Floats | None = None
 
 
-class Encoder(Protocol):
+class TouchEncoder(Protocol):
     """What makes codes of touches: PyTorch or ONNX Runtime."""
 
     @property
     def name(self) -> str:
         """How it is called in the answer."""
 
-    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchCodes:
+    def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchEncodings:
         """Encode grasps, each its fingers' images."""
 
 
-class Encoded(NamedTuple):
+class EncodedTouches(NamedTuple):
     """What the matcher keeps of images, a row each: unit `embeddings` (N, embedding_dim), by which candidates are
-    found, and `halves` (N, half), by which it judges pairs. float32.
+    found, and `partials` (N, half), by which it judges pairs. float32.
 
     >>> with retrieval.open("index") as searcher:
-    ...     embeddings, halves = searcher.encode([["a.png", "b.png"], ["a2.png", "b2.png"]])
-    >>> len(embeddings), len(halves), embeddings.dtype.name
+    ...     embeddings, partials = searcher.encode([["a.png", "b.png"], ["a2.png", "b2.png"]])
+    >>> len(embeddings), len(partials), embeddings.dtype.name
     (2, 2, 'float32')
     """
 
     embeddings: Floats
-    halves: Floats
+    partials: Floats
 
 
 class Stopwatch:
@@ -201,20 +202,21 @@ class Stopwatch:
         for stage, ms in timing_ms.items():
             self._stages[stage] = self._stages.get(stage, 0.0) + ms
 
-    def finished(self, shares: int) -> dict[str, float]:
+    def finish(self, shares: int) -> dict[str, float]:
         """One of so many equal shares: of the stages in their order, and of "total" since it was made."""
         everything = {**self._stages, "total": 1e3 * (time.perf_counter() - self._start)}
         return {stage: ms / shares for stage, ms in everything.items()}
 
 
-LONGEST_WAIT_S = 10.0
+MAX_FORK_WAIT_S = 10.0
 """For computations to end before a fork; one that is forked all the same may wait for a lock for ever."""
 
 
-class _Forks:
+class _ForkGuard:
     """A fork copies the locks of the libraries that compute as they are, and nobody in it opens one that another thread
     held. So a process that forks waits until no touch is read or encoded, and until threads that did so are gone: one
-    that Python has joined still gives back its memory for a while, under an allocator's lock."""
+    that Python has joined still gives back its memory for a while, under an allocator's lock.
+    """
 
     def __init__(self) -> None:
         self._idle, self._computing, self._threads = threading.Condition(), 0, set[int]()
@@ -235,8 +237,8 @@ class _Forks:
     def before(self) -> None:
         """Wait, and keep others from beginning until the fork is made."""
         self._idle.acquire()
-        deadline = time.monotonic() + LONGEST_WAIT_S
-        self._idle.wait_for(lambda: self._computing == 0, LONGEST_WAIT_S)
+        deadline = time.monotonic() + MAX_FORK_WAIT_S
+        self._idle.wait_for(lambda: self._computing == 0, MAX_FORK_WAIT_S)
         alive = {thread.native_id for thread in threading.enumerate()}
         for ended in self._threads - alive:
             while os.path.exists(f"/proc/self/task/{ended}") and time.monotonic() < deadline:
@@ -252,21 +254,24 @@ class _Forks:
         self._idle, self._computing, self._threads = threading.Condition(), 0, set()
 
 
-_forks = _Forks()
-os.register_at_fork(before=_forks.before, after_in_parent=_forks.after_in_parent, after_in_child=_forks.after_in_child)
+_fork_guard = _ForkGuard()
+os.register_at_fork(
+    before=_fork_guard.before, after_in_parent=_fork_guard.after_in_parent, after_in_child=_fork_guard.after_in_child
+)
 
 
 class TouchReader:
     """Reads and encodes the touches of a model."""
 
-    def __init__(self, config: Config, encoder: Encoder, compares: bool = False) -> None:
+    def __init__(self, config: Config, encoder: TouchEncoder, compares_contact: bool = False) -> None:
         """compares: whether a touch is compared with its no-contact frame, to see if there is a contact."""
-        self.encoder, self.fingers, self._compares = encoder, config.matcher.fingers, compares
+        self.encoder, self.fingers, self._compares_contact = encoder, config.matcher.fingers, compares_contact
         self._preprocessing = config.preprocessing
 
-    def references(self, background: Sequence[AnyImage] | None) -> Sequence[GelImage | None]:
+    def no_contact_frames(self, background: Sequence[AnyImage] | None) -> Sequence[GelImage | None]:
         """The no-contact frame of each finger, None for a model that looks at no such frame. Raises BadInput for one
-        that is missing, and for one that would not be looked at."""
+        that is missing, and for one that would not be looked at.
+        """
         policy = self._preprocessing.background
         if background is None and policy != "none":
             raise BadInput(
@@ -275,36 +280,37 @@ class TouchReader:
             )
         if background is None:
             return [None] * self.fingers
-        if policy == "none" and not self._compares:
+        if policy == "none" and not self._compares_contact:
             raise BadInput("this model takes gel images as they are and would not look at --background; leave it out")
-        frames = read_grasps(background, self.fingers, what="background")
+        frames = parse_grasps(background, self.fingers, what="background")
         if len(frames) != 1:
             raise BadInput(f"give one background, with a no-contact frame for each finger; got {len(frames)}")
         return [self._gel_image(frame, True) for frame in frames[0]]
 
     def encode(
-        self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[GelImage | None], clock: Stopwatch
-    ) -> TouchCodes:
+        self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[GelImage | None], clock: Stopwatch
+    ) -> TouchEncodings:
         """The codes of grasps, made in batches; the clock counts the stages "decode" and "encode". references: the
-        no-contact frame of each finger, or None."""
+        no-contact frame of each finger, or None.
+        """
         parts, levels = [], []
         for start in range(0, len(grasps), BATCH):
             with clock("decode"):
-                views = self._views(grasps[start : start + BATCH], references)
+                views = self._preprocessed(grasps[start : start + BATCH], no_contact_frames)
                 levels += [[level for _, level in grasp] for grasp in views]
-            with clock("encode"), _forks.computing():
+            with clock("encode"), _fork_guard.computing():
                 parts.append(self.encoder.encode([[view for view, _ in grasp] for grasp in views]))
-        halves, embeddings = (np.concatenate([part[place] for part in parts]) for place in (0, 1))
+        partials, embeddings = (np.concatenate([part[place] for part in parts]) for place in (0, 1))
         readings = [part.readings for part in parts if part.readings is not None]
-        return TouchCodes(
-            _finite(halves, "half"),
+        return TouchEncodings(
+            _finite(partials, "partial"),
             _finite(embeddings, "embedding"),
             np.concatenate(readings) if readings else None,
-            None if references[0] is None else np.array(levels, dtype=np.float32),
+            None if no_contact_frames[0] is None else np.array(levels, dtype=np.float32),
         )
 
-    def _views(
-        self, grasps: Sequence[Sequence[GivenImage]], references: Sequence[GelImage | None]
+    def _preprocessed(
+        self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[GelImage | None]
     ) -> list[list[tuple[RgbImage, float]]]:
         """The images of grasps as the tower sees them, and how far each is from its no-contact frame (0 without one);
         made side by side; of several bad ones the first is told.
@@ -318,8 +324,8 @@ class TouchReader:
                 with suppress(Exception):  # told by `read`
                     given.image.load()
 
-        def view(given: GivenImage, reference: GelImage | None) -> tuple[RgbImage, float]:
-            with _forks.computing():
+        def view(given: InputImage, reference: GelImage | None) -> tuple[RgbImage, float]:
+            with _fork_guard.computing():
                 image = self._gel_image(given, reference is not None)
                 if reference is None:
                     return self._preprocessing.touch(image.touch), 0.0
@@ -328,19 +334,20 @@ class TouchReader:
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
             jobs = [
-                [threads.submit(view, given, frame) for given, frame in zip(grasp, references, strict=True)]
+                [threads.submit(view, given, frame) for given, frame in zip(grasp, no_contact_frames, strict=True)]
                 for grasp in grasps
             ]
             return [[job.result() for job in grasp] for grasp in jobs]
 
-    def _gel_image(self, given: GivenImage, compares: bool) -> GelImage:
-        """An image at the sizes of this model. compares: with a no-contact frame. Raises ImageError, and Unanswered for
-        one that was read for another model."""
+    def _gel_image(self, given: InputImage, compares_contact: bool) -> GelImage:
+        """An image at the sizes of this model. compares: with a no-contact frame. Raises ImageError, and IncompleteSearch for
+        one that was read for another model.
+        """
         px = self._preprocessing.touch_px
         if not isinstance(given.image, GelImage):
-            return GelImage.of(given.read(), px, compares)
+            return GelImage.of(given.read(), px, compares_contact)
         if given.image.touch.shape != (px, px, 3):
-            raise Unanswered("an index of another model was opened meanwhile; ask again")
+            raise IncompleteSearch("an index of another model was opened meanwhile; ask again")
         return given.image
 
 

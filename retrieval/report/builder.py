@@ -8,7 +8,7 @@ from typing import Any
 from retrieval.report.canvas import draw
 from retrieval.report.document import Block, Card, Details, Picture, Spot
 from retrieval.report.galleries import Grasps
-from retrieval.report.results import Results, at_start, measure_label, method_label, percent
+from retrieval.report.results import Results, capitalized, measure_label, method_label, percent
 
 
 class Builder:
@@ -29,7 +29,8 @@ class Builder:
         spots: Mapping[str, Sequence[tuple[str, Sequence[Any]]]] | None = None,
     ) -> Picture:
         """A figure. spots: by the `gid` of what the figure shows, for each of its places a label and the grasps that
-        results.json names there."""
+        results.json names there.
+        """
         path = self.out / "figures" / name
         places = draw(path, make, *arguments)
         self.figures.append(path)
@@ -70,5 +71,5 @@ class Builder:
         for name in self.results.learned:
             if self.results.data["methods"][name].get(what):
                 blocks = tuple(show(self, name))
-                folded = (Details(at_start(method_label(name)), blocks),) if blocks else ()
+                folded = (Details(capitalized(method_label(name)), blocks),) if blocks else ()
                 yield from blocks if name == self.main else folded

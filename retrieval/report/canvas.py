@@ -16,7 +16,7 @@ from retrieval.errors import RetrievalError
 Figure = Any
 Axes = Any
 
-FAINT = "#8a949e"
+MUTED_COLOUR = "#8a949e"
 PART_COLOURS = {"test": "#c8382e", "validation": "#9aa3ab", "train": "#2f6fb3"}
 FIGURE_DPI = 144
 # No $...$ formulas: an object may be called anything.
@@ -48,7 +48,7 @@ class Style:
 _STYLES = {
     "late_fusion": Style("#0072b2", "o"),
     "set_fusion": Style("#56b4e9", "s"),
-    "prune_rerank": Style("#009e73", "D"),
+    "retrieve_rerank": Style("#009e73", "D"),
     "contrastive": Style("#d55e00", "^"),
     "contrastive_sigmoid": Style("#e69f00", "v"),
     "cca": Style("#aa3377", "P"),
@@ -80,7 +80,7 @@ def percent_axis(panel: Axes, label: str) -> None:
 
 
 @dataclass(frozen=True)
-class Box:
+class RelativeBox:
     """Where something stands in a figure, in shares of its width and height; left and top from its upper left."""
 
     left: float
@@ -89,7 +89,7 @@ class Box:
     height: float
 
 
-def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> dict[str, list[Box]]:
+def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> dict[str, list[RelativeBox]]:
     """Write the figure that `make(*arguments)` gives; a .jpg holds photographs, a .png holds lines.
 
     Returns where what the figure gave a name to (`gid`) stands: a line's points, the box of anything else. Raises
@@ -121,7 +121,7 @@ def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> dict[str, 
         if hasattr(artist, "get_xydata"):
             corners = [(x, y, x, y) for x, y in artist.get_transform().transform(artist.get_xydata())]
         places[artist.get_gid()] = [
-            Box(left / width, 1 - top / height, (right - left) / width, (top - bottom) / height)
+            RelativeBox(left / width, 1 - top / height, (right - left) / width, (top - bottom) / height)
             for left, bottom, right, top in corners
         ]
     return places

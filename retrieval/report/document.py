@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 
 from PIL import Image
 
-from retrieval.console.files import MARKED, PAGE, TEXT, text_bytes, write_output
-from retrieval.report.canvas import FIGURE_DPI, Box
+from retrieval.console.files import GENERATOR_COMMENT, PAGE, TEXT, text_bytes, write_output
+from retrieval.report.canvas import FIGURE_DPI, RelativeBox
 from retrieval.report.pages import data_uri, jpeg, render, script, thumbnail
 
 _PAGE_DPI = 96
@@ -45,7 +45,8 @@ class Listing:
 @dataclass(frozen=True)
 class Table:
     """Cells of plain text. words: columns of sentences, not of numbers; bold: (row, column) of cells that stand out;
-    notes: paragraphs below."""
+    notes: paragraphs below.
+    """
 
     kind: ClassVar[str] = "table"
     header: tuple[str, ...]
@@ -67,7 +68,7 @@ class Card:
 class Spot:
     """A place of a picture that shows cards when it is clicked. label: what is clicked, and what stands above them."""
 
-    box: Box
+    box: RelativeBox
     label: str
     cards: tuple[Card, ...]
 
@@ -115,7 +116,7 @@ class Document:
 def write_document(document: Document, out: Path) -> list[Path]:
     """Write a document, whose pictures lie under `out`, as report.md and report.html; returns both paths."""
     text, page = out / "report.md", out / "report.html"
-    write_output(text, text_bytes(f"{MARKED}\n\n{to_markdown(document)}"), TEXT)
+    write_output(text, text_bytes(f"{GENERATOR_COMMENT}\n\n{to_markdown(document)}"), TEXT)
     write_output(page, text_bytes(to_html(document, out)), PAGE)
     return [text, page]
 
@@ -127,7 +128,7 @@ def to_html(document: Document, folder: Path) -> str:
     """One page with every picture, read from under `folder`, inside it; those of cards once each."""
     photographs: dict[Path, str] = {}
 
-    def called(path: Path) -> str:
+    def photograph_id(path: Path) -> str:
         """By which a card finds its picture on the page."""
         return photographs.setdefault(path, f"p{len(photographs)}")
 
@@ -153,7 +154,7 @@ def to_html(document: Document, folder: Path) -> str:
         width=width,
         anchor=anchor,
         percent="{:.2%}".format,
-        called=called,
+        photograph_id=photograph_id,
         photographs=photographs,
         photograph=photograph,
         scripts=[script("tables.js"), script("spots.js")],

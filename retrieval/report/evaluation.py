@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from retrieval.data.dataset import AnyRecording, load_grasps
-from retrieval.report import comparing, looking, tables
+from retrieval.report import error_analysis, method_comparison, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Document, Listing, Section, Table, Text, write_document
 from retrieval.report.results import (
-    FEW,
-    FEW_MEANS,
-    at_start,
+    FEW_OBJECTS_MARK,
+    FEW_OBJECTS_NOTE,
+    capitalized,
     measure_label,
     method_label,
     percent,
@@ -44,9 +44,9 @@ def write_report(out: Path, recording: AnyRecording | None) -> list[Path]:
     >>> import dataclasses
     >>> from pathlib import Path
     >>> config = retrieval.load_config("tiny")
-    >>> config = dataclasses.replace(config, training=config.training.of_steps(2))
-    >>> done = retrieval.evaluate("lab", Path("told"), config=config, methods=["cca", "chance"], quiet=True)
-    >>> [path.name for path in retrieval.write_report(Path("told"), "lab")][:2]
+    >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))
+    >>> done = retrieval.evaluate("lab", Path("summaries"), config=config, methods=["cca", "chance"], quiet=True)
+    >>> [path.name for path in retrieval.write_report(Path("summaries"), "lab")][:2]
     ['report.md', 'report.html']
     """
     results = read_results(out)
@@ -69,14 +69,16 @@ def _lead(builder: Builder) -> Iterator[Block]:
         f"Fitted on {len(parts['train'])} objects, chosen and calibrated on {len(parts['validation'])}, judged on "
         f"{len(parts['test'])} that nothing has seen. Seeds: {', '.join(map(str, data['setting']['seeds']))}."
     )
-    keys = ("pair_accuracy", "guesses_k5", "guesses_k5_g5_p3")
+    keys = ("pair_accuracy", "topn_k5", "topn_k5_g5_p3")
     found = [(key, summary) for key in keys if (summary := builder.results.summary(builder.main, key))]
-    told = [
+    summaries = [
         f"{measure_label(key)}: {with_interval(summary)} (chance {percent(summary['chance'][0])})"
         for key, summary in found
     ]
-    text = f"{at_start(method_label(builder.main))} on unseen objects, in percent. {at_start('; '.join(told))}."
-    yield Text(f"{text} {FEW_MEANS}" if FEW in text else text)
+    text = (
+        f"{capitalized(method_label(builder.main))} on unseen objects, in percent. {capitalized('; '.join(summaries))}."
+    )
+    yield Text(f"{text} {FEW_OBJECTS_NOTE}" if FEW_OBJECTS_MARK in text else text)
     if audit := data.get("audit"):
         yield Text(f"Leakage audit: {audit['verdict']}", warn=not audit["clean"])
     if builder.results.simulated:
@@ -100,7 +102,9 @@ def _setting(builder: Builder) -> Iterator[Block | None]:
     yield Table(("setting", "value"), rows, words=frozenset({1}))
     yield Details("Objects of each part", (tables.split(builder.results),))
     yield Details("Configuration", (Listing.of_json(setting["config"]),))
-    if chosen := {name: one["chosen"] for name, one in data["methods"].items() if any(one.get("chosen") or ())}:
+    if chosen := {
+        name: one["best_params"] for name, one in data["methods"].items() if any(one.get("best_params") or ())
+    }:
         yield Details("Chosen on validation objects, for each seed", (Listing.of_json(chosen),))
 
 
@@ -109,21 +113,21 @@ def _everything(builder: Builder) -> Iterator[Block | None]:
 
 
 SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
-    "Methods side by side": comparing.side_by_side,
-    "Guess curves": comparing.guess_curves,
-    "More grasps of an object, more photos": comparing.grasps_and_photos,
-    "Accuracy and time": comparing.time,
-    "Full gallery": comparing.gallery,
-    "Differences between methods": comparing.comparisons,
-    "Controls": comparing.controls,
-    "Ceilings": comparing.ceilings,
-    "Touches that hardly press": comparing.faint,
-    "Leakage audit": comparing.audit,
-    "Object by object": looking.objects,
-    "What was mistaken for what": looking.confusions,
-    "Best and worst queries": looking.examples,
-    "Calibration": looking.calibration,
-    "Is the object in the catalogue?": looking.reject,
+    "Methods side by side": method_comparison.method_overview,
+    "Guess curves": method_comparison.guess_curves,
+    "More grasps of an object, more photos": method_comparison.grasps_and_photos,
+    "Accuracy and time": method_comparison.time,
+    "Full gallery": method_comparison.gallery,
+    "Differences between methods": method_comparison.comparisons,
+    "Controls": method_comparison.controls,
+    "Ceilings": method_comparison.ceilings,
+    "Touches that hardly press": method_comparison.low_contact,
+    "Leakage audit": method_comparison.audit,
+    "Object by object": error_analysis.objects,
+    "What was mistaken for what": error_analysis.confusions,
+    "Best and worst queries": error_analysis.examples,
+    "Calibration": error_analysis.calibration,
+    "Is the object in the catalogue?": error_analysis.reject,
     "How this was made": _setting,
     "Every number": _everything,
 }

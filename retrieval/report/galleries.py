@@ -11,7 +11,7 @@ from typing import Any
 from retrieval.data.dataset import Grasp
 from retrieval.report.canvas import Axes, Figure, canvas
 from retrieval.report.pages import thumbnail
-from retrieval.report.results import number, percent, short
+from retrieval.report.results import format_number, percent, shortened
 
 _TILE_PX = 150
 _RIGHT, _WRONG, _LINE = "#0a9d58", "#c8382e", "#c3cad1"
@@ -35,7 +35,12 @@ def examples(queries: Sequence[Any], grasps: Grasps) -> Figure:
         top, own = 1.4 * row, grasps.get(query["grasp_id"])
         for column in range(fingers):
             _tile(panel, column, top, own.touches[column] if own else None)
-        _label(panel, 0, top, f"{short(query['object_id'], 2 * _LETTERS + 4)}\nrank {number(query['true_rank'])}")
+        _label(
+            panel,
+            0,
+            top,
+            f"{shortened(query['object_id'], 2 * _LETTERS + 4)}\nrank {format_number(query['true_rank'])}",
+        )
         for place, name in enumerate(query["ranked"]):
             shown, left = grasps.get(name), fingers + 0.35 + place
             right = shown is not None and shown.object_id == query["object_id"]
@@ -46,7 +51,8 @@ def examples(queries: Sequence[Any], grasps: Grasps) -> Figure:
 
 def confusions(pairs: Sequence[Any], photo_of: Mapping[str, Path]) -> Figure:
     """Object and what it was taken for, side by side, with the share of its queries where that came first; the Nth pair
-    is called N."""
+    is called N.
+    """
     from matplotlib.patches import Rectangle
 
     columns = min(3, len(pairs))
@@ -78,7 +84,7 @@ def nearest_frames(frames: Mapping[str, Any], grasps: Grasps) -> Figure:
         for column, pair in enumerate(frames[kind]["nearest"][:shown]):
             left, top = 2.35 * column, 1.5 * row
             panel.text(left, top - 0.05, f"{kind}: distance {pair['distance']:.2f}", fontsize=8)
-            for side, part in enumerate(("test", "seen")):
+            for side, part in enumerate(("test", "train_validation")):
                 grasp, path = grasps.get(pair[part]), None
                 if grasp is not None:
                     path = grasp.photo if kind == "photo" else grasp.touches[ascii_lowercase.index(kind[-1])]
@@ -129,4 +135,4 @@ def _two_lines(name: str, taken: int = 3) -> str:
         return name
     marks = [at + 1 for at, letter in enumerate(name[:length]) if letter in "-_. " and len(name) - at - 1 <= length]
     cut = marks[-1] if marks else length
-    return f"{name[:cut]}\n{short(name[cut:], length)}"
+    return f"{name[:cut]}\n{shortened(name[cut:], length)}"

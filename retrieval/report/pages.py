@@ -1,5 +1,6 @@
 """What pages are made of: the package's templates, thumbnails of image files, images inside a page; and contact sheets
-of what the matcher sees of a catalogue's photos."""
+of what the matcher sees of a catalogue's photos.
+"""
 
 import base64
 import io
@@ -22,7 +23,7 @@ from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
 from retrieval.errors import ImageError
 
-Thumbnail = NDArray[np.uint8]
+ThumbnailPixels = NDArray[np.uint8]
 """(H, W, 3) red first."""
 COLUMNS = 2
 """Photos of a contact sheet side by side."""
@@ -40,7 +41,7 @@ def script(name: str) -> Markup:
     return Markup((resources.files("retrieval") / "templates" / name).read_text("utf-8"))
 
 
-def thumbnail(path: Path, px: int) -> Thumbnail | None:
+def thumbnail(path: Path, px: int) -> ThumbnailPixels | None:
     """The image at `path`, its longer side at most `px`; None where it cannot be read."""
     try:
         image = read_rgb(path)
@@ -52,7 +53,7 @@ def thumbnail(path: Path, px: int) -> Thumbnail | None:
     return np.rint(image * 255).astype(np.uint8)
 
 
-def jpeg(image: Thumbnail) -> bytes:
+def jpeg(image: ThumbnailPixels) -> bytes:
     """The image as the bytes of a JPEG file."""
     _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
     return data.tobytes()

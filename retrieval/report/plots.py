@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.methods import KNOW_NOTHING
-from retrieval.metrics.registry import PHOTO_COUNTS, SET_SIZES, of_grasps, of_photos
-from retrieval.report.canvas import FAINT, PART_COLOURS, Axes, Figure, canvas, percent_axis, style_of
-from retrieval.report.results import Results, measure_label, method_label, percent, short
+from retrieval.methods import TRIVIAL_BASELINES
+from retrieval.metrics.registry import PHOTO_COUNTS, SET_SIZES, grasps_metric_name, photos_metric_name
+from retrieval.report.canvas import MUTED_COLOUR, PART_COLOURS, Axes, Figure, canvas, percent_axis, style_of
+from retrieval.report.results import Results, measure_label, method_label, percent, shortened
 
-OVERVIEW = ("pair_accuracy", "guesses_k5", "guesses_k10", of_grasps(5), "map")
+OVERVIEW = ("pair_accuracy", "topn_k5", "topn_k10", grasps_metric_name(5), "map")
 _LABELLED_OBJECTS = 130
 
 
@@ -27,7 +27,7 @@ def overview(results: Results) -> Figure:
                 value, low, high = _first(summary)
                 panel.plot([low, high], [row, row], color=style_of(name).colour, lw=2.2, solid_capstyle="butt")
                 panel.plot(value, row, style_of(name).marker, color=style_of(name).colour, ms=6.5)
-                panel.axvline(100 * summary["chance"][0], color=FAINT, ls="--", lw=1, zorder=0)
+                panel.axvline(100 * summary["chance"][0], color=MUTED_COLOUR, ls="--", lw=1, zorder=0)
         panel.set_title(measure_label(key).replace(", ", "\n", 1), fontsize=9)
         panel.set_xlabel("%")
         panel.tick_params(axis="y", length=0)
@@ -49,7 +49,7 @@ def _percents(shares: Sequence[float | None]) -> NDArray[np.float64]:
 
 def guess_curves(results: Results) -> Figure:
     """Share of queries whose object is among the first N guesses, for 5 and, where there are so many, 10 candidates."""
-    both = ("guesses_k5", "guesses_k10")
+    both = ("topn_k5", "topn_k10")
     keys = [key for key in both if any(results.summary(name, key) for name in results.methods)] or both
     figure = canvas(2.5 + 4 * len(keys), 4.6)
     for panel, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys, strict=True):
@@ -58,12 +58,12 @@ def guess_curves(results: Results) -> Figure:
                 continue
             value, low, high = (_percents(summary[part]) for part in ("value", "low", "high"))
             guesses, style = np.arange(1, len(value) + 1), style_of(name)
-            panel.plot(guesses, _percents(summary["chance"]), color=FAINT, ls="--", lw=1.2, zorder=1)
+            panel.plot(guesses, _percents(summary["chance"]), color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
             (line,) = panel.plot(guesses, value, color=style.colour, marker=style.marker, ls=style.line)
             line.set_gid(f"{name} {key}")
-            if name not in KNOW_NOTHING:
+            if name not in TRIVIAL_BASELINES:
                 panel.fill_between(guesses, low, high, color=style.colour, alpha=0.13, lw=0)
-        panel.set_title(f"{key.removeprefix('guesses_k')} candidate objects")
+        panel.set_title(f"{key.removeprefix('topn_k')} candidate objects")
         panel.set_xlabel("guesses")
         panel.xaxis.get_major_locator().set_params(integer=True)
         percent_axis(panel, "object found within so many guesses, %")
@@ -79,7 +79,7 @@ def _legend(figure: Figure, names: Sequence[str]) -> None:
         Line2D([], [], color=style.colour, marker=style.marker, ls=style.line, label=method_label(name))
         for name, style in ((name, style_of(name)) for name in names)
     ]
-    handles.append(Line2D([], [], color=FAINT, ls="--", lw=1.2, label="chance, closed form"))
+    handles.append(Line2D([], [], color=MUTED_COLOUR, ls="--", lw=1.2, label="chance, closed form"))
     figure.legend(handles=handles, loc="outside right center", frameon=False)
 
 
@@ -87,8 +87,8 @@ def grasps_and_photos(results: Results) -> Figure:
     """First guess of five against grasps of a query (three photos of each candidate) and against photos (one grasp)."""
     figure = canvas(12.5, 4.4)
     left, right = figure.subplots(1, 2)
-    _against_counts(left, results, of_grasps, SET_SIZES)
-    _against_counts(right, results, of_photos, PHOTO_COUNTS)
+    _against_counts(left, results, grasps_metric_name, SET_SIZES)
+    _against_counts(right, results, photos_metric_name, PHOTO_COUNTS)
     left.set_xlabel("grasps of the same object in one query")
     right.set_xlabel("photos of each candidate")
     _legend(figure, results.methods)
@@ -105,7 +105,7 @@ def _against_counts(panel: Axes, results: Results, metric: Callable[[int], str],
         panel.plot(points[:, 0], points[:, 1], color=style.colour, marker=style.marker, ls=style.line, ms=5)
         panel.vlines(points[:, 0], points[:, 2], points[:, 3], color=style.colour, lw=1.4, alpha=0.7)
         for at, summary in found:
-            panel.hlines(100 * summary["chance"][0], at - 0.4, at + 0.4, color=FAINT, ls="--", lw=1.2, zorder=1)
+            panel.hlines(100 * summary["chance"][0], at - 0.4, at + 0.4, color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
     panel.set_xticks(range(len(counts)), list(map(str, counts)))
     percent_axis(panel, "right first guess among 5 objects, %")
 
@@ -120,7 +120,7 @@ def objects_among_test(results: Results, method: str) -> Figure:
     figure = canvas(10.5, 3.6)
     panel = figure.subplots()
     bars = [(name, shares[name], PART_COLOURS["test"]) for name in ranked]
-    _bars(panel, bars, results, "guesses_k5", method, letters=36)
+    _bars(panel, bars, results, "topn_k5", method, letters=36)
     return figure
 
 
@@ -136,7 +136,7 @@ def objects_among_all(results: Results, method: str) -> Figure:
     ]
     figure = canvas(13, 3.8)
     panel = figure.subplots()
-    _bars(panel, bars, results, "all_objects_k5", method, letters=24)
+    _bars(panel, bars, results, "topn_k5_all_objects", method, letters=24)
     names = {"test": "test: never seen", "validation": "validation: chosen on", "train": "train: fitted on"}
     handles = [Patch(color=PART_COLOURS[part], label=label) for part, label in names.items()]
     panel.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False)
@@ -158,7 +158,9 @@ def _bars(
         panel.text(len(bars) - 0.4, 100 * summary["chance"][0], " chance", va="center", fontsize=8)
     if len(bars) <= _LABELLED_OBJECTS:
         size = float(np.clip(700 / len(bars), 5.5, 8))
-        panel.set_xticks(range(len(bars)), [short(name, letters) for name, _, _ in bars], rotation=90, fontsize=size)
+        panel.set_xticks(
+            range(len(bars)), [shortened(name, letters) for name, _, _ in bars], rotation=90, fontsize=size
+        )
     else:
         panel.set_xticks([])
         panel.set_xlabel(f"{len(bars)} objects")
@@ -167,7 +169,7 @@ def _bars(
     percent_axis(panel, "right first guess, %")
 
 
-def among_test(results: Results) -> dict[str, dict[str, float]]:
+def test_object_accuracy(results: Results) -> dict[str, dict[str, float]]:
     """By method, then by test object: share of right first guesses among test objects."""
     found = {name: results.data["methods"][name].get("per_object", {}) for name in results.learned}
     return {name: shares["test_candidates"] for name, shares in found.items() if shares.get("test_candidates")}
@@ -175,7 +177,7 @@ def among_test(results: Results) -> dict[str, dict[str, float]]:
 
 def objects_by_method(results: Results) -> Figure:
     """Every test object against every method: are the hard ones hard for all?"""
-    shares = among_test(results)
+    shares = test_object_accuracy(results)
     names = list(shares)
     objects = sorted(shares[names[0]], key=lambda item: (-shares[names[0]][item], item))
     values = np.array([[100 * shares[name].get(item, math.nan) for name in names] for item in objects])
@@ -188,7 +190,7 @@ def objects_by_method(results: Results) -> Figure:
             panel.text(column, row, f"{value:.0f}", ha="center", va="center", fontsize=7.5, color=colour)
     labels = [method_label(name).replace(", ", ",\n").replace(" + ", " +\n") for name in names]
     panel.set_xticks(range(len(names)), labels, fontsize=8)
-    panel.set_yticks(range(len(objects)), [short(item, 40) for item in objects], fontsize=8)
+    panel.set_yticks(range(len(objects)), [shortened(item, 40) for item in objects], fontsize=8)
     panel.tick_params(length=0, top=True, labeltop=True, bottom=False, labelbottom=False)
     panel.grid(visible=False)
     figure.colorbar(image, ax=panel, label="right first guess of 5, %", shrink=0.9)
@@ -214,8 +216,8 @@ def reliability(results: Results, method: str) -> Figure:
     colour = style_of(method).colour
     for panel, counts, kind in zip(*grid, kinds, strict=True):
         bins = [found for found in diagrams[kind]["bins"] if found["count"]]
-        given, found = _percents([one["probability"] for one in bins]), _percents([one["share"] for one in bins])
-        panel.plot([0, 100], [0, 100], color=FAINT, ls="--", lw=1.2)
+        given, found = _percents([one["probability"] for one in bins]), _percents([one["frequency"] for one in bins])
+        panel.plot([0, 100], [0, 100], color=MUTED_COLOUR, ls="--", lw=1.2)
         panel.vlines(given, given, found, color=colour, lw=1, alpha=0.5)
         panel.plot(given, found, "o-", color=colour, ms=5)
         panel.set_xlim(-2, 102)
@@ -247,10 +249,10 @@ def reject(results: Results) -> Figure:
         found = results.data["methods"][name]["reject"]
         _decisions(accepts, name, found["roc"])
         _decisions(risk, name, found["risk_coverage"])
-    accepts.plot([0, 100], [0, 100], color=FAINT, ls="--", lw=1.2)
-    accepts.axhline(95, color=FAINT, lw=0.8)
+    accepts.plot([0, 100], [0, 100], color=MUTED_COLOUR, ls="--", lw=1.2)
+    accepts.axhline(95, color=MUTED_COLOUR, lw=0.8)
     accepts.set(xlabel="accepted though its object is absent, %", ylabel="accepted where its object is there, %")
-    risk.axhline(50, color=FAINT, lw=0.8)
+    risk.axhline(50, color=MUTED_COLOUR, lw=0.8)
     risk.set(xlabel="queries answered, the surest first, %", ylabel="wrong first guesses among these, %")
     for panel in (accepts, risk):
         panel.set(xlim=(-1, 101), ylim=(-1, 101))
@@ -278,7 +280,7 @@ def accuracy_and_time(results: Results) -> Figure:
     for panel, (what, title) in zip(panels, titles.items(), strict=True):
         front: list[tuple[float, float]] = []
         for name in results.methods:
-            time, summary = results.time(name, what), results.summary(name, "guesses_k5")
+            time, summary = results.time(name, what), results.summary(name, "topn_k5")
             if not (time and summary):
                 continue
             value, low, high = _first(summary)
@@ -286,7 +288,7 @@ def accuracy_and_time(results: Results) -> Figure:
             panel.errorbar(
                 time, value, [[value - low], [high - value]], fmt=style_of(name).marker, color=style_of(name).colour
             )
-            panel.axhline(100 * summary["chance"][0], color=FAINT, ls="--", lw=1.2, zorder=0)
+            panel.axhline(100 * summary["chance"][0], color=MUTED_COLOUR, ls="--", lw=1.2, zorder=0)
         # Steps through the methods that no other one beats in both time and accuracy.
         front = [
             (time, value)

@@ -25,7 +25,7 @@ def query_html(result: QueryResult, catalogue: Path) -> str:
         {
             **match.to_dict(),
             "uri": _data_uri(catalogue / match.photo),
-            "felt": [
+            "reference_images": [
                 {"uri": _data_uri(catalogue / path)} for path in (match.reference.touch if match.reference else ())
             ],
         }

@@ -1,5 +1,6 @@
 """The report of the benchmark of real data: its results.json and the recordings' pictures in, Markdown, HTML and
-figures out."""
+figures out.
+"""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -9,20 +10,20 @@ from typing import Any
 from retrieval.console.output import show
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.evaluation.real import PROTOCOLS, SCHEMA_VERSION
-from retrieval.evaluation.real.measuring import QUARTILES, quartile_name
+from retrieval.evaluation.real.fold_measures import QUARTILES, quartile_name
 from retrieval.evaluation.real.protocol import PHOTO, TOUCHES
-from retrieval.evaluation.real.references import with_references
+from retrieval.evaluation.real.reference_rows import replace_photos_by_references
 from retrieval.evaluation.real.verdict import CONTROL_NAMES, RULE
 from retrieval.report import galleries
-from retrieval.report.canvas import FAINT, Figure, canvas, draw, style_of
+from retrieval.report.canvas import MUTED_COLOUR, Figure, canvas, draw, style_of
 from retrieval.report.document import Block, Details, Document, Listing, Picture, Section, Table, Text, write_document
 from retrieval.report.galleries import Grasps
 from retrieval.report.results import (
-    FEW,
-    FEW_MEANS,
-    METHODS,
-    NOTHING,
-    few,
+    FEW_OBJECTS_MARK,
+    FEW_OBJECTS_NOTE,
+    METHOD_LABELS,
+    MISSING_VALUE,
+    few_objects_mark,
     file_name,
     method_label,
     percent,
@@ -37,13 +38,13 @@ INTERVALS = (
     "In percent; brackets hold 95 % intervals that resample {unit}s, since queries of one {unit} are alike; seeds are "
     "averaged first. Equal scores count by their expected rank, so that a constant scorer gets exactly chance."
 )
-OVER_CHOICES = (
+INTERVALS_OVER_CHOICES = (
     "In percent: the mean over choices of test objects. Brackets hold 95 % intervals that cover the choice of objects "
     "that test and of those that train (corrected resampled t-test: choices share objects). Equal scores count by "
     "their expected rank, so that a constant scorer gets exactly chance."
 )
-SEARCHED = {"gallery": "a gallery", "all": "all test objects, look-alikes among them"}
-BLURRED = "the same, touches blurred to 8 x 6"
+SEARCH_SPACES = {"gallery": "a gallery", "all": "all test objects, look-alikes among them"}
+LOW_PASS_LABEL = "the same, touches blurred to 8 x 6"
 
 
 def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
@@ -78,14 +79,14 @@ def _grasps(recording: Path, entry: str) -> list[Grasp]:
     grasps = load_grasps(recording)
     if entry == TOUCHES:
         return [dataclasses.replace(grasp, photo=grasp.touches[0]) for grasp in grasps]
-    return grasps if entry == PHOTO else with_references(grasps)
+    return grasps if entry == PHOTO else replace_photos_by_references(grasps)
 
 
 def _ordered(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """The protocols, their measures and rows in the order in which they are known; the file's is that of letters."""
     entries: Mapping[str, Entry] = results["protocols"]
 
-    def place(name: str, known: list[str] = [*METHODS, *PROTOCOLS]) -> tuple[int, str]:  # noqa: B006
+    def place(name: str, known: list[str] = [*METHOD_LABELS, *PROTOCOLS]) -> tuple[int, str]:  # noqa: B006
         return known.index(name) if name in known else len(known), name
 
     return {
@@ -116,7 +117,7 @@ def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[P
     )
     yield from (Text(line, warn="does not count" in line) for line in verdicts(entry))
     yield numbers(entry)
-    yield from (Text(anchor) for anchor in entry["anchors"])
+    yield from (Text(anchor) for anchor in entry["published_results"])
     yield Text("Controls:")
     yield controls(entry)
     for table in (choices(entry), contact(entry), reliability(entry)):
@@ -162,24 +163,28 @@ def _label(name: str, row: Entry) -> str:
 def numbers(entry: Entry) -> Table:
     """A row for each method with touches, one with blurred touches, those of the controls, and chance."""
     labels: Mapping[str, str] = entry["labels"]
-    counted = any(row["counted"] for row in entry["rows"].values())
+    counted = any(row["correct_counts"] for row in entry["rows"].values())
     rows = []
     for name, row in entry["rows"].items():
         touch = {None: "", True: "yes", False: "no"}[row["verdict"] and row["verdict"]["counts_as_touch"]]
-        rows.append((_label(name, row), *_values(row["measures"], labels), *_counts(row["counted"], counted), touch))
-        if row["blurred"]:
-            rows.append((BLURRED, *_values(row["blurred"], labels), *_counts(None, counted), ""))
+        rows.append(
+            (_label(name, row), *_values(row["measures"], labels), *_counts(row["correct_counts"], counted), touch)
+        )
+        if row["low_pass"]:
+            rows.append((LOW_PASS_LABEL, *_values(row["low_pass"], labels), *_counts(None, counted), ""))
     for name, one in entry["controls"].items():
         if one["measures"]:
-            rows.append((f"control: {name}", *_values(one["measures"], labels), *_counts(one["counted"], counted), ""))
+            rows.append(
+                (f"control: {name}", *_values(one["measures"], labels), *_counts(one["correct_counts"], counted), "")
+            )
     first = next(iter(entry["rows"].values()))["measures"]
-    chance = [percent(first[key]["chance"][0]) if key in first else NOTHING for key in labels]
+    chance = [percent(first[key]["chance"][0]) if key in first else MISSING_VALUE for key in labels]
     rows.append(("chance, closed form", *chance, *_counts(None, counted), ""))
     basis = next(iter(first.values()))
     over_choices = entry["unit"] == "choice"
     asked = f"{basis['queries']:,} queries of {basis['objects']} {'object' if over_choices else entry['unit']}s"
     notes = [
-        OVER_CHOICES if over_choices else INTERVALS.format(unit=entry["unit"]),
+        INTERVALS_OVER_CHOICES if over_choices else INTERVALS.format(unit=entry["unit"]),
         f"{asked} {'in all' if over_choices else 'a seed'}. Gallery: {basis['gallery']}.",
     ]
     if counted:
@@ -187,8 +192,8 @@ def numbers(entry: Entry) -> Table:
             "Right: right first guesses, mean of the seeds, with an exact binomial interval: of "
             f"{labels[next(row['counted']['measure'] for row in entry['rows'].values() if row['counted'])]}."
         )
-    if any(FEW in cell for row in rows for cell in row):
-        notes.append(FEW_MEANS)
+    if any(FEW_OBJECTS_MARK in cell for row in rows for cell in row):
+        notes.append(FEW_OBJECTS_NOTE)
     header = ("method", *labels.values(), *(("right",) if counted else ()), "counts as touch")
     return Table(header, tuple(rows), tuple(notes))
 
@@ -206,10 +211,10 @@ def _counts(counted: Mapping[str, Any] | None, wanted: bool) -> list[str]:
 
 def controls(entry: Entry) -> Table:
     """What each control is, and what it gives by the measure that decides."""
-    rows = [("blurred", "each gel image is reduced to a blur of 8 x 6 pixels, in fitting and in judging", "see above")]
+    rows = [("low_pass", "each gel image is reduced to a blur of 8 x 6 pixels, in fitting and in judging", "see above")]
     for name, one in entry["controls"].items():
         value = with_interval(one["measures"].get(entry["main"])) if one["measures"] else f"none: {one['why_not']}"
-        rows.append((name, one["what"], value))
+        rows.append((name, one["description"], value))
     header = ("control", "what was done", f"{entry['labels'][entry['main']]}, %")
     return Table(header, tuple(rows), words=frozenset({1, 2}))
 
@@ -239,7 +244,7 @@ def towers(entry: Entry) -> Table | None:
 
 
 def _points(one: Mapping[str, Any]) -> str:
-    return f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few(one)}"
+    return f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few_objects_mark(one)}"
 
 
 def choices(entry: Entry) -> Table | None:
@@ -248,7 +253,7 @@ def choices(entry: Entry) -> Table | None:
         return None
     rows = []
     for name, row in entry["rows"].items():
-        for label, measures in ((_label(name, row), row["measures"]), (BLURRED, row["blurred"])):
+        for label, measures in ((_label(name, row), row["measures"]), (LOW_PASS_LABEL, row["low_pass"])):
             if measures:
                 rows.append((label, *_spread(measures[entry["main"]])))
     for name, one in entry["controls"].items():
@@ -259,8 +264,8 @@ def choices(entry: Entry) -> Table | None:
 
 
 def _spread(summary: Mapping[str, Any]) -> list[str]:
-    values = (summary[key][0] for key in ("value", "least", "most"))
-    return [*map(percent, values), str(len(summary["by_choice"]))]
+    values = (summary[key][0] for key in ("value", "min", "max"))
+    return [*map(percent, values), str(len(summary["by_split"]))]
 
 
 def contact(entry: Entry) -> Table | None:
@@ -271,7 +276,7 @@ def contact(entry: Entry) -> Table | None:
         if not row["verdict"] or not set(names) <= set(row["measures"]):  # objects of few touches lack some
             continue
         rows.append((_label(name, row), *(with_interval(row["measures"][key]) for key in names)))
-        rows.append((BLURRED, *(with_interval(row["blurred"][key]) for key in names)))
+        rows.append((LOW_PASS_LABEL, *(with_interval(row["low_pass"][key]) for key in names)))
         for which, control in CONTROL_NAMES.items():
             if row[which]:
                 rows.append((f"points over {control}", *(_points(row[which][key]) for key in names)))
@@ -287,7 +292,7 @@ def reliability(entry: Entry) -> Table | None:
     rows = [
         (
             _label(name, row),
-            SEARCHED[searched],
+            SEARCH_SPACES[searched],
             f"{one['from']:.1f} to {one['to']:.1f}",
             f"{one['stated']:.3f}",
             f"{one['true']:.3f}",
@@ -304,7 +309,7 @@ def reliability(entry: Entry) -> Table | None:
         "First guesses of one touch among the objects searched, each shown by one photo, one of them known to be "
         "true; the posterior is fitted on held-out training objects of each fold."
     )
-    header = ("method", "searched", "stated", "mean stated", "true", "difference", "answers")
+    header = ("method", "searched", "confidence", "mean stated", "accuracy", "difference", "answers")
     return Table(header, tuple(rows), (note,), words=frozenset({1}))
 
 
@@ -318,16 +323,16 @@ OVERVIEW = (
 
 def overview(entries: Mapping[str, Entry]) -> Figure:
     """A panel for each protocol, a line for each row: with touches and with blurred ones."""
-    most = max(len(entry["rows"]) for entry in entries.values())
+    max_rows = max(len(entry["rows"]) for entry in entries.values())
     columns = min(2, len(entries))
     lines = -(-len(entries) // columns)
-    figure = canvas(5.2 * columns, lines * (1.1 + 0.42 * most))
+    figure = canvas(5.2 * columns, lines * (1.1 + 0.42 * max_rows))
     panels = figure.subplots(lines, columns, squeeze=False).ravel()
     for panel, entry in zip(panels, entries.values(), strict=False):
         names = list(entry["rows"])
         for place, name in enumerate(names):
             row, style = entry["rows"][name], style_of(name)
-            for measures, shift, fill in ((row["measures"], -0.13, style.colour), (row["blurred"], 0.13, "white")):
+            for measures, shift, fill in ((row["measures"], -0.13, style.colour), (row["low_pass"], 0.13, "white")):
                 if measures is None:
                     continue
                 found = measures[entry["main"]]
@@ -335,7 +340,7 @@ def overview(entries: Mapping[str, Entry]) -> Figure:
                 panel.plot([low, high], [place + shift] * 2, color=style.colour, lw=2, solid_capstyle="butt")
                 panel.plot(value, place + shift, "o", ms=6, mec=style.colour, mfc=fill)
         chance = entry["rows"][names[0]]["measures"][entry["main"]]["chance"][0]
-        panel.axvline(100 * chance, color=FAINT, ls="--", lw=1, zorder=0)
+        panel.axvline(100 * chance, color=MUTED_COLOUR, ls="--", lw=1, zorder=0)
         panel.set_yticks(range(len(names)), [_label(name, entry["rows"][name]) for name in names])
         panel.set_ylim(len(names) - 0.5, -0.5)
         panel.set_title(entry["title"], fontsize=9, loc="left")

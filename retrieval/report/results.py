@@ -9,17 +9,17 @@ from typing import Any
 from _touch_retrieval.files import read_json
 from retrieval.errors import BadInput
 from retrieval.evaluation import SCHEMA_VERSION
-from retrieval.methods import KNOW_NOTHING
+from retrieval.methods import TRIVIAL_BASELINES
 from retrieval.metrics.intervals import FEW_OBJECTS
 from retrieval.metrics.registry import METRICS
 
-NOTHING = "–"
+MISSING_VALUE = "–"
 
 # Order of every table and figure. A method that is not here comes last, under its own name.
-METHODS = {
+METHOD_LABELS = {
     "late_fusion": "late fusion",
     "set_fusion": "set fusion",
-    "prune_rerank": "prune + rerank",
+    "retrieve_rerank": "prune + rerank",
     "contrastive": "contrastive, InfoNCE",
     "contrastive_sigmoid": "contrastive, sigmoid",
     "cca_towers": "CCA, tower by tower",
@@ -42,13 +42,13 @@ class Results:
     @property
     def methods(self) -> list[str]:
         """The methods that were judged, in the order of METHODS."""
-        known = list(METHODS)
+        known = list(METHOD_LABELS)
         return sorted(self.data["methods"], key=lambda name: (known.index(name) if name in known else 99, name))
 
     @property
     def learned(self) -> list[str]:
         """The methods that look at their input."""
-        return [name for name in self.methods if name not in KNOW_NOTHING]
+        return [name for name in self.methods if name not in TRIVIAL_BASELINES]
 
     def summary(self, method: str, measure: str) -> Summary | None:
         """Value, interval, chance and basis of a measure; None where it was not taken."""
@@ -91,10 +91,10 @@ def read_results_file(path: Path, version: int | None, command: str) -> dict[str
 
 def method_label(name: str) -> str:
     """What a method is called in the report."""
-    return METHODS.get(name, name.rpartition(":")[2].replace("_", " "))
+    return METHOD_LABELS.get(name, name.rpartition(":")[2].replace("_", " "))
 
 
-def at_start(label: str) -> str:
+def capitalized(label: str) -> str:
     """The label as a sentence begins with it: CCA stays CCA."""
     return label[:1].upper() + label[1:]
 
@@ -106,11 +106,11 @@ def measure_label(name: str) -> str:
 
 def percent(share: float | None, digits: int = 1) -> str:
     """A share in percent, without the sign."""
-    return NOTHING if share is None else f"{100 * share:.{digits}f}"
+    return MISSING_VALUE if share is None else f"{100 * share:.{digits}f}"
 
 
-FEW = " †"
-FEW_MEANS = (
+FEW_OBJECTS_MARK = " †"
+FEW_OBJECTS_NOTE = (
     f"† Fewer than {FEW_OBJECTS} objects: the interval is too narrow. In simulated samples it held the truth in "
     "50 % of cases for 2 objects, 74 % for 3 and 87 % for 4, instead of 95 %."
 )
@@ -119,20 +119,20 @@ FEW_MEANS = (
 def with_interval(summary: Summary | None, place: int = 0) -> str:
     """Value and interval in percent, as in "71.2 [65.0, 77.1]"; marked where objects are too few for it."""
     if summary is None or summary["value"][place] is None:
-        return NOTHING
+        return MISSING_VALUE
     low, high = percent(summary["low"][place]), percent(summary["high"][place])
-    return f"{percent(summary['value'][place])} [{low}, {high}]{few(summary)}"
+    return f"{percent(summary['value'][place])} [{low}, {high}]{few_objects_mark(summary)}"
 
 
-def few(summary: Mapping[str, Any]) -> str:
+def few_objects_mark(summary: Mapping[str, Any]) -> str:
     """The mark of an interval from too few objects, else nothing."""
-    return FEW if summary.get("few_objects") else ""
+    return FEW_OBJECTS_MARK if summary.get("few_objects") else ""
 
 
-def number(value: float | None) -> str:
+def format_number(value: float | None) -> str:
     """Three significant digits; whole numbers and all from 100 on without a point."""
     if value is None:
-        return NOTHING
+        return MISSING_VALUE
     return f"{value:,.0f}" if abs(value) >= 99.95 or value == int(value) else f"{value:#.3g}"
 
 
@@ -141,7 +141,7 @@ def file_name(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name)
 
 
-def short(name: str, length: int) -> str:
+def shortened(name: str, length: int) -> str:
     """The name, its middle left out where it is longer than `length`: the ends tell objects apart."""
     if len(name) <= length:
         return name

@@ -4,20 +4,20 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from retrieval.methods import KNOW_NOTHING
+from retrieval.methods import TRIVIAL_BASELINES
 from retrieval.metrics.registry import METRICS
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Table
 from retrieval.report.results import (
-    FEW,
-    FEW_MEANS,
-    NOTHING,
+    FEW_OBJECTS_MARK,
+    FEW_OBJECTS_NOTE,
+    MISSING_VALUE,
     Results,
     Summary,
-    few,
+    few_objects_mark,
+    format_number,
     measure_label,
     method_label,
-    number,
     percent,
     with_interval,
 )
@@ -42,10 +42,10 @@ def guesses(results: Results, measure: str) -> Table | None:
     return _table(results, [(f"N = {place + 1}", measure, place) for place in range(max(lengths, default=0))])
 
 
-def _explained(table: Table) -> Table:
+def _with_notes(table: Table) -> Table:
     """The table, with what its marks mean below it."""
-    if any(FEW in cell for row in table.rows for cell in row):
-        return dataclasses.replace(table, notes=(*table.notes, FEW_MEANS))
+    if any(FEW_OBJECTS_MARK in cell for row in table.rows for cell in row):
+        return dataclasses.replace(table, notes=(*table.notes, FEW_OBJECTS_NOTE))
     return table
 
 
@@ -61,8 +61,8 @@ def _table(results: Results, columns: Sequence[Column]) -> Table | None:
     chance = ["chance, closed form"]
     for _, key, place in columns:
         found = [summary for name in results.methods if (summary := results.summary(name, key))]
-        chance.append(" or ".join(sorted({percent(summary["chance"][place]) for summary in found})) or NOTHING)
-    return _explained(
+        chance.append(" or ".join(sorted({percent(summary["chance"][place]) for summary in found})) or MISSING_VALUE)
+    return _with_notes(
         Table(
             ("method, %", *(heading for heading, _, _ in columns)),
             (*rows, tuple(chance)),
@@ -76,7 +76,7 @@ def _without_threshold(results: Results) -> list[str]:
     """Which methods have no pair accuracy, and why."""
     reasons: dict[str, list[str]] = {}
     for name in results.methods:
-        if why := (results.data["methods"][name].get("pair_threshold") or {}).get("why_not"):
+        if why := (results.data["methods"][name].get("pair_threshold") or {}).get("reason"):
             reasons.setdefault(why, []).append(method_label(name))
     return [f"No pair accuracy of {', '.join(names)}: {why}." for why, names in reasons.items()]
 
@@ -135,7 +135,7 @@ def everything(results: Results) -> Table:
         if (found := results.summary(name, key))
     ]
     header = ("method", "measure", "value [interval], %", "chance, %", "by seed, %", "queries", "objects", "gallery")
-    return _explained(Table(header, tuple(rows), words=frozenset({1, 7})))
+    return _with_notes(Table(header, tuple(rows), words=frozenset({1, 7})))
 
 
 def comparisons(results: Results) -> Table:
@@ -144,7 +144,7 @@ def comparisons(results: Results) -> Table:
         (
             f"{method_label(one['a'])} − {method_label(one['b'])}",
             measure_label(one["measure"]),
-            f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few(one)}",
+            f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few_objects_mark(one)}",
             probability(one["p"]),
         )
         for one in results.data["comparisons"]
@@ -152,7 +152,7 @@ def comparisons(results: Results) -> Table:
     note = (
         "Same queries for both. Interval: bootstrap over objects; p: sign flips of the objects' differences, two-sided."
     )
-    return _explained(Table(("methods", "measure", "difference, points", "p"), tuple(rows), (note,), frozenset({1})))
+    return _with_notes(Table(("methods", "measure", "difference, points", "p"), tuple(rows), (note,), frozenset({1})))
 
 
 def probability(value: float) -> str:
@@ -162,48 +162,50 @@ def probability(value: float) -> str:
 
 def controls(results: Results) -> Table:
     """What late fusion gives when the answer is taken out of its input, and whether that is chance."""
-    keys = ("pair_accuracy", "guesses_k5")
+    keys = ("pair_accuracy", "topn_k5")
     real = (with_interval(results.summary("late_fusion", key)) for key in keys)
     rows = [("the result", "late fusion as it is", *real, "")]
     for name, control in results.data["controls"].items():
-        left, at_chance = (control["measures"].get(key) for key in keys), NOTHING
+        left, at_chance = (control["measures"].get(key) for key in keys), MISSING_VALUE
         if found := next((control["measures"][key] for key in keys if key in control["measures"]), None):
             at_chance = "yes" if found["low"][0] <= found["chance"][0] <= found["high"][0] else "no"
-        rows.append((name, control["what"], *map(with_interval, left), at_chance))
+        rows.append((name, control["description"], *map(with_interval, left), at_chance))
     header = ("control", "what was done", *(f"{measure_label(key)}, %" for key in keys), "chance in the interval")
-    return _explained(Table(header, tuple(rows), tuple(_without_threshold(results)), words=frozenset({1})))
+    return _with_notes(Table(header, tuple(rows), tuple(_without_threshold(results)), words=frozenset({1})))
 
 
 def ceilings(results: Results) -> Table:
     """CCA between touch and photo, and between two touches or two photos of an object."""
-    keys = ("pair_accuracy", "guesses_k5", "guesses_k10")
+    keys = ("pair_accuracy", "topn_k5", "topn_k10")
     rows = [
-        (name.replace("_", " "), one["what"], *(with_interval(one["measures"].get(key)) for key in keys))
+        (name.replace("_", " "), one["description"], *(with_interval(one["measures"].get(key)) for key in keys))
         for name, one in results.data["ceilings"].items()
     ]
     if "cca" in results.methods:
         real = (with_interval(results.summary("cca", key)) for key in keys)
         rows.insert(0, ("touch to photo", "the result of CCA", *real))
     header = ("ceiling", "what was done", *(f"{measure_label(key)}, %" for key in keys))
-    return _explained(Table(header, tuple(rows), words=frozenset({1})))
+    return _with_notes(Table(header, tuple(rows), words=frozenset({1})))
 
 
-def faint(results: Results) -> Table:
+def low_contact(results: Results) -> Table:
     """The faintest touches and the others, of every method that looks at them."""
-    keys = ("pair_accuracy", "guesses_k5", "guesses_k10")
+    keys = ("pair_accuracy", "topn_k5", "topn_k10")
     rows = [
         (method_label(name), words, *(with_interval(parts[part].get(key)) for key in keys))
-        for name, parts in results.data["faint"]["methods"].items()
-        if name not in KNOW_NOTHING
-        for part, words in (("faint", "faintest"), ("others", "others"))
+        for name, parts in results.data["low_contact"]["methods"].items()
+        if name not in TRIVIAL_BASELINES
+        for part, words in (("low_contact", "faintest"), ("others", "others"))
     ]
     header = ("method", "touches", *(f"{measure_label(key)}, %" for key in keys))
-    return _explained(Table(header, tuple(rows), words=frozenset({1})))
+    return _with_notes(Table(header, tuple(rows), words=frozenset({1})))
 
 
 def rejects(results: Results) -> Table:
     """The decision that the object is in the catalogue."""
-    found = {name: results.data["methods"][name]["reject"] for name in results.methods if _has(results, name, "reject")}
+    found = {
+        name: results.data["methods"][name]["reject"] for name in results.methods if _has_entry(results, name, "reject")
+    }
     rows = [
         (
             method_label(name),
@@ -220,7 +222,7 @@ def rejects(results: Results) -> Table:
         "Balanced accuracy is that of accepting where the posterior, fitted on validation objects, thinks one of the "
         f"gallery's at least as likely as none: {FORMULA}.",
     )
-    return _explained(Table(header, tuple(rows), notes))
+    return _with_notes(Table(header, tuple(rows), notes))
 
 
 def rejects_by_grasps(results: Results) -> Table | None:
@@ -228,7 +230,7 @@ def rejects_by_grasps(results: Results) -> Table | None:
     found = {
         name: results.data["methods"][name]["reject"]["by_grasps"]
         for name in results.methods
-        if _has(results, name, "reject")
+        if _has_entry(results, name, "reject")
     }
     sizes = sorted({int(grasps) for one in found.values() for grasps in one})
     if len(sizes) < 2:
@@ -241,10 +243,10 @@ def rejects_by_grasps(results: Results) -> Table | None:
     ]
     header = ("%, by grasps in a query", *map(str, sizes))
     note = "A set of grasps is asked as a whole; each number of grasps has a posterior of its own."
-    return _explained(Table(header, tuple(rows), (note,)))
+    return _with_notes(Table(header, tuple(rows), (note,)))
 
 
-def _has(results: Results, name: str, what: str) -> bool:
+def _has_entry(results: Results, name: str, what: str) -> bool:
     return bool(results.data["methods"][name].get(what))
 
 
@@ -273,15 +275,15 @@ def times(results: Results) -> Table:
         "query_ms": "a query, ms",
     }
     rows = [
-        (method_label(name), *(number(results.time(name, key)) for key in columns))
+        (method_label(name), *(format_number(results.time(name, key)) for key in columns))
         for name in results.methods
         if name in results.timings.get("methods", {})
     ]
     towers, machine = results.timings.get("encode", {}), results.timings.get("machine", {})
     note = (
-        f"On {machine.get('cpus', NOTHING)} CPU(s) with {machine.get('threads', NOTHING)} thread(s). Times of the "
+        f"On {machine.get('cpus', MISSING_VALUE)} CPU(s) with {machine.get('threads', MISSING_VALUE)} thread(s). Times of the "
         "methods alone: one query is one touch against the whole gallery, features given. The towers, shared "
-        f"by all methods, take {number(towers.get('touch_ms'))} ms for a touch and {number(towers.get('photo_ms'))} ms "
+        f"by all methods, take {format_number(towers.get('touch_ms'))} ms for a touch and {format_number(towers.get('photo_ms'))} ms "
         "for a photo."
     )
     return Table(("method", *columns.values()), tuple(rows), (note,))
@@ -301,10 +303,15 @@ def audit(found: Any) -> Table:
     points = [f"{100 * share:g} %" if share else "nearest" for share in found["quantiles"]]
     rows = []
     for kind, frames in found["frames"].items():
-        for key, what in (("to_seen", "to training and validation objects"), ("within_object", "to its own object")):
-            values = [f"{value:.2f}" for value in frames[key] or ()] or [NOTHING] * len(points)
+        for key, what in (
+            ("to_train_validation", "to training and validation objects"),
+            ("within_object", "to its own object"),
+        ):
+            values = [f"{value:.2f}" for value in frames[key] or ()] or [MISSING_VALUE] * len(points)
             counts = (
-                (f"{frames['close']} of {frames['checked']:,}", f"{frames['test']:,}") if key == "to_seen" else ("", "")
+                (f"{frames['near_copies']} of {frames['checked']:,}", f"{frames['test']:,}")
+                if key == "to_train_validation"
+                else ("", "")
             )
             rows.append((f"{kind}, {what}", *values, *counts))
     return Table(

@@ -5,13 +5,13 @@ from collections.abc import Collection, Sequence
 from itertools import chain, repeat
 from typing import TYPE_CHECKING
 
-from retrieval.console.output import printable, printing, show
+from retrieval.console.output import checked_stdout, printable, show
 from retrieval.search.query.answer import NearestReference, QueryResult
 
 if TYPE_CHECKING:
     from retrieval.report.results import Results
 
-MEASURES = ("pair_accuracy", "guesses_k5", "guesses_k10", "map")
+MEASURES = ("pair_accuracy", "topn_k5", "topn_k10", "map")
 """What the table of an evaluation shows; the report has the others."""
 
 
@@ -36,7 +36,7 @@ def print_table(result: QueryResult) -> None:
     if any(match.reference for match in result.results):
         header += ("nearest touch", "cosine", "adds")
         nearest = chain((_reference(match.reference) for match in result.results), repeat(_reference(None)))
-        rows = [(*row, *told) for row, told in zip(rows, nearest, strict=False)]
+        rows = [(*row, *reference_cells) for row, reference_cells in zip(rows, nearest, strict=False)]
     print_columns("Which object is in the hand?", header, rows, words=(1, 5, 6))
 
 
@@ -60,10 +60,10 @@ def print_measures(results: "Results") -> None:
 
 def print_columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int]) -> None:
     """Print a table of text. words: columns of names, set to the left; numbers are set to the right."""
-    seen = [[printable(cell) for cell in row] for row in rows]
+    printable_rows = [[printable(cell) for cell in row] for row in rows]
     if not sys.stdout.isatty():
-        widths = [max(map(len, column)) for column in zip(header, *seen, strict=True)]
-        for row in (header, *seen):
+        widths = [max(map(len, column)) for column in zip(header, *printable_rows, strict=True)]
+        for row in (header, *printable_rows):
             cells = enumerate(zip(row, widths, strict=True))
             aligned = [cell.ljust(width) if at in words else cell.rjust(width) for at, (cell, width) in cells]
             show("  ".join(aligned).rstrip())
@@ -76,7 +76,7 @@ def print_columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str
     for column, name in enumerate(header):
         # Names are the answer: folded where they are long, never cut.
         table.add_column(name, justify="left" if column in words else "right", overflow="fold")
-    for row in seen:
+    for row in printable_rows:
         table.add_row(*map(Text, row))  # as Text: a name may hold what rich takes for markup, such as "[bold]"
-    with printing():
+    with checked_stdout():
         Console().print(table)

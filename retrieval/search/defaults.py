@@ -13,21 +13,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from _touch_retrieval.files import file_digest, read_json, write_atomically
-from retrieval.data.storage import is_url, place_of
+from retrieval.data.storage import is_url, url_or_path
 from retrieval.errors import BadInput, CheckpointError
 
 if TYPE_CHECKING:
-    from indexes.store.cluster import ClusterManifest
     from indexes.store.manifest import Manifest
+    from indexes.store.sharded import ShardedManifest
 
 SHIPPED = {2: "simulated-mobilenet.safetensors", 1: "simulated-mobilenet-one-finger.safetensors"}
 """The checkpoints that come with the package, by the gel images of a touch."""
-NAMED = {"shipped": 2, "shipped-one-finger": 1}
+SHIPPED_NAMES = {"shipped": 2, "shipped-one-finger": 1}
 """What they are called where a command takes a checkpoint."""
 INDEX = Path("index")
 """Where `build-index` writes and `query` looks, if nothing else is said."""
 
-MOST_FOLDERS = 100
+MAX_FOLDERS = 100
 """Of how many working folders it is remembered what was made there last."""
 
 
@@ -52,16 +52,16 @@ def is_shipped(path: Path) -> bool:
 def find_model(given: str | None, index: str | Path = INDEX) -> tuple[Path, str]:
     """The checkpoint to use and why: the one given, else that of `index`, else the last trained here, else the shipped.
 
-    given: a path, or one of `NAMED`. Raises CheckpointError where there is none, or where that of `index` is gone.
+    given: a path, or one of `SHIPPED_NAMES`. Raises CheckpointError where there is none, or where that of `index` is gone.
     """
-    if given in NAMED:
-        return shipped_model(NAMED[given]), "shipped; trained on the simulated rig"
+    if given in SHIPPED_NAMES:
+        return shipped_model(SHIPPED_NAMES[given]), "shipped; trained on the simulated rig"
     if given is not None:
         return Path(given), "given"
     from indexes.errors import IndexesError
 
-    here = _trained_here()
-    manifest: Manifest | ClusterManifest | None = None
+    here = _last_model()
+    manifest: Manifest | ShardedManifest | None = None
     with suppress(IndexesError):  # no usable index is none
         manifest = manifest_of(index)
     if manifest is not None:
@@ -75,17 +75,20 @@ def find_model(given: str | None, index: str | Path = INDEX) -> tuple[Path, str]
     raise CheckpointError("there is no trained model; make one with `retrieve train`, or name it with --model")
 
 
-def manifest_of(index: str | Path) -> "Manifest | ClusterManifest":
+def manifest_of(index: str | Path) -> "Manifest | ShardedManifest":
     """What an index folder, or a cluster of them, says of what it holds now. Raises the errors of `indexes.store`, and
-    StorageError of what lies behind a URL."""
+    StorageError of what lies behind a URL.
+    """
     from indexes.store.folder import IndexStore
     from indexes.store.manifest import read_manifest
-    from retrieval.search.sharding.object_store import is_cluster, read_cluster
+    from retrieval.search.sharding.object_store import is_sharded, read_sharded_manifest
 
-    return read_cluster(index) if is_cluster(index) else read_manifest(Path(index) / IndexStore(index).current())
+    return (
+        read_sharded_manifest(index) if is_sharded(index) else read_manifest(Path(index) / IndexStore(index).current())
+    )
 
 
-def model_of(manifest: "Manifest | ClusterManifest") -> Path:
+def model_of(manifest: "Manifest | ShardedManifest") -> Path:
     """The checkpoint that built an index: where it lay then, else the last trained here or the shipped one, if equal.
 
     Raises CheckpointError where none is.
@@ -93,7 +96,7 @@ def model_of(manifest: "Manifest | ClusterManifest") -> Path:
     path = Path(str(manifest.about.get("checkpoint")))
     if path.is_file():
         return path
-    for other in (_trained_here(), shipped_model()):
+    for other in (_last_model(), shipped_model()):
         if other is not None and other.is_file() and file_digest(other) == manifest.fingerprint.get("checkpoint"):
             return other
     raise CheckpointError(
@@ -103,15 +106,16 @@ def model_of(manifest: "Manifest | ClusterManifest") -> Path:
 
 def find_index(given: str | None) -> tuple[str | Path, str]:
     """The index to use, a folder or a URL, and why: the one given, else ./index, else the last one built from this
-    folder. Raises BadInput where there is none."""
+    folder. Raises BadInput where there is none.
+    """
     if given is not None:
         if not is_url(given) and Path(given).is_file():
             raise BadInput(f"{given} is a file; an index is a folder, which `retrieve build-index` writes")
-        return place_of(given), "given"
+        return url_or_path(given), "given"
     if _is_index(INDEX):
         return INDEX, "in this folder"
-    if (last := _noted().get("index")) and (is_url(last) or _is_index(Path(last))):
-        return place_of(last), "the last one built from this folder"
+    if (last := _last_of_folder().get("index")) and (is_url(last) or _is_index(Path(last))):
+        return url_or_path(last), "the last one built from this folder"
     raise BadInput(
         "there is no index in this folder and none was built from it; run `retrieve build-index CATALOGUE` first, "
         "or name one with --index"
@@ -120,37 +124,37 @@ def find_index(given: str | None) -> tuple[str | Path, str]:
 
 def _is_index(folder: Path) -> bool:
     """Whether an index folder or a cluster of them lies there."""
-    return any((folder / name).is_file() for name in ("CURRENT", "CLUSTER.json"))
+    return any((folder / name).is_file() for name in ("CURRENT", "SHARDS.json"))
 
 
 def remember(kind: str, path: str | Path) -> None:
     """Note `path` as the last "model" or "index" made from the working folder; does nothing where it cannot."""
     try:
         here = str(Path.cwd())
-        notes = _notes()
+        notes = _read_state()
         mine = {**notes.pop(here, {}), kind: str(path if is_url(path) else Path(path).resolve())}
-        notes = {**dict(list(notes.items())[-MOST_FOLDERS + 1 :]), here: mine}
+        notes = {**dict(list(notes.items())[-MAX_FOLDERS + 1 :]), here: mine}
         _state_file().parent.mkdir(parents=True, exist_ok=True)
         write_atomically(_state_file(), json.dumps(notes).encode())
     except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
         return
 
 
-def _trained_here() -> Path | None:
+def _last_model() -> Path | None:
     """The last model trained from the working folder, while it is there."""
-    path = Path(_noted().get("model", ""))
+    path = Path(_last_of_folder().get("model", ""))
     return path if path.is_file() else None
 
 
-def _noted() -> dict[str, str]:
+def _last_of_folder() -> dict[str, str]:
     """The last "model" and "index" that were made from the working folder, by their whole paths."""
     try:
-        return _notes().get(str(Path.cwd()), {})
+        return _read_state().get(str(Path.cwd()), {})
     except OSError:  # the working folder was removed
         return {}
 
 
-def _notes() -> dict[str, dict[str, str]]:
+def _read_state() -> dict[str, dict[str, str]]:
     """By working folder, the one noted last at the end."""
     try:
         notes = read_json(_state_file())

@@ -9,11 +9,11 @@ from retrieval.data.resize import RgbImage
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import encode_photos
-from retrieval.model.touches import AnyImage, Encoded, read_image
+from retrieval.model.touches import AnyImage, EncodedTouches, read_image
 from retrieval.search.defaults import find_model
 
 
-def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint | None = None) -> Encoded:
+def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint | None = None) -> EncodedTouches:
     """The unit embeddings (N, embedding_dim) and halves (N, half) of N photos, in their order, float32.
 
     photos: paths, bytes of files, Pillow images or uint8 arrays (height, width, 3), red first. model: a checkpoint or
@@ -22,10 +22,10 @@ def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint |
     BadInput where there is no photo, and CheckpointError.
 
     >>> photos = ["catalog/mug/1.jpg", "catalog/tin/1.jpg"]
-    >>> embeddings, halves = retrieval.embed_photos(photos, model="model.safetensors")
+    >>> embeddings, partials = retrieval.embed_photos(photos, model="model.safetensors")
     >>> with retrieval.open("index") as searcher:
     ...     touch = searcher.encode(["a.png", "b.png"])
-    ...     logits = searcher.judge.logits(touch.halves, halves)
+    ...     logits = searcher.scorer.logits(touch.partials, partials)
     >>> scores = touch.embeddings @ embeddings.T  # a row for each grasp
     >>> scores.shape, logits.shape
     ((1, 2), (2,))
@@ -37,15 +37,15 @@ def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint |
     if not isinstance(model, Checkpoint):
         model = load_checkpoint(find_model(None)[0] if model is None else Path(model))
     settings = model.config.preprocessing
-    images = (_seen(photo, f"photo {number}", settings) for number, photo in enumerate(photos, start=1))
+    images = (_preprocess(photo, f"photo {number}", settings) for number, photo in enumerate(photos, start=1))
     code = encode_photos(model.matcher, images)
-    return Encoded(code.embedding.numpy(), code.half.numpy())
+    return EncodedTouches(code.embedding.numpy(), code.partial.numpy())
 
 
-def _seen(photo: AnyImage, name: str, settings: Preprocessing) -> RgbImage:
+def _preprocess(photo: AnyImage, name: str, settings: Preprocessing) -> RgbImage:
     """What the tower sees of a photo, which a file or its bytes say how to decode."""
     if isinstance(photo, str | os.PathLike):
         return settings.load_photo(os.fspath(photo))
     if isinstance(photo, bytes | bytearray | memoryview):
-        return settings.photo_of(bytes(photo), name)
+        return settings.photo_from_bytes(bytes(photo), name)
     return settings.photo(read_image(photo, name))

@@ -16,13 +16,13 @@ from pydantic import BaseModel
 from threadpoolctl import threadpool_limits
 
 from retrieval.search.query.opening import OpenShards
-from retrieval.serve import catalogue, errors, health, history, human, live, page_files, queries
+from retrieval.serve import catalogue, errors, health, history, human_baseline, live, page_files, queries
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
 from retrieval.serve.health import SessionBody
 from retrieval.serve.history import FeedbackBody
-from retrieval.serve.human import ChoiceBody, NewRun
-from retrieval.serve.keeping import Keeping, Recorder
+from retrieval.serve.history_writer import HistoryWriter, Recorder
+from retrieval.serve.human_baseline import ChoiceBody, RunBody
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.queries import AgreementBody
 from retrieval.serve.queue import Queue
@@ -37,7 +37,7 @@ from retrieval.version import __version__
 log = logging.getLogger(__name__)
 THREADS = 4
 """That read files and make thumbnails; the model and the rig have their own."""
-MAX_GRASPS = 4
+MAX_RIG_GRASPS = 4
 """Grasps of the rig that are held at once, the one in work among them."""
 MAX_FRAMES = 8
 """Requests for single pictures of a sensor that are held at once, besides streams."""
@@ -48,7 +48,7 @@ _BODIES: tuple[type[BaseModel], ...] = (
     BatchBody,
     AgreementBody,
     FeedbackBody,
-    NewRun,
+    RunBody,
     ChoiceBody,
     SessionBody,
     errors.ProblemDocument,
@@ -72,21 +72,21 @@ def create_app(
     metrics, rig = Metrics(), rig or LiveRig()
     generations = Generations(settings, metrics, shards)
     decoders = Decoders()
-    alone = replace(settings, workers=1, batch_most=1, batch_ms=0.0)
+    single = replace(settings, workers=1, max_batch=1, batch_ms=0.0)
     parts = Service(
         settings,
         metrics,
         generations,
         decoders,
         Queue(generations, settings, metrics, decoders),
-        Queue(generations, replace(alone, queue=MAX_GRASPS), metrics, decoders),
+        Queue(generations, replace(single, queue=MAX_RIG_GRASPS), metrics, decoders),
         {
-            name: Queue(generations, replace(alone, queue=settings.streams + MAX_FRAMES), metrics, decoders)
+            name: Queue(generations, replace(single, queue=settings.streams + MAX_FRAMES), metrics, decoders)
             for name in rig.sensors
         },
         rig,
         Thumbnails(),
-        Keeping(settings.history, recorder, settings, metrics) if settings.history and recorder else None,
+        HistoryWriter(settings.history, recorder, settings, metrics) if settings.history and recorder else None,
         Trials(trials) if trials else None,
         asyncio.Semaphore(settings.streams),
     )
@@ -100,8 +100,8 @@ def create_app(
         separate_input_output_schemas=False,
     )
     app.state.service = parts
-    errors.install(app)
-    for paths in (queries, catalogue, live, history, human, health):
+    errors.install_handlers(app)
+    for paths in (queries, catalogue, live, history, human_baseline, health):
         app.include_router(paths.router)
     app.include_router(page_files.router_of())
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
@@ -121,21 +121,21 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
     queues = (parts.queue, parts.grasps, *parts.frames.values())
     for queue in queues:
         queue.start()
-    if parts.keeping:
-        parts.keeping.start()
+    if parts.history_writer:
+        parts.history_writer.start()
     watching = asyncio.ensure_future(parts.generations.watch())
     try:
         with threadpool_limits(parts.settings.threads, "blas"):  # its threads spin between two queries
             yield
     finally:
         parts.stopping.set()
-        if parts.keeping:
-            await parts.keeping.written()
+        if parts.history_writer:
+            await parts.history_writer.drain()
         watching.cancel()
         await asyncio.wait([watching, asyncio.ensure_future(parts.decoders.close())], timeout=_CLOSING_S)
         closing: list[Callable[[], None]] = [partial(queue.close, _CLOSING_S) for queue in queues]
-        if parts.keeping:
-            closing.append(parts.keeping.close)
+        if parts.history_writer:
+            closing.append(parts.history_writer.close)
         await asyncio.wait([_in_daemon(close) for close in closing], timeout=_CLOSING_S)
 
 
@@ -170,7 +170,7 @@ def _document(app: FastAPI) -> dict[str, Any]:
             for operation in path.values():
                 if "application/json" in operation["responses"].get("422", {}).get("content", {}):
                     operation["responses"] |= {
-                        str(status): said for status, said in errors.problems("bad-input").items()
+                        str(status): said for status, said in errors.problem_responses("bad-input").items()
                     }
         app.openapi_schema = document
     return app.openapi_schema

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response
 
 from retrieval.data.images import read_bytes
-from retrieval.data.text import utf8_of
+from retrieval.data.text import replace_surrogates
 from retrieval.errors import ImageError
 from retrieval.report.pages import jpeg, thumbnail
 from retrieval.search.query.neighbours import nearest_photos
@@ -23,34 +23,34 @@ from retrieval.serve.documents import (
     NearPhotosDocument,
     PhotoDocument,
 )
-from retrieval.serve.errors import Problem, problems
-from retrieval.serve.generations import Opened
-from retrieval.serve.keeping import recordable
+from retrieval.serve.errors import HttpProblem, problem_responses
+from retrieval.serve.generations import ServedGeneration
+from retrieval.serve.history_writer import recordable
 from retrieval.serve.service import Parts
 from retrieval.version import __version__
 
 router = APIRouter(tags=["catalogue"])
-SHOWN = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
+BROWSER_IMAGE_TYPES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
 """Files that every browser shows, by their first bytes; others are sent as JPEG."""
-PICTURES: dict[int | str, dict[str, Any]] = {
+IMAGE_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {"content": {"image/jpeg": {}, "image/png": {}}, "description": "the picture"}
 }
-WHOLE_PX = 4096
+MAX_PHOTO_PX = 4096
 """Longer side of a photo that is sent as another file than it is."""
 
 
-def photo_of(opened: Opened, photo: str) -> ListedPhoto:
+def photo_of(generation: ServedGeneration, photo: str) -> ListedPhoto:
     """The photo of that id. Raises Problem where the index has none."""
-    row = _row(opened, photo)
+    row = _row(generation, photo)
     if row.get("touch"):
-        raise Problem("unknown", f"{photo!r} is a gel image of a reference touch, and no photo")
+        raise HttpProblem("unknown", f"{photo!r} is a gel image of a reference touch, and no photo")
     return listed_photo(row)
 
 
-def _row(opened: Opened, photo: str) -> dict[str, object]:
-    (row,) = opened.shard.rows([photo])
+def _row(generation: ServedGeneration, photo: str) -> dict[str, object]:
+    (row,) = generation.shard.rows([photo])
     if row is None:
-        raise Problem("unknown", f"the index has no photo {photo!r}; /v1/catalogue lists them")
+        raise HttpProblem("unknown", f"the index has no photo {photo!r}; /v1/catalogue lists them")
     return row
 
 
@@ -59,19 +59,19 @@ Limit = Annotated[int, Query(ge=1, le=500, description="photos of a page")]
 Search = Annotated[
     str, Query(max_length=200, description="words that object, path and metadata must hold, all of them")
 ]
-Named = Annotated[str | None, Query(max_length=1000, alias="object", description="photos of this object alone")]
+ObjectFilter = Annotated[str | None, Query(max_length=1000, alias="object", description="photos of this object alone")]
 
 
-@router.get("/v1/catalogue", responses=problems("bad-input", "not-ready"))
+@router.get("/v1/catalogue", responses=problem_responses("bad-input", "not-ready"))
 def catalogue(
-    parts: Parts, offset: Offset = 0, limit: Limit = 100, search: Search = "", name: Named = None
+    parts: Parts, offset: Offset = 0, limit: Limit = 100, search: Search = "", name: ObjectFilter = None
 ) -> CatalogueDocument:
     """Photos of the index, in its order, page by page."""
-    opened = parts.generations.current
-    found = opened.shard.page(search.casefold().split(), name, offset, limit)
+    generation = parts.generations.current
+    found = generation.shard.page(search.casefold().split(), name, offset, limit)
     end = offset + len(found.rows)
     return CatalogueDocument(
-        generation=opened.name,
+        generation=generation.name,
         total=found.total,
         offset=offset,
         next=end if offset < end < found.total else None,
@@ -83,22 +83,28 @@ def _document(photo: ListedPhoto) -> PhotoDocument:
     return PhotoDocument(id=photo.path, object_id=photo.object_id, metadata=photo.metadata)
 
 
-@router.get("/v1/photos/{photo:path}", response_class=Response, responses={**PICTURES, **problems("unknown")})
+@router.get(
+    "/v1/photos/{photo:path}", response_class=Response, responses={**IMAGE_RESPONSES, **problem_responses("unknown")}
+)
 def photo(request: Request, photo: str, parts: Parts) -> Response:
     """A photo of the catalogue, or a gel image of a reference touch, as it is; what browsers do not show, as JPEG."""
 
     def read(path: Path, _: dict[str, object]) -> bytes | None:
         data = read_bytes(path)
-        if data.startswith(tuple(SHOWN)):
+        if data.startswith(tuple(BROWSER_IMAGE_TYPES)):
             return data
-        image = thumbnail(path, WHOLE_PX)
+        image = thumbnail(path, MAX_PHOTO_PX)
         return None if image is None else jpeg(image)
 
-    return _catalogue_picture(request, parts, photo, "whole", read)
+    return _catalogue_image_response(request, parts, photo, "whole", read)
 
 
-@router.get("/v1/thumbnails/{photo:path}", response_class=Response, responses={**PICTURES, **problems("unknown")})
-def small(
+@router.get(
+    "/v1/thumbnails/{photo:path}",
+    response_class=Response,
+    responses={**IMAGE_RESPONSES, **problem_responses("unknown")},
+)
+def get_thumbnail(
     request: Request,
     photo: str,
     parts: Parts,
@@ -109,68 +115,68 @@ def small(
     def read(path: Path, row: dict[str, object]) -> bytes | None:
         return parts.thumbnails.of(path, str(row.get("digest")), px)
 
-    return _catalogue_picture(request, parts, photo, str(px), read)
+    return _catalogue_image_response(request, parts, photo, str(px), read)
 
 
-def _catalogue_picture(
+def _catalogue_image_response(
     request: Request, parts: Parts, photo: str, size: str, read: Callable[[Path, dict[str, object]], bytes | None]
 ) -> Response:
     """What `read` makes of the photo's file, PNG or JPEG, unless the client has it; it is gone where that is None."""
-    opened = parts.generations.current
-    row = _row(opened, photo)
+    generation = parts.generations.current
+    row = _row(generation, photo)
     headers = {"etag": f'"{row.get("digest")}-{size}"', "cache-control": "private, no-cache"}
     if row.get("digest") and request.headers.get("if-none-match") == headers["etag"]:
         return Response(status_code=304, headers=headers)
     listed = listed_photo(row)
     data = None
     with suppress(ImageError):
-        data = read(opened.searcher.catalogue / listed.path, row)
+        data = read(generation.searcher.catalogue / listed.path, row)
     if data is None:
-        told = f"the photo {listed.path!r} cannot be read any more; run `retrieve build-index` again"
-        raise Problem("unknown", told)
-    return shown_picture(data, headers)
+        detail = f"the photo {listed.path!r} cannot be read any more; run `retrieve build-index` again"
+        raise HttpProblem("unknown", detail)
+    return image_response(data, headers)
 
 
-def shown_picture(data: bytes, headers: Mapping[str, str] | None = None) -> Response:
+def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Response:
     """A picture's file as a response: PNG or JPEG as it is, another as PNG. Raises ImageError."""
     data = recordable(data)
-    kind = next(kind for magic, kind in SHOWN.items() if data.startswith(magic))
+    kind = next(kind for magic, kind in BROWSER_IMAGE_TYPES.items() if data.startswith(magic))
     return Response(data, media_type=kind, headers=headers)
 
 
-@router.get("/v1/nearest/{photo:path}", responses=problems("unknown", "bad-input"))
+@router.get("/v1/nearest/{photo:path}", responses=problem_responses("unknown", "bad-input"))
 def nearest(photo: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)] = 12) -> NearPhotosDocument:
     """Photos that look to the model like this one."""
-    opened = parts.generations.current
-    photo_of(opened, photo)  # says what is missing
+    generation = parts.generations.current
+    photo_of(generation, photo)  # says what is missing
     items = [
         NearPhoto(**_document(near.photo).model_dump(), score=near.score)
-        for near in nearest_photos(opened.searcher, photo, count)
+        for near in nearest_photos(generation.searcher, photo, count)
     ]
-    return NearPhotosDocument(generation=opened.name, photo=photo, items=items)
+    return NearPhotosDocument(generation=generation.name, photo=photo, items=items)
 
 
-@router.get("/v1/index", responses=problems("not-ready"))
+@router.get("/v1/index", responses=problem_responses("not-ready"))
 def index(parts: Parts) -> IndexDocument:
     """What answers, and with what it is asked."""
-    opened = parts.generations.current
-    searcher, described = opened.searcher, opened.searcher.described
-    measured = described.about.get("candidates") or {}
+    generation = parts.generations.current
+    searcher, info = generation.searcher, generation.searcher.info
+    measured = info.about.get("candidates") or {}
     return IndexDocument(
-        generation=opened.name,
-        kind=described.kind,
-        photos=described.photos,
-        objects=described.objects,
-        model=utf8_of(searcher.checkpoint.path.name),
-        trained_on=utf8_of(str(searcher.checkpoint.provenance.get("source", "unknown"))),
+        generation=generation.name,
+        kind=info.kind,
+        photos=info.photos,
+        objects=info.objects,
+        model=replace_surrogates(searcher.checkpoint.path.name),
+        trained_on=replace_surrogates(str(searcher.checkpoint.provenance.get("source", "unknown"))),
         encoder=searcher.encoder.name,
-        fingers=opened.fingers,
+        fingers=generation.fingers,
         background=searcher.checkpoint.config.preprocessing.background,
         calibrated=searcher.posterior is not None,
         candidates=measured.get("k"),
         sensors=sorted(parts.rig.sensors),
         can_grasp=parts.rig.grasp is not None,
-        keeps=parts.keeping is not None,
-        trials=len(parts.trials.unseen(opened)) if parts.trials else 0,
+        stores_history=parts.history_writer is not None,
+        trials=len(parts.trials.unseen(generation)) if parts.trials else 0,
         version=__version__,
     )

@@ -15,7 +15,7 @@ from PIL import Image
 from retrieval.data.images import read_bytes
 from retrieval.errors import BadInput, ImageError, RetrievalError
 from retrieval.model.gel_images import GelImage
-from retrieval.model.touches import AnyImage, AnyTouches, GivenImage, read_grasps
+from retrieval.model.touches import AnyImage, AnyTouches, InputImage, parse_grasps
 from retrieval.search.query.answer import Match, QueryResult
 
 try:
@@ -23,8 +23,10 @@ try:
 except ImportError as missing:
     raise BadInput("a client needs httpx; run: pip install 'touch-retrieval[serve]'") from missing
 
-_AS_PNG = frozenset({"1", "L", "LA", "P", "RGB", "RGBA"})
-_REFUSED = frozenset({"malformed", "bad-input", "too-large", "unsupported-type", "unknown", "conflict", "no-token"})
+_PNG_MODES = frozenset({"1", "L", "LA", "P", "RGB", "RGBA"})
+_BAD_INPUT_KINDS = frozenset(
+    {"malformed", "bad-input", "too-large", "unsupported-type", "unknown", "conflict", "no-token"}
+)
 
 
 class QueryOptions(TypedDict, total=False):
@@ -68,21 +70,22 @@ class Client:
 
     def query(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> QueryResult:
         """`Searcher.query` with its keywords, answered there. Paths are of this machine, `Match.photo_path` is of the
-        other: `photo` gets the picture. Raises what that raises, and RetrievalError where no answer can be had."""
+        other: `photo` gets the picture. Raises what that raises, and RetrievalError where no answer can be had.
+        """
         return self._ask("query", touches, options)[0]
 
-    def query_growing(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> list[QueryResult]:
-        """`Searcher.query_growing`, answered there; see `query`."""
-        return self._ask("query/growing", touches, options)
+    def query_cumulative(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> list[QueryResult]:
+        """`Searcher.query_cumulative`, answered there; see `query`."""
+        return self._ask("query/cumulative", touches, options)
 
     def query_many(self, objects: Sequence[AnyTouches], **options: Unpack[QueryOptions]) -> list[QueryResult]:
         """`Searcher.query_many`, answered there; see `query`."""
         if not objects:
             return []
-        asked = [self._grasps(one, f"object {number}, ") for number, one in enumerate(objects, start=1)]
-        body = {"objects": [_encoded(grasps) for grasps in asked], **_said(options)}
+        queries = [self._grasps(one, f"object {number}, ") for number, one in enumerate(objects, start=1)]
+        body = {"objects": [_encoded(grasps) for grasps in queries], **_request_options(options)}
         answers = _document(self._send("POST", "query/batch", json=body), "answers")["answers"]
-        return [_result(answer, grasps) for answer, grasps in zip(answers, asked, strict=True)]
+        return [_result(answer, grasps) for answer, grasps in zip(answers, queries, strict=True)]
 
     def photo(self, match: Match) -> bytes:
         """The file of a match's photo. Raises BadInput where it is gone."""
@@ -90,13 +93,13 @@ class Client:
 
     def _ask(self, path: str, touches: AnyTouches, options: QueryOptions) -> list[QueryResult]:
         grasps = self._grasps(touches)
-        answer = _document(self._send("POST", path, json={"touches": _encoded(grasps), **_said(options)}))
+        answer = _document(self._send("POST", path, json={"touches": _encoded(grasps), **_request_options(options)}))
         return [_result(one, grasps) for one in answer.get("answers", [answer])]
 
-    def _grasps(self, touches: AnyTouches, of: str = "") -> list[list[GivenImage]]:
+    def _grasps(self, touches: AnyTouches, of: str = "") -> list[list[InputImage]]:
         if self._fingers is None:
             self._fingers = int(_document(self._send("GET", "index"), "fingers")["fingers"])
-        return read_grasps(touches, self._fingers, of=of)
+        return parse_grasps(touches, self._fingers, of=of)
 
     def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
         """The response; where the service is busy, it is asked again when it says so, until the time is over."""
@@ -108,8 +111,8 @@ class Client:
                 raise RetrievalError(
                     f"{self.url} cannot be reached ({error}); is `retrieve serve` running there?"
                 ) from error
-            told = response.headers.get("retry-after", "")
-            pause = float(told) if told.isdecimal() else 1.0  # a proxy may name a date
+            retry_after = response.headers.get("retry-after", "")
+            pause = float(retry_after) if retry_after.isdecimal() else 1.0  # a proxy may name a date
             if response.status_code not in (429, 503) or time.monotonic() + pause > until:
                 break
             time.sleep(pause)
@@ -120,17 +123,18 @@ class Client:
 
 def _document(response: httpx.Response, *keys: str) -> dict[str, Any]:
     """The JSON object of a response, which has these keys. Raises RetrievalError for another one: what listens there
-    is no service of ours."""
+    is no service of ours.
+    """
     try:
         found = response.json()
     except ValueError as error:
-        raise _not_ours(response) from error
+        raise _unexpected_response(response) from error
     if not isinstance(found, dict) or not all(key in found for key in keys):
-        raise _not_ours(response)
+        raise _unexpected_response(response)
     return found
 
 
-def _not_ours(response: httpx.Response) -> RetrievalError:
+def _unexpected_response(response: httpx.Response) -> RetrievalError:
     return RetrievalError(f"{response.url} answered {response.status_code}, and not as `retrieve serve` does")
 
 
@@ -140,43 +144,43 @@ def _error(response: httpx.Response) -> RetrievalError:
         problem = response.json()
         kind, detail = problem["type"].rpartition(":")[2], problem["detail"]
     except (ValueError, KeyError, TypeError, AttributeError):
-        return _not_ours(response)
+        return _unexpected_response(response)
     if kind == "bad-image":
         name, _, reason = detail.partition(": ")
         return ImageError(name, reason)
-    return BadInput(detail) if kind in _REFUSED else RetrievalError(detail)
+    return BadInput(detail) if kind in _BAD_INPUT_KINDS else RetrievalError(detail)
 
 
-def _result(answer: dict[str, Any], grasps: list[list[GivenImage]]) -> QueryResult:
+def _result(answer: dict[str, Any], grasps: list[list[InputImage]]) -> QueryResult:
     """The answer, whose images are called as they were given here."""
     result = QueryResult.from_dict(answer)
     names = [[image.name for image in grasp] for grasp in grasps]
     return replace(result, touches=names[: len(result.touches)])
 
 
-def _said(options: QueryOptions) -> dict[str, Any]:
+def _request_options(options: QueryOptions) -> dict[str, Any]:
     """The options of a query as the service takes them in a body, beside the touches."""
     frames = options.get("background")
     if frames is None:
         return dict(options)
-    images = [GivenImage(image, f"background {number}") for number, image in enumerate(frames, start=1)]
+    images = [InputImage(image, f"background {number}") for number, image in enumerate(frames, start=1)]
     return {**options, "background": [_base64(image) for image in images]}
 
 
-def _encoded(grasps: list[list[GivenImage]]) -> list[list[str]]:
+def _encoded(grasps: list[list[InputImage]]) -> list[list[str]]:
     return [[_base64(image) for image in grasp] for grasp in grasps]
 
 
-def _base64(given: GivenImage) -> str:
+def _base64(given: InputImage) -> str:
     return base64.b64encode(_file(given)).decode("ascii")
 
 
-def _file(given: GivenImage) -> bytes:
+def _file(given: InputImage) -> bytes:
     """An image as a file that reads as the same numbers there. Raises ImageError."""
     image = given.image
     if isinstance(image, bytes | bytearray | memoryview):
         return bytes(image)
-    if isinstance(image, Image.Image) and image.mode in _AS_PNG:
+    if isinstance(image, Image.Image) and image.mode in _PNG_MODES:
         return _png(image, given.name)
     if isinstance(image, Image.Image | np.ndarray):
         return _png(Image.fromarray(np.rint(255 * given.read()).astype(np.uint8)), given.name)

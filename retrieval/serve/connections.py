@@ -13,7 +13,7 @@ from uvicorn import Config
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
-from retrieval.serve.errors import Problem
+from retrieval.serve.errors import HttpProblem
 
 MAX_CONNECTIONS = 512
 MAX_CONNECTIONS_OF_ADDRESS = 128
@@ -82,7 +82,8 @@ class ConnectionTable:
 
 class _Group:
     """Connections that share a limit. waiting_new, waiting_idle: those that wait for their client, the oldest first
-    (sets in order): before their first request is complete, and later."""
+    (sets in order): before their first request is complete, and later.
+    """
 
     def __init__(self, limit: int) -> None:
         self.limit, self.count = limit, 0
@@ -137,7 +138,8 @@ class Connection(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Bytes of the client have come (asyncio). They are parsed in pieces, so that headers are refused soon after
-        they exceed their limit."""
+        they exceed their limit.
+        """
         start = 0
         while start < len(data) and not self.transport.is_closing():
             piece = data[start : start + (_BODY_PIECE if self._has_request else _HEADER_PIECE)]
@@ -145,7 +147,7 @@ class Connection(H11Protocol):
             if self.conn.their_state is h11.IDLE:
                 self._header_lines += piece.partition(b"\r\n\r\n")[0].count(b"\n")
             if self._header_lines > MAX_HEADERS:
-                self._refuse(Problem("too-large-headers", f"a request may have at most {MAX_HEADERS} headers"))
+                self._refuse(HttpProblem("too-large-headers", f"a request may have at most {MAX_HEADERS} headers"))
                 return
             super().data_received(piece)
             if self._has_request:
@@ -181,10 +183,10 @@ class Connection(H11Protocol):
     def send_400_response(self, msg: str) -> None:
         """Refuse what is not HTTP, or is too much of it (uvicorn)."""
         if self._has_request or len(self.conn.trailing_data[0]) <= MAX_HEADER_BYTES:
-            self._refuse(Problem("malformed", msg))
+            self._refuse(HttpProblem("malformed", msg))
         else:
             self._refuse(
-                Problem("too-large-headers", f"a request may have at most {MAX_HEADER_BYTES:,} bytes of headers")
+                HttpProblem("too-large-headers", f"a request may have at most {MAX_HEADER_BYTES:,} bytes of headers")
             )
 
     def close_if_late(self, now: float) -> None:
@@ -197,10 +199,10 @@ class Connection(H11Protocol):
             self.transport.abort()
         elif self._headers_since is not None and now - self._headers_since > HEADERS_S:
             if self.conn.trailing_data[0]:
-                self._refuse(Problem("too-slow", f"the headers of a request must come within {HEADERS_S:g} s"))
+                self._refuse(HttpProblem("too-slow", f"the headers of a request must come within {HEADERS_S:g} s"))
             self.transport.close()
 
-    def _refuse(self, problem: Problem) -> None:
+    def _refuse(self, problem: HttpProblem) -> None:
         """Answer with a problem document where no response has begun, and close the connection."""
         if self._has_request:
             self.cycle.disconnected = True  # the application's answer comes too late

@@ -18,8 +18,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from retrieval.errors import ImageError
+from retrieval.model.fusion_scorer import BLOCKS
 from retrieval.model.gel_images import GelImage, PictureSize, read_gel_image
-from retrieval.model.judge import BLOCKS
 
 DECODE_CPU_S = 5
 """Processor time of one picture; the slowest one of the most pixels that we could make takes 2 s."""
@@ -66,13 +66,13 @@ def image_of(document: dict[str, Any], content: bytes) -> GelImage | PictureSize
 
 
 def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
-    asked, data = json.loads(requests.read(text)), requests.read(content)
+    options, data = json.loads(requests.read(text)), requests.read(content)
     try:
         _limit(resource.RLIMIT_CPU, math.ceil(time.process_time()) + DECODE_CPU_S)
         if sys.platform == "linux":  # elsewhere the system does not hold a process to it
             pages = int(Path("/proc/self/statm").read_text().split()[5])
             _limit(resource.RLIMIT_DATA, pages * resource.getpagesize() + DECODE_BYTES)
-        found = read_gel_image(data, **asked)
+        found = read_gel_image(data, **options)
     except ImageError as error:
         if isinstance(error.__cause__, MemoryError):
             return frame({"memory": DECODE_BYTES})

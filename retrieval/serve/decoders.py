@@ -16,7 +16,7 @@ from retrieval.data.images import MAX_PIXELS
 from retrieval.errors import ImageError, RetrievalError
 from retrieval.model.gel_images import GelImage, PictureSize
 from retrieval.serve.decode_process import DECODE_BYTES, DECODE_CPU_S, LENGTHS, READY, frame, image_of
-from retrieval.serve.errors import Problem
+from retrieval.serve.errors import HttpProblem
 from retrieval.serve.settings import MAX_BODY_PIXELS
 
 PROGRAM = "from retrieval.serve.decode_process import serve_pictures; serve_pictures()"
@@ -47,13 +47,13 @@ class Decoders:
         idle, self._idle = self._idle, []
         await asyncio.gather(*self._ending, *(process.end() for process in idle))
 
-    async def read(self, named: Sequence[tuple[str, bytes]], px: int, compares: bool) -> list[GelImage]:
+    async def read(self, named: Sequence[tuple[str, bytes]], px: int, compares_contact: bool) -> list[GelImage]:
         """Read pictures, each with its name, at the sizes of a model whose `touch_px` is px.
 
         Nothing large is decoded before the sizes of all are known. Raises ImageError for the first picture that cannot
         be used, and Problem for pictures that are too large together.
         """
-        small = (self._read_small(name, data, px, compares) for name, data in named)
+        small = (self._read_small(name, data, px, compares_contact) for name, data in named)
         found = await asyncio.gather(*small, return_exceptions=True)
         for (name, _), one in zip(named, found, strict=True):
             if isinstance(one, BaseException):
@@ -64,7 +64,7 @@ class Decoders:
         first = [one for one in found if not isinstance(one, BaseException)]
         total = sum(one.pixels for one in first if isinstance(one, PictureSize))
         if total > MAX_BODY_PIXELS:
-            raise Problem(
+            raise HttpProblem(
                 "too-large",
                 f"the pictures of a request may have {MAX_BODY_PIXELS:,} pixels together; "
                 f"the large ones have {total:,}",
@@ -73,30 +73,36 @@ class Decoders:
         for (name, data), one in zip(named, first, strict=True):
             if isinstance(one, PictureSize):
                 async with self._large:
-                    one = await self._run(name, data, px, compares, MAX_PIXELS)
+                    one = await self._run(name, data, px, compares_contact, MAX_PIXELS)
             assert isinstance(one, GelImage), "of MAX_PIXELS at most"
             images.append(one)
         return images
 
-    async def _read_small(self, name: str, data: bytes, px: int, compares: bool) -> GelImage | PictureSize:
+    async def _read_small(self, name: str, data: bytes, px: int, compares_contact: bool) -> GelImage | PictureSize:
         """A small picture, or the size of a large one. Its process goes on where nobody waits for it any more: it will
-        be needed sooner than a new one could start."""
+        be needed sooner than a new one could start.
+        """
         await self._small.acquire()
-        task = asyncio.ensure_future(self._run(name, data, px, compares, SMALL_PIXELS))
+        task = asyncio.ensure_future(self._run(name, data, px, compares_contact, SMALL_PIXELS))
         self._running.add(task)
-        task.add_done_callback(self._read_one)
+        task.add_done_callback(self._release_slot)
         return await asyncio.shield(task)
 
-    def _read_one(self, task: asyncio.Task[GelImage | PictureSize]) -> None:
+    def _release_slot(self, task: asyncio.Task[GelImage | PictureSize]) -> None:
         self._running.discard(task)
         self._small.release()
 
-    async def _run(self, name: str, data: bytes, px: int, compares: bool, most: int) -> GelImage | PictureSize:
+    async def _run(
+        self, name: str, data: bytes, px: int, compares_contact: bool, max_pixels: int
+    ) -> GelImage | PictureSize:
         """What a process makes of a picture; it is ended where this is cancelled. Raises ImageError, and RetrievalError
-        where no process can be started."""
+        where no process can be started.
+        """
         process = self._idle.pop() if self._idle else await _Process.start()
         try:
-            document, content = await process.ask({"name": name, "px": px, "compares": compares, "most": most}, data)
+            document, content = await process.request(
+                {"name": name, "px": px, "compares_contact": compares_contact, "max_pixels": max_pixels}, data
+            )
             self._idle.append(process)
             return image_of(document, content)
         except (EOFError, ConnectionError, MemoryError):
@@ -142,7 +148,7 @@ class _Process:
         await process.end()
         raise RetrievalError("the process that decodes pictures ended as it started; the log of the service says more")
 
-    async def ask(self, document: dict[str, Any], content: bytes) -> tuple[dict[str, Any], bytes]:
+    async def request(self, document: dict[str, Any], content: bytes) -> tuple[dict[str, Any], bytes]:
         """What it answers. Raises EOFError or ConnectionError where it ended."""
         assert self._process.stdin is not None
         self._process.stdin.write(frame(document, content))

@@ -41,7 +41,7 @@ EXAMPLE: dict[str, Any] = {
         "next_grasp_bits": 0.04,
         "next_effective_grasps": 1.11,
     },
-    "posterior": {"none_prior": 0.5, "grasps": 1, "objects": 20, "judged_objects": 20, "unjudged_probability": 0.0},
+    "posterior": {"none_prior": 0.5, "grasps": 1, "objects": 20, "scored_objects": 20, "unscored_probability": 0.0},
     "results": [
         {
             "rank": 1,
@@ -58,7 +58,8 @@ EXAMPLE: dict[str, Any] = {
 
 class MatchDocument(BaseModel):
     """One object of a ranking, shown by its best photo, whose id is `photo`. probability_if_present: given that the
-    catalogue has the object. reference: only where the catalogue has touches of the object."""
+    catalogue has the object. reference: only where the catalogue has touches of the object.
+    """
 
     rank: int
     object_id: str
@@ -74,7 +75,8 @@ class QueryDocument(BaseModel):
     """The document of `retrieve query --json`. unlisted_probability: of all objects that `results` does not list.
     more_grasps: further grasps after which the verdict is expected to be "match"; null for other verdicts than "none of
     these", and where more grasps do not help. advice: a sentence for people on how to get a clearer answer. Optional
-    keys are absent from answers that a history holds of earlier versions."""
+    keys are absent from answers that a history holds of earlier versions.
+    """
 
     model_config = {"json_schema_extra": {"examples": [EXAMPLE]}}
 
@@ -97,12 +99,13 @@ class BatchDocument(BaseModel):
     answers: list[QueryDocument]
 
 
-class GrowingDocument(BaseModel):
+class CumulativeQueryDocument(BaseModel):
     """The answer after the first grasp, after the first two, and so on. alone: what each grasp says by itself, where
-    that was asked."""
+    that was asked.
+    """
 
     answers: list[QueryDocument]
-    alone: list[QueryDocument]
+    per_grasp: list[QueryDocument]
 
 
 class PhotoDocument(BaseModel):
@@ -153,7 +156,8 @@ class AgreementDocument(BaseModel):
 
 class IndexDocument(BaseModel):
     """What answers, and with what it is asked. sensors: names of live pictures; can_grasp: whether POST /v1/grasp
-    works; keeps: whether queries and what is said of them are kept; trials: unseen objects for the human test."""
+    works; keeps: whether queries and what is said of them are kept; trials: unseen objects for the human test.
+    """
 
     generation: str
     kind: str
@@ -168,7 +172,7 @@ class IndexDocument(BaseModel):
     candidates: int | None
     sensors: list[str]
     can_grasp: bool
-    keeps: bool
+    stores_history: bool
     trials: int
     version: str
 

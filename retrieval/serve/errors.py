@@ -11,12 +11,12 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from indexes.errors import IndexesError
-from retrieval.data.text import utf8_of
-from retrieval.errors import BadInput, ImageError, RetrievalError, Unanswered
+from retrieval.data.text import replace_surrogates
+from retrieval.errors import BadInput, ImageError, IncompleteSearch, RetrievalError
 
 MEDIA_TYPE = "application/problem+json"
 PREFIX = "urn:touch-retrieval:problem:"
-LONGEST = 2000
+MAX_DETAIL_CHARACTERS = 2000
 """Characters of a sentence; what stands in a hostile request may be of any length."""
 
 KINDS: Mapping[str, tuple[int, str]] = {
@@ -50,7 +50,7 @@ class DocumentResponse(JSONResponse):
         try:
             return super().render(content)
         except UnicodeEncodeError:
-            return super().render(utf8_of(content))
+            return super().render(replace_surrogates(content))
 
 
 class ProblemDocument(BaseModel):
@@ -64,7 +64,7 @@ class ProblemDocument(BaseModel):
     )
 
 
-class Problem(Exception):
+class HttpProblem(Exception):
     """A request that is not answered as asked: its kind, of KINDS, and why."""
 
     def __init__(self, kind: str, detail: str, headers: Mapping[str, str] | None = None) -> None:
@@ -79,59 +79,61 @@ class Problem(Exception):
     def response(self) -> JSONResponse:
         """The problem document as a response."""
         status, title = KINDS[self.kind]
-        detail = self.detail if len(self.detail) <= LONGEST else self.detail[:LONGEST] + " ..."
+        detail = (
+            self.detail if len(self.detail) <= MAX_DETAIL_CHARACTERS else self.detail[:MAX_DETAIL_CHARACTERS] + " ..."
+        )
         document = ProblemDocument(type=PREFIX + self.kind, title=title, status=status, detail=detail)
         return DocumentResponse(
             document.model_dump(), status, {"cache-control": "no-store", **self.headers}, MEDIA_TYPE
         )
 
 
-def problem_of(error: Exception) -> Problem:
+def problem_of(error: Exception) -> HttpProblem:
     """What an exception means to the one who asked."""
     match error:
-        case Problem():
+        case HttpProblem():
             return error
         case ImageError():
-            return Problem("bad-image", str(error))
+            return HttpProblem("bad-image", str(error))
         case BadInput():
-            return Problem("bad-input", str(error))
-        case Unanswered():
-            return Problem("not-ready", str(error), {"retry-after": "1"})
+            return HttpProblem("bad-input", str(error))
+        case IncompleteSearch():
+            return HttpProblem("not-ready", str(error), {"retry-after": "1"})
         case RetrievalError() | IndexesError():
-            return Problem("failed", str(error))
+            return HttpProblem("failed", str(error))
         case RequestValidationError():
-            return Problem("bad-input", invalid(error.errors()))
+            return HttpProblem("bad-input", validation_message(error.errors()))
         case ClientDisconnect():
-            return Problem("malformed", "the connection ended before the whole body had come")
+            return HttpProblem("malformed", "the connection ended before the whole body had come")
         case HTTPException():
             kind = _OF_STATUS.get(error.status_code, "malformed" if error.status_code < 500 else "failed")
-            return Problem(kind, str(error.detail), error.headers)
+            return HttpProblem(kind, str(error.detail), error.headers)
         case _:
-            return Problem("failed", f"unexpected {type(error).__name__}; the log of the service says more")
+            return HttpProblem("failed", f"unexpected {type(error).__name__}; the log of the service says more")
 
 
-def invalid(errors: Any) -> str:
-    """pydantic's findings in a sentence: the first ones, each with its place."""
-    told = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in list(errors)[:5]]
-    return "; ".join(told) or "the request does not have the form that /openapi.json says"
+def validation_message(errors: Any) -> str:
+    """Pydantic's findings in a sentence: the first ones, each with its place."""
+    messages = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in list(errors)[:5]]
+    return "; ".join(messages) or "the request does not have the form that /openapi.json says"
 
 
-def install(app: FastAPI) -> None:
+def install_handlers(app: FastAPI) -> None:
     """What a path raises on purpose becomes its problem document; `security.Guard` answers for the rest."""
 
     async def answer(request: Request, error: Exception) -> JSONResponse:
         return problem_of(error).response()
 
-    for kind in (Problem, RetrievalError, IndexesError, RequestValidationError, ClientDisconnect, HTTPException):
+    for kind in (HttpProblem, RetrievalError, IndexesError, RequestValidationError, ClientDisconnect, HTTPException):
         app.add_exception_handler(kind, answer)
 
 
-def problems(*kinds: str) -> dict[int | str, dict[str, Any]]:
+def problem_responses(*kinds: str) -> dict[int | str, dict[str, Any]]:
     """The `responses` of a path for OpenAPI: those of these kinds, and what every path may say."""
     found: dict[int | str, dict[str, Any]] = {}
     for kind in (*kinds, "malformed", "no-token", "refused", "wrong-host", "failed"):
         status, title = KINDS[kind]
-        said = [title, *([found[status]["description"]] if status in found else [])]
+        descriptions = [title, *([found[status]["description"]] if status in found else [])]
         schema = {"$ref": "#/components/schemas/ProblemDocument"}
-        found[status] = {"description": "; ".join(said), "content": {MEDIA_TYPE: {"schema": schema}}}
+        found[status] = {"description": "; ".join(descriptions), "content": {MEDIA_TYPE: {"schema": schema}}}
     return found

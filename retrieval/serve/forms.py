@@ -8,7 +8,7 @@ from email.parser import HeaderParser
 from email.utils import collapse_rfc2231_value
 from typing import NamedTuple
 
-from retrieval.serve.errors import Problem
+from retrieval.serve.errors import HttpProblem
 from retrieval.serve.settings import MAX_PICTURES
 
 MAX_PARTS = MAX_PICTURES + 8
@@ -30,26 +30,26 @@ def form_parts(body: bytes, content_type: str) -> list[FormPart]:
     header["content-type"] = content_type
     boundary = header.get_boundary("")
     if not boundary or not boundary.isascii() or len(boundary) > 70:
-        raise Problem("malformed", "multipart/form-data needs a boundary of 1 to 70 ASCII characters")
+        raise HttpProblem("malformed", "multipart/form-data needs a boundary of 1 to 70 ASCII characters")
     delimiter = b"\r\n--" + boundary.encode("ascii")
     body = b"\r\n" + body
     found = body.count(delimiter) - 1  # the last one ends the form
     if found > MAX_PARTS:
-        raise Problem("bad-input", f"a form may have at most {MAX_PARTS} parts; got {found}")
+        raise HttpProblem("bad-input", f"a form may have at most {MAX_PARTS} parts; got {found}")
     _, *parts = body.split(delimiter)
     if not parts or not parts[-1].startswith(b"--"):
-        raise Problem("bad-input", "the form is not whole: it must end with its boundary and two dashes")
+        raise HttpProblem("bad-input", "the form is not whole: it must end with its boundary and two dashes")
     return [_part(part) for part in parts[:-1]]
 
 
 def _part(part: bytes) -> FormPart:
     end = part.find(b"\r\n\r\n", 0, MAX_PART_HEADER_BYTES)
     if end < 0:
-        raise Problem(
+        raise HttpProblem(
             "bad-input", f"each part of a form must begin with at most {MAX_PART_HEADER_BYTES} bytes of headers"
         )
     headers = HeaderParser().parsestr(part[:end].decode("utf-8", "replace").lstrip())
     name = headers.get_param("name", header="content-disposition")
     if name is None:
-        raise Problem("bad-input", "each part of a form must name its field in content-disposition")
+        raise HttpProblem("bad-input", "each part of a form must name its field in content-disposition")
     return FormPart(collapse_rfc2231_value(name), headers.get_filename() is not None, part[end + 4 :])

@@ -10,45 +10,47 @@ from fastapi.responses import StreamingResponse
 
 from retrieval.search.query.objects import listed_photo
 from retrieval.serve.documents import GraspDocument
-from retrieval.serve.errors import Problem, problems
-from retrieval.serve.generations import Opened
+from retrieval.serve.errors import HttpProblem, problem_responses
+from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.service import Parts, Service
 
 router = APIRouter(tags=["live"])
-MOST_NAMES = 1000
+MAX_OBJECT_NAMES = 1000
 """Objects among which one is drawn to be grasped."""
 BOUNDARY = "picture"
-Named = Annotated[str | None, Query(max_length=1000, alias="object", description="close on this object")]
+ObjectParameter = Annotated[str | None, Query(max_length=1000, alias="object", description="close on this object")]
 Rate = Annotated[float, Query(gt=0, le=30, description="pictures a second at most")]
 
 
-@router.post("/v1/grasp", responses=problems("unknown", "bad-input", "failed", "busy", "late", "not-ready"))
-async def grasp(request: Request, parts: Parts, name: Named = None) -> GraspDocument:
+@router.post("/v1/grasp", responses=problem_responses("unknown", "bad-input", "failed", "busy", "late", "not-ready"))
+async def grasp(request: Request, parts: Parts, name: ObjectParameter = None) -> GraspDocument:
     """Close the jaws on one of the catalogue's objects: the one that is named, else one drawn at random. The rig makes
-    one grasp after the other."""
+    one grasp after the other.
+    """
     close = parts.rig.grasp
     if close is None:
-        raise Problem("unknown", "no rig can grasp here: neither the catalogue nor --rig is of the simulated one")
+        raise HttpProblem("unknown", "no rig can grasp here: neither the catalogue nor --rig is of the simulated one")
     try:
-        felt = await parts.grasps.do(lambda opened: close(_object_ids(opened, name)), request)
-    except Problem:
+        grasped = await parts.grasps.submit(lambda generation: close(_object_ids(generation, name)), request)
+    except HttpProblem:
         raise
     except Exception as error:  # of any rig
-        raise Problem("failed", f"the rig could not grasp: {error}") from error
+        raise HttpProblem("failed", f"the rig could not grasp: {error}") from error
     encoded = [
-        [base64.b64encode(data).decode("ascii") for data in some] for some in (felt.touches, felt.background or [])
+        [base64.b64encode(data).decode("ascii") for data in some]
+        for some in (grasped.touches, grasped.background or [])
     ]
-    return GraspDocument(object_id=felt.object_id, touches=encoded[0], background=encoded[1] or None)
+    return GraspDocument(object_id=grasped.object_id, touches=encoded[0], background=encoded[1] or None)
 
 
-def _object_ids(opened: Opened, name: str | None) -> list[str]:
+def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:
     """Names of objects, spread over the catalogue; the one that is named alone. Raises Problem."""
-    shard, photos = opened.shard, opened.searcher.described.photos
+    shard, photos = generation.shard, generation.searcher.info.photos
     if name is not None:
         if not shard.page([], name, 0, 1).total:
-            raise Problem("unknown", f"the index has no object {name!r}; /v1/catalogue lists them")
+            raise HttpProblem("unknown", f"the index has no object {name!r}; /v1/catalogue lists them")
         return [name]
-    step = max(1, photos // MOST_NAMES)
+    step = max(1, photos // MAX_OBJECT_NAMES)
     rows = [row for number in range(0, photos, step) for row in shard.page([], None, number, 1).rows]
     return sorted({listed_photo(row).object_id for row in rows})
 
@@ -58,7 +60,7 @@ def _object_ids(opened: Opened, name: str | None) -> list[str]:
     response_class=Response,
     responses={
         200: {"content": {"image/jpeg": {}}, "description": "the picture"},
-        **problems("unknown", "failed", "busy", "late"),
+        **problem_responses("unknown", "failed", "busy", "late"),
     },
 )
 async def frame(name: str, request: Request, parts: Parts) -> Response:
@@ -71,13 +73,13 @@ async def frame(name: str, request: Request, parts: Parts) -> Response:
     response_class=StreamingResponse,
     responses={
         200: {"content": {"multipart/x-mixed-replace": {}}, "description": "pictures without end (MJPEG)"},
-        **problems("unknown", "failed", "busy", "late"),
+        **problem_responses("unknown", "failed", "busy", "late"),
     },
 )
 async def stream(name: str, request: Request, parts: Parts, rate: Rate = 10.0) -> StreamingResponse:
     """The pictures of a sensor as they come; an `<img>` shows them."""
     if parts.streams.locked():
-        raise Problem("busy", f"{parts.settings.streams} streams run already", {"retry-after": "5"})
+        raise HttpProblem("busy", f"{parts.settings.streams} streams run already", {"retry-after": "5"})
     first = await _read(parts, name, request)  # what fails, fails before the stream begins
     return StreamingResponse(
         _pictures(parts, name, request, first, 1 / rate), media_type=f"multipart/x-mixed-replace; boundary={BOUNDARY}"
@@ -96,7 +98,7 @@ async def _pictures(parts: Service, name: str, request: Request, first: bytes, p
             await asyncio.sleep(pause_s)
             try:
                 data = await _read(parts, name, request)
-            except Problem as problem:
+            except HttpProblem as problem:
                 if problem.kind != "busy":
                     data = None  # the sensor was unplugged: the stream ends
 
@@ -105,10 +107,10 @@ async def _read(parts: Service, name: str, request: Request) -> bytes:
     read = parts.rig.sensors.get(name)
     if read is None:
         known = ", ".join(sorted(parts.rig.sensors)) or "none; name a rig with --rig"
-        raise Problem("unknown", f"there is no sensor {name[:100]!r}; known: {known}")
+        raise HttpProblem("unknown", f"there is no sensor {name[:100]!r}; known: {known}")
     try:
-        return await parts.frames[name].do(lambda _: read(), request)
-    except Problem:
+        return await parts.frames[name].submit(lambda _: read(), request)
+    except HttpProblem:
         raise
     except Exception as error:  # of any driver
-        raise Problem("failed", f"sensor {name}: {error}") from error
+        raise HttpProblem("failed", f"sensor {name}: {error}") from error

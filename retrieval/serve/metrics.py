@@ -24,21 +24,25 @@ class Metrics:
         self.batches = Histogram(
             "retrieve_batch_queries", "Queries answered together", buckets=_SIZES, registry=self.registry
         )
-        self.held = Gauge("retrieve_held_requests", "Requests that wait or are in work", registry=self.registry)
+        self.in_flight = Gauge(
+            "retrieve_requests_in_flight", "Requests that wait or are in work", registry=self.registry
+        )
         self.verdicts = Counter("retrieve_verdicts", "Answers by verdict", ["verdict"], registry=self.registry)
-        self.dropped = Counter("retrieve_dropped", "Requests that were not worked on", ["why"], registry=self.registry)
+        self.dropped = Counter(
+            "retrieve_dropped", "Requests that were not worked on", ["reason"], registry=self.registry
+        )
         self.responses = Counter("retrieve_responses", "Responses by status", ["status"], registry=self.registry)
         self.problems = Counter("retrieve_problems", "Problem documents by kind", ["kind"], registry=self.registry)
         self.reloads = Counter("retrieve_reloads", "Generations taken up", registry=self.registry)
         self.reload_failures = Counter(
             "retrieve_reload_failures", "Generations that could not be opened", registry=self.registry
         )
-        self.unrecorded = Counter(
-            "retrieve_unrecorded", "What could not be kept, by what", ["what"], registry=self.registry
+        self.history_failures = Counter(
+            "retrieve_history_failures", "What could not be kept, by what", ["kind"], registry=self.registry
         )
         self.generation = Gauge("retrieve_generation", "1 for the one that answers", ["name"], registry=self.registry)
 
-    def answered(self, results: Mapping[str, float] | QueryResult) -> None:
+    def count_answer(self, results: Mapping[str, float] | QueryResult) -> None:
         """Count an answer and its stages."""
         if isinstance(results, QueryResult):
             self.verdicts.labels(results.verdict).inc()
@@ -46,12 +50,12 @@ class Metrics:
         for stage, ms in results.items():
             self.stages.labels(stage).observe(ms / 1e3)
 
-    def serves(self, generation: str) -> None:
+    def set_generation(self, generation: str) -> None:
         """A generation was taken up."""
         self.generation.clear()
         self.generation.labels(generation).set(1)
         self.reloads.inc()
 
-    def page(self) -> bytes:
+    def render(self) -> bytes:
         """All numbers, in the text format of Prometheus."""
         return generate_latest(self.registry)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from fastapi import APIRouter, Request, Response
 
-from retrieval.serve.errors import Problem
+from retrieval.serve.errors import HttpProblem
 
 FOLDER = Path(__file__).parent / "page"
 _TYPES = {".js": "text/javascript", ".svg": "image/svg+xml", ".woff2": "font/woff2", ".webmanifest": "application/json"}
@@ -23,7 +23,7 @@ def router_of(folder: Path = FOLDER) -> APIRouter:
     async def file(request: Request, name: str) -> Response:
         found = answers.get(f"/{name}")
         if found is None:
-            raise Problem("unknown", f"there is no page /{name[:200]}; /openapi.json lists the paths")
+            raise HttpProblem("unknown", f"there is no page /{name[:200]}; /openapi.json lists the paths")
         data, headers = found
         if request.headers.get("if-none-match") == headers["etag"]:
             return Response(status_code=304, headers=headers)

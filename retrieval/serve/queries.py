@@ -6,16 +6,16 @@ from pydantic import Field
 from retrieval.search.query.agreement import agreement
 from retrieval.search.query.answer import QueryResult
 from retrieval.serve.catalogue import photo_of
-from retrieval.serve.documents import AgreementDocument, BatchDocument, GrowingDocument, QueryDocument
-from retrieval.serve.errors import DocumentResponse, problems
-from retrieval.serve.generations import Opened
+from retrieval.serve.documents import AgreementDocument, BatchDocument, CumulativeQueryDocument, QueryDocument
+from retrieval.serve.errors import DocumentResponse, problem_responses
+from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.service import Parts
 from retrieval.serve.uploads import (
     QUERY_BODY,
-    Asked,
+    Base64Image,
     BatchBody,
     Grasps,
-    Picture,
+    ParsedQuery,
     RequestBody,
     json_body,
     pictures_of,
@@ -24,7 +24,9 @@ from retrieval.serve.uploads import (
 )
 
 router = APIRouter(tags=["queries"])
-_PROBLEMS = problems("bad-input", "bad-image", "too-large", "too-slow", "unsupported-type", "busy", "late", "not-ready")
+_PROBLEMS = problem_responses(
+    "bad-input", "bad-image", "too-large", "too-slow", "unsupported-type", "busy", "late", "not-ready"
+)
 
 
 @router.post(
@@ -36,48 +38,52 @@ _PROBLEMS = problems("bad-input", "bad-image", "too-large", "too-slow", "unsuppo
 )
 async def query(request: Request, parts: Parts) -> DocumentResponse:
     """The document of `retrieve query --json` for one or several grasps of one object."""
-    parts.queue.require_room()
-    asked = await read_query(request, parts.generations.current.fingers)
-    answered = await parts.queue.ask(asked, request)
-    name = parts.keeping.keep(asked, answered) if parts.keeping else None
-    return DocumentResponse(answered.result.to_dict(), headers={"x-query-id": name} if name else None)
+    parts.queue.require_capacity()
+    parsed_query = await read_query(request, parts.generations.current.fingers)
+    count_answer = await parts.queue.answer(parsed_query, request)
+    name = parts.history_writer.keep(parsed_query, count_answer) if parts.history_writer else None
+    return DocumentResponse(count_answer.result.to_dict(), headers={"x-query-id": name} if name else None)
 
 
 @router.post(
-    "/v1/query/growing", response_model=GrowingDocument, responses=_PROBLEMS, openapi_extra={"requestBody": QUERY_BODY}
+    "/v1/query/cumulative",
+    response_model=CumulativeQueryDocument,
+    responses=_PROBLEMS,
+    openapi_extra={"requestBody": QUERY_BODY},
 )
-async def query_growing(request: Request, parts: Parts, alone: bool = False) -> DocumentResponse:
-    """How the answer changes grasp by grasp: after the first, after the first two, and so on; `alone`: and what each
-    grasp says by itself."""
-    parts.queue.require_room()
-    asked = await read_query(request, parts.generations.current.fingers)
+async def query_cumulative(request: Request, parts: Parts, per_grasp: bool = False) -> DocumentResponse:
+    """How the answer changes grasp by grasp: after the first, after the first two, and so on; `per_grasp`: and what each
+    grasp says by itself.
+    """
+    parts.queue.require_capacity()
+    parsed_query = await read_query(request, parts.generations.current.fingers)
 
-    def work(opened: Opened) -> dict[str, list[QueryResult]]:
-        searcher, (touches,) = opened.searcher, asked.pictures.images
-        each = [[grasp] for grasp in touches if alone]
+    def work(generation: ServedGeneration) -> dict[str, list[QueryResult]]:
+        searcher, (touches,) = generation.searcher, parsed_query.pictures.images
+        each = [[grasp] for grasp in touches if per_grasp]
         return {
-            "answers": searcher.query_growing(touches, **asked.keywords),
-            "alone": searcher.query_many(each, **asked.keywords),
+            "answers": searcher.query_cumulative(touches, **parsed_query.keywords),
+            "per_grasp": searcher.query_many(each, **parsed_query.keywords),
         }
 
-    found = await parts.queue.do(work, request, asked.options.deadline_ms, asked.pictures)
+    found = await parts.queue.submit(work, request, parsed_query.options.deadline_ms, parsed_query.pictures)
     return DocumentResponse({name: [answer.to_dict() for answer in answers] for name, answers in found.items()})
 
 
 @router.post("/v1/query/batch", response_model=BatchDocument, responses=_PROBLEMS, openapi_extra=json_body("BatchBody"))
 async def query_batch(request: Request, parts: Parts) -> DocumentResponse:
     """Several objects in one request: their touches are encoded together, an answer for each in their order."""
-    parts.queue.require_room()
+    parts.queue.require_capacity()
     body = await read_json(request, BatchBody)
-    asked = Asked(pictures_of(body.objects, body.background, is_batch=True), body)
-    answers = await parts.queue.do(
-        lambda opened: opened.searcher.query_many(asked.pictures.images, **asked.keywords),
+    parsed_query = ParsedQuery(pictures_of(body.objects, body.background, is_batch=True), body)
+    answers = await parts.queue.submit(
+        lambda generation: generation.searcher.query_many(parsed_query.pictures.images, **parsed_query.keywords),
         request,
         body.deadline_ms,
-        asked.pictures,
+        parsed_query.pictures,
     )
     for answer in answers:
-        parts.metrics.answered(answer)
+        parts.metrics.count_answer(answer)
     return DocumentResponse({"answers": [answer.to_dict() for answer in answers]})
 
 
@@ -86,34 +92,34 @@ class AgreementBody(RequestBody):
 
     photo: str = Field(min_length=1, max_length=4096, examples=["mug/1.jpg"])
     touches: Grasps
-    background: list[Picture] | None = None
+    background: list[Base64Image] | None = None
     squares: int = Field(8, ge=2, le=16, description="squares of a side")
 
 
 @router.post(
     "/v1/agreement",
     response_model=AgreementDocument,
-    responses={**_PROBLEMS, **problems("unknown")},
+    responses={**_PROBLEMS, **problem_responses("unknown")},
     openapi_extra=json_body("AgreementBody"),
 )
 async def agree(request: Request, parts: Parts) -> AgreementDocument:
     """Where a photo agrees with a touch: the match logit's fall as one square after the other is hidden."""
-    parts.queue.require_room()
+    parts.queue.require_capacity()
     body = await read_json(request, AgreementBody)
     pictures = pictures_of([body.touches], body.background)
 
-    def work(opened: Opened) -> AgreementDocument:
-        photo = photo_of(opened, body.photo)
+    def work(generation: ServedGeneration) -> AgreementDocument:
+        photo = photo_of(generation, body.photo)
         found = agreement(
-            opened.searcher,
+            generation.searcher,
             pictures.images[0],
-            opened.searcher.catalogue / photo.path,
+            generation.searcher.catalogue / photo.path,
             background=pictures.frames,
-            model=opened.checkpoint(),
+            model=generation.checkpoint(),
             squares=body.squares,
         )
         return AgreementDocument(
-            generation=opened.name,
+            generation=generation.name,
             photo=body.photo,
             logit=found.logit,
             rows=body.squares,
@@ -121,4 +127,4 @@ async def agree(request: Request, parts: Parts) -> AgreementDocument:
             falls=found.falls.tolist(),
         )
 
-    return await parts.queue.do(work, request, pictures=pictures)
+    return await parts.queue.submit(work, request, pictures=pictures)

@@ -18,16 +18,16 @@ from starlette.requests import Request
 
 from retrieval.search.query.answer import QueryResult
 from retrieval.serve.decoders import Decoders
-from retrieval.serve.errors import Problem
-from retrieval.serve.generations import Generations, Opened
+from retrieval.serve.errors import HttpProblem
+from retrieval.serve.generations import Generations, ServedGeneration
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.settings import ServiceSettings
-from retrieval.serve.uploads import Asked, Pictures
+from retrieval.serve.uploads import ParsedQuery, RequestPictures
 
 Result = TypeVar("Result")
 
 
-class Answered(NamedTuple):
+class QueryAnswer(NamedTuple):
     """An answer, and the digest of the model that gave it."""
 
     result: QueryResult
@@ -38,8 +38,8 @@ class Answered(NamedTuple):
 class _Job:
     """Work for the model, its pictures read. asked: the query, where it is one and nothing else."""
 
-    work: Callable[[Opened], Any]
-    asked: Asked | None
+    work: Callable[[ServedGeneration], Any]
+    parsed_query: ParsedQuery | None
     answer: asyncio.Future[Any]
     began: float
     deadline: float
@@ -47,7 +47,8 @@ class _Job:
 
 class Queue:
     """Requests that wait for the model, in the order in which they came. The threads that work on them take one after
-    the other themselves: none waits for the event loop in between. held: requests that wait or are in work."""
+    the other themselves: none waits for the event loop in between. held: requests that wait or are in work.
+    """
 
     def __init__(
         self, generations: Generations, settings: ServiceSettings, metrics: Metrics, decoders: Decoders
@@ -57,7 +58,7 @@ class Queue:
         self._jobs: deque[_Job] = deque()
         self._changed, self._closed = Condition(), False
         self._threads: list[Thread] = []
-        self.held = 0
+        self.in_flight = 0
 
     def start(self) -> None:
         """Begin to answer, for the event loop that calls."""
@@ -75,74 +76,79 @@ class Queue:
         for thread in self._threads:
             thread.join(max(0.0, until - time.monotonic()))
 
-    def require_room(self) -> None:
+    def require_capacity(self) -> None:
         """Raises Problem where one more request would not be held; asked before its body is read."""
-        if self.held >= self._settings.queue:
+        if self.in_flight >= self._settings.queue:
             self._metrics.dropped.labels("busy").inc()
-            raise Problem(
+            raise HttpProblem(
                 "busy",
-                f"{self.held} requests are held already; come again",
+                f"{self.in_flight} requests are held already; come again",
                 {"retry-after": "1", "connection": "close"},
             )
 
-    async def ask(self, asked: Asked, request: Request) -> Answered:
+    async def answer(self, parsed_query: ParsedQuery, request: Request) -> QueryAnswer:
         """Answer a query. Raises Problem, and the errors of `Searcher.query`."""
-        answered: Answered = await self.do(
-            lambda opened: Answered(opened.searcher.query(asked.pictures.images[0], **asked.keywords), opened.model),
+        count_answer: QueryAnswer = await self.submit(
+            lambda generation: QueryAnswer(
+                generation.searcher.query(parsed_query.pictures.images[0], **parsed_query.keywords), generation.model
+            ),
             request,
-            asked.options.deadline_ms,
-            asked.pictures,
-            asked,
+            parsed_query.options.deadline_ms,
+            parsed_query.pictures,
+            parsed_query,
         )
-        self._metrics.answered(answered.result)
-        return answered
+        self._metrics.count_answer(count_answer.result)
+        return count_answer
 
-    async def do(
+    async def submit(
         self,
-        work: Callable[[Opened], Result],
+        work: Callable[[ServedGeneration], Result],
         request: Request,
         deadline_ms: float | None = None,
-        pictures: Pictures | None = None,
-        asked: Asked | None = None,
+        pictures: RequestPictures | None = None,
+        parsed_query: ParsedQuery | None = None,
     ) -> Result:
         """Have `pictures` read, and `work` done with the generation that answers when its turn comes. Raises Problem,
-        ImageError, and what the work raises."""
-        self.require_room()
+        ImageError, and what the work raises.
+        """
+        self.require_capacity()
         now = time.monotonic()
         seconds = min(self._settings.deadline_s, (deadline_ms or 1e9) / 1e3)
-        self.held += 1
-        self._metrics.held.inc()
-        answer = asyncio.ensure_future(self._answer(work, pictures, asked, now, now + seconds))
-        answer.add_done_callback(self._let_go)
-        gone: asyncio.Future[None] = asyncio.ensure_future(_gone(request))
-        either: set[asyncio.Future[Any]] = {answer, gone}
+        self.in_flight += 1
+        self._metrics.in_flight.inc()
+        answer = asyncio.ensure_future(self._answer(work, pictures, parsed_query, now, now + seconds))
+        answer.add_done_callback(self._release)
+        disconnected: asyncio.Future[None] = asyncio.ensure_future(_wait_for_disconnect(request))
+        either: set[asyncio.Future[Any]] = {answer, disconnected}
         try:
             await asyncio.wait(either, timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
             if not answer.done():
-                left = gone.done()
-                self._metrics.dropped.labels("left" if left else "late").inc()
-                raise Problem("late", "who asked has left" if left else f"no answer within {1e3 * seconds:g} ms")
+                client_left = disconnected.done()
+                self._metrics.dropped.labels("disconnected" if client_left else "late").inc()
+                raise HttpProblem(
+                    "late", "who asked has left" if client_left else f"no answer within {1e3 * seconds:g} ms"
+                )
             return answer.result()
         finally:
-            gone.cancel()
+            disconnected.cancel()
             answer.cancel()
 
     async def _answer(
         self,
-        work: Callable[[Opened], Result],
-        pictures: Pictures | None,
-        asked: Asked | None,
+        work: Callable[[ServedGeneration], Result],
+        pictures: RequestPictures | None,
+        parsed_query: ParsedQuery | None,
         began: float,
         deadline: float,
     ) -> Result:
         """Have pictures read, then wait for the model. Cancelling stops both."""
         if pictures is not None:
             px = self._generations.current.searcher.checkpoint.config.preprocessing.touch_px
-            images = await self._decoders.read(pictures.named(), px, pictures.background is not None)
-            pictures.take(iter(images))
+            images = await self._decoders.read(pictures.named_files(), px, pictures.background is not None)
+            pictures.set_images(iter(images))
             self._metrics.stages.labels("pictures").observe(time.monotonic() - began)
         answer: asyncio.Future[Result] = asyncio.get_running_loop().create_future()
-        job = _Job(work, asked, answer, began, deadline)
+        job = _Job(work, parsed_query, answer, began, deadline)
         with self._changed:
             self._jobs.append(job)
             self._changed.notify_all()
@@ -153,45 +159,47 @@ class Queue:
                 if job in self._jobs:
                     self._jobs.remove(job)
 
-    def _let_go(self, answer: asyncio.Future[Any]) -> None:
-        self.held -= 1
-        self._metrics.held.dec()
+    def _release(self, answer: asyncio.Future[Any]) -> None:
+        self.in_flight -= 1
+        self._metrics.in_flight.dec()
         if not answer.cancelled():
             answer.exception()  # which nobody may be there to ask for
 
     def _work(self, loop: asyncio.AbstractEventLoop) -> None:
-        while jobs := self._together():
-            opened, now = self._generations.current, time.monotonic()
+        while jobs := self._next_batch():
+            generation, now = self._generations.current, time.monotonic()
             for job in jobs:
                 self._metrics.waiting.observe(now - job.began)
             self._metrics.batches.observe(len(jobs))
-            answers = _answers(opened, jobs)
+            answers = _answers(generation, jobs)
             with suppress(RuntimeError):  # the loop has ended meanwhile
-                loop.call_soon_threadsafe(_tell, jobs, answers)
+                loop.call_soon_threadsafe(_set_results, jobs, answers)
 
-    def _together(self) -> list[_Job]:
+    def _next_batch(self) -> list[_Job]:
         """The next job, and those that wait or come in the window and can be answered with it; none at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._jobs or self._closed)
             if not self._jobs:
                 return []
             jobs, until = [first := self._jobs.popleft()], time.monotonic() + self._settings.batch_ms / 1e3
-            while first.asked and len(jobs) < self._settings.batch_most:
+            while first.parsed_query and len(jobs) < self._settings.max_batch:
                 if not self._changed.wait_for(lambda: self._jobs, until - time.monotonic()):
                     break
-                if not (asked := self._jobs[0].asked) or not asked.goes_with(first.asked):
+                if not (parsed_query := self._jobs[0].parsed_query) or not parsed_query.can_batch_with(
+                    first.parsed_query
+                ):
                     break
                 jobs.append(self._jobs.popleft())
             return jobs
 
 
-async def _gone(request: Request) -> None:
+async def _wait_for_disconnect(request: Request) -> None:
     """Ends when the connection does; the body has been read."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
 
 
-def _tell(jobs: list[_Job], answers: list[Any]) -> None:
+def _set_results(jobs: list[_Job], answers: list[Any]) -> None:
     for job, answer in zip(jobs, answers, strict=True):
         if job.answer.done():
             continue
@@ -201,21 +209,23 @@ def _tell(jobs: list[_Job], answers: list[Any]) -> None:
             job.answer.set_result(answer)
 
 
-def _answers(opened: Opened, jobs: list[_Job]) -> list[Any]:
+def _answers(generation: ServedGeneration, jobs: list[_Job]) -> list[Any]:
     """The answer of each job, or the exception that is its answer; one bad query spoils no other."""
-    asked = [job.asked for job in jobs if job.asked is not None]
+    parsed_query = [job.parsed_query for job in jobs if job.parsed_query is not None]
     if len(jobs) > 1:
         with suppress(BaseException):  # else each alone says which of them it was
-            found = opened.searcher.query_many([one.pictures.images[0] for one in asked], **asked[0].keywords)
-            return [Answered(result, opened.model) for result in found]
-    return [_answer(opened, job) for job in jobs]
+            found = generation.searcher.query_many(
+                [one.pictures.images[0] for one in parsed_query], **parsed_query[0].keywords
+            )
+            return [QueryAnswer(result, generation.model) for result in found]
+    return [_answer(generation, job) for job in jobs]
 
 
-def _answer(opened: Opened, job: _Job) -> Any:
+def _answer(generation: ServedGeneration, job: _Job) -> Any:
     if time.monotonic() > job.deadline:
-        return Problem("late", "the deadline passed before the request's turn came")
+        return HttpProblem("late", "the deadline passed before the request's turn came")
     try:
-        return job.work(opened)
+        return job.work(generation)
     except BaseException as error:
         if isinstance(error, Exception) and not isinstance(error, StopIteration):
             return error

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from retrieval.serve.errors import Problem, problem_of
+from retrieval.serve.errors import HttpProblem, problem_of
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.settings import ServiceSettings
 
@@ -89,7 +89,7 @@ class Guard:
             await self.app(scope, receive, with_headers)
         except asyncio.CancelledError:  # the server ends, and has waited long enough
             if not begun:
-                ending = Problem("not-ready", "the service ends", {"retry-after": "1", "connection": "close"})
+                ending = HttpProblem("not-ready", "the service ends", {"retry-after": "1", "connection": "close"})
                 await ending.response()(scope, receive, with_headers)
         except Exception as error:
             log.exception("unexpected error at %s", scope["path"])
@@ -97,30 +97,31 @@ class Guard:
                 raise
             await problem_of(error).response()(scope, receive, with_headers)
 
-    def _refusal(self, path: str, headers: Headers) -> Problem | None:
+    def _refusal(self, path: str, headers: Headers) -> HttpProblem | None:
         try:
             host = urlsplit(f"//{headers.get('host', '')}").hostname
         except ValueError:
             host = None
         if self.settings.is_local and host not in _LOCAL_NAMES:
-            return Problem("wrong-host", "this service hears this machine alone: ask it as localhost or 127.0.0.1")
+            return HttpProblem("wrong-host", "this service hears this machine alone: ask it as localhost or 127.0.0.1")
         origin = headers.get("origin")
         if origin is not None and urlsplit(origin).netloc != headers.get("host"):
-            return Problem("refused", "a page of another origin may not ask this service")
+            return HttpProblem("refused", "a page of another origin may not ask this service")
         if headers.get("sec-fetch-site") in ("cross-site", "same-site") and headers.get("sec-fetch-mode") != "navigate":
-            return Problem("refused", "a page of another site may not ask this service")
+            return HttpProblem("refused", "a page of another site may not ask this service")
         token = self.settings.token
         if token is None or path in _OPEN_PATHS or not path.startswith(("/v1/", "/metrics")):
             return None
         if any(same_token(given, token) for given in _given_tokens(headers)):
             return None
         why = "send the service's token as `Authorization: Bearer TOKEN`"
-        return Problem("no-token", why, {"www-authenticate": "Bearer"})
+        return HttpProblem("no-token", why, {"www-authenticate": "Bearer"})
 
 
 def _given_tokens(headers: Headers) -> list[str]:
     """The tokens that a request carries: in the header, as programs send it, and in the cookie of the page, whose
-    pictures cannot send a header."""
+    pictures cannot send a header.
+    """
     scheme, _, value = headers.get("authorization", "").partition(" ")
     found = [value.strip()] if scheme.lower() == "bearer" else []
     try:

@@ -10,7 +10,7 @@ from fastapi import Depends, Request
 
 from retrieval.serve.decoders import Decoders
 from retrieval.serve.generations import Generations
-from retrieval.serve.keeping import Keeping as Keeping
+from retrieval.serve.history_writer import HistoryWriter as HistoryWriter
 from retrieval.serve.metrics import Metrics
 from retrieval.serve.queue import Queue
 from retrieval.serve.settings import ServiceSettings
@@ -19,9 +19,10 @@ from retrieval.serve.trials import Trials
 
 
 @dataclass(frozen=True)
-class Grasped:
+class GraspResult:
     """What a rig felt: the name of the object, and PNG files of the fingers, in their order; of the untouched gels
-    where the rig has seen them."""
+    where the rig has seen them.
+    """
 
     object_id: str
     touches: list[bytes]
@@ -37,13 +38,14 @@ class LiveRig:
     """
 
     sensors: Mapping[str, Callable[[], bytes]] = field(default_factory=dict)
-    grasp: Callable[[list[str]], Grasped] | None = None
+    grasp: Callable[[list[str]], GraspResult] | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Service:
     """The parts of one service. grasps: the queue of the rig; frames: one for each sensor, by name. streams: places for
-    live pictures. stopping: set when it is to end, for what would never end by itself."""
+    live pictures. stopping: set when it is to end, for what would never end by itself.
+    """
 
     settings: ServiceSettings
     metrics: Metrics
@@ -54,7 +56,7 @@ class Service:
     frames: Mapping[str, Queue]
     rig: LiveRig
     thumbnails: Thumbnails
-    keeping: Keeping | None
+    history_writer: HistoryWriter | None
     trials: Trials | None
     streams: Semaphore
     stopping: Event = field(default_factory=Event)

@@ -15,7 +15,7 @@ MAX_BODY_PIXELS = 5 * MAX_PIXELS
 """Of all pictures of one request together; of each, MAX_PIXELS."""
 MAX_PICTURES = 128
 """Of one request."""
-LEAST_TOKEN = 16
+MIN_TOKEN_CHARACTERS = 16
 MAX_WAIT_S = 86_400
 
 
@@ -24,7 +24,7 @@ class ServiceSettings:
     """What `retrieve serve` was told.
 
     host: where it listens; anything but this machine needs a `token` (16 characters at least). queue: requests that
-    are held at once, those in work among them. workers: threads that answer. batch_most: so many queries that wait and
+    are held at once, those in work among them. workers: threads that answer. max_batch: so many queries that wait and
     ask alike are answered together at most. batch_ms: how long one waits for others besides. deadline_s: after which an
     answer is no longer waited for. body_s: by which the body of a request must have come. poll_s: how often a new
     generation of the index is looked for. history: folder where queries are kept, and what is said of them; None keeps
@@ -41,7 +41,7 @@ class ServiceSettings:
     queue: int = 8
     workers: int = 1
     batch_ms: float = 0.0
-    batch_most: int = 4
+    max_batch: int = 4
     deadline_s: float = 30.0
     body_s: float = 10.0
     poll_s: float = 1.0
@@ -52,27 +52,28 @@ class ServiceSettings:
 
     def __post_init__(self) -> None:
         """Raises ConfigError."""
-        for name in ("queue", "workers", "batch_most", "keep", "keep_bytes", "streams"):
+        for name in ("queue", "workers", "max_batch", "keep", "keep_bytes", "streams"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be 1 or more; got {getattr(self, name)}")
         for name in ("deadline_s", "body_s", "poll_s"):
             if not 0 < getattr(self, name) <= MAX_WAIT_S:
                 raise ConfigError(f"{name} must be above 0 and at most {MAX_WAIT_S} seconds; got {getattr(self, name)}")
-        for name, most in (("batch_ms", 1000), ("port", 2**16 - 1)):
-            if not 0 <= getattr(self, name) <= most:
-                raise ConfigError(f"{name} must be from 0 to {most}; got {getattr(self, name)}")
+        for name, maximum in (("batch_ms", 1000), ("port", 2**16 - 1)):
+            if not 0 <= getattr(self, name) <= maximum:
+                raise ConfigError(f"{name} must be from 0 to {maximum}; got {getattr(self, name)}")
         if self.token is None and not self.is_local:
             raise ConfigError(
-                f"{self.host} can be reached from other machines, so a token must be given: write {LEAST_TOKEN} or "
+                f"{self.host} can be reached from other machines, so a token must be given: write {MIN_TOKEN_CHARACTERS} or "
                 "more characters into a file and name it with --token-file, or leave out --host"
             )
-        if self.token is not None and not (len(self.token) >= LEAST_TOKEN and self.token.isascii()):
-            raise ConfigError(f"a token must be {LEAST_TOKEN} or more ASCII characters; got {len(self.token)}")
+        if self.token is not None and not (len(self.token) >= MIN_TOKEN_CHARACTERS and self.token.isascii()):
+            raise ConfigError(f"a token must be {MIN_TOKEN_CHARACTERS} or more ASCII characters; got {len(self.token)}")
 
     @property
     def threads(self) -> int:
         """With which one request is worked on. A core is left to the event loop, which else answers late; and threads
-        of one computation wait for each other, so that a taken core holds up all of them."""
+        of one computation wait for each other, so that a taken core holds up all of them.
+        """
         return max(1, ((os.cpu_count() or 1) - 1) // self.workers)
 
     @property

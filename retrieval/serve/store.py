@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from _touch_retrieval.files import open_regular
-from retrieval.data.text import utf8_of
+from retrieval.data.text import replace_surrogates
 from retrieval.errors import BadInput, RetrievalError
 from retrieval.search.query.answer import QueryResult
 
 RIGHT, OBJECT, NONE = "right", "object", "none"
-SAID = (RIGHT, OBJECT, NONE)
+FEEDBACK_VALUES = (RIGHT, OBJECT, NONE)
 _APPLICATION, _VERSION = 0x746F7563, 1
 _TRIM_EVERY = 32
 _LOCK_S = 5.0
@@ -59,31 +59,31 @@ BACKGROUND = 0
 
 
 @dataclass(frozen=True)
-class Kept:
+class StoredQuery:
     """A query of the history. said: what a person said of it, one of SAID, and of which object; None before."""
 
     id: str
     time: float
     verdict: str
     answer: dict[str, Any]
-    said: str | None
+    feedback: str | None
     object_id: str | None
 
 
 @dataclass(frozen=True)
-class Run:
+class TrialRun:
     """A series of trials that one person does."""
 
     id: str
     time: float
-    who: str
+    participant: str
     seed: int
     count: int
     recording: str
 
 
 @dataclass(frozen=True)
-class Choice:
+class TrialChoice:
     """What was chosen in a trial, counted from 1: by the person, in truth, and by the model."""
 
     number: int
@@ -97,9 +97,10 @@ def new_id() -> str:
     return f"{time.time_ns() // 1_000_000:011x}{secrets.token_hex(6)}"
 
 
-class Store:
+class HistoryStore:
     """The database in a file, made where there is none. Raises BadInput for another file, RetrievalError where the disk
-    refuses."""
+    refuses.
+    """
 
     def __init__(self, path: Path, keep: int, keep_bytes: int) -> None:
         self.path, self._keep, self._keep_bytes = path, keep, keep_bytes
@@ -120,16 +121,19 @@ class Store:
         self._files = self._identity()
 
     def _prepare(self) -> None:
-        said = self._database.execute
-        said("PRAGMA journal_mode = WAL")
-        said("PRAGMA synchronous = FULL")
-        said("PRAGMA foreign_keys = ON")
-        if said("PRAGMA user_version").fetchone()[0] == 0 and not said("SELECT 1 FROM sqlite_master").fetchone():
+        feedback = self._database.execute
+        feedback("PRAGMA journal_mode = WAL")
+        feedback("PRAGMA synchronous = FULL")
+        feedback("PRAGMA foreign_keys = ON")
+        if (
+            feedback("PRAGMA user_version").fetchone()[0] == 0
+            and not feedback("SELECT 1 FROM sqlite_master").fetchone()
+        ):
             self._database.executescript(
                 f"BEGIN IMMEDIATE; {_SCHEMA} PRAGMA application_id = {_APPLICATION};"
                 f"PRAGMA user_version = {_VERSION}; COMMIT;"
             )
-        found = said("PRAGMA application_id").fetchone()[0], said("PRAGMA user_version").fetchone()[0]
+        found = feedback("PRAGMA application_id").fetchone()[0], feedback("PRAGMA user_version").fetchone()[0]
         if found != (_APPLICATION, _VERSION):
             raise sqlite3.DatabaseError(f"it is of another program or version ({found[1]})")
 
@@ -236,30 +240,31 @@ class Store:
         )
 
     def history(
-        self, *, words: Sequence[str] = (), said: str | None = None, offset: int = 0, limit: int = 100
-    ) -> tuple[int, list[Kept]]:
+        self, *, words: Sequence[str] = (), feedback: str | None = None, offset: int = 0, limit: int = 100
+    ) -> tuple[int, list[StoredQuery]]:
         """How many queries hold all words and of which this was said ("nothing": no one said anything), and some of
-        them, the newest first."""
+        them, the newest first.
+        """
         conditions = ["instr(search, ?) > 0"] * len(words)
         values: list[Any] = [word.casefold() for word in words]
-        if said == "nothing":
+        if feedback == "missing":
             conditions.append("said IS NULL")
-        elif said is not None:
+        elif feedback is not None:
             conditions.append("said = ?")
-            values.append(said)
+            values.append(feedback)
         where = f"FROM queries LEFT JOIN said ON query = id WHERE {' AND '.join(conditions) or '1'}"
         total = self._read(f"SELECT COUNT(*) {where}", values)[0][0]
         found = self._read(f"SELECT {_COLUMNS} {where} ORDER BY id DESC LIMIT ? OFFSET ?", [*values, limit, offset])
-        return total, [_kept(row) for row in found]
+        return total, [_stored_query(row) for row in found]
 
     def names(self) -> list[str]:
         """The ids of all queries, the oldest first."""
         return [name for (name,) in self._read("SELECT id FROM queries ORDER BY id")]
 
-    def query(self, name: str) -> Kept | None:
+    def query(self, name: str) -> StoredQuery | None:
         """A query by its id."""
         found = self._read(f"SELECT {_COLUMNS} FROM queries LEFT JOIN said ON query = id WHERE id = ?", [name])  # noqa: S608
-        return _kept(found[0]) if found else None
+        return _stored_query(found[0]) if found else None
 
     def picture(self, name: str, grasp: int, finger: str) -> bytes | None:
         """A gel image as it was sent; grasp: from 1, BACKGROUND for a no-contact frame."""
@@ -280,23 +285,26 @@ class Store:
 
     # What people said -----------------------------------------------------------------------------------------
 
-    def say(self, name: str, said: str, object_id: str | None, photo: bytes | None) -> bool:
+    def add_feedback(self, name: str, feedback: str, object_id: str | None, photo: bytes | None) -> bool:
         """Keep what was said of a query; False where the same was said before. Raises BadInput where something else
-        was, and KeyError where there is no such query, or no more."""
+        was, and KeyError where there is no such query, or no more.
+        """
         before = self._read("SELECT said, object_id FROM said WHERE query = ?", [name])
         if before:
-            if before[0] == (said, object_id):
+            if before[0] == (feedback, object_id):
                 return False
             raise BadInput(f"of this query was said already: {before[0][0]}, {before[0][1] or 'no object'}")
         try:
             with self._writing() as database:
-                database.execute("INSERT INTO said VALUES (?, ?, ?, ?, ?)", (name, time.time(), said, object_id, photo))
-                more = _searched([said, object_id or ""])
+                database.execute(
+                    "INSERT INTO said VALUES (?, ?, ?, ?, ?)", (name, time.time(), feedback, object_id, photo)
+                )
+                more = _searched([feedback, object_id or ""])
                 database.execute("UPDATE queries SET search = search || ? WHERE id = ?", (more, name))
         except sqlite3.IntegrityError:  # between the two steps the query went, or something was said of it
             if self.query(name) is None:
                 raise KeyError(name) from None
-            return self.say(name, said, object_id, photo)
+            return self.add_feedback(name, feedback, object_id, photo)
         return True
 
     def recordable(self) -> list[tuple[str, str]]:
@@ -311,17 +319,19 @@ class Store:
 
     # Trials -------------------------------------------------------------------------------------------------
 
-    def add_run(self, run: Run) -> None:
+    def add_run(self, run: TrialRun) -> None:
         """Keep a new series of trials."""
         with self._writing() as database:
-            values = (run.id, run.time, run.who, run.seed, run.count, run.recording)
+            values = (run.id, run.time, run.participant, run.seed, run.count, run.recording)
             database.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?)", values)
 
-    def runs(self, recording: str) -> list[Run]:
+    def runs(self, recording: str) -> list[TrialRun]:
         """All series of a recording's objects, the newest first."""
-        return [Run(*row) for row in self._read("SELECT * FROM runs WHERE recording = ? ORDER BY id DESC", [recording])]
+        return [
+            TrialRun(*row) for row in self._read("SELECT * FROM runs WHERE recording = ? ORDER BY id DESC", [recording])
+        ]
 
-    def choose(self, run: str, choice: Choice) -> bool:
+    def choose(self, run: str, choice: TrialChoice) -> bool:
         """Keep what was chosen; False where something was chosen before."""
         try:
             with self._writing() as database:
@@ -331,18 +341,18 @@ class Store:
             return False
         return True
 
-    def choices(self, run: str) -> list[Choice]:
+    def choices(self, run: str) -> list[TrialChoice]:
         """What was chosen so far, by number."""
         found = self._read("SELECT number, choice, truth, model FROM choices WHERE run = ? ORDER BY number", [run])
-        return [Choice(*row) for row in found]
+        return [TrialChoice(*row) for row in found]
 
 
 _COLUMNS = "id, queries.time, verdict, answer, said, object_id"
 
 
-def _kept(row: tuple[Any, ...]) -> Kept:
-    name, when, verdict, answer, said, object_id = row
-    return Kept(name, when, verdict, utf8_of(json.loads(answer)), said, object_id)
+def _stored_query(row: tuple[Any, ...]) -> StoredQuery:
+    name, when, verdict, answer, feedback, object_id = row
+    return StoredQuery(name, when, verdict, replace_surrogates(json.loads(answer)), feedback, object_id)
 
 
 def _searched(words: Sequence[str]) -> str:

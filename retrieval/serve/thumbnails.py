@@ -12,25 +12,25 @@ CACHED_BYTES = 32 * 2**20
 class Thumbnails:
     """Small JPEG pictures of photo files, kept in memory by the content of the file."""
 
-    def __init__(self, most_bytes: int = CACHED_BYTES) -> None:
-        self._kept: OrderedDict[tuple[Path, str, int], bytes] = OrderedDict()
-        self._bytes, self._most, self._lock = 0, most_bytes, Lock()
+    def __init__(self, max_bytes: int = CACHED_BYTES) -> None:
+        self._cache: OrderedDict[tuple[Path, str, int], bytes] = OrderedDict()
+        self._bytes, self._max_bytes, self._lock = 0, max_bytes, Lock()
 
     def of(self, path: Path, digest: str, px: int) -> bytes | None:
         """A JPEG file whose longer side is at most `px`; None where the picture at `path` cannot be read."""
         key = (path, digest, px)
         with self._lock:
-            if (found := self._kept.get(key)) is not None:
-                self._kept.move_to_end(key)
+            if (found := self._cache.get(key)) is not None:
+                self._cache.move_to_end(key)
                 return found
         image = thumbnail(path, px)
         if image is None:
             return None
         data = jpeg(image)
         with self._lock:
-            if key not in self._kept:
-                self._kept[key] = data
+            if key not in self._cache:
+                self._cache[key] = data
                 self._bytes += len(data)
-            while self._bytes > self._most:
-                self._bytes -= len(self._kept.popitem(last=False)[1])
+            while self._bytes > self._max_bytes:
+                self._bytes -= len(self._cache.popitem(last=False)[1])
         return data

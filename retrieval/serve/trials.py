@@ -15,10 +15,10 @@ import numpy as np
 
 from retrieval.data.dataset import Grasp, finger_count, load_grasps
 from retrieval.errors import BadInput
-from retrieval.metrics.guesses import binomial_interval
+from retrieval.metrics.k_way import binomial_interval
 from retrieval.search.embeddings import embed_photos
-from retrieval.serve.generations import Opened
-from retrieval.serve.store import Choice
+from retrieval.serve.generations import ServedGeneration
+from retrieval.serve.store import TrialChoice
 
 CHOICES = 10
 
@@ -33,28 +33,28 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Share:
+class TrialAccuracy:
     """How many trials were right, and the exact interval of 95 % (Clopper and Pearson 1934); None before the first."""
 
     right: int
     trials: int
-    share: float | None
+    accuracy: float | None
     low: float | None
     high: float | None
 
 
-def share_of(right: int, trials: int) -> Share:
+def trial_accuracy(right: int, trials: int) -> TrialAccuracy:
     """The share and its interval."""
     if not trials:
-        return Share(0, 0, None, None, None)
+        return TrialAccuracy(0, 0, None, None, None)
     low, high = binomial_interval(right, trials)
-    return Share(right, trials, right / trials, low, high)
+    return TrialAccuracy(right, trials, right / trials, low, high)
 
 
-def results(choices: list[Choice]) -> tuple[Share, Share]:
+def trial_accuracies(choices: list[TrialChoice]) -> tuple[TrialAccuracy, TrialAccuracy]:
     """The shares of right choices: of the person, and of the model in the same trials."""
     right = [sum(one.choice == one.truth for one in choices), sum(one.model == one.truth for one in choices)]
-    return share_of(right[0], len(choices)), share_of(right[1], len(choices))
+    return trial_accuracy(right[0], len(choices)), trial_accuracy(right[1], len(choices))
 
 
 class Trials:
@@ -72,22 +72,23 @@ class Trials:
             found[grasp.object_id].append(grasp)
         return found
 
-    def unseen(self, opened: Opened) -> list[str]:
+    def unseen(self, generation: ServedGeneration) -> list[str]:
         """Objects that the model was neither trained nor calibrated on, sorted."""
-        split = opened.checkpoint().split
+        split = generation.checkpoint().split
         seen = {*split.train, *split.validation} if split else set()
         return sorted(set(self._by_object) - seen)
 
-    def trial(self, opened: Opened, seed: int, number: int) -> Trial:
+    def trial(self, generation: ServedGeneration, seed: int, number: int) -> Trial:
         """Trial `number`, from 1, of a series. Raises BadInput where the recording has too few unseen objects, or the
-        model is for another number of fingers."""
-        names = self.unseen(opened)
+        model is for another number of fingers.
+        """
+        names = self.unseen(generation)
         if len(names) < CHOICES:
             raise BadInput(
                 f"a trial needs {CHOICES} objects that the model was not trained on; {self.folder} has {len(names)}"
             )
-        if (fingers := finger_count(self._grasps)) != opened.fingers:
-            raise BadInput(f"the model takes {opened.fingers} gel image(s); {self.folder} has {fingers}")
+        if (fingers := finger_count(self._grasps)) != generation.fingers:
+            raise BadInput(f"the model takes {generation.fingers} gel image(s); {self.folder} has {fingers}")
         turn, place = divmod(number - 1, len(names))  # every object once before any comes again
         name = names[np.random.default_rng([seed, turn]).permutation(len(names))[place]]
         rng = np.random.default_rng([seed, turn, place])
@@ -101,10 +102,10 @@ class Trials:
         shown.insert(truth, others[rng.integers(len(others))].photo)
         return Trial(grasp, tuple(shown), truth + 1)
 
-    def model_choice(self, opened: Opened, trial: Trial) -> int:
+    def model_choice(self, generation: ServedGeneration, trial: Trial) -> int:
         """What the model chooses in the same trial, counted from 1: the photo of largest match logit."""
-        background = opened.searcher.checkpoint.config.preprocessing.background
+        background = generation.searcher.checkpoint.config.preprocessing.background
         reference = trial.grasp.backgrounds if background != "none" else None
-        halves = opened.searcher.encode([trial.grasp.touches], background=reference).halves
-        photos = embed_photos(trial.photos, model=opened.checkpoint()).halves
-        return int(opened.searcher.judge.logits(halves, photos).argmax()) + 1
+        partials = generation.searcher.encode([trial.grasp.touches], background=reference).partials
+        photos = embed_photos(trial.photos, model=generation.checkpoint()).partials
+        return int(generation.searcher.scorer.logits(partials, photos).argmax()) + 1

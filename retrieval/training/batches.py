@@ -14,17 +14,17 @@ from torch import Tensor
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, ImageCache, PairBatch
-from retrieval.data.loading import Timed, in_order, worker_count, worker_pool
-from retrieval.errors import DatasetError, Interrupted
+from retrieval.data.loading import TimedFunction, map_in_order, worker_count, worker_pool
+from retrieval.errors import DatasetError, JobInterrupted
 from retrieval.model.config import Config
 from retrieval.model.encode import Image, autocast, one_thread, photo_features, to_batch, touch_batch, touch_features
 from retrieval.model.fusion import Matcher
 from retrieval.training import distributed
-from retrieval.training.kept import KeptImages
+from retrieval.training.disk_image_cache import DiskImageCache
 
 
 @dataclass(frozen=True)
-class Loaded:
+class LoadedBatch:
     """A batch with what its features are made from: images, or the features themselves."""
 
     batch: PairBatch
@@ -41,9 +41,9 @@ class BatchImages:
     def __init__(self, config: Config, device: torch.device, *, keep_bytes: int = 4 << 30) -> None:
         self.config, self.device = config, device
         self.uses_background = config.preprocessing.background != "none"
-        self.decoders = Timed(config.preprocessing.load_touch), Timed(config.preprocessing.load_photo)
-        self._touch: ImageCache | KeptImages
-        self._photo: ImageCache | KeptImages
+        self.decoders = TimedFunction(config.preprocessing.load_touch), TimedFunction(config.preprocessing.load_photo)
+        self._touch: ImageCache | DiskImageCache
+        self._photo: ImageCache | DiskImageCache
         self._touch, self._photo = (ImageCache(load, keep_bytes) for load in self.decoders)
         self._ahead = ThreadPoolExecutor(1)
         self._workers = worker_pool(config.training.workers)
@@ -86,95 +86,97 @@ class BatchImages:
         """A photo, preprocessed."""
         return self._photo(path)
 
-    def keep(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
-        """Have the images of these grasps decoded into `folder`, and taken from there from now on (`KeptImages`)."""
+    def cache_decoded(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
+        """Have the images of these grasps decoded into `folder`, and taken from there from now on (`DiskImageCache`)."""
         settings = self.config.preprocessing
         by, workers = settings.digest(), self.config.training.workers
-        self._touch = touches = KeptImages(settings.load_touch, folder, "touch", by, workers)
-        touches.keep([files for grasp in grasps for files in self._fingers(grasp)], quiet=quiet)
-        self._photo = photos = KeptImages(settings.load_photo, folder, "photo", by, workers)
-        photos.keep([(grasp.photo,) for grasp in grasps], quiet=quiet)
+        self._touch = touches = DiskImageCache(settings.load_touch, folder, "touch", by, workers)
+        touches.cache_decoded([files for grasp in grasps for files in self._fingers(grasp)], quiet=quiet)
+        self._photo = photos = DiskImageCache(settings.load_photo, folder, "photo", by, workers)
+        photos.cache_decoded([(grasp.photo,) for grasp in grasps], quiet=quiet)
 
 
 class TrainedFeatures(BatchImages):
     """Features of towers in training: this rank encodes its share of the images, and gathers the others'."""
 
-    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[Loaded]":
+    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[LoadedBatch]":
         """Start loading this rank's share of the batch's images."""
         return self._ahead.submit(self._load, batch)
 
-    def _load(self, batch: PairBatch) -> Loaded:
-        grasps = [batch.grasps[row] for row in distributed.share(len(batch.grasps))]
-        photos = [batch.photos[row] for row in distributed.share(len(batch.photos))]
+    def _load(self, batch: PairBatch) -> LoadedBatch:
+        grasps = [batch.grasps[row] for row in distributed.rank_rows(len(batch.grasps))]
+        photos = [batch.photos[row] for row in distributed.rank_rows(len(batch.photos))]
         felt = [self._workers.submit(self.touch, grasp) for grasp in grasps]
         seen = [self._workers.submit(self.photo, path) for path in photos]
         touches = touch_batch([future.result() for future in felt])
-        return Loaded(batch, self._moved(touches), self._moved(to_batch([future.result() for future in seen])))
+        return LoadedBatch(
+            batch, self._to_device(touches), self._to_device(to_batch([future.result() for future in seen]))
+        )
 
-    def _moved(self, images: Tensor) -> Tensor:
+    def _to_device(self, images: Tensor) -> Tensor:
         """Images on the device, copied from pinned memory while the device computes."""
         pinned = self.device.type == "cuda" and self.config.training.pinned_memory
         return (images.pin_memory() if pinned else images).to(self.device, non_blocking=pinned)
 
-    def stepping(self) -> AbstractContextManager[None]:
+    def step_context(self) -> AbstractContextManager[None]:
         """What a step is computed in: towers use every core."""
         return nullcontext()
 
-    def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
+    def train_features(self, matcher: Matcher, loaded: LoadedBatch) -> tuple[Tensor, Tensor]:
         """Pass each distinct image through its tower once."""
         touches, photos = len(loaded.batch.grasps), len(loaded.batch.photos)
         with autocast(self.device, self.config.training.precision):
-            with distributed.encoding(touches):
+            with distributed.counting_rank_rows(touches):
                 touch = matcher.touch_features(loaded.touches)
-            with distributed.encoding(photos):
+            with distributed.counting_rank_rows(photos):
                 photo = matcher.photo_features(loaded.photos)
         return distributed.gather_rows(touch, touches), distributed.gather_rows(photo, photos)
 
     def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
         """Encode the images of the pairs, each once."""
-        touch = touch_features(matcher, in_order(self._workers, self.touch, pairs.grasps))
-        return touch, photo_features(matcher, in_order(self._workers, self.photo, pairs.photos))
+        touch = touch_features(matcher, map_in_order(self._workers, self.touch, pairs.grasps))
+        return touch, photo_features(matcher, map_in_order(self._workers, self.photo, pairs.photos))
 
 
 class FrozenFeatures(BatchImages):
     """Features of towers that stand still: each image is encoded the first time it is met, and never again.
 
     known: features by grasp id (of the touch) and by photo file that need no encoding
-    (`retrieval.training.features.by_image`).
+    (`retrieval.training.features.features_by_image`).
     """
 
     def __init__(self, config: Config, device: torch.device, known: Mapping[str | Path, Tensor]) -> None:
         super().__init__(config, device, keep_bytes=0)  # an image is read once: its features are kept
-        self._kept: dict[str | Path, Tensor] = dict(known)
+        self._features: dict[str | Path, Tensor] = dict(known)
 
-    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[Loaded]":
+    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[LoadedBatch]":
         """Look up the features of a batch, encoding what is new; done when this returns.
 
         Not on the thread ahead: PyTorch gives every thread that calls it a team of workers of its own, and two teams
         on the same cores spend a hundred times a step's arithmetic waiting for each other.
         """
-        done: Future[Loaded] = Future()
-        done.set_result(self._look_up(matcher, batch))
+        done: Future[LoadedBatch] = Future()
+        done.set_result(self._cached_features(matcher, batch))
         return done
 
     @torch.inference_mode()
-    def _look_up(self, matcher: Matcher, batch: PairBatch) -> Loaded:
-        new = {grasp.grasp_id: grasp for grasp in batch.grasps if grasp.grasp_id not in self._kept}
+    def _cached_features(self, matcher: Matcher, batch: PairBatch) -> LoadedBatch:
+        new = {grasp.grasp_id: grasp for grasp in batch.grasps if grasp.grasp_id not in self._features}
         if new:
-            images = in_order(self._workers, self.touch, new.values())
-            self._kept.update(zip(new, touch_features(matcher, images), strict=True))
-        photos = [path for path in batch.photos if path not in self._kept]
+            images = map_in_order(self._workers, self.touch, new.values())
+            self._features.update(zip(new, touch_features(matcher, images), strict=True))
+        photos = [path for path in batch.photos if path not in self._features]
         if photos:
-            shown = in_order(self._workers, self.photo, photos)
-            self._kept.update(zip(photos, photo_features(matcher, shown), strict=True))
-        touches = torch.stack([self._kept[grasp.grasp_id] for grasp in batch.grasps])
-        return Loaded(batch, touches, torch.stack([self._kept[path] for path in batch.photos]))
+            shown = map_in_order(self._workers, self.photo, photos)
+            self._features.update(zip(photos, photo_features(matcher, shown), strict=True))
+        touches = torch.stack([self._features[grasp.grasp_id] for grasp in batch.grasps])
+        return LoadedBatch(batch, touches, torch.stack([self._features[path] for path in batch.photos]))
 
-    def stepping(self) -> AbstractContextManager[None]:
+    def step_context(self) -> AbstractContextManager[None]:
         """What a step is computed in: the head's few small products gain nothing from a second core."""
         return one_thread()
 
-    def train_features(self, matcher: Matcher, loaded: Loaded) -> tuple[Tensor, Tensor]:
+    def train_features(self, matcher: Matcher, loaded: LoadedBatch) -> tuple[Tensor, Tensor]:
         """The features, as constants of the step."""
         return loaded.touches.clone(), loaded.photos.clone()
 
@@ -197,19 +199,19 @@ def recorded_features(
     *,
     what: str,
     quiet: bool = False,
-    stopped: Callable[[], bool] = lambda: False,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Tensor, dict[Path, Tensor]]:
     """Features of the touches of grasps (G, fingers * F), one grasp at least, and of each of their photo files (F,).
 
-    what: what they are for, in the bar and where it was stopped. Raises Interrupted.
+    what: what they are for, in the bar and where it was stopped. Raises JobInterrupted.
     """
     none = np.zeros(0, dtype=np.int64)
     touches: list[Tensor] = []
     photos: dict[Path, Tensor] = {}
     with Bar(f"encode for {what}", len(grasps), "grasps", quiet=quiet) as bar:
         for start in range(0, len(grasps), _CHUNK):
-            if stopped():
-                raise Interrupted(f"stopped before the {what} was fitted")
+            if should_stop():
+                raise JobInterrupted(f"stopped before the {what} was fitted")
             part = list(grasps[start : start + _CHUNK])
             files = list(dict.fromkeys(grasp.photo for grasp in part))
             batch = PairBatch(part, files, none, none, np.zeros(0, dtype=np.float32), none, none)

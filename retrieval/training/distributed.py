@@ -48,7 +48,7 @@ def world_size() -> int:
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
-def share(count: int) -> list[int]:
+def rank_rows(count: int) -> list[int]:
     """Rows of a batch of `count` that this rank encodes: equally many on each rank, the last ones repeated."""
     size = -(-count // world_size())
     start_row = rank() * size
@@ -56,7 +56,7 @@ def share(count: int) -> list[int]:
 
 
 def gather_rows(local: Tensor, count: int) -> Tensor:
-    """All ranks' rows (count, d) from this rank's share (`share(count)`, d), with gradients to the other ranks."""
+    """All ranks' rows (count, d) from this rank's share (`rank_rows(count)`, d), with gradients to the other ranks."""
     if world_size() == 1:
         return local
     rows: Tensor = _Gather.apply(local)  # type: ignore[no-untyped-call]
@@ -102,22 +102,22 @@ def average_gradients(model: nn.Module) -> None:
 
 # Batch normalisation -------------------------------------------------------------------------------------
 
-_counted: ContextVar[float] = ContextVar("_counted", default=1.0)
+_counted_fraction: ContextVar[float] = ContextVar("_counted", default=1.0)
 """Which part of the rows at hand, from the first on, are of the batch; the others fill up a share."""
 
 
 @contextmanager
-def encoding(count: int) -> Iterator[None]:
-    """While this rank passes its share (`share(count)`) through a tower: what fills it up counts in no statistics."""
-    size = len(share(count))
-    token = _counted.set(min(max(count - rank() * size, 0), size) / size)
+def counting_rank_rows(count: int) -> Iterator[None]:
+    """While this rank passes its share (`rank_rows(count)`) through a tower: what fills it up counts in no statistics."""
+    size = len(rank_rows(count))
+    token = _counted_fraction.set(min(max(count - rank() * size, 0), size) / size)
     try:
         yield
     finally:
-        _counted.reset(token)
+        _counted_fraction.reset(token)
 
 
-def share_batch_statistics(tower: nn.Module) -> None:
+def synchronize_batch_norm(tower: nn.Module) -> None:
     """Make the batch normalisations of a tower take their statistics over the images of all ranks."""
     if world_size() == 1:
         return
@@ -127,24 +127,24 @@ def share_batch_statistics(tower: nn.Module) -> None:
 
 
 class SharedBatchNorm(nn.BatchNorm2d):
-    """Batch normalisation (B, C, H, W) whose training statistics are those of all ranks' images; see `encoding`."""
+    """Batch normalisation (B, C, H, W) whose training statistics are those of all ranks' images; see `counting_rank_rows`."""
 
     def forward(self, x: Tensor) -> Tensor:
         """As BatchNorm2d. In training every rank must call it, for the ranks wait for each other."""
         if not self.training:
             return super().forward(x)
-        rows = round(_counted.get() * len(x))
+        rows = round(_counted_fraction.get() * len(x))
         # Half precision would lose the small ones among many; BatchNorm2d too takes its sums in float32 then.
         wide = x.to(torch.promote_types(x.dtype, torch.float32))
         mean, variance, count = _statistics(wide.detach()[:rows])
-        self._remember(mean, variance * count / (count - 1))
+        self._update_running_statistics(mean, variance * count / (count - 1))
         made: Tensor = _Normalise.apply(  # type: ignore[no-untyped-call]
             wide, self.weight, self.bias, mean, variance, count, rows, self.eps
         )
         return made.to(x.dtype)
 
     @torch.no_grad()
-    def _remember(self, mean: Tensor, variance: Tensor) -> None:
+    def _update_running_statistics(self, mean: Tensor, variance: Tensor) -> None:
         """Take the batch into the running statistics."""
         assert self.running_mean is not None  # towers keep PyTorch's defaults
         assert self.running_var is not None
@@ -174,7 +174,8 @@ def _statistics(counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 class _Normalise(torch.autograd.Function):
     """x (B, C, H, W) less `mean` over its standard deviation, by weight and bias, all (C,): statistics of `count`
     numbers a channel, which are those of the first `rows` rows of every rank. PyTorch's own kernels do it, in a third
-    of the passes over x that plain operations take."""
+    of the passes over x that plain operations take.
+    """
 
     @staticmethod
     def forward(

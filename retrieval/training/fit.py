@@ -39,24 +39,24 @@ def fit(
     *,
     bar: Bar,
     done: int = 0,
-    stepping: Callable[[], AbstractContextManager[Any]] = nullcontext,
+    step_context: Callable[[], AbstractContextManager[Any]] = nullcontext,
     before_step: Callable[[], None] = lambda: None,
     after_step: Callable[[int], None] = lambda done: None,
     note: Callable[[], str] = lambda: "",
     validate: Callable[[int], None] = lambda done: None,
-    stopped: Callable[[], bool] = lambda: False,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> int:
-    """Minimise the `loss` of batches, one a step; returns how many steps are done, fewer than planned once `stopped()`.
+    """Minimise the `loss` of batches, one a step; returns how many steps are done, fewer than planned once `should_stop()`.
 
     done: steps of an earlier run that this one goes on from; `batches` are those after them. Each step is taken within
-    `stepping()`; before_step: called with the gradients in place; after_step: with the number of steps done; note: what
+    `step_context()`; before_step: called with the gradients in place; after_step: with the number of steps done; note: what
     the bar says behind the loss; validate: with the number of steps done, also when it is stopped. Raises
     NumericalError for a loss that is not finite, before anything has changed by it.
     """
     for batch in batches:
         for group in optimizer.param_groups:
             group["lr"] = plan.learning_rate * SCHEDULES[plan.schedule](done, plan.steps)
-        with stepping():
+        with step_context():
             optimizer.zero_grad(set_to_none=True)
             current = loss(batch)
             value = current.item()
@@ -71,7 +71,7 @@ def fit(
         done += 1
         after_step(done)
         bar.advance(note=f"loss {value:.3f}{note()}")
-        stop = stopped()
+        stop = should_stop()
         if stop or done % plan.validate_every == 0 or done == plan.steps:
             validate(done)
         if stop:
@@ -80,7 +80,7 @@ def fit(
 
 
 @dataclass(frozen=True)
-class Best:
+class BestStep:
     """The step after which a module was worth most on validation objects, and what it was worth."""
 
     step: int
@@ -91,29 +91,29 @@ def fit_best(
     module: nn.Module,
     plan: Plan,
     loss: Callable[[int], Tensor],
-    worth: Callable[[], float],
+    score: Callable[[], float],
     *,
     bar: Bar,
     weight_decay: float = 0.0,
     after_step: Callable[[int], None] = lambda done: None,
-) -> Best:
-    """`fit` by AdamW, leaving `module` in evaluation mode as it was when `worth()` was highest.
+) -> BestStep:
+    """`fit` by AdamW, leaving `module` in evaluation mode as it was when `score()` was highest.
 
     loss: of the step with this number. Only matrices decay: a bias or a temperature has no reason to be small.
     """
     groups: list[dict[str, Any]] = [{"params": [], "weight_decay": 0.0}, {"params": [], "weight_decay": weight_decay}]
     for parameter in module.parameters():
         groups[parameter.ndim > 1]["params"].append(parameter)
-    best, kept = Best(0, -math.inf), dict[str, Tensor]()
+    best, kept = BestStep(0, -math.inf), dict[str, Tensor]()
 
     def validate(done: int) -> None:
         nonlocal best, kept
         module.eval()
         with torch.inference_mode():
-            value = worth()
+            value = score()
         module.train()
         if value > best.value:
-            best = Best(done, value)
+            best = BestStep(done, value)
             kept = {name: tensor.clone() for name, tensor in module.state_dict().items()}
 
     def note() -> str:

@@ -72,7 +72,8 @@ def _convolution(inputs: int, outputs: int, kernel: int) -> list[nn.Module]:
 
 class FingerFrames(Protocol):
     """One finger's pictures, (H, W, 3) uint8 RGB; None where the rig does not take them. `robot.grasping.gates` makes
-    them."""
+    them.
+    """
 
     @property
     def before(self) -> NDArray[np.uint8] | None: ...
@@ -82,7 +83,7 @@ class FingerFrames(Protocol):
     def after(self) -> NDArray[np.uint8] | None: ...
 
 
-class Gate:
+class GraspSuccessGate:
     """Judges grasps, as a function of {finger: frames}. It is independent of the number of fingers."""
 
     def __init__(self, net: GraspNet, settings: GateSettings) -> None:
@@ -102,12 +103,13 @@ class Gate:
         if not fingers:
             raise BadInput("a grasp must have the frames of at least one finger; got none")
         names = sorted(fingers)
-        return dict(zip(names, self.judge([[self._difference(name, fingers[name]) for name in names]])[0], strict=True))
+        return dict(zip(names, self.score([[self._difference(name, fingers[name]) for name in names]])[0], strict=True))
 
     @torch.inference_mode()
-    def judge(self, differences: Sequence[Sequence[NDArray[np.float32]]]) -> list[list[float]]:
+    def score(self, differences: Sequence[Sequence[NDArray[np.float32]]]) -> list[list[float]]:
         """Logits of grasps, each a sequence of its fingers' differences. Raises NumericalError for a NaN or infinite
-        one: it is not above 0, and the grasp would count as failed."""
+        one: it is not above 0, and the grasp would count as failed.
+        """
         with one_thread():
             logits = self.net(touch_batch(differences))
         bad = torch.nonzero(~torch.isfinite(logits))
@@ -130,7 +132,7 @@ class Gate:
         return self._preprocessing.touch(to_float(judged), to_float(before))
 
 
-def load_gate(path: Path) -> Gate:
+def load_gate(path: Path) -> GraspSuccessGate:
     """Read a gate that `train_gate` wrote. Raises CheckpointError with what is wrong and what to do."""
     state, header = read_tensors(path)
     if header.get("task") != TASK:
@@ -144,4 +146,4 @@ def load_gate(path: Path) -> Gate:
         load_weights(net, state)
     except (BadInput, TypeError, KeyError) as error:
         raise CheckpointError(f"{path} is not a gate that this version can use: {error}") from error
-    return Gate(net, settings)
+    return GraspSuccessGate(net, settings)

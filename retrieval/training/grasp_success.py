@@ -32,13 +32,13 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Attempt, ImageCache, Split, data_digest, load_attempts, make_split, recording_source
 from retrieval.data.loading import worker_pool
 from retrieval.errors import ConfigError, DatasetError
-from retrieval.metrics.guesses import grouped_interval
 from retrieval.metrics.intervals import FEW_OBJECTS
+from retrieval.metrics.k_way import grouped_interval
 from retrieval.model.checkpoint import require_writable, write_tensors
 from retrieval.model.encode import batches, one_thread, touch_batch
 from retrieval.model.losses.match import match_loss
 from retrieval.training.fit import Plan, fit
-from retrieval.training.gate import TASK, Gate, GateSettings, GraspNet
+from retrieval.training.gate import TASK, GateSettings, GraspNet, GraspSuccessGate
 from retrieval.training.gate import load_gate as load_gate
 
 BATCH = 32
@@ -67,7 +67,7 @@ class GateReport:
     interval: tuple[float, float]
     chance: float
     accepted: dict[str, tuple[int, int]]
-    least: tuple[str, float] | None
+    lowest_acceptance: tuple[str, float] | None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON."""
@@ -90,8 +90,8 @@ class GateReport:
                 "narrow, and holds the truth less often than in 95 % of cases (2 objects: 79 %, 3: 86 %, 4: 89 %)"
             )
         yield "accepted: " + ", ".join(f"{part} of {whole} {name}" for name, (part, whole) in self.accepted.items())
-        if self.least:
-            yield f"held grasps are accepted least often of {self.least[0]}: {self.least[1]:.0%}"
+        if self.lowest_acceptance:
+            yield f"held grasps are accepted least often of {self.lowest_acceptance[0]}: {self.lowest_acceptance[1]:.0%}"
 
 
 def train_gate(
@@ -118,20 +118,20 @@ def train_gate(
     attempts = load_attempts(recording)
     settings = settings or GateSettings(frame="after" if all(attempt.after for attempt in attempts) else "during")
     _require_frames(attempts, settings.frame)
-    _require_both(attempts, f"{recording} must hold")
+    _require_both_outcomes(attempts, f"{recording} must hold")
     split = make_split([attempt.grasp for attempt in attempts], validation=VALIDATION, test=0, seed=seed)
     train, validation = (
         [attempt for attempt in attempts if attempt.grasp.object_id in objects]
         for objects in (split.train, split.validation)
     )
-    _require_both(train, f"the training objects of seed {seed} must have")
+    _require_both_outcomes(train, f"the training objects of seed {seed} must have")
     with worker_pool() as pool, one_thread():
-        differences = _Differences(settings, pool)
-        gate = Gate(_trained(train, differences, iterations, seed, quiet), settings)
+        differences = _DifferenceLoader(settings, pool)
+        gate = GraspSuccessGate(_train_net(train, differences, iterations, seed, quiet), settings)
         with Bar("judge", len(validation), "grasps", quiet=quiet) as bar:
             logits: list[float] = []  # the highest of each grasp
             for part in batches(validation, BATCH):
-                logits += [max(fingers) for fingers in gate.judge(differences(part))]
+                logits += [max(fingers) for fingers in gate.score(differences(part))]
                 bar.advance(len(part))
     report = _report(out, settings.frame, train, validation, np.array(logits))
     _save(out, gate, split, attempts, recording, report, {"iterations": iterations, "seed": seed})
@@ -149,7 +149,7 @@ def _require_frames(attempts: Sequence[Attempt], frame: str) -> None:
                 )
 
 
-def _require_both(attempts: Sequence[Attempt], who: str) -> None:
+def _require_both_outcomes(attempts: Sequence[Attempt], who: str) -> None:
     held = sum(attempt.held for attempt in attempts)
     if held in (0, len(attempts)):
         raise DatasetError(
@@ -158,7 +158,7 @@ def _require_both(attempts: Sequence[Attempt], who: str) -> None:
         )
 
 
-class _Differences:
+class _DifferenceLoader:
     """The differences of grasps, decoded by a pool of workers and kept in memory."""
 
     def __init__(self, settings: GateSettings, pool: Executor) -> None:
@@ -175,7 +175,9 @@ class _Differences:
         return [self._load(*pair) for pair in zip(judged, attempt.grasp.backgrounds, strict=True)]
 
 
-def _trained(attempts: list[Attempt], differences: _Differences, iterations: int, seed: int, quiet: bool) -> GraspNet:
+def _train_net(
+    attempts: list[Attempt], differences: _DifferenceLoader, iterations: int, seed: int, quiet: bool
+) -> GraspNet:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         net = GraspNet()
@@ -234,9 +236,9 @@ def _report(
 ) -> GateReport:
     accepted = logits >= 0
     held = np.array([attempt.held for attempt in validation])
-    right = _grouped([attempt.grasp.object_id for attempt in validation], accepted == held)
-    good = _grouped([attempt.grasp.object_id for attempt in validation if attempt.held], accepted[held])
-    least = min(((sum(part) / len(part), name) for name, part in good.items()), default=None)
+    right = _group_flags([attempt.grasp.object_id for attempt in validation], accepted == held)
+    good = _group_flags([attempt.grasp.object_id for attempt in validation if attempt.held], accepted[held])
+    lowest_acceptance = min(((sum(part) / len(part), name) for name, part in good.items()), default=None)
     return GateReport(
         path=str(out),
         frame=frame,
@@ -249,13 +251,13 @@ def _report(
         chance=float(max(held.mean(), 1 - held.mean())),
         accepted={
             name: (sum(part), len(part))
-            for name, part in _grouped([attempt.outcome for attempt in validation], accepted).items()
+            for name, part in _group_flags([attempt.outcome for attempt in validation], accepted).items()
         },
-        least=least and (least[1], least[0]),
+        lowest_acceptance=lowest_acceptance and (lowest_acceptance[1], lowest_acceptance[0]),
     )
 
 
-def _grouped(names: Sequence[str], flags: NDArray[np.bool_]) -> dict[str, list[bool]]:
+def _group_flags(names: Sequence[str], flags: NDArray[np.bool_]) -> dict[str, list[bool]]:
     groups: dict[str, list[bool]] = defaultdict(list)
     for name, flag in zip(names, flags.tolist(), strict=True):
         groups[name].append(flag)
@@ -264,7 +266,7 @@ def _grouped(names: Sequence[str], flags: NDArray[np.bool_]) -> dict[str, list[b
 
 def _save(
     out: Path,
-    gate: Gate,
+    gate: GraspSuccessGate,
     split: Split,
     attempts: Sequence[Attempt],
     recording: Path,

@@ -12,7 +12,14 @@ import torch
 from torch import Tensor, nn
 
 from retrieval.errors import CheckpointError
-from retrieval.model.checkpoint import Checkpoint, beside, load_checkpoint, load_weights, read_tensors, write_tensors
+from retrieval.model.checkpoint import (
+    Checkpoint,
+    load_checkpoint,
+    load_weights,
+    read_tensors,
+    sibling_file,
+    write_tensors,
+)
 
 if TYPE_CHECKING:
     from retrieval.training.train import Trainer
@@ -23,10 +30,10 @@ _MODEL, _OPTIMIZER = "model.", "optimizer."
 
 def state_path(out: Path) -> Path:
     """Return the file of an unfinished training of `out`."""
-    return beside(out, ".state.safetensors")
+    return sibling_file(out, ".state.safetensors")
 
 
-def require_fresh(out: Path) -> None:
+def require_no_unfinished_state(out: Path) -> None:
     """Raise CheckpointError where an unfinished training of `out` would be lost."""
     if state_path(out).exists():
         raise CheckpointError(
@@ -40,7 +47,7 @@ def save_state(
     optimizer: torch.optim.Optimizer,
     header: Mapping[str, Any],
     *,
-    left_out: tuple[str, ...] = (),
+    excluded: tuple[str, ...] = (),
 ) -> None:
     """Write the state of an unfinished training of `out`.
 
@@ -52,7 +59,7 @@ def save_state(
         left_out: How the names of weights begin that are stored elsewhere.
     """
     tensors = {
-        f"{_MODEL}{name}": tensor for name, tensor in modules.state_dict().items() if not name.startswith(left_out)
+        f"{_MODEL}{name}": tensor for name, tensor in modules.state_dict().items() if not name.startswith(excluded)
     }
     for name, parameter in modules.named_parameters():
         for quantity, tensor in optimizer.state.get(parameter, {}).items():
@@ -66,7 +73,7 @@ def load_state(
     optimizer: torch.optim.Optimizer,
     identity: Mapping[str, Any],
     *,
-    left_out: Callable[[], Mapping[str, Tensor]] = dict,
+    excluded: Callable[[], Mapping[str, Tensor]] = dict,
 ) -> dict[str, Any]:
     """Load what `save_state` wrote into `modules` and `optimizer`.
 
@@ -92,7 +99,7 @@ def load_state(
                 "configuration, or delete the file to start afresh"
             )
     weights = {name.removeprefix(_MODEL): tensor for name, tensor in tensors.items() if name.startswith(_MODEL)}
-    load_weights(modules, weights | dict(left_out()))
+    load_weights(modules, weights | dict(excluded()))
     for name, parameter in modules.named_parameters():
         prefix = f"{_OPTIMIZER}{name}."
         stored = {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
@@ -104,7 +111,7 @@ def load_state(
     return header
 
 
-def code_of(*classes: type) -> dict[str, str]:
+def code_digest(*classes: type) -> dict[str, str]:
     """Return {"code": SHA-256} of the source of classes that are not this project's; {} where all are ours.
 
     An edited loss or method is then fitted again. The source is that of the module, or of a class in a notebook.
@@ -120,21 +127,21 @@ def code_of(*classes: type) -> dict[str, str]:
     return {"code": hashlib.sha256("\n".join(sources).encode()).hexdigest()} if sources else {}
 
 
-def unfinished(done: Path) -> Path:
+def unfinished_path(done: Path) -> Path:
     """Return where a checkpoint lies until its training is finished: in another folder, so that `done` is whole."""
     return done.parent / "unfinished" / done.name
 
 
-def finish(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
+def finish_training(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
     """Train to the end and return the checkpoint, once: a finished training is read, an unfinished one resumed.
 
     Args:
-        trainer: A training whose `out` is `unfinished(done)`.
+        trainer: A training whose `out` is `unfinished_path(done)`.
         done: Where the finished checkpoint lies afterwards. One of another training is replaced.
         quiet: No progress on stderr.
 
     Raises:
-        Interrupted: After Ctrl-C; the next call resumes.
+        JobInterrupted: After Ctrl-C; the next call resumes.
     """
     mine = (trainer.config, trainer.split, trainer.data_digest, trainer.code.get("code"))
     if done.is_file():
@@ -148,5 +155,5 @@ def finish(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
             state_path(trainer.out).unlink()
     trainer.run(quiet)
     for ending in (".md", ".safetensors"):
-        beside(trainer.out, ending).replace(beside(done, ending))
+        sibling_file(trainer.out, ending).replace(sibling_file(done, ending))
     return load_checkpoint(done)

@@ -52,8 +52,8 @@ def batch_loss(
     """Loss (scalar) and match logits (P,) of a batch from the features of its distinct touches and photos."""
     arrays = batch.touch_index, batch.photo_index, batch.labels, batch.touch_objects, batch.photo_objects
     touch_index, photo_index, labels, *objects = (torch.from_numpy(array).to(touch_features.device) for array in arrays)
-    touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
-    logits = matcher.head(touch.half[touch_index], photo.half[photo_index])
+    touch, photo = matcher.touch_encoding(touch_features), matcher.photo_encoding(photo_features)
+    logits = matcher.head(touch.partial[touch_index], photo.partial[photo_index])
     loss = match_loss(logits, labels)
     for term in losses(EncodedBatch(matcher, touch, photo, *objects)):
         loss = loss + term
@@ -72,7 +72,7 @@ def pair_logits(matcher: Matcher, pairs: PairBatch, source: FeatureSource) -> ND
     """Match logits (P,) of pairs, in evaluation mode, each image encoded once."""
     matcher.eval()
     touch_features, photo_features = source.eval_features(matcher, pairs)
-    with source.stepping():
-        touch, photo = matcher.touch_code(touch_features), matcher.photo_code(photo_features)
-        logits = matcher.head(touch.half[pairs.touch_index], photo.half[pairs.photo_index])
+    with source.step_context():
+        touch, photo = matcher.touch_encoding(touch_features), matcher.photo_encoding(photo_features)
+        logits = matcher.head(touch.partial[pairs.touch_index], photo.partial[pairs.photo_index])
     return np.asarray(logits.cpu().numpy())

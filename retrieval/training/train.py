@@ -33,9 +33,9 @@ from retrieval.data.dataset import (
     make_split,
     recording_source,
 )
-from retrieval.data.labelled import pair_by_label
-from retrieval.data.loading import ahead, worker_count
-from retrieval.errors import CheckpointError, ConfigError, Interrupted
+from retrieval.data.labelled_pictures import pair_by_label
+from retrieval.data.loading import prefetch, worker_count
+from retrieval.errors import CheckpointError, ConfigError, JobInterrupted
 from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
     Checkpoint,
@@ -47,17 +47,17 @@ from retrieval.model.checkpoint import (
 from retrieval.model.config import Config, TrainingConfig, named_config
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
-from retrieval.model.towers.base import Tower
+from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.search.defaults import shipped_model
 from retrieval.training import distributed
-from retrieval.training.batches import FeatureSource, FrozenFeatures, Loaded, TrainedFeatures
-from retrieval.training.distil import add_pruner
-from retrieval.training.features import Features, by_image
+from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
+from retrieval.training.distil import add_candidate_encoder
+from retrieval.training.features import Features, features_by_image
 from retrieval.training.fit import Plan, fit
-from retrieval.training.judgement import with_verdicts
-from retrieval.training.state import code_of, load_state, require_fresh, save_state, state_path
+from retrieval.training.state import code_digest, load_state, require_no_unfinished_state, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
+from retrieval.training.verdicts import with_verdicts
 
 
 def train(
@@ -80,17 +80,17 @@ def train(
         config: As an object (`Config.using` takes towers and losses of your own) or as `load_config` takes it.
         split: Objects of each part; drawn from the configuration where None.
         resume: Continue from the state next to `out`.
-        cache: Folder of decoded images (`retrieval.training.kept`), for towers that are trained.
+        cache: Folder of decoded images (`retrieval.training.disk_image_cache`), for towers that are trained.
         quiet: No progress on stderr.
 
     Raises:
         DatasetError, ConfigError, CheckpointError: The data or settings cannot be trained with.
-        Interrupted: After Ctrl-C.
+        JobInterrupted: After Ctrl-C.
 
     >>> import dataclasses
     >>> from pathlib import Path
     >>> config = retrieval.load_config("tiny").using(losses={"contrastive": 1.0, "sigmoid": 0.1})
-    >>> config = dataclasses.replace(config, training=config.training.of_steps(2))  # a real one takes thousands
+    >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))  # a real one takes thousands
     >>> made = retrieval.train("lab", Path("lab.safetensors"), config, quiet=True)
     >>> made.provenance["step"], len(made.split.train)
     (2, 7)
@@ -113,11 +113,11 @@ def train(
         require_fit(split, grasps)
     trainer = Trainer(config, split, grasps, out, source=recording_source(recording))
     if not resume:
-        require_fresh(out)
+        require_no_unfinished_state(out)
     else:
         trainer.resume()
     if cache:
-        trainer.features.keep(cache, [*grasps, *labelled_pairs(config)], quiet=quiet or distributed.rank() > 0)
+        trainer.features.cache_decoded(cache, [*grasps, *labelled_pairs(config)], quiet=quiet or distributed.rank() > 0)
     trainer.run(quiet)
     return load_checkpoint(out)
 
@@ -141,25 +141,27 @@ class Trainer:
         self.data_digest = known.digest if known else data_digest([*grasps, *pairs])
         self.device = default_device()
         torch.manual_seed(settings.seed)
-        self.unpruned = config.without_pruner()
+        self.config_without_encoder = config.without_candidate_encoder()
         self.has_images = known is None
-        self.matcher = build_matcher(self.unpruned).to(self.device)
+        self.matcher = build_matcher(self.config_without_encoder).to(self.device)
         self.sampler = self._sampler([*split.select(grasps, "train"), *pairs])
         self.losses = WeightedLosses(settings.weights, self.matcher, len(self.sampler.grasps)).to(self.device)
         self.modules = nn.ModuleDict({"matcher": self.matcher, "losses": self.losses})
         towers = (module for module in self.matcher.modules() if isinstance(module, Tower))
-        self.code = code_of(*map(type, (*self.losses.terms, *towers)))
+        self.code = code_digest(*map(type, (*self.losses.terms, *towers)))
         trained = [parameter for parameter in self.modules.parameters() if parameter.requires_grad]
         # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
         self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
         held_out = split.select(grasps, "validation")
-        self.validation = self._sampler(held_out).every_touch() if split.validation else None
+        self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
         self.features: FeatureSource = TrainedFeatures(config, self.device)
         if settings.freeze_towers:
-            self.features = FrozenFeatures(config, self.device, by_image(grasps, known, self.device) if known else {})
+            self.features = FrozenFeatures(
+                config, self.device, features_by_image(grasps, known, self.device) if known else {}
+            )
         set_training_mode(self.matcher, settings)
         self.step, self.best = 0, -math.inf
-        self._passed, self._busy_s = 0, 0.0
+        self._image_count, self._compute_s = 0, 0.0
 
     def _sampler(self, chosen: list[Grasp]) -> PairSampler:
         settings = self.config.training
@@ -189,87 +191,89 @@ class Trainer:
             fit(
                 self.optimizer,
                 plan,
-                ahead(map(self._prepare, range(self.step, plan.steps)), settings.prefetch),
+                prefetch(map(self._prepare, range(self.step, plan.steps)), settings.prefetch),
                 self.loss,
                 bar=bar,
                 done=self.step,
-                stepping=self.features.stepping,
+                step_context=self.features.step_context,
                 before_step=lambda: distributed.average_gradients(self.modules),
-                after_step=self._stepped,
+                after_step=self._after_step,
                 note=self._note,
                 validate=lambda _: self._validate_and_save(),
                 # All ranks stop after the same step: one that went on would wait for the others for ever.
-                stopped=lambda: distributed.any_rank(stop.is_set(), self.device),
+                should_stop=lambda: distributed.any_rank(stop.is_set(), self.device),
             )
         if not quiet and not settings.freeze_towers:
             say(self._rates())
         if self.step < plan.steps:
-            raise Interrupted(
+            raise JobInterrupted(
                 f"stopped at step {self.step} of {plan.steps}; {self.out} is usable, --resume goes on from here"
             )
 
     def _rates(self) -> str:
         """Say how fast the loader decodes and the towers compute: the slower one decides how long a step takes."""
-        towers = f"the towers take {self._passed / self._busy_s:.0f} images/s"
+        towers = f"the towers take {self._image_count / self._compute_s:.0f} images/s"
         if (rate := self.features.decode_rate) is None:
             return f"loader: no image was decoded; {towers}"
         count = worker_count(self.config.training.workers)
         return f"loader: {count} worker(s) can decode {rate:.0f} images/s; {towers}"
 
-    def _prepare(self, step: int) -> "Future[Loaded]":
+    def _prepare(self, step: int) -> "Future[LoadedBatch]":
         batch = self.sampler.batch(step, self.config.training.touches_per_batch)
         return self.features.prepare(self.matcher, batch)
 
-    def loss(self, loaded: Loaded) -> Tensor:
+    def loss(self, loaded: LoadedBatch) -> Tensor:
         """The loss of a prepared batch."""
         settings, batch = self.config.training, loaded.batch
-        self._passed += loaded.touches.shape[:2].numel() + len(loaded.photos)
-        self._began = time.perf_counter()
+        self._image_count += loaded.touches.shape[:2].numel() + len(loaded.photos)
+        self._step_start_s = time.perf_counter()
         torch.manual_seed(settings.seed * 1_000_003 + self.step)  # the dropout mask, the same on every rank
         touch, photo = self.features.train_features(self.matcher, loaded)
         if settings.shuffle_fingers:
             touch = shuffle_fingers(touch, self.matcher.config.fingers)
         loss, logits = batch_loss(self.matcher, self.losses, batch, touch, photo)
-        self._judged = logits.detach(), batch.labels
+        self._last_logits = logits.detach(), batch.labels
         return loss
 
-    def _stepped(self, done: int) -> None:
+    def _after_step(self, done: int) -> None:
         # Fused steps do not count as changes by themselves, and what is made from the weights would seem to be fresh.
         increment_version(list(self.matcher.parameters()))
         self.matcher.clamp_scale()
         self.losses.clamp()
         self.step = done
-        self._busy_s += time.perf_counter() - self._began
+        self._compute_s += time.perf_counter() - self._step_start_s
 
     def _note(self) -> str:
-        logits, labels = self._judged
+        logits, labels = self._last_logits
         best = "" if math.isinf(self.best) else f"  validation AUC {self.best:.3f}"
         return f"  accuracy {pair_accuracy(logits.cpu().numpy(), labels):.2f}{best}"
 
     def _finish(self, stop: threading.Event, quiet: bool) -> None:
         """Complete the best checkpoint, on the first rank; after Ctrl-C all ranks leave."""
-        stopped = False
+        should_stop = False
         if not distributed.rank():
             try:
                 self._complete(stop, quiet)
                 state_path(self.out).unlink(missing_ok=True)
-            except Interrupted:
-                stopped = True
-        if distributed.any_rank(stopped, self.device):  # and no rank leaves before the files are there
-            raise Interrupted(
+            except JobInterrupted:
+                should_stop = True
+        if distributed.any_rank(should_stop, self.device):  # and no rank leaves before the files are there
+            raise JobInterrupted(
                 f"stopped before the checkpoint was complete; {self.out} ranks photos, --resume adds the rest"
             )
 
     def _complete(self, stop: threading.Event, quiet: bool) -> None:
-        """Add to the best checkpoint what is fitted when all is learned: the pruner, the posterior, the gel check."""
+        """Add to the best checkpoint what is fitted when all is learned: the candidate_encoder, the posterior, the gel check."""
         train = [grasp for part in self.sampler.grasps for grasp in part]
         held_out = self.validation.grasps if self.validation else []
         made = load_checkpoint(self.out)
         made.matcher.to(self.device)
-        if self.config.matcher.pruner_width:
-            made = add_pruner(made, self.config, self.features, train, held_out, quiet=quiet, stopped=stop.is_set)
+        if self.config.matcher.candidate_width:
+            made = add_candidate_encoder(
+                made, self.config, self.features, train, held_out, quiet=quiet, should_stop=stop.is_set
+            )
         if self.has_images:
-            made = with_verdicts(made, self.features, train, held_out, quiet=quiet, stopped=stop.is_set)
+            made = with_verdicts(made, self.features, train, held_out, quiet=quiet, should_stop=stop.is_set)
         store_checkpoint(made, self.out)
 
     def _validate_and_save(self) -> None:
@@ -283,7 +287,7 @@ class Trainer:
         distributed.any_rank(False, self.device)  # no rank reads or leaves before the files are there
 
     def validate(self) -> dict[str, float]:
-        """Judge the fixed validation pairs; nothing where the split has no validation objects."""
+        """FusionScorer the fixed validation pairs; nothing where the split has no validation objects."""
         if self.validation is None:
             return {}
         logits, labels = pair_logits(self.matcher, self.validation, self.features), self.validation.labels
@@ -305,7 +309,7 @@ class Trainer:
         save_checkpoint(
             self.out,
             self.matcher,
-            self.unpruned,
+            self.config_without_encoder,
             split=self.split,
             provenance=provenance,
         )
@@ -320,27 +324,31 @@ class Trainer:
         }
 
     def _save_state(self) -> None:
-        left_out = FROZEN if self.config.training.freeze_towers else ()  # these are in the checkpoint
+        excluded = FROZEN if self.config.training.freeze_towers else ()  # these are in the checkpoint
         header = {"step": self.step, "best": None if self.validation is None else self.best, **self._identity()}
-        save_state(self.out, self.modules, self.optimizer, header, left_out=left_out)
+        save_state(self.out, self.modules, self.optimizer, header, excluded=excluded)
 
     def resume(self) -> None:
         """Continue from the state next to `out`. Raises CheckpointError where it belongs to another run."""
-        header = load_state(self.out, self.modules, self.optimizer, self._identity(), left_out=self._frozen_weights)
+        header = load_state(self.out, self.modules, self.optimizer, self._identity(), excluded=self._frozen_weights)
         self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
 
     def _frozen_weights(self) -> dict[str, Tensor]:
-        weights = self._own_checkpoint().matcher.state_dict().items()
+        weights = self._load_own_checkpoint().matcher.state_dict().items()
         named = {f"matcher.{name}": tensor for name, tensor in weights}
         frozen = self.config.training.freeze_towers
         return {name: tensor for name, tensor in named.items() if frozen and name.startswith(FROZEN)}
 
-    def _own_checkpoint(self) -> Checkpoint:
+    def _load_own_checkpoint(self) -> Checkpoint:
         """The best checkpoint so far is part of the state. It may be newer than the rest of it (a crash between the
-        two writes): the steps since then are repeated to the same end."""
+        two writes): the steps since then are repeated to the same end.
+        """
         kept = load_checkpoint(self.out)
         mine = (kept.split, kept.provenance.get("data_digest")) == (self.split, self.data_digest)
-        if not mine or kept.config not in (self.unpruned, self.config):  # before and after its pruner is taught
+        if not mine or kept.config not in (
+            self.config_without_encoder,
+            self.config,
+        ):  # before and after its candidate_encoder is taught
             raise CheckpointError(
                 f"{self.out} is not of the training to resume; put its checkpoint back or start afresh"
             )
@@ -365,9 +373,9 @@ def build_matcher(config: Config) -> Matcher:
         (matcher.photo_tower, settings.init_photo, "photo_tower"),
     ):
         shipped = partial(_shipped_tower, config.matcher.fingers, side)
-        initialise_tower(tower, settings.first_weights(init), shipped)
+        initialise_tower(tower, settings.tower_init(init), shipped)
         tower.requires_grad_(not settings.freeze_towers)
-        distributed.share_batch_statistics(tower)
+        distributed.synchronize_batch_norm(tower)
     return matcher
 
 

@@ -15,7 +15,7 @@ NEAR_MM, NEAR_RAD = 1.0, math.radians(1.0)
 class ManualArm(Arm):
     """Asks a person to bring the hand to each pose, and believes them. `ask` shows a sentence and returns when done."""
 
-    by_hand = True
+    is_manual = True
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class ManualArm(Arm):
             return self._at
         self._at = None
         try:
-            self._ask(in_words(pose))
+            self._ask(describe_pose(pose))
         except EOFError as error:
             raise RobotConfigError("a person must move the hand of this rig: run it in a terminal") from error
         self._at = pose
@@ -63,7 +63,7 @@ def is_near(here: Pose, there: Pose) -> bool:
     return math.dist(here.as_tuple()[:3], there.as_tuple()[:3]) <= NEAR_MM and abs(turn) <= NEAR_RAD
 
 
-def in_words(pose: Pose) -> str:
+def describe_pose(pose: Pose) -> str:
     """What a person is asked to do; right and away are as the camera sees them, which looks on from the -y side."""
     sideways = f"{abs(pose.x_mm):.0f} mm to the {'right' if pose.x_mm >= 0 else 'left'} of the middle of the workspace"
     along = f"{abs(pose.y_mm):.0f} mm {'away from' if pose.y_mm >= 0 else 'towards'} the camera"

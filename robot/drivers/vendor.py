@@ -9,21 +9,21 @@ from importlib import import_module
 from typing import Any
 
 from robot.devices import Camera
-from robot.drivers.video.frames import MOST_S
+from robot.drivers.video.frames import MAX_CAMERA_WAIT_S
 from robot.errors import DeviceError
-from robot.settings import TypedSettings, limited
+from robot.settings import TypedSettings, bounded
 
 _LIBRARY = re.compile(r"(lib[^\s:/]+\.(?:so|dylib)[.\d]*)")
 """As the loaders of Linux and macOS name what they do not find."""
 
-_BRINGS = {
+_INSTALL_COMMANDS = {
     "libfreenect2": "ldconfig after building libfreenect2 with shared libraries (github.com/OpenKinect/libfreenect2)",
     "libusb": "apt-get install libusb-1.0-0 (Debian, Ubuntu) or brew install libusb (macOS)",
     "libudev": "apt-get install libudev1 (Debian, Ubuntu)",
 }
 
 
-def load(package: str, device: str, install: str) -> Any:
+def import_package(package: str, device: str, install: str) -> Any:
     """The maker's package, imported. Raises DeviceError that says what is missing: it, or a library of the system."""
     try:
         return import_module(package)
@@ -38,21 +38,21 @@ def missing_library(package: str, error: ImportError) -> str | None:
     if found is None:
         return None
     library = found[1]
-    run = next((run for name, run in _BRINGS.items() if library.startswith(name)), None)
+    run = next((run for name, run in _INSTALL_COMMANDS.items() if library.startswith(name)), None)
     cure = f"run {run}" if run else "install the package of your system that brings it"
     return f"{library}, a library of the system that {package} cannot find; {cure}"
 
 
 @dataclass(frozen=True, kw_only=True)
-class MakerSettings(TypedSettings):
+class VendorSettings(TypedSettings):
     """serial: which camera, where several are connected. warmup_frames: dropped at first. timeout_s: of a picture."""
 
     serial: str = ""
-    warmup_frames: int = limited(0, 1000, 5)
-    timeout_s: float = limited(1e-3, MOST_S, 3.0, unit="s")
+    warmup_frames: int = bounded(0, 1000, 5)
+    timeout_s: float = bounded(1e-3, MAX_CAMERA_WAIT_S, 3.0, unit="s")
 
 
-def finite(what: str, numbers: Iterable[float]) -> list[float]:
+def check_finite(what: str, numbers: Iterable[float]) -> list[float]:
     """What a camera says of itself. Raises DeviceError for NaN or infinity."""
     found = [float(each) for each in numbers]
     if not all(map(math.isfinite, found)):
@@ -71,13 +71,13 @@ def vendor_errors(failure: str) -> Iterator[None]:
         raise DeviceError(f"{failure}: {error or type(error).__name__}") from error
 
 
-class MakerCamera(Camera):
-    """A camera behind its maker's package. `_has`: what it says of its settings."""
+class VendorCamera(Camera):
+    """A camera behind its maker's package. `_reported`: what it says of its settings."""
 
-    _has: Mapping[str, Any] = {}
+    _reported: Mapping[str, Any] = {}
 
     def _settings(self) -> dict[str, Any]:
-        return dict(self._has)
+        return dict(self._reported)
 
     def _recover(self) -> None:
         """Close whatever can be closed, then connect whole or not at all."""
@@ -90,11 +90,11 @@ class MakerCamera(Camera):
                 self._close()
             raise
 
-    def _chosen(self, asked: str, connected: Sequence[str]) -> int:
+    def _choose_camera(self, requested: str, connected: Sequence[str]) -> int:
         """Return the place of the camera to open among the serial numbers of those connected. Raises DeviceError."""
-        if asked in connected or (not asked and len(connected) == 1):
-            return connected.index(asked) if asked else 0
+        if requested in connected or (not requested and len(connected) == 1):
+            return connected.index(requested) if requested else 0
         known = ", ".join(connected) or "none"
-        if asked:
-            raise DeviceError(f"{self.name} {asked} must be connected; connected: {known}")
+        if requested:
+            raise DeviceError(f"{self.name} {requested} must be connected; connected: {known}")
         raise DeviceError(f"one {self.name} must be connected, or its serial number given; connected: {known}")

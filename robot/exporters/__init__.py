@@ -2,7 +2,7 @@
 
 from _touch_retrieval.registry import Registry
 from robot.errors import UnknownName
-from robot.exporters.base import Exporter
+from robot.exporters.exporting import Exporter
 
 EXPORTERS: Registry[Exporter] = Registry(
     "format",

@@ -13,22 +13,23 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from robot.errors import RecordingError
-from robot.exporters.base import Exported, Parts, in_parts, read_picture, whole_folder
-from robot.importers.base import Progress
+from robot.exporters.exporting import Parts, RecordingExport, atomic_folder, grasps_by_part, read_picture
+from robot.importers.importing import Progress
 from robot.recording.folder import METADATA_FILE, RecordedGrasp, Recording
-from robot.storage import content_of
+from robot.storage import read_content
 
 
 def export_imagefolder(
     recording: Recording, out: Path, *, parts: Parts | None = None, progress: Progress | None = None
-) -> Exported:
+) -> RecordingExport:
     """Write an imagefolder; every picture is decoded once, so that a broken one is refused here. Raises RecordingError,
-    StorageError."""
-    found, notes = in_parts(recording, parts)
+    StorageError.
+    """
+    found, notes = grasps_by_part(recording, parts)
     columns, left_out = _common_columns(found.values())
     notes += [f"left out {name}, which grasps lack: `datasets` wants the same columns throughout" for name in left_out]
     total, done = sum(map(len, found.values())), 0
-    with whole_folder(out) as folder:
+    with atomic_folder(out) as folder:
         (folder / "README.md").write_text(_card(recording), "utf-8")
         for part, grasps in found.items():
             (folder / part).mkdir()
@@ -38,12 +39,13 @@ def export_imagefolder(
                     done += 1
                     if progress is not None:
                         progress(done, total)
-    return Exported(out, total, tuple(notes))
+    return RecordingExport(out, total, tuple(notes))
 
 
 def _common_columns(parts: Collection[Sequence[RecordedGrasp]]) -> tuple[list[str], list[str]]:
     """Keys of lines that `datasets` can read, and the others: a picture that every grasp has, and of the rest what
-    grasps of every part have."""
+    grasps of every part have.
+    """
     counted = [(len(grasps), Counter(key for grasp in grasps for key in grasp.to_row())) for grasps in parts]
     every = dict.fromkeys(key for _, counts in counted for key in counts)
     least = {key: [total if key.endswith("_file_name") else 1 for total, _ in counted] for key in every}
@@ -59,7 +61,7 @@ def _line(recording: Recording, grasp: RecordedGrasp, folder: Path, columns: Seq
             if column != "depth":
                 read_picture(source)
             target.parent.mkdir(parents=True, exist_ok=True)
-            target.write_bytes(content_of(source, RecordingError))
+            target.write_bytes(read_content(source, RecordingError))
     row = grasp.to_row()
     return {key: row.get(key) for key in columns}
 

@@ -23,17 +23,17 @@ from typing import Any
 
 import numpy as np
 
-from robot.exporters.base import (
-    MOMENTS,
-    Exported,
+from robot.exporters.exporting import (
+    MOMENT_SUFFIXES,
+    EpisodeSteps,
     Parts,
     Picture,
-    Steps,
-    in_parts,
+    RecordingExport,
+    atomic_folder,
+    grasps_by_part,
     plain_fields,
-    whole_folder,
 )
-from robot.importers.base import Progress, library
+from robot.importers.importing import Progress, import_extra
 from robot.recording.folder import RecordedGrasp, Recording
 
 FPS = 1
@@ -50,17 +50,17 @@ _WHAT = "LeRobot's format"
 
 def export_lerobot(
     recording: Recording, out: Path, *, parts: Parts | None = None, progress: Progress | None = None
-) -> Exported:
+) -> RecordingExport:
     """Write a LeRobot data set, version 3. Raises RecordingError, ImporterError without pyarrow or av, StorageError."""
-    library("pyarrow", _WHAT), library("av", _WHAT)
-    found, notes = in_parts(recording, parts)
+    import_extra("pyarrow", _WHAT), import_extra("av", _WHAT)
+    found, notes = grasps_by_part(recording, parts)
     grasps = [grasp for part in found.values() for grasp in part]
-    steps = Steps(recording, grasps)
+    steps = EpisodeSteps(recording, grasps)
     tasks = {name: number for number, name in enumerate(dict.fromkeys(grasp.object_id for grasp in grasps))}
-    with whole_folder(out) as folder:
+    with atomic_folder(out) as folder:
         stats = {name: _Stats() for name in (*_STEP_COLUMNS, *map(_key, steps.sizes))}
         for start in range(0, len(grasps), EPISODES_A_FILE):
-            with _File(folder, start, steps, tasks, stats) as file:
+            with _FileWriter(folder, start, steps, tasks, stats) as file:
                 for episode, grasp in enumerate(grasps[start : start + EPISODES_A_FILE], start):
                     file.append(episode, grasp)
                     if progress is not None:
@@ -68,44 +68,44 @@ def export_lerobot(
         _write_tasks(folder / "meta" / "tasks.parquet", tasks)
         _write_json(folder / "meta" / "stats.json", {name: each.to_dict() for name, each in stats.items()})
         _write_json(folder / "meta" / "info.json", _info(recording, steps, len(tasks), found))
-    return Exported(out, len(grasps), (*notes, *steps.remarks()))
+    return RecordingExport(out, len(grasps), (*notes, *steps.remarks()))
 
 
 def _key(camera: str) -> str:
     return f"observation.images.{camera}"
 
 
-class _File:
+class _FileWriter:
     """The data, videos and episodes of one file number. Closed by `with`, also where something fails."""
 
     def __init__(
-        self, folder: Path, start: int, steps: Steps, tasks: Mapping[str, int], stats: Mapping[str, "_Stats"]
+        self, folder: Path, start: int, steps: EpisodeSteps, tasks: Mapping[str, int], stats: Mapping[str, "_Stats"]
     ) -> None:
         chunk, file = divmod(start // EPISODES_A_FILE, FILES_A_CHUNK)
         self._place = {"chunk_index": chunk, "file_index": file}
         self._folder, self._start, self._steps, self._tasks, self._stats = folder, start, steps, tasks, stats
         self._rows: list[dict[str, Any]] = []
         self._episodes: list[dict[str, Any]] = []
-        self._films: dict[str, _Film] = {}
+        self._videos: dict[str, _VideoWriter] = {}
 
-    def __enter__(self) -> "_File":
+    def __enter__(self) -> "_FileWriter":
         for camera, size in self._steps.sizes.items():
             path = self._folder / _VIDEO.format(video_key=_key(camera), **self._place)
-            self._films[camera] = _Film(path, size)
+            self._videos[camera] = _VideoWriter(path, size)
         return self
 
     def append(self, episode: int, grasp: RecordedGrasp) -> None:
         """Write one grasp as an episode."""
-        pictures, length = self._steps.of(grasp), len(self._steps.moments)
+        pictures, length = self._steps.pictures_of(grasp), len(self._steps.moments)
         first, task = episode * length, self._tasks[grasp.object_id]
         for step, moment in enumerate(self._steps.moments):
-            values = (step / FPS, step, episode, first + step, task, list(MOMENTS).index(moment))
+            values = (step / FPS, step, episode, first + step, task, list(MOMENT_SUFFIXES).index(moment))
             self._rows.append(dict(zip(_STEP_COLUMNS, values, strict=True)))
             for name, value in zip(_STEP_COLUMNS, values, strict=True):
                 self._stats[name].add(np.array([[value]], dtype=np.float64))
         for camera, frames in pictures.items():
             for frame in frames:
-                self._films[camera].append(frame)
+                self._videos[camera].append(frame)
                 self._stats[_key(camera)].add(frame.reshape(-1, 3) / 255.0)
         self._episodes.append(self._episode(episode, grasp, first, length))
 
@@ -123,21 +123,21 @@ class _File:
         return row | {key: said.get(key) for key in _PLAIN}
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
-        for film in self._films.values():
+        for film in self._videos.values():
             film.close()
         if kind is None:
-            pa = library("pyarrow", _WHAT)
+            pa = import_extra("pyarrow", _WHAT)
             kinds = {"string": pa.string(), "bool": pa.bool_(), "double": pa.float64(), "list": pa.list_(pa.float64())}
             plain = {key: kinds[kind] for key, kind in _PLAIN.items()}
             _write_table(self._folder / _DATA.format(**self._place), self._rows, {"timestamp": pa.float32()})
             _write_table(self._folder / _EPISODES.format(**self._place), self._episodes, plain)
 
 
-class _Film:
+class _VideoWriter:
     """A video of pictures of one size, each a key frame."""
 
     def __init__(self, path: Path, size: tuple[int, int]) -> None:
-        av = library("av", _WHAT)
+        av = import_extra("av", _WHAT)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._av, self._count = av, 0
         self._container = av.open(str(path), "w")
@@ -199,15 +199,15 @@ _PLAIN = {
 
 def _write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[str, Any]) -> None:
     """A Parquet file of rows that have the same keys; types: of those that values do not tell."""
-    pa = library("pyarrow", _WHAT)
+    pa = import_extra("pyarrow", _WHAT)
     columns = {key: pa.array([row[key] for row in rows], types.get(key)) for key in rows[0]}
     path.parent.mkdir(parents=True, exist_ok=True)
-    library("pyarrow.parquet", _WHAT).write_table(pa.table(columns), path)
+    import_extra("pyarrow.parquet", _WHAT).write_table(pa.table(columns), path)
 
 
 def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
     """As pandas writes a frame with a column task_index whose index are the tasks: so LeRobot reads it."""
-    pa = library("pyarrow", _WHAT)
+    pa = import_extra("pyarrow", _WHAT)
     index = "__index_level_0__"
     columns = [
         {"name": name, "field_name": field, "pandas_type": kind, "numpy_type": numpy_type, "metadata": None}
@@ -221,7 +221,7 @@ def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
         {"task_index": pa.array(list(tasks.values()), pa.int64()), index: pa.array(list(tasks), pa.string())}
     )
     table = table.replace_schema_metadata({b"pandas": json.dumps(about).encode()})
-    library("pyarrow.parquet", _WHAT).write_table(table, path)
+    import_extra("pyarrow.parquet", _WHAT).write_table(table, path)
 
 
 def _write_json(path: Path, value: Any) -> None:
@@ -229,7 +229,7 @@ def _write_json(path: Path, value: Any) -> None:
 
 
 def _info(
-    recording: Recording, steps: Steps, tasks: int, found: Mapping[str, Sequence[RecordedGrasp]]
+    recording: Recording, steps: EpisodeSteps, tasks: int, found: Mapping[str, Sequence[RecordedGrasp]]
 ) -> dict[str, Any]:
     ends = list(itertools.accumulate(map(len, found.values())))
     episodes = ends[-1]

@@ -19,32 +19,32 @@ from typing import Any
 
 import numpy as np
 
-from robot.exporters.base import Exported, Parts, Steps, in_parts, plain_fields, whole_folder
-from robot.importers.base import Progress, library
+from robot.exporters.exporting import EpisodeSteps, Parts, RecordingExport, atomic_folder, grasps_by_part, plain_fields
+from robot.importers.importing import Progress, import_extra
 from robot.recording.folder import RecordedGrasp, Recording
 
 STORE = "grasps.zarr"
 _WHAT = "the format of Open-X-Tactile"
-_SAID = ("source", "sensor", "rig", "licence", "citation", "background")
+_INFO_KEYS = ("source", "sensor", "rig", "licence", "citation", "background")
 
 
 def export_open_x_tactile(
     recording: Recording, out: Path, *, parts: Parts | None = None, progress: Progress | None = None
-) -> Exported:
+) -> RecordingExport:
     """Write a zarr store of version 2. Raises RecordingError, ImporterError without zarr, StorageError."""
-    zarr = library("zarr", _WHAT)
-    found, notes = in_parts(recording, parts)
+    zarr = import_extra("zarr", _WHAT)
+    found, notes = grasps_by_part(recording, parts)
     grasps = [grasp for part in found.values() for grasp in part]
-    steps = Steps(recording, grasps)
+    steps = EpisodeSteps(recording, grasps)
     length = len(steps.moments)
     if len({steps.sizes[f"touch_{finger}"] for finger in steps.fingers}) > 1:
         for finger in steps.fingers[1:]:
             steps.sizes[f"touch_{finger}"] = steps.sizes[f"touch_{steps.fingers[0]}"]
-    with whole_folder(out) as folder:
+    with atomic_folder(out) as folder:
         root = zarr.open_group(str(folder / STORE), mode="w", zarr_format=2)
         ends = np.cumsum([0, *map(len, found.values())]).tolist()
         root.attrs["splits"] = {part: [ends[at], ends[at + 1]] for at, part in enumerate(found)}
-        root.attrs["recording"] = {key: recording.info.get(key) for key in _SAID}
+        root.attrs["recording"] = {key: recording.info.get(key) for key in _INFO_KEYS}
         data, meta = root.create_group("data"), root.create_group("meta")
         photo, touch = (steps.sizes[name] for name in ("photo", f"touch_{steps.fingers[0]}"))
         photos = _frames(data, "camera_main_rgb", len(grasps) * length, (*photo, 3))
@@ -53,7 +53,7 @@ def export_open_x_tactile(
         _store(data, "right_tactile_type_0", np.array(["image"]))
         _store(data, "right_tactile_area_0", np.arange(len(steps.fingers), dtype=np.int64))
         for episode, grasp in enumerate(grasps):
-            pictures = steps.of(grasp)
+            pictures = steps.pictures_of(grasp)
             at = slice(episode * length, (episode + 1) * length)
             photos[at] = np.stack(pictures["photo"])
             touches[at] = np.stack([np.stack(pictures[f"touch_{finger}"]) for finger in steps.fingers], axis=1)
@@ -63,7 +63,7 @@ def export_open_x_tactile(
             _store(meta, name, values)
         _store(meta, "moment", np.array(steps.moments))
         _store(meta, "episode_ends", length * np.arange(1, len(grasps) + 1, dtype=np.int64))
-    return Exported(out, len(grasps), (*notes, *steps.remarks()))
+    return RecordingExport(out, len(grasps), (*notes, *steps.remarks()))
 
 
 def _frames(group: Any, name: str, count: int, shape: tuple[int, ...]) -> Any:
@@ -80,7 +80,8 @@ def _store(group: Any, name: str, values: np.ndarray[Any, Any]) -> None:
 
 def _lines(grasps: list[RecordedGrasp]) -> dict[str, np.ndarray[Any, Any]]:
     """What was recorded of any grasp, by key: (E,) strings, numbers with NaN, and grasped as 1, 0, -1 unknown; poses
-    (E, k)."""
+    (E, k).
+    """
     rows = [plain_fields(grasp) for grasp in grasps]
     found: dict[str, np.ndarray[Any, Any]] = {}
     for key in dict.fromkeys(key for row in rows for key in row):

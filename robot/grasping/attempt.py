@@ -23,7 +23,7 @@ from robot.readings import RGBD, Pose
 from robot.rig import Rig, check_seed
 from robot.storage import file_content
 
-_OUTCOME_OF = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
+_OUTCOME_FROM = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class GraspAttempt:
     """What came of an attempt, as it travels between processes: images are the content of JPEG and PNG files.
 
     outcome: "held", "missed", "slipped" by the gripper after the lift, or for the `reason` given "no_plan", or
-    "ungraspable" where further attempts are useless; then there are no images. at_s, lasted_s: from the photo to the
+    "ungraspable" where further attempts are useless; then there are no images. touch_time_s, lasted_s: from the photo to the
     picture of the closed jaws, and to the end.
     """
 
@@ -42,11 +42,11 @@ class GraspAttempt:
     fields: Mapping[str, Any] = field(default_factory=dict)
     fit: Mapping[str, Any] = field(default_factory=dict)
     reason: str | None = None
-    at_s: float = 0.0
-    lasted_s: float = 0.0
+    touch_time_s: float = 0.0
+    duration_s: float = 0.0
 
 
-class Attempter:
+class AttemptRunner:
     """Makes attempts with a connected rig."""
 
     def __init__(self, rig: Rig, seed: int, settings: AttemptSettings) -> None:
@@ -63,22 +63,23 @@ class Attempter:
             try:
                 if trial:
                     self.rig.recover()
-                return self._once(object_id, number)
+                return self._attempt_once(object_id, number)
             except DeviceError as error:
-                left = self._let_go()
+                left = self._open_jaws()
                 if trial == self.settings.retries:
                     raise DeviceError(
                         f"attempt {number} at {object_id} failed {trial + 1} time(s), last: {error}{left}"
                     ) from error
             except BaseException as error:
-                if left := self._let_go():
+                if left := self._open_jaws():
                     error.add_note(left)
                 raise
         raise AssertionError("the loop returns or raises")
 
-    def _let_go(self) -> str:
+    def _open_jaws(self) -> str:
         """Open the jaws, of a gripper that is brought back first where it must be; returns what to add to the error at
-        hand where that fails too."""
+        hand where that fails too.
+        """
         gripper = self.rig.gripper
         try:
             with contextlib.suppress(DeviceError):
@@ -90,7 +91,7 @@ class Attempter:
             return f"; and the jaws could not be opened: {second}"
         return ""
 
-    def _once(self, object_id: str, number: int) -> GraspAttempt:
+    def _attempt_once(self, object_id: str, number: int) -> GraspAttempt:
         rig = self.rig
         rng = np.random.default_rng([self.seed, zlib.crc32(object_id.encode()), number])
         rig.gripper.open(rig.gripper.stroke_mm)
@@ -99,18 +100,18 @@ class Attempter:
         rig.prepare(object_id, number)
         start = rig.clock()
         records_depth = rig.camera.has_depth and "depth" in self.settings.outputs
-        image = rig.camera.read(depth=records_depth or (rig.given is None and rig.planner.needs_depth))
+        image = rig.camera.read(depth=records_depth or (rig.object_fit is None and rig.planner.needs_depth))
         try:
             plan = rig.planner.plan(rig, image, self.settings.grasp, rng)
         except PlanError as error:
             outcome = "ungraspable" if isinstance(error, UngraspableError) else "no_plan"
             lasted = round(rig.clock() - start, 3)
-            return GraspAttempt(object_id, number, outcome, reason=str(error), lasted_s=lasted)
+            return GraspAttempt(object_id, number, outcome, reason=str(error), duration_s=lasted)
         images = self._pictures(image)
         touches, fields, at = self._grasp(plan)
         outcome = self._outcome()
         if "after" in self.settings.outputs:
-            touches |= self._feel("_after", self.settings.hold_s)[0]
+            touches |= self._read_touches("_after", self.settings.hold_s)[0]
         self._put_down(plan, outcome == "held", rng)
         return GraspAttempt(
             object_id,
@@ -119,14 +120,14 @@ class Attempter:
             {**images, **touches},
             fields,
             plan.fit,
-            at_s=round(at - start, 3),
-            lasted_s=round(rig.clock() - start, 3),
+            touch_time_s=round(at - start, 3),
+            duration_s=round(rig.clock() - start, 3),
         )
 
     def _rise(self) -> None:
         """Straight up from wherever the hand is: on a slant, open jaws would sweep over what stands between them."""
         arm = self.rig.arm
-        if arm.by_hand:
+        if arm.is_manual:
             return
         here, top = arm.pose(), arm.workspace.upper[2]
         if here.z_mm < top and arm.workspace.contains(here):
@@ -139,11 +140,11 @@ class Attempter:
             rig.arm.move_to(pose, settings.travel_mm_s)
         rig.gripper.open(plan.opening_mm)
         reached = rig.arm.move_to(plan.pose, settings.approach_mm_s)
-        touches = self._feel("_before", MAX_AGE_S)[0] if "before" in settings.outputs else {}
+        touches = self._read_touches("_before", MAX_AGE_S)[0] if "before" in settings.outputs else {}
         closed = rig.gripper.grasp(plan.force_n, settings.closing_mm_s)
         rig.sleep(settings.settle_s)
         at = rig.clock()
-        during, skew_s = self._feel("", settings.settle_s)
+        during, skew_s = self._read_touches("", settings.settle_s)
         rig.arm.move_to(plan.above, settings.approach_mm_s)
         rig.sleep(settings.hold_s)
         fields = {
@@ -154,28 +155,30 @@ class Attempter:
         }
         return touches | during, fields, at
 
-    def _feel(self, moment: str, since_s: float) -> tuple[dict[str, bytes], float]:
+    def _read_touches(self, moment: str, since_s: float) -> tuple[dict[str, bytes], float]:
         """Gel images by column, and how far apart in time they were taken (s); none older than what has just been
-        waited for, which may have been before it."""
+        waited for, which may have been before it.
+        """
         frames, skew_s = read_together(self.rig.sensors, max_age_s=min(MAX_AGE_S, since_s))
         return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}, skew_s
 
     def _outcome(self) -> str:
         status = self.rig.gripper.state().status
-        if status not in _OUTCOME_OF:
+        if status not in _OUTCOME_FROM:
             raise DeviceError(
                 f"{self.rig.gripper.name} must be holding, no_part or part_lost after a lift; it says {status}"
             )
-        return _OUTCOME_OF[status]
+        return _OUTCOME_FROM[status]
 
     def _put_down(self, plan: GraspPlan, held: bool, rng: np.random.Generator) -> None:
         """Let go: of a held object on the table, at a random place and turned at random; where it was given, or where a
-        tilted hand took it and has room to withdraw."""
+        tilted hand took it and has room to withdraw.
+        """
         rig, settings = self.rig, self.settings
         low, high = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)
         x, y = (low + high)[:2] / 2 + settings.table_share * rng.uniform(-0.5, 0.5, 2) * (high - low)[:2]
         yaw = float(rng.uniform(0.0, math.pi))
-        if rig.given is not None or plan.pose.tilt_rad:
+        if rig.object_fit is not None or plan.pose.tilt_rad:
             x, y, yaw = plan.pose.x_mm, plan.pose.y_mm, plan.pose.yaw_rad
         if held:
             z = min(plan.pose.z_mm + settings.release_mm, float(high[2]))

@@ -6,32 +6,32 @@ from robot.devices import Arm, Gripper, VirtualDevice
 from robot.readings import GripperState, Pose
 from robot.rig import Rig
 
-Say = Callable[[str], object]
+Report = Callable[[str], object]
 
 
-def without_motion(rig: Rig, say: Say) -> Rig:
+def make_dry_run(rig: Rig, report: Report) -> Rig:
     """`rig`, unconnected, with its arm and gripper replaced: nothing of these two is connected or moved.
 
-    `say` takes a sentence for each motion. The limits are those of the rig, so that what they refuse is refused here.
+    `report` takes a sentence for each motion. The limits are those of the rig, so that what they refuse is refused here.
     """
-    rig.arm = DryArm(rig.arm, say)
-    rig.gripper = DryGripper(rig.gripper, say)
+    rig.arm = DryRunArm(rig.arm, report)
+    rig.gripper = DryRunGripper(rig.gripper, report)
     return rig
 
 
-class DryArm(VirtualDevice, Arm):
+class DryRunArm(VirtualDevice, Arm):
     """Says where it would go, and is there."""
 
-    def __init__(self, arm: Arm, say: Say) -> None:
+    def __init__(self, arm: Arm, report: Report) -> None:
         super().__init__(f"{arm.name} (dry run)", arm.workspace, max_speed_mm_s=arm.max_speed_mm_s, clock=arm.clock)
         self.can_tilt = arm.can_tilt
-        self._say = say
+        self._report = report
         lower, upper = arm.workspace.lower, arm.workspace.upper
         self._at = Pose((lower[0] + upper[0]) / 2, (lower[1] + upper[1]) / 2, upper[2], 0.0)
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         tilt = f"tilt {pose.tilt_rad:.3f} rad, " if pose.tilt_rad else ""
-        self._say(
+        self._report(
             f"arm: to x {pose.x_mm:.1f}, y {pose.y_mm:.1f}, z {pose.z_mm:.1f} mm, yaw {pose.yaw_rad:.3f} rad, "
             f"{tilt}at {speed_mm_s:g} mm/s"
         )
@@ -42,10 +42,10 @@ class DryArm(VirtualDevice, Arm):
         return self._at
 
 
-class DryGripper(VirtualDevice, Gripper):
+class DryRunGripper(VirtualDevice, Gripper):
     """Says how it would move its jaws; whatever it closes on, it holds."""
 
-    def __init__(self, gripper: Gripper, say: Say) -> None:
+    def __init__(self, gripper: Gripper, report: Report) -> None:
         super().__init__(
             f"{gripper.name} (dry run)",
             stroke_mm=gripper.stroke_mm,
@@ -54,18 +54,18 @@ class DryGripper(VirtualDevice, Gripper):
             max_speed_mm_s=gripper.max_speed_mm_s,
             clock=gripper.clock,
         )
-        self._say = say
+        self._report = report
         self._now = GripperState(gripper.stroke_mm, 0.0, "idle")
 
     def _state(self) -> GripperState:
         return self._now
 
     def _open(self, opening_mm: float) -> GripperState:
-        self._say(f"jaws: open to {opening_mm:.1f} mm")
+        self._report(f"jaws: open to {opening_mm:.1f} mm")
         self._now = GripperState(opening_mm, 0.0, "idle")
         return self._now
 
     def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
-        self._say(f"jaws: close with {force_n:.1f} N at {speed_mm_s:g} mm/s")
+        self._report(f"jaws: close with {force_n:.1f} N at {speed_mm_s:g} mm/s")
         self._now = GripperState(self._now.opening_mm, force_n, "holding")
         return self._now

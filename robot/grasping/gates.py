@@ -29,7 +29,7 @@ class GraspFrames:
 Gate = Callable[[Mapping[str, GraspFrames]], bool | float]
 
 
-def judge(gate: Gate, touches: Mapping[str, GraspFrames]) -> tuple[bool, float]:
+def apply_gate(gate: Gate, touches: Mapping[str, GraspFrames]) -> tuple[bool, float]:
     """Ask a gate; returns its decision, and its answer as a number. Raises RobotError for an answer that is none."""
     answer = float(gate(touches))
     if not 0.0 <= answer <= 1.0:  # also refuses NaN
@@ -67,14 +67,14 @@ class ContactAreaGate:
 
     def __call__(self, touches: Mapping[str, GraspFrames]) -> bool:
         """Raises RobotConfigError without frames of the untouched gel."""
-        enough = (self._share(finger, frames) >= self.least_share for finger, frames in touches.items())
+        enough = (self._changed_fraction(finger, frames) >= self.least_share for finger, frames in touches.items())
         return (all if self.every_finger else any)(enough)  # which look no further than they must
 
-    def shares(self, touches: Mapping[str, GraspFrames]) -> dict[str, float]:
+    def changed_fractions(self, touches: Mapping[str, GraspFrames]) -> dict[str, float]:
         """Share of changed pixels, 0 to 1, by finger."""
-        return {finger: self._share(finger, frames) for finger, frames in touches.items()}
+        return {finger: self._changed_fraction(finger, frames) for finger, frames in touches.items()}
 
-    def _share(self, finger: str, frames: GraspFrames) -> float:
+    def _changed_fraction(self, finger: str, frames: GraspFrames) -> float:
         if frames.before is None:
             raise RobotConfigError(
                 f"the contact-area gate compares with the untouched gel: record frames before the grasp; finger "

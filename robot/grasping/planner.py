@@ -5,7 +5,7 @@ the table are the planner's keywords:
 
     [planner]
     name = "cylinder"
-    sight_mm = 100
+    search_margin_mm = 100
 
 In Python a rig is given one: `Rig(..., planner=MyPlanner())`.
 """
@@ -76,7 +76,7 @@ class GraspPlanner(ABC):
 
     def check(self, rig: "Rig") -> None:
         """Raise RobotConfigError where this planner cannot plan for `rig`."""
-        if self.needs_depth and rig.given is None and not rig.camera.has_depth:
+        if self.needs_depth and rig.object_fit is None and not rig.camera.has_depth:
             raise RobotConfigError(
                 f"{rig.camera.name} has no depth: say where every object stands and how large it is, in [object]"
             )
@@ -95,19 +95,19 @@ class CylinderPlanner(GraspPlanner):
     """As in the paper: fit a cylinder to the depth picture, or take the one that the rig was given, and pinch it from
     above about its axis (`plan_grasp`).
 
-    sight_mm: an object may stand so far outside the workspace and still be found.
+    search_margin_mm: an object may stand so far outside the workspace and still be found.
     """
 
-    def __init__(self, *, sight_mm: float = 150.0) -> None:
-        check_range("sight_mm", sight_mm, 0, 1e6, "mm")
-        self.sight_mm = sight_mm
+    def __init__(self, *, search_margin_mm: float = 150.0) -> None:
+        check_range("search_margin_mm", search_margin_mm, 0, 1e6, "mm")
+        self.search_margin_mm = search_margin_mm
 
     def plan(self, rig: "Rig", image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
         workspace = rig.arm.workspace
         lower, upper = workspace.lower, workspace.upper
-        beyond = self.sight_mm
+        beyond = self.search_margin_mm
         sight = Region((lower[0] - beyond, lower[1] - beyond, -1.0), (upper[0] + beyond, upper[1] + beyond, upper[2]))
-        fit = rig.given or fit_cylinder(image, rig.camera.extrinsics, sight)
+        fit = rig.object_fit or fit_cylinder(image, rig.camera.extrinsics, sight)
         plan = plan_grasp(fit, settings, workspace, rig.gripper.stroke_mm, rng)
         return replace(plan, fit=fit.to_dict())
 

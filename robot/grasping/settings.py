@@ -6,7 +6,7 @@ from typing import Any
 
 from robot.devices import Arm, Gripper
 from robot.errors import RobotConfigError
-from robot.settings import TypedSettings, build, limited
+from robot.settings import TypedSettings, bounded, build
 
 OUTPUTS = ("depth", "before", "after")
 """What may be left out of a recording: the depth picture, and gel images of the moments before and after a grasp."""
@@ -23,13 +23,13 @@ class GraspSettings(TypedSettings):
     """
 
     force_n: tuple[float, float] = (5.0, 25.0)
-    jitter_mm: float = limited(0, 1e6, 1.0)
-    floor_mm: float = limited(0, 1e6, 10.0)
-    top_margin_mm: float = limited(0, 1e6, 15.0)
-    reach_mm: float = limited(1, 1e6, 110.0)
-    finger_mm: float = limited(1, 1e6, 25.0)
-    clearance_mm: float = limited(0, 1e6, 5.0)
-    lift_mm: float = limited(1, 1e6, 180.0)
+    jitter_mm: float = bounded(0, 1e6, 1.0)
+    floor_mm: float = bounded(0, 1e6, 10.0)
+    top_margin_mm: float = bounded(0, 1e6, 15.0)
+    reach_mm: float = bounded(1, 1e6, 110.0)
+    finger_mm: float = bounded(1, 1e6, 25.0)
+    clearance_mm: float = bounded(0, 1e6, 5.0)
+    lift_mm: float = bounded(1, 1e6, 180.0)
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError for a setting of the wrong type or out of range."""
@@ -60,15 +60,15 @@ class AttemptSettings(TypedSettings):
 
     grasp: GraspSettings = field(default_factory=GraspSettings)
     outputs: tuple[str, ...] = OUTPUTS
-    travel_mm_s: float = limited(1e-3, 1e6, 200.0)
-    approach_mm_s: float = limited(1e-3, 1e6, 50.0)
-    closing_mm_s: float = limited(1e-3, 1e6, 80.0)
-    settle_s: float = limited(0, 1e6, 1.0)
-    hold_s: float = limited(0, 1e6, 1.0)
-    release_mm: float = limited(0, 1e6, 5.0)
-    table_share: float = limited(0, 1, 0.7)
-    retries: int = limited(0, 1000, 2)
-    jpeg_quality: int = limited(0, 100, 95)
+    travel_mm_s: float = bounded(1e-3, 1e6, 200.0)
+    approach_mm_s: float = bounded(1e-3, 1e6, 50.0)
+    closing_mm_s: float = bounded(1e-3, 1e6, 80.0)
+    settle_s: float = bounded(0, 1e6, 1.0)
+    hold_s: float = bounded(0, 1e6, 1.0)
+    release_mm: float = bounded(0, 1e6, 5.0)
+    table_share: float = bounded(0, 1, 0.7)
+    retries: int = bounded(0, 1000, 2)
+    jpeg_quality: int = bounded(0, 100, 95)
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError for a setting of the wrong type or out of range."""
@@ -77,6 +77,6 @@ class AttemptSettings(TypedSettings):
             raise RobotConfigError(f"outputs must be of {', '.join(OUTPUTS)}; got {unknown[0]!r}")
 
 
-def attempt_of(attempt: Mapping[str, Any], grasp: Mapping[str, Any]) -> AttemptSettings:
+def parse_attempt_settings(attempt: Mapping[str, Any], grasp: Mapping[str, Any]) -> AttemptSettings:
     """From the tables [attempt] and [grasp] of a rig's file. Raises RobotConfigError."""
     return build(AttemptSettings, attempt, where="[attempt]", grasp=build(GraspSettings, grasp, where="[grasp]"))

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from _touch_retrieval.registry import Registry
 from robot.errors import ImporterError, UnknownName
-from robot.importers.base import DataSet, Progress
+from robot.importers.importing import DataSet, Progress
 from robot.recording.folder import Recording
 
 

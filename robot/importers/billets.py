@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Skip, folders, import_items
+from robot.importers.importing import DataSet, Item, Progress, Skip, import_items, subfolders
 from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
@@ -25,7 +25,7 @@ DATA_SET = DataSet(
     sensor="GelSight Mini",
     rig="by hand, phone camera",
     expects="pairs `<billet>/<place>_touch.png`, `<billet>/<place>_photo.jpg`",
-    traps=(
+    caveats=(
         "Light and gel drift from billet to billet: on the ground billets an 8 x 6 thumbnail of a blurred touch "
         "names the billet far above chance. That is the capture leaking, not touch: print that control beside "
         "every result, split by sequence_id, prefer the welded billets, give exact intervals: 9 billets are few.",
@@ -42,12 +42,12 @@ def import_billets(src: Path, out: Path, progress: Progress | None = None) -> Re
     for item in _places(src):
         total, pairs = total + 1, pairs or isinstance(item, Item)
     if not pairs:
-        raise DATA_SET.refusal(src, "it holds no pair")
+        raise DATA_SET.mismatch_error(src, "it holds no pair")
     return import_items(DATA_SET, _places(src), out, total=total, progress=progress)
 
 
 def _places(src: Path) -> Iterator[Item | Skip]:
-    for billet in folders(src):
+    for billet in subfolders(src):
         for place, files in sorted(_find_files(billet).items()):
             name = f"{billet.name}-{place}"
             if len(files) < 2:

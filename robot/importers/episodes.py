@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import ImporterError
-from robot.importers.base import Images
+from robot.importers.importing import Images
 
 Picture = NDArray[np.uint8]
 """(H, W, 3), red first."""
 Step = tuple[Picture, Sequence[Picture]]
 """The camera's picture, and one gel image a finger."""
 
-ENDINGS = {"before": "_before", "during": "", "after": "_after"}
+MOMENT_SUFFIXES = {"before": "_before", "during": "", "after": "_after"}
 """What the columns of a moment end in."""
 
 
@@ -37,7 +37,9 @@ class Episode:
     def images(self) -> Images:
         """Columns of the grasp, each made when it is its turn."""
         moments = self._moments or ("before", "during")
-        columns = [f"touch_{finger}{ENDINGS[m]}" for finger in ascii_lowercase[: self._fingers] for m in moments]
+        columns = [
+            f"touch_{finger}{MOMENT_SUFFIXES[m]}" for finger in ascii_lowercase[: self._fingers] for m in moments
+        ]
         return {column: partial(self._picture, column) for column in ("photo", *columns)}
 
     def _picture(self, column: str) -> Picture:
@@ -49,28 +51,28 @@ class Episode:
 
     def _read(self) -> Iterator[tuple[str, Picture]]:
         steps = iter(self._steps())
-        found = _as_said(steps, self._moments) if self._moments else _most_pressed(steps)
+        found = _labelled_steps(steps, self._moments) if self._moments else _peak_contact_steps(steps)
         photo = None
         for moment, (camera, touches) in found.items():
             photo = camera if photo is None else photo
             for finger, touch in zip(ascii_lowercase, touches, strict=False):
-                yield f"touch_{finger}{ENDINGS[moment]}", touch
+                yield f"touch_{finger}{MOMENT_SUFFIXES[moment]}", touch
         assert photo is not None
         yield "photo", photo
 
 
-def _as_said(steps: Iterator[Step], moments: Sequence[str]) -> dict[str, Step]:
-    found = {moment: _copied(step) for moment, step in zip(moments, steps, strict=False)}
+def _labelled_steps(steps: Iterator[Step], moments: Sequence[str]) -> dict[str, Step]:
+    found = {moment: _copy_step(step) for moment, step in zip(moments, steps, strict=False)}
     if len(found) < len(moments):
         raise ImporterError(f"its episode has {len(found)} steps of {len(moments)}")
     return found
 
 
-def _most_pressed(steps: Iterator[Step]) -> dict[str, Step]:
+def _peak_contact_steps(steps: Iterator[Step]) -> dict[str, Step]:
     first = next(steps, None)
     if first is None:
         raise ImporterError("its episode is empty")
-    first = _copied(first)
+    first = _copy_step(first)
     rest = [touch.astype(np.int16) for touch in first[1]]
     best, most = first, 0.0
     for step in steps:
@@ -78,12 +80,12 @@ def _most_pressed(steps: Iterator[Step]) -> dict[str, Step]:
             raise ImporterError("the gel images of its episode differ in size")
         pressed = sum(float(np.abs(touch - still).mean()) for touch, still in zip(step[1], rest, strict=True))
         if pressed > most:
-            best, most = _copied(step), pressed
+            best, most = _copy_step(step), pressed
     if not most:
         raise ImporterError("no gel image of its episode differs from the first")
     return {"before": first, "during": best}
 
 
-def _copied(step: Step) -> Step:
+def _copy_step(step: Step) -> Step:
     """Apart from the block of steps that it was read with."""
     return step[0].copy(), [touch.copy() for touch in step[1]]

@@ -21,17 +21,17 @@ from typing import Any
 import numpy.typing as npt
 
 from robot.errors import ImporterError
-from robot.importers.base import (
+from robot.importers.importing import (
     DataSet,
     Images,
     Item,
     Progress,
     Skip,
+    import_extra,
     import_items,
-    library,
-    name_of,
-    natural,
-    numbered,
+    natural_sort_key,
+    numbered_files,
+    safe_name,
 )
 from robot.recording.folder import Recording
 
@@ -45,7 +45,7 @@ DATA_SET = DataSet(
     fingers=2,
     background="before each grasp",
     expects="`calandra_corl2017_000.h5` to `calandra_corl2017_037.h5`, or some of them",
-    traps=(
+    caveats=(
         "The gels of 2017 carry black marks, which move with shear.",
         "Objects were grasped one after the other, so that light and gel drift with the object: print the control of "
         "the blurred touch beside every result.",
@@ -64,17 +64,17 @@ _COLUMNS = {
     **{f"touch_{ours}_before": f"gelsight{theirs}_before" for ours, theirs in (("a", "A"), ("b", "B"))},
     **{f"touch_{ours}_after": f"gelsight{theirs}_after" for ours, theirs in (("a", "A"), ("b", "B"))},
 }
-_MOST_PIXELS = 50_000_000
+_MAX_PIXELS = 50_000_000
 _BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError)
 """What h5py raises for damaged files."""
 
 
 def import_feeling_of_success(src: Path, out: Path, progress: Progress | None = None) -> Recording:
     """Import the HDF5 files in `src`. Raises ImporterError where it holds none, and where h5py is missing."""
-    files = [path for _, path in numbered(Path(src), _FILE)]
+    files = [path for _, path in numbered_files(Path(src), _FILE)]
     if not files:
-        raise DATA_SET.refusal(Path(src), "it holds no HDF5 file")
-    h5py = library("h5py", "The Feeling of Success")
+        raise DATA_SET.mismatch_error(Path(src), "it holds no HDF5 file")
+    h5py = import_extra("h5py", "The Feeling of Success")
     with contextlib.suppress(ImportError):
         import_module("hdf5plugin")  # which registers its filters
     total = sum(_count(h5py, path) for path in files)
@@ -102,7 +102,7 @@ def _items(h5py: Any, files: list[Path]) -> Iterator[Item | Skip]:
                 if isinstance(group, Skip):
                     yield Skip(group.reason, path.name)
                     continue
-                name = name_of(path.stem, group.name.rpartition("/")[2])
+                name = safe_name(path.stem, group.name.rpartition("/")[2])
                 object_id, grasped = _attributes(group)
                 if object_id is None or grasped is None:
                     yield Skip("its object_name or is_gripping is missing", name)
@@ -124,7 +124,7 @@ def _groups(h5py: Any, file: Any) -> Iterator[Any]:
     except _BROKEN:
         yield Skip("its file is not HDF5, or is cut off", "")
         return
-    for name in sorted(names, key=natural):
+    for name in sorted(names, key=natural_sort_key):
         group = _own(h5py, data, name)
         yield group if isinstance(group, h5py.Group) else Skip("a grasp is no group", "")
 
@@ -158,7 +158,7 @@ def _reader(h5py: Any, group: Any, name: str) -> Callable[[], npt.NDArray[Any]]:
             if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
                 raise ImporterError(f"its {name} is missing")
             height, width, *colours = (*(dataset.shape or ()), 0, 0)[:3]
-            if dataset.dtype != "uint8" or dataset.ndim != 3 or colours != [3] or height * width > _MOST_PIXELS:
+            if dataset.dtype != "uint8" or dataset.ndim != 3 or colours != [3] or height * width > _MAX_PIXELS:
                 raise ImporterError(f"its {name} is not a picture of 8-bit colours")
             return dataset[()]  # type: ignore[no-any-return]
         except _BROKEN as error:

@@ -29,9 +29,9 @@ from string import ascii_lowercase
 from typing import Any, NoReturn
 
 from robot.errors import ImporterError, RecordingError
-from robot.importers.base import DataSet, Images, Item, Progress, Skip, import_items, name_of, natural
-from robot.recording.folder import Recording, Shared
-from robot.storage import object_of
+from robot.importers.importing import DataSet, Images, Item, Progress, Skip, import_items, natural_sort_key, safe_name
+from robot.recording.folder import Recording, SharedImage
+from robot.storage import parse_object
 
 DATA_SET = DataSet(
     source="pictures of one's own",
@@ -69,7 +69,9 @@ def import_folder(
     src = Path(src)
     if not src.is_dir():
         raise ImporterError(f"{src} must be a folder of pictures, and is none")
-    found: _Listed | _Found = _Listed(src, pairs) if pairs else _Found(src, touch, photo, background)
+    found: _PairsFile | _PatternMatches = (
+        _PairsFile(src, pairs) if pairs else _PatternMatches(src, touch, photo, background)
+    )
     facts = replace(
         DATA_SET,
         sensor=sensor,
@@ -113,7 +115,7 @@ class _Pattern:
         return found.groupdict() if found else None
 
 
-class _Found:
+class _PatternMatches:
     """What the patterns find. The names of all files are held in memory, their pictures are not."""
 
     def __init__(self, src: Path, touch: str, photo: str, background: str) -> None:
@@ -125,8 +127,8 @@ class _Found:
                 raise ImporterError(
                     f"the pattern {option} must say where {{object}} stands, such as {{object}}/touch_*"
                 )
-        self._photos = _Agreeing(self._photo, self._touch)
-        self._frames = _Agreeing(self._background, self._touch)
+        self._photos = _MatchingFiles(self._photo, self._touch)
+        self._frames = _MatchingFiles(self._background, self._touch)
         some, touched, names = "", False, set[str]()
         for path in _pictures(src):
             some = some or path
@@ -145,14 +147,14 @@ class _Found:
                     f"{src} must hold a {option} that fits {text!r}, and holds none, {there}; see --option"
                 )
         if len(names) > len(ascii_lowercase):
-            first = sorted(names, key=natural)[:3]
+            first = sorted(names, key=natural_sort_key)[:3]
             raise ImporterError(f"{{finger}} must name at most 26 fingers, got {len(names)}, such as {first}")
-        self.fingers = dict(zip(sorted(names, key=natural), ascii_lowercase, strict=False))
+        self.fingers = dict(zip(sorted(names, key=natural_sort_key), ascii_lowercase, strict=False))
         self.has_background = bool(self._frames)
         self._repeated: list[str] = []
-        self._grasps = self._by_words()
+        self._grasps = self._group_by_words()
 
-    def _by_words(self) -> dict[tuple[str, ...], list[str]]:
+    def _group_by_words(self) -> dict[tuple[str, ...], list[str]]:
         """Grasps by their words but the finger's: the path of each finger's picture, empty where it has none."""
         grasps: dict[tuple[str, ...], list[str]] = {}
         place = {finger: number for number, finger in enumerate(self.fingers)}
@@ -174,7 +176,7 @@ class _Found:
         dealt: Counter[tuple[str, ...]] = Counter()
         yield from (Skip("another touch has the same words in its path", path) for path in self._repeated)
         for key, paths in self._grasps.items():
-            name, words = name_of(*key), self._touch.fit(next(filter(None, paths))) or {}
+            name, words = safe_name(*key), self._touch.fit(next(filter(None, paths))) or {}
             choice, which = self._photos.of(words)
             if not all(paths):
                 yield Skip("a finger has no picture", name)
@@ -193,7 +195,7 @@ class _Found:
                 yield Item(name, key[0], images, {"sequence_id": words.get("sequence")})
 
 
-class _Agreeing:
+class _MatchingFiles:
     """Files by the words that their pattern shares with that of the touches."""
 
     def __init__(self, pattern: _Pattern | None, others: _Pattern) -> None:
@@ -220,7 +222,8 @@ class _Agreeing:
 
 def _pictures(src: Path) -> Iterator[str]:
     """The pictures below a folder, by path from it, hidden ones left out, in the order of their numbers. A link to a
-    folder is followed where it leads out of `src`, and each target once. Raises ImporterError."""
+    folder is followed where it leads out of `src`, and each target once. Raises ImporterError.
+    """
     root, followed = Path(os.path.realpath(src)), set[Path]()
 
     def is_walked(path: str) -> bool:
@@ -232,27 +235,27 @@ def _pictures(src: Path) -> Iterator[str]:
         followed.add(target)
         return True
 
-    for folder, below, files in os.walk(src, onerror=_refuse, followlinks=True):
-        shown = sorted((name for name in below if not name.startswith(".")), key=natural)
+    for folder, below, files in os.walk(src, onerror=_raise_unlistable, followlinks=True):
+        shown = sorted((name for name in below if not name.startswith(".")), key=natural_sort_key)
         below[:] = [name for name in shown if is_walked(os.path.join(folder, name))]
-        for name in sorted(files, key=natural):
+        for name in sorted(files, key=natural_sort_key):
             if name.lower().endswith(_ENDINGS) and not name.startswith("."):
                 yield (Path(folder) / name).relative_to(src).as_posix()
 
 
-def _refuse(error: OSError) -> NoReturn:
+def _raise_unlistable(error: OSError) -> NoReturn:
     """A folder that cannot be listed would be an object that is silently missing."""
     raise ImporterError(f"{error.filename} cannot be listed: {error.strerror}") from error
 
 
-def _shared(src: Path, path: str) -> Shared:
-    return Shared(f"{sha256(path.encode(errors='surrogateescape')).hexdigest()[:24]}", src / path)
+def _shared(src: Path, path: str) -> SharedImage:
+    return SharedImage(f"{sha256(path.encode(errors='surrogateescape')).hexdigest()[:24]}", src / path)
 
 
 # By a file of pairs ----------------------------------------------------------------------------------------
 
 
-class _Listed:
+class _PairsFile:
     """What a file of pairs lists, read line by line."""
 
     def __init__(self, src: Path, pairs: str) -> None:
@@ -273,12 +276,12 @@ class _Listed:
             if isinstance(row, str):
                 yield Skip(row, f"number {number}")
                 continue
-            name = name_of(row.get("object_id") or "", str(number))
+            name = safe_name(row.get("object_id") or "", str(number))
             columns = ("photo", *self.fingers, *(f"{each}_before" for each in self.fingers))
             paths = {column: row[column] for column in columns if row.get(column)}
             if self._fingers(row) != self.fingers or not paths.get("photo") or not row.get("object_id"):
                 yield Skip("its line lacks its object, its photo or a touch", name)
-            elif any(not _inside(path) for path in paths.values()):
+            elif any(not _is_inside(path) for path in paths.values()):
                 yield Skip("a path must lead to a file below the folder, from there on", name)
             elif (numbers := _numbers(row)) is None:
                 yield Skip(f"{', '.join(_NUMBERS)} must be numbers", name)
@@ -299,7 +302,7 @@ class _Listed:
                 lines = iter(lambda: file.readline(_LINE), "")
                 rows = csv.DictReader(lines) if self._file.suffix.lower() == ".csv" else _documents(lines)
                 for row in rows:
-                    yield row if isinstance(row, str) else _named(row)
+                    yield row if isinstance(row, str) else _rename_columns(row)
         except (csv.Error, UnicodeDecodeError) as error:
             raise ImporterError(f"{self._file} must be CSV with a header, or JSONL, in UTF-8: {error}") from error
 
@@ -308,12 +311,12 @@ def _documents(lines: Iterator[str]) -> Iterator[dict[str, Any] | str]:
     for line in lines:
         if line.strip():
             try:
-                yield object_of(line.encode(), RecordingError)
+                yield parse_object(line.encode(), RecordingError)
             except RecordingError:
                 yield "its line is not a JSON object"
 
 
-def _named(row: Mapping[Any, Any]) -> dict[str, Any]:
+def _rename_columns(row: Mapping[Any, Any]) -> dict[str, Any]:
     """Columns by the recording's names; values that are no plain text or number count as absent."""
     plain = {str(key).removesuffix("_file_name"): value for key, value in row.items() if key is not None}
     return {
@@ -323,7 +326,7 @@ def _named(row: Mapping[Any, Any]) -> dict[str, Any]:
     }
 
 
-def _inside(path: str) -> bool:
+def _is_inside(path: str) -> bool:
     parts = PurePosixPath(path).parts
     return bool(parts) and ".." not in parts and not path.startswith("/") and "\\" not in path and path.isprintable()
 

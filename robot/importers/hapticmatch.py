@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Skip, folders, import_items, name_of, numbered
+from robot.importers.importing import DataSet, Item, Progress, Skip, import_items, numbered_files, safe_name, subfolders
 from robot.importers.pickled_arrays import MAX_BYTES, read_array
 from robot.recording.folder import Recording
-from robot.storage import content_of
+from robot.storage import read_content
 
 DATA_SET = DataSet(
     source="HapticMatch",
@@ -31,7 +31,7 @@ DATA_SET = DataSet(
     sensor="GelSight Mini, height maps",
     rig="by hand; a camera at the same patch",
     expects="`Texture/<material>/<k>.jpg` and `<k>.pkl`, or be `Texture` itself",
-    traps=(
+    caveats=(
         "The touch is a picture of the normals of a height map, not a gel image: a model that is trained on gel images "
         "does not know it.",
         "The samples of a material were captured in one sitting, and there is no no-contact frame: drift of the sensor "
@@ -55,26 +55,26 @@ def import_hapticmatch(src: Path, out: Path, progress: Progress | None = None, *
         raise ImporterError(f"scale must be above 0 and finite, got {scale:g}")
     root = src / "Texture" if (src / "Texture").is_dir() else src
     if not root.is_dir():
-        raise DATA_SET.refusal(src, "it is no folder")
-    materials = [(folder, numbered(folder, _HEIGHTS)) for folder in folders(root)]
+        raise DATA_SET.mismatch_error(src, "it is no folder")
+    materials = [(folder, numbered_files(folder, _HEIGHTS)) for folder in subfolders(root)]
     if not (total := sum(len(samples) for _, samples in materials)):
-        raise DATA_SET.refusal(src, "it holds no such height map")
+        raise DATA_SET.mismatch_error(src, "it holds no such height map")
     items = (item for folder, samples in materials for item in _items(folder.name, samples, scale))
     return import_items(DATA_SET, items, out, total=total, progress=progress)
 
 
 def _items(material: str, samples: Any, scale: float) -> Iterator[Item | Skip]:
-    sequence = name_of(material)
+    sequence = safe_name(material)
     for match, path in samples:
         images = {"photo": path.with_name(f"{match[1]}.jpg"), "touch_a": partial(_touch, path, scale)}
-        yield Item(name_of(material, match[1]), material, images, {"sequence_id": sequence})
+        yield Item(safe_name(material, match[1]), material, images, {"sequence_id": sequence})
 
 
 def _touch(path: Path, scale: float) -> NDArray[np.uint8]:
     """The picture of a height map. Raises ImporterError, which says no file's name."""
     try:
         too_large = path.stat().st_size > MAX_BYTES
-        data = b"" if too_large else content_of(path, ImporterError)
+        data = b"" if too_large else read_content(path, ImporterError)
     except (OSError, ImporterError) as error:
         raise ImporterError("its height map cannot be read") from error
     if too_large:

@@ -26,10 +26,20 @@ from typing import Any
 import numpy as np
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Published, Skip, import_items, library, name_of, video_stream
-from robot.importers.episodes import ENDINGS, Episode, Picture, Step
+from robot.importers.episodes import MOMENT_SUFFIXES, Episode, Picture, Step
+from robot.importers.importing import (
+    DataSet,
+    DataSetMetadata,
+    Item,
+    Progress,
+    Skip,
+    import_extra,
+    import_items,
+    safe_name,
+    video_stream,
+)
 from robot.recording.folder import Recording
-from robot.storage import decoded, document_of
+from robot.storage import decode_picture, read_json_object
 
 DATA_SET = DataSet(
     source="LeRobot data set",
@@ -40,7 +50,7 @@ DATA_SET = DataSet(
     expects="`meta/info.json` of a LeRobot data set, version 3",
     fingers=0,
     background="the first step of each episode",
-    traps=(
+    caveats=(
         "A task counts as one object unless the episodes name objects; a task that names several objects does not tell "
         "them apart.",
         "The touch of an episode is its step that differs most from the first, which a change of light may be too.",
@@ -52,7 +62,7 @@ _PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 _PATHS = {"data_path": f"data/{_PLACE}.parquet", "video_path": "videos/{video_key}/" + f"{_PLACE}.mp4"}
 _GEL = re.compile("touch|tactile|gel|digit", re.IGNORECASE)
 _FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
-_MOMENTS = tuple(ENDINGS)
+_MOMENTS = tuple(MOMENT_SUFFIXES)
 _WHAT = "a LeRobot data set"
 
 _Row = dict[str, Any]
@@ -64,10 +74,10 @@ def import_lerobot(
     """Import the episodes below `src`. Raises ImporterError without pyarrow or av, and for another version."""
     src = Path(src)
     if not (src / "meta" / "info.json").is_file():
-        raise DATA_SET.refusal(src, "there is no such file")
-    library("pyarrow", _WHAT)
-    library("av", _WHAT)
-    source = _Source(src, touch, photo)
+        raise DATA_SET.mismatch_error(src, "there is no such file")
+    import_extra("pyarrow", _WHAT)
+    import_extra("av", _WHAT)
+    source = _LeRobotSource(src, touch, photo)
     total = sum(1 for _ in source.episodes(("episode_index",)))
     return import_items(
         replace(DATA_SET, fingers=len(source.touch), **source.said()),
@@ -75,16 +85,16 @@ def import_lerobot(
         out,
         total=total,
         progress=progress,
-        published=Published({}, source.splits()),
+        metadata=DataSetMetadata({}, source.splits()),
     )
 
 
-class _Source:
+class _LeRobotSource:
     """A data set on disk: its cameras, and its episodes as grasps."""
 
     def __init__(self, src: Path, touch: str, photo: str) -> None:
         self.src = src
-        self.info = document_of(src / "meta" / "info.json", ImporterError)
+        self.info = read_json_object(src / "meta" / "info.json", ImporterError)
         version = str(self.info.get("codebase_version"))
         if not re.fullmatch(r"v3(\.\d+)*", version):
             raise ImporterError(f"{src} must be of LeRobot's version 3, and is of {version}; convert it with lerobot")
@@ -114,7 +124,7 @@ class _Source:
         if not 0 < self._fps < math.inf:
             raise ImporterError(f"{src}: fps of info.json must be above 0 and finite, got {self._fps:g}")
         self._has_moments = isinstance(features, dict) and "moment" in features
-        self._films: dict[str, tuple[Path, Any]] = {}
+        self._videos: dict[str, tuple[Path, Any]] = {}
 
     def said(self) -> dict[str, Any]:
         """What our own export, or the data set, says of where it comes from, and of its sensors."""
@@ -149,7 +159,7 @@ class _Source:
             raise ImporterError(f"{self.src} must hold meta/episodes/chunk-000/file-000.parquet")
         for path in paths:
             with _readable(path):
-                file = library("pyarrow.parquet", _WHAT).ParquetFile(path)
+                file = import_extra("pyarrow.parquet", _WHAT).ParquetFile(path)
                 known = [name for name in columns if name in file.schema_arrow.names]
                 for batch in file.iter_batches(256, columns=known):
                     yield from batch.to_pylist()
@@ -163,7 +173,7 @@ class _Source:
             ("episode_index", "tasks", "length", "data/chunk_index", "data/file_index", *own, *columns)
         ):
             number = row.get("episode_index")
-            name = name_of(str(row.get("grasp_id") or f"episode-{number}"))
+            name = safe_name(str(row.get("grasp_id") or f"episode-{number}"))
             if not isinstance(number, int) or not isinstance(row.get("length"), int):
                 yield Skip("its episode has no number or no length", name)
                 continue
@@ -191,7 +201,7 @@ class _Source:
         if self._file[0] != place:
             path = self.src / f"data/{place}.parquet"
             with _readable(path):
-                table = library("pyarrow.parquet", _WHAT).read_table(path, columns=["episode_index", "moment"])
+                table = import_extra("pyarrow.parquet", _WHAT).read_table(path, columns=["episode_index", "moment"])
                 self._file = (place, list(zip(*(column.to_pylist() for column in table.columns), strict=True)))
         return self._file[1]
 
@@ -209,18 +219,18 @@ class _Source:
     def _frames(self, key: str, row: _Row) -> Iterator[Picture]:
         """The pictures of one camera through an episode. Raises ImporterError."""
         if self._kinds[key] == "image":
-            return self._stored(key, row)
-        return self._filmed(key, row)
+            return self._image_frames(key, row)
+        return self._video_frames(key, row)
 
-    def _filmed(self, key: str, row: _Row) -> Iterator[Picture]:
-        av = library("av", _WHAT)
+    def _video_frames(self, key: str, row: _Row) -> Iterator[Picture]:
+        av = import_extra("av", _WHAT)
         path = self.src / f"videos/{key}/{_place(row, f'videos/{key}')}.mp4"
         start = row.get(f"videos/{key}/from_timestamp")
         if not isinstance(start, float) or not path.is_file():
             raise ImporterError("its video is missing")
         end = start + (row["length"] - 0.5) / self._fps
         try:
-            film = self._film(key, path)
+            film = self._open_video(key, path)
             stream = video_stream(film)
             film.seek(int(start / stream.time_base), stream=stream)
             for frame in film.decode(stream):
@@ -229,20 +239,21 @@ class _Source:
                         return
                     yield frame.to_ndarray(format="rgb24")
         except (av.error.FFmpegError, OSError, ValueError, IndexError, OverflowError) as error:
-            self._films.pop(key, None)
+            self._videos.pop(key, None)
             raise ImporterError("its video cannot be decoded") from error
 
-    def _film(self, key: str, path: Path) -> Any:
+    def _open_video(self, key: str, path: Path) -> Any:
         """The film of one camera, which holds many episodes and stays open until another is wanted. Opened for each,
-        its buffers leave holes in the heap between the names of grasps, several kB an episode."""
-        if self._films.get(key, (None, None))[0] != path:
-            self._films[key] = (path, library("av", _WHAT).open(str(path)))
-        return self._films[key][1]
+        its buffers leave holes in the heap between the names of grasps, several kB an episode.
+        """
+        if self._videos.get(key, (None, None))[0] != path:
+            self._videos[key] = (path, import_extra("av", _WHAT).open(str(path)))
+        return self._videos[key][1]
 
-    def _stored(self, key: str, row: _Row) -> Iterator[Picture]:
+    def _image_frames(self, key: str, row: _Row) -> Iterator[Picture]:
         """Pictures that stand in the rows of steps as PNG or JPEG."""
         path = self.src / f"data/{_place(row, 'data')}.parquet"
-        dataset = library("pyarrow.dataset", _WHAT)
+        dataset = import_extra("pyarrow.dataset", _WHAT)
         with _readable(path):
             wanted = dataset.field("episode_index") == row["episode_index"]
             for batch in dataset.dataset(path).to_batches(
@@ -250,7 +261,7 @@ class _Source:
             ):
                 for cell in batch.column(0).to_pylist():
                     data = cell.get("bytes") if isinstance(cell, dict) else None
-                    image = decoded(data) if data else None
+                    image = decode_picture(data) if data else None
                     if image is None:
                         raise ImporterError("a picture of its episode cannot be decoded")
                     yield np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)
@@ -273,7 +284,7 @@ def _place(row: _Row, what: str) -> str:
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
     """Turn what pyarrow says of a damaged file into an ImporterError."""
-    pa = library("pyarrow", _WHAT)
+    pa = import_extra("pyarrow", _WHAT)
     try:
         yield
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:

@@ -21,9 +21,19 @@ from pathlib import Path
 from typing import Any
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Published, Skip, folders, import_items, name_of, numbered
-from robot.recording.folder import Recording, Shared
-from robot.storage import content_of, document_of
+from robot.importers.importing import (
+    DataSet,
+    DataSetMetadata,
+    Item,
+    Progress,
+    Skip,
+    import_items,
+    numbered_files,
+    safe_name,
+    subfolders,
+)
+from robot.recording.folder import Recording, SharedImage
+from robot.storage import read_content, read_json_object
 
 DATA_SET = DataSet(
     source="ObjectFolder",
@@ -33,7 +43,7 @@ DATA_SET = DataSet(
     sensor="GelSight",
     rig="robot arm; photos of the object alone",
     expects="`<index>/visual/0.png` and `<index>/tactile/0.png`, or `vision/<object>/` and `touch/<object>/`",
-    traps=(
+    caveats=(
         "In the benchmark a query counts as right when any picture of its object is found (mAP), and some published "
         "numbers on real objects are on objects that were trained on.",
     ),
@@ -53,36 +63,38 @@ def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) 
     """Import the samples or the pack in `src`. Raises ImporterError where it is neither."""
     src = Path(src)
     if not src.is_dir():
-        raise DATA_SET.refusal(src, "it is no folder")
+        raise DATA_SET.mismatch_error(src, "it is no folder")
     is_pack = (src / "vision").is_dir() and (src / "touch").is_dir()
     if is_pack:
-        objects = [(each.name, each, src / "vision" / each.name) for each in folders(src / "touch")]
+        objects = [(each.name, each, src / "vision" / each.name) for each in subfolders(src / "touch")]
     else:
-        objects = [(each.name, each / "tactile", each / "visual") for each in folders(src)]
+        objects = [(each.name, each / "tactile", each / "visual") for each in subfolders(src)]
     objects = [each for each in objects if each[0].isdecimal() and each[1].is_dir()]
-    touched = [touch for _, touch, _ in objects for _, touch in islice(numbered(touch, _PICTURE), 1)]
+    touched = [touch for _, touch, _ in objects for _, touch in islice(numbered_files(touch, _PICTURE), 1)]
     if not touched:
-        raw = any((each / "tactile_data").is_dir() for each in folders(src))
-        raise DATA_SET.refusal(src, "it holds raw videos, without photos" if raw else "it holds no touch of that kind")
+        raw = any((each / "tactile_data").is_dir() for each in subfolders(src))
+        raise DATA_SET.mismatch_error(
+            src, "it holds raw videos, without photos" if raw else "it holds no touch of that kind"
+        )
     facts = replace(DATA_SET, sensor=_SIMULATED) if _width(touched[0]) == _SIMULATED_WIDTH else DATA_SET
     about = _names(src / _NAMES)
-    published = Published(
+    metadata = DataSetMetadata(
         {name: about.get(name, {}) for name, _, _ in objects}, _split(src / "split.json") if is_pack else {}
     )
-    total = sum(len(numbered(touch, _PICTURE)) for _, touch, _ in objects)
-    return import_items(facts, _items(objects), out, total=total, progress=progress, published=published)
+    total = sum(len(numbered_files(touch, _PICTURE)) for _, touch, _ in objects)
+    return import_items(facts, _items(objects), out, total=total, progress=progress, metadata=metadata)
 
 
 def _items(objects: Sequence[tuple[str, Path, Path]]) -> Iterator[Item | Skip]:
     for name, touch, vision in objects:
-        photos = {match[1]: path for match, path in numbered(vision, _PICTURE)}
-        for number, (match, path) in enumerate(numbered(touch, _PICTURE)):
+        photos = {match[1]: path for match, path in numbered_files(vision, _PICTURE)}
+        for number, (match, path) in enumerate(numbered_files(touch, _PICTURE)):
             if not photos:
-                yield Skip("its object has no photo", name_of(name, match[1]))
+                yield Skip("its object has no photo", safe_name(name, match[1]))
                 continue
             photo = photos.get(match[1]) or list(photos.values())[number % len(photos)]
-            shared = Shared(name_of(name, "photo", photo.stem), photo)
-            yield Item(name_of(name, match[1]), name, {"photo": shared, "touch_a": path})
+            shared = SharedImage(safe_name(name, "photo", photo.stem), photo)
+            yield Item(safe_name(name, match[1]), name, {"photo": shared, "touch_a": path})
 
 
 def _width(path: Path) -> int:
@@ -97,7 +109,7 @@ def _names(path: Path) -> Mapping[str, Mapping[str, Any]]:
     if not path.is_file():
         return {}
     try:
-        rows = csv.DictReader(content_of(path, ImporterError).decode("utf-8-sig").splitlines())
+        rows = csv.DictReader(read_content(path, ImporterError).decode("utf-8-sig").splitlines())
         return {
             str(row["Index"]).strip(): {"name": row["Name"], "material": row["Material"]}
             for row in rows
@@ -111,7 +123,7 @@ def _split(path: Path) -> Mapping[str, Mapping[str, Sequence[str]]]:
     """The objects of each part: of {"<object>": [instances]}, or of [["<object>", instance], ...]."""
     if not path.is_file():
         return {}
-    document = document_of(path, ImporterError)
+    document = read_json_object(path, ImporterError)
     parts: dict[str, list[str]] = {}
     for theirs, ours in _PARTS.items():
         listed = document.get(theirs, {})

@@ -21,9 +21,18 @@ from typing import Any
 import numpy as np
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Published, Skip, import_items, library, name_of
-from robot.importers.episodes import ENDINGS, Episode, Step
-from robot.importers.zarr_store import Store
+from robot.importers.episodes import MOMENT_SUFFIXES, Episode, Step
+from robot.importers.importing import (
+    DataSet,
+    DataSetMetadata,
+    Item,
+    Progress,
+    Skip,
+    import_extra,
+    import_items,
+    safe_name,
+)
+from robot.importers.zarr_store import ZarrStore
 from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
@@ -35,7 +44,7 @@ DATA_SET = DataSet(
     expects="`<task>.zarr.zip` or `<task>.zarr/` with `meta/episode_ends` and `data/<side>_tactile_data_<group>`",
     fingers=0,
     background="the first step of each episode",
-    traps=(
+    caveats=(
         "A task counts as one object unless its store names objects: compare tasks, or give the objects yourself.",
         "The touch of an episode is its step that differs most from the first, which a change of light may be too.",
     ),
@@ -63,10 +72,10 @@ def import_open_x_tactile(
     if not paths:
         packed = sorted(src.glob("*.tar*")) if src.is_dir() else []
         lacking = f"unpack {packed[0].name} first" if packed else "there is no such file or folder"
-        raise DATA_SET.refusal(src, lacking)
-    library("zarr", "Open-X-Tactile")
-    tasks = [_Task(Store(path), camera) for path in paths]
-    facts = _said(tasks)
+        raise DATA_SET.mismatch_error(src, lacking)
+    import_extra("zarr", "Open-X-Tactile")
+    tasks = [_TaskStore(ZarrStore(path), camera) for path in paths]
+    facts = _store_facts(tasks)
     fingers = {task.fingers for task in tasks}
     if len(fingers) > 1:
         raise ImporterError(
@@ -80,11 +89,11 @@ def import_open_x_tactile(
         out,
         total=sum(len(task.ends) for task in tasks),
         progress=progress,
-        published=Published({}, splits),
+        metadata=DataSetMetadata({}, splits),
     )
 
 
-def _said(tasks: list["_Task"]) -> DataSet:
+def _store_facts(tasks: list["_TaskStore"]) -> DataSet:
     """The facts, and what the stores say of themselves instead."""
     sensors = sorted({sensor for task in tasks for sensor in task.sensors()})
     said = tasks[0].store.attributes().get("recording") if len(tasks) == 1 else None
@@ -93,10 +102,10 @@ def _said(tasks: list["_Task"]) -> DataSet:
     return replace(DATA_SET, sensor=", ".join(sensors) or "unknown", **texts)
 
 
-class _Task:
+class _TaskStore:
     """One store: its episodes, cameras and fingers."""
 
-    def __init__(self, store: Store, camera: str) -> None:
+    def __init__(self, store: ZarrStore, camera: str) -> None:
         self.store = store
         self._tactile = [name for name in store.names() if self._is_image(name)]
         if f"data/{camera}" not in store.names():
@@ -114,7 +123,7 @@ class _Task:
         self.fingers = sum(array.shape[1] for array in self._gels)
         if not 1 <= self.fingers <= 26:
             raise ImporterError(f"{store.path}: a touch must have 1 to 26 areas, got {self.fingers}")
-        self._moments = self._known_moments()
+        self._moments = self._read_moments()
         self._lines = {key: self._line(key) for key in (*_NAMES, *_FIELDS)}
 
     def _is_image(self, name: str) -> bool:
@@ -122,10 +131,10 @@ class _Task:
         kind = self.store.texts(name.replace("_tactile_data_", "_tactile_type_")) if found else []
         return bool(found) and kind in ([], ["image"])
 
-    def _known_moments(self) -> list[str] | None:
+    def _read_moments(self) -> list[str] | None:
         moments = self.store.texts("meta/moment")
         lengths = {end - start for start, end in zip([0, *self.ends], self.ends, strict=False)}
-        known = lengths == {len(moments)} and len(set(moments)) == len(moments) and set(moments) <= set(ENDINGS)
+        known = lengths == {len(moments)} and len(set(moments)) == len(moments) and set(moments) <= set(MOMENT_SUFFIXES)
         return moments if known and "during" in moments else None
 
     def _line(self, key: str) -> Any:
@@ -171,7 +180,7 @@ class _Task:
         """A grasp of each episode. alone: whether names need not say of which store they are."""
         for episode, (start, end) in enumerate(zip([0, *self.ends], self.ends, strict=False)):
             named = self._text("grasp_id", episode)
-            grasp_id = name_of(named) if named and alone else name_of(self.store.name, named or f"{episode:06d}")
+            grasp_id = safe_name(named) if named and alone else safe_name(self.store.name, named or f"{episode:06d}")
             sequence = self._text("sequence_id", episode) or f"{self.store.name}-{episode:06d}"
             fields = {key: value for key in _FIELDS if (value := self._field(key, episode)) is not None}
             pictures = Episode(partial(self._steps, start, end), self.fingers, self._moments)
@@ -195,6 +204,6 @@ class _Task:
             yield self._camera.step(at), [area for array in self._gels for area in array.step(at)]
 
 
-def _items(tasks: list[_Task]) -> Iterator[Item | Skip]:
+def _items(tasks: list[_TaskStore]) -> Iterator[Item | Skip]:
     for task in tasks:
         yield from task.items(alone=len(tasks) == 1)

@@ -19,8 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Skip, import_items, library, name_of, numbered, video_stream
-from robot.recording.folder import Recording, Shared
+from robot.importers.importing import (
+    DataSet,
+    Item,
+    Progress,
+    Skip,
+    import_extra,
+    import_items,
+    numbered_files,
+    safe_name,
+    video_stream,
+)
+from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="PhysiCLeAR",
@@ -30,7 +40,7 @@ DATA_SET = DataSet(
     rig="by hand",
     expects="`<part>_<k>.mov`, or `dataset/` with them in it",
     background="the first frame of each video",
-    traps=(
+    caveats=(
         "There are no photos: the gel image itself stands in place of each photo. Do not train a matcher on it.",
         "The videos of a part were made one after the other, and light and gel drift: the no-contact frame alone names "
         "the part far above chance. Print that control, and the contact difference on one common no-contact frame.",
@@ -47,30 +57,31 @@ Frame = NDArray[np.uint8]
 
 def import_physiclear(src: Path, out: Path, progress: Progress | None = None, *, frames: int = 5) -> Recording:
     """Import the frames of strongest contact of the videos in `src`. Raises ImporterError where there is no video, and
-    without av."""
+    without av.
+    """
     src = Path(src)
     if frames < 1:
         raise ImporterError(f"frames must be at least 1, got {frames}")
-    videos = numbered(src / "dataset" if (src / "dataset").is_dir() else src, _VIDEO)
+    videos = numbered_files(src / "dataset" if (src / "dataset").is_dir() else src, _VIDEO)
     if not len(videos):
-        raise DATA_SET.refusal(src, "it holds no such video")
-    library("av", _WHAT)
+        raise DATA_SET.mismatch_error(src, "it holds no such video")
+    import_extra("av", _WHAT)
     items = (item for match, path in videos for item in _items(match["part"], path, frames))
     return import_items(DATA_SET, items, out, total=len(videos) * frames, progress=progress)
 
 
 def _items(part: str, path: Path, frames: int) -> Iterator[Item | Skip]:
-    sequence = name_of(path.stem)
-    press = Press(path, frames)
-    before = Shared(name_of(sequence, "untouched"), press.untouched)  # type: ignore[arg-type]  # import_items calls it
+    sequence = safe_name(path.stem)
+    press = StrongestFrames(path, frames)
+    before = SharedImage(safe_name(sequence, "no_contact"), press.no_contact)  # type: ignore[arg-type]  # import_items calls it
     for place in range(frames):
-        name = name_of(sequence, str(place + 1))
-        touch = Shared(name, partial(press.frame, place))  # type: ignore[arg-type]
+        name = safe_name(sequence, str(place + 1))
+        touch = SharedImage(name, partial(press.frame, place))  # type: ignore[arg-type]
         images = {"photo": touch, "touch_a": touch, "touch_a_before": before}
         yield Item(name, part, images, {"sequence_id": sequence})
 
 
-class Press:
+class StrongestFrames:
     """The frames of strongest contact of one video, which is decoded once, when the first of them is asked for.
 
     path: of the video. count: how many frames are kept. Reading raises ImporterError.
@@ -79,7 +90,7 @@ class Press:
     def __init__(self, path: Path, count: int) -> None:
         self._path, self._count = path, count
 
-    def untouched(self) -> Frame:
+    def no_contact(self) -> Frame:
         """The first frame, (H, W, 3), red first."""
         return self._read[0]
 
@@ -109,7 +120,7 @@ class Press:
         return [first, *(frame for _, _, frame in sorted(strongest, key=lambda each: -each[1]))]
 
     def _decoded(self) -> Iterator[Frame]:
-        av = library("av", _WHAT)
+        av = import_extra("av", _WHAT)
         try:
             with av.open(str(self._path)) as film:
                 for frame in film.decode(video_stream(film)):

@@ -32,7 +32,7 @@ _NAMES = {
 }
 _TYPES = ("f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "b1")
 
-_PASSED_OVER = {"PROTO", "FRAME"}
+_IGNORED = {"PROTO", "FRAME"}
 _VALUES = {
     *("BININT", "BININT1", "BININT2", "LONG1"),
     *("SHORT_BINUNICODE", "BINUNICODE", "SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8"),
@@ -65,7 +65,7 @@ class _Dtype:
 
 
 @dataclass(eq=False)
-class _Array:
+class _PickledArray:
     """An array, empty until BUILD fills it."""
 
     value: NDArray[Any] | None = None
@@ -119,7 +119,7 @@ class _Reader:
         self._memo: dict[int, Any] = {}
 
     def result(self) -> NDArray[Any]:
-        found = self._stack[0].value if len(self._stack) == 1 and isinstance(self._stack[0], _Array) else None
+        found = self._stack[0].value if len(self._stack) == 1 and isinstance(self._stack[0], _PickledArray) else None
         if found is None:
             raise _refusal("it holds something else")
         return found
@@ -127,7 +127,7 @@ class _Reader:
     def take(self, name: str, argument: Any) -> None:
         """Do what one opcode says. Raises ImporterError, IndexError, KeyError."""
         stack = self._stack
-        if name in _PASSED_OVER:
+        if name in _IGNORED:
             return
         if name in _VALUES:
             stack.append(argument)
@@ -139,7 +139,7 @@ class _Reader:
             marks = [place for place, each in enumerate(stack) if isinstance(each, _Mark)]
             stack[marks[-1] :] = [tuple(stack[marks[-1] + 1 :])]
         elif name in _TUPLES:
-            parts = self._popped(_TUPLES[name])
+            parts = self._pop(_TUPLES[name])
             stack.append(tuple(parts))
         elif name == "MEMOIZE":
             self._memo[len(self._memo)] = stack[-1]
@@ -148,19 +148,19 @@ class _Reader:
         elif name in _GETS:
             stack.append(self._memo[argument])
         elif name == "GLOBAL":
-            stack.append(_named(*argument.partition(" ")[::2]))
+            stack.append(_checked_name(*argument.partition(" ")[::2]))
         elif name == "STACK_GLOBAL":
-            stack.append(_named(*self._popped(2)))
+            stack.append(_checked_name(*self._pop(2)))
         elif name == "REDUCE":
-            what, arguments = self._popped(2)
-            stack.append(_made(what, arguments))
+            what, arguments = self._pop(2)
+            stack.append(_call_result(what, arguments))
         elif name == "BUILD":
-            (state,) = self._popped(1)
+            (state,) = self._pop(1)
             _fill(stack[-1], state)
         else:
             raise _refusal(f"an array has no opcode {name}")
 
-    def _popped(self, count: int) -> list[Any]:
+    def _pop(self, count: int) -> list[Any]:
         if len(self._stack) < count:
             raise _refusal("its stack is empty")
         found = self._stack[-count:]
@@ -168,7 +168,7 @@ class _Reader:
         return found
 
 
-def _named(module: Any, name: Any) -> _Name:
+def _checked_name(module: Any, name: Any) -> _Name:
     if not (isinstance(module, str) and isinstance(name, str)) or (module, name) not in _NAMES:
         raise _refusal(f"it asks for {_word(module)} {_word(name)}")
     return _Name(_NAMES[module, name])
@@ -176,11 +176,12 @@ def _named(module: Any, name: Any) -> _Name:
 
 def _word(part: Any) -> str:
     """A part of a pickle for an error. Of a tuple only its kind: written out, one that holds another twice, and so on,
-    has no end."""
+    has no end.
+    """
     return repr(part[:40]) if isinstance(part, str) else f"a {type(part).__name__}"
 
 
-def _made(what: Any, arguments: Any) -> _Dtype | _Array:
+def _call_result(what: Any, arguments: Any) -> _Dtype | _PickledArray:
     """What NumPy would make by calling a name."""
     word = what.word if isinstance(what, _Name) else None
     if not isinstance(arguments, tuple):
@@ -190,10 +191,10 @@ def _made(what: Any, arguments: Any) -> _Dtype | _Array:
             raise _refusal(f"its numbers are of the type {_word(arguments[0])}")
         return _Dtype(arguments[0])
     if word == _RECONSTRUCT and len(arguments) == 3 and arguments[0] == _Name("ndarray"):
-        return _Array()
+        return _PickledArray()
     if word == _FROM_BUFFER and len(arguments) == 4:
         data, dtype, shape, order = arguments
-        return _Array(_array(shape, dtype, order == "F", data))
+        return _PickledArray(_array(shape, dtype, order == "F", data))
     raise _refusal("it calls something else than what makes an array")
 
 
@@ -205,7 +206,7 @@ def _fill(what: Any, state: Any) -> None:
         if state[1] not in ("<", ">", "=", "|") or any(part is not None for part in state[2:5]):
             raise _refusal("its numbers have fields, or no order of bytes")
         what.order = state[1]
-    elif isinstance(what, _Array) and what.value is None and len(state) == 5:
+    elif isinstance(what, _PickledArray) and what.value is None and len(state) == 5:
         _, shape, dtype, is_fortran, data = state
         what.value = _array(shape, dtype, is_fortran is True, data)
     else:

@@ -16,9 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Published, Skip, import_items, name_of
+from robot.importers.importing import DataSet, DataSetMetadata, Item, Progress, Skip, import_items, safe_name
 from robot.importers.tvl import csv_rows
-from robot.recording.folder import Recording, Shared
+from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="RCT, arXiv 2606.31694",
@@ -27,7 +27,7 @@ DATA_SET = DataSet(
     sensor="DIGIT",
     rig="robot arm, presses along z",
     expects="`metadata/force_metadata.csv` and the pictures that the options touch and photo name",
-    traps=(
+    caveats=(
         "Frames of one press are nearly alike, and its authors found 17.7 points of recall gone once presses no longer "
         "stood on both sides: split by material, which is the object here, or by sequence_id, never by frame.",
         "Three DIGITs took turns; a press names its sensor in its sequence_id. One sensor alone: --option sensor=...",
@@ -40,7 +40,7 @@ DATA_SET = DataSet(
 )
 _COLUMNS = ("material_id", "position", "sensor", "z_frame")
 _WORD = re.compile(r"[\w. +-]{1,80}")
-_PLACE = re.compile(r"\{(\w*)\}")
+_FIELD = re.compile(r"\{(\w*)\}")
 
 
 def import_rct(
@@ -56,9 +56,9 @@ def import_rct(
     src = Path(src)
     table = src / "metadata" / "force_metadata.csv"
     if not table.is_file():
-        raise DATA_SET.refusal(src, "it has no metadata/force_metadata.csv")
+        raise DATA_SET.mismatch_error(src, "it has no metadata/force_metadata.csv")
     for option, pattern in (("touch", touch), ("photo", photo)):
-        if set(_PLACE.findall(pattern)) - set(_COLUMNS):
+        if set(_FIELD.findall(pattern)) - set(_COLUMNS):
             raise ImporterError(f"braces of {option} may hold {', '.join(_COLUMNS)}, got {pattern!r}")
         if not pattern or pattern.startswith("/") or ".." in pattern:
             raise ImporterError(f"{option} must be a path below the data set's folder, got {pattern!r}")
@@ -72,7 +72,7 @@ def import_rct(
         example = example or (row if _find(src, touch, row) and _find(src, photo, row) else None)
     if example is None:
         there = ", ".join(sorted(path.name for path in src.iterdir())[:8])
-        raise DATA_SET.refusal(
+        raise DATA_SET.mismatch_error(
             src,
             f"no row has a picture at touch={touch} and a photo at photo={photo} (there are: {there}); say where they "
             "lie by --option touch=... photo=...",
@@ -85,7 +85,7 @@ def import_rct(
         out,
         total=total,
         progress=progress,
-        published=Published({name: {"frames": count} for name, count in counts.items()}),
+        metadata=DataSetMetadata({name: {"frames": count} for name, count in counts.items()}),
     )
 
 
@@ -105,19 +105,19 @@ def _items(src: Path, table: Path, touch: str, photo: str, sensor: str) -> Itera
         if isinstance(row, Skip):
             yield row
             continue
-        name = name_of(*(row[key] for key in _COLUMNS))
+        name = safe_name(*(row[key] for key in _COLUMNS))
         felt, seen = _find(src, touch, row), _find(src, photo, row)
         if felt is None or seen is None:
             yield Skip(f"no picture lies where the option {'touch' if felt is None else 'photo'} says", name)
             continue
-        shared = Shared(name_of("photo", row["material_id"]), seen)
+        shared = SharedImage(safe_name("photo", row["material_id"]), seen)
         fields = {"sequence_id": "-".join(row[key] for key in _COLUMNS[:3])} | _force(row["raw_fz"])
         yield Item(name, row["material_id"], {"photo": shared, "touch_a": felt}, fields)
 
 
 def _find(src: Path, pattern: str, row: dict[str, str]) -> Path | None:
     """The first file that the pattern names for a row; None where there is none. Raises ImporterError."""
-    filled = _PLACE.sub(lambda place: row[place[1]], pattern)
+    filled = _FIELD.sub(lambda place: row[place[1]], pattern)
     try:
         found = sorted(src.glob(filled))
     except (ValueError, IndexError) as error:  # of "a**b" and of "."

@@ -25,7 +25,7 @@ class RowSplit:
         self._parts[part][object_id] += 1
         self._sequence[object_id] = sequence_id
 
-    def settle(self) -> tuple[dict[str, Split], list[str]]:
+    def object_splits(self) -> tuple[dict[str, Split], list[str]]:
         """The splits of whole sequences that come of it, by name, and what is to be said of it."""
         if len(self._parts) < 2:
             return {}, []

@@ -18,10 +18,20 @@ from pathlib import Path
 from typing import Any
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Images, Item, Numbered, Progress, Published, Skip, import_items, numbered
+from robot.importers.importing import (
+    DataSet,
+    DataSetMetadata,
+    Images,
+    Item,
+    NumberedFiles,
+    Progress,
+    Skip,
+    import_items,
+    numbered_files,
+)
 from robot.importers.row_splits import RowSplit
 from robot.importers.tvl import LICENCE, csv_rows
-from robot.recording.folder import Recording, Shared
+from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="tactile-vlm.github.io, SSVTP",
@@ -32,7 +42,7 @@ DATA_SET = DataSet(
     rig="robot arm, camera and sensor on its wrist",
     expects="`images_tac/image_<n>_tac.jpg` and `images_rgb/image_<n>_rgb.jpg`, or `ssvtp` with them in it",
     background="one frame for all grasps",
-    traps=(
+    caveats=(
         "Each pair counts as an object, with one grasp; neighbouring pairs may show overlapping places of one thing. "
         "Blocks of pairs in a row are one sequence: a surrogate, for nothing says where a thing begins.",
         "The one frame of the untouched gel is older than most touches: what drifted since stays in the difference.",
@@ -48,9 +58,9 @@ def import_ssvtp(src: Path, out: Path, progress: Progress | None = None, *, bloc
     if block < 1:
         raise ImporterError(f"block must be 1 or more pairs, got {block}")
     root = Path(src) / "ssvtp" if (Path(src) / "ssvtp").is_dir() else Path(src)
-    touches = numbered(root / "images_tac", _TOUCH)
+    touches = numbered_files(root / "images_tac", _TOUCH)
     if not len(touches):
-        raise DATA_SET.refusal(Path(src), "images_tac/ has no such file, or is not there")
+        raise DATA_SET.mismatch_error(Path(src), "images_tac/ has no such file, or is not there")
     known = {int(match[1]) for match, _ in touches}
     split, captions = RowSplit("published"), dict[str, dict[str, Any]]()
     same: dict[str | None, dict[str, Any]] = {}  # many pairs share a caption
@@ -63,16 +73,16 @@ def import_ssvtp(src: Path, out: Path, progress: Progress | None = None, *, bloc
                 caption = row.get("caption")
                 captions[_object(number)] = same.setdefault(caption, {"caption": caption})
     del known
-    splits, said = split.settle()
+    splits, said = split.object_splits()
     background = root / "tac_background.png"
-    facts = replace(DATA_SET, traps=(*DATA_SET.traps, *said))
+    facts = replace(DATA_SET, caveats=(*DATA_SET.caveats, *said))
     return import_items(
         facts if background.is_file() else replace(facts, background="none"),
         _items(root, touches, background, block),
         out,
         total=len(touches),
         progress=progress,
-        published=Published(captions, splits),
+        metadata=DataSetMetadata(captions, splits),
     )
 
 
@@ -84,13 +94,13 @@ def _sequence(number: int, block: int) -> str:
     return f"block-{number // block}"
 
 
-def _items(root: Path, touches: Numbered, background: Path, block: int) -> Iterator[Item | Skip]:
+def _items(root: Path, touches: NumberedFiles, background: Path, block: int) -> Iterator[Item | Skip]:
     for match, touch in touches:
         number = int(match[1])
         photo = next((path for suffix in ("jpg", "png") if (path := _photo(root, match[1], suffix)).exists()), None)
         images: Images = {"photo": photo or _photo(root, match[1], "jpg"), "touch_a": touch}
         if background.is_file():
-            images = {**images, "touch_a_before": Shared("untouched", background)}
+            images = {**images, "touch_a_before": SharedImage("no_contact", background)}
         yield Item(_object(number), _object(number), images, {"sequence_id": _sequence(number, block)})
 
 

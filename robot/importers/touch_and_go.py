@@ -18,9 +18,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Images, Item, Progress, Published, Skip, import_items, name_of
+from robot.importers.importing import DataSet, DataSetMetadata, Images, Item, Progress, Skip, import_items, safe_name
 from robot.importers.row_splits import RowSplit, Split
-from robot.recording.folder import Recording, Shared
+from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="touch-and-go.github.io",
@@ -31,7 +31,7 @@ DATA_SET = DataSet(
     rig="by hand, camera on the head",
     expects="`label.txt` and `dataset/<sequence>/{video_frame,gelsight_frame}/<frame>.jpg`",
     background="one frame a video",
-    traps=(
+    caveats=(
         "An object here is a run of frames in contact with one material: a surrogate, for the data set names no "
         "instances. Two runs of a video may touch one thing, so split by sequence_id.",
         "Each photo is of the moment of the touch: hand and sensor are in it, and frames of a run are nearly alike.",
@@ -46,7 +46,7 @@ _CATEGORY = re.compile(r"\s*(?P<name>[^:]+?)\s*:\s*(?P<label>-?\d{1,6})\b.*")
 
 
 @dataclass
-class _Run:
+class _ContactRun:
     """Frames in contact with one material, first to last, without a gap."""
 
     sequence: str
@@ -73,26 +73,28 @@ def import_touch_and_go(src: Path, out: Path, progress: Progress | None = None, 
     src = Path(src)
     labels = src / "label.txt"
     if not labels.is_file():
-        raise DATA_SET.refusal(src, "it has no label.txt")
+        raise DATA_SET.mismatch_error(src, "it has no label.txt")
     runs, skipped = _runs(labels)
     if not runs:
-        raise DATA_SET.refusal(src, "its label.txt names no frame, such as 20220601_182052/0000033833.jpg,3")
+        raise DATA_SET.mismatch_error(src, "its label.txt names no frame, such as 20220601_182052/0000033833.jpg,3")
     first = src / "dataset" / runs[0].sequence
     if first.is_dir() and not (first / "gelsight_frame").is_dir():
-        raise DATA_SET.refusal(src, f"{first.name} has no gelsight_frame/; run the authors' extract_frame.py first")
-    splits, said = _published(src, runs)
+        raise DATA_SET.mismatch_error(
+            src, f"{first.name} has no gelsight_frame/; run the authors' extract_frame.py first"
+        )
+    splits, said = _read_splits(src, runs)
     materials = _materials(src / "category_reference.txt")
     objects = {
         run.object_id: {"label": run.label, "material": materials.get(run.label, "unknown"), "sequence": run.sequence}
         for run in runs
     }
     return import_items(
-        replace(DATA_SET, traps=(*DATA_SET.traps, *said)),
+        replace(DATA_SET, caveats=(*DATA_SET.caveats, *said)),
         _items(src / "dataset", runs, skipped, frames),
         out,
         total=len(skipped) + sum(len(run.frames(frames)) for run in runs),
         progress=progress,
-        published=Published(objects, splits),
+        metadata=DataSetMetadata(objects, splits),
     )
 
 
@@ -110,9 +112,9 @@ def _lines(path: Path) -> Iterator[tuple[str, int, int] | None]:
         raise ImporterError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def _runs(path: Path) -> tuple[list[_Run], list[Skip]]:
+def _runs(path: Path) -> tuple[list[_ContactRun], list[Skip]]:
     """Runs of the frames that label.txt names, in its order, and its lines that cannot be used."""
-    runs: list[_Run] = []
+    runs: list[_ContactRun] = []
     skipped = []
     for number, line in enumerate(_lines(path), start=1):
         if line is None:
@@ -124,30 +126,30 @@ def _runs(path: Path) -> tuple[list[_Run], list[Skip]]:
         elif runs and (runs[-1].sequence, runs[-1].last + 1, runs[-1].label) == (sequence, frame, label):
             runs[-1].last = frame
         else:
-            runs.append(_Run(sequence, frame, frame, label))
+            runs.append(_ContactRun(sequence, frame, frame, label))
     return runs, skipped
 
 
-def _items(folder: Path, runs: list[_Run], skipped: list[Skip], frames: int) -> Iterator[Item | Skip]:
+def _items(folder: Path, runs: list[_ContactRun], skipped: list[Skip], frames: int) -> Iterator[Item | Skip]:
     yield from skipped
-    untouched = _Untouched(folder, runs)
+    no_contact = _NoContactFrames(folder, runs)
     for run in runs:
         at = folder / run.sequence
-        before = untouched.of(run.sequence)
+        before = no_contact.of(run.sequence)
         for frame in run.frames(frames):
             name = f"{frame:010d}.jpg"
             images: Images = {"photo": at / "video_frame" / name, "touch_a": at / "gelsight_frame" / name}
             if before is not None:
-                images = {**images, "touch_a_before": Shared(name_of(run.sequence, "untouched"), before)}
-            yield Item(name_of(run.sequence, f"{frame:010d}"), run.object_id, images, {"sequence_id": run.sequence})
+                images = {**images, "touch_a_before": SharedImage(safe_name(run.sequence, "no_contact"), before)}
+            yield Item(safe_name(run.sequence, f"{frame:010d}"), run.object_id, images, {"sequence_id": run.sequence})
 
 
-class _Untouched:
+class _NoContactFrames:
     """The first frame of each video that no line names."""
 
-    def __init__(self, folder: Path, runs: list[_Run]) -> None:
+    def __init__(self, folder: Path, runs: list[_ContactRun]) -> None:
         self._folder = folder
-        self._runs: dict[str, list[_Run]] = {}
+        self._runs: dict[str, list[_ContactRun]] = {}
         for run in runs:
             self._runs.setdefault(run.sequence, []).append(run)
         self._found: dict[str, Path | None] = {}
@@ -172,12 +174,12 @@ def _materials(path: Path) -> dict[int, str]:
     return {int(found["label"]): found["name"] for line in lines if (found := _CATEGORY.fullmatch(line))}
 
 
-def _published(src: Path, runs: list[_Run]) -> tuple[dict[str, Split], list[str]]:
+def _read_splits(src: Path, runs: list[_ContactRun]) -> tuple[dict[str, Split], list[str]]:
     """Splits by whole runs and videos of train.txt and test.txt, where both are there, and what is to be said."""
     files = {part: src / f"{part}.txt" for part in ("train", "test")}
     if not all(path.is_file() for path in files.values()):
         return {}, []
-    by_sequence: dict[str, list[_Run]] = {}
+    by_sequence: dict[str, list[_ContactRun]] = {}
     for run in sorted(runs, key=lambda run: run.first):
         by_sequence.setdefault(run.sequence, []).append(run)
     split = RowSplit("published")
@@ -187,4 +189,4 @@ def _published(src: Path, runs: list[_Run]) -> tuple[dict[str, Split], list[str]
             at = bisect_right(known, line[1], key=lambda run: run.first) - 1 if line else -1
             if line and at >= 0 and line[1] <= known[at].last:
                 split.add(part, known[at].object_id, line[0])
-    return split.settle()
+    return split.object_splits()

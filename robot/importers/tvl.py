@@ -18,9 +18,19 @@ from pathlib import Path
 from typing import Any
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Images, Item, Progress, Published, Skip, folders, import_items, name_of
+from robot.importers.importing import (
+    DataSet,
+    DataSetMetadata,
+    Images,
+    Item,
+    Progress,
+    Skip,
+    import_items,
+    safe_name,
+    subfolders,
+)
 from robot.importers.row_splits import RowSplit
-from robot.recording.folder import Recording, Shared
+from robot.recording.folder import Recording, SharedImage
 
 CITATION = (
     "Fu, Datta, Huang, Panitch, Drake, Ortiz, Mukadam, Lambeta, Calandra, Goldberg, A Touch, Vision, and Language "
@@ -35,7 +45,7 @@ DATA_SET = DataSet(
     rig="by hand, webcam beside the sensor",
     expects="`hct/data1/<k>-<time>/{tactile,vision}/<frame>.jpg`, or be `hct` itself",
     background="one frame a contact",
-    traps=(
+    caveats=(
         "Frames of one timestamp folder are neighbours in a video, and the authors' validation rows are drawn from the "
         "training rows frame by frame: the nearest neighbour by raw pixels names the folder. Here a folder is one "
         "object and one sequence, so that no split of objects parts it.",
@@ -45,16 +55,16 @@ DATA_SET = DataSet(
     ),
     unverified=("sizes of the photos", "that the paths of contact.json and of the CSV files begin at their own folder"),
 )
-_MOST_JSON = 256 * 2**20
+_MAX_JSON_BYTES = 256 * 2**20
 
 
 def import_tvl(src: Path, out: Path, progress: Progress | None = None) -> Recording:
     """Import the contacts below `src`. Raises ImporterError where there is none."""
     root = Path(src) / "hct" if (Path(src) / "hct").is_dir() else Path(src)
-    parts = [part for part in (folders(root) if root.is_dir() else []) if part.name.startswith("data")]
-    contacts = [contact for part in parts for contact in folders(part) if (contact / "tactile").is_dir()]
+    parts = [part for part in (subfolders(root) if root.is_dir() else []) if part.name.startswith("data")]
+    contacts = [contact for part in parts for contact in subfolders(part) if (contact / "tactile").is_dir()]
     if not contacts:
-        raise DATA_SET.refusal(Path(src), "no folder with tactile/ in it was found")
+        raise DATA_SET.mismatch_error(Path(src), "no folder with tactile/ in it was found")
     split, objects = RowSplit("published"), dict[str, dict[str, Any]]()
     known = {_name(contact) for contact in contacts}
     for part in parts:
@@ -64,15 +74,15 @@ def import_tvl(src: Path, out: Path, progress: Progress | None = None) -> Record
                 if object_id in known:
                     split.add(side, object_id, object_id)
                     objects.setdefault(object_id, {"caption": row.get("caption")})
-    splits, said = split.settle()
-    named = _Named(parts)
+    splits, said = split.object_splits()
+    named = _ContactFrames(parts)
     return import_items(
-        replace(DATA_SET, traps=(*DATA_SET.traps, *said)),
+        replace(DATA_SET, caveats=(*DATA_SET.caveats, *said)),
         _items(contacts, named),
         out,
         total=sum(len(named.frames(contact)) for contact in contacts),
         progress=progress,
-        published=Published(objects, splits),
+        metadata=DataSetMetadata(objects, splits),
     )
 
 
@@ -80,24 +90,24 @@ def _name(contact: Path) -> str:
     return f"{contact.parent.name}-{contact.name}"
 
 
-def _items(contacts: list[Path], named: "_Named") -> Iterator[Item | Skip]:
+def _items(contacts: list[Path], named: "_ContactFrames") -> Iterator[Item | Skip]:
     for contact in contacts:
         background = contact / "tactile_bg_latent.jpg"
-        untouched = Shared(name_of(contact.parent.name, contact.name, "untouched"), background)
+        no_contact = SharedImage(safe_name(contact.parent.name, contact.name, "no_contact"), background)
         for frame in named.frames(contact):
             images: Images = {"photo": contact / "vision" / frame, "touch_a": contact / "tactile" / frame}
             if background.is_file():
-                images = {**images, "touch_a_before": untouched}
-            grasp_id = name_of(contact.parent.name, contact.name, Path(frame).stem)
+                images = {**images, "touch_a_before": no_contact}
+            grasp_id = safe_name(contact.parent.name, contact.name, Path(frame).stem)
             yield Item(grasp_id, _name(contact), images, {"sequence_id": _name(contact)})
 
 
-class _Named:
+class _ContactFrames:
     """The frames that contact.json names, or else all that both folders of a contact hold."""
 
     def __init__(self, parts: list[Path]) -> None:
-        self._contact = {part: _listed(part / "contact.json") for part in parts}
-        self._other = {part: _listed(part / "not_contact.json") or {} for part in parts}
+        self._contact = {part: _read_frame_lists(part / "contact.json") for part in parts}
+        self._other = {part: _read_frame_lists(part / "not_contact.json") or {} for part in parts}
 
     def frames(self, contact: Path) -> list[str]:
         """File names, in order of their frame numbers."""
@@ -112,13 +122,13 @@ def _number(name: str) -> tuple[int, str]:
     return (int(head) if head.isdecimal() and len(head) < 19 else -1, name)
 
 
-def _listed(path: Path) -> dict[str, set[str]] | None:
+def _read_frame_lists(path: Path) -> dict[str, set[str]] | None:
     """contact.json: folder -> names of its tactile files; None where there is no such file. Raises ImporterError."""
     if not path.exists():
         return None
     try:
         with open(path, "rb") as file:
-            found = json.loads(file.read(_MOST_JSON))
+            found = json.loads(file.read(_MAX_JSON_BYTES))
     except (OSError, ValueError) as error:
         raise ImporterError(f"{path} cannot be read: {error}") from error
     tactile = found.get("tactile") if isinstance(found, dict) else None

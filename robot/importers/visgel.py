@@ -20,9 +20,19 @@ import cv2
 import numpy as np
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Published, Skip, folders, import_items, name_of, numbered
+from robot.importers.importing import (
+    DataSet,
+    DataSetMetadata,
+    Item,
+    Progress,
+    Skip,
+    import_items,
+    numbered_files,
+    safe_name,
+    subfolders,
+)
 from robot.recording.folder import Recording
-from robot.storage import content_of, decoded
+from robot.storage import decode_picture, read_content
 
 DATA_SET = DataSet(
     source="VisGel",
@@ -32,7 +42,7 @@ DATA_SET = DataSet(
     rig="KUKA iiwa arm; webcam",
     background="at the start of each touch",
     expects="`data_seen/` or `data_unseen/`, and in them `touch/<n>/<rec>/frame0000.jpg` and `vision/`, which is alike",
-    traps=(
+    caveats=(
         "Nothing says which object is touched: object_id names one recording of one touch, and two of them may be of "
         "one object. Pair accuracy and guesses are too low by that.",
         "The camera sees arm and scene: who knows the place knows the touch. Print the control of the photo's "
@@ -44,7 +54,7 @@ DATA_SET = DataSet(
     ),
 )
 _FRAME = re.compile(r"frame(\d+)\.jpe?g")
-_LOOKED_AT = 16
+_FRAMES_COMPARED = 16
 _DEPTH = 4
 """Folders below data_seen in which touch/ is looked for."""
 
@@ -54,7 +64,7 @@ def import_visgel(src: Path, out: Path, progress: Progress | None = None) -> Rec
     src = Path(src)
     objects = {part: [_name(part, each) for each in _recordings(src / f"data_{part}")] for part in ("seen", "unseen")}
     if not any(objects.values()):
-        raise DATA_SET.refusal(src, "it holds no recording of a touch")
+        raise DATA_SET.mismatch_error(src, "it holds no recording of a touch")
     splits = {"unseen": {"train": objects["seen"], "test": objects["unseen"]}} if all(objects.values()) else {}
     return import_items(
         DATA_SET,
@@ -62,7 +72,7 @@ def import_visgel(src: Path, out: Path, progress: Progress | None = None) -> Rec
         out,
         total=sum(map(len, objects.values())),
         progress=progress,
-        published=Published(splits=splits),
+        metadata=DataSetMetadata(splits=splits),
     )
 
 
@@ -70,32 +80,32 @@ def _recordings(root: Path, depth: int = _DEPTH) -> Iterator[Path]:
     """The folders touch/<n>/<rec> below `root`."""
     if not root.is_dir():
         return
-    for folder in folders(root):
+    for folder in subfolders(root):
         if folder.name == "touch":
-            for sitting in folders(folder):
-                yield from folders(sitting)
+            for sitting in subfolders(folder):
+                yield from subfolders(sitting)
         elif depth and folder.name != "vision":
             yield from _recordings(folder, depth - 1)
 
 
 def _name(part: str, recording: Path) -> str:
-    return name_of(part, recording.parent.name, recording.name)
+    return safe_name(part, recording.parent.name, recording.name)
 
 
 def _items(src: Path) -> Iterator[Item | Skip]:
     for part in ("seen", "unseen"):
         for recording in _recordings(src / f"data_{part}"):
-            pressed = _Pressed(recording)
+            pressed = _TouchRecording(recording)
             images = {
                 "photo": pressed.photo,
                 "touch_a": pressed.touch,
-                "touch_a_before": pressed.untouched,
+                "touch_a_before": pressed.no_contact,
             }
             name = _name(part, recording)
-            yield Item(name, name, images, {"sequence_id": name_of(part, recording.parent.name)})
+            yield Item(name, name, images, {"sequence_id": safe_name(part, recording.parent.name)})
 
 
-class _Pressed:
+class _TouchRecording:
     """One recording of a touch, looked at when its pictures are asked for."""
 
     def __init__(self, recording: Path) -> None:
@@ -108,12 +118,12 @@ class _Pressed:
     def photo(self) -> Path:
         return self._vision / self._frame
 
-    def untouched(self) -> Path:
+    def no_contact(self) -> Path:
         return self._touch / self._names[0]
 
     @cached_property
     def _names(self) -> list[str]:
-        names = [path.name for _, path in numbered(self._touch, _FRAME)]
+        names = [path.name for _, path in numbered_files(self._touch, _FRAME)]
         if len(names) < 2:
             raise ImporterError("it has no two frames")
         return names
@@ -123,7 +133,10 @@ class _Pressed:
         """The frame that differs most from the first; an unreadable one does not count."""
         first = _small(self._touch / self._names[0])
         spread = (
-            np.linspace(1, len(self._names) - 1, min(_LOOKED_AT, len(self._names) - 1)).round().astype(int).tolist()
+            np.linspace(1, len(self._names) - 1, min(_FRAMES_COMPARED, len(self._names) - 1))
+            .round()
+            .astype(int)
+            .tolist()
         )
         names: list[str] = [self._names[index] for index in spread]
         differences = [_difference(_small(self._touch / name), first) for name in names]
@@ -135,7 +148,7 @@ class _Pressed:
 def _small(path: Path) -> np.ndarray | None:
     """Grey levels at an eighth of the size; None for what is no picture."""
     try:
-        return decoded(content_of(path, ImporterError), cv2.IMREAD_REDUCED_GRAYSCALE_8)
+        return decode_picture(read_content(path, ImporterError), cv2.IMREAD_REDUCED_GRAYSCALE_8)
     except ImporterError:
         return None
 

@@ -19,19 +19,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from robot.importers.base import (
+from robot.importers.importing import (
     DataSet,
+    DataSetMetadata,
     Images,
     Item,
     Progress,
-    Published,
     Skip,
-    folders,
     import_items,
-    name_of,
-    numbered,
+    numbered_files,
+    safe_name,
+    subfolders,
 )
-from robot.recording.folder import Recording, Shared
+from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="github.com/Exhor/deep_visuotactile_classification",
@@ -42,7 +42,7 @@ DATA_SET = DataSet(
     rig="robot arm, one finger; photos on a turntable, one table and one light for all",
     expects="`touch/<NN_class>/<II>/`, `vision/<NN_class>/<II>/`, `touch/baselineForCalibration.jpg`",
     background="one frame for all grasps",
-    traps=(
+    caveats=(
         "08_bottlefull and 02_bottleempty are the same bottles, full and empty: no photo tells them apart. They share "
         "a sequence_id, so that drawn splits keep them together; of a gallery leave one of the classes out.",
         "The no-contact frame is touch 4 of the first stapler, byte for byte (that touch is skipped), and the finger's "
@@ -56,12 +56,12 @@ DATA_SET = DataSet(
 _TOUCH = re.compile(r"touch_(\d+)_img_(\d+)_name_(?P<class>[^_]+)_(?P<nickname>.+)_at_.*\.jpe?g", re.IGNORECASE)
 _PHOTO = re.compile(r"IMG_inst_(\d+)_img_(\d+)_.*\.jpe?g", re.IGNORECASE)
 _CLASS = re.compile(r"\d+_(.+)")
-_TWICE = {"bottleempty": "bottle", "bottlefull": "bottle"}
+_SAME_OBJECTS = {"bottleempty": "bottle", "bottlefull": "bottle"}
 """Classes of the same things."""
 
 
 @dataclass(frozen=True)
-class _Object:
+class _Instance:
     """The folders of one instance, and how many files of touches lie there."""
 
     object_id: str
@@ -76,57 +76,57 @@ def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recor
     src = Path(src)
     for part in ("touch", "vision"):
         if not (src / part).is_dir():
-            raise DATA_SET.refusal(src, f"it has no {part}/ (the folder is code/data/vt60 of the repository)")
-    objects = [each for each in map(_look, _instances(src)) if each.count]
+            raise DATA_SET.mismatch_error(src, f"it has no {part}/ (the folder is code/data/vt60 of the repository)")
+    objects = [each for each in map(_read_instance, _instances(src)) if each.count]
     if not objects:
-        raise DATA_SET.refusal(src, "it holds no touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg")
-    untouched = src / "touch" / "baselineForCalibration.jpg"
-    has_frame = untouched.is_file()
+        raise DATA_SET.mismatch_error(src, "it holds no touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg")
+    no_contact = src / "touch" / "baselineForCalibration.jpg"
+    has_frame = no_contact.is_file()
     return import_items(
         DATA_SET if has_frame else replace(DATA_SET, background="none"),
-        _items(src, objects, untouched if has_frame else None),
+        _items(src, objects, no_contact if has_frame else None),
         out,
         total=sum(each.count for each in objects),
         progress=progress,
-        published=Published({each.object_id: each.about for each in objects}),
+        metadata=DataSetMetadata({each.object_id: each.about for each in objects}),
     )
 
 
 def _instances(src: Path) -> Iterator[Path]:
     """The folders touch/<NN_class>/<II>."""
-    for kind in folders(src / "touch"):
+    for kind in subfolders(src / "touch"):
         if _CLASS.fullmatch(kind.name):
-            yield from folders(kind)
+            yield from subfolders(kind)
 
 
-def _look(folder: Path) -> _Object:
+def _read_instance(folder: Path) -> _Instance:
     kind, instance = folder.parent.name, folder.name
-    found = numbered(folder, _TOUCH)
+    found = numbered_files(folder, _TOUCH)
     name = kind.partition("_")[2]
     about = {"class": name, "instance": instance, "nickname": next((match["nickname"] for match, _ in found), None)}
     vision = folder.parents[2] / "vision" / kind / instance
-    return _Object(name_of(kind, instance), folder, vision, len(found), about)
+    return _Instance(safe_name(kind, instance), folder, vision, len(found), about)
 
 
-def _items(src: Path, objects: list[_Object], untouched: Path | None) -> Iterator[Item | Skip]:
-    background = {"touch_a_before": Shared("untouched", untouched)} if untouched else {}
+def _items(src: Path, objects: list[_Instance], no_contact: Path | None) -> Iterator[Item | Skip]:
+    background = {"touch_a_before": SharedImage("no_contact", no_contact)} if no_contact else {}
     touched = {each.vision for each in objects}
-    for shown in (instance for kind in folders(src / "vision") for instance in folders(kind)):
+    for shown in (instance for kind in subfolders(src / "vision") for instance in subfolders(kind)):
         if shown not in touched:
             yield Skip("photos of an object that was not touched", f"{shown.parent.name}/{shown.name}")
     for each in objects:
-        photos = [path for _, path in numbered(each.vision, _PHOTO)]
-        thing = _TWICE.get(each.about["class"])
+        photos = [path for _, path in numbered_files(each.vision, _PHOTO)]
+        thing = _SAME_OBJECTS.get(each.about["class"])
         sequence = f"{thing}-{each.about['nickname']}" if thing else each.object_id
-        for number, (match, touch) in enumerate(numbered(each.touch, _TOUCH)):
-            name = name_of(each.object_id, match[2])
+        for number, (match, touch) in enumerate(numbered_files(each.touch, _TOUCH)):
+            name = safe_name(each.object_id, match[2])
             if not photos:
                 yield Skip("its object has no photo", name)
                 continue
-            if untouched and touch.is_file() and filecmp.cmp(touch, untouched, shallow=False):
+            if no_contact and touch.is_file() and filecmp.cmp(touch, no_contact, shallow=False):
                 yield Skip("its touch is the no-contact frame itself", name)
                 continue
             photo = photos[number % len(photos)]
-            shared = Shared(name_of(each.object_id, photo.stem), photo)
+            shared = SharedImage(safe_name(each.object_id, photo.stem), photo)
             images: Images = {"photo": shared, "touch_a": touch, **background}
             yield Item(name, each.object_id, images, {"sequence_id": sequence})

@@ -16,9 +16,19 @@ from pathlib import Path
 import numpy as np
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Images, Item, Progress, Skip, folders, import_items, name_of, numbered
+from robot.importers.importing import (
+    DataSet,
+    Images,
+    Item,
+    Progress,
+    Skip,
+    import_items,
+    numbered_files,
+    safe_name,
+    subfolders,
+)
 from robot.recording.folder import Recording
-from robot.storage import content_of, decoded
+from robot.storage import decode_picture, read_content
 
 DATA_SET = DataSet(
     source="X-Capture",
@@ -27,7 +37,7 @@ DATA_SET = DataSet(
     sensor="DIGIT-like",
     rig="by hand, a portable device",
     expects="`<object>/<point>/<point>_<force>N_tactile.png` and `<point>_rgb.png`",
-    traps=(
+    caveats=(
         "No no-contact frame is there, and an object was captured in one sitting: light and gel of it may name the "
         "object. Print the order of capture and the low-pass control beside every result.",
     ),
@@ -45,19 +55,19 @@ def import_x_capture(src: Path, out: Path, progress: Progress | None = None) -> 
     """Import the points below `src`. Raises ImporterError where there is none."""
     src = Path(src)
     if not src.is_dir():
-        raise DATA_SET.refusal(src, "it is no folder")
-    points = [point for each in folders(src) for point in folders(each) if len(numbered(point, _TOUCH))]
+        raise DATA_SET.mismatch_error(src, "it is no folder")
+    points = [point for each in subfolders(src) for point in subfolders(each) if len(numbered_files(point, _TOUCH))]
     if not points:
-        raise DATA_SET.refusal(src, "it holds no such touch")
-    total = sum(len(numbered(point, _TOUCH)) for point in points)
+        raise DATA_SET.mismatch_error(src, "it holds no such touch")
+    total = sum(len(numbered_files(point, _TOUCH)) for point in points)
     return import_items(DATA_SET, _items(points), out, total=total, progress=progress)
 
 
 def _items(points: list[Path]) -> Iterator[Item | Skip]:
     for point in points:
         object_id = point.parent.name
-        for match, touch in numbered(point, _TOUCH):
-            name = name_of(object_id, point.name, f"{match['force']}N")
+        for match, touch in numbered_files(point, _TOUCH):
+            name = safe_name(object_id, point.name, f"{match['force']}N")
             depth = _depth(point / f"{match['point']}_depth.png")
             images: Images = {"photo": point / f"{match['point']}_rgb.png", "touch_a": touch, **depth}
             yield Item(name, object_id, images, {"sequence_id": object_id, "force_n": float(match["force"])})
@@ -70,8 +80,8 @@ def _depth(path: Path) -> Images:
     if not path.is_file():
         return {}
     try:
-        data = content_of(path, ImporterError)
+        data = read_content(path, ImporterError)
     except ImporterError:
         return {}
-    image = decoded(data, cv2.IMREAD_UNCHANGED)
+    image = decode_picture(data, cv2.IMREAD_UNCHANGED)
     return {"depth": image} if image is not None and image.ndim == 2 and image.dtype == np.uint16 else {}

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from robot.errors import ImporterError
-from robot.importers.base import DataSet, Item, Progress, Skip, folders, import_items, name_of
+from robot.importers.importing import DataSet, Item, Progress, Skip, import_items, safe_name, subfolders
 from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
@@ -24,7 +24,7 @@ DATA_SET = DataSet(
     sensor="DIGIT",
     rig="by hand, the object in a vise; webcam",
     expects="`real/<object>/dataset_<k>/frames/` and `webcam_frames/`",
-    traps=(
+    caveats=(
         "Ten objects are few, and the webcam shows the vise, the hand and one place: print the control of the photo's "
         "background beside every result.",
     ),
@@ -43,13 +43,13 @@ def import_ycb_slide(src: Path, out: Path, progress: Progress | None = None, *, 
     if every < 1:
         raise ImporterError(f"every must be at least 1, got {every}")
     if not src.is_dir():
-        raise DATA_SET.refusal(src, "it is no folder")
+        raise DATA_SET.mismatch_error(src, "it is no folder")
     root = src / "real" if (src / "real").is_dir() else src
-    logs = [log for each in folders(root) for log in folders(each) if _LOG.fullmatch(log.name)]
+    logs = [log for each in subfolders(root) for log in subfolders(each) if _LOG.fullmatch(log.name)]
     counts = [len(_frames(log, every)) for log in logs]
     if not sum(counts):
         simulated = (src / "sim").is_dir() or any(root.glob("*/*/tactile_images"))
-        raise DATA_SET.refusal(src, "simulated logs have no photos" if simulated else "it holds no frame")
+        raise DATA_SET.mismatch_error(src, "simulated logs have no photos" if simulated else "it holds no frame")
     return import_items(DATA_SET, _items(logs, every), out, total=sum(counts), progress=progress)
 
 
@@ -65,9 +65,9 @@ def _frames(log: Path, every: int) -> list[str]:
 
 def _items(logs: list[Path], every: int) -> Iterator[Item | Skip]:
     for log in logs:
-        sequence = name_of(log.parent.name, log.name)
+        sequence = safe_name(log.parent.name, log.name)
         for frame in _frames(log, every):
             photo = log / "webcam_frames" / frame
-            name = name_of(sequence, frame.split(".")[0])
+            name = safe_name(sequence, frame.split(".")[0])
             images = {"photo": photo, "touch_a": log / "frames" / frame}
             yield Item(name, log.parent.name, images, {"sequence_id": sequence})

@@ -16,30 +16,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import ImporterError
-from robot.importers.base import library, name_of
+from robot.importers.importing import import_extra, safe_name
 
 _CODECS = ("blosc", "bz2", "gzip", "lz4", "lzma", "zlib", "zstd")
-_MOST_CHUNK = 512 * 2**20
+_MAX_CHUNK_BYTES = 512 * 2**20
 """Bytes of a chunk, which is in memory whole."""
-_MOST_LINE = 64 * 2**20
+_MAX_ARRAY_BYTES = 64 * 2**20
 """Bytes of an array along episodes."""
-_MOST_JSON = 16 * 2**20
+_MAX_JSON_BYTES = 16 * 2**20
 
 
-class Store:
+class ZarrStore:
     """One store, a folder or a .zip file of it."""
 
     def __init__(self, path: Path) -> None:
         """Raises ImporterError for a file that is no .zip."""
         self.path = path
-        self.name = name_of(path.name.removesuffix(".zip").removesuffix(".zarr"))
+        self.name = safe_name(path.name.removesuffix(".zip").removesuffix(".zarr"))
         self._zip = None
         try:
             self._zip = None if path.is_dir() else zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
             raise ImporterError(f"{path} cannot be read as a zip file: {error}") from error
-        if self._zip and any(file.file_size > _MOST_CHUNK for file in self._zip.infolist()):
-            raise ImporterError(f"{path} holds files of more than {_MOST_CHUNK} bytes, which no chunk may have")
+        if self._zip and any(file.file_size > _MAX_CHUNK_BYTES for file in self._zip.infolist()):
+            raise ImporterError(f"{path} holds files of more than {_MAX_CHUNK_BYTES} bytes, which no chunk may have")
         # A .zip may hold the store itself, or the folder with it.
         tops = {name.split("/")[0] for name in self._zip.namelist()} if self._zip else set()
         self._top = f"{tops.pop()}/" if len(tops) == 1 else ""
@@ -72,7 +72,7 @@ class Store:
             dict.fromkeys(text.decode("utf-8", "replace") if isinstance(text, bytes) else text for text in found)
         )
 
-    def array(self, name: str, *, ndim: int | None = None, kind: str) -> "Array":
+    def array(self, name: str, *, ndim: int | None = None, kind: str) -> "ZarrArray":
         """Open an array. kind: letters of NumPy's kinds that are taken, "u1" for bytes. Raises ImporterError."""
         about = self._json(f"{name}/.zarray")
         where = f"{self.path.name}/{name}"
@@ -90,7 +90,7 @@ class Store:
             raise ImporterError(f"{where} has the shape {shape} in chunks of {chunks}, which is none")
         size = math.prod(chunks) * dtype.itemsize
         whole = math.prod(shape) * dtype.itemsize
-        if size > _MOST_CHUNK or (kind != "u1" and whole > _MOST_LINE):
+        if size > _MAX_CHUNK_BYTES or (kind != "u1" and whole > _MAX_ARRAY_BYTES):
             raise ImporterError(f"{where} is too large: chunks of {size} bytes, {whole} in all")
         codec = about.get("compressor")
         known = codec is None or (isinstance(codec, dict) and codec.get("id") in _CODECS)
@@ -98,10 +98,10 @@ class Store:
             raise ImporterError(f"{where} must be zarr of version 2 without filters, in one of {', '.join(_CODECS)}")
         separator = "/" if about.get("dimension_separator") == "/" else "."
         first = separator.join(["{}", *["0"] * (len(shape) - 1)])
-        return Array(self._open(name), where, lambda at: self._has(f"{name}/{first.format(at // chunks[0])}"))
+        return ZarrArray(self._open(name), where, lambda at: self._has(f"{name}/{first.format(at // chunks[0])}"))
 
     def _open(self, name: str) -> Any:
-        zarr = library("zarr", "zarr stores")
+        zarr = import_extra("zarr", "zarr stores")
         try:
             store = zarr.storage.ZipStore(self.path, mode="r") if self._zip else str(self.path)
             return zarr.open_array(store, path=self._top + name, mode="r", zarr_format=2)
@@ -115,10 +115,10 @@ class Store:
         try:
             if self._zip:
                 with self._zip.open(self._top + name) as file:
-                    text = file.read(_MOST_JSON)
+                    text = file.read(_MAX_JSON_BYTES)
             else:
                 with open(self.path / name, "rb") as file:
-                    text = file.read(_MOST_JSON)
+                    text = file.read(_MAX_JSON_BYTES)
             found = json.loads(text)
         except Exception as error:  # zipfile lets out what zlib, bz2 and lzma raise
             raise ImporterError(f"{self.path.name}/{name} cannot be read: {error}") from error
@@ -127,7 +127,7 @@ class Store:
         return found
 
 
-class Array:
+class ZarrArray:
     """A checked array: indexing reads what is asked for."""
 
     def __init__(self, array: Any, where: str, has: Callable[[int], bool]) -> None:
@@ -136,7 +136,8 @@ class Array:
 
     def step(self, at: int) -> NDArray[Any]:
         """What stands at one place of the first axis. Raises ImporterError where its chunk is damaged or not there,
-        which zarr would take for one full of zeros."""
+        which zarr would take for one full of zeros.
+        """
         if not self._has(at):
             raise ImporterError(f"a chunk of {self._where} is missing")
         return self._read(at)

@@ -20,7 +20,7 @@ from typing import Any, Self
 from robot.errors import RecordingError, RobotConfigError
 from robot.recording.grasp import OUTCOMES
 from robot.settings import build
-from robot.storage import append_line, content_of, object_of, storage_errors
+from robot.storage import append_line, parse_object, read_content, storage_errors
 
 ATTEMPTS_FILE = "attempts.jsonl"
 UNGRASPABLE = "ungraspable"
@@ -66,7 +66,7 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
     """Attempts that count, each with where its line ends in the file."""
     if not path.exists():
         return []
-    lines = content_of(path, RecordingError).splitlines(keepends=True)
+    lines = read_content(path, RecordingError).splitlines(keepends=True)
     found: list[tuple[LoggedAttempt, int]] = []
     made: Counter[str] = Counter()
     end = 0
@@ -75,7 +75,7 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
         if last and not line.endswith(b"\n"):
             break
         try:
-            attempt = LoggedAttempt.from_row(object_of(line, RecordingError))
+            attempt = LoggedAttempt.from_row(parse_object(line, RecordingError))
         except RecordingError as error:
             raise RecordingError(f"{path}, line {number}: {error}") from error
         if attempt.grasp_id is not None and attempt.grasp_id not in grasp_ids:
@@ -155,14 +155,15 @@ def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
     return tallies
 
 
-def acceptance_table(tallies: Sequence[Tally], wanted: int | None = None) -> str:
-    """Plain text, a line an object and one for all; marked are objects that have fewer than `wanted`, and why those
-    were skipped that cannot be grasped."""
+def acceptance_table(tallies: Sequence[Tally], grasps_wanted: int | None = None) -> str:
+    """Plain text, a line an object and one for all; marked are objects that have fewer than `grasps_wanted`, and why those
+    were skipped that cannot be grasped.
+    """
     width = max([len(each.object_id) for each in tallies] + [6])
     lines = [f"{'object':{width}}  accepted  of  {'  '.join(OUTCOMES)}"]
     total = Tally("all")
     for each in tallies:
-        gave_up = "  gave up" if wanted is not None and each.accepted < wanted else ""
+        gave_up = "  gave up" if grasps_wanted is not None and each.accepted < grasps_wanted else ""
         lines.append(_line(each, width) + (f"  skipped: {each.skipped}" if each.skipped else gave_up))
         total.attempts, total.accepted = total.attempts + each.attempts, total.accepted + each.accepted
         total.outcomes += each.outcomes

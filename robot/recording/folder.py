@@ -36,10 +36,10 @@ from robot.recording.grasp import check_name, unknown_keys
 from robot.storage import (
     ImageSource,
     append_line,
-    content_of,
-    document_of,
     file_content,
-    object_of,
+    parse_object,
+    read_content,
+    read_json_object,
     storage_errors,
     write_files,
 )
@@ -57,17 +57,17 @@ UNITS = {
     "touch_skew_s": "second between the fingers' images",
     "depth": "millimetre, uint16, 0 where unknown",
 }
-_MUST_AGREE = ("source", "sensor", "units", "background")
+_FIXED_KEYS = ("source", "sensor", "units", "background")
 GRASP_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 
 @dataclass(frozen=True)
-class Shared:
+class SharedImage:
     """An image of several grasps, such as one no-contact frame for all: kept once. `name`, a grasp_id in form, tells it
     from the other shared ones of the recording; of the same name the first is kept.
 
     >>> from pathlib import Path
-    >>> photo = robot.Shared("mug-front", Path("catalog/mug/1.jpg"))
+    >>> photo = robot.SharedImage("mug-front", Path("catalog/mug/1.jpg"))
     >>> with robot.RecordingWriter("shared", {"source": "bench 3", "sensor": "DIGIT"}) as writer:
     ...     one = writer.append("000001", "mug", {"photo": photo, "touch_a": Path("a.png")})
     ...     two = writer.append("000002", "mug", {"photo": photo, "touch_a": Path("a2.png")})
@@ -113,10 +113,10 @@ def read_recording(folder: str | Path) -> Recording:
     root = Path(folder)
     info = read_info(root)
     path = root / METADATA_FILE
-    data = content_of(path, RecordingError)
+    data = read_content(path, RecordingError)
     ignored: set[str] = set()
     grasps = tuple(_grasps(path, data, ignored))
-    torn = len(_torn(data))
+    torn = len(_incomplete_last_line(data))
     notes = [f"{path}: dropped a half-written last line ({torn} bytes) that a crash left"] if torn else []
     if ignored:
         notes.append(f"{path}: passed over keys that are not of the format: {', '.join(sorted(ignored))}")
@@ -126,11 +126,11 @@ def read_recording(folder: str | Path) -> Recording:
 def _grasps(path: Path, data: bytes, ignored: set[str]) -> Iterator[RecordedGrasp]:
     """The grasps of a metadata.jsonl, line by line; keys that mean nothing go to `ignored`. Raises RecordingError."""
     seen: set[str] = set()
-    for number, line in enumerate(io.BytesIO(data.removesuffix(_torn(data))), start=1):
+    for number, line in enumerate(io.BytesIO(data.removesuffix(_incomplete_last_line(data))), start=1):
         if not line.strip():
             continue
         try:
-            row = object_of(line, RecordingError)
+            row = parse_object(line, RecordingError)
             grasp = RecordedGrasp.from_row(row)
             if grasp.grasp_id in seen:
                 raise RecordingError(f"grasp_id {grasp.grasp_id!r} has a line already; each must be its own")
@@ -146,7 +146,7 @@ def read_info(root: Path) -> dict[str, Any]:
     path = root / INFO_FILE
     if not os.path.exists(path):  # False, and no error, for a name that no disk takes
         raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")
-    info = document_of(path, RecordingError)
+    info = read_json_object(path, RecordingError)
     _check_info(info, path)
     return info
 
@@ -160,7 +160,7 @@ def _check_info(info: Mapping[str, Any], path: str | Path = INFO_FILE) -> None:
         check_name(f"{path}: {key}", info.get(key))
 
 
-def _torn(data: bytes) -> bytes:
+def _incomplete_last_line(data: bytes) -> bytes:
     """What a crash left of a last line; one that only lacks its newline is whole."""
     last = _after_last_newline(data)
     try:
@@ -199,7 +199,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
     def __init__(self, folder: str | Path, info: Mapping[str, Any]) -> None:
         self.folder = Path(folder)
         wanted = _full_info(info)
-        _check_holds_nothing_else(self.folder)
+        _check_no_other_files(self.folder)
         with storage_errors(self.folder):
             (self.folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
             descriptor = os.open(self.folder / METADATA_FILE, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
@@ -215,17 +215,17 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
     def _start(self, wanted: dict[str, Any]) -> None:
         """Create recording.json unless it is there, and cut metadata.jsonl after its last whole line."""
         if not (self.folder / INFO_FILE).exists():
-            write_atomically(self.folder / INFO_FILE, _text_of(wanted))
+            write_atomically(self.folder / INFO_FILE, _encode_info(wanted))
         self.info = read_info(self.folder)
-        for key in _MUST_AGREE:
+        for key in _FIXED_KEYS:
             if (old := self.info.get(key)) != (new := wanted.get(key)):
                 raise RecordingError(f"{self.folder} was recorded with {key} {old!r}, not {new!r}; give another folder")
         self._shared: dict[str, str] = {}
         data = self._file.read()
         self._grasp_ids = {grasp.grasp_id: None for grasp in _grasps(self.folder / METADATA_FILE, data, set())}
-        self._end = len(data) - len(_torn(data))
+        self._end = len(data) - len(_incomplete_last_line(data))
         self._file.truncate(self._end)
-        if (last := _after_last_newline(data)) and not _torn(data):
+        if (last := _after_last_newline(data)) and not _incomplete_last_line(data):
             self._end -= len(last)
             self._write_line(last)
 
@@ -235,7 +235,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         return self._grasp_ids.keys()
 
     def append(
-        self, grasp_id: str, object_id: str, images: Mapping[str, ImageSource | Shared], **fields: Any
+        self, grasp_id: str, object_id: str, images: Mapping[str, ImageSource | SharedImage], **fields: Any
     ) -> RecordedGrasp:
         """Add one grasp: first its images, then its line; when it returns, both are on the disk.
 
@@ -252,11 +252,11 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         contents: dict[str, bytes] = {}
         paths: dict[str, str] = {}
         for column, source in images.items():
-            if isinstance(source, Shared) and self.has_shared(source.name):
+            if isinstance(source, SharedImage) and self.has_shared(source.name):
                 paths[f"{column}_file_name"] = self._shared[source.name]
                 continue
-            data, suffix = file_content(column, source.source if isinstance(source, Shared) else source)
-            name = f"{source.name}_shared" if isinstance(source, Shared) else f"{grasp_id}_{column}"
+            data, suffix = file_content(column, source.source if isinstance(source, SharedImage) else source)
+            name = f"{source.name}_shared" if isinstance(source, SharedImage) else f"{grasp_id}_{column}"
             paths[f"{column}_file_name"] = path = f"{IMAGES_FOLDER}/{name}{suffix}"
             contents[path] = data
         row = {"grasp_id": grasp_id, "object_id": object_id, **fields, **paths}
@@ -281,18 +281,18 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
                     self._shared[name] = path
         return name in self._shared
 
-    def tell(self, **info: Any) -> None:
+    def update_info(self, **info: Any) -> None:
         """Say more in recording.json, or say it anew, but not what grasps are held to.
 
         Raises RecordingError, StorageError.
         """
-        if fixed := sorted({*_MUST_AGREE, "schema_version"} & set(info)):
+        if fixed := sorted({*_FIXED_KEYS, "schema_version"} & set(info)):
             raise RecordingError(f"{fixed[0]} of a recording stays as it is")
-        told = _full_info({**self.info, **info})
-        if told != self.info:
+        updated = _full_info({**self.info, **info})
+        if updated != self.info:
             with storage_errors(self.folder):
-                write_atomically(self.folder / INFO_FILE, _text_of(told))
-            self.info = told
+                write_atomically(self.folder / INFO_FILE, _encode_info(updated))
+            self.info = updated
 
     def _write_line(self, line: bytes) -> None:
         """Write after the last whole line and sync; whatever fails, no half of it stays."""
@@ -327,7 +327,7 @@ def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
     return full
 
 
-def _text_of(info: Mapping[str, Any]) -> bytes:
+def _encode_info(info: Mapping[str, Any]) -> bytes:
     return json.dumps(info, indent=2).encode() + b"\n"
 
 
@@ -341,7 +341,7 @@ def software_version() -> str:
         return "unknown"
 
 
-def _check_holds_nothing_else(folder: Path) -> None:
+def _check_no_other_files(folder: Path) -> None:
     """Refuse to mix a new recording into a folder of other files."""
     if (folder / INFO_FILE).is_file() or not folder.exists():
         return

@@ -20,7 +20,7 @@ OUTCOMES = ("held", "missed", "slipped", "no_plan")
 
 _PLAIN_KEYS = ("grasp_id", "object_id", *_NUMBERS, "pose", "grasped", "outcome", "sequence_id")
 _IMAGE_KEY = re.compile(r"(photo|depth|touch_([a-z])(_before|_after)?)_file_name")
-_OF_MANY = re.compile(r"object_id|sequence_id|outcome|photo_file_name|touch_[a-z]_before_file_name")
+_REPEATED_KEYS = re.compile(r"object_id|sequence_id|outcome|photo_file_name|touch_[a-z]_before_file_name")
 """Keys under which many lines say the same; their text is in memory once."""
 
 
@@ -90,13 +90,13 @@ class RecordedGrasp:
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Self:
         """Inverse of `to_row`; null counts as left out, other keys are passed over. Raises RecordingError."""
-        said: dict[str, Any] = {
-            key: sys.intern(value) if type(value) is str and _OF_MANY.fullmatch(key) else value
+        present: dict[str, Any] = {
+            key: sys.intern(value) if type(value) is str and _REPEATED_KEYS.fullmatch(key) else value
             for key, value in row.items()
             if value is not None
         }
-        files = {key: value for key, value in said.items() if _IMAGE_KEY.fullmatch(key)}
-        plain = {key: value for key, value in said.items() if key in _PLAIN_KEYS}
+        files = {key: value for key, value in present.items() if _IMAGE_KEY.fullmatch(key)}
+        plain = {key: value for key, value in present.items() if key in _PLAIN_KEYS}
         for key in ("grasp_id", "object_id", "photo_file_name"):
             if key not in plain and key not in files:
                 raise RecordingError(f"{key} is missing")

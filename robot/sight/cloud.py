@@ -18,7 +18,7 @@ _NEAR_TABLE_MM = 40.0
 _TABLE_TOLERANCE_MM = 6.0
 _MAX_SLOPE = 0.1
 _SAMPLES, _HYPOTHESES = 3000, 64
-_LEAST_MM, _LEAST_PX, _MOST_POINTS = 5.0, 30, 900
+_MIN_HEIGHT_MM, _MIN_PX, _MAX_POINTS = 5.0, 30, 900
 _FILTER_PX = 5
 
 
@@ -50,7 +50,7 @@ class Rays:
         return float(self.x[1] - self.x[0])
 
     @classmethod
-    def of(cls, image: RGBD, extrinsics: Array) -> "Rays":
+    def from_image(cls, image: RGBD, extrinsics: Array) -> "Rays":
         """For the pixels of `image`."""
         lens, (rows, columns) = image.intrinsics, image.colour.shape[:2]
         assert lens is not None, "a picture with depth has intrinsics"
@@ -71,14 +71,14 @@ class Rays:
 
 
 @dataclass(frozen=True)
-class Thing:
+class ObjectPoints:
     """What stands on the table: (N, 3) points (mm; z above the table), the table, and what was noticed."""
 
     points: Array
     table: TablePlane
     missing: float
     """Share of the pixels of its outline that have no depth."""
-    cut_off: bool
+    is_cut_off: bool
     """Whether it touches the picture's border, so that a part of it is not seen."""
 
 
@@ -139,15 +139,15 @@ def _heights(plane: Array, points: Array) -> Array:
     return np.asarray(plane[0] * points[:, 0] + plane[1] * points[:, 1] + plane[2])
 
 
-def find_thing(depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None = None) -> Thing:
+def find_object_points(depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None = None) -> ObjectPoints:
     """The largest connected thing above the table, inside `region`. Raises PlanError when there is none."""
     above = height_above(depth_mm, rays, table)
-    least = max(_LEAST_MM, 3.0 * table.noise_mm * abs(_steepness(rays)))
-    raised = (above > least) & (above < MAX_HEIGHT_MM)
+    min_height_mm = max(_MIN_HEIGHT_MM, 3.0 * table.noise_mm * abs(_steepness(rays)))
+    raised = (above > min_height_mm) & (above < MAX_HEIGHT_MM)
     if region is not None:
         raised &= _inside(depth_mm, rays, region)
     # Single pixels are outvoted.
-    patch = largest_patch(cv2.medianBlur(raised.astype(np.uint8), _FILTER_PX), _LEAST_PX)
+    patch = largest_patch(cv2.medianBlur(raised.astype(np.uint8), _FILTER_PX), _MIN_PX)
     if patch is None:
         raise PlanError("depth shows nothing on the table: the object is gone, transparent or out of the picture")
     rows, columns = (patch.mask & raised[patch.window]).nonzero()
@@ -155,10 +155,10 @@ def find_thing(depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | 
     points = rays.points(depth_mm, rows, columns)
     points[:, 2] = above[rows, columns]
     level = abs(_steepness(rays)) / (float(np.median(depth_mm[rows, columns])) * rays.pixel) ** 2
-    points = _without_strays(points, level)
-    if len(points) > _MOST_POINTS:
-        points = points[np.sort(np.random.default_rng(0).choice(len(points), _MOST_POINTS, replace=False))]
-    return Thing(points, table, _missing(depth_mm[patch.window], patch.mask), patch.cut_off)
+    points = _remove_outliers(points, level)
+    if len(points) > _MAX_POINTS:
+        points = points[np.sort(np.random.default_rng(0).choice(len(points), _MAX_POINTS, replace=False))]
+    return ObjectPoints(points, table, _missing(depth_mm[patch.window], patch.mask), patch.is_cut_off)
 
 
 def height_above(depth_mm: Depth, rays: Rays, table: TablePlane) -> Depth:
@@ -183,26 +183,26 @@ class Patch:
 
     window: tuple[slice, slice]
     mask: Mask
-    cut_off: bool
+    is_cut_off: bool
 
 
-def largest_patch(candidates: npt.NDArray[np.uint8], least_px: int) -> Patch | None:
-    """The largest connected part of what is not 0; None where none has `least_px` pixels."""
+def largest_patch(candidates: npt.NDArray[np.uint8], min_px: int) -> Patch | None:
+    """The largest connected part of what is not 0; None where none has `min_px` pixels."""
     first_column, first_row, columns, rows = cv2.boundingRect(candidates)
     around = candidates[first_row : first_row + rows, first_column : first_column + columns]
     if around.size == 0:
         return None
     _, labels, stats, _ = cv2.connectedComponentsWithStats(np.ascontiguousarray(around), connectivity=8)
     sizes = stats[1:, cv2.CC_STAT_AREA]
-    if sizes.max() < least_px:
+    if sizes.max() < min_px:
         return None
     best = 1 + int(sizes.argmax())
     mask = labels == best
     left, top, width, height = (int(value) for value in stats[best, :4])
     mask = mask[top : top + height, left : left + width]
     left, top, (rows, columns) = left + first_column, top + first_row, candidates.shape
-    cut_off = left <= 1 or top <= 1 or left + width >= columns - 1 or top + height >= rows - 1
-    return Patch((slice(top, top + height), slice(left, left + width)), mask, cut_off)
+    is_cut_off = left <= 1 or top <= 1 or left + width >= columns - 1 or top + height >= rows - 1
+    return Patch((slice(top, top + height), slice(left, left + width)), mask, is_cut_off)
 
 
 def _missing(depth_mm: Depth, mask: Mask) -> float:
@@ -214,7 +214,7 @@ def _missing(depth_mm: Depth, mask: Mask) -> float:
     return float(np.isnan(depth_mm[outline]).mean())
 
 
-def _without_strays(points: Array, level: float, cell_mm: float = 6.0) -> Array:
+def _remove_outliers(points: Array, level: float, cell_mm: float = 6.0) -> Array:
     """Drop points with fewer neighbours in plan than a level surface has, of which `level` points see each mm2.
 
     Outliers lie along their ray, far from the thing's footprint and from each other.

@@ -21,30 +21,30 @@ import numpy.typing as npt
 
 from robot.errors import PlanError, RobotConfigError
 from robot.readings import RGBD, Region
-from robot.sight.cloud import Depth, Rays, TablePlane, Thing, find_table, find_thing
+from robot.sight.cloud import Depth, ObjectPoints, Rays, TablePlane, find_object_points, find_table
 from robot.sight.silhouette import fit_silhouette
 from robot.sight.solids import (
-    CUT,
+    OUTLIER_CUT,
     Array,
     Circle,
     Cuboid,
     Solid,
-    Upright,
+    UprightCylinder,
     fit_circle,
     fit_cuboid,
-    fit_lying,
+    fit_lying_cylinder,
     refine_circle,
 )
 
-LEAST_SIDE_POINTS = 10
-LEAST_ARC_DEG = 60.0
+MIN_SIDE_POINTS = 10
+MIN_ARC_DEG = 60.0
 _SECTOR_DEG = 10.0
-_MUCH_MISSING = 0.5
-_ARC_WHEN_CUT_OFF_DEG = 90.0
-_MANY_OFF = 0.3
-_LEAST_TOP = 0.05
-_POOR, _OUTLIER_MM = 0.35, 2.0
-_OUTLINE_SHARE = 0.15
+_MAX_MISSING = 0.5
+_MIN_CUT_OFF_ARC_DEG = 90.0
+_MAX_OUTLIER_FRACTION = 0.3
+_MIN_TOP_FRACTION = 0.05
+_MAX_LOSS, _OUTLIER_MM = 0.35, 2.0
+_OUTLINE_ERROR = 0.15
 """Standard error of an outline's fit as a share of the radius: measured on cylinders whose base nothing hides."""
 
 _CRUDE_MM, _ROUGH_MM, _GUESS_MM = 3.0, 6.0, 10.0
@@ -110,25 +110,25 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None =
         numbers = np.asarray(extrinsics).tolist()
         raise RobotConfigError(f"extrinsics must be finite, got {numbers}; calibrate the camera again")
     depth = np.where(image.depth_m > 0, image.depth_m, np.nan) * np.float32(1000)
-    rays = Rays.of(image, np.asarray(extrinsics, np.float64))
+    rays = Rays.from_image(image, np.asarray(extrinsics, np.float64))
     table = find_table(depth, rays)
     try:
-        thing = find_thing(depth, rays, table, region)
+        object_points = find_object_points(depth, rays, table, region)
     except PlanError:
         return _from_colour(image, depth, rays, table, region)
-    if thing.missing > _MUCH_MISSING:
+    if object_points.missing > _MAX_MISSING:
         try:
             return _from_colour(image, depth, rays, table, region)
         except PlanError:
             pass  # what depth there is has to do
-    return _fit(thing, rays)
+    return _fit(object_points, rays)
 
 
 def _from_colour(image: RGBD, depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None) -> CylinderFit:
     """See robot.sight.silhouette."""
     found = fit_silhouette(image.colour, depth_mm, rays, table, region)
     notes = (*table.notes, "depth shows nothing here: fitted to the outline in the colour picture")
-    error_mm = max(3.0, _OUTLINE_SHARE * found.radius)
+    error_mm = max(3.0, _OUTLINE_ERROR * found.radius)
     return CylinderFit(found.x, found.y, found.height, found.radius, error_mm, "silhouette", found.half, notes=notes)
 
 
@@ -143,42 +143,42 @@ class _Candidate:
     note: str = ""
 
 
-def _fit(thing: Thing, rays: Rays) -> CylinderFit:
-    noise = max(1.0, thing.table.noise_mm)
-    top = _top(thing.points, noise)
-    points = thing.points[thing.points[:, 2] < top + CUT * noise]
+def _fit(object_points: ObjectPoints, rays: Rays) -> CylinderFit:
+    noise = max(1.0, object_points.table.noise_mm)
+    top = _top(object_points.points, noise)
+    points = object_points.points[object_points.points[:, 2] < top + OUTLIER_CUT * noise]
     eye = rays.pose[:2, 3]
     box = fit_cuboid(points, top, eye)
-    lying = (fit_lying(points, box, along, eye) for along in (True, False))
+    lying = (fit_lying_cylinder(points, box, along, eye) for along in (True, False))
     candidates = [
-        _upright(points, top, noise, rays, box),
-        _boxed(points, box, top, noise),
+        _upright_candidate(points, top, noise, rays, box),
+        _box_candidate(points, box, top, noise),
         *(_Candidate(solid, "lying", _CRUDE_MM) for solid in lying if solid is not None),
     ]
     best = min(candidates, key=lambda candidate: candidate.solid.misfit(points, noise, rays.pose[:3, 3]))
-    if best.method != "circle" and _loss(best.solid, points, noise) > _POOR:
-        best = _enclosing(points, top, "no simple solid explains what is seen", _ROUGH_MM)
-    if thing.cut_off and best.arc_deg < _ARC_WHEN_CUT_OFF_DEG:
+    if best.method != "circle" and _loss(best.solid, points, noise) > _MAX_LOSS:
+        best = _enclosing_candidate(points, top, "no simple solid explains what is seen", _ROUGH_MM)
+    if object_points.is_cut_off and best.arc_deg < _MIN_CUT_OFF_ARC_DEG:
         raise PlanError("the object touches the border of the picture, and too little of it is seen to place it")
-    return _described(best, points, noise, _notes(thing, best, points, noise))
+    return _to_fit(best, points, noise, _notes(object_points, best, points, noise))
 
 
 def _loss(solid: Solid, points: Array, noise: float) -> float:
     """0 to 1: mean squared distance of the points from the surface, cut off where they count as outliers."""
-    return float((np.minimum(solid.distance(points) / (CUT * noise), 1.0) ** 2).mean())
+    return float((np.minimum(solid.distance(points) / (OUTLIER_CUT * noise), 1.0) ** 2).mean())
 
 
-def _boxed(points: Array, box: Cuboid, top: float, noise: float) -> _Candidate:
+def _box_candidate(points: Array, box: Cuboid, top: float, noise: float) -> _Candidate:
     """A box, whose far side is where its top ends: without a top in sight it is a guess."""
-    if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _LEAST_TOP:
+    if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _MIN_TOP_FRACTION:
         return _Candidate(box, "box", _CRUDE_MM)
     return _Candidate(box, "box", _GUESS_MM, note="its top is not seen, and so not how far it reaches back")
 
 
-def _described(best: _Candidate, points: Array, noise: float, notes: tuple[str, ...]) -> CylinderFit:
+def _to_fit(best: _Candidate, points: Array, noise: float, notes: tuple[str, ...]) -> CylinderFit:
     """The candidate as an upright cylinder with the footprint of its solid."""
     solid = best.solid
-    stray = CUT * noise * math.sqrt(_loss(solid, points, noise))
+    stray = OUTLIER_CUT * noise * math.sqrt(_loss(solid, points, noise))
     return CylinderFit(
         solid.x,
         solid.y,
@@ -194,11 +194,11 @@ def _described(best: _Candidate, points: Array, noise: float, notes: tuple[str, 
     )
 
 
-def _notes(thing: Thing, best: _Candidate, points: Array, noise: float) -> tuple[str, ...]:
-    notes = [*thing.table.notes, best.note]
-    if thing.cut_off:
+def _notes(object_points: ObjectPoints, best: _Candidate, points: Array, noise: float) -> tuple[str, ...]:
+    notes = [*object_points.table.notes, best.note]
+    if object_points.is_cut_off:
         notes.append("it touches the border of the picture: a part of it is not seen")
-    if (best.solid.distance(points) > CUT * noise).mean() > _MANY_OFF:
+    if (best.solid.distance(points) > OUTLIER_CUT * noise).mean() > _MAX_OUTLIER_FRACTION:
         notes.append("it is no simple solid: many points lie off the fitted surface")
     return tuple(note for note in notes if note)
 
@@ -220,25 +220,25 @@ def _top(points: Array, noise: float) -> float:
     return float(np.quantile(z[layer <= last], 0.99))
 
 
-def _upright(points: Array, top: float, noise: float, rays: Rays, box: Cuboid) -> _Candidate:
+def _upright_candidate(points: Array, top: float, noise: float, rays: Rays, box: Cuboid) -> _Candidate:
     """An upright cylinder from its visible side; where that says too little, from all points."""
     side = points[points[:, 2] < top - max(4.0, noise), :2]
-    if len(side) < LEAST_SIDE_POINTS:
-        return _enclosing(points, top, f"only {len(side)} points on its side")
+    if len(side) < MIN_SIDE_POINTS:
+        return _enclosing_candidate(points, top, f"only {len(side)} points on its side")
     sight = side.mean(0) - rays.pose[:2, 3]
     largest = 2 * math.hypot(*box.half)
     away = sight / max(float(np.hypot(*sight)), 1e-9)
     circle = fit_circle(side, noise, away, largest)
     if circle is None:
-        return _enclosing(points, top, "no circle of its size fits its side")
+        return _enclosing_candidate(points, top, "no circle of its size fits its side")
     arc = _arc_deg(circle, side)
     start = np.array([circle.x, circle.y]), circle.radius
     whole = refine_circle(points[:, :2], *start, noise, largest, away, top - points[:, 2])
     if whole is not None:
         circle, side = whole, points[:, :2]
-    if arc < LEAST_ARC_DEG or circle.used.sum() < LEAST_SIDE_POINTS:
-        return _enclosing(points, top, f"its side shows an arc of only {arc:.0f} degrees")
-    solid = Upright(circle.x, circle.y, circle.radius, top)
+    if arc < MIN_ARC_DEG or circle.inliers.sum() < MIN_SIDE_POINTS:
+        return _enclosing_candidate(points, top, f"its side shows an arc of only {arc:.0f} degrees")
+    solid = UprightCylinder(circle.x, circle.y, circle.radius, top)
     return _Candidate(solid, "circle", _circle_error(circle, side, arc), arc)
 
 
@@ -248,24 +248,24 @@ def _circle_error(circle: Circle, side: Array, arc_deg: float) -> float:
     Residuals of neighbouring points are alike (relief, a body that is not quite round), so that each sector of the arc
     counts as one measurement.
     """
-    off = np.hypot(*(side[circle.used] - [circle.x, circle.y]).T) - circle.radius
-    alike = circle.used.sum() / (arc_deg / _SECTOR_DEG)
+    off = np.hypot(*(side[circle.inliers] - [circle.x, circle.y]).T) - circle.radius
+    alike = circle.inliers.sum() / (arc_deg / _SECTOR_DEG)
     return float(np.sqrt(np.trace(circle.covariance[:2, :2]) * np.mean(off**2) * alike))
 
 
 def _arc_deg(circle: Circle, side: Array) -> float:
     """Degrees of the circle that points lie on, counted in sectors."""
-    on = side[circle.used] - [circle.x, circle.y]
+    on = side[circle.inliers] - [circle.x, circle.y]
     sector = np.degrees(np.arctan2(on[:, 1], on[:, 0])) // _SECTOR_DEG
     count = np.bincount(sector.astype(int) + 18, minlength=37)
     return float((count >= 2).sum() * _SECTOR_DEG)
 
 
-def _enclosing(points: Array, top: float, why: str, error_mm: float = _CRUDE_MM) -> _Candidate:
+def _enclosing_candidate(points: Array, top: float, why: str, error_mm: float = _CRUDE_MM) -> _Candidate:
     """The smallest circle round the plan, without the farthest points on each side, which may be outliers."""
     plan = points[:, :2]
     low, high = np.quantile(plan, [0.02, 0.98], axis=0)
     inner = plan[((plan > low - _OUTLIER_MM) & (plan < high + _OUTLIER_MM)).all(1)]
     (x, y), radius = cv2.minEnclosingCircle(inner.astype(np.float32))
     note = f"{why}: the smallest circle round all its points was taken"
-    return _Candidate(Upright(float(x), float(y), float(radius), top), "enclosing circle", error_mm, 0.0, note)
+    return _Candidate(UprightCylinder(float(x), float(y), float(radius), top), "enclosing circle", error_mm, 0.0, note)

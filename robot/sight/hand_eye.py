@@ -23,7 +23,7 @@ from msgspec import Meta
 from _touch_retrieval.documents import typed
 from _touch_retrieval.files import write_atomically
 from robot.errors import RobotConfigError
-from robot.storage import content_of, document_of, storage_errors
+from robot.storage import read_content, read_json_object, storage_errors
 
 Points = npt.NDArray[np.float64]
 Fit = Callable[[Points, Points], Points]
@@ -31,26 +31,27 @@ Fit = Callable[[Points, Points], Points]
 
 VERSION = 1
 COLUMNS = tuple(f"{frame}_{axis}_mm" for frame in ("camera", "rig") for axis in "xyz")
-LEAST_SPREAD = 0.02
+MIN_SPREAD = 0.02
 """Points count as on one line (plane) when they stray from it by less than this share of their extent: at 300 mm
 that is 6 mm, below which errors of 5 mm in the points turn the camera at will."""
 SUSPECT_MM = 20.0
 """Points further off than this in the mean are warned of: twice what the paper's rig had left out."""
-_SUSPECT_SHARE, _SUSPECT_MM = 0.6, 1.0
-_LEAST_MM = 5.0
+_SUSPECT_RATIO, _SUSPECT_MM = 0.6, 1.0
+_MIN_EXTENT_MM = 5.0
 """Points of so small an extent are in metres: nobody calibrates within a few mm."""
-_ENOUGH = 6
+_MIN_MIRROR_POINTS = 6
 """Of fewer points some order of them may look like their mirror image."""
-_THOUSAND = (500.0, 2000.0)
+_METRES_RATIO = (500.0, 2000.0)
 """Extents whose quotient lies here are in mm and in metres: noise and a wrong depth scale do not halve or double."""
-_FAR_MM = 1e6
-_FUTURE = timedelta(days=1)
+_MAX_COORDINATE_MM = 1e6
+_MAX_CLOCK_ERROR = timedelta(days=1)
 
 
 @dataclass(frozen=True)
-class Errors:
+class FitErrors:
     """Distances (mm) between mapped camera points and rig points: of the points fitted, and of each point when left
-    out of the fit (loo)."""
+    out of the fit (loo).
+    """
 
     mean_mm: float
     max_mm: float
@@ -62,26 +63,27 @@ class Errors:
 class HandEye:
     """A calibration. camera_mm, rig_mm: the points (N, 3) it was made from. rigid, affine: (4, 4), camera to rig, mm.
 
-    `affine` and its errors are None where the points do not tell it; `no_affine` says why. written: when, in UTC.
+    `affine` and its errors are None where the points do not tell it; `affine_problem` says why. written: when, in UTC.
     """
 
     camera_mm: Points
     rig_mm: Points
     rigid: Points
-    rigid_errors: Errors
+    rigid_errors: FitErrors
     affine: Points | None
-    affine_errors: Errors | None
-    no_affine: str
+    affine_errors: FitErrors | None
+    affine_problem: str
     written: datetime
 
     @property
     def warning(self) -> str | None:
         """What is suspicious, with its likely cause: another unit, a mirrored axis, a camera that measures wrong (as
-        stretching space explains left-out points much better than moving the camera), or wrong pairs."""
+        stretching space explains left-out points much better than moving the camera), or wrong pairs.
+        """
         rigid, affine = self.rigid_errors, self.affine_errors
         if causes := [*_unit_causes(self.camera_mm, self.rig_mm), *_mirror_causes(self)]:
-            return f"{_off(rigid)}: {'; '.join(causes)}"
-        enough = min(_SUSPECT_SHARE * rigid.loo_mean_mm, rigid.loo_mean_mm - _SUSPECT_MM)
+            return f"{_describe_errors(rigid)}: {'; '.join(causes)}"
+        enough = min(_SUSPECT_RATIO * rigid.loo_mean_mm, rigid.loo_mean_mm - _SUSPECT_MM)
         if affine is not None and affine.loo_mean_mm <= enough:
             return (
                 f"left-out points are {affine.loo_mean_mm:.1f} mm off by an affine map and {rigid.loo_mean_mm:.1f} mm "
@@ -91,7 +93,7 @@ class HandEye:
         if max(rigid.mean_mm, rigid.loo_mean_mm) <= SUSPECT_MM:
             return None
         return (
-            f"{_off(rigid)}, which is more than {SUSPECT_MM:g}: are camera points paired with the wrong rig points, or "
+            f"{_describe_errors(rigid)}, which is more than {SUSPECT_MM:g}: are camera points paired with the wrong rig points, or "
             "single points mistaken? Look at each pair"
         )
 
@@ -128,20 +130,20 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
     if len(camera) < 4:
         raise RobotConfigError(f"a hand-eye fit must have at least 4 pairs of points, got {len(camera)}; add some")
     for name, points in (("camera", camera), ("rig", rig)):
-        if _least_spread(points, 2) < LEAST_SPREAD:
+        if _min_spread(points, 2) < MIN_SPREAD:
             raise RobotConfigError(
                 f"the {name} points must not lie on one line, nor all but one of them; add points to its sides"
             )
-    no_affine = _no_affine(camera)
-    affine = None if no_affine else fit_affine(camera, rig)
+    affine_problem = _affine_problem(camera)
+    affine = None if affine_problem else fit_affine(camera, rig)
     return HandEye(
         camera,
         rig,
         fit_rigid(camera, rig),
-        errors_of(fit_rigid, camera, rig),
+        measure_errors(fit_rigid, camera, rig),
         affine,
-        None if no_affine else errors_of(fit_affine, camera, rig),
-        no_affine,
+        None if affine_problem else measure_errors(fit_affine, camera, rig),
+        affine_problem,
         (written or datetime.now(UTC)).replace(microsecond=0),
     )
 
@@ -166,7 +168,7 @@ def apply_map(matrix: Points, points_mm: Points) -> Points:
     return points_mm @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def errors_of(fit: Fit, camera_mm: Points, rig_mm: Points) -> Errors:
+def measure_errors(fit: Fit, camera_mm: Points, rig_mm: Points) -> FitErrors:
     """Errors of a fit on its own points, and of each point under the fit of the others."""
     own = np.linalg.norm(apply_map(fit(camera_mm, rig_mm), camera_mm) - rig_mm, axis=1)
     left_out = np.empty(len(own))
@@ -174,13 +176,13 @@ def errors_of(fit: Fit, camera_mm: Points, rig_mm: Points) -> Errors:
         others = np.arange(len(own)) != index
         found = apply_map(fit(camera_mm[others], rig_mm[others]), camera_mm[index : index + 1])
         left_out[index] = np.linalg.norm(found[0] - rig_mm[index])
-    return Errors(float(own.mean()), float(own.max()), float(left_out.mean()), float(left_out.max()))
+    return FitErrors(float(own.mean()), float(own.max()), float(left_out.mean()), float(left_out.max()))
 
 
 def read_pairs(path: Path) -> tuple[Points, Points]:
     """Camera and rig points from a CSV file with the columns COLUMNS, in any order. Raises RobotConfigError."""
     try:
-        with io.StringIO(content_of(path, RobotConfigError).decode("utf-8-sig"), newline="") as file:
+        with io.StringIO(read_content(path, RobotConfigError).decode("utf-8-sig"), newline="") as file:
             rows = csv.DictReader(file, strict=True)
             if sorted(rows.fieldnames or ()) != sorted(COLUMNS):
                 raise RobotConfigError(f"{path} must have the columns {', '.join(COLUMNS)}; it has {rows.fieldnames}")
@@ -191,10 +193,11 @@ def read_pairs(path: Path) -> tuple[Points, Points]:
     return pairs[:, :3], pairs[:, 3:]
 
 
-def load(path: Path, max_age_days: float | None = None, now: datetime | None = None) -> HandEye:
+def load_hand_eye(path: Path, max_age_days: float | None = None, now: datetime | None = None) -> HandEye:
     """A saved calibration, fitted again from its points. Raises RobotConfigError, also for one older than asked, and
-    for a file whose map is not that of its points."""
-    plain = document_of(path, RobotConfigError)
+    for a file whose map is not that of its points.
+    """
+    plain = read_json_object(path, RobotConfigError)
     if plain.get("version") != VERSION:
         raise RobotConfigError(f"{path} must be a hand-eye calibration of version {VERSION}; make it again")
     try:
@@ -211,7 +214,7 @@ def load(path: Path, max_age_days: float | None = None, now: datetime | None = N
 
 def _check_age(path: Path, found: HandEye, max_age_days: float | None, now: datetime | None) -> None:
     age = found.age_days(now)
-    if timedelta(days=age) < -_FUTURE:
+    if timedelta(days=age) < -_MAX_CLOCK_ERROR:
         raise RobotConfigError(f"{path} was written {-age:.0f} days in the future; set the clock, or calibrate again")
     if max_age_days is not None and not age <= max_age_days:
         raise RobotConfigError(
@@ -224,7 +227,7 @@ _Matrix = tuple[tuple[float, float, float, float], ...]
 
 
 @dataclass(frozen=True)
-class _Pair:
+class _PointPair:
     camera_mm: _Place
     rig_mm: _Place
 
@@ -236,28 +239,29 @@ class _Document:
     version: int
     written: datetime
     rigid: Annotated[_Matrix, Meta(min_length=4, max_length=4)]
-    rigid_errors: Errors
+    rigid_errors: FitErrors
     affine: _Matrix | None
-    affine_errors: Errors | None
-    points: tuple[_Pair, ...]
+    affine_errors: FitErrors | None
+    points: tuple[_PointPair, ...]
 
 
-def _off(errors: Errors) -> str:
+def _describe_errors(errors: FitErrors) -> str:
     return f"points are {errors.mean_mm:.1f} mm off by the rigid map, and {errors.loo_mean_mm:.1f} mm when left out"
 
 
 def _unit_causes(camera: Points, rig: Points) -> list[str]:
-    if max(_extent(rig), _extent(camera)) < _LEAST_MM:
+    if max(_extent(rig), _extent(camera)) < _MIN_EXTENT_MM:
         return ["all points seem to be in metres, they must be in mm"]
     share = _extent(rig) / _extent(camera)
-    low, high = _THOUSAND
+    low, high = _METRES_RATIO
     named = (("camera", low <= share <= high), ("rig", low <= 1 / share <= high))
     return [f"the {name} points seem to be in metres, they must be in mm" for name, is_so in named if is_so]
 
 
 def _mirror_causes(found: HandEye) -> list[str]:
     """Whether a mirrored camera, of whatever unit, fits much better, or the affine map mirrors. Points on a plane do
-    not tell, and of the corners of a tetrahedron two confused ones look the same."""
+    not tell, and of the corners of a tetrahedron two confused ones look the same.
+    """
     rig, scaled = found.rig_mm, found.camera_mm * (_extent(found.rig_mm) / _extent(found.camera_mm))
     plain, mirrored = (
         float(np.linalg.norm(apply_map(fit_rigid(points, rig), points) - rig, axis=1).mean())
@@ -266,7 +270,9 @@ def _mirror_causes(found: HandEye) -> list[str]:
     explains = plain > 2 * mirrored + _SUSPECT_MM
     if not explains and (found.affine is None or np.linalg.det(found.affine[:3, :3]) > 0):
         return []
-    other = "" if explains and len(rig) >= _ENOUGH else ", or camera points are paired with the wrong rig points"
+    other = (
+        "" if explains and len(rig) >= _MIN_MIRROR_POINTS else ", or camera points are paired with the wrong rig points"
+    )
     return [f"one axis seems to be mirrored, or two swapped (x right, y down, z forward; the rig's z up){other}"]
 
 
@@ -280,7 +286,7 @@ def _points(name: str, points: npt.ArrayLike) -> Points:
         found = np.array(points, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise RobotConfigError(f"{name} points must be rows of x, y and z in mm: {error}") from error
-    if found.ndim != 2 or found.shape[1] != 3 or not (np.abs(found) < _FAR_MM).all():  # also refuses NaN
+    if found.ndim != 2 or found.shape[1] != 3 or not (np.abs(found) < _MAX_COORDINATE_MM).all():  # also refuses NaN
         raise RobotConfigError(
             f"{name} points must be (N, 3) finite mm within a kilometre, got {found.shape}: {found.tolist()}"
         )
@@ -297,16 +303,16 @@ def _row(path: Path, line: int, row: Mapping[str, Any]) -> list[float]:
     return numbers
 
 
-def _no_affine(camera: Points) -> str:
+def _affine_problem(camera: Points) -> str:
     """Why these points do not tell an affine map, or nothing."""
     if len(camera) < 5:
         return f"an affine map must have at least 5 pairs of points, got {len(camera)}"
-    if _least_spread(camera, 3) < LEAST_SPREAD:
+    if _min_spread(camera, 3) < MIN_SPREAD:
         return "an affine map must have points that do not lie on one plane, nor all but one of them"
     return ""
 
 
-def _least_spread(points: Points, dimensions: int) -> float:
+def _min_spread(points: Points, dimensions: int) -> float:
     """Extent in the last of the main `dimensions` as a share of the first, the least with any one point left out."""
     shares = []
     for index in range(len(points)):

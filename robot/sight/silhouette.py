@@ -15,23 +15,23 @@ import numpy.typing as npt
 from robot.errors import PlanError
 from robot.readings import Region
 from robot.sight.cloud import Array, Depth, Mask, Patch, Rays, TablePlane, height_above, largest_patch
-from robot.sight.solids import Upright
+from robot.sight.solids import UprightCylinder
 
 _COLOUR_LEVELS = 12.0
-_LEAST_PX = 60
+_MIN_PX = 60
 
 
 def fit_silhouette(
     colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None = None
-) -> Upright:
+) -> UprightCylinder:
     """Fit the largest patch without depth and of another colour than the table. Raises PlanError if there is none."""
-    patch = _patch(_unlike_the_table(colour, depth_mm, rays, table) & np.isnan(depth_mm))
+    patch = _patch(_differs_from_table(colour, depth_mm, rays, table) & np.isnan(depth_mm))
     rows, columns = (at + part.start for at, part in zip(patch.mask.nonzero(), patch.window, strict=True))
     directions = rays.points(np.ones(depth_mm.shape, np.float32), rows, columns) - rays.pose[:3, 3]
     return _cylinder(directions, rows, rays.pose[:3, 3] - [0.0, 0.0, table.c], region)
 
 
-def _unlike_the_table(colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: TablePlane) -> Mask:
+def _differs_from_table(colour: npt.NDArray[np.uint8], depth_mm: Depth, rays: Rays, table: TablePlane) -> Mask:
     """Pixels whose colour is far from that of the pixels that depth puts on the table."""
     flat = np.abs(height_above(depth_mm, rays, table)) < max(5.0, 3 * table.noise_mm)
     if flat.sum() < 100:
@@ -47,15 +47,15 @@ def _patch(candidates: Mask) -> Patch:
     kernel = np.ones((5, 5), np.uint8)
     closed = cv2.morphologyEx(candidates.astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, kernel)
-    patch = largest_patch(opened, _LEAST_PX)
+    patch = largest_patch(opened, _MIN_PX)
     if patch is None:
         raise PlanError("nothing stands on the table, by depth and by colour; put the object there, or light it better")
-    if patch.cut_off:
+    if patch.is_cut_off:
         raise PlanError("depth shows nothing, and the outline touches the border of the picture")
     return patch
 
 
-def _cylinder(directions: Array, rows: npt.NDArray[np.intp], eye: Array, region: Region | None) -> Upright:
+def _cylinder(directions: Array, rows: npt.NDArray[np.intp], eye: Array, region: Region | None) -> UprightCylinder:
     """Closed form, see the top of the file. directions: (N, 3) of sight; eye: (3,) above the table's plane."""
     turn = np.arctan2(directions[:, 1], directions[:, 0])
     middle = math.atan2(float(np.sin(turn).mean()), float(np.cos(turn).mean()))
@@ -76,4 +76,4 @@ def _cylinder(directions: Array, rows: npt.NDArray[np.intp], eye: Array, region:
     )
     if outside or height <= 0:
         raise PlanError("the outline in the colour picture is of nothing that stands on the table")
-    return Upright(x, y, radius, height)
+    return UprightCylinder(x, y, radius, height)

@@ -14,12 +14,12 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-CUT = 3.0
+OUTLIER_CUT = 3.0
 """Residuals count up to so many times the noise: beyond, a point is an outlier and costs the same wherever it is."""
 _SPACING_MM = 6.0
 """Distance to the next of some 300 points on an object of usual size: nothing nearer can be told from seen."""
 _HYPOTHESES = 200
-_ROUNDS = 12
+_MAX_ITERATIONS = 12
 _NEAR_SIDE = 0.3
 """Points of a visible side lie at most this share of the radius behind the centre; noise and relief have room."""
 
@@ -39,12 +39,12 @@ class Solid(ABC):
         """Half sizes in plan: along the axis and across it."""
 
     @abstractmethod
-    def beyond(self, points: Array) -> tuple[Array, ...]:
+    def face_distances(self, points: Array) -> tuple[Array, ...]:
         """Signed distances (N,) beyond each pair of faces, negative between them."""
 
     def distance(self, points: Array) -> Array:
         """(N,) distance of points from the surface."""
-        q = np.stack(self.beyond(points))
+        q = np.stack(self.face_distances(points))
         outside = np.sqrt((np.maximum(q, 0.0) ** 2).sum(0))
         return np.asarray(np.where(outside > 0, outside, -q.max(0)))
 
@@ -57,15 +57,17 @@ class Solid(ABC):
 
         The first alone would let a solid reach far behind what is seen.
         """
-        squared = np.minimum((self.distance(points) / noise_mm) ** 2, CUT**2)
+        squared = np.minimum((self.distance(points) / noise_mm) ** 2, OUTLIER_CUT**2)
         surface, normals = self.surface()
         facing = surface[((eye - surface) * normals).sum(1) > 0]
-        missed = np.minimum(_nearest_squared(facing, _thinned(points)) / max(noise_mm, _SPACING_MM) ** 2, CUT**2)
+        missed = np.minimum(
+            _nearest_squared_distance(facing, _subsample(points)) / max(noise_mm, _SPACING_MM) ** 2, OUTLIER_CUT**2
+        )
         return float(squared.sum() + len(points) * missed.mean()) + self.parameters * math.log(len(points))
 
 
 @dataclass(frozen=True)
-class Upright(Solid):
+class UprightCylinder(Solid):
     """A cylinder that stands."""
 
     x: float
@@ -79,7 +81,7 @@ class Upright(Solid):
     def half(self) -> tuple[float, float]:
         return self.radius, self.radius
 
-    def beyond(self, points: Array) -> tuple[Array, ...]:
+    def face_distances(self, points: Array) -> tuple[Array, ...]:
         rho = np.hypot(points[:, 0] - self.x, points[:, 1] - self.y)
         return rho - self.radius, _slab(points[:, 2] - self.height / 2, self.height / 2)
 
@@ -109,8 +111,8 @@ class Cuboid(Solid):
     def half(self) -> tuple[float, float]:
         return self.half_length, self.half_width
 
-    def beyond(self, points: Array) -> tuple[Array, ...]:
-        along, across = turned(points[:, :2] - [self.x, self.y], self.yaw_rad).T
+    def face_distances(self, points: Array) -> tuple[Array, ...]:
+        along, across = rotate_plan(points[:, :2] - [self.x, self.y], self.yaw_rad).T
         return (
             _slab(along, self.half_length),
             _slab(across, self.half_width),
@@ -123,11 +125,11 @@ class Cuboid(Solid):
         faces = [(one, u, up), (-one, u, up), (u, one, up), (u, -one, up), (u, v, one)]
         points = np.concatenate([np.stack(face, axis=1) for face in faces]) * [*self.half, self.height]
         normals = np.repeat([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], len(u), axis=0)
-        return _placed(points, normals, self)
+        return _to_table_frame(points, normals, self)
 
 
 @dataclass(frozen=True)
-class Lying(Solid):
+class LyingCylinder(Solid):
     """A cylinder on its side."""
 
     x: float
@@ -145,8 +147,8 @@ class Lying(Solid):
     def half(self) -> tuple[float, float]:
         return self.half_length, self.radius
 
-    def beyond(self, points: Array) -> tuple[Array, ...]:
-        along, across = turned(points[:, :2] - [self.x, self.y], self.yaw_rad).T
+    def face_distances(self, points: Array) -> tuple[Array, ...]:
+        along, across = rotate_plan(points[:, :2] - [self.x, self.y], self.yaw_rad).T
         return np.hypot(across, points[:, 2] - self.radius) - self.radius, _slab(along, self.half_length)
 
     def surface(self) -> tuple[Array, Array]:
@@ -155,10 +157,10 @@ class Lying(Solid):
         side = np.stack([self.half_length * u, c, s + self.radius], axis=1)
         end = np.stack([self.half_length * np.sign(u), u * c, u * s + self.radius], axis=1)
         normals = [np.stack([flat, c, s], axis=1), np.stack([np.sign(u), flat, flat], axis=1)]
-        return _placed(np.concatenate([side, end]), np.concatenate(normals), self)
+        return _to_table_frame(np.concatenate([side, end]), np.concatenate(normals), self)
 
 
-def _nearest_squared(points: Array, others: Array) -> Array:
+def _nearest_squared_distance(points: Array, others: Array) -> Array:
     """(N,) squared distance to the nearest of others, by |a|^2 + |b|^2 - 2 a b about the middle of the others."""
     middle = others.mean(0)
     a, b = points - middle, others - middle
@@ -172,14 +174,14 @@ def _grid(first: Array, second: Array) -> tuple[Array, Array]:
     return a.ravel(), b.ravel()
 
 
-def _placed(points: Array, normals: Array, solid: Solid) -> tuple[Array, Array]:
+def _to_table_frame(points: Array, normals: Array, solid: Solid) -> tuple[Array, Array]:
     """From the solid's own frame to the table's."""
     c, s = math.cos(solid.yaw_rad), math.sin(solid.yaw_rad)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     return points @ turn + [solid.x, solid.y, 0.0], normals @ turn
 
 
-def turned(plan: Array, yaw_rad: float) -> Array:
+def rotate_plan(plan: Array, yaw_rad: float) -> Array:
     """(N, 2) coordinates along and across the direction of yaw."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.asarray(plan @ np.array([[c, -s], [s, c]]))
@@ -200,7 +202,7 @@ class Circle:
     y: float
     radius: float
     covariance: Array
-    used: npt.NDArray[np.bool_]
+    inliers: npt.NDArray[np.bool_]
 
 
 def fit_circle(plan: Array, noise_mm: float, away: Array, largest_mm: float) -> Circle | None:
@@ -229,7 +231,7 @@ def refine_circle(
     seen, and says nothing of the circle unless it lies outside.
     """
     edge = np.zeros(len(plan), bool) if below is None else below < 2 * noise_mm
-    for step in range(_ROUNDS):
+    for step in range(_MAX_ITERATIONS):
         arms = plan - centre
         rho = np.maximum(np.hypot(arms[:, 0], arms[:, 1]), 1e-9)
         error = rho - radius
@@ -255,9 +257,9 @@ def _tukey(scaled: Array) -> Array:
 def _circle_hypothesis(plan: Array, noise_mm: float, away: Array, largest_mm: float) -> tuple[Array, float] | None:
     """The circle through three points that misses the fewest others."""
     rng = np.random.default_rng(0)
-    some = _thinned(plan)
+    some = _subsample(plan)
     a, b, c = np.moveaxis(some[rng.integers(len(some), size=(_HYPOTHESES, 3))], 1, 0)
-    centres, radii = _through(a, b, c)
+    centres, radii = _circles_through(a, b, c)
     behind = (centres - some.mean(0)) @ away > 0
     good = np.isfinite(radii) & (radii < largest_mm) & behind
     if not good.any():
@@ -265,12 +267,12 @@ def _circle_hypothesis(plan: Array, noise_mm: float, away: Array, largest_mm: fl
     centres, radii = centres[good], radii[good]
     gap = np.sqrt((some[:, 0] - centres[:, :1]) ** 2 + (some[:, 1] - centres[:, 1:]) ** 2) - radii[:, None]
     behind = (some @ away)[None] - (centres @ away)[:, None] > _NEAR_SIDE * radii[:, None]
-    cost = np.where(behind, CUT**2, np.minimum((gap / noise_mm) ** 2, CUT**2))
+    cost = np.where(behind, OUTLIER_CUT**2, np.minimum((gap / noise_mm) ** 2, OUTLIER_CUT**2))
     best = int(cost.sum(1).argmin())
     return centres[best], float(radii[best])
 
 
-def _through(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
+def _circles_through(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
     """Centres (K, 2) and radii (K,) of circles through three points each; not finite for points in a line."""
     ab, ac = b - a, c - a
     cross = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
@@ -295,27 +297,29 @@ def fit_cuboid(points: Array, height: float, eye: Array) -> Cuboid:
     side = plan[below] if below.sum() > 20 else plan
     coarse = _best_yaw(plan, side, np.radians(np.arange(0.0, 90.0, 6.0)))
     yaw = _best_yaw(plan, side, coarse + np.radians(np.arange(-5.0, 5.1, 1.0)))
-    local = turned(plan, yaw)
-    low, high = _seen_faces(local, height - points[:, 2], *_extent(local), turned((eye - centre)[None], yaw)[0])
+    local = rotate_plan(plan, yaw)
+    low, high = _fit_visible_faces(
+        local, height - points[:, 2], *_extent(local), rotate_plan((eye - centre)[None], yaw)[0]
+    )
     middle, half = (low + high) / 2, np.maximum((high - low) / 2, 0.5)
-    x, y = turned(middle[None], -yaw)[0] + centre
+    x, y = rotate_plan(middle[None], -yaw)[0] + centre
     if half[0] < half[1]:
         half, yaw = half[::-1], yaw + math.pi / 2
     return Cuboid(float(x), float(y), float(half[0]), float(half[1]), height, yaw % math.pi)
 
 
-def _seen_faces(local: Array, below: Array, low: Array, high: Array, eye: Array) -> tuple[Array, Array]:
+def _fit_visible_faces(local: Array, below: Array, low: Array, high: Array, eye: Array) -> tuple[Array, Array]:
     """Put faces towards the eye at the median of the points that are nearest to them, the others where the top ends."""
     faces = np.concatenate([low, high])
     for _ in range(2):
         gaps = np.abs(np.concatenate([local, local], axis=1) - faces)
         nearest = np.column_stack([gaps, np.abs(below)]).argmin(1)
         top = local[nearest == 4]
-        for face, seen in enumerate((*(eye < low), *(eye > high))):
+        for face, is_visible in enumerate((*(eye < low), *(eye > high))):
             own = local[nearest == face, face % 2]
-            if seen and len(own) >= 10:
+            if is_visible and len(own) >= 10:
                 faces[face] = np.median(own)
-            elif not seen and len(top) >= 100:
+            elif not is_visible and len(top) >= 100:
                 faces[face] = np.quantile(top[:, face % 2], 0.005 if face < 2 else 0.995)
     return faces[:2], faces[2:]
 
@@ -332,17 +336,17 @@ def _best_yaw(plan: Array, side: Array, yaws: Array) -> float:
     """The yaw at which side points lie nearest to the faces of the box, by the mean distance cut off at 10 mm."""
     c, s = np.cos(yaws), np.sin(yaws)
     turns = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
-    low, high = _extent(_thinned(plan) @ turns)
-    local = _thinned(side) @ turns
+    low, high = _extent(_subsample(plan) @ turns)
+    local = _subsample(side) @ turns
     gap = np.minimum(np.abs(local - low[:, None]), np.abs(local - high[:, None])).min(-1)
     return float(yaws[np.minimum(gap, 10.0).mean(-1).argmin()])
 
 
-def _thinned(points: Array, most: int = 300) -> Array:
-    return points[:: max(1, len(points) // most)]
+def _subsample(points: Array, max_points: int = 300) -> Array:
+    return points[:: max(1, len(points) // max_points)]
 
 
-def fit_lying(points: Array, box: Cuboid, along_length: bool, eye: Array) -> Lying | None:
+def fit_lying_cylinder(points: Array, box: Cuboid, along_length: bool, eye: Array) -> LyingCylinder | None:
     """A cylinder on its side, begun at the box's long or short direction; None where the steps run away.
 
     Gauss-Newton with Tukey's weights on sqrt(v^2 + (z - r)^2) - r, where v is the distance across the axis: unknown
@@ -351,8 +355,8 @@ def fit_lying(points: Array, box: Cuboid, along_length: bool, eye: Array) -> Lyi
     yaw = box.yaw_rad if along_length else box.yaw_rad + math.pi / 2
     offset, radius = 0.0, box.height / 2
     origin = np.array([box.x, box.y])
-    for _ in range(_ROUNDS):
-        along, across = turned(points[:, :2] - origin, yaw).T
+    for _ in range(_MAX_ITERATIONS):
+        along, across = rotate_plan(points[:, :2] - origin, yaw).T
         arms = np.stack([across - offset, points[:, 2] - radius], axis=1)
         rho = np.maximum(np.hypot(arms[:, 0], arms[:, 1]), 1e-9)
         error = rho - radius
@@ -364,15 +368,15 @@ def fit_lying(points: Array, box: Cuboid, along_length: bool, eye: Array) -> Lyi
         if not 1.0 < radius < box.height or abs(move[0]) > 0.5:
             return None
     low, high = _ends(points, origin, yaw, offset, radius, eye)
-    x, y = origin + turned(np.array([[(low + high) / 2, offset]]), -yaw)[0]
-    return Lying(float(x), float(y), radius, (high - low) / 2, yaw % math.pi)
+    x, y = origin + rotate_plan(np.array([[(low + high) / 2, offset]]), -yaw)[0]
+    return LyingCylinder(float(x), float(y), radius, (high - low) / 2, yaw % math.pi)
 
 
 def _ends(points: Array, origin: Array, yaw: float, offset: float, radius: float, eye: Array) -> tuple[float, float]:
     """Where the axis ends: at the flat end that the camera sees, else where the points end."""
-    along, across = turned(points[:, :2] - origin, yaw).T
+    along, across = rotate_plan(points[:, :2] - origin, yaw).T
     low, high = (float(edge[0]) for edge in _extent(along[:, None]))
-    towards = float(turned((eye - origin)[None], yaw)[0, 0])
+    towards = float(rotate_plan((eye - origin)[None], yaw)[0, 0])
     inner = np.hypot(across - offset, points[:, 2] - radius) < 0.7 * radius
     flat = along[inner & (np.abs(along - (low if towards < 0 else high)) < 0.5 * radius)]
     if len(flat) >= 10 and not low < towards < high:

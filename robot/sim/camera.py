@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import SceneError
-from robot.sim.light import GAMMA, Floats, Lamps, Surfaces, developed, radiance
+from robot.sim.light import GAMMA, Floats, GBuffer, Lamps, develop, radiance
 from robot.sim.objects.body import Body
 from robot.sim.objects.draw import SimObject
 from robot.sim.objects.materials import ObjectMaterial
@@ -37,7 +37,7 @@ _TABLE_PX = (400, 560)
 _SHADOW_DETAIL = 2.0
 """Shadows show relief only from this many pixels up."""
 
-_OFF_SURFACE_MM = 0.4
+_SHADOW_BIAS_MM = 0.4
 """Shadow rays start this far above the surface, so that rounding does not put a point in its own shadow."""
 
 
@@ -102,7 +102,7 @@ class PinholeCamera:
         return np.asarray(local @ self.to_rig[:3, :3].T)
 
     @cached_property
-    def table_mm(self) -> Array:
+    def table_distance_mm(self) -> Array:
         """(px * px,): how far along each ray the table is. Raises SceneError where a ray never meets it."""
         if not self.rays[:, 2].max() < 0:
             raise SceneError(f"the camera must see nothing but the table behind the object, got {self}")
@@ -111,9 +111,9 @@ class PinholeCamera:
     @cached_property
     def table(self) -> Array:
         """(px * px, 3): where each ray meets the table, in the rig frame."""
-        return self.position_mm + self.table_mm[:, None] * self.rays
+        return self.position_mm + self.table_distance_mm[:, None] * self.rays
 
-    def pixels_round(self, corners: Array) -> Pixels:
+    def pixels_around(self, corners: Array) -> Pixels:
         """The pixels, in order, of the upright rectangle that holds a convex thing with these corners (N, 3)."""
         x, y, forward = ((corners - self.position_mm) @ self.to_rig[:3, :3]).T
         if forward.min() <= 0:  # it reaches behind the camera
@@ -176,15 +176,15 @@ class CameraView:
         return mask
 
     @cached_property
-    def on_object(self) -> Array:
+    def object_points(self) -> Array:
         """Points of the object's pixels in its own frame."""
         return self.placement.to_object(self.points[self.pixels])
 
 
-def look(obj: SimObject, placement: Placement, camera: PinholeCamera) -> CameraView:
+def cast_camera_rays(obj: SimObject, placement: Placement, camera: PinholeCamera) -> CameraView:
     """The geometry pass: the nearest of object and table along each ray. Only rays near the object are cast."""
-    distance, points = camera.table_mm.copy(), camera.table.copy()
-    pixels = camera.pixels_round(placement.corners(obj.body))
+    distance, points = camera.table_distance_mm.copy(), camera.table.copy()
+    pixels = camera.pixels_around(placement.corners(obj.body))
     origin, rays = np.asarray(camera.position_mm), camera.rays[pixels]
     origins = np.broadcast_to(placement.to_object(origin[None]), rays.shape)
     detail_mm = float(np.linalg.norm(np.subtract(camera.target_mm, camera.position_mm))) / camera.focal_px
@@ -201,25 +201,25 @@ def look(obj: SimObject, placement: Placement, camera: PinholeCamera) -> CameraV
 def photo(view: CameraView, lighting: Lighting, noise_seed: int, shadow: bool = True) -> Picture:
     """(px, px, 3) RGB."""
     px = view.camera.px
-    linear = radiance(*lit(view, lighting, shadow)).reshape(px, px, 3)
+    linear = radiance(*shading_inputs(view, lighting, shadow)).reshape(px, px, 3)
     linear = cv2.GaussianBlur(linear, (0, 0), _LENS_BLUR_PX)
     noise = NOISE * np.random.default_rng([72, noise_seed]).standard_normal(linear.shape)
-    return developed(linear, noise)
+    return develop(linear, noise)
 
 
-def lit(view: CameraView, lighting: Lighting, shadow: bool = True) -> tuple[Surfaces, Lamps]:
+def shading_inputs(view: CameraView, lighting: Lighting, shadow: bool = True) -> tuple[GBuffer, Lamps]:
     """What light meets at each pixel, and where it comes from."""
     px = view.camera.px
     light = np.asarray(lighting.direction)
     # Across about one pixel, so that finer relief does not flicker.
-    own = view.obj.body.normals(view.on_object, 0.4 * view.detail_mm) @ view.placement.rotation().T
+    own = view.obj.body.normals(view.object_points, 0.4 * view.detail_mm) @ view.placement.rotation().T
     normals = np.zeros((px * px, 3), np.float32)
     normals[:, 2], normals[view.pixels] = 1, own
-    seen = _lamp_seen(view, own, light) if shadow else np.ones(px * px, np.float32)
-    hidden = hidden_sky(view.is_object.reshape(px, px))
+    seen = _lamp_visibility(view, own, light) if shadow else np.ones(px * px, np.float32)
+    occlusion = sky_occlusion(view.is_object.reshape(px, px))
     colour = _table(lighting.table_seed, view.camera)
-    colour[view.pixels] = view.obj.looks.albedo(view.on_object)
-    surfaces = Surfaces(view.camera.rays, normals, view.is_object, seen, hidden.ravel(), colour)
+    colour[view.pixels] = view.obj.appearance.albedo(view.object_points)
+    surfaces = GBuffer(view.camera.rays, normals, view.is_object, seen, occlusion.ravel(), colour)
     return surfaces, _lamps(lighting, view.obj.material)
 
 
@@ -232,33 +232,33 @@ def _lamps(lighting: Lighting, material: ObjectMaterial) -> Lamps:
     return Lamps(np.array(lighting.direction), lamp, sky, gloss, sharpness)
 
 
-def _lamp_seen(view: CameraView, own: Array, light: Array) -> Floats:
+def _lamp_visibility(view: CameraView, own: Array, light: Array) -> Floats:
     """0..1: how much of the lamp each point sees; the edge is softened as by a lamp of some size.
 
     own: (n, 3), the normals at the object's pixels.
     """
-    px, facing, table = view.camera.px, own @ light > 0, near_shadow(view, light)
+    px, facing, table = view.camera.px, own @ light > 0, shadow_pixels(view, light)
     pixels, up = np.concatenate([view.pixels[facing], table]), np.broadcast_to([0.0, 0.0, 1.0], (len(table), 3))
-    starts = view.placement.to_object(view.points[pixels] + _OFF_SURFACE_MM * np.concatenate([own[facing], up]))
+    starts = view.placement.to_object(view.points[pixels] + _SHADOW_BIAS_MM * np.concatenate([own[facing], up]))
     towards = np.broadcast_to(light @ view.placement.rotation(), starts.shape)
     seen = np.ones(px * px, np.float32)
     seen[pixels] = ~view.obj.body.hit(starts, towards, _SHADOW_DETAIL * view.detail_mm)
     return np.asarray(cv2.GaussianBlur(seen.reshape(px, px), (0, 0), _SHADOW_BLUR_PX)).ravel()
 
 
-def near_shadow(view: CameraView, light: Array) -> Pixels:
+def shadow_pixels(view: CameraView, light: Array) -> Pixels:
     """The table's pixels in the upright rectangle that holds the shadow of the object's bounding box."""
     if not light[2] > 0:
         return np.zeros(0, np.intp)
     corners, table = view.placement.corners(view.obj.body), view.camera.table
-    fallen = corners - light * ((corners[:, 2:] - _OFF_SURFACE_MM) / light[2])
+    fallen = corners - light * ((corners[:, 2:] - _SHADOW_BIAS_MM) / light[2])
     inside = ~view.is_object
     for axis in (0, 1):
         inside &= (table[:, axis] >= fallen[:, axis].min()) & (table[:, axis] <= fallen[:, axis].max())
     return np.flatnonzero(inside)
 
 
-def hidden_sky(is_object: npt.NDArray[np.bool_], steps: int = SKY_STEPS) -> Floats:
+def sky_occlusion(is_object: npt.NDArray[np.bool_], steps: int = SKY_STEPS) -> Floats:
     """0..1, (px, px): how much of the sky the object hides from the table beside it.
 
     It is the object's mask (px, px), blurred on a grid of `steps` points over the blur's width.
@@ -278,14 +278,14 @@ def _table(seed: int, camera: PinholeCamera) -> Floats:
     streaks, strength = int(rng.choice([24, 64, 160])), rng.uniform(0.02, 0.09)
     grain = cv2.resize(rng.uniform(-1, 1, (160, streaks)).astype(np.float32), _TABLE_PX, interpolation=cv2.INTER_CUBIC)
     grain += 0.5 * cv2.resize(rng.uniform(-1, 1, (9, 9)).astype(np.float32), _TABLE_PX)
-    shade = cv2.remap(grain, *_grain_places(camera), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    shade = cv2.remap(grain, *_grain_coordinates(camera), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
     # Colour and grain are grey levels: of their product each has its own power, of which the grain's serves three.
     tone = cv2.pow(1 + np.float32(strength) * shade, GAMMA).reshape(-1, 1)
     return np.asarray(np.minimum(tone * (colour**GAMMA).astype(np.float32), 1))
 
 
 @lru_cache(maxsize=4)
-def _grain_places(camera: PinholeCamera) -> tuple[Floats, Floats]:
+def _grain_coordinates(camera: PinholeCamera) -> tuple[Floats, Floats]:
     """Column and row of the table's grain at each pixel, both (px, px)."""
     at = (camera.table[:, :2] * _TABLE_PX_PER_MM + [_TABLE_PX[0] / 2, 0.2 * _TABLE_PX[1]]).astype(np.float32)
     column, row = np.ascontiguousarray(at.T).reshape(2, camera.px, camera.px)
@@ -305,12 +305,12 @@ def depth(view: CameraView, noise_seed: int) -> npt.NDArray[np.float32]:
     rng = np.random.default_rng([73, noise_seed])
     forward = view.camera.to_rig[:3, 2]
     exact = (view.distance_mm * (view.camera.rays @ forward)).reshape(px, px)
-    noisy = _flying(exact, rng) + 1.5 * rng.standard_normal(exact.shape) * (exact / 700.0) ** 2
-    noisy[_holes(view, exact, rng)] = np.nan
+    noisy = _add_flying_pixels(exact, rng) + 1.5 * rng.standard_normal(exact.shape) * (exact / 700.0) ** 2
+    noisy[_hole_mask(view, exact, rng)] = np.nan
     return (np.round(noisy) / 1000.0).astype(np.float32)
 
 
-def _flying(exact: Array, rng: np.random.Generator) -> Array:
+def _add_flying_pixels(exact: Array, rng: np.random.Generator) -> Array:
     """Beside an edge a pixel may mix the near and the far surface."""
     window = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(exact, window), cv2.dilate(exact, window)
@@ -318,7 +318,7 @@ def _flying(exact: Array, rng: np.random.Generator) -> Array:
     return np.where((far - near > 12.0) & (rng.random(exact.shape) < 0.35), mixed, exact)
 
 
-def _holes(view: CameraView, exact: Array, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
+def _hole_mask(view: CameraView, exact: Array, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
     """Where nothing comes back: steep surfaces, glossy ones now and then, and single pixels anywhere."""
     px = view.camera.px
     steep = np.hypot(cv2.Sobel(exact, cv2.CV_64F, 1, 0, scale=0.125), cv2.Sobel(exact, cv2.CV_64F, 0, 1, scale=0.125))

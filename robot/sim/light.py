@@ -1,12 +1,13 @@
 """What light does at each pixel of the camera, in one compiled pass: reflectance and lamps to radiance, radiance to
-grey levels. Powers of float32 are exponentials of logarithms: they err by less than a thousandth of a grey level."""
+grey levels. Powers of float32 are exponentials of logarithms: they err by less than a thousandth of a grey level.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.sim.compiled import compiled
+from robot.sim.jit import jit
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -14,21 +15,23 @@ Picture = NDArray[np.uint8]
 GAMMA = 2.2
 
 
-class Surfaces(NamedTuple):
+class GBuffer(NamedTuple):
     """Of each pixel, (n,) or (n, 3): its ray and outward normal, whether it is the object's, how much of the lamp it
-    sees and how much of the sky around is hidden by the object (0..1), and the linear reflectance there."""
+    sees and how much of the sky around is hidden by the object (0..1), and the linear reflectance there.
+    """
 
     rays: Array
     normals: Floats
     is_object: NDArray[np.bool_]
-    lamp_seen: Floats
-    hidden: Floats
+    lamp_visibility: Floats
+    occlusion: Floats
     colour: Floats
 
 
 class Lamps(NamedTuple):
     """Unit direction to the lamp, its colour and the sky's, all with the exposure; gloss and sharpness of the object's
-    highlight and of the table's."""
+    highlight and of the table's.
+    """
 
     direction: Array
     lamp: Array
@@ -37,31 +40,31 @@ class Lamps(NamedTuple):
     sharpness: float
 
 
-def radiance(surfaces: Surfaces, lamps: Lamps) -> Floats:
+def radiance(surfaces: GBuffer, lamps: Lamps) -> Floats:
     """(n, 3): by the lamp (Lambert, and Blinn's highlight) and the sky, whose half above is seen."""
     out = np.empty(surfaces.rays.shape, np.float32)
     _shade(surfaces, lamps, out)
     return out
 
 
-def developed(linear: Floats, noise: Array) -> Picture:
+def develop(linear: Floats, noise: Array) -> Picture:
     """(rows, columns, 3) grey levels of a linear picture, with the noise of the sensor in grey levels."""
     out = np.empty(linear.shape, np.uint8)
     _develop(linear.reshape(-1), noise.reshape(-1), out.reshape(-1))
     return out
 
 
-@compiled
+@jit
 def _shade(surfaces, lamps, out):  # type: ignore[no-untyped-def]
     x, y, z = np.float32(lamps.direction[0]), np.float32(lamps.direction[1]), np.float32(lamps.direction[2])
     sharpness = np.float32(lamps.sharpness)
     for i in range(len(out)):
         n_x, n_y, n_z = surfaces.normals[i, 0], surfaces.normals[i, 1], surfaces.normals[i, 2]
         is_object = surfaces.is_object[i]
-        lit = max(n_x * x + n_y * y + n_z * z, np.float32(0)) * surfaces.lamp_seen[i]
+        lit = max(n_x * x + n_y * y + n_z * z, np.float32(0)) * surfaces.lamp_visibility[i]
         above = np.float32(0.6) + np.float32(0.4) * n_z
         if not is_object:
-            above *= np.float32(1) - np.float32(0.45) * surfaces.hidden[i]
+            above *= np.float32(1) - np.float32(0.45) * surfaces.occlusion[i]
         shine = np.float32(0)
         if lit > 0:
             h_x = x - np.float32(surfaces.rays[i, 0])
@@ -77,7 +80,7 @@ def _shade(surfaces, lamps, out):  # type: ignore[no-untyped-def]
             out[i, channel] = colour * (lit * lamp + above * sky) + shine * lamp
 
 
-@compiled
+@jit
 def _develop(linear, noise, out):  # type: ignore[no-untyped-def]
     power = np.float32(1 / GAMMA)
     for i in range(len(out)):

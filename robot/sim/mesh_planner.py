@@ -10,7 +10,7 @@ from robot.grasping.planner import GraspPlan, GraspPlanner
 from robot.grasping.settings import GraspSettings
 from robot.readings import RGBD, Pose, Region
 from robot.rig import Rig
-from robot.sim.antipodal import Array, Grasps
+from robot.sim.antipodal import AntipodalGrasps, Array
 from robot.sim.camera import Placement
 from robot.sim.meshes import grasps_of
 from robot.sim.objects.mesh import MeshBody
@@ -34,33 +34,33 @@ class MeshPlanner(GraspPlanner):
 
     def plan(self, rig: Rig, image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
         assert isinstance(rig, SimRig), "check refuses others"
-        scene = rig.world.now()
+        scene = rig.sim_state.current_scene()
         assert isinstance(scene.obj.body, MeshBody)
         grasps = grasps_of(scene.obj.body, settings)
         _check_graspable(scene, grasps, settings, rig.gripper.stroke_mm)
         jitter = rng.uniform(-settings.jitter_mm, settings.jitter_mm, 2)
         force = round(float(rng.uniform(*settings.force_n)), 3)
         shift = rig.error_mm + np.array([*jitter, 0.0])
-        poses = _Poses(grasps, scene.placement, shift, rig.arm.workspace, settings)
+        poses = _PlacedGrasps(grasps, scene.placement, shift, rig.arm.workspace, settings)
         tilted = grasps.tilt_rad != 0
-        approaches = [kind for kind in (~tilted, tilted) if (poses.possible & kind).any()]
+        approaches = [kind for kind in (~tilted, tilted) if (poses.is_reachable & kind).any()]
         if not approaches:
             raise PlanError(f"no grasp of the object lies in the workspace {rig.arm.workspace}")
-        number = int(rng.choice(np.flatnonzero(poses.possible & approaches[rng.integers(len(approaches))])))
+        number = int(rng.choice(np.flatnonzero(poses.is_reachable & approaches[rng.integers(len(approaches))])))
         fit = {"method": "mesh", "width_mm": round(float(grasps.width_mm[number]), 3)}
         return poses.plan(number, rig.gripper.stroke_mm, force, fit)
 
 
-def _check_graspable(scene: Scene, grasps: Grasps, settings: GraspSettings, stroke_mm: float) -> None:
+def _check_graspable(scene: Scene, grasps: AntipodalGrasps, settings: GraspSettings, stroke_mm: float) -> None:
     """Raise UngraspableError where no attempt can succeed."""
     if not len(grasps):
-        if math.isinf(grasps.narrowest_mm):
+        if math.isinf(grasps.min_width_mm):
             raise UngraspableError(
                 f"no two opposite sides that the fingers could hold, {settings.floor_mm:g} mm above the table or higher"
             )
-        if grasps.narrowest_mm + 2 * settings.clearance_mm > stroke_mm:
+        if grasps.min_width_mm + 2 * settings.clearance_mm > stroke_mm:
             raise UngraspableError(
-                f"wider than the gripper opens: {grasps.narrowest_mm:.0f} mm at least between opposite sides, "
+                f"wider than the gripper opens: {grasps.min_width_mm:.0f} mm at least between opposite sides, "
                 f"{stroke_mm:.0f} mm less {settings.clearance_mm:g} mm of clearance on either side"
             )
         raise UngraspableError("no approach from above or from a side is clear of the object and the table")
@@ -72,11 +72,11 @@ def _check_graspable(scene: Scene, grasps: Grasps, settings: GraspSettings, stro
         )
 
 
-class _Poses:
+class _PlacedGrasps:
     """The grasps in the rig's frame, and which of them the arm can reach."""
 
     def __init__(
-        self, grasps: Grasps, placement: Placement, shift_mm: Array, workspace: Region, settings: GraspSettings
+        self, grasps: AntipodalGrasps, placement: Placement, shift_mm: Array, workspace: Region, settings: GraspSettings
     ) -> None:
         self._top = workspace.upper[2]
         self._points = grasps.points @ placement.rotation().T + [placement.x_mm, placement.y_mm, 0.0] + shift_mm
@@ -85,12 +85,12 @@ class _Poses:
         self._tilt = np.where(turns % 2 == 1, -grasps.tilt_rad, grasps.tilt_rad)
         back = np.stack([np.sin(self._yaw), -np.cos(self._yaw)], axis=1) * np.sin(self._tilt)[:, None]
         self._start = self._points.copy()
-        self._start[:, :2] += grasps.back_mm[:, None] * back
+        self._start[:, :2] += grasps.retreat_mm[:, None] * back
         self._lift = np.minimum(self._points[:, 2] + settings.lift_mm, self._top)
         lower, upper = (np.asarray(bound) for bound in (workspace.lower, workspace.upper))
         inside = [((points >= lower) & (points <= upper)).all(axis=1) for points in (self._points, self._start)]
-        rises = self._lift - self._points[:, 2] >= np.where(grasps.tilt_rad == 0, grasps.back_mm, 0.0)
-        self.possible = inside[0] & inside[1] & rises
+        rises = self._lift - self._points[:, 2] >= np.where(grasps.tilt_rad == 0, grasps.retreat_mm, 0.0)
+        self.is_reachable = inside[0] & inside[1] & rises
 
     def plan(self, number: int, stroke_mm: float, force_n: float, fit: dict[str, Any]) -> GraspPlan:
         """The plan of one of them."""

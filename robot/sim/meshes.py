@@ -7,12 +7,12 @@ from pathlib import Path
 
 from robot.errors import RobotConfigError
 from robot.grasping.settings import GraspSettings
-from robot.sim.antipodal import Grasps, find_grasps
+from robot.sim.antipodal import AntipodalGrasps, find_grasps
 from robot.sim.objects.draw import STROKE_MM, SimObject
 from robot.sim.objects.mesh import FORMATS, MeshBody, mesh_object, object_prefix, read_mesh
-from robot.sim.objects.resting import resting_ups
+from robot.sim.objects.resting import stable_up_directions
 
-_ENOUGH = 100
+_ENOUGH_GRASPS = 100
 """A resting pose with so many grasps is taken; few may be a chance of the grid, out of the arm's reach."""
 
 
@@ -53,28 +53,29 @@ class MeshFolder:
     def candidates(self, object_id: str) -> list[SimObject]:
         """Objects that may have this name, for their files' names fit. Raises SceneError."""
         paths = [path for path in self._paths if object_id.startswith(object_prefix(path))]
-        return [_rested(path, self._seed, self._settings) for path in paths]
+        return [_resting_object(path, self._seed, self._settings) for path in paths]
 
 
 # An object keeps its search tree and its grasps from attempt to attempt.
 
 
 @lru_cache(maxsize=4)
-def _rested(path: Path, seed: int, settings: GraspSettings) -> SimObject:
+def _resting_object(path: Path, seed: int, settings: GraspSettings) -> SimObject:
     """The mesh in the first resting pose with enough grasps, else in that with the most; where there are none, in that
-    whose opposite sides are nearest to each other."""
+    whose opposite sides are nearest to each other.
+    """
     mesh = read_mesh(path)
     rated: list[tuple[int, float, SimObject]] = []
-    for up in resting_ups(mesh.vertices, mesh.centre_of_mass):
+    for up in stable_up_directions(mesh.vertices, mesh.centre_of_mass):
         obj = mesh_object(path, mesh, seed, up=up)
         found = grasps_of(obj.body, settings)
-        rated.append((len(found), -found.narrowest_mm, obj))
-        if len(found) >= _ENOUGH:
+        rated.append((len(found), -found.min_width_mm, obj))
+        if len(found) >= _ENOUGH_GRASPS:
             return obj
     return max(rated, key=lambda each: each[:2])[2]
 
 
 @lru_cache(maxsize=16)
-def grasps_of(body: MeshBody, settings: GraspSettings) -> Grasps:
+def grasps_of(body: MeshBody, settings: GraspSettings) -> AntipodalGrasps:
     """`find_grasps` for the stroke of the simulated gripper, once."""
     return find_grasps(body, settings, STROKE_MM)

@@ -25,13 +25,13 @@ from robot.errors import RecordingError, RobotConfigError
 from robot.recording.folder import IMAGES_FOLDER, METADATA_FILE, software_version
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
-from robot.storage import append_line, content_of, document_of, file_content, storage_errors, write_files
-from robot.workers import Jobs, Work
+from robot.storage import append_line, file_content, read_content, read_json_object, storage_errors, write_files
+from robot.workers import Work, WorkerPool
 
 INFO_FILE = "pictures.json"
 SCHEMA_VERSION = 1
 KINDS = ("photo", "touch")
-_PRESSES = 3
+_MAX_PRESSES = 3
 """At most so many tries at an object on which the jaws close without meeting it."""
 Pictures = dict[str, npt.NDArray[np.uint8]]
 
@@ -54,43 +54,43 @@ def collect_pictures(
     """
     if kind not in KINDS:
         raise RobotConfigError(f"pictures must be of kind {' or '.join(KINDS)}, got {kind!r}")
-    make = functools.partial(_work, kind, rig, seed)
-    names = _simulated(rig, seed).object_ids(objects)
+    make = functools.partial(_make_worker, kind, rig, seed)
+    names = _load_sim_rig(rig, seed).object_ids(objects)
     folder = Path(out)
-    info = {**_simulated(rig, seed).info, "schema_version": SCHEMA_VERSION, "kind": kind, "seed": seed}
-    done = _begin(folder, info | {"software_version": software_version()})
+    info = {**_load_sim_rig(rig, seed).info, "schema_version": SCHEMA_VERSION, "kind": kind, "seed": seed}
+    done = _open_folder(folder, info | {"software_version": software_version()})
     count = sum(done.values())
     left = [name for name in names if name not in done]
-    with storage_errors(folder), Jobs(jobs, make(), make) as workers:
-        for made, (name, (pictures, labels)) in enumerate(_in_order(workers, left), start=1):
+    with storage_errors(folder), WorkerPool(jobs, make(), make) as workers:
+        for made, (name, (pictures, labels)) in enumerate(_ordered_results(workers, left), start=1):
             count += _write(folder, kind, name, pictures, labels)
             if progress is not None:
                 progress(len(names) - len(left) + made, len(names))
     return count
 
 
-def _simulated(rig: str, seed: int) -> SimRig:
+def _load_sim_rig(rig: str, seed: int) -> SimRig:
     made = load_rig(rig, seed=seed)
     if not isinstance(made, SimRig):
         raise RobotConfigError(f"pictures with labels come from a simulated rig, for it knows its objects; got {rig}")
     return made
 
 
-def _work(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str, Any]]]:
-    made = _simulated(rig, seed)
+def _make_worker(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str, Any]]]:
+    made = _load_sim_rig(rig, seed)
 
     def photograph(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
         made.prepare(object_id, number)
-        return {"photo": made.world.now().image("photo")}, made.labels(object_id)
+        return {"photo": made.sim_state.current_scene().image("photo")}, made.labels(object_id)
 
     def press(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
-        tries = (made.press(object_id, number + each) for each in range(_PRESSES))
+        tries = (made.press(object_id, number + each) for each in range(_MAX_PRESSES))
         return next((pictures for pictures in tries if pictures), {}), made.labels(object_id)
 
     return photograph if kind == "photo" else press
 
 
-def _in_order(workers: Jobs[Any], names: list[str]) -> Iterator[tuple[str, Any]]:
+def _ordered_results(workers: WorkerPool[Any], names: list[str]) -> Iterator[tuple[str, Any]]:
     """What is made of each object, in their order; a few are under way ahead."""
     pending: deque[tuple[str, Callable[[], Any]]] = deque()
     for name in names:
@@ -102,17 +102,17 @@ def _in_order(workers: Jobs[Any], names: list[str]) -> Iterator[tuple[str, Any]]
         yield first, result()
 
 
-def _begin(folder: Path, info: dict[str, Any]) -> dict[str, int]:
+def _open_folder(folder: Path, info: dict[str, Any]) -> dict[str, int]:
     """Make the folder, or check that it holds pictures made likewise; object -> how many pictures it has."""
     plain = json.loads(json.dumps(info))
     with storage_errors(folder):
         if (folder / INFO_FILE).exists():
-            held = document_of(folder / INFO_FILE, RecordingError)
+            held = read_json_object(folder / INFO_FILE, RecordingError)
             if differ := sorted(key for key in plain if key != "software_version" and held.get(key) != plain[key]):
                 raise RecordingError(
                     f"{folder} holds pictures made otherwise ({differ[0]} differs); give another --out"
                 )
-            return _done(folder / METADATA_FILE)
+            return _completed_objects(folder / METADATA_FILE)
         ours = (IMAGES_FOLDER, METADATA_FILE, f".{METADATA_FILE}.", f".{INFO_FILE}.")
         if folder.exists() and any(not path.name.startswith(ours) for path in folder.iterdir()):
             raise RecordingError(f"{folder} must be a new folder, or one of pictures; it holds something else")
@@ -122,9 +122,9 @@ def _begin(folder: Path, info: dict[str, Any]) -> dict[str, int]:
     return {}
 
 
-def _done(path: Path) -> dict[str, int]:
+def _completed_objects(path: Path) -> dict[str, int]:
     """Objects whose lines are whole. Half a last line is cut off, and with it the last object, whose it may be."""
-    lines = content_of(path, RecordingError).splitlines(keepends=True)
+    lines = read_content(path, RecordingError).splitlines(keepends=True)
     try:
         names = [json.loads(line)["object_id"] for line in lines if line.endswith(b"\n")]
     except (ValueError, KeyError, TypeError) as error:

@@ -32,16 +32,16 @@ _START_MM = 400.0
 """Rays towards the object start this far from the closing plane, outside any object that a gripper meets."""
 _COARSE_RAD = [math.radians(angle) for angle in range(-40, 41, 4)]
 _FINE_RAD = [math.radians(0.4 * step) for step in range(-10, 11)]
-_REST_RAD = math.radians(0.2)
+_MAX_TURN_ERROR_RAD = math.radians(0.2)
 """The object ends at most this far from the position towards which the jaws turn it."""
 
-_SQUEEZED = 0.2
+_MIN_WIDTH_RATIO = 0.2
 """A soft object stands at this share of its width at least, as foam does that has no more room to give."""
 
 PAD_MM = (15.2, 20.3)
 """Height and width of a bare finger's pad."""
 
-_FEELERS = (5, 9)
+_COARSE_GRID = (5, 9)
 """Rows and columns of the coarse grid with which the turning of the object is worked out."""
 
 
@@ -89,8 +89,8 @@ class Pinch:
     hand: Hand
     seed: int
     passes: Counter[str]
-    _solved: dict[str, Contact] = field(default_factory=dict, init=False, repr=False)
-    _lit: dict[str, npt.NDArray[np.float32]] = field(default_factory=dict, init=False, repr=False)
+    _contacts: dict[str, Contact] = field(default_factory=dict, init=False, repr=False)
+    _clean_images: dict[str, npt.NDArray[np.float32]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Raises SceneError for a force that no gripper has."""
@@ -103,17 +103,17 @@ class Pinch:
     # Where the object ends ----------------------------------------------------------------------------------
 
     @cached_property
-    def turned(self) -> Placement:
+    def final_placement(self) -> Placement:
         """The object as the closing jaws turn it: towards the nearest position in which they come closest together.
 
         The jaws push it while they close, so that flat sides end square to the fingers but for a trifle.
         """
-        coarse = _nearest_widest(_COARSE_RAD, self._reaches)
+        coarse = _nearest_widest_turn(_COARSE_RAD, self._coarse_reach)
         fine = [coarse + angle for angle in _FINE_RAD]
-        rest = np.random.default_rng([81, self.seed]).uniform(-1.0, 1.0) * _REST_RAD
-        return self._turn(_nearest_widest(fine, self._reached(fine)) + rest)
+        rest = np.random.default_rng([81, self.seed]).uniform(-1.0, 1.0) * _MAX_TURN_ERROR_RAD
+        return self._rotated_placement(_nearest_widest_turn(fine, self._finger_reach(fine)) + rest)
 
-    def _turn(self, angle: float) -> Placement:
+    def _rotated_placement(self, angle: float) -> Placement:
         x, y, pose = self.placement.x_mm, self.placement.y_mm, self.grip.pose
         if self.hand.turns_about_grip:
             c, s, along, across = math.cos(angle), math.sin(angle), x - pose.x_mm, y - pose.y_mm
@@ -121,21 +121,22 @@ class Pinch:
         return Placement(x, y, self.placement.yaw_rad + angle)
 
     @cached_property
-    def _reaches(self) -> Array:
-        return self._reached(_COARSE_RAD)
+    def _coarse_reach(self) -> Array:
+        return self._finger_reach(_COARSE_RAD)
 
-    def _reached(self, turns: Sequence[float]) -> Array:
+    def _finger_reach(self, turns: Sequence[float]) -> Array:
         """(turns, fingers): how far along its rays each finger goes until it touches; inf where it meets nothing."""
         self.passes["turn"] += 1
-        placements = [self._turn(angle) for angle in turns]
-        rays = [self._rays(side, _FEELERS, placements) for side in SIDES.values()]
+        placements = [self._rotated_placement(angle) for angle in turns]
+        rays = [self._rays(side, _COARSE_GRID, placements) for side in SIDES.values()]
         starts, directions = (np.stack(parts, axis=1).reshape(-1, 3) for parts in zip(*rays, strict=True))
         reach = self.obj.body.cast(starts, directions)
         return np.asarray(reach.reshape(len(turns), len(SIDES), -1).min(axis=2))
 
     def _rays(self, side: float, grid: tuple[int, int], placements: Sequence[Placement]) -> tuple[Array, Array]:
         """Starts and directions, (placements, pixels, 3) in the object's frame as it is placed, of parallel rays from
-        the pad of a finger."""
+        the pad of a finger.
+        """
         height, width = self._field_mm
         z = height * (0.5 - (np.arange(grid[0]) + 0.5) / grid[0])
         y = -side * width * ((np.arange(grid[1]) + 0.5) / grid[1] - 0.5)
@@ -153,9 +154,9 @@ class Pinch:
         return next(iter(self.sensors.values())).field.size_mm if self.sensors else PAD_MM
 
     @cached_property
-    def missed(self) -> str | None:
+    def miss_reason(self) -> str | None:
         """Why the fingers close on nothing, or None: one comes down on the object, or the object is not between."""
-        reach = self._reaches[len(_COARSE_RAD) // 2]
+        reach = self._coarse_reach[len(_COARSE_RAD) // 2]
         if (reach < _START_MM - self.grip.opening_mm / 2).any():
             return "a finger comes down on the object"
         if not np.isfinite(self._walls["a"]).any() or not np.isfinite(self._walls["b"]).any():
@@ -167,9 +168,9 @@ class Pinch:
         """Distance along each finger's rays to the turned object; a bare finger feels its way on the coarse grid."""
         walls = {}
         for finger, side in SIDES.items():
-            grid = self.hand.grid if finger in self.sensors else _FEELERS
-            self.passes["wall" if finger in self.sensors else "feel"] += 1
-            (starts,), (directions,) = self._rays(side, grid, [self.turned])
+            grid = self.hand.grid if finger in self.sensors else _COARSE_GRID
+            self.passes["wall" if finger in self.sensors else "bare_finger"] += 1
+            (starts,), (directions,) = self._rays(side, grid, [self.final_placement])
             walls[finger] = self.obj.body.cast(starts, directions).reshape(grid)
         return walls
 
@@ -181,9 +182,9 @@ class Pinch:
 
     def contact(self, finger: str) -> Contact:
         """The gel of one finger pressed against the object's side. Only where the fingers did not miss."""
-        if finger not in self._solved:
+        if finger not in self._contacts:
             self.passes["contact"] += 1
-            self._solved[finger] = press(
+            self._contacts[finger] = press(
                 self.gap(finger),
                 self._pixel_mm,
                 self.sensors[finger].layer,
@@ -192,40 +193,40 @@ class Pinch:
                 object_poisson=self.obj.material.poisson,
                 tolerance=self.hand.tolerance,
             )
-        return self._solved[finger]
+        return self._contacts[finger]
 
     def touch(self, finger: str, noise_seed: int) -> Picture:
         """The gel image while the object is held."""
-        if self.missed:
+        if self.miss_reason:
             return self.sensors[finger].background(noise_seed)
-        if finger not in self._lit:
+        if finger not in self._clean_images:
             self.passes["gel"] += 1
-            self._lit[finger] = self.sensors[finger].lit(self.contact(finger).displacement_mm)
-        return self.sensors[finger].taken(self._lit[finger], noise_seed)
+            self._clean_images[finger] = self.sensors[finger].render_clean(self.contact(finger).displacement_mm)
+        return self.sensors[finger].capture(self._clean_images[finger], noise_seed)
 
     # What comes of it ---------------------------------------------------------------------------------------
 
     @cached_property
-    def closed_mm(self) -> float:
+    def final_opening_mm(self) -> float:
         """Opening when the jaws have come to rest: 0 for a miss, else the width less what gels and object give way.
 
         A soft object is never squeezed below a fifth of its width, where linear elasticity has long ceased to hold.
         """
-        if self.missed:
+        if self.miss_reason:
             return 0.0
         width = 2 * _START_MM - sum(float(wall.min()) for wall in self._walls.values())
         gives_way = sum(self.contact(finger).approach_mm for finger in self.sensors)
-        return max(width - gives_way, _SQUEEZED * width)
+        return max(width - gives_way, _MIN_WIDTH_RATIO * width)
 
     @cached_property
-    def slip(self) -> str | None:
+    def slip_reason(self) -> str | None:
         """Why the object is lost in the lift, or None. Coulomb friction, a hard-finger model.
 
         The weight must stay below what both fingers' friction carries; the line between the contacts and the mean
         slope under each finger must lie within the friction cone (Nguyen 1988).
         """
-        if self.missed:
-            return self.missed
+        if self.miss_reason:
+            return self.miss_reason
         friction, weight = self.obj.material.friction, self.obj.mass_kg * GRAVITY_M_S2
         if 2 * friction * self.grip.force_n < self.hand.safety * weight:
             return "the object is too heavy for the friction"
@@ -252,7 +253,7 @@ class Pinch:
         return np.array([SIDES[finger] * (float(wall.min()) - _START_MM), y, z])
 
 
-def _nearest_widest(turns: Sequence[float], reached: Array) -> float:
+def _nearest_widest_turn(turns: Sequence[float], reached: Array) -> float:
     """From the middle turn, the way on which the fingers reach further, up to the nearest place where neither does."""
     reach = reached.sum(axis=1)
     reach[np.isinf(reach)] = -np.inf  # turned away from a finger is not narrow

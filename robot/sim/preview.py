@@ -21,9 +21,9 @@ Picture = npt.NDArray[np.uint8]
 TILE_PX = 160
 _HEADER_PX = 24
 _CAPTION_PX = 20
-_FIRST = 8 + 25
+_FIRST_CHUNK_END = 8 + 25
 """Bytes of a PNG file before its second chunk: the signature and the header."""
-_DEEPEST_MM = 3.0
+_MAX_DEPTH_MM = 3.0
 """Walls are drawn from touched (bright) to this far behind (dark)."""
 
 
@@ -34,20 +34,20 @@ def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
     """
     recording = read_recording(folder)
     rig = _rig(recording.folder, recording.info)
-    chosen = _one_each(recording.grasps, rows)
+    chosen = _pick_grasps(recording.grasps, rows)
     sheet = np.vstack([_header(tuple(rig.sensors)), *(_row(recording.folder, grasp, rig) for grasp in chosen)])
     data, _ = file_content("preview", sheet)
     with storage_errors(Path(out)):
         Path(out).parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(Path(out), _signed(data))
+        write_atomically(Path(out), _add_software_chunk(data))
     return Path(out)
 
 
-def _signed(png: bytes) -> bytes:
+def _add_software_chunk(png: bytes) -> bytes:
     """The PNG file with a chunk after its first that says what made it, by which a later preview may replace it."""
     chunk = b"tEXtSoftware\0touch-retrieval"
     length, check = (struct.pack(">I", number) for number in (len(chunk) - 4, zlib.crc32(chunk)))
-    return png[:_FIRST] + length + chunk + check + png[_FIRST:]
+    return png[:_FIRST_CHUNK_END] + length + chunk + check + png[_FIRST_CHUNK_END:]
 
 
 def _rig(folder: Path, info: Mapping[str, Any]) -> SimRig:
@@ -59,7 +59,7 @@ def _rig(folder: Path, info: Mapping[str, Any]) -> SimRig:
     return rig
 
 
-def _one_each(grasps: Sequence[RecordedGrasp], rows: int) -> list[RecordedGrasp]:
+def _pick_grasps(grasps: Sequence[RecordedGrasp], rows: int) -> list[RecordedGrasp]:
     """The first accepted grasp of each of up to `rows` objects; of all grasps where none was accepted."""
     accepted = [grasp for grasp in grasps if grasp.grasped is not False] or list(grasps)
     first: dict[str, RecordedGrasp] = {}
@@ -86,7 +86,7 @@ def _row(folder: Path, grasp: RecordedGrasp, rig: SimRig) -> Picture:
     for finger in rig.sensors:
         for images in (grasp.touches_before, grasp.touches):
             tiles.append(_tile(_read(folder, images.get(finger))))
-        tiles.append(_tile(_coloured(walls.get(finger), _DEEPEST_MM)))
+        tiles.append(_tile(_apply_colormap(walls.get(finger), _MAX_DEPTH_MM)))
     row = np.hstack(tiles)
     text = (
         f"{grasp.object_id}   {grasp.force_n or 0:.1f} N   jaws {grasp.opening_mm or 0:.1f} mm   {grasp.outcome or ''}"
@@ -109,10 +109,10 @@ def _depth(folder: Path, grasp: RecordedGrasp) -> Picture | None:
         return None
     depth = image.astype(np.float64)
     known = depth > 0
-    return _coloured(np.where(known, depth - depth[known].min(), np.inf), float(np.ptp(depth[known])))
+    return _apply_colormap(np.where(known, depth - depth[known].min(), np.inf), float(np.ptp(depth[known])))
 
 
-def _coloured(distance: npt.NDArray[Any] | None, deepest: float) -> Picture | None:
+def _apply_colormap(distance: npt.NDArray[Any] | None, deepest: float) -> Picture | None:
     """Near is bright, `deepest` and beyond dark, nothing at all (inf) black."""
     if distance is None:
         return None

@@ -12,14 +12,14 @@ import numpy.typing as npt
 
 from robot.devices import Arm, Camera, Gripper, TactileSensor, VirtualDevice
 from robot.errors import DeviceError, RecordingError, RobotConfigError
-from robot.gel_settings import gels_of
+from robot.gel_settings import parse_gel_settings
 from robot.grasping.planner import load_planner
-from robot.grasping.settings import GraspSettings, attempt_of
+from robot.grasping.settings import GraspSettings, parse_attempt_settings
 from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
 from robot.recording.folder import UNITS
 from robot.recording.grasp import RecordedGrasp
 from robot.rig import Rig, check_seed
-from robot.settings import TypedSettings, limited
+from robot.settings import TypedSettings, bounded
 from robot.sim.camera import PinholeCamera, Placement
 from robot.sim.gel.marks import Markers
 from robot.sim.gel.sensor import draw_sensor
@@ -37,7 +37,7 @@ FORCE_N = (5.0, 80.0)
 
 _MESH_UNITS = UNITS | {"pose": f"{UNITS['pose']}; then its tilt in radian, where it does not point straight down"}
 _ATTEMPT_S = 40.0
-_MOST_OBJECTS = 100_000
+_MAX_OBJECTS = 100_000
 _WORKSPACE = Region((-150.0, -150.0, 0.5 * PAD_MM[0]), (150.0, 150.0, 500.0))
 _TABLE_MM = 15.0
 """Objects stand at most this far from the centre of the workspace in x and y."""
@@ -57,7 +57,7 @@ class SimClock:
         self.now_s += seconds
 
 
-class World:
+class SimState:
     """What the devices share: the scene of this attempt, where the hand is, what it holds, and the time."""
 
     def __init__(self, clock: SimClock) -> None:
@@ -66,16 +66,16 @@ class World:
         self.pose = Pose(0.0, 0.0, 300.0, 0.0)
         self.opening_mm = STROKE_MM
 
-    def now(self) -> Scene:
+    def current_scene(self) -> Scene:
         """The scene of this attempt. Raises DeviceError before there is one."""
         if self.scene is None:
             raise DeviceError("nothing stands on the simulated table yet; call prepare(object_id, number) first")
         return self.scene
 
     @property
-    def lifted(self) -> bool:
+    def is_lifted(self) -> bool:
         """Whether the hand has left the place where it closed."""
-        grip = self.now().grip
+        grip = self.current_scene().grip
         return grip is not None and self.pose.z_mm > grip.pose.z_mm + 1.0
 
 
@@ -97,14 +97,14 @@ class SimSettings(TypedSettings):
 
     fingers: tuple[str, ...] = ("a", "b")
     optics: str = "led"
-    gels: int = limited(1, 1000, 1, unit="pairs")
+    gels: int = bounded(1, 1000, 1, unit="pairs")
     markers: bool = False
     families: tuple[str, ...] = ()
     meshes: str = ""
     contact_grid: tuple[int, int] = (120, 160)
-    contact_tolerance: float = limited(1e-12, 0.999, 1e-2)
+    contact_tolerance: float = bounded(1e-12, 0.999, 1e-2)
     shadow: bool = True
-    focal_px: float = limited(300, 10_000, 860.0, unit="px")
+    focal_px: float = bounded(300, 10_000, 860.0, unit="px")
     localisation_mm: tuple[float, float] = (5.0, 10.0)
     grasp: Mapping[str, Any] = field(default_factory=dict)
     attempt: Mapping[str, Any] = field(default_factory=dict)
@@ -127,7 +127,8 @@ class SimSettings(TypedSettings):
 
 class SimRig(Rig):
     """Arm, gripper with a gel on each finger, and an RGB-D camera over a table with procedural objects; its keywords
-    are those of SimSettings."""
+    are those of SimSettings.
+    """
 
     Settings = SimSettings
     can_run_jobs: ClassVar[bool] = True
@@ -137,7 +138,7 @@ class SimRig(Rig):
         check_seed(seed)
         asked = SimSettings(**settings)
         self._seed, self._families = seed, tuple(sorted(asked.families))
-        attempt = attempt_of(asked.attempt, asked.grasp)
+        attempt = parse_attempt_settings(asked.attempt, asked.grasp)
         self.meshes = _mesh_folder(asked.meshes, seed, attempt.grasp) if asked.meshes else None
         self._shadow = asked.shadow
         self._hand = Hand(
@@ -145,7 +146,7 @@ class SimRig(Rig):
         )
         drawn = np.random.default_rng([103, seed]).integers(2**31, size=asked.gels)
         dots = Markers() if asked.markers else None
-        fingers, known = asked.fingers, gels_of(asked.gel, asked.fingers)
+        fingers, known = asked.fingers, parse_gel_settings(asked.gel, asked.fingers)
         self._gels = [
             {
                 finger: replace(draw_sensor(int(pair), finger, optics=asked.optics, gel=known[finger]), markers=dots)
@@ -155,18 +156,18 @@ class SimRig(Rig):
         ]
         self._camera = PinholeCamera(focal_px=asked.focal_px)
         clock, self.error_mm = SimClock(), _calibration_error(seed, asked.localisation_mm)
-        self.world = World(clock)
+        self.sim_state = SimState(clock)
         super().__init__(
-            SimArm(self.world),
-            SimGripper(self.world),
-            {finger: SimTactileSensor(self.world, finger) for finger in fingers},
-            SimCamera(self.world, self._camera, self.error_mm),
+            SimArm(self.sim_state),
+            SimGripper(self.sim_state),
+            {finger: SimTactileSensor(self.sim_state, finger) for finger in fingers},
+            SimCamera(self.sim_state, self._camera, self.error_mm),
             info={
                 "source": "simulated rig",
                 "sensor": f"simulated GelSight ({asked.optics} optics)",
                 "rig": "sim",
                 "fingers": sorted(fingers),
-                "gels": [{finger: pair[finger].gel.as_recorded() for finger in sorted(pair)} for pair in self._gels],
+                "gels": [{finger: pair[finger].gel.to_dict() for finger in sorted(pair)} for pair in self._gels],
                 **({"meshes_sha256": self.meshes.digest, "units": _MESH_UNITS} if self.meshes else {}),
             },
             clock=clock,
@@ -178,20 +179,20 @@ class SimRig(Rig):
 
     def object_ids(self, count: int) -> list[str]:
         """The first `count` objects of this seed. Raises RobotConfigError for more than 100000, or than meshes."""
-        if count > _MOST_OBJECTS:
-            raise RobotConfigError(f"the simulated rig has at most {_MOST_OBJECTS} objects a seed, got {count}")
+        if count > _MAX_OBJECTS:
+            raise RobotConfigError(f"the simulated rig has at most {_MAX_OBJECTS} objects a seed, got {count}")
         if self.meshes is not None:
             return self.meshes.object_ids(count)
         return [_procedural(self._seed, index, self._families).object_id for index in range(count)]
 
     def prepare(self, object_id: str, number: int) -> None:
         """Stand the object on the table, turned and placed at random, under new light."""
-        obj = self._find(object_id)
+        obj = self._find_object(object_id)
         name = zlib.crc32(object_id.encode())
         rng = np.random.default_rng([101, self._seed, name, number])
         x, y = rng.uniform(-_TABLE_MM, _TABLE_MM, 2)
         placement = Placement(float(x), float(y), float(rng.uniform(0.0, 2.0 * math.pi)))
-        self.world.scene = Scene(
+        self.sim_state.scene = Scene(
             obj,
             placement,
             self._camera,
@@ -200,17 +201,18 @@ class SimRig(Rig):
             seed=int(rng.integers(2**31)),
             shadow=self._shadow,
         )
-        self.world.clock.now_s = number * _ATTEMPT_S
+        self.sim_state.clock.now_s = number * _ATTEMPT_S
 
     def labels(self, object_id: str) -> dict[str, float | bool | str]:
         """`SimObject.labels` of an object of this rig. Raises RobotConfigError where it has none of this name."""
-        return self._find(object_id).labels()
+        return self._find_object(object_id).labels()
 
     def press(self, object_id: str, number: int) -> dict[str, npt.NDArray[np.uint8]]:
         """Gel images of each finger, pressed and before (touch_a, touch_a_before, ...), as jaws close on the object
-        at a random height, turn and force, without arm or camera; nothing where they close on air."""
+        at a random height, turn and force, without arm or camera; nothing where they close on air.
+        """
         self.prepare(object_id, number)
-        scene = self.world.now()
+        scene = self.sim_state.current_scene()
         rng = np.random.default_rng([104, self._seed, zlib.crc32(object_id.encode()), number])
         place, settings, height = scene.placement, self.attempt.grasp, float(scene.obj.body.upper[2])
         x, y = rng.normal([place.x_mm, place.y_mm], settings.jitter_mm)
@@ -218,7 +220,7 @@ class SimRig(Rig):
         z = rng.uniform(lowest, max(lowest, height - settings.top_margin_mm))
         pose = Pose(float(x), float(y), float(z), float(rng.uniform(0.0, math.pi)))
         scene = replace(scene, grip=Grip(pose, float(rng.uniform(*settings.force_n))))
-        if scene.pinch.missed:
+        if scene.pinch.miss_reason:
             return {}
         names = [f"touch_{finger}{moment}" for finger in sorted(self.sensors) for moment in ("", "_before")]
         return {name: scene.image(name) for name in names}
@@ -231,10 +233,10 @@ class SimRig(Rig):
         if grasp.pose is None or grasp.force_n is None:
             raise RecordingError(f"{grasp.grasp_id} must have a pose and a force for its walls to be simulated again")
         self.prepare(grasp.object_id, int(grasp.grasp_id.rsplit("-", 1)[-1]))
-        scene = replace(self.world.now(), grip=Grip(Pose(*grasp.pose), grasp.force_n))
-        return {} if scene.pinch.missed else {finger: scene.pinch.gap(finger) for finger in self.sensors}
+        scene = replace(self.sim_state.current_scene(), grip=Grip(Pose(*grasp.pose), grasp.force_n))
+        return {} if scene.pinch.miss_reason else {finger: scene.pinch.gap(finger) for finger in self.sensors}
 
-    def _find(self, object_id: str) -> SimObject:
+    def _find_object(self, object_id: str) -> SimObject:
         """The object of this name: procedural ones end in their index, meshes begin with their file's name."""
         if self.meshes is not None:
             candidates = self.meshes.candidates(object_id)
@@ -272,85 +274,89 @@ def _calibration_error(seed: int, localisation_mm: Sequence[float]) -> Array:
 class SimArm(VirtualDevice, Arm):
     """Goes where it is told, at once but for the clock."""
 
-    def __init__(self, world: World) -> None:
-        super().__init__("simulated arm", _WORKSPACE, clock=world.clock)
+    def __init__(self, sim_state: SimState) -> None:
+        super().__init__("simulated arm", _WORKSPACE, clock=sim_state.clock)
         self.can_tilt = True
-        self._world = world
+        self._sim_state = sim_state
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
-        before = self._world.pose.as_tuple()[:3]
-        self._world.clock.sleep(math.dist(before, pose.as_tuple()[:3]) / speed_mm_s)
-        self._world.pose = pose
+        before = self._sim_state.pose.as_tuple()[:3]
+        self._sim_state.clock.sleep(math.dist(before, pose.as_tuple()[:3]) / speed_mm_s)
+        self._sim_state.pose = pose
         return pose
 
     def _pose(self) -> Pose:
-        return self._world.pose
+        return self._sim_state.pose
 
 
 class SimGripper(VirtualDevice, Gripper):
     """Closes on what stands between its fingers; what it reports comes from the mechanics of the pinch."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, sim_state: SimState) -> None:
         super().__init__(
-            "simulated gripper", stroke_mm=STROKE_MM, min_force_n=FORCE_N[0], max_force_n=FORCE_N[1], clock=world.clock
+            "simulated gripper",
+            stroke_mm=STROKE_MM,
+            min_force_n=FORCE_N[0],
+            max_force_n=FORCE_N[1],
+            clock=sim_state.clock,
         )
-        self._world = world
+        self._sim_state = sim_state
 
     def _settings(self) -> dict[str, Any]:
         return {"stroke_mm": STROKE_MM, "force_n": list(FORCE_N)}
 
     def _open(self, opening_mm: float) -> GripperState:
-        world = self._world
-        world.opening_mm = opening_mm
-        if world.scene is not None and world.scene.grip is not None:
-            world.scene = replace(world.scene, grip=None)
+        sim_state = self._sim_state
+        sim_state.opening_mm = opening_mm
+        if sim_state.scene is not None and sim_state.scene.grip is not None:
+            sim_state.scene = replace(sim_state.scene, grip=None)
         return self._state()
 
     def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
-        world = self._world
-        grip = Grip(world.pose, force_n, world.opening_mm)
-        world.scene = replace(world.now(), grip=grip)
-        world.clock.sleep(world.opening_mm / speed_mm_s)
+        sim_state = self._sim_state
+        grip = Grip(sim_state.pose, force_n, sim_state.opening_mm)
+        sim_state.scene = replace(sim_state.current_scene(), grip=grip)
+        sim_state.clock.sleep(sim_state.opening_mm / speed_mm_s)
         return self._state()
 
     def _state(self) -> GripperState:
-        scene = self._world.scene
+        scene = self._sim_state.scene
         if scene is None or scene.grip is None:
-            return GripperState(self._world.opening_mm, 0.0, "idle")
+            return GripperState(self._sim_state.opening_mm, 0.0, "idle")
         pinch = scene.pinch
-        if pinch.missed:
+        if pinch.miss_reason:
             return GripperState(0.0, 0.0, "no_part")
-        if self._world.lifted and pinch.slip:
+        if self._sim_state.is_lifted and pinch.slip_reason:
             return GripperState(0.0, 0.0, "part_lost")
-        return GripperState(pinch.closed_mm, scene.grip.force_n, "holding")
+        return GripperState(pinch.final_opening_mm, scene.grip.force_n, "holding")
 
 
 class SimTactileSensor(VirtualDevice, TactileSensor):
     """The gel of one finger: untouched, pressed, or after the lift."""
 
-    def __init__(self, world: World, finger: str) -> None:
-        super().__init__(f"simulated gel {finger}", finger, clock=world.clock)
-        self._world = world
+    def __init__(self, sim_state: SimState, finger: str) -> None:
+        super().__init__(f"simulated gel {finger}", finger, clock=sim_state.clock)
+        self._sim_state = sim_state
 
     def _read(self) -> Frame:
-        scene = self._world.now()
-        moment = "_before" if scene.grip is None else "_after" if self._world.lifted else ""
+        scene = self._sim_state.current_scene()
+        moment = "_before" if scene.grip is None else "_after" if self._sim_state.is_lifted else ""
         return Frame(scene.image(f"touch_{self.finger}{moment}"), self.clock())
 
 
 class SimCamera(VirtualDevice, Camera):
     """Looks at the table; it knows where it stands only as well as it was calibrated."""
 
-    def __init__(self, world: World, camera: PinholeCamera, error_mm: Array) -> None:
-        believed = camera.to_rig.copy()
-        believed[:3, 3] += error_mm
-        super().__init__("simulated camera", believed, clock=world.clock)
-        self._world, self._camera = world, camera
+    def __init__(self, sim_state: SimState, camera: PinholeCamera, error_mm: Array) -> None:
+        reported = camera.to_rig.copy()
+        reported[:3, 3] += error_mm
+        super().__init__("simulated camera", reported, clock=sim_state.clock)
+        self._sim_state, self._camera = sim_state, camera
 
     def _settings(self) -> dict[str, Any]:
         return {"px": self._camera.px, "focal_px": self._camera.focal_px}
 
     def _read(self, depth: bool) -> RGBD:
-        scene, centre = self._world.now(), (self._camera.px - 1) / 2
+        scene, centre = self._sim_state.current_scene(), (self._camera.px - 1) / 2
         lens = Intrinsics(self._camera.focal_px, self._camera.focal_px, centre, centre)
         return RGBD(scene.image("photo"), scene.image("depth") if depth else None, lens, self.clock())

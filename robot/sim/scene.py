@@ -91,7 +91,7 @@ class Scene:
     def _view(self) -> cameras.CameraView:
         """What the camera meets; photo and depth share it."""
         self.passes["view"] += 1
-        return cameras.look(self.obj, self.placement, self.camera)
+        return cameras.cast_camera_rays(self.obj, self.placement, self.camera)
 
     @cached_property
     def pinch(self) -> Pinch:
@@ -111,7 +111,7 @@ class Scene:
     def _touch(self, finger: str, moment: str | None) -> npt.NDArray[np.uint8]:
         """The gel image before, while and after holding; a gel that lost its object is a background."""
         noise = self._noise(_MOMENTS[moment], ord(finger))
-        if moment == "_before" or (moment == "_after" and self.pinch.slip):
+        if moment == "_before" or (moment == "_after" and self.pinch.slip_reason):
             self.passes["background"] += 1
             return self.sensors[finger].background(noise)
         return self.pinch.touch(finger, noise)

@@ -24,7 +24,7 @@ def test_builds_that_are_killed_refused_and_torn_lose_nothing(monkeypatch, capsy
 
 def test_a_photo_that_is_lost_doubled_or_changed_is_found():
     """The check of codes, by hand: of what is there, what must be."""
-    bench = object.__new__(faults.Bench)
+    bench = object.__new__(faults.FaultFixture)
     bench.codes = {"a": ("mug", faults.np.zeros(2)), "b": ("tin", faults.np.ones(2))}
     for found in (
         {"a": bench.codes["a"]},
@@ -32,7 +32,7 @@ def test_a_photo_that_is_lost_doubled_or_changed_is_found():
         bench.codes | {"b": ("tin", faults.np.full(2, 1.1))},
     ):
         bench.codes_of = lambda cluster, found=found: found
-        with pytest.raises(faults.Wrong):
+        with pytest.raises(faults.ExpectationFailed):
             bench.check_codes(None)
     bench.codes_of = lambda cluster: dict(bench.codes)
     bench.check_codes(None)

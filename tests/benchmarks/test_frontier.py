@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.frontier import APPROXIMATIONS, NEED_NO_MODEL
 from benchmarks.frontier.__main__ import main
-from benchmarks.frontier.correlation import Problem, _by_covariance, _by_svd, known_problem
+from benchmarks.frontier.correlation import CcaProblem, _by_covariance, _by_svd, known_problem
 from retrieval.frontier import load_approximation
 from retrieval.frontier.sample import Sample, Scale
 from tests import synthetic
@@ -80,5 +80,5 @@ def test_the_textbook_way_fails_where_ours_does_not():
 
 def test_a_correlation_that_was_not_found_counts_as_zero():
     problem = known_problem(40, 3, spread=2.0)
-    same = Problem(np.repeat(problem.x[:, :1], 3, axis=1), problem.y, problem.rho)
+    same = CcaProblem(np.repeat(problem.x[:, :1], 3, axis=1), problem.y, problem.rho)
     assert _by_svd(same)[1:].tolist() == [0.0, 0.0]

@@ -36,7 +36,7 @@ def test_each_point_decodes_the_file_at_its_fraction_and_the_last_as_a_training_
     assert [point.setting for point, _ in fixed] == ["whole", "1/2", "1/4", "1/8"]
     assert sizes == [(640, 800), (320, 400), (160, 200), (80, 100)]
     assert needed.series == "reduced"
-    assert np.array_equal(see(file), dataclasses.replace(SETTINGS, reduced=True).photo_of(file, "x"))
+    assert np.array_equal(see(file), dataclasses.replace(SETTINGS, reduced=True).photo_from_bytes(file, "x"))
 
 
 @pytest.mark.parametrize(("said", "default"), [(False, "whole"), (True, "what the views need")])

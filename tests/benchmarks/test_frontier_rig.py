@@ -9,7 +9,7 @@ from benchmarks.frontier.contact import contact_panels, products_panel
 from benchmarks.frontier.light import light_panel, sky_panel
 from benchmarks.frontier.optics import optics_panel
 from benchmarks.frontier.rays import gel_panel, limit_panel, photo_panel
-from robot.sim.objects.packets import MOST_STEPS
+from robot.sim.objects.packets import MAX_STEPS
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +85,7 @@ def test_photos_of_shorter_steps_are_nearer_to_those_of_equal_steps_and_the_rig_
 
 
 def test_few_steps_lose_rays_and_as_many_as_the_rig_s_none():
-    panel = limit_panel(1, objects=2, px=64, limits=(4, 8, 12, MOST_STEPS))
+    panel = limit_panel(1, objects=2, px=64, limits=(4, 8, 12, MAX_STEPS))
     *few, ours = errors(panel, "")
     assert few[0] > few[1] > few[2] > ours == 0
     assert panel.default.setting == "600 steps"

@@ -9,7 +9,7 @@ from benchmarks.frontier import training
 from benchmarks.frontier.training import _with_no_layer_spared, training_formats
 from retrieval.frontier.sample import Sample, Scale
 from retrieval.model.encode import has_fast_bfloat16
-from retrieval.model.towers.small import Small
+from retrieval.model.towers.small import SmallTower
 
 needs_bfloat16 = pytest.mark.skipif(
     not has_fast_bfloat16(torch.device("cpu")), reason="this processor multiplies no bfloat16"
@@ -62,6 +62,6 @@ def test_no_layer_is_spared_and_the_weights_are_the_same_ones(sample):
     with torch.autocast("cpu", torch.bfloat16), torch.inference_mode():
         made.touch_tower(torch.rand(2, 3, 32, 32))
     assert set(kinds) == {torch.bfloat16}
-    assert len(kinds) == sum(isinstance(module, nn.Conv2d) for module in Small("pooled").modules())
+    assert len(kinds) == sum(isinstance(module, nn.Conv2d) for module in SmallTower("pooled").modules())
     pairs = zip(made.parameters(), sample.checkpoint.matcher.parameters(), strict=True)
     assert all(torch.equal(one, other) for one, other in pairs)

@@ -15,7 +15,7 @@ from indexes.errors import RowError
 from retrieval.errors import BadInput
 from robot.errors import SceneError
 from tests.documents import ROOT
-from tests.hard_case import HardCase, refused
+from tests.hard_case import HardCase, error_of
 from tests.retrieval.methods import hard_linear as linear
 from tests.retrieval.metrics import hard_probability as probability
 from tests.retrieval.metrics import hard_ranking as ranking
@@ -29,7 +29,7 @@ OF_PACKAGE = {
         "InfoNCE",
         "listwise loss",
         "sigmoid loss",
-        "pruner loss",
+        "candidate_encoder loss",
         "tower statistics",
         "cosine",
         "pooling of grasps",
@@ -43,7 +43,7 @@ OF_PACKAGE = {
         "whitening",
         "standardising",
         "top k",
-        "halves",
+        "partials",
         "rank measures",
         "bootstrap",
         "intervals",
@@ -52,7 +52,7 @@ OF_PACKAGE = {
         "samples",
         "resize",
     ),
-    "indexes": ("unit vectors", "top k", "inner products", "recall", "halves"),
+    "indexes": ("unit vectors", "top k", "inner products", "recall", "partials"),
     "robot": (
         "layer kernel",
         "contact solver",
@@ -100,11 +100,11 @@ def test_what_is_accepted_does_not_count_as_refused(kind):
     def raising():
         raise kind("row 7 is NaN")
 
-    assert refused(raising, "row 7") == ("refused: row 7 is NaN", True)
-    assert refused(raising, "row 8") == ("refused: row 7 is NaN", False)
-    assert refused(lambda: 3) == ("accepted: 3", False)
+    assert error_of(raising, "row 7") == ("refused: row 7 is NaN", True)
+    assert error_of(raising, "row 8") == ("refused: row 7 is NaN", False)
+    assert error_of(lambda: 3) == ("accepted: 3", False)
     with pytest.raises(ZeroDivisionError):
-        refused(lambda: 1 / 0)
+        error_of(lambda: 1 / 0)
 
 
 # The naive formulae are right where nothing is hard: they fail by their arithmetic, not by a mistake ----------
@@ -124,7 +124,7 @@ def test_the_naive_fits_are_ours_where_pairs_overlap():
     # Platt's targets differ from 0 and 1 by 1 in 20,000.
     assert probability.naive_fit(logits, labels) == pytest.approx((fitted.slope, fitted.intercept), rel=1e-3, abs=1e-3)
     scores = rng.normal(0, 1, (5000, 5)) + 1.5 * np.eye(5)[0]
-    fitted = probability.fit_posterior(probability.judged_choices(scores))
+    fitted = probability.fit_posterior(probability.scored_choices(scores))
     assert probability.naive_slope(scores) == pytest.approx(fitted.slope, rel=2e-2)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.importers_memory import MOST_KB, WIDE, growth_kb, peak_mb
+from benchmarks.importers_memory import MAX_KB, WIDE, growth_kb, peak_mb
 from robot.importers import IMPORTERS
 
 FEW, MANY = 1000, 6000
@@ -25,5 +25,5 @@ def test_rows_are_drawn_for_every_importer():
 def test_memory_grows_by_the_names_of_rows_alone(name):
     peaks = {rows: peak_mb(name, rows) for rows in (FEW, MANY)}
     spread_kb = 1000 * SPREAD_MB / (MANY - FEW)
-    for what, most in MOST_KB.items():
+    for what, most in MAX_KB.items():
         assert growth_kb(peaks, what) < most + spread_kb, peaks

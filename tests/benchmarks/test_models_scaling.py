@@ -10,10 +10,10 @@ from benchmarks.models import scaling
 from retrieval.metrics.table import ScoreTable
 from retrieval.training.features import Features
 from tests import synthetic
-from tests.labelled import label_recording
+from tests.labelled_pictures import label_recording
 
 
-def test_every_training_set_is_judged_on_the_same_unseen_objects(recording, tmp_path, capsys):
+def test_every_training_set_is_scored_on_the_same_unseen_objects(recording, tmp_path, capsys):
     unseen = synthetic.write_recording(tmp_path / "unseen", synthetic.make_objects(11, seed=5), 2)
     sizes = ("--objects", "4", "100", "--grasps", "1", "3", "--validation", "3", "--iterations", "2")
     options = ("--preset", "tiny", "--init", "random", "--methods", "late_fusion", "cca")
@@ -23,12 +23,12 @@ def test_every_training_set_is_judged_on_the_same_unseen_objects(recording, tmp_
     # 12 objects less 3 of validation: 100 are not there, 9 are.
     wanted = [(4, 3, 12), (9, 3, 27), (9, 1, 9)]
     assert asked == [(method, *size) for size in wanted for method in ("late_fusion", "cca")]
-    assert all(point["guesses_k10"]["queries"] == 22 and point["guesses_k10"]["objects"] == 11 for point in points)
+    assert all(point["topn_k10"]["queries"] == 22 and point["topn_k10"]["objects"] == 11 for point in points)
     assert capsys.readouterr().out.count("| late_fusion | 9 | 3 |") == 2  # when it is there, and in the table
     assert (tmp_path / "out" / "scaling.png").stat().st_size > 10_000
 
 
-def test_felt_and_photographed_objects_are_crossed(recording, tmp_path):
+def test_touched_and_photographed_objects_are_crossed(recording, tmp_path):
     unseen = synthetic.write_recording(tmp_path / "unseen", synthetic.make_objects(11, seed=5), 2)
     apart = synthetic.write_recording(tmp_path / "apart", synthetic.make_objects(6, seed=7), 1)
     pictures = [word for name, folder in label_recording(apart, tmp_path).items() for word in (f"--{name}", folder)]
@@ -51,9 +51,9 @@ def test_every_method_that_draws_is_trained_as_often_as_asked_and_its_numbers_ar
         assert scaling.main([str(recording), str(unseen), "--out", str(out), "--seeds", seeds, *options]) == 0
         points[seeds] = {point["method"]: point for point in json.loads((out / "scaling.json").read_text())["points"]}
     assert {name: point["seeds"] for name, point in points["2"].items()} == {"late_fusion": 2, "cca": 1}
-    assert points["2"]["cca"]["guesses_k5"] == points["1"]["cca"]["guesses_k5"]
-    assert points["1"]["late_fusion"]["together"]["guesses_k5"] == points["1"]["late_fusion"]["guesses_k5"]
-    assert points["2"]["late_fusion"]["guesses_k5"]["value"] != points["1"]["late_fusion"]["guesses_k5"]["value"]
+    assert points["2"]["cca"]["topn_k5"] == points["1"]["cca"]["topn_k5"]
+    assert points["1"]["late_fusion"]["together"]["topn_k5"] == points["1"]["late_fusion"]["topn_k5"]
+    assert points["2"]["late_fusion"]["topn_k5"]["value"] != points["1"]["late_fusion"]["topn_k5"]["value"]
 
 
 def test_what_several_trainings_say_together_is_the_mean_of_their_scores():

@@ -14,8 +14,8 @@ def test_the_shipped_checkpoint_is_far_above_chance_on_objects_it_never_saw(tmp_
     monkeypatch.setattr(shipped, "FITTED", 3)
     assert shipped.main(["score", str(tmp_path), "--objects", "13", "--grasps", "2", "--jobs", "1"]) == 0
     measures = json.loads((tmp_path / "report" / "results.json").read_text())["methods"]["late_fusion"]["measures"]
-    assert measures["guesses_k5"]["objects"] == 7
-    assert measures["guesses_k5"]["value"][0] > 0.4  # chance 0.2
+    assert measures["topn_k5"]["objects"] == 7
+    assert measures["topn_k5"]["value"][0] > 0.4  # chance 0.2
 
 
 @pytest.mark.parametrize("fingers", defaults.SHIPPED)
@@ -23,6 +23,6 @@ def test_the_shipped_checkpoints_know_what_a_touch_is_worth_beside_and_without_a
     made = load_checkpoint(defaults.shipped_model(fingers))
     references = made.references
     assert references.objects == len(made.split.validation) == 100
-    apart, equal = references.alone.log_ratio([-0.2, 0.9], 1)
+    apart, equal = references.touch_only.log_ratio([-0.2, 0.9], 1)
     assert apart < 0 < equal  # a touch that is nothing like it speaks against the object
-    assert references.weight * references.beside.slope > 1
+    assert references.weight * references.with_photos.slope > 1

@@ -16,7 +16,7 @@ from benchmarks.optics import photometric
 from benchmarks.optics import real_presses as presses
 from benchmarks.optics.image_error import compare, ssim
 from benchmarks.optics.least_squares import OpticsSetting, aligned, columns_of, features, gram, labelled_poses, solve
-from benchmarks.optics.model_choice import fit, held_out_error, judged, select, to_optics
+from benchmarks.optics.model_choice import fit, held_out_error, picture_error, select, to_optics
 from benchmarks.optics.real_presses import PIXEL_MM, Presses, ball_table, find_presses, read_presses
 from robot.errors import BadRobotInput, UnknownName
 from robot.sim.gel.fitted_optics import fitted_document, fitted_names, load_fitted, optics_from_json
@@ -33,8 +33,8 @@ def draw_presses(count=6, seed=0, setting=PLAIN, noise=1.0):
     flat = np.stack([120 + 20 * x, 110 - 10 * y, 100 + 10 * x * y], axis=-1)
     centres = np.column_stack([rng.uniform(110, 210, count), rng.uniform(105, 155, count)])
     radii = rng.uniform(50, 62, count)
-    untouched = np.clip(np.rint(flat + rng.normal(0, noise, flat.shape)), 0, 255).astype(np.uint8)
-    drawn = Presses("gelsight", untouched, np.repeat(untouched[None], count, axis=0), centres, radii)
+    no_contact = np.clip(np.rint(flat + rng.normal(0, noise, flat.shape)), 0, 255).astype(np.uint8)
+    drawn = Presses("gelsight", no_contact, np.repeat(no_contact[None], count, axis=0), centres, radii)
     weights = rng.normal(0, 12, (features(drawn, 0, labelled_poses(drawn, setting)[0], setting).shape[1], 3))
     for index, pose in enumerate(labelled_poses(drawn, setting)):
         rows, cols = drawn.crop(index)
@@ -90,7 +90,12 @@ def test_errors_are_counted_on_what_a_person_would_see():
 
 def write(folder, **changes):
     drawn, _ = draw_presses(2)
-    arrays = {"f0": drawn.untouched, "imgs": drawn.pictures, "touch_center": drawn.centres, "touch_radius": drawn.radii}
+    arrays = {
+        "f0": drawn.no_contact,
+        "imgs": drawn.pictures,
+        "touch_center": drawn.centres,
+        "touch_radius": drawn.radii,
+    }
     (folder / "gelsight").mkdir(parents=True, exist_ok=True)
     kept = {key: value for key, value in {**arrays, **changes}.items() if value is not None}
     np.savez(folder / "gelsight" / "dataPack.npz", **kept)
@@ -155,7 +160,7 @@ def test_missing_and_broken_files_and_unknown_sensors_are_refused(tmp_path, monk
 
 def test_a_crop_at_the_border_is_moved_inside():
     drawn, _ = draw_presses(1)
-    moved = Presses("gelsight", drawn.untouched, drawn.pictures, np.array([[3.0, 258.0]]), drawn.radii)
+    moved = Presses("gelsight", drawn.no_contact, drawn.pictures, np.array([[3.0, 258.0]]), drawn.radii)
     assert moved.crop(0) == (slice(60, 260), slice(0, 200))
 
 
@@ -242,7 +247,7 @@ def test_a_press_is_found_again_from_its_picture():
 
 def test_a_press_that_shows_nothing_stays_where_it_was():
     drawn, weights = draw_presses(1)
-    drawn.pictures[0] = drawn.untouched
+    drawn.pictures[0] = drawn.no_contact
     found = aligned(drawn, 0, pose_fit.first_pose(drawn, 0, PLAIN), 0 * weights, PLAIN, 5)
     np.testing.assert_array_equal(found, pose_fit.first_pose(drawn, 0, PLAIN))
     np.testing.assert_array_equal(found[:2], drawn.centres[0])
@@ -258,7 +263,7 @@ def test_a_fit_predicts_held_out_presses_to_their_noise(monkeypatch):
     model = fit(drawn, range(6), setting, align=False)
     for index in range(6, 9):
         assert held_out_error(drawn, index, model).mse < 1.6  # noise 1 and rounding 1/12; that of f0 is blurred away
-        assert judged(drawn, index, 0.0).mse > 20
+        assert picture_error(drawn, index, 0.0).mse > 20
 
 
 @pytest.mark.slow
@@ -316,9 +321,14 @@ def test_an_interval_goes_over_presses_not_over_repeats_of_one():
 
 
 @pytest.mark.slow
-def test_the_command_fits_judges_and_writes_a_file_that_loads(tmp_path, monkeypatch, capsys):
+def test_the_command_fits_scores_and_writes_a_file_that_loads(tmp_path, monkeypatch, capsys):
     drawn, _ = draw_presses(5)
-    arrays = {"f0": drawn.untouched, "imgs": drawn.pictures, "touch_center": drawn.centres, "touch_radius": drawn.radii}
+    arrays = {
+        "f0": drawn.no_contact,
+        "imgs": drawn.pictures,
+        "touch_center": drawn.centres,
+        "touch_radius": drawn.radii,
+    }
     data = write(tmp_path / "data", **arrays)
     monkeypatch.setattr(press_model, "_THICKNESSES_MM", (4.0,))
     monkeypatch.setattr(photometric, "FIT_COUNT", {"gelsight": 4})
@@ -380,7 +390,7 @@ def test_held_out_presses_are_predicted_better_than_before(name, packs):
     assert errors[3] > HELD_OUT[name][0] > 30.5
     assert errors[2] > HELD_OUT[name][1] > 0.966
     table = dict(np.load(find_presses() / name / "polycalib.npz", allow_pickle=False))
-    theirs = [judged(pack, index, presses.taxim_change(pack, index, table)).mse for index in held_out]
+    theirs = [picture_error(pack, index, presses.taxim_change(pack, index, table)).mse for index in held_out]
     assert errors[1] < 0.5 * np.mean(theirs)
 
 
@@ -400,7 +410,7 @@ def test_the_first_channel_is_red_by_the_lamps(packs):
     pack = packs["gelsight"]
     index = int(np.argmin(np.hypot(*(pack.centres - (320, 240)).T)))
     rows, cols = pack.crop(index)
-    change = cv2.GaussianBlur(pack.pictures[index][rows, cols].astype(float) - pack.untouched[rows, cols], (0, 0), 4)
+    change = cv2.GaussianBlur(pack.pictures[index][rows, cols].astype(float) - pack.no_contact[rows, cols], (0, 0), 4)
     y, x = np.mgrid[-100:100, -100:100]
     inside = np.hypot(x, y) < 55
     towards = [np.array([(change[..., c] * axis)[inside].sum() for axis in (x, y)]) for c in range(3)]

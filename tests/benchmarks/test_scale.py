@@ -12,19 +12,19 @@ from benchmarks import needed, scale, several
 from benchmarks.common import matcher_of
 from indexes.store.folder import IndexStore
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.fusion import judge_of
+from retrieval.model.fusion import scorer_of
 from tests.conftest import TINY
 
 
 @pytest.fixture(scope="module")
 def crowd():
-    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, pruner_width=8))
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, candidate_width=8))
     matcher = matcher_of(config)
     checkpoint = Checkpoint.__new__(Checkpoint)
     object.__setattr__(checkpoint, "matcher", matcher)
     rng = np.random.default_rng(0)
-    photos, touches = (rng.normal(size=(n, config.matcher.half)).astype(np.float32) for n in (50, 19))
-    return scale.Crowd(checkpoint, judge_of(matcher.head), photos, touches[:12], touches[12:])
+    photos, touches = (rng.normal(size=(n, config.matcher.partial_width)).astype(np.float32) for n in (50, 19))
+    return scale.BlendedPhotos(checkpoint, scorer_of(matcher.head), photos, touches[:12], touches[12:])
 
 
 def test_every_kind_gives_its_figures(crowd, tmp_path, monkeypatch):
@@ -43,30 +43,30 @@ def test_every_kind_gives_its_figures(crowd, tmp_path, monkeypatch):
     json.dumps(vars(size), allow_nan=False)
 
 
-def test_contrastive_embeddings_are_the_last_part_of_the_halves_at_unit_length(crowd):
+def test_contrastive_embeddings_are_the_last_part_of_the_partials_at_unit_length(crowd):
     hidden = TINY.matcher.hidden
     checkpoint = SimpleNamespace(config=TINY)
-    halves = np.zeros((2, hidden + 2), np.float32)
-    halves[:, :hidden], halves[:, hidden:] = 9, [[3, 4], [0, -2]]
-    found = dataclasses.replace(crowd, checkpoint=checkpoint, by="contrastive").embeddings(halves, "photo")
+    partials = np.zeros((2, hidden + 2), np.float32)
+    partials[:, :hidden], partials[:, hidden:] = 9, [[3, 4], [0, -2]]
+    found = dataclasses.replace(crowd, checkpoint=checkpoint, by="contrastive").embeddings(partials, "photo")
     assert found.tolist() == pytest.approx(np.array([[0.6, 0.8], [0, -1]]))
 
 
-def test_held_out_touches_judge_candidates_that_others_chose(crowd, tmp_path, monkeypatch):
+def test_held_out_touches_measure_candidate_counts_that_others_chose(crowd, tmp_path, monkeypatch):
     """Where a search never names the winner of a held-out touch, and always that of the others."""
     asked = {touch.tobytes(): number for number, touch in enumerate(crowd.embeddings(crowd.touches, "touch"))}
 
-    def point(winner_of):
+    def point(top1_of):
         found = SimpleNamespace(
             count=9,
             manifest=None,
-            arrays={"halves": np.zeros((9, crowd.photos.shape[1]), np.float16)},
-            index=SimpleNamespace(along_ladder=lambda: [SimpleNamespace(settings=dict)]),
-            search=lambda query, k: [(np.array([winner_of(asked.get(query[0].tobytes()))]), None)],
+            arrays={"partials": np.zeros((9, crowd.photos.shape[1]), np.float16)},
+            index=SimpleNamespace(search_variants=lambda: [SimpleNamespace(settings=dict)]),
+            search=lambda query, k: [(np.array([top1_of(asked.get(query[0].tobytes()))]), None)],
         )
         touches = np.concatenate([crowd.touches, crowd.held_out])
-        winners = np.concatenate([np.arange(12), np.full(7, 8)]) % 9
-        return scale._operating_point(crowd, found, touches, winners, asked=12)
+        exhaustive_top1 = np.concatenate([np.arange(12), np.full(7, 8)]) % 9
+        return scale._operating_point(crowd, found, touches, exhaustive_top1, asked=12)
 
     missed = point(lambda number: 0 if number is None else number % 9)
     assert (missed["k"], missed["recall"], missed["needed"]) == (4, 0, 9)  # the touches that chose needed one
@@ -78,13 +78,13 @@ def test_a_kind_that_needs_more_photos_says_so(crowd, tmp_path):
     assert "624 or more vectors" in "\n".join(scale.lines(size))
 
 
-def test_the_winner_is_the_photo_that_the_classifier_puts_first(crowd):
-    halves = np.concatenate([block.arrays["halves"] for block in crowd.blocks(0, 60, 0)])
-    winners, seconds = scale._winners(crowd.judge, crowd.touches[:3], halves)
+def test_the_exhaustive_top1_is_the_photo_that_the_classifier_puts_first(crowd):
+    partials = np.concatenate([block.arrays["partials"] for block in crowd.blocks(0, 60, 0)])
+    exhaustive_top1, seconds = scale._top1(crowd.scorer, crowd.touches[:3], partials)
     with torch.inference_mode():
-        head, photos = crowd.checkpoint.matcher.head, torch.from_numpy(halves.astype(np.float32))
+        head, photos = crowd.checkpoint.matcher.head, torch.from_numpy(partials.astype(np.float32))
         must = [int(head(torch.from_numpy(touch[None]), photos).argmax()) for touch in crowd.touches[:3]]
-    assert winners.tolist() == must
+    assert exhaustive_top1.tolist() == must
     assert seconds > 0
 
 
@@ -96,20 +96,20 @@ def test_the_slope_of_a_power_of_n_is_its_exponent():
     assert dict(scale.slopes(sizes)) == pytest.approx({"exhaustive_s": 0.7, "flat search_s": 1.0})
 
 
-def test_winners_of_blocks_that_are_not_kept_are_those_of_the_whole_catalogue(crowd, monkeypatch):
-    """Judged in half as many bits, and exactly where that could tell wrong."""
+def test_exhaustive_top1_by_blocks_equals_that_of_the_whole_catalogue(crowd, monkeypatch):
+    """ShardResult in half as many bits, and exactly where that could tell wrong."""
     monkeypatch.setattr(scale, "BLOCK", 64)
     sizes, touches = [100, 300], np.concatenate([crowd.touches, crowd.held_out])
-    cosines, _ = needed.winners(crowd, touches, sizes)
+    cosines, _ = needed.exhaustive_top1(crowd, touches, sizes)
     found = needed.places(crowd, touches, sizes, cosines)
     blocks = [*crowd.blocks(0, 100, 0), *crowd.blocks(100, 300, 0)]
-    halves, photos = (
-        np.concatenate(part) for part in zip(*((b.arrays["halves"], b.embeddings) for b in blocks), strict=True)
+    partials, photos = (
+        np.concatenate(part) for part in zip(*((b.arrays["partials"], b.embeddings) for b in blocks), strict=True)
     )
     for size, places in zip(sizes, found, strict=True):
         for touch, query, place in zip(touches, crowd.embeddings(touches, "touch"), places, strict=True):
             scores = photos[:size] @ query
-            winner = scores[crowd.judge.logits(touch[None], halves[:size]).argmax()]
+            winner = scores[crowd.scorer.logits(touch[None], partials[:size]).argmax()]
             assert place == 1 + (scores > winner + 1e-6).sum()
 
 
@@ -119,21 +119,21 @@ def test_candidates_are_four_times_as_many_as_the_touches_that_choose_need():
     assert (line["needed_by_chosen"], line["taken"], line["found"], line["worst"]) == (5, 20, 0.5, 21)
 
 
-def test_two_ways_to_name_candidates_of_several_grasps_are_told_beside_each_other(crowd, tmp_path, monkeypatch):
+def test_two_ways_to_find_candidates_of_several_grasps_are_compared(crowd, tmp_path, monkeypatch):
     made = IndexStore(tmp_path / "index").write_blocks(crowd.blocks(0, 300, 0), fingerprint={}, kind="flat")
     sets = several.sets_of(np.array([0, 0, 0, 1, 1, 1, 1, 2]), 3, most=5)
     assert len(sets) == 5
     assert all(set(row) <= {0, 1, 2} or set(row) <= {3, 4, 5, 6} for row in sets.tolist())
     together, each = several.measure(crowd, made, crowd.touches, sets, k=20)
-    assert (together["photos"], together["grasps"], together["sets"], together["judged"]) == (300, 3, 5, 20)
-    assert 20 <= each["judged"] <= 60
+    assert (together["photos"], together["grasps"], together["sets"], together["reranked"]) == (300, 3, 5, 20)
+    assert 20 <= each["reranked"] <= 60
     for figures in (together, each):
         assert 1 <= figures["needed"] <= figures["worst"] <= 300
         assert 0 <= figures["low"] <= figures["found"] <= figures["high"] <= 1
         assert "300 photos, 3 grasps, nearest to " in several.line(figures)
 
 
-def test_the_winner_of_several_grasps_has_the_greatest_sum_of_logits():
+def test_the_exhaustive_top1_of_several_grasps_has_the_greatest_sum_of_logits():
     """Of four photos the third is between both grasps, and the classifier likes it best."""
     grasps = np.eye(2, dtype=np.float32)
     photos = np.array([[1, 0], [0, 1], [0.7, 0.7], [0.8, 0]], dtype=np.float32)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks import queueing, shards
-from benchmarks.queueing import ENCODE_S, HOP_S, Service, answers, service_of, tables
+from benchmarks.queueing import ENCODE_S, HOP_S, ServiceTimes, answers, service_of, tables
 
 MEASURED = [
     {
@@ -24,14 +24,14 @@ MEASURED = [
 
 
 def test_drawn_times_have_the_median_and_the_percentile_that_were_measured():
-    times = Service(0.02, 0.05).draw(np.random.default_rng(0), (200_000,))
+    times = ServiceTimes(0.02, 0.05).draw(np.random.default_rng(0), (200_000,))
     assert np.median(times) == pytest.approx(0.02, rel=0.02)
     assert np.percentile(times, 99) == pytest.approx(0.05, rel=0.03)
-    assert times.mean() == pytest.approx(Service(0.02, 0.05).mean, rel=0.02)
+    assert times.mean() == pytest.approx(ServiceTimes(0.02, 0.05).mean, rel=0.02)
 
 
 def test_a_lonely_request_waits_for_its_shard_alone_and_of_many_for_the_slowest():
-    service = Service(0.02, 0.04)
+    service = ServiceTimes(0.02, 0.04)
     one, many = (answers(shards, 1, service, rate=0.01) - ENCODE_S - HOP_S for shards in (1, 60))
     assert np.median(one) == pytest.approx(0.02, rel=0.05)
     spread = math.log(2) / 2.3263  # the median of the largest of 60: the 0.5 ** (1 / 60) quantile, 2.27 deviations
@@ -40,7 +40,7 @@ def test_a_lonely_request_waits_for_its_shard_alone_and_of_many_for_the_slowest(
 
 def test_one_server_waits_as_the_formula_of_pollaczek_and_khinchine_says():
     """Mean wait = rate * E[S^2] / (2 (1 - rate E[S]))."""
-    service = Service(0.02, 0.04)
+    service = ServiceTimes(0.02, 0.04)
     waits = [answers(1, 1, service, rate=30.0, seed=seed).mean() - ENCODE_S - HOP_S for seed in range(10)]
     spread = math.log(2) / 2.3263
     second = 0.02**2 * math.exp(2 * spread**2)
@@ -49,7 +49,7 @@ def test_one_server_waits_as_the_formula_of_pollaczek_and_khinchine_says():
 
 
 def test_a_lost_replica_and_a_slow_shard_cost_time():
-    service = Service(0.02, 0.04)
+    service = ServiceTimes(0.02, 0.04)
     plain, slow, lost = (answers(4, 2, service, 40.0, **how) for how in ({}, {"slow": 1}, {"lost": 1}))
     assert np.percentile(plain, 99) < np.percentile(lost, 99)
     assert np.median(slow) > np.median(plain) + 0.03
@@ -77,5 +77,5 @@ def test_shards_answer_as_one_folder_does(monkeypatch, capsys):
     shards.main()
     measured, opened = map(json.loads, capsys.readouterr().out.splitlines())
     assert (measured["photos"], measured["shards"]) == (1000, 2)
-    assert measured["all_judged_same"] == measured["winner_no_worse"] == 1
+    assert measured["all_scored_same"] == measured["top1_no_worse"] == 1
     assert list(opened) == ["client_open_1e+03_s"]

@@ -46,7 +46,7 @@ def test_every_benchmark_has_a_smallest_case():
 
 @pytest.mark.parametrize("name", sorted(SMALLEST))
 def test_a_benchmark_gives_its_lines(name, monkeypatch):
-    monkeypatch.setattr(common, "LEAST_S", 0.0)  # one call of each arm
+    monkeypatch.setattr(common, "MIN_SECONDS", 0.0)  # one call of each arm
     measure, sizes, count = SMALLEST[name]
     lines = list(measure(TINY, **sizes))
     assert len(lines) == count
@@ -59,7 +59,7 @@ def test_a_benchmark_gives_its_lines(name, monkeypatch):
 def test_large_photos_are_compared_with_themselves_reduced_and_saved_again():
     lines = list(large.measure(photos=2, side=64, sizes=((64, 64), (1600, 1600))))
     small, big, again = (line.figures for line in lines)
-    assert (small["grey_levels"], small["same_winner"]) == (0, 1)
+    assert (small["grey_levels"], small["same_top1"]) == (0, 1)
     assert 0 < big["grey_levels"] < 5
     assert 0 < again["logit"] <= again["most_logit"]
     for line in lines:
@@ -67,7 +67,7 @@ def test_large_photos_are_compared_with_themselves_reduced_and_saved_again():
 
 
 def test_the_benchmark_of_a_card_runs_on_any_device(monkeypatch):
-    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     lines = list(gpu.measure(TINY, "cpu:0", photos=3, repetitions=1))
     assert [line.text.split(",")[0] for line in lines] == ["build", "ask", "train"]
     for line in lines:
@@ -76,7 +76,7 @@ def test_the_benchmark_of_a_card_runs_on_any_device(monkeypatch):
 
 
 def test_naming_candidates_stands_beside_the_bare_call(monkeypatch):
-    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     monkeypatch.setattr(peers, "NAMED", (10, 50))
     lines = list(peers.named(photos=700, queries=3, repetitions=2))
     assert [(line.tower, line.figures["k"]) for line in lines] == [
@@ -89,16 +89,16 @@ def test_naming_candidates_stands_beside_the_bare_call(monkeypatch):
 
 @pytest.mark.slow
 def test_a_build_with_the_shipped_model_stands_beside_its_encoder(monkeypatch):
-    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     (line,) = build.measure_shipped(photos=3, photo_px=64, repetitions=1)
     assert line.figures["build_per_s"] == pytest.approx(3 / line.each["build"][0])
     assert line.each["looking"] == [0.0]  # a build of so few does not
 
 
 def test_a_row_of_the_table_tells_medians_with_their_spread():
-    row = table.Row("work", "ms", [2.0, 1.0, 1234.5], "other work", [4.0])
+    row = table.TableRow("work", "ms", [2.0, 1.0, 1234.5], "other work", [4.0])
     assert str(row) == "| work | 2 (1 to 1,234) ms | other work | 4 (4 to 4) ms | 0.50 |"
-    assert str(table.Row("work", "ms", [2.0])) == "| work | 2 (2 to 2) ms |  |  |  |"
+    assert str(table.TableRow("work", "ms", [2.0])) == "| work | 2 (2 to 2) ms |  |  |  |"
 
 
 @pytest.mark.slow
@@ -109,16 +109,16 @@ def test_a_section_of_the_table_is_measured_by_a_process_of_its_own():
 
 
 def test_the_benchmark_of_training_tells_rates_and_parts_of_a_step(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     with training.matching(TINY, recording, tmp_path) as (trainer, works):
         rates, parts = training.rates("small", works, threads=1, steps=1, repetitions=1)
         assert training.validation("small", trainer).figures["validation_s"] > 0
         if has_fast_bfloat16(trainer.device):
-            assert 0 < training.rounding("small", trainer, works["kept"]).figures["apart"] < 1
+            assert 0 < training.rounding("small", trainer, works["cached"]).figures["apart"] < 1
     images = 4 * 2 + len(trainer.sampler.batch(0, 4).photos)
-    assert works["kept"].images == images
+    assert works["cached"].images == images
     rate = rates.figures
-    assert rate["ratio_kept"] == pytest.approx(rate["kept_per_s"] / rate["bare_per_s"])
+    assert rate["ratio_cached"] == pytest.approx(rate["cached_per_s"] / rate["bare_per_s"])
     assert list(parts.figures) == ["draw and decode_s", "draw and map_s", "forward_s", "backward_s", "optimiser_s"]
 
 
@@ -144,7 +144,7 @@ def test_every_engine_is_asked_at_the_least_width_that_finds_enough():
     for line in lines:
         assert line.figures["recall"] > 0.8
         assert line.figures["query_us"] > 0
-    width_of = peers.Built(lambda query, width: np.arange(width), (1, 10, 20))
+    width_of = peers.GraphIndex(lambda query, width: np.arange(width), (1, 10, 20))
     vectors = np.eye(30, peers.DIM, dtype=np.float32)
     assert peers.least_width(width_of, vectors, vectors[:1]) == 10
 
@@ -212,7 +212,7 @@ def test_the_table_of_cylinders_has_a_line_a_case():
 
 
 def test_the_arms_take_turns_and_the_first_round_is_not_measured(monkeypatch):
-    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     order = []
     times = common.in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 2)
     assert order == ["a", "b"] * 3
@@ -227,14 +227,14 @@ def test_a_short_arm_is_called_until_its_time_can_be_told(monkeypatch):
         calls[name] += 1
         time.sleep(seconds)
 
-    monkeypatch.setattr(common, "LEAST_S", 0.5)
+    monkeypatch.setattr(common, "MIN_SECONDS", 0.5)
     common.in_turns({"short": lambda: arm("short", 0.002), "long": lambda: arm("long", 0.6)}, 1)
     assert calls["long"] == 2
     assert 2 < calls["short"] <= 251
 
 
 def test_the_program_prints_a_document_a_line(monkeypatch, capsys):
-    monkeypatch.setattr(common, "LEAST_S", 0.0)
+    monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     monkeypatch.setattr(program, "BENCHMARKS", {"step": lambda config: step.measure(TINY, 2, 2, 1)})
     monkeypatch.setattr(sys, "argv", ["benchmarks", "--tower", "small", "resnet18", "--only", "step", "--json"])
     program.main()

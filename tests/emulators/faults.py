@@ -9,7 +9,7 @@ from robot.errors import RobotConfigError
 from robot.settings import check_range
 
 
-class Faults:
+class FaultInjector:
     """Something goes wrong in a share `rate` of the operations, of `kinds` drawn evenly; `counts` says how often what.
 
     A subclass says in KINDS what can go wrong. Safe in several threads. Raises RobotConfigError.

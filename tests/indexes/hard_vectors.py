@@ -7,12 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from indexes import load_kind
-from indexes.kinds.base import VectorIndex
 from indexes.kinds.exact import ExactIndex
 from indexes.kinds.measure import recall_against_exact
-from indexes.kinds.scores import Floats, grid_scores, on_grid
+from indexes.kinds.scores import Floats, grid_scores, to_grid
+from indexes.kinds.vector_index import VectorIndex
 from indexes.store.folder import IndexStore
-from tests.hard_case import HardCase, refused
+from tests.hard_case import HardCase, error_of
 
 _SEARCH, _UNIT, _SCORES = "top k", "unit vectors", "inner products"
 
@@ -55,7 +55,7 @@ def _nan_vector() -> HardCase:
     vectors = _axes()
     vectors[1, 0] = np.nan
     order = np.argsort(vectors @ _axes()[0])[::-1]
-    ours, holds = refused(lambda: ExactIndex.build(vectors, names=["mug", "cup", "jar"]), "'cup'", "NaN")
+    ours, holds = error_of(lambda: ExactIndex.build(vectors, names=["mug", "cup", "jar"]), "'cup'", "NaN")
     naive = f"argsort ranks photos {_text(order)}: the NaN is best"
     return HardCase(_UNIT, "one of three photos is NaN", "refused, and named", naive, ours, holds, order[0] != 1)
 
@@ -67,7 +67,7 @@ def _nan_query() -> HardCase:
     structure = faiss.IndexFlatIP(3)
     structure.add(_axes())
     found = structure.search(query, 2)[1][0]
-    ours, holds = refused(lambda: ExactIndex.build(_axes()).search(query, 2), "query '0'", "NaN")
+    ours, holds = error_of(lambda: ExactIndex.build(_axes()).search(query, 2), "query '0'", "NaN")
     naive = f"FAISS answers rows {_text(found)}, and row -1 of a list is its last photo"
     return HardCase(_UNIT, "a query is NaN", "refused, and named", naive, ours, holds, bool((found >= 0).all()))
 
@@ -76,7 +76,7 @@ def _zero_vector() -> HardCase:
     vectors = _axes()
     vectors[2] = 0.0
     cosine = float((vectors[2] / np.linalg.norm(vectors[2])) @ _axes()[0])
-    ours, holds = refused(lambda: ExactIndex.build(vectors), "'2'", "zero")
+    ours, holds = error_of(lambda: ExactIndex.build(vectors), "'2'", "zero")
     return HardCase(
         _UNIT, "one vector is zero", "refused, and named", f"cosine {cosine}", ours, holds, math.isfinite(cosine)
     )
@@ -86,7 +86,7 @@ def _huge_vector() -> HardCase:
     """Its cosine with itself is 1, and float32 squares end at 3e38."""
     vector = np.full((1, 4), 1e30, np.float32)
     unit = vector / np.sqrt((vector * vector).sum())
-    ours, holds = refused(lambda: ExactIndex.build(vector), "'0'", "2e+30")
+    ours, holds = error_of(lambda: ExactIndex.build(vector), "'0'", "2e+30")
     wanted = "refused, its norm of 2e30 named"
     cosine = float((unit @ unit.T)[0, 0])
     return HardCase(
@@ -98,7 +98,7 @@ def _tiny_vector() -> HardCase:
     """float32 squares end at 1e-45."""
     vector = np.full((1, 4), 1e-30, np.float32)
     norm = float(np.sqrt((vector * vector).sum()))
-    ours, holds = refused(lambda: ExactIndex.build(vector), "'0'", "2e-30")
+    ours, holds = error_of(lambda: ExactIndex.build(vector), "'0'", "2e-30")
     wanted = "refused, its norm of 2e-30 named"
     return HardCase(_UNIT, "components of 1e-30", wanted, f"a norm of {norm}", ours, holds, norm > 0)
 
@@ -159,7 +159,7 @@ def _another_order_of_the_sum() -> HardCase:
     turned = np.random.default_rng([6]).permutation(256)
     ways = (np.arange(256), turned)
     naive = [np.cumsum(query[:, way] * vectors[:, way], axis=1)[:, -1] for way in ways]
-    ours = [grid_scores(on_grid(query[:, way]), on_grid(vectors[:, way])) for way in ways]
+    ours = [grid_scores(to_grid(query[:, way]), to_grid(vectors[:, way])) for way in ways]
     differ = [int((one != other).sum()) for one, other in (naive, ours)]
     before, after = (f"{count} of 299 scores differ" for count in differ)
     wanted = "the same bits"
@@ -195,13 +195,13 @@ def _recall_among_equals() -> HardCase:
 
 def _overflowing_half() -> HardCase:
     """float16 ends at 65504; what lies beyond is infinite in it, and infinity less infinity is NaN."""
-    halves = np.array([[1.0], [7e4]], np.float32).astype(np.float16)
-    naive = float(halves[1, 0] - halves[1, 0])
+    partials = np.array([[1.0], [7e4]], np.float32).astype(np.float16)
+    naive = float(partials[1, 0] - partials[1, 0])
     rows = [{"id": "mug"}, {"id": "cup"}]
     with tempfile.TemporaryDirectory() as folder:
         store = IndexStore(folder)
-        ours, holds = refused(
-            lambda: store.write(rows, _axes(2), {"halves": halves}, fingerprint={}, kind="exact"), "'cup'"
+        ours, holds = error_of(
+            lambda: store.write(rows, _axes(2), {"partials": partials}, fingerprint={}, kind="exact"), "'cup'"
         )
-    words = f"a half of {halves[1, 0]}, and {naive} in the next sum"
-    return HardCase("halves", "7e4 in float16", "refused, and named", words, ours, holds, math.isfinite(naive))
+    words = f"a half of {partials[1, 0]}, and {naive} in the next sum"
+    return HardCase("partials", "7e4 in float16", "refused, and named", words, ours, holds, math.isfinite(naive))

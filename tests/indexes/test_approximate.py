@@ -62,7 +62,7 @@ def test_approximate_kinds_find_most_of_the_best_in_clustered_data(kind):
 def test_looking_further_finds_more(kind, setting):
     vectors = unit(2000, 32)
     index, queries = load_kind(kind).build(vectors, threads=1), sample_queries(vectors, 100)
-    recalls = [recall_against_exact(index.tuned(**{setting: value}), queries) for value in (1, 8, 64)]
+    recalls = [recall_against_exact(index.with_settings(**{setting: value}), queries) for value in (1, 8, 64)]
     assert recalls[0] <= recalls[1] < recalls[2]
 
 
@@ -97,7 +97,7 @@ def test_codes_are_trained_without_a_warning(count, capfd):
 
 @pytest.mark.parametrize(("dim", "parts"), [(8, 8), (12, 6), (13, 1), (64, 8), (128, 16), (512, 64)])
 def test_code_bytes_divide_the_vector(dim, parts):
-    assert IVFPQIndex.resolved(IVFPQParameters(), 1000, dim).code_bytes == parts
+    assert IVFPQIndex.resolve_parameters(IVFPQParameters(), 1000, dim).code_bytes == parts
 
 
 def test_code_bytes_that_do_not_divide_are_refused():

@@ -18,7 +18,7 @@ from indexes.store import locking
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from tests.indexes.test_store import FINGERPRINT, filled, names, rows_of, unit
-from tests.waiting import first_line, running
+from tests.waiting import first_line, run_process
 
 STEPS = ("fsync", "rename", "replace", "mkdir", "unlink", "rmdir")
 
@@ -134,7 +134,7 @@ while True:
 def test_kills_at_random_moments_leave_a_whole_index(tmp_path, kind):
     store, rng = IndexStore(tmp_path), np.random.default_rng(0)
     for _ in range(3):
-        with running([sys.executable, "-c", WRITING_FOREVER, str(tmp_path), kind]) as writer:
+        with run_process([sys.executable, "-c", WRITING_FOREVER, str(tmp_path), kind]) as writer:
             first_line(writer)
             time.sleep(float(rng.uniform(0, 0.05)))
             found = store.open()  # reading while it writes
@@ -169,11 +169,11 @@ class Steps:
 def test_everything_is_on_the_disk_before_it_is_named(tmp_path, monkeypatch):
     filled(tmp_path)
     steps = Steps(monkeypatch, None)
-    filled(tmp_path, kind="hnsw", arrays={"halves": np.ones((20, 2))}, documents={"calibration": {}})
+    filled(tmp_path, kind="hnsw", arrays={"partials": np.ones((20, 2))}, documents={"calibration": {}})
     suffix = f".tmp-{os.getpid()}"
     calls = [(step, re.sub(r"^\.CURRENT\..*", "beside", name)) for step, name in steps.calls if step != "mkdir"]
     assert calls == [
-        *(("fsync", name) for name in ("rows.jsonl", "embeddings.npy", "halves.npy", "table.npy")),
+        *(("fsync", name) for name in ("rows.jsonl", "embeddings.npy", "partials.npy", "table.npy")),
         *(("fsync", name) for name in ("calibration.json", "vectors.faiss")),
         ("fsync", "manifest.json"),
         ("fsync", f"gen-000002{suffix}"),
@@ -253,7 +253,7 @@ with IndexStore(sys.argv[1]).lock():
 
 def test_a_writer_in_another_process_is_named_and_its_death_frees_the_lock(tmp_path):
     filled(tmp_path)
-    with running([sys.executable, "-c", HOLDING, str(tmp_path)]) as holder:
+    with run_process([sys.executable, "-c", HOLDING, str(tmp_path)]) as holder:
         first_line(holder)
         with pytest.raises(LockedIndex, match=f"process {holder.pid} is writing"):
             filled(tmp_path)

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import indexes.errors
-from _touch_retrieval.files import DEEPEST, file_digest, read_regular
+from _touch_retrieval.files import MAX_DEPTH, file_digest, read_regular
 from indexes import KINDS, load_kind
 from indexes.errors import (
     CorruptIndex,
@@ -27,15 +27,15 @@ from indexes.errors import (
     WriteFailed,
 )
 from indexes.store.folder import IndexStore
-from indexes.store.manifest import own_digest
+from indexes.store.manifest import content_digest
 from tests.indexes.test_store import FINGERPRINT, filled, names, rows_of, unit
 
-TABLES = ["rows.jsonl", "table.npy", "embeddings.npy", "halves.npy"]
+TABLES = ["rows.jsonl", "table.npy", "embeddings.npy", "partials.npy"]
 FILES = ["manifest.json", "vectors.faiss", "calibration.json", *TABLES]
 
 
 def make(path, count=20, kind="hnsw"):
-    arrays, documents = {"halves": np.ones((count, 3), np.float16)}, {"calibration": {"a": 1}}
+    arrays, documents = {"partials": np.ones((count, 3), np.float16)}, {"calibration": {"a": 1}}
     return filled(path, count, kind, arrays=arrays, documents=documents).folder
 
 
@@ -68,7 +68,7 @@ def forge(folder, change=lambda content: None, **fields):
         if (folder / name).is_file():
             must |= {"bytes": (folder / name).stat().st_size, "sha256": file_digest(folder / name)}
     change(content)
-    path.write_text(json.dumps(content | {"sha256": own_digest(content)}))
+    path.write_text(json.dumps(content | {"sha256": content_digest(content)}))
 
 
 def flip(path, position: int, bit: int = 0) -> None:
@@ -197,7 +197,7 @@ def test_garbage_of_the_right_size_never_escapes_as_a_raw_exception(folder, name
 
 
 def test_a_pickled_array_is_not_loaded(folder):
-    np.save(folder / "halves.npy", np.array([{"a": 1}] * 20, dtype=object), allow_pickle=True)
+    np.save(folder / "partials.npy", np.array([{"a": 1}] * 20, dtype=object), allow_pickle=True)
     forge(folder)
     with pytest.raises(CorruptIndex, match="cannot be read"):
         opened(folder)
@@ -210,7 +210,7 @@ def test_a_pickled_array_is_not_loaded(folder):
         *(({"format": old}, UnsupportedFormat, f"older format {old}.*build-index") for old in (3, 2, 0, -1)),
         *(({"format": odd}, CorruptIndex, "must say its format version") for odd in (None, "1", True, 1.5, [1])),
         ({"kind": "quantum"}, UnsupportedFormat, r"quantum.*Update the software"),
-        ({"kind": "ivf_flat", "parameters": {}, "asked": {}}, CorruptIndex, "IndexHNSWFlat"),
+        ({"kind": "ivf_flat", "parameters": {}, "requested": {}}, CorruptIndex, "IndexHNSWFlat"),
         ({"colour": "red"}, CorruptIndex, "has no setting 'colour'"),
     ],
 )
@@ -232,7 +232,7 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
     max_leaves=5,
 )
-FIELDS = ["about", "arrays", "asked", "counts", "dim", "documents", "files", "fingerprint", "format", "generation"]
+FIELDS = ["about", "arrays", "requested", "counts", "dim", "documents", "files", "fingerprint", "format", "generation"]
 FIELDS += ["kind", "parameters", "parent", "recall", "seed", "metric", "created", "software"]
 
 
@@ -257,8 +257,8 @@ def test_any_field_of_the_manifest_may_be_forged(kept, field, value):
         lambda content: content["files"]["calibration.json"].pop("bytes"),
         lambda content: content["files"].pop("rows.jsonl"),
         lambda content: content["documents"].append("calibration"),
-        lambda content: content["documents"].append("halves"),
-        lambda content: content["arrays"].append("halves"),
+        lambda content: content["documents"].append("partials"),
+        lambda content: content["arrays"].append("partials"),
         lambda content: content["documents"].append("../../secret"),
         lambda content: content["arrays"].append("../../secret"),
         lambda content: content["files"].__setitem__("rows.jsonl\n", {"bytes": 1, "sha256": ""}),
@@ -311,7 +311,7 @@ def same(field):
         ("table.npy", out_of("slot", 10**6)),
         ("table.npy", lambda table: table[:0]),
         ("table.npy", lambda table: table["stop"]),
-        ("halves.npy", lambda halves: halves[:7]),
+        ("partials.npy", lambda partials: partials[:7]),
         ("embeddings.npy", lambda vectors: vectors * np.float32("nan")),
         ("embeddings.npy", lambda vectors: vectors * 1000),
         ("embeddings.npy", lambda vectors: vectors[:, :5]),
@@ -344,7 +344,7 @@ def test_any_row_may_be_forged(kept, line):
 
 
 def test_a_row_nested_deeper_than_anyone_reads_is_refused_as_it_is_written(tmp_path):
-    deep = json.loads("[" * DEEPEST + "]" * DEEPEST)
+    deep = json.loads("[" * MAX_DEPTH + "]" * MAX_DEPTH)
     rows = rows_of(names(2))
     with pytest.raises(RowError, match="must not be nested deeper than 64 levels"):
         IndexStore(tmp_path).write([rows[0], rows[1] | {"metadata": deep}], unit(2), fingerprint=FINGERPRINT)

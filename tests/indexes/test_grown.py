@@ -8,7 +8,7 @@ import pytest
 from indexes.errors import CorruptIndex, MismatchedIndex, ParameterError, RowError, VectorError
 from indexes.store import equal
 from indexes.store.arrays import ArrayFile
-from indexes.store.equal import first_of_equals
+from indexes.store.equal import first_equal_rows
 from indexes.store.folder import IndexStore
 from indexes.store.rows import key_of
 from indexes.store.tables import Block
@@ -17,10 +17,10 @@ from tests.indexes.test_store import APPROXIMATE, DIM, EVERY_KIND, FINGERPRINT, 
 
 def block(start: int, stop: int, **more) -> Block:
     """Rows start to stop - 1, whose halves hold their numbers."""
-    halves = np.arange(start, stop, dtype=np.float32)[:, None] * np.ones(3, np.float32)
+    partials = np.arange(start, stop, dtype=np.float32)[:, None] * np.ones(3, np.float32)
     rows = [row | more for row in rows_of(names(stop - start, start))]
     return Block(
-        rows, unit(stop, seed=7)[start:stop] if start == 0 else unit(stop - start, seed=start), {"halves": halves}
+        rows, unit(stop, seed=7)[start:stop] if start == 0 else unit(stop - start, seed=start), {"partials": partials}
     )
 
 
@@ -46,7 +46,7 @@ def test_a_grown_index_holds_the_parents_rows_and_the_new_ones_and_leaves_the_pa
     assert {path.name: path.read_bytes() for path in first.folder.iterdir()} == before
     opened = store.open(threads=1)
     assert [row["id"] for row in opened.rows] == names(1010)
-    assert opened.arrays["halves"][:, 0].tolist() == list(range(1010))
+    assert opened.arrays["partials"][:, 0].tolist() == list(range(1010))
     assert np.array_equal(opened.embeddings[:1000], unit(1000, seed=7))
     assert [hits[0] for hits, _ in opened.search(unit(10, seed=1000), 1)] == list(range(1000, 1010))
     opened.self_check(1010)
@@ -68,9 +68,9 @@ def test_a_generation_is_a_folder_that_can_be_taken_elsewhere_alone(tmp_path):
 def test_blocks_and_one_writing_give_the_same_files(tmp_path):
     whole, parts = (IndexStore(tmp_path / name) for name in "ab")
     rows = rows_of(names(300))
-    halves = np.arange(900, dtype=np.float16).reshape(300, 3)
-    whole.write(rows, unit(300), {"halves": halves}, fingerprint=FINGERPRINT, kind="hnsw", threads=1)
-    blocks = (Block(rows[n : n + 7], unit(300)[n : n + 7], {"halves": halves[n : n + 7]}) for n in range(0, 300, 7))
+    partials = np.arange(900, dtype=np.float16).reshape(300, 3)
+    whole.write(rows, unit(300), {"partials": partials}, fingerprint=FINGERPRINT, kind="hnsw", threads=1)
+    blocks = (Block(rows[n : n + 7], unit(300)[n : n + 7], {"partials": partials[n : n + 7]}) for n in range(0, 300, 7))
     grown(parts, blocks, kind="hnsw")
     for path in (tmp_path / "a" / "gen-000001").iterdir():
         if path.name != "manifest.json":
@@ -83,7 +83,7 @@ def test_blocks_are_asked_for_one_at_a_time_and_on_the_disk_before_the_next(tmp_
     def blocks():
         for start in range(0, 5000, 1000):
             (folder,) = tmp_path.glob("gen-*")
-            seen.append((folder / "halves.npy").stat().st_size if start else 0)
+            seen.append((folder / "partials.npy").stat().st_size if start else 0)
             yield block(start, start + 1000)
 
     assert grown(IndexStore(tmp_path), blocks()).count == 5000
@@ -102,7 +102,7 @@ def test_rows_that_go_are_gone_and_their_slots_stay_until_a_tenth_of_them_has_no
     assert third.slots.tolist() == list(range(899))
     for generation in (second, third):
         assert [row["id"] for row in generation.rows] == names(900, 100)[::-1][: generation.count]
-        assert generation.arrays["halves"][:2, 0].tolist() == [999, 998]
+        assert generation.arrays["partials"][:2, 0].tolist() == [999, 998]
         assert generation.row_number("p00500") == 499
         generation.self_check(900)
 
@@ -114,7 +114,7 @@ def test_rows_with_other_metadata_keep_their_vectors_and_get_new_lines(tmp_path)
     second = store.write(rows, None, fingerprint=FINGERPRINT, parent=first)
     assert second.manifest.counts.slots == 100
     assert (second.rows[4], second.rows[5]) == (rows[4], rows[5])
-    assert np.array_equal(second.arrays["halves"], first.arrays["halves"])
+    assert np.array_equal(second.arrays["partials"], first.arrays["partials"])
     assert np.array_equal(second.slots, first.slots)
 
 
@@ -135,8 +135,8 @@ def test_rows_are_taken_over_only_from_a_parent_made_by_the_same_model_and_come_
     ("later", "error", "words"),
     [
         (Block(rows_of("x"), unit(1), {}), RowError, "must have the same arrays"),
-        (Block(rows_of("x"), unit(1), {"halves": np.zeros((1, 2), np.float32)}), RowError, "same arrays"),
-        (Block(rows_of("x"), unit(1, 5), {"halves": np.zeros((1, 3), np.float32)}), VectorError, "8 components"),
+        (Block(rows_of("x"), unit(1), {"partials": np.zeros((1, 2), np.float32)}), RowError, "same arrays"),
+        (Block(rows_of("x"), unit(1, 5), {"partials": np.zeros((1, 3), np.float32)}), VectorError, "8 components"),
         (Block([], None), RowError, "at least one row"),
     ],
 )
@@ -190,7 +190,7 @@ def test_codes_need_enough_vectors_to_be_trained():
 def test_training_looks_at_a_bounded_number_of_vectors(monkeypatch):
     from indexes.kinds.ivf import IVFFlatIndex, IVFParameters
 
-    monkeypatch.setattr("indexes.kinds.ivf.MOST_POINTS_PER_CENTRE", 39)
+    monkeypatch.setattr("indexes.kinds.ivf.MAX_POINTS_PER_CENTRE", 39)
     index = IVFFlatIndex.build(unit(2000), IVFParameters(lists=4), threads=1)
     drawn = index._training()
     assert drawn.shape == (156, DIM)
@@ -245,16 +245,16 @@ def test_codes_of_rows_are_equal_for_equal_texts_and_count_up(tmp_path):
 def test_equal_vectors_are_found_as_two_plain_loops_find_them():
     vectors = unit(40)[np.random.default_rng(1).integers(40, size=200)]
     must = [min(other for other in range(200) if (vectors[other] == vector).all()) for vector in vectors]
-    assert first_of_equals(vectors).tolist() == must
+    assert first_equal_rows(vectors).tolist() == must
 
 
 def test_vectors_that_begin_alike_are_told_apart_by_the_rest():
-    vectors = np.zeros((5, equal.BEGINNING + 4), np.float32)
+    vectors = np.zeros((5, equal.COMPARED_COMPONENTS + 4), np.float32)
     vectors[:, 0] = 1
     vectors[[1, 3], -1], vectors[4, -2] = 0.5, 0.5
-    assert first_of_equals(vectors).tolist() == [0, 1, 0, 1, 4]
+    assert first_equal_rows(vectors).tolist() == [0, 1, 0, 1, 4]
 
 
 def test_zero_and_minus_zero_are_other_bytes():
     vectors = np.array([[1, 0], [1, -0.0], [1, 0]], np.float32)
-    assert first_of_equals(vectors).tolist() == [0, 1, 0]
+    assert first_equal_rows(vectors).tolist() == [0, 1, 0]

@@ -5,9 +5,9 @@ import pytest
 
 from indexes import load_kind
 from indexes.errors import ParameterError
-from indexes.kinds.base import VectorIndex
 from indexes.kinds.exact import ExactIndex
 from indexes.kinds.measure import query_ms, recall_against_exact, sample_queries
+from indexes.kinds.vector_index import VectorIndex
 from tests.oracle import disagreements
 
 AXES = np.eye(6, dtype=np.float32)
@@ -101,7 +101,7 @@ def test_recall_without_queries_is_refused():
 
 def test_recall_of_the_whole_is_the_mean_over_any_partition():
     vectors = unit(800, 16)
-    index = load_kind("ivf_flat").build(vectors).tuned(probes=1)
+    index = load_kind("ivf_flat").build(vectors).with_settings(probes=1)
     queries = sample_queries(vectors, 60)
     parts = [recall_against_exact(index, queries[start : start + 20]) for start in (0, 20, 40)]
     assert np.mean(parts) == pytest.approx(recall_against_exact(index, queries))

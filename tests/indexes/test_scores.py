@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from indexes.kinds.scores import best, grid_scores, on_grid, scan, slack
+from indexes.kinds.scores import error_bound, grid_scores, scan, to_grid, top_k
 
 
 def unit(count: int, dim: int, seed: int = 0) -> np.ndarray:
@@ -18,7 +18,7 @@ def unit(count: int, dim: int, seed: int = 0) -> np.ndarray:
 def test_a_score_is_the_sum_of_products_by_hand():
     query = np.array([[0.6, 0.8]], np.float32)
     vectors = np.array([[1.0, 0.0], [0.0, 1.0], [-0.6, 0.8]], np.float32)
-    scores = grid_scores(on_grid(query), on_grid(vectors))
+    scores = grid_scores(to_grid(query), to_grid(vectors))
     np.testing.assert_allclose(scores, [[0.6, 0.8, 0.28]], rtol=0, atol=2**-24)  # one rounding to float32
 
 
@@ -26,11 +26,11 @@ def test_a_score_is_the_sum_of_products_by_hand():
 def test_every_order_of_the_sum_gives_the_same_bits(dim):
     rng = np.random.default_rng(dim)
     query, vectors = unit(1, dim, seed=1), unit(50, dim, seed=2)
-    must = grid_scores(on_grid(query), on_grid(vectors))
+    must = grid_scores(to_grid(query), to_grid(vectors))
     for _ in range(5):
         order = rng.permutation(dim)
-        assert np.array_equal(must, grid_scores(on_grid(query[:, order]), on_grid(vectors[:, order])))
-    one_by_one = [grid_scores(on_grid(query), on_grid(vector[None]))[0, 0] for vector in vectors]
+        assert np.array_equal(must, grid_scores(to_grid(query[:, order]), to_grid(vectors[:, order])))
+    one_by_one = [grid_scores(to_grid(query), to_grid(vector[None]))[0, 0] for vector in vectors]
     assert np.array_equal(must[0], one_by_one)
 
 
@@ -38,9 +38,9 @@ def test_every_order_of_the_sum_gives_the_same_bits(dim):
 @given(dim=st.integers(1, 600), seed=st.integers(0, 10**6), scale=st.sampled_from([0.999, 1.0, 1.001]))
 def test_the_gridded_sum_is_exact_and_near_the_true_one(dim, seed, scale):
     left, right = unit(1, dim, seed)[0] * np.float32(scale), unit(1, dim, seed + 1)[0]
-    counted = on_grid(left).astype(object) * on_grid(right).astype(object)
+    counted = to_grid(left).astype(object) * to_grid(right).astype(object)
     whole = sum(int(product) for product in counted)  # Python's integers are exact
-    score = grid_scores(on_grid(left), on_grid(right[None]))[0]
+    score = grid_scores(to_grid(left), to_grid(right[None]))[0]
     assert score == np.float32(whole * 2.0**-52)
     true = math.fsum(float(a) * float(b) for a, b in zip(left, right, strict=True))
     assert abs(whole * 2.0**-52 - true) <= 2.0**-26 * 1.002 * math.sqrt(dim)
@@ -49,8 +49,8 @@ def test_the_gridded_sum_is_exact_and_near_the_true_one(dim, seed, scale):
 @pytest.mark.parametrize("dim", [2, 64, 512])
 def test_the_slack_covers_what_a_float32_product_may_be_off(dim):
     queries, vectors = unit(20, dim, seed=3), unit(200, dim, seed=4)
-    off = np.abs((queries @ vectors.T) - grid_scores(on_grid(queries), on_grid(vectors)))
-    assert off.max() <= slack(dim) < 1e-3
+    off = np.abs((queries @ vectors.T) - grid_scores(to_grid(queries), to_grid(vectors)))
+    assert off.max() <= error_bound(dim) < 1e-3
 
 
 def test_the_worst_case_of_the_grid_stays_within_the_slack():
@@ -58,13 +58,13 @@ def test_the_worst_case_of_the_grid_stays_within_the_slack():
     dim = 4096
     vector = np.full((1, dim), 1 / 64 + 2.0**-28, np.float32)
     exact = dim * float(vector[0, 0]) ** 2
-    assert abs(float(grid_scores(on_grid(vector), on_grid(vector))[0, 0]) - exact) <= slack(dim)
+    assert abs(float(grid_scores(to_grid(vector), to_grid(vector))[0, 0]) - exact) <= error_bound(dim)
 
 
 def test_the_best_are_ordered_by_score_and_then_slot():
     scores = np.array([0.5, 0.9, 0.5, 0.9, 0.1], np.float32)
     slots = np.array([7, 4, 2, 1, 0])
-    got = best(scores, slots, 4)
+    got = top_k(scores, slots, 4)
     assert got[1].tolist() == [1, 4, 2, 7]
     assert got[0].tolist() == np.array([0.9, 0.9, 0.5, 0.5], np.float32).tolist()
 

@@ -324,16 +324,16 @@ def test_settings_are_checked(kind):
     ("name", "value", "least"),
     [("neighbours", 1, 2), ("neighbours", 2**31, 2), ("ef_construction", 2**31, 1), ("ef_search", 2**31, 1)],
 )
-def test_what_faiss_cannot_count_is_refused(name, value, least):
+def test_what_faiss_cannot_count_is_refused(name, value, minimum):
     """With one link a node FAISS ends the process."""
-    with pytest.raises(ParameterError, match=f"{name} must be a whole number of at least {least} and at most 2147"):
+    with pytest.raises(ParameterError, match=f"{name} must be a whole number of at least {minimum} and at most 2147"):
         load_kind("hnsw").parameters_from({name: value})
 
 
 def test_the_broadest_search_there_is_may_look_further():
     """One slot in forty is live, so that the first round finds too few."""
     vectors = unit(400)
-    index = load_kind("hnsw").build(vectors).tuned(ef_search=2**31 - 1)
+    index = load_kind("hnsw").build(vectors).with_settings(ef_search=2**31 - 1)
     live = np.arange(400) % 40 == 7
     slots = index.search(vectors[:50], 2, live)[1]
     assert np.array_equal(slots, load_kind("exact").build(vectors).search(vectors[:50], 2, live)[1])
@@ -348,16 +348,16 @@ def test_parameters_of_another_kind_are_refused():
 
 def test_only_search_settings_change_without_a_build(built):
     with pytest.raises(ParameterError, match=f"{built.kind} can change"):
-        built.tuned(neighbours=3)
+        built.with_settings(neighbours=3)
     for setting in built.search_settings:
-        other = built.tuned(**{setting: 3})
+        other = built.with_settings(**{setting: 3})
         assert other.settings()[setting] == 3
         assert built.settings()[setting] != 3
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_tiny_indexes_of_every_kind_without_codes_work(kind, count):
-    if count < kind.fewest:
+    if count < kind.min_vectors:
         with pytest.raises(ParameterError, match="624 or more vectors"):
             kind.build(unit(count))
         return

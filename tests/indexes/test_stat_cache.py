@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from indexes.errors import MismatchedIndex, RowError
-from indexes.kinds.base import VectorIndex
+from indexes.kinds.vector_index import VectorIndex
 from indexes.store import stat_cache
 from indexes.store.folder import IndexStore
 from indexes.store.rows import KeyIndex, are_distinct, keys_of
@@ -27,11 +27,11 @@ def rows(numbers):
 def store(tmp_path):
     """An index of 40 rows with an array."""
     made = IndexStore(tmp_path / "index")
-    made.write(rows(range(40)), unit(40), {"halves": np.arange(80, dtype=np.float16).reshape(40, 2)}, fingerprint=OF)
+    made.write(rows(range(40)), unit(40), {"partials": np.arange(80, dtype=np.float16).reshape(40, 2)}, fingerprint=OF)
     return made
 
 
-def test_a_file_is_known_by_all_that_it_looks_like(tmp_path):
+def test_a_file_is_identified_by_its_whole_status(tmp_path):
     ids, digests = keys_of(["a", "b", "c"]), keys_of(["1", "2", "3"])
     statuses = np.arange(12, dtype=np.uint64).reshape(3, 4) + np.uint64(2**64 - 20)
     StatRecords(tmp_path).write(ids, digests, statuses)
@@ -92,16 +92,16 @@ def test_keys_are_distinct_though_they_begin_alike():
 
 def test_rows_that_are_kept_are_those_that_would_have_been_written(store, tmp_path):
     parent = store.open()
-    new = Block(rows([50]), unit(1, seed=5), {"halves": np.ones((1, 2), np.float16)})
+    new = Block(rows([50]), unit(1, seed=5), {"partials": np.ones((1, 2), np.float16)})
     kept = store.write_blocks([range(5), new, range(9, 40)], fingerprint=OF, parent=parent)
     other = IndexStore(tmp_path / "other")
-    other.write(rows(range(40)), unit(40), {"halves": parent.arrays["halves"]}, fingerprint=OF)
+    other.write(rows(range(40)), unit(40), {"partials": parent.arrays["partials"]}, fingerprint=OF)
     written = other.write_blocks(
         [Block(rows(range(5))), new, Block(rows(range(9, 40)))], fingerprint=OF, parent=other.open()
     )
     assert kept.rows.text.tobytes() == written.rows.text.tobytes()
     np.testing.assert_array_equal(kept.rows.table, written.rows.table)
-    np.testing.assert_array_equal(kept.arrays["halves"], written.arrays["halves"])
+    np.testing.assert_array_equal(kept.arrays["partials"], written.arrays["partials"])
     np.testing.assert_array_equal(kept.embeddings, written.embeddings)
     assert kept.manifest.parent == parent.name
 
@@ -119,7 +119,7 @@ def test_what_a_parent_has_checked_is_checked_by_a_sample(store, monkeypatch):
     searched = []
     search = VectorIndex.search
     monkeypatch.setattr(VectorIndex, "search", lambda self, q, *how: searched.append(len(q)) or search(self, q, *how))
-    new = Block(rows([50, 51]), unit(2, seed=5), {"halves": np.ones((2, 2), np.float16)})
+    new = Block(rows([50, 51]), unit(2, seed=5), {"partials": np.ones((2, 2), np.float16)})
     store.write_blocks([range(40), new], fingerprint=OF, parent=store.open(), self_check=32)
     assert searched == [2 + 32 // 16]
     store.write_blocks([range(40)], fingerprint=OF, parent=store.open(), self_check=32, kind="hnsw")
@@ -128,6 +128,6 @@ def test_what_a_parent_has_checked_is_checked_by_a_sample(store, monkeypatch):
 
 def test_the_ends_of_lines_are_compared_unparsed(store):
     found = store.open().rows
-    assert found.ending(b'"metadata": {}}').all()
-    assert found.ending(b'"d7", "metadata": {}}').nonzero()[0].tolist() == [7]
-    assert not found.ending(b"x" * 1000).any()
+    assert found.lines_end_with(b'"metadata": {}}').all()
+    assert found.lines_end_with(b'"d7", "metadata": {}}').nonzero()[0].tolist() == [7]
+    assert not found.lines_end_with(b"x" * 1000).any()

@@ -49,11 +49,11 @@ def test_what_is_written_is_read_back(tmp_path, kind):
         {"id": f"фото/{n}\u2028.jpg", "digest": str(n), "metadata": {"price": 0.1 + n, "tags": [None, True]}}
         for n in range(count)
     ]
-    halves = np.random.default_rng(0).normal(size=(count, 6)).astype(np.float16)
+    partials = np.random.default_rng(0).normal(size=(count, 6)).astype(np.float16)
     written = IndexStore(tmp_path / "a" / "index").write(
         rows,
         unit(count),
-        {"halves": halves, "sizes": np.arange(count)},
+        {"partials": partials, "sizes": np.arange(count)},
         {"calibration": {"scale": 1.25}},
         fingerprint=FINGERPRINT,
         about={"checkpoint": "model.safetensors"},
@@ -67,9 +67,9 @@ def test_what_is_written_is_read_back(tmp_path, kind):
         assert generation.folder == tmp_path / "a" / "index" / "gen-000001"
         assert generation.rows == rows
         assert generation.count == count
-        assert np.array_equal(generation.arrays["halves"], halves)
+        assert np.array_equal(generation.arrays["partials"], partials)
         assert np.array_equal(generation.arrays["sizes"], np.arange(count))
-        assert isinstance(generation.arrays["halves"], np.memmap)
+        assert isinstance(generation.arrays["partials"], np.memmap)
         assert generation.documents == {"calibration": {"scale": 1.25}}
         assert np.array_equal(generation.embeddings[generation.slots], unit(count))
         assert generation.row_number(rows[7]["id"]) == 7
@@ -153,8 +153,8 @@ def test_ties_between_slots_go_by_row_id_whatever_the_order_of_writing(tmp_path)
 @pytest.mark.parametrize("kind", EVERY_KIND)
 def test_unchanged_rows_keep_their_vectors_and_only_new_ones_are_given(tmp_path, kind):
     store, count = IndexStore(tmp_path), 700
-    halves = np.arange(count, dtype=np.float32)[:, None]
-    first = store.write(rows_of(names(count)), unit(count), {"halves": halves}, kind=kind, **MORE)
+    partials = np.arange(count, dtype=np.float32)[:, None]
+    first = store.write(rows_of(names(count)), unit(count), {"partials": partials}, kind=kind, **MORE)
     # p00000 goes, p00001 changes, "new" comes; the rest stays, in another order and with other metadata.
     kept = [row | {"price": 3} for row in rows_of(names(count - 2, start=2))][::-1]
     wanted = [{"id": "new", "digest": "1"}, *kept, {"id": "p00001", "digest": "2"}]
@@ -162,12 +162,12 @@ def test_unchanged_rows_keep_their_vectors_and_only_new_ones_are_given(tmp_path,
     assert sorted(reuse) == names(count - 2, start=2)
     assert reuse["p00005"] == 5
     fresh, extra = unit(2, seed=9), np.array([[-1.0], [-2.0]], np.float32)
-    second = store.write(wanted, fresh, {"halves": extra}, kind=kind, parent=first, **MORE)
+    second = store.write(wanted, fresh, {"partials": extra}, kind=kind, parent=first, **MORE)
     assert second.manifest.parent == "gen-000001"
     assert second.rows == wanted
     expected = np.concatenate([fresh[:1], unit(count)[2:][::-1], fresh[1:]])
     assert np.array_equal(second.embeddings[second.slots], expected)
-    assert np.asarray(second.arrays["halves"])[:, 0].tolist() == [-1.0, *range(count - 1, 1, -1), -2.0]
+    assert np.asarray(second.arrays["partials"])[:, 0].tolist() == [-1.0, *range(count - 1, 1, -1), -2.0]
     for place in (0, 5, count - 1):
         hits, scores = second.search(expected[place : place + 1], 1)[0]
         assert hits.tolist() == [place]
@@ -272,10 +272,10 @@ def test_file_names_of_unknown_coding_survive(tmp_path):
         ({"embeddings": unit(2)}, VectorError, "each of the 3 new rows; got 2"),
         ({"embeddings": None}, VectorError, "each of the 3 new rows; got 0"),
         ({"embeddings": unit(3) * np.float32(2)}, VectorError, "row 'a': the norm must be 1"),
-        ({"arrays": {"halves": np.zeros((2, 4))}}, RowError, "each of 3 new rows; got 2"),
-        ({"arrays": {"halves": np.float16([[1], [np.inf], [2]])}}, RowError, "row 'b' holds NaN or inf"),
-        ({"arrays": {"halves": np.array([{}, 1, 2])}}, RowError, "array of numbers"),
-        ({"arrays": {"halves": np.zeros((3, 0))}}, RowError, "at least one number"),
+        ({"arrays": {"partials": np.zeros((2, 4))}}, RowError, "each of 3 new rows; got 2"),
+        ({"arrays": {"partials": np.float16([[1], [np.inf], [2]])}}, RowError, "row 'b' holds NaN or inf"),
+        ({"arrays": {"partials": np.array([{}, 1, 2])}}, RowError, "array of numbers"),
+        ({"arrays": {"partials": np.zeros((3, 0))}}, RowError, "at least one number"),
         ({"arrays": {"rows": np.zeros(3)}}, RowError, "lower-case words"),
         ({"arrays": {"../x": np.zeros(3)}}, RowError, "lower-case words"),
         ({"documents": {"manifest": {}}}, RowError, "lower-case words"),
@@ -317,13 +317,13 @@ def test_a_search_for_no_number_of_results_is_refused_and_ends(tmp_path, k):
     ("arrays", "words"),
     [
         (None, r"the same arrays: halves float64 \(2,\); got none"),
-        ({"halves": np.zeros((1, 2)), "more": np.zeros(1)}, r"got halves float64 \(2,\), more float64 \(\)"),
-        ({"halves": np.zeros((1, 3))}, r"got halves float64 \(3,\)"),
-        ({"halves": np.zeros((1, 2), np.float32)}, r"got halves float32 \(2,\)"),
+        ({"partials": np.zeros((1, 2)), "more": np.zeros(1)}, r"got halves float64 \(2,\), more float64 \(\)"),
+        ({"partials": np.zeros((1, 3))}, r"got halves float64 \(3,\)"),
+        ({"partials": np.zeros((1, 2), np.float32)}, r"got halves float32 \(2,\)"),
     ],
 )
 def test_arrays_that_differ_from_the_parents_are_refused(tmp_path, arrays, words):
-    parent = filled(tmp_path, arrays={"halves": np.zeros((20, 2))})
+    parent = filled(tmp_path, arrays={"partials": np.zeros((20, 2))})
     with pytest.raises(RowError, match=words):
         IndexStore(tmp_path).write(rows_of(names(21)), unit(1, seed=3), arrays, fingerprint=FINGERPRINT, parent=parent)
 
@@ -365,7 +365,7 @@ def test_the_self_check_passes_where_codes_cannot_tell_near_copies_apart(tmp_pat
     more = {"fingerprint": {}, "kind": "ivf_pq", "parameters": coarse, "threads": 1, "self_check": 50}
     generation = IndexStore(tmp_path).write(rows_of(names(count)), vectors, **more)
     drawn = np.arange(0, count, 200)
-    assert len(generation._lost(drawn, 1)) > 20 > len(generation._lost(drawn, 200)) == 0
+    assert len(generation._rows_not_found(drawn, 1)) > 20 > len(generation._rows_not_found(drawn, 200)) == 0
 
 
 def test_the_self_check_names_the_rows_that_a_wrong_structure_loses(tmp_path):
@@ -389,21 +389,21 @@ def test_old_generations_are_deleted_but_for_the_last_two(tmp_path):
 
 
 def test_a_reader_keeps_its_generation_while_a_writer_makes_four_more(tmp_path):
-    halves = np.arange(40, dtype=np.float32).reshape(20, 2)
-    filled(tmp_path, arrays={"halves": halves}, kind="hnsw")
+    partials = np.arange(40, dtype=np.float32).reshape(20, 2)
+    filled(tmp_path, arrays={"partials": partials}, kind="hnsw")
     reader = IndexStore(tmp_path).open()
     before = reader.search(unit(4, seed=2), 3)
     for turn in range(4):
         IndexStore(tmp_path).write(rows_of("ab"), unit(2, seed=turn), fingerprint=FINGERPRINT)
     assert not reader.folder.exists()
-    assert np.array_equal(reader.arrays["halves"], halves)
+    assert np.array_equal(reader.arrays["partials"], partials)
     assert np.array_equal(reader.embeddings[reader.slots], unit(20))
     for a, b in zip(before, reader.search(unit(4, seed=2), 3), strict=True):
         assert np.array_equal(a[0], b[0])
     assert IndexStore(tmp_path).open().count == 2
     # Even a deleted generation can be the parent of the next.
     again = IndexStore(tmp_path).write(reader.rows, None, parent=reader, kind="hnsw", **MORE)
-    assert np.array_equal(again.arrays["halves"], halves)
+    assert np.array_equal(again.arrays["partials"], partials)
 
 
 CHANGES = st.lists(st.dictionaries(st.integers(0, 11), st.integers(0, 4), min_size=1), min_size=2, max_size=4)
@@ -422,12 +422,12 @@ def test_any_changes_of_a_catalogue_end_in_what_a_fresh_build_gives(tmp_path_fac
         known = generation.reusable({row["id"]: row["digest"] for row in rows}) if generation else {}
         fresh = np.array([contents[int(row["digest"])] for row in rows if row["id"] not in known])
         fresh = fresh.reshape(-1, DIM).astype(np.float32)
-        halves = fresh[:, :2].astype(np.float16)
-        generation = store.write(rows, fresh, {"halves": halves}, parent=generation, **more)
+        partials = fresh[:, :2].astype(np.float16)
+        generation = store.write(rows, fresh, {"partials": partials}, parent=generation, **more)
         whole = contents[[int(row["digest"]) for row in rows]]
-        anew = IndexStore(folder / "fresh").write(rows, whole, {"halves": whole[:, :2].astype(np.float16)}, **more)
+        anew = IndexStore(folder / "fresh").write(rows, whole, {"partials": whole[:, :2].astype(np.float16)}, **more)
         assert generation.rows == anew.rows
-        assert np.array_equal(generation.arrays["halves"], anew.arrays["halves"])
+        assert np.array_equal(generation.arrays["partials"], anew.arrays["partials"])
         for k in (1, 2, 12):
             # Approximate kinds are exhaustive when all slots are asked for.
             if k < 12 and kind not in ("exact", "flat"):

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from indexes.errors import WriteFailed
-from indexes.store.unfinished import NAME, Unfinished
+from indexes.store.unfinished import NAME, UnfinishedBuild
 
 LAYOUTS = {"embedding": (np.dtype(np.float32), (3,)), "error": (np.dtype(np.float32), ())}
 OF = {"checkpoint": "abc"}
 
 
 def opened(index, of=None, layouts=LAYOUTS):
-    return Unfinished(index, of or OF, layouts)
+    return UnfinishedBuild(index, of or OF, layouts)
 
 
 def made(*numbers):
@@ -25,7 +25,7 @@ def made(*numbers):
 
 def kept(index, *numbers):
     with opened(index) as unfinished:
-        unfinished.keep([f"digest {number}" for number in numbers], made(*numbers))
+        unfinished.add([f"digest {number}" for number in numbers], made(*numbers))
 
 
 def found(index, *numbers, **how):
@@ -79,14 +79,14 @@ def test_a_record_that_does_not_fit_its_checksum_is_not_there(tmp_path):
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_is_not_kept(tmp_path, bad):
     with opened(tmp_path) as unfinished:
-        unfinished.keep(["digest 1", "digest 2"], made(1, bad))
+        unfinished.add(["digest 1", "digest 2"], made(1, bad))
     assert set(found(tmp_path, 1, 2)) == {1}
 
 
 def test_clearing_takes_away_what_every_model_left(tmp_path):
     kept(tmp_path, 1)
     with opened(tmp_path, {"checkpoint": "other"}) as unfinished:
-        unfinished.keep(["digest 2"], made(2))
+        unfinished.add(["digest 2"], made(2))
         unfinished.clear()
         unfinished.clear()
     assert list(tmp_path.iterdir()) == []
@@ -94,10 +94,10 @@ def test_clearing_takes_away_what_every_model_left(tmp_path):
 
 def test_a_disk_that_refuses_is_named(tmp_path):
     with opened(tmp_path) as unfinished:
-        unfinished.keep(["digest 1"], made(1))
+        unfinished.add(["digest 1"], made(1))
         unfinished._connection.execute("PRAGMA max_page_count = 2")  # as a full disk
         with pytest.raises(WriteFailed, match=r"unfinished\.sqlite: the disk refused \(database or disk is full"):
-            unfinished.keep([f"digest {number}" for number in range(1000)], made(*range(1000)))
+            unfinished.add([f"digest {number}" for number in range(1000)], made(*range(1000)))
     (tmp_path / "file").touch()
     with opened(tmp_path / "file") as unfinished, pytest.raises(WriteFailed, match="the disk refused"):
-        unfinished.keep(["digest 1"], made(1))
+        unfinished.add(["digest 1"], made(1))

@@ -19,10 +19,10 @@ from retrieval.data import views
 from retrieval.data.dataset import PairBatch
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.evaluation.real import PROTOCOLS
-from retrieval.evaluation.real.protocol import Protocol, first_guess
-from retrieval.frontier.points import Row
+from retrieval.evaluation.real.protocol import Protocol, topn_accuracy
+from retrieval.frontier.points import ApproximationResult
 from retrieval.methods import METHODS
-from retrieval.methods.base import Setting
+from retrieval.methods.method import MethodSettings
 from retrieval.methods.trivial import Chance
 from retrieval.metrics import protocols, registry
 from retrieval.metrics.registry import Metric
@@ -32,14 +32,14 @@ from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses.loss import Loss
 from retrieval.model.losses.match import match_loss
-from retrieval.model.towers.small import Small
+from retrieval.model.towers.small import SmallTower
 from retrieval.training.step import WeightedLosses, batch_loss
 from robot import real_rig
 from robot.devices import TactileSensor
 from robot.errors import PlanError
-from robot.exporters.base import Exported, whole_folder
+from robot.exporters.exporting import RecordingExport, atomic_folder
 from robot.grasping import gates
-from robot.grasping.attempt import Attempter, AttemptSettings
+from robot.grasping.attempt import AttemptRunner, AttemptSettings
 from robot.grasping.planner import GraspPlanner
 from robot.readings import Frame
 from robot.sim.objects import draw, materials, relief, shapes
@@ -64,7 +64,7 @@ def add_a_tower(monkeypatch):
     assert matcher(torch.rand(1, 1, 3, 32, 32), torch.rand(1, 3, 32, 32)).shape == (1,)
 
 
-class MyTower(Small):
+class MyTower(SmallTower):
     pass
 
 
@@ -91,7 +91,7 @@ def add_a_view_of_a_photo(monkeypatch):
 
 
 def add_a_method_to_compare(monkeypatch):
-    assert isinstance(METHODS.resolve(f"{HERE}:Mine")(Setting(Config())), Mine)
+    assert isinstance(METHODS.resolve(f"{HERE}:Mine")(MethodSettings(Config())), Mine)
 
 
 class Mine(Chance):
@@ -103,15 +103,15 @@ def add_a_metric(monkeypatch):
     monkeypatch.setitem(registry.METRICS, "mine", metric)
     owner = np.arange(3)
     table = ScoreTable(np.eye(3, dtype=np.float32), owner, owner, np.zeros((3, 3), bool))
-    scored = registry.Scored(table, table, {}, None, 0)
-    assert registry.take(scored, ["mine"])["mine"].values.shape == (3, 1)
+    scored = registry.MethodScoreTables(table, table, {}, None, 0)
+    assert registry.compute(scored, ["mine"])["mine"].values.shape == (3, 1)
 
 
 def add_a_protocol_of_real_data(monkeypatch):
-    assert PROTOCOLS.resolve(f"{HERE}:MY_PROTOCOL").main == "guesses_k3"
+    assert PROTOCOLS.resolve(f"{HERE}:MY_PROTOCOL").main == "topn_k3"
 
 
-MY_PROTOCOL = Protocol("vt60", "Mine", "Nothing is split.", lambda facts, seed: [], first_guess(3))
+MY_PROTOCOL = Protocol("vt60", "Mine", "Nothing is split.", lambda facts, seed: [], topn_accuracy(3))
 
 
 def add_a_kind_of_index(monkeypatch):
@@ -149,7 +149,7 @@ def add_a_setting_of_a_device(monkeypatch):
 def add_a_grasp_planner(monkeypatch):
     rig = robot.load_rig("sim", seed=3, planner={"name": f"{HERE}:Nowhere", "place": "the moon"})
     with rig:
-        attempt = Attempter(rig, 3, AttemptSettings()).run(rig.object_ids(1)[0], 0)
+        attempt = AttemptRunner(rig, 3, AttemptSettings()).run(rig.object_ids(1)[0], 0)
     assert attempt.reason == "the moon is out of reach"
 
 
@@ -181,7 +181,7 @@ def add_a_shape_relief_or_material(monkeypatch):
 
 
 def add_a_gate(monkeypatch):
-    assert gates.judge(lambda touches: 0.75, {}) == (True, 0.75)
+    assert gates.apply_gate(lambda touches: 0.75, {}) == (True, 0.75)
 
 
 def add_an_importer(monkeypatch, tmp_path):
@@ -206,9 +206,9 @@ def add_a_format_to_export_to(monkeypatch, tmp_path):
 
 
 def exported(recording, out, *, parts=None, progress=None):
-    with whole_folder(out) as folder:
+    with atomic_folder(out) as folder:
         (folder / "mine").write_text(recording.grasps[0].grasp_id)
-    return Exported(out, 1)
+    return RecordingExport(out, 1)
 
 
 def add_an_approximation_to_measure(monkeypatch):
@@ -217,7 +217,7 @@ def add_an_approximation_to_measure(monkeypatch):
 
 
 def approximation(sample):
-    return Row("mine", "", ())
+    return ApproximationResult("mine", "", ())
 
 
 def add_a_hard_case(monkeypatch):

@@ -9,9 +9,9 @@ from dataclasses import replace
 import pytest
 
 from retrieval.commands.main import main
-from retrieval.model.stored import read_header
+from retrieval.model.checkpoint_info import read_header
 from retrieval.search.query.answer import EXIT_CODES
-from retrieval.serve.store import Store
+from retrieval.serve.store import HistoryStore
 from robot.recording.folder import RecordingWriter, read_recording
 from tests import real_data_sets
 from tests.documents import ROOT, text_of
@@ -20,7 +20,7 @@ from tests.miniatures import physiclear
 PAGE = ROOT / "docs" / "formats.md"
 
 
-def keys_said(table):
+def documented_keys(table):
     """The keys in the first column of the n-th table of the page."""
     tables = re.findall(r"^\| key \|.*\n\|.*\n((?:\|.*\n)+)", text_of(PAGE), re.M)
     return {key for row in tables[table].splitlines() for key in re.findall(r"`([\w.]+)`", row.split("|")[1])}
@@ -35,7 +35,7 @@ def keys_of(document, said):
 
 
 def check(table, document):
-    said = keys_said(table)
+    said = documented_keys(table)
     assert said == keys_of(document, said)
 
 
@@ -44,7 +44,7 @@ def test_a_recording(tmp_path, recording):
     names = ("photo", "touch_a", "touch_b", "touch_a_before", "touch_a_after", "depth")
     with RecordingWriter(tmp_path / "recording", {"source": "drawn", "sensor": "none"}) as writer:
         writer.append("1", "mug", dict.fromkeys(names, picture))
-        writer.tell(skipped_objects={"ball": "wider than the gripper opens"})
+        writer.update_info(skipped_objects={"ball": "wider than the gripper opens"})
     read = read_recording(tmp_path / "recording")
     check(0, read.info)
     numbers = dict.fromkeys(("force_n", "opening_mm", "touch_skew_s", "time_s"), 1.0)
@@ -98,7 +98,7 @@ def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     assert set(results["skipped"]) == {"rct"}
     entry = results["protocols"]["billets-places"]
     check(10, entry)
-    row, control = entry["rows"]["cca_pca"], entry["controls"]["dealt"]
+    row, control = entry["rows"]["cca_pca"], entry["controls"]["permuted"]
     page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
     said = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}
     touch_to_touch = next(iter(results["protocols"]["physiclear"]["rows"].values()))
@@ -108,7 +108,7 @@ def test_the_results_of_the_benchmark_of_real_data(tmp_path):
 
 
 def test_what_a_service_keeps(tmp_path):
-    store = Store(tmp_path / "history.sqlite", 1, 1)
+    store = HistoryStore(tmp_path / "history.sqlite", 1, 1)
     store.close()
     with closing(sqlite3.connect(tmp_path / "history.sqlite")) as database:
         made = {

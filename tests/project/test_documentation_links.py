@@ -9,7 +9,7 @@ import pytest
 from tests.documents import CONTRIBUTING, NOTEBOOKS, PAGES, README, ROOT, SITE, anchors, links, table_rows, text_of
 
 LINKED = (*PAGES, CONTRIBUTING, *NOTEBOOKS)
-LONGEST_README = 150
+MAX_README_LINES = 150
 OURS = r"(?:retrieval|robot|indexes|tests|benchmarks)"
 
 
@@ -34,7 +34,7 @@ def test_every_page_and_every_picture_is_reached_from_the_readme_or_the_first_pa
 
 
 def test_the_readme_is_short():
-    assert len(text_of(README).splitlines()) <= LONGEST_README
+    assert len(text_of(README).splitlines()) <= MAX_README_LINES
 
 
 def test_the_readmes_tables_are_parts_of_those_in_the_pages():

@@ -8,7 +8,7 @@ from importlib import import_module
 import pytest
 
 from benchmarks.notebooks import FOLDER, execute, kinds
-from retrieval.model.judge import CONTACT, GelCheck
+from retrieval.model.fusion_scorer import CONTACT, GelCheck
 from tests import synthetic
 
 TINY = {
@@ -54,9 +54,9 @@ TINY = {
         "top": 2,
     },
 }
-LARGEST_BYTES = 400_000
+MAX_OUTPUT_BYTES = 400_000
 PACKAGES = ("retrieval", "robot", "indexes")
-LONGEST_CELL = 14
+MAX_CELL_LINES = 14
 
 every_notebook = pytest.mark.parametrize("name", sorted(path.stem for path in FOLDER.glob("*.ipynb")))
 
@@ -114,7 +114,7 @@ def test_committed_outputs_are_small_without_errors_and_name_no_folder_of_a_mach
     assert not any(output.get("name") == "stderr" for output in outputs)
     told = json.dumps([output.get("text", output.get("data", {}).get("text/plain")) for output in outputs])
     assert not re.search(r"(?<![\w.])/(home|root|tmp|work|Users|var|mnt)\b|[A-Z]:\\\\", told)
-    assert (FOLDER / f"{name}.ipynb").stat().st_size < LARGEST_BYTES
+    assert (FOLDER / f"{name}.ipynb").stat().st_size < MAX_OUTPUT_BYTES
 
 
 @every_notebook
@@ -126,7 +126,7 @@ def test_a_notebook_holds_no_logic_and_says_what_it_does(name):
     assert not any(heading.startswith("# ") for heading in headings[1:])
     for cell in code_cells(name)[2:]:  # after parameters and imports
         lines = "".join(cell["source"]).splitlines()
-        assert len(lines) <= LONGEST_CELL, lines[0]
+        assert len(lines) <= MAX_CELL_LINES, lines[0]
         built = [type(node) for node in ast.walk(ast.parse("\n".join(lines)))]
         assert not {ast.FunctionDef, ast.ClassDef, ast.While, ast.Try} & set(built)
     assert not set(document["metadata"]) - {"kernelspec", "language_info"}

@@ -53,7 +53,7 @@ def test_every_folder_of_modules_is_a_package_and_thus_installed():
     assert [folder for folder in sorted(folders) if not (folder / "__init__.py").exists()] == []
 
 
-def test_what_stands_beside_the_tests_is_told():
+def test_test_helpers_are_listed():
     there = {
         path.stem for path in (ROOT / "tests").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
     }

@@ -9,7 +9,7 @@ from urllib.parse import unquote
 import pytest
 
 from tests.documents import ROOT, SITE
-from tests.pages import Page
+from tests.pages import HtmlPage
 
 SETTINGS = ROOT / "zensical.toml"
 
@@ -34,7 +34,9 @@ def site(tmp_path_factory):
     build = [sys.executable, "-m", "zensical", "build", "--clean", "--strict"]
     done = subprocess.run(build, cwd=root, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
-    return root / "site", {page.stem: Page((root / "site" / f"{page.stem}.html").read_text("utf-8")) for page in SITE}
+    return root / "site", {
+        page.stem: HtmlPage((root / "site" / f"{page.stem}.html").read_text("utf-8")) for page in SITE
+    }
 
 
 def test_every_link_of_the_site_leads_to_a_file_and_to_a_place_in_it(site):

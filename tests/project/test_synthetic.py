@@ -20,7 +20,7 @@ from tests.synthetic import (
     relief,
 )
 
-FELT = ("pitch_mm", "depth_mm", "anisotropy", "regularity", "sharpness")
+RELIEF_FIELDS = ("pitch_mm", "depth_mm", "anisotropy", "regularity", "sharpness")
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_every_family_fills_its_depth_and_dents_the_gel(number: int) -> None:
     assert np.abs(pressed - draw_background(0).astype(float)).mean() > 5
 
 
-def test_a_finger_without_force_shows_the_untouched_gel() -> None:
+def test_a_finger_without_force_shows_the_no_contact_frame() -> None:
     """The two differ by their sensor noise alone, of deviation 1.5 each."""
     empty = draw_touch(make_object(1), 0, force_n=0.0)["b"].astype(float) - draw_background(0, "b").astype(float)
     assert abs(empty.mean()) < 0.1
@@ -95,9 +95,9 @@ def test_more_force_dents_more() -> None:
     assert change[2] > 1.3 * change[0]
 
 
-def test_looks_are_independent_of_what_can_be_felt(many: list[DrawnObject]) -> None:
+def test_appearance_is_independent_of_relief(many: list[DrawnObject]) -> None:
     """2000 objects: independent columns correlate by less than 0.1 (4.5 standard errors)."""
-    felt = np.array([[getattr(obj, name) for name in FELT] for obj in many])
+    felt = np.array([[getattr(obj, name) for name in RELIEF_FIELDS] for obj in many])
     looks = np.array([[*obj.colour, *obj.paint, obj.paint_share, obj.gloss, *obj.outline] for obj in many])
     correlation = np.corrcoef(felt.T, looks.T)[: felt.shape[1], felt.shape[1] :]
     assert np.abs(correlation).max() < 0.1
@@ -106,11 +106,11 @@ def test_looks_are_independent_of_what_can_be_felt(many: list[DrawnObject]) -> N
         off = (looks[family == name].mean(0) - looks.mean(0)) / looks.std(0)
         assert np.abs(off).max() < 0.45  # 5.5 standard errors of 154 objects
     assert {field.name for field in fields(DrawnObject)} == {
-        *FELT, "object_id", "seed", "family", "colour", "paint", "paint_share", "gloss", "outline",
+        *RELIEF_FIELDS, "object_id", "seed", "family", "colour", "paint", "paint_share", "gloss", "outline",
     }  # fmt: skip
 
 
-def test_relief_does_not_set_the_photos_mean_colour_nor_looks_the_touch() -> None:
+def test_relief_does_not_set_the_photos_mean_colour_nor_appearance_the_touch() -> None:
     obj = make_object(3)
     deep = replace(obj, depth_mm=2 * obj.depth_mm)
     repainted = replace(obj, colour=(0.9, 0.2, 0.2), paint=(0.1, 0.1, 0.1))
@@ -132,7 +132,7 @@ def test_a_recording_reads_back_and_repeats(tmp_path: Path) -> None:
     assert _tree(folders[0]) == _tree(folders[1])
 
 
-def test_a_recording_of_one_finger_without_untouched_frames(tmp_path: Path) -> None:
+def test_a_recording_of_one_finger_without_no_contact_frames(tmp_path: Path) -> None:
     folder = synthetic.write_recording(tmp_path, make_objects(1), grasps=1, fingers=["a"], before=False)
     row = json.loads((folder / "metadata.jsonl").read_text())
     assert {key for key in row if key.endswith("_file_name")} == {"photo_file_name", "touch_a_file_name"}

@@ -15,7 +15,7 @@ from robot.errors import DeviceError
 from robot.recording.folder import read_recording
 from tests.emulated_rig import SPEED_UP, broken_images, collect_among_faults, emulated_rig
 from tests.fake_video import own_threads
-from tests.waiting import until
+from tests.waiting import wait_until
 
 
 @pytest.mark.slow
@@ -68,5 +68,5 @@ def test_jaws_that_a_failed_call_leaves_moving_are_seen(stops, monkeypatch):
 
 def interrupt_when(true):
     """Ctrl-C, as soon as something is so."""
-    until(true)
+    wait_until(true)
     signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)

@@ -18,7 +18,7 @@ from robot.rig import load_rig
 from tests.fake_rig import FakeRig
 from tests.robot.recording.test_crash import Failing
 from tests.robot.test_collection import files
-from tests.waiting import running, until
+from tests.waiting import run_process, wait_until
 
 ROOT = Path(__file__).parents[2]
 NAMES = ["round-0", "thin-1", "wide-2", "round-3"]
@@ -157,7 +157,7 @@ def test_any_other_failure_of_a_worker_is_a_robot_error_that_says_where(tmp_path
         run(tmp_path / "r", jobs=2, make=functools.partial(BrokenRig, 3, "value"))
 
 
-def test_a_worker_that_dies_is_told_and_the_collection_can_go_on(tmp_path, whole):
+def test_a_dead_worker_raises_and_the_collection_can_continue(tmp_path, whole):
     with pytest.raises(RobotError, match="a worker process died: it was killed, or memory ran out"):
         run(tmp_path / "r", jobs=2, make=functools.partial(BrokenRig, 3, "die"))
     run(tmp_path / "r", jobs=2)
@@ -213,16 +213,16 @@ def test_workers_leave_with_their_parent(tmp_path, end):
     (tmp_path / "endless.py").write_text(ENDLESS)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(tmp_path / "endless.py"), str(tmp_path / "r")]
-    with running(command, env=environment, cwd=ROOT) as parent:
+    with run_process(command, env=environment, cwd=ROOT) as parent:
         log = tmp_path / "r" / "attempts.jsonl"
-        until(lambda: log.exists() and log.read_bytes().count(b"\n") >= 3, limit_s=60.0)
+        wait_until(lambda: log.exists() and log.read_bytes().count(b"\n") >= 3, limit_s=60.0)
         workers = children(parent.pid)
         assert len(workers) >= 2
         for each in end:
             parent.send_signal(each)
             time.sleep(0.1)
         said = parent.communicate(timeout=60)[1]
-        until(lambda: not any(map(is_running, workers)), limit_s=60.0)
+        wait_until(lambda: not any(map(is_running, workers)), limit_s=60.0)
     if signal.SIGINT in end:
         assert "KeyboardInterrupt" in said
     assert read_recording(tmp_path / "r").grasps

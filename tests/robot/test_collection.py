@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.collection import CollectSettings, Progress, RecordedTouches, collect, name_of
+from robot.collection import CollectSettings, Progress, RecordedTouches, collect, grasp_id_of
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError, UngraspableError
-from robot.grasping.attempt import Attempter, depth_in_mm
+from robot.grasping.attempt import AttemptRunner, depth_in_mm
 from robot.grasping.gates import ContactAreaGate
 from robot.grasping.planner import CylinderPlanner, GraspPlan
 from robot.grasping.settings import AttemptSettings, GraspSettings
@@ -184,13 +184,13 @@ def test_more_objects_may_be_added(tmp_path):
     assert files(tmp_path / "r") == files(tmp_path / "whole")
 
 
-def test_progress_is_told_after_every_attempt(tmp_path):
+def test_progress_is_reported_after_every_attempt(tmp_path):
     told: list[Progress] = []
     run(tmp_path / "r", ["round-0", "wide-1"], grasps=2, most=4, progress=told.append)
     assert [each.attempts for each in told] == list(range(len(told)))
-    assert (told[0].settled, told[0].objects_done, told[0].seconds_left, told[0].accept_rate) == (0, 0, None, 0.0)
+    assert (told[0].grasps_done, told[0].objects_done, told[0].seconds_left, told[0].accept_rate) == (0, 0, None, 0.0)
     last = told[-1]
-    assert (last.objects, last.objects_done, last.wanted, last.settled, last.accepted) == (2, 2, 4, 4, 2)
+    assert (last.objects, last.objects_done, last.grasps_wanted, last.grasps_done, last.accepted) == (2, 2, 4, 4, 2)
     assert last.accept_rate == 2 / last.attempts
     assert str(last) == f"2 of 2 objects, {2 / last.attempts:.0%} of {last.attempts} attempts accepted"
     assert last.seconds_left == 0.0
@@ -212,18 +212,18 @@ def test_a_collection_goes_on_with_devices_that_read_back_other_values(tmp_path)
         if now.attempts == 1:
             raise KeyboardInterrupt
 
-    given = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(2)}
+    object_fit = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(2)}
     with pytest.raises(KeyboardInterrupt):
-        collect(lambda: OneRig(3), tmp_path / "r", progress=interrupted, **given)
-    collect(lambda: OneRig(3), tmp_path / "r", **given)
+        collect(lambda: OneRig(3), tmp_path / "r", progress=interrupted, **object_fit)
+    collect(lambda: OneRig(3), tmp_path / "r", **object_fit)
     assert sum(grasp.grasped for grasp in read_recording(tmp_path / "r").grasps) == 2
     assert OneRig.times == 2
 
 
 @pytest.mark.parametrize("make", [OneRig, FakeRig])
 def test_a_collection_of_software_that_said_nothing_of_the_gels_goes_on(tmp_path, make):
-    given = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(1)}
-    collect(lambda: make(3), tmp_path / "r", **given)
+    object_fit = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(1)}
+    collect(lambda: make(3), tmp_path / "r", **object_fit)
     path = tmp_path / "r" / "recording.json"
     info = json.loads(path.read_text())
     assert info.pop("gels") == "unknown"
@@ -234,7 +234,7 @@ def test_a_collection_of_software_that_said_nothing_of_the_gels_goes_on(tmp_path
         rig.info["gels"] = [{"a": {"thickness_mm": 2.0}}]
         return rig
 
-    collect(knowing, tmp_path / "r", **(given | {"objects": ["round-0", "round-2"]}))
+    collect(knowing, tmp_path / "r", **(object_fit | {"objects": ["round-0", "round-2"]}))
     assert {grasp.object_id for grasp in read_recording(tmp_path / "r").grasps} == {"round-0", "round-2"}
 
 
@@ -244,11 +244,11 @@ def test_a_collection_of_software_that_said_nothing_of_the_gels_goes_on(tmp_path
 def calls_of(attempt, name="round-0", faults=None, seed=3):
     rig = FakeRig(seed, faults=faults)
     with rig:
-        result = Attempter(rig, seed, attempt).run(name, 0)
+        result = AttemptRunner(rig, seed, attempt).run(name, 0)
     return result, [call for call in rig.world.calls if "." not in call]
 
 
-def test_an_attempt_asks_in_this_order():
+def test_the_order_of_the_calls_of_an_attempt():
     _, calls = calls_of(AttemptSettings())
     gels = ["gel a", "gel b"]
     start, close, up = ["open", "arm", "arm", "depth", "arm", "open", "arm"], ["grasp"], ["arm"]
@@ -267,7 +267,7 @@ def test_what_begins_low_goes_straight_up_or_down(faults, monkeypatch):
     monkeypatch.setattr(FakeArm, "_move_to", noted)
     rig = FakeRig(3, faults=faults)
     with rig:
-        attempter = Attempter(rig, 3, AttemptSettings())
+        attempter = AttemptRunner(rig, 3, AttemptSettings())
         for number in range(3):
             attempter.run("round-0", number)
         low = [(here, there) for here, there in moves if here.z_mm < rig.world.solid.height + 10]
@@ -280,10 +280,10 @@ def test_where_the_place_is_given_no_depth_is_asked_for_and_the_object_is_put_ba
     with rig:
         rig.prepare("round-0", 0)
         solid = rig.world.solid
-        rig.given = CylinderFit(
+        rig.object_fit = CylinderFit(
             solid.x, solid.y, solid.height, solid.radius, 1.0, "given", (solid.radius, solid.radius)
         )
-        attempt = Attempter(rig, 3, AttemptSettings(outputs=("before",))).run("round-0", 0)
+        attempt = AttemptRunner(rig, 3, AttemptSettings(outputs=("before",))).run("round-0", 0)
     assert attempt.fit["method"] == "given"
     assert "camera" in rig.world.calls
     assert "depth" not in rig.world.calls
@@ -340,7 +340,7 @@ def test_a_planner_without_need_of_depth_has_none_taken():
     rig = FakeRig(3)
     rig.planner = Blind()
     with rig:
-        attempt = Attempter(rig, 3, AttemptSettings(outputs=("before",))).run("round-0", 0)
+        attempt = AttemptRunner(rig, 3, AttemptSettings(outputs=("before",))).run("round-0", 0)
     assert "depth" not in rig.world.calls
     assert (attempt.fields["force_n"], attempt.fit) == (12.0, {"seen": "not"})
 
@@ -348,14 +348,14 @@ def test_a_planner_without_need_of_depth_has_none_taken():
 def test_a_person_is_asked_to_put_the_object_back_before_each_attempt_at_a_given_place():
     asked = []
     rig = FakeRig(3)
-    rig.ask, rig.given = asked.append, CylinderFit(5.0, -2.5, 100.0, 30.0, 1.0, "given", (30.0, 30.0))
+    rig.ask, rig.object_fit = asked.append, CylinderFit(5.0, -2.5, 100.0, 30.0, 1.0, "given", (30.0, 30.0))
     for number in range(2):
         Rig.prepare(rig, "mug", number)
     assert asked == ["Put mug at x 5, y -2.5 mm, alone, and press Enter."] * 2
 
 
 def test_a_person_is_not_asked_to_rise_first(monkeypatch):
-    monkeypatch.setattr(FakeArm, "by_hand", True)
+    monkeypatch.setattr(FakeArm, "is_manual", True)
     _, calls = calls_of(AttemptSettings())
     assert calls[:3] == ["open", "arm", "depth"]
 
@@ -382,7 +382,7 @@ def test_the_gate_that_needs_what_is_not_recorded_says_so(tmp_path):
         run(tmp_path / "r", attempt=AttemptSettings(outputs=("depth",)))
 
 
-def test_any_gate_decides_what_is_kept(tmp_path):
+def test_any_gate_decides_which_grasps_are_accepted(tmp_path):
     seen = []
 
     def picky(touches):
@@ -401,7 +401,7 @@ def test_any_gate_decides_what_is_kept(tmp_path):
 def test_the_jaws_are_open_and_the_object_is_put_down_inside_the_table():
     rig = FakeRig(3)
     with rig:
-        attempter = Attempter(rig, 3, AttemptSettings())
+        attempter = AttemptRunner(rig, 3, AttemptSettings())
         results = [attempter.run("round-0", number) for number in range(12)]
         assert rig.gripper.state().status == "idle"
     assert {"held", "slipped"} == {result.outcome for result in results}
@@ -409,7 +409,7 @@ def test_the_jaws_are_open_and_the_object_is_put_down_inside_the_table():
 
 def test_an_attempt_is_a_function_of_seed_object_and_number_alone():
     with FakeRig(3) as one, FakeRig(3) as two:
-        first, second = (Attempter(rig, 3, AttemptSettings()) for rig in (one, two))
+        first, second = (AttemptRunner(rig, 3, AttemptSettings()) for rig in (one, two))
         for number in (0, 1, 2):
             first.run("round-0", number)
         second.run("thin-1", 5)
@@ -467,7 +467,7 @@ def test_after_the_device_was_mended_the_collection_goes_on(tmp_path):
 
 
 def test_a_gripper_that_never_stops_moving_is_a_fault(monkeypatch):
-    monkeypatch.setattr("tests.fake_rig.World.status", lambda self: "idle" if self.force is None else "moving")
+    monkeypatch.setattr("tests.fake_rig.FakeRigState.status", lambda self: "idle" if self.force is None else "moving")
     with pytest.raises(DeviceError, match="must be holding, no_part or part_lost after a lift; it says moving"):
         calls_of(AttemptSettings())
 
@@ -610,7 +610,7 @@ def test_a_real_rig_cannot_be_doubled(tmp_path, monkeypatch):
         run(tmp_path / "r", jobs=2)
 
 
-def test_a_full_disk_is_told_and_what_was_recorded_is_whole(tmp_path, monkeypatch):
+def test_a_full_disk_raises_and_recorded_grasps_are_whole(tmp_path, monkeypatch):
     from robot.recording import folder as module
 
     real, count = module.write_files, []
@@ -640,13 +640,13 @@ def test_a_grasp_has_a_name_that_a_recording_takes(tmp_path, object_id):
     image = np.zeros((2, 2, 3), np.uint8)
     with RecordingWriter(tmp_path, {"source": "test", "sensor": "test"}) as writer:
         for number in (0, 12345):
-            writer.append(name_of(object_id, number), object_id, {"photo": image, "touch_a": image})
-    assert name_of("mug", 7) == "mug-0007"
+            writer.append(grasp_id_of(object_id, number), object_id, {"photo": image, "touch_a": image})
+    assert grasp_id_of("mug", 7) == "mug-0007"
 
 
 def test_names_that_look_alike_stay_apart():
     names = ["a b", "a_b", "a/b", "a:b", "y" * 150, "y" * 151]
-    assert len({name_of(name, 0) for name in names}) == len(names)
+    assert len({grasp_id_of(name, 0) for name in names}) == len(names)
 
 
 def test_the_picture_of_the_camera_is_not_changed_by_what_is_made_of_it():

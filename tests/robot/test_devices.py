@@ -8,7 +8,7 @@ import pytest
 from robot.devices import Camera, Device, TactileSensor
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Frame, GripperState, Intrinsics, Pose, Region
-from tests.fake_rig import FORCE_N, STROKE_MM, WORKSPACE, FakeArm, FakeGripper, World
+from tests.fake_rig import FORCE_N, STROKE_MM, WORKSPACE, FakeArm, FakeGripper, FakeRigState
 
 
 class Plug(Device):
@@ -107,11 +107,11 @@ def test_a_device_that_fails_to_close_says_so_once_and_counts_as_closed():
     "use",
     [
         lambda: Plug().settings(),
-        lambda: FakeArm(World(0)).move_to(Pose(0, 0, 100, 0), 10),
-        lambda: FakeArm(World(0)).pose(),
-        lambda: FakeGripper(World(0)).state(),
-        lambda: FakeGripper(World(0)).open(10),
-        lambda: FakeGripper(World(0)).grasp(10),
+        lambda: FakeArm(FakeRigState(0)).move_to(Pose(0, 0, 100, 0), 10),
+        lambda: FakeArm(FakeRigState(0)).pose(),
+        lambda: FakeGripper(FakeRigState(0)).state(),
+        lambda: FakeGripper(FakeRigState(0)).open(10),
+        lambda: FakeGripper(FakeRigState(0)).grasp(10),
         lambda: Gel(None).read(),
         lambda: Eye(picture()).read(),
     ],
@@ -122,7 +122,7 @@ def test_no_device_can_be_used_before_it_is_connected(use):
 
 
 def test_no_device_can_be_used_after_it_is_closed():
-    gripper = FakeGripper(World(0))
+    gripper = FakeGripper(FakeRigState(0))
     with gripper:
         gripper.state()
     with pytest.raises(DeviceError, match="must be connected"):
@@ -137,7 +137,7 @@ def test_no_device_can_be_used_after_it_is_closed():
     [Pose(151, 0, 100, 0), Pose(0, -151, 100, 0), Pose(0, 0, 7.9, 0), Pose(0, 0, math.nan, 0), Pose(0, 0, 9, math.inf)],
 )
 def test_a_pose_out_of_the_workspace_never_reaches_the_arm(pose):
-    with FakeArm(World(0)) as arm:
+    with FakeArm(FakeRigState(0)) as arm:
         with pytest.raises(DeviceError, match="must be in the workspace"):
             arm.move_to(pose, 100)
         assert "arm" not in arm.world.calls
@@ -151,7 +151,7 @@ def test_a_place_that_is_no_number_never_leaves_the_arm(bad, monkeypatch):
         lost = Pose(*(bad if axis == place else 9.0 for axis in range(4)))
         monkeypatch.setattr(FakeArm, "_pose", lambda arm, lost=lost: lost)
         monkeypatch.setattr(FakeArm, "_move_to", lambda arm, pose, speed, lost=lost: lost)
-        with FakeArm(World(0)) as arm:
+        with FakeArm(FakeRigState(0)) as arm:
             for ask in (arm.pose, lambda arm=arm: arm.move_to(Pose(0, 0, 100, 0), 100)):
                 with pytest.raises(DeviceError, match="fake arm: the pose that an arm reports must be finite"):
                     ask()
@@ -165,13 +165,13 @@ def test_a_lens_that_is_no_lens_is_refused(lens):
 
 @pytest.mark.parametrize("speed", [0, -1, math.nan, math.inf, 1001])
 def test_an_impossible_speed_never_reaches_the_arm(speed):
-    with FakeArm(World(0)) as arm, pytest.raises(DeviceError, match="speed must be"):
+    with FakeArm(FakeRigState(0)) as arm, pytest.raises(DeviceError, match="speed must be"):
         arm.move_to(Pose(0, 0, 100, 0), speed)
 
 
 @pytest.mark.parametrize("force", [FORCE_N[0] - 0.01, FORCE_N[1] + 0.01, 0, -5, math.nan, math.inf])
 def test_a_force_out_of_range_never_reaches_the_gripper(force):
-    with FakeGripper(World(0)) as gripper:
+    with FakeGripper(FakeRigState(0)) as gripper:
         with pytest.raises(DeviceError, match="fake gripper: force must be from 5 to 80 N, got"):
             gripper.grasp(force)
         assert "grasp" not in gripper.world.calls
@@ -179,7 +179,7 @@ def test_a_force_out_of_range_never_reaches_the_gripper(force):
 
 @pytest.mark.parametrize("opening", [-0.1, STROKE_MM + 0.1, math.nan])
 def test_an_opening_beyond_the_stroke_never_reaches_the_gripper(opening):
-    with FakeGripper(World(0)) as gripper:
+    with FakeGripper(FakeRigState(0)) as gripper:
         with pytest.raises(DeviceError, match="opening must be from 0 to 110 mm"):
             gripper.open(opening)
         assert "open" not in gripper.world.calls

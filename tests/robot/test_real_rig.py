@@ -8,7 +8,7 @@ import pytest
 
 from robot.drivers.cameras.uvc import UvcCamera
 from robot.drivers.manual_arm import ManualArm
-from robot.drivers.replay import ImagesSensor
+from robot.drivers.replay import ImageFolderSensor
 from robot.drivers.wsg50.driver import WSG50
 from robot.errors import RobotConfigError, UnknownName
 from robot.grasping.planner import CylinderPlanner, GraspPlan, GraspPlanner
@@ -56,7 +56,7 @@ def test_a_file_becomes_a_rig_with_its_devices_under_its_ceilings(tmp_path):
     rig = load_rig(written(tmp_path), seed=0)
     assert isinstance(rig.arm, ManualArm)
     assert isinstance(rig.gripper, WSG50)
-    assert isinstance(rig.sensors["a"], ImagesSensor)
+    assert isinstance(rig.sensors["a"], ImageFolderSensor)
     assert isinstance(rig.camera, UvcCamera)
     assert rig.arm.workspace.upper == (100, 100, 300)
     assert rig.arm.max_speed_mm_s == 90
@@ -81,19 +81,25 @@ def test_what_is_known_of_the_gels_is_recorded_and_the_rest_is_called_unknown(tm
 
 
 def test_a_given_object_stands_for_what_a_camera_without_depth_cannot_see(tmp_path):
-    given = load_rig(written(tmp_path), seed=0).given
-    assert (given.x_mm, given.y_mm, given.height_mm, given.radius_mm, given.method) == (0, 5, 100, 30, "given")
-    assert given.width_mm(1.0, 25.0) == 60
+    object_fit = load_rig(written(tmp_path), seed=0).object_fit
+    assert (object_fit.x_mm, object_fit.y_mm, object_fit.height_mm, object_fit.radius_mm, object_fit.method) == (
+        0,
+        5,
+        100,
+        30,
+        "given",
+    )
+    assert object_fit.width_mm(1.0, 25.0) == 60
     with pytest.raises(RobotConfigError, match="has no depth: say where every object stands and how large it is"):
         load_rig(written(tmp_path, object=None), seed=0)
 
 
 def test_a_file_chooses_the_grasp_planner_and_its_settings(tmp_path):
-    assert load_rig(written(tmp_path), seed=0).planner.sight_mm == 150
-    assert load_rig(written(tmp_path, planner="sight_mm = 20"), seed=0).planner.sight_mm == 20
-    named = load_rig(written(tmp_path, planner='name = "cylinder"\nsight_mm = 30'), seed=0)
-    assert (type(named.planner), named.planner.sight_mm) == (CylinderPlanner, 30)
-    assert named.info["rig_settings"]["planner"] == {"name": "cylinder", "sight_mm": 30}
+    assert load_rig(written(tmp_path), seed=0).planner.search_margin_mm == 150
+    assert load_rig(written(tmp_path, planner="search_margin_mm = 20"), seed=0).planner.search_margin_mm == 20
+    named = load_rig(written(tmp_path, planner='name = "cylinder"\nsearch_margin_mm = 30'), seed=0)
+    assert (type(named.planner), named.planner.search_margin_mm) == (CylinderPlanner, 30)
+    assert named.info["rig_settings"]["planner"] == {"name": "cylinder", "search_margin_mm": 30}
 
 
 class Blind(GraspPlanner):
@@ -132,7 +138,7 @@ def test_a_camera_with_depth_must_be_calibrated_and_not_long_ago(tmp_path):
     points(tmp_path)
     found = load_rig(written(tmp_path, camera=replay + 'hand_eye = "hand_eye.json"', object=None), seed=0)
     assert found.camera.extrinsics[:3, 3] == pytest.approx([0, 0, 800], abs=1e-6)
-    assert found.given is None
+    assert found.object_fit is None
     points(tmp_path, days=40)
     with pytest.raises(RobotConfigError, match="must be at most 30 days old, it is 40"):
         load_rig(written(tmp_path, camera=replay + 'hand_eye = "hand_eye.json"'), seed=0)
@@ -207,7 +213,10 @@ BAD = {
         {"planner": 'name = "tests.robot.test_real_rig:Blind"'},
         r"\[planner\] must say 'height_mm'",
     ),
-    "a planner that looks inwards": ({"planner": "sight_mm = -1"}, r"\[planner\]: sight_mm must be from 0 to"),
+    "a planner that looks inwards": (
+        {"planner": "search_margin_mm = -1"},
+        r"\[planner\]: search_margin_mm must be from 0 to",
+    ),
     "a planner of no name": ({"planner": "name = 3"}, r"\[planner\]: name must be one of cylinder, mesh.*; got 3"),
     "a planner that is none": ({"planner": 'name = "json:dumps"'}, "'json:dumps' must be a GraspPlanner"),
     "meshes of a real rig": ({"planner": 'name = "mesh"'}, "plans for meshes of the simulated rig only"),

@@ -11,7 +11,7 @@ from tests.fake_rig import FakeGripper, FakeRig, FakeSensor
 
 @pytest.fixture(autouse=True)
 def _a_short_look(monkeypatch):
-    monkeypatch.setattr(rig_check, "WATCHED_S", 0.2)
+    monkeypatch.setattr(rig_check, "MEASURE_S", 0.2)
 
 
 @pytest.fixture
@@ -73,28 +73,28 @@ def test_a_device_that_fails_is_a_row_and_the_others_are_still_checked(rig):
     assert not any(device.is_connected for device in rig.devices)
 
 
-def test_what_is_held_is_not_let_go(rig, monkeypatch):
+def test_a_held_object_is_not_released(rig, monkeypatch):
     monkeypatch.setattr(FakeGripper, "_state", lambda self: GripperState(40.0, 10.0, "holding"))
     monkeypatch.setattr(FakeGripper, "_open", lambda *_: pytest.fail("it let go"))
     (row,) = [row for row in check_rig(rig) if row.role == "gripper"]
     assert row.measured["moved"] == "not: it is holding"
 
 
-def test_settings_that_a_device_refused_are_told(rig, monkeypatch):
+def test_refused_settings_are_reported(rig, monkeypatch):
     rig.sensors["a"].refused = {"exposure": "asked 5, has 8"}
     row = next(row for row in check_rig(rig) if row.device == "fake gel a")
     assert row.line().endswith("; refused exposure: asked 5, has 8")
 
 
 def test_an_arm_that_is_a_person_is_not_asked_for_motions(rig, monkeypatch):
-    monkeypatch.setattr(type(rig.arm), "by_hand", True)
+    monkeypatch.setattr(type(rig.arm), "is_manual", True)
     row = next(check_rig(rig))
     assert row.measured == {"moved": "by a person"}
     assert "arm" not in rig.world.calls
 
 
 def test_a_stream_that_stands_is_one_frame(rig, monkeypatch):
-    monkeypatch.setattr(rig_check, "WATCHED_S", 0.1)
+    monkeypatch.setattr(rig_check, "MEASURE_S", 0.1)
     kept = {}
     real = FakeSensor._read
     monkeypatch.setattr(FakeSensor, "_read", lambda self: kept.setdefault(self.finger, real(self)))

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from retrieval.console.output import some
+from retrieval.console.output import abbreviate_list
 from retrieval.console.progress import Bar
-from retrieval.data.check import doubts, published
-from retrieval.data.check.copies import thumbnail
-from retrieval.data.check.findings import Files, Finding, Seen, named
-from retrieval.data.dataset import Attempt, Grasp, Split, load_all, require_accepted
+from retrieval.data.check import appearance_checks, known_problems
+from retrieval.data.check.findings import Finding, ImageRecord, ImageRecords, findings_for
+from retrieval.data.check.near_copies import thumbnail
+from retrieval.data.dataset import Attempt, Grasp, Split, load_all_attempts, require_accepted
 from retrieval.data.images import decode_rgb, read_bytes
 from retrieval.data.resize import resize
 from retrieval.errors import DatasetError, ImageError
@@ -26,7 +26,7 @@ _SMALL, _PHOTO = (6, 8), (64, 64)
 _FLAT = 3.5 / 255
 """What JPEG makes of one colour stays within it."""
 
-_Check = Callable[[Sequence[Grasp], Files], Iterable[Finding]]
+_Check = Callable[[Sequence[Grasp], ImageRecords], Iterable[Finding]]
 
 
 def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
@@ -39,29 +39,39 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     >>> {finding.severity for finding in retrieval.check_recording(Path("lab"))} <= {"note", "warning", "error"}
     True
     """
-    attempts = load_all(folder)
+    attempts = load_all_attempts(folder)
     accepted = require_accepted(folder, attempts)
-    seen = _look_at_all(attempts)
+    records = _read_pictures(attempts)
     grasps = [attempt.grasp for attempt in attempts]
     findings = [
-        Finding("error", "broken", f"{path.relative_to(folder)}: {image.broken}")
-        for path, image in seen.items()
-        if image.broken
+        Finding("error", "broken", f"{path.relative_to(folder)}: {image.error}")
+        for path, image in records.items()
+        if image.error
     ]
     counts = Counter(grasp.object_id for grasp in accepted)
     if single := sorted(name for name, count in counts.items() if count == 1):
         text = (
             f"{len(single)} of {len(counts)} object(s) have one grasp, so photo and touch of a pair always come from "
-            f"the same moment: {some(single)}"
+            f"the same moment: {abbreviate_list(single)}"
         )
         findings.append(Finding("warning", "one-grasp", text))
-    findings += _duplicates(folder, grasps, seen)
-    whole = [one.grasp for one in attempts if all(not seen[path].broken for path in _pictures(one))]
+    findings += _duplicates(folder, grasps, records)
+    whole = [one.grasp for one in attempts if all(not records[path].error for path in _pictures(one))]
     trained_on = {grasp.grasp_id for grasp in accepted}
-    of_all: tuple[_Check, ...] = (_same_images, published.dead, doubts.swapped, doubts.fingers, doubts.moments)
+    of_all: tuple[_Check, ...] = (
+        _same_images,
+        known_problems.check_dead_frames,
+        appearance_checks.swapped,
+        appearance_checks.fingers,
+        appearance_checks.moments,
+    )
     of_accepted: tuple[_Check, ...] = (
-        *(published.frozen, published.one_background, published.repeated),
-        *(doubts.own_photo, doubts.light, doubts.exchanged),
+        *(
+            known_problems.check_frozen_frames,
+            known_problems.check_shared_backgrounds,
+            known_problems.check_repeated_touches,
+        ),
+        *(appearance_checks.check_own_photo, appearance_checks.light, appearance_checks.check_exchanged_photos),
     )
 
     def unnamed() -> list[Grasp]:
@@ -69,12 +79,12 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
         return [grasp for grasp in whole if grasp.grasp_id not in known]
 
     for check in of_all + of_accepted:
-        findings += check([one for one in unnamed() if check in of_all or one.grasp_id in trained_on], seen)
-    findings += doubts.copies([one for one in unnamed() if one.grasp_id in trained_on], seen, accepted)
+        findings += check([one for one in unnamed() if check in of_all or one.grasp_id in trained_on], records)
+    findings += appearance_checks.copies([one for one in unnamed() if one.grasp_id in trained_on], records, accepted)
     if split:
         findings += check_split(accepted, split)
         looked_at = [grasp for grasp in whole if grasp.grasp_id in trained_on]
-        findings += published.sequences_in_training(looked_at, split, seen)
+        findings += known_problems.check_sequences_in_training(looked_at, split, records)
     return sorted(findings, key=lambda finding: finding.severity == "note")
 
 
@@ -86,20 +96,22 @@ def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
         for name in objects:
             part_of[name].add(part)
     if shared := sorted(name for name, on in part_of.items() if len(on) > 1):
-        yield Finding("error", "split-objects", f"the split shares {len(shared)} object(s): {some(shared)}")
+        yield Finding("error", "split-objects", f"the split shares {len(shared)} object(s): {abbreviate_list(shared)}")
     sides: dict[str, set[str]] = defaultdict(set)
     for grasp in grasps:
         if grasp.sequence_id is not None:
             sides[grasp.sequence_id] |= part_of.get(grasp.object_id, set())
     if leaking := sorted(name for name, on in sides.items() if len(on) > 1):
         text = f"the split cuts {len(leaking)} sequence(s) in two, so that neighbouring frames are on both sides"
-        yield Finding("error", "split-sequences", f"{text}: {some(leaking)}")
+        yield Finding("error", "split-sequences", f"{text}: {abbreviate_list(leaking)}")
     recorded = {grasp.object_id for grasp in grasps}
     if unknown := sorted(set(part_of) - recorded):
-        text = f"the split names {len(unknown)} object(s) not recorded: {some(unknown)}"
+        text = f"the split names {len(unknown)} object(s) not recorded: {abbreviate_list(unknown)}"
         yield Finding("warning", "split-unknown", text)
     if absent := sorted(recorded - set(part_of)):
-        yield Finding("warning", "split-absent", f"the split leaves out {len(absent)} object(s): {some(absent)}")
+        yield Finding(
+            "warning", "split-absent", f"the split leaves out {len(absent)} object(s): {abbreviate_list(absent)}"
+        )
 
 
 def require_fit(split: Split, grasps: Sequence[Grasp]) -> None:
@@ -123,18 +135,18 @@ def _pictures(attempt: Attempt) -> tuple[Path, ...]:
     return (grasp.photo, *grasp.touches, *grasp.backgrounds, *attempt.after)
 
 
-def _look_at_all(attempts: Sequence[Attempt]) -> Files:
+def _read_pictures(attempts: Sequence[Attempt]) -> ImageRecords:
     files = sorted({path for attempt in attempts for path in _pictures(attempt)})
     photos = {attempt.grasp.photo for attempt in attempts}
     copied = {path for one in attempts if one.accepted for path in (one.grasp.photo, *one.grasp.touches)}
 
-    def look(path: Path) -> Seen:
+    def look(path: Path) -> ImageRecord:
         try:
             data = read_bytes(path)
             image = decode_rgb(data, path)
         except ImageError as error:
-            return Seen(broken=error.reason)
-        return Seen(
+            return ImageRecord(error=error.reason)
+        return ImageRecord(
             sha256(data).hexdigest(),
             bool(np.ptp(image, axis=(0, 1)).max() <= _FLAT),
             resize(image, _SMALL),
@@ -142,36 +154,36 @@ def _look_at_all(attempts: Sequence[Attempt]) -> Files:
             thumbnail(data, image) if path in copied else None,
         )
 
-    seen: Files = {}
+    records: ImageRecords = {}
     with ThreadPoolExecutor(2) as pool, Bar("check", len(files), "images") as bar:
         for path, found in zip(files, pool.map(look, files), strict=True):
-            seen[path] = found
+            records[path] = found
             bar.advance()
-    return seen
+    return records
 
 
-def _duplicates(folder: Path, grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+def _duplicates(folder: Path, grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
     """The same bytes under two objects."""
     holders: dict[str, dict[str, Path]] = defaultdict(dict)
     for grasp in grasps:
         for path in (grasp.photo, *grasp.touches):
-            if seen[path].digest:
-                holders[seen[path].digest].setdefault(grasp.object_id, path)
+            if records[path].digest:
+                holders[records[path].digest].setdefault(grasp.object_id, path)
     for objects in holders.values():
         if len(objects) > 1:
             where = [f"{name} ({path.relative_to(folder)})" for name, path in sorted(objects.items())]
-            yield Finding("error", "duplicate", f"{len(objects)} objects share one image: {some(where)}")
+            yield Finding("error", "duplicate", f"{len(objects)} objects share one image: {abbreviate_list(where)}")
 
 
-def _same_images(grasps: Sequence[Grasp], seen: Files) -> Iterator[Finding]:
+def _same_images(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
     """The same bytes for the photo and a touch, or for two fingers, of one grasp."""
     kinds = {"same-modality": ("error", "photo and touch are"), "same-fingers": ("warning", "two fingers have")}
     names: dict[str, list[str]] = {kind: [] for kind in kinds}
     for grasp in grasps:
-        touches = [seen[path].digest for path in grasp.touches]
-        if seen[grasp.photo].digest in touches:
+        touches = [records[path].digest for path in grasp.touches]
+        if records[grasp.photo].digest in touches:
             names["same-modality"].append(grasp.grasp_id)
         if len(set(touches)) < len(touches):
             names["same-fingers"].append(grasp.grasp_id)
     for kind, (severity, what) in kinds.items():
-        yield from named(severity, kind, f"{what} the same image", names[kind], grasps)
+        yield from findings_for(severity, kind, f"{what} the same image", names[kind], grasps)

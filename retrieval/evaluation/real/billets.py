@@ -1,5 +1,6 @@
 """Steel billets: which place of a billet was touched. Welded billets alone where there are such: touches of ground ones
-look nearly blank, and what names those is the drift of the capture."""
+look nearly blank, and what names those is the drift of the capture.
+"""
 
 from collections import defaultdict
 
@@ -7,12 +8,12 @@ import numpy as np
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.protocol import Facts, Protocol, first_guess, registered
+from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, registered_metrics, topn_accuracy
 
 _PARTS = 4
 
 
-def by_billet(facts: Facts) -> dict[str, list[str]]:
+def by_billet(facts: RecordingFacts) -> dict[str, list[str]]:
     """Places of each welded billet, sorted; of all billets where none is called welded. Raises DatasetError."""
     found: dict[str, list[str]] = defaultdict(list)
     for place, billet in facts.sequence_of.items():
@@ -26,7 +27,7 @@ def by_billet(facts: Facts) -> dict[str, list[str]]:
     return billets
 
 
-def _unseen(facts: Facts, seed: int) -> list[Split]:
+def _unseen(facts: RecordingFacts, seed: int) -> list[Split]:
     billets = by_billet(facts)
     names = list(billets)
     found = []
@@ -38,7 +39,7 @@ def _unseen(facts: Facts, seed: int) -> list[Split]:
     return found
 
 
-def _places(facts: Facts, seed: int) -> list[Split]:
+def _places(facts: RecordingFacts, seed: int) -> list[Split]:
     parts: list[list[str]] = [[] for _ in range(_PARTS)]
     for number, places in enumerate(by_billet(facts).values()):
         order = np.random.default_rng([seed, 29, number]).permutation(len(places))
@@ -57,10 +58,10 @@ UNSEEN = Protocol(
     "Billets: a place of an unseen welded billet",
     "Each welded billet is left out once, another one chooses settings; the gallery holds the places of that billet.",
     _unseen,
-    {**first_guess(5), **first_guess(10), **first_guess(16), **registered("pair_auc")},
-    own_photos=True,
-    by_sequence=True,
-    counted="guesses_k16",
+    {**topn_accuracy(5), **topn_accuracy(10), **topn_accuracy(16), **registered_metrics("pair_auc")},
+    allows_own_photos=True,
+    is_by_sequence=True,
+    binomial_measure="topn_k16",
 )
 PLACES = Protocol(
     "billets",
@@ -68,8 +69,8 @@ PLACES = Protocol(
     "A quarter of the places of each welded billet tests, a quarter chooses, half trains; every place is tested once. "
     "The gallery holds the four test places of the same billet.",
     _places,
-    {**first_guess(4), **registered("pair_auc")},
-    own_photos=True,
-    by_sequence=True,
-    counted="guesses_k4",
+    {**topn_accuracy(4), **registered_metrics("pair_auc")},
+    allows_own_photos=True,
+    is_by_sequence=True,
+    binomial_measure="topn_k4",
 )

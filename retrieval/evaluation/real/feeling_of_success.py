@@ -4,12 +4,12 @@ import numpy as np
 
 from retrieval.data.dataset import Split
 from retrieval.evaluation.calibrate import MIN_THRESHOLD_OBJECTS
-from retrieval.evaluation.real.protocol import Facts, Protocol, fold, registered
+from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, fold, registered_metrics
 
 _OBJECTS, _TEST = 98, 18
 
 
-def _paper(facts: Facts, seed: int) -> list[Split]:
+def _paper(facts: RecordingFacts, seed: int) -> list[Split]:
     """One split, as in the paper; with the seed only those who choose change."""
     rng = np.random.default_rng(37)
     names = [facts.names[place] for place in rng.permutation(len(facts.names))[:_OBJECTS]]
@@ -23,8 +23,8 @@ PAPER = Protocol(
     "98 objects by lot, of which 18 test and 80 train (ten of these choose settings and the threshold of pairs); "
     "grasps that held. A touch is never shown the photo of its own grasp.",
     _paper,
-    registered("guesses_k5", "guesses_k10", "pair_accuracy", "pair_auc"),
-    anchors=(
+    registered_metrics("topn_k5", "topn_k10", "pair_accuracy", "pair_auc"),
+    published_results=(
         "On data of its own, with this rig's sensors, the paper reports a pair accuracy of 64.3 % (Lin, Calandra, "
         "Levine, ICRA 2019); its guess curves are printed without numbers.",
     ),

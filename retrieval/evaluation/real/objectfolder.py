@@ -2,10 +2,10 @@
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.protocol import Facts, Protocol, registered
+from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, registered_metrics
 
 
-def _published(facts: Facts, seed: int) -> list[Split]:
+def _published(facts: RecordingFacts, seed: int) -> list[Split]:
     if not facts.splits:
         raise DatasetError(
             "the recording must hold splits/published.json, which parts objects; import a pack of the benchmark with "
@@ -21,8 +21,8 @@ PUBLISHED = Protocol(
     "The published split: its test objects are asked, its validation objects choose. Any picture of the object is "
     "right, that of the query's own number too.",
     _published,
-    registered("objectfolder_touch_to_photo", "objectfolder_photo_to_touch", "pair_auc", "guesses_k10"),
-    anchors=(
+    registered_metrics("objectfolder_touch_to_photo", "objectfolder_photo_to_touch", "pair_auc", "topn_k10"),
+    published_results=(
         "On 100 unseen simulated objects the benchmark's authors report a mAP of 8.50 % (CCA) and 8.80 % (DAR).",
         "For real objects 64.9 % are reported, on objects that were trained on.",
     ),

@@ -10,17 +10,17 @@ import numpy as np
 from _touch_retrieval.files import read_json
 from retrieval.data.dataset import Grasp, Split, load_grasps
 from retrieval.errors import DatasetError
-from retrieval.metrics.registry import METRICS, Metric, guesses
+from retrieval.metrics.registry import METRICS, Metric, k_way_measure
 
 PHOTO, REFERENCE, BOTH, TOUCHES = "photo", "reference", "both", "touches"
 """What an entry of the catalogue shows: a photo, a reference touch, the one with the other, or touches that nothing is
 fitted to (`retrieval.evaluation.real.touch_to_touch`)."""
-CHOOSING = 5
+VALIDATION_OBJECTS = 5
 """Objects, of those that do not test, by which methods choose their settings."""
 
 
 @dataclass(frozen=True, eq=False)
-class Facts:
+class RecordingFacts:
     """A recording as protocols see it.
 
     objects: object_id -> what the data set says of it; splits: name -> a published split.
@@ -51,7 +51,7 @@ class Facts:
         return found
 
 
-def read_facts(folder: Path) -> Facts:
+def read_recording_facts(folder: Path) -> RecordingFacts:
     """What is known of a recording's grasps. Raises DatasetError."""
     grasps = load_grasps(folder)  # which checks the files that are read here
     info = read_json(folder / "recording.json")
@@ -63,7 +63,7 @@ def read_facts(folder: Path) -> Facts:
             splits[path.stem] = Split.from_dict(read_json(path))
         except ValueError as error:
             raise DatasetError(f"{path} is not a JSON file: {error}") from error
-    return Facts(str(info["source"]), grasps, objects, splits)
+    return RecordingFacts(str(info["source"]), grasps, objects, splits)
 
 
 @dataclass(frozen=True)
@@ -76,36 +76,36 @@ class Protocol:
     them by lot, or has one photo of an object). by_sequence: a gallery holds the objects of one sequence, and sequences
     are what intervals resample. counted: a measure of right and wrong answers alone, which are counted too, with an
     exact binomial interval. anchors: what others reached, a sentence each. entry: what an object's entries in the
-    catalogue show, one of `PHOTO`, `REFERENCE`, `BOTH` (`retrieval.evaluation.real.references`). galleries: the gallery
+    catalogue show, one of `PHOTO`, `REFERENCE`, `BOTH` (`retrieval.evaluation.real.reference_rows`). galleries: the gallery
     in which each test object of a split stands, where there are several. choices: every fold is another choice of test
     objects, which share objects with those of others; values are means over the folds, and intervals cover the choice.
 
-    >>> from retrieval.evaluation.real.protocol import first_guess, folds
+    >>> from retrieval.evaluation.real.protocol import topn_accuracy, folds
     >>> def halves(facts, seed):
     ...     return folds(facts.names, [facts.names[::2], facts.names[1::2]], seed)
-    >>> protocol = retrieval.Protocol("vt60", "Halves", "Objects are halved by name.", halves, first_guess(10))
+    >>> protocol = retrieval.Protocol("vt60", "Halves", "Objects are halved by name.", halves, topn_accuracy(10))
     >>> protocol.main
-    'guesses_k10'
+    'topn_k10'
     """
 
     data_set: str
     title: str
     rule: str
-    folds: Callable[[Facts, int], list[Split]]
+    folds: Callable[[RecordingFacts, int], list[Split]]
     measures: Mapping[str, Metric]
-    own_photos: bool = False
-    by_sequence: bool = False
-    counted: str | None = None
-    anchors: tuple[str, ...] = ()
+    allows_own_photos: bool = False
+    is_by_sequence: bool = False
+    binomial_measure: str | None = None
+    published_results: tuple[str, ...] = ()
     entry: str = PHOTO
-    galleries: Callable[[Facts, Split], Mapping[str, str]] | None = None
+    galleries: Callable[[RecordingFacts, Split], Mapping[str, str]] | None = None
     choices: bool = False
 
-    def gallery_of(self, facts: Facts, split: Split) -> Mapping[str, str]:
+    def gallery_of(self, facts: RecordingFacts, split: Split) -> Mapping[str, str]:
         """The name of the gallery in which each test object of a split stands."""
         if self.galleries:
             return self.galleries(facts, split)
-        return {name: facts.sequence_of[name] if self.by_sequence else "" for name in split.test}
+        return {name: facts.sequence_of[name] if self.is_by_sequence else "" for name in split.test}
 
     @property
     def main(self) -> str:
@@ -113,11 +113,14 @@ class Protocol:
         return next(iter(self.measures))
 
 
-def fold(rest: Sequence[str], test: Sequence[str], seed: Sequence[int], choosing: int = CHOOSING) -> Split:
-    """A split that tests on `test`; of the other objects `choosing`, or a quarter where that is fewer, validate, and
-    the rest train."""
+def fold(
+    rest: Sequence[str], test: Sequence[str], seed: Sequence[int], validation_objects: int = VALIDATION_OBJECTS
+) -> Split:
+    """A split that tests on `test`; of the other objects `validation_objects`, or a quarter where that is fewer, validate, and
+    the rest train.
+    """
     order = np.random.default_rng([*seed, 17]).permutation(len(rest))
-    count = max(2, min(choosing, len(rest) // 4))
+    count = max(2, min(validation_objects, len(rest) // 4))
     return Split(
         seed=seed[0],
         train=tuple(sorted(rest[place] for place in order[count:])),
@@ -137,15 +140,16 @@ def folds(names: Sequence[str], tests: Sequence[Sequence[str]], seed: int) -> li
 # Measures --------------------------------------------------------------------------------------------
 
 
-def registered(*names: str) -> dict[str, Metric]:
+def registered_metrics(*names: str) -> dict[str, Metric]:
     """Metrics of every evaluation, by name."""
     return {name: METRICS[name] for name in names}
 
 
-def first_guess(k: int, *, grasps: int = 1, photos: int = 1, entries: str = "photos") -> dict[str, Metric]:
+def topn_accuracy(k: int, *, grasps: int = 1, photos: int = 1, entries: str = "photos") -> dict[str, Metric]:
     """The first guess among k objects, after so many touches, each object shown by so many photos, or what `entries`
-    calls them."""
-    name = f"guesses_k{k}" + (f"_g{grasps}" if grasps > 1 else "") + (f"_p{photos}" if photos > 1 else "")
+    calls them.
+    """
+    name = f"topn_k{k}" + (f"_g{grasps}" if grasps > 1 else "") + (f"_p{photos}" if photos > 1 else "")
     label = f"first guess of {k}"
     label += f", {grasps} touches" if grasps > 1 else ""
     label += f", {photos} {entries}" if photos > 1 else ""
@@ -154,6 +158,6 @@ def first_guess(k: int, *, grasps: int = 1, photos: int = 1, entries: str = "pho
             label,
             label,
             "real",
-            lambda of: guesses(of.test if grasps == 1 else of.sets.get(grasps), k, of.seed, photos),
+            lambda of: k_way_measure(of.test if grasps == 1 else of.sets.get(grasps), k, of.seed, photos),
         )
     }

@@ -3,12 +3,12 @@
 import numpy as np
 
 from retrieval.data.dataset import Split
-from retrieval.evaluation.real.protocol import Facts, Protocol, first_guess, folds, registered
+from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, folds, registered_metrics, topn_accuracy
 
 _FOLDS = 5
 
 
-def five_folds(facts: Facts, seed: int) -> list[Split]:
+def five_folds(facts: RecordingFacts, seed: int) -> list[Split]:
     """Objects dealt by lot into five folds."""
     names = facts.names
     order = [names[place] for place in np.random.default_rng([seed, 31]).permutation(len(names))]
@@ -21,6 +21,6 @@ MATERIALS = Protocol(
     "Materials are dealt by lot into five folds, again for each seed; all presses of a material stay together. "
     "There is one photo of a material, which every press of it is shown.",
     five_folds,
-    {**first_guess(10), **first_guess(5), **registered("pair_auc")},
-    own_photos=True,
+    {**topn_accuracy(10), **topn_accuracy(5), **registered_metrics("pair_auc")},
+    allows_own_photos=True,
 )

@@ -25,13 +25,19 @@ from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.data.images import encode_image, read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.lines import CONTROLS, Row, Towers, clock, why_not_untouched
-from retrieval.evaluation.real.protocol import TOUCHES, Facts, Protocol
-from retrieval.evaluation.real.verdict import Summing, control_entry, row_entry
-from retrieval.evaluation.shown import Shown
+from retrieval.evaluation.example_grasps import ExampleGrasps
+from retrieval.evaluation.real.conditions import (
+    CONTROLS,
+    BenchmarkRow,
+    TowerEncoder,
+    clock_features,
+    missing_no_contact_reason,
+)
+from retrieval.evaluation.real.protocol import TOUCHES, Protocol, RecordingFacts
+from retrieval.evaluation.real.verdict import Aggregation, control_entry, row_entry
 from retrieval.metrics import protocols
 from retrieval.metrics.measure import Measure, pooled
-from retrieval.metrics.registry import Metric, Scored
+from retrieval.metrics.registry import MethodScoreTables, Metric
 from retrieval.metrics.table import ScoreTable
 from retrieval.training.features import Features, encode_recording
 
@@ -51,7 +57,7 @@ MEASURES = {
 """Of sequences that find sequences; the first one decides."""
 
 
-def _no_folds(facts: Facts, seed: int) -> list[Split]:
+def _no_folds(facts: RecordingFacts, seed: int) -> list[Split]:
     return []
 
 
@@ -105,7 +111,8 @@ class Sequences:
     @classmethod
     def of(cls, grasps: Sequence[Grasp]) -> "Sequences":
         """Group grasps by object and sequence. Raises DatasetError where an object has fewer than two sequences, and
-        for fewer than two objects."""
+        for fewer than two objects.
+        """
         places: dict[tuple[str, str], list[int]] = {}
         for place, grasp in enumerate(grasps):
             places.setdefault((grasp.object_id, grasp.sequence_id or grasp.grasp_id), []).append(place)
@@ -155,21 +162,21 @@ def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = Tr
             for finger, (touch, before) in enumerate(zip(grasp.touches, grasp.backgrounds, strict=True)):
                 path = folder / f"{grasp.grasp_id}-{finger}.png"
                 if not path.is_file():
-                    write_atomically(path, _png(_moved(touch, before, common[finger])))
+                    write_atomically(path, _png(_on_common_frame(touch, before, common[finger])))
                 files.append(path)
             found.append(dataclasses.replace(grasp, touches=tuple(files), backgrounds=grasps[0].backgrounds))
             bar.advance()
     return found
 
 
-def _moved(touch: Path, before: Path, common: NDArray[np.float32]) -> NDArray[np.float32]:
-    pressed, untouched = read_rgb(touch), read_rgb(before)
-    if not pressed.shape == untouched.shape == common.shape:
+def _on_common_frame(touch: Path, before: Path, common: NDArray[np.float32]) -> NDArray[np.float32]:
+    pressed, no_contact = read_rgb(touch), read_rgb(before)
+    if not pressed.shape == no_contact.shape == common.shape:
         raise DatasetError(
             f"{touch}, its no-contact frame and the first one of the recording must be of one size; got "
-            f"{pressed.shape}, {untouched.shape} and {common.shape}"
+            f"{pressed.shape}, {no_contact.shape} and {common.shape}"
         )
-    return common + pressed - untouched
+    return common + pressed - no_contact
 
 
 def _png(image: NDArray[np.float32]) -> bytes:
@@ -178,26 +185,28 @@ def _png(image: NDArray[np.float32]) -> bytes:
 
 
 @dataclass(frozen=True, eq=False)
-class _Encoder:
+class _SequenceEncoder:
     """The sequences of a recording as the towers of one row see them; each kind of picture is encoded once."""
 
     sequences: Sequences
-    towers: Towers
+    towers: TowerEncoder
     common: Sequence[Grasp]
 
-    def vectors(self, representation: str, variant: str) -> Vectors:
+    def vectors(self, representation: str, touch_variant: str) -> Vectors:
         """(S, F) of a representation; variant: "touch", or "blurred" for the low-pass control."""
         if representation == "common-frame":
-            return self.sequences.mean(self._features(self.common, variant))
-        return self.sequences.mean(self._features(self.sequences.grasps, variant)) - self.untouched(variant)
+            return self.sequences.mean(self._features(self.common, touch_variant))
+        return self.sequences.mean(self._features(self.sequences.grasps, touch_variant)) - self.no_contact(
+            touch_variant
+        )
 
-    def untouched(self, variant: str = "touch") -> Vectors:
+    def no_contact(self, touch_variant: str = "touch") -> Vectors:
         """(S, F): features of each sequence's no-contact frame, that of its first grasp."""
         first = [self.sequences.grasps[rows[0]] for rows in self.sequences.rows]
         frames = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in first]
-        return self._features(frames, variant).astype(np.float64)
+        return self._features(frames, touch_variant).astype(np.float64)
 
-    def _features(self, grasps: Sequence[Grasp], variant: str) -> NDArray[np.float32]:
+    def _features(self, grasps: Sequence[Grasp], touch_variant: str) -> NDArray[np.float32]:
         """(G, fingers * F) of these touches; photos are not looked at."""
         fingers = self.towers.config.matcher.fingers
         if fingers > 1 and len(grasps[0].touches) == 1:  # a model of two fingers feels with both what one felt
@@ -213,8 +222,8 @@ class _Encoder:
             towers.matcher,
             towers.config,
             towers.cache,
-            variant=variant,
-            photos_of=no_photos,
+            touch_variant=touch_variant,
+            photo_features_from=no_photos,
             quiet=towers.quiet,
         )
         return found.touch.reshape(len(ids), -1)
@@ -222,8 +231,8 @@ class _Encoder:
 
 def touch_to_touch_entry(
     protocol: TouchToTouch,
-    facts: Facts,
-    rows: Sequence[Row],
+    facts: RecordingFacts,
+    rows: Sequence[BenchmarkRow],
     seeds: Sequence[int],
     cache: Path,
     draws: int,
@@ -244,44 +253,44 @@ def touch_to_touch_entry(
         DatasetError: Where no-contact frames or second sequences are missing.
     """
     sequences = Sequences.of(facts.grasps)
-    if why_not := why_not_untouched(facts.grasps):
-        raise DatasetError(f"touch to touch needs the no-contact frame of each sequence: {why_not}")
+    if reason := missing_no_contact_reason(facts.grasps):
+        raise DatasetError(f"touch to touch needs the no-contact frame of each sequence: {reason}")
     digest = data_digest(facts.grasps)
     common = with_common_frame(facts.grasps, cache / "common-frame" / digest[:32], quiet=quiet)
-    summing = Summing(draws, seeds[0])
-    order = _measures(protocol, sequences, clock(len(sequences.names)).astype(np.float64))
+    aggregation = Aggregation(draws, seeds[0])
+    order = _measures(protocol, sequences, clock_features(len(sequences.names)).astype(np.float64))
     entries: dict[str, Any] = {}
     controls: dict[str, list[dict[str, Measure]]] = {"order": [order]}
     shown: tuple[str, ScoreTable] | None = None
     frozen: dict[str, dict[str, Measure]] = {}
     for label, towers in _towers(rows):
-        encoder = _Encoder(sequences, towers, common)
-        untouched = _measures(protocol, sequences, encoder.untouched())
-        controls.setdefault("untouched", [untouched])
+        encoder = _SequenceEncoder(sequences, towers, common)
+        no_contact = _measures(protocol, sequences, encoder.no_contact())
+        controls.setdefault("no_contact", [no_contact])
         for representation in REPRESENTATIONS:
             name = f"{label}-{representation}"
             table = sequences.table(leave_one_out_scores(encoder.vectors(representation, "touch")))
-            blurred = _measures(protocol, sequences, encoder.vectors(representation, "blurred"))
-            measured = _taken(protocol, table)
+            low_pass = _measures(protocol, sequences, encoder.vectors(representation, "low_pass"))
+            measured = _measure_table(protocol, table)
             model = towers.checkpoint
             first = frozen.setdefault(representation, measured)
             entries[name] = {
                 "method": "nearest",
                 "model": model.digest if model else None,
-                **row_entry(protocol, [measured], [blurred], [order], summing, [untouched]),
-                "tower_differences": None if first is measured else summing.differences([measured], [first]),
+                **row_entry(protocol, [measured], [low_pass], [order], aggregation, [no_contact]),
+                "tower_differences": None if first is measured else aggregation.differences([measured], [first]),
                 "reliability": {},
-                "chosen": [],
+                "best_params": [],
             }
-            controls.setdefault("permuted", list(_permuted(protocol, sequences, table.scores, seeds)))
+            controls.setdefault("permuted", list(_permuted_measures(protocol, sequences, table.scores, seeds)))
             shown = shown or (name, table)
     assert shown is not None
     objects = sorted(set(sequences.objects))
-    examples = Shown(shown[1], objects, sequences.middle, sequences.middle).examples(one_of_each=True)
+    examples = ExampleGrasps(shown[1], objects, sequences.middle, sequences.middle).examples(one_of_each=True)
     return {
         "title": protocol.title,
         "rule": protocol.rule,
-        "anchors": list(protocol.anchors),
+        "published_results": list(protocol.published_results),
         "main": protocol.main,
         "labels": [[name, metric.label] for name, metric in protocol.measures.items()],
         "entry": protocol.entry,
@@ -296,16 +305,16 @@ def touch_to_touch_entry(
         "folds": [[{"test": [name]} for name in sequences.names]],
         "rows": entries,
         "controls": {
-            name: control_entry(protocol, PERMUTED if name == "permuted" else CONTROLS[name], None, taken, summing)
+            name: control_entry(protocol, PERMUTED if name == "permuted" else CONTROLS[name], None, taken, aggregation)
             for name, taken in controls.items()
         },
         "examples": {"row": shown[0], **examples},
     }
 
 
-def _towers(rows: Sequence[Row]) -> Iterator[tuple[str, Towers]]:
+def _towers(rows: Sequence[BenchmarkRow]) -> Iterator[tuple[str, TowerEncoder]]:
     """The towers under the rows, each once, and what they are called."""
-    seen: list[Towers] = []
+    seen: list[TowerEncoder] = []
     for row in rows:
         if not any(row.towers is one for one in seen):
             seen.append(row.towers)
@@ -313,19 +322,21 @@ def _towers(rows: Sequence[Row]) -> Iterator[tuple[str, Towers]]:
 
 
 def _measures(protocol: Protocol, sequences: Sequences, vectors: Vectors) -> dict[str, Measure]:
-    return _taken(protocol, sequences.table(leave_one_out_scores(vectors)))
+    return _measure_table(protocol, sequences.table(leave_one_out_scores(vectors)))
 
 
-def _taken(protocol: Protocol, table: ScoreTable) -> dict[str, Measure]:
+def _measure_table(protocol: Protocol, table: ScoreTable) -> dict[str, Measure]:
     """The measures of a table, queries in the order of their objects."""
-    found = {name: metric.take(Scored(table, table, {}, None, 0)) for name, metric in protocol.measures.items()}
+    found = {
+        name: metric.compute(MethodScoreTables(table, table, {}, None, 0)) for name, metric in protocol.measures.items()
+    }
     same = {int(name): int(name) for name in table.objects}
     return {name: pooled([one], [same]) for name, one in found.items() if one is not None}
 
 
-def _permuted(
+def _permuted_measures(
     protocol: Protocol, sequences: Sequences, scores: NDArray[np.float32], seeds: Sequence[int]
 ) -> Iterator[dict[str, Measure]]:
     for seed in seeds:
         owner = np.random.default_rng([seed, 41]).permutation(sequences.owner)
-        yield _taken(protocol, sequences.table(scores, owner))
+        yield _measure_table(protocol, sequences.table(scores, owner))

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.evaluation.real.protocol import Protocol
-from retrieval.metrics.choices import compare_choices, summarise_choices
-from retrieval.metrics.guesses import clopper_pearson
 from retrieval.metrics.intervals import LEVEL, compare, summarise
+from retrieval.metrics.k_way import clopper_pearson
 from retrieval.metrics.measure import Measure
+from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
 
 RULE = (
     "A result counts as touch only where its first measure beats its controls, each by more than the interval of the "
@@ -19,18 +19,18 @@ RULE = (
     "touches find touches, also the no-contact frame in place of the touch."
 )
 CONTROL_NAMES = {
-    "differences": "the blurred control",
+    "low_pass_differences": "the blurred control",
     "order_differences": "the order of capture",
-    "untouched_differences": "the no-contact frame alone",
+    "no_contact_differences": "the no-contact frame alone",
 }
 """Key of a row's paired differences -> what the control is called."""
-STATED_BINS = 10
+CONFIDENCE_BINS = 10
 
 BySeed = Sequence[Mapping[str, Measure]]
 
 
 @dataclass(frozen=True)
-class Summing:
+class Aggregation:
     """How measures become numbers: over seeds, intervals resampling objects; or over choices of test objects.
 
     ratio: test objects of a choice for each training object; None: measures are those of seeds.
@@ -44,7 +44,7 @@ class Summing:
         """Values with intervals, by name; those that all have."""
         found = {name: [one[name] for one in taken] for name in _shared(taken)}
         if self.ratio is not None:
-            return {name: summarise_choices(measures, self.ratio) for name, measures in found.items()}
+            return {name: summarise_splits(measures, self.ratio) for name, measures in found.items()}
         return {name: summarise(measures, draws=self.draws, seed=self.seed) for name, measures in found.items()}
 
     def differences(self, a: BySeed, b: BySeed) -> dict[str, Any]:
@@ -52,7 +52,7 @@ class Summing:
         names = [name for name in _shared(a) if name in _shared(b)]
         pairs = {name: ([one[name] for one in a], [one[name] for one in b]) for name in names}
         if self.ratio is not None:
-            return {name: compare_choices(*pair, self.ratio) for name, pair in pairs.items()}
+            return {name: compare_splits(*pair, self.ratio) for name, pair in pairs.items()}
         return {name: compare(*pair, draws=self.draws, seed=self.seed) for name, pair in pairs.items()}
 
 
@@ -61,21 +61,26 @@ def _shared(taken: BySeed) -> list[str]:
 
 
 def row_entry(
-    protocol: Protocol, touch: BySeed, blurred: BySeed, order: BySeed, summing: Summing, untouched: BySeed = ()
+    protocol: Protocol,
+    touch: BySeed,
+    low_pass: BySeed,
+    order: BySeed,
+    aggregation: Aggregation,
+    no_contact: BySeed = (),
 ) -> dict[str, Any]:
     """The numbers of a row: measures of touches, of blurred touches, paired differences from the controls, verdict.
 
     blurred is empty for a method that looks at nothing, which has no verdict. order: of the control of that name.
     untouched: of the no-contact frames alone, where the verdict counts them.
     """
-    measures = summing.summaries(touch)
-    entry: dict[str, Any] = {"measures": measures, "blurred": None, "verdict": None, **dict.fromkeys(CONTROL_NAMES)}
-    entry["counted"] = _counted(touch, protocol.counted)
-    if blurred:
-        entry["blurred"] = summing.summaries(blurred)
+    measures = aggregation.summaries(touch)
+    entry: dict[str, Any] = {"measures": measures, "low_pass": None, "verdict": None, **dict.fromkeys(CONTROL_NAMES)}
+    entry["correct_counts"] = _correct_counts(touch, protocol.binomial_measure)
+    if low_pass:
+        entry["low_pass"] = aggregation.summaries(low_pass)
         entry |= {
-            key: summing.differences(touch, one)
-            for key, one in zip(CONTROL_NAMES, (blurred, order, untouched), strict=True)
+            key: aggregation.differences(touch, one)
+            for key, one in zip(CONTROL_NAMES, (low_pass, order, no_contact), strict=True)
             if one
         }
         entry["verdict"] = verdict(
@@ -85,14 +90,14 @@ def row_entry(
 
 
 def control_entry(
-    protocol: Protocol, what: str, why_not: str | None, taken: BySeed, summing: Summing
+    protocol: Protocol, description: str, reason: str | None, taken: BySeed, aggregation: Aggregation
 ) -> dict[str, Any]:
     """The numbers of a control, or why there are none."""
     return {
-        "what": what,
-        "why_not": why_not,
-        "measures": summing.summaries(taken) if taken else None,
-        "counted": _counted(taken, protocol.counted),
+        "description": description,
+        "reason": reason,
+        "measures": aggregation.summaries(taken) if taken else None,
+        "correct_counts": _correct_counts(taken, protocol.binomial_measure),
     }
 
 
@@ -119,37 +124,38 @@ def _against(difference: Mapping[str, Any], control: str) -> str:
     return f"{points} against {control}, an interval that holds 0"
 
 
-def reliability_entry(stated: Sequence[Mapping[str, NDArray[np.float64]]]) -> dict[str, list[dict[str, Any]]]:
+def reliability_entry(confidences: Sequence[Mapping[str, NDArray[np.float64]]]) -> dict[str, list[dict[str, Any]]]:
     """Whether stated probabilities of first guesses came true, by what was searched: for each bin of .1 that is not
     empty {"from", "to", "stated", "true", "count"}.
 
     stated: for each fold, by what was searched (Q, 2), the probability and the share that is right.
     """
-    names = dict.fromkeys(name for one in stated for name in one)
-    return {name: _bins(np.concatenate([one[name] for one in stated if name in one])) for name in names}
+    names = dict.fromkeys(name for one in confidences for name in one)
+    return {name: _bins(np.concatenate([one[name] for one in confidences if name in one])) for name in names}
 
 
-def _bins(stated: NDArray[np.float64]) -> list[dict[str, Any]]:
-    said, right = stated.T
-    which = np.minimum((said * STATED_BINS).astype(int), STATED_BINS - 1)
+def _bins(confidences: NDArray[np.float64]) -> list[dict[str, Any]]:
+    said, right = confidences.T
+    which = np.minimum((said * CONFIDENCE_BINS).astype(int), CONFIDENCE_BINS - 1)
     return [
         {
-            "from": place / STATED_BINS,
-            "to": (place + 1) / STATED_BINS,
-            "stated": float(said[which == place].mean()),
-            "true": float(right[which == place].mean()),
+            "from": place / CONFIDENCE_BINS,
+            "to": (place + 1) / CONFIDENCE_BINS,
+            "confidence": float(said[which == place].mean()),
+            "accuracy": float(right[which == place].mean()),
             "count": int((which == place).sum()),
         }
         for place in np.unique(which).tolist()
     ]
 
 
-def _counted(by_seed: BySeed, name: str | None) -> dict[str, Any] | None:
+def _correct_counts(by_seed: BySeed, name: str | None) -> dict[str, Any] | None:
     """Right first answers, by seed, and the exact interval of their mean number: the queries of all seeds are the same,
-    so that more seeds make no more of them."""
+    so that more seeds make no more of them.
+    """
     if name is None or not by_seed or any(name not in found for found in by_seed):
         return None
     values = [found[name].values[:, 0] for found in by_seed]
     right, asked = [float(one.sum()) for one in values], len(values[0])
     low, high = clopper_pearson(sum(right) / len(right), asked, LEVEL)
-    return {"measure": name, "right": right, "asked": asked, "low": low, "high": high}
+    return {"measure": name, "right": right, "queries": asked, "low": low, "high": high}

@@ -1,5 +1,6 @@
 """VT60: nine everyday objects, of which one was touched. One of the two classes of bottles is left out: 08_bottlefull
-and 02_bottleempty are the same things, and no photo tells them apart."""
+and 02_bottleempty are the same things, and no photo tells them apart.
+"""
 
 from collections import defaultdict
 from dataclasses import replace
@@ -9,32 +10,40 @@ import numpy as np
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.protocol import BOTH, REFERENCE, Facts, Protocol, first_guess, folds, registered
+from retrieval.evaluation.real.protocol import (
+    BOTH,
+    REFERENCE,
+    Protocol,
+    RecordingFacts,
+    folds,
+    registered_metrics,
+    topn_accuracy,
+)
 
 LEFT_OUT = "bottlefull"
 GALLERY = 9
 DRAWN_CHOICES = 9
 _CLASSES_OF_A_FOLD = 3
 _MEASURES = {
-    **first_guess(GALLERY),
-    **first_guess(GALLERY, photos=3),
-    **first_guess(GALLERY, grasps=5, photos=3),
-    **registered("pair_auc"),
+    **topn_accuracy(GALLERY),
+    **topn_accuracy(GALLERY, photos=3),
+    **topn_accuracy(GALLERY, grasps=5, photos=3),
+    **registered_metrics("pair_auc"),
 }
-_SHARED = "08_bottlefull is left out, which is 02_bottleempty filled. Five of the other objects choose settings."
-_OF_REFERENCES = {
-    **first_guess(GALLERY),
-    **first_guess(GALLERY, photos=3, entries="references"),
-    **first_guess(GALLERY, grasps=5, photos=3, entries="references"),
-    **registered("pair_auc"),
+_SPLIT_NOTE = "08_bottlefull is left out, which is 02_bottleempty filled. Five of the other objects choose settings."
+_REFERENCE_MEASURES = {
+    **topn_accuracy(GALLERY),
+    **topn_accuracy(GALLERY, photos=3, entries="references"),
+    **topn_accuracy(GALLERY, grasps=5, photos=3, entries="references"),
+    **registered_metrics("pair_auc"),
 }
-_PARTED = (
+_REFERENCE_SPLIT = (
     "Of each object the first quarter of its touches are references, the last half asks. References and queries are of "
     "one sitting and one finger, so that the control of the order knows all: only what the blur loses is touch."
 )
 
 
-def by_class(facts: Facts) -> dict[str, list[str]]:
+def by_class(facts: RecordingFacts) -> dict[str, list[str]]:
     """Objects of each class, sorted; without the class that is left out. Raises DatasetError where none is told."""
     found: dict[str, list[str]] = defaultdict(list)
     for name in facts.names:
@@ -48,7 +57,7 @@ def by_class(facts: Facts) -> dict[str, list[str]]:
     return dict(sorted(found.items()))
 
 
-def _seen_classes(facts: Facts, seed: int) -> list[Split]:
+def _seen_classes(facts: RecordingFacts, seed: int) -> list[Split]:
     """Instance number i of every class."""
     classes = by_class(facts)
     least = min(map(len, classes.values()))
@@ -56,9 +65,10 @@ def _seen_classes(facts: Facts, seed: int) -> list[Split]:
     return folds([name for names in classes.values() for name in names], tests, seed)
 
 
-def _choices(facts: Facts, seed: int) -> list[Split]:
+def _choices(facts: RecordingFacts, seed: int) -> list[Split]:
     """Two instances of every class: all pairs of instance numbers, the same in every class, then seeded draws. Raises
-    DatasetError for fewer than three instances of a class."""
+    DatasetError for fewer than three instances of a class.
+    """
     classes = by_class(facts)
     rng = np.random.default_rng([seed, 31])
     least = min(map(len, classes.values()))
@@ -72,7 +82,7 @@ def _choices(facts: Facts, seed: int) -> list[Split]:
     return folds([name for names in classes.values() for name in names], tests, seed)
 
 
-def _one_of_each_class(facts: Facts, split: Split) -> dict[str, str]:
+def _one_of_each_class(facts: RecordingFacts, split: Split) -> dict[str, str]:
     """Galleries of one test object of each class: the first of each, the second, and so on."""
     test = set(split.test)
     return {
@@ -82,14 +92,14 @@ def _one_of_each_class(facts: Facts, split: Split) -> dict[str, str]:
     }
 
 
-def _random(facts: Facts, seed: int) -> list[Split]:
+def _random(facts: RecordingFacts, seed: int) -> list[Split]:
     names = [name for members in by_class(facts).values() for name in members]
     order = [names[place] for place in np.random.default_rng([seed, 19]).permutation(len(names))]
     count = max(1, len(names) // GALLERY)
     return folds(names, [order[turn::count] for turn in range(count)], seed)
 
 
-def _classes(facts: Facts, seed: int) -> list[Split]:
+def _classes(facts: RecordingFacts, seed: int) -> list[Split]:
     classes = by_class(facts)
     kinds = list(classes)
     order = [kinds[place] for place in np.random.default_rng([seed, 23]).permutation(len(kinds))]
@@ -102,10 +112,10 @@ SEEN_CLASSES = Protocol(
     "vt60",
     "VT60: an unseen instance of each seen class",
     "A fold tests one instance of each of nine classes, the other instances train; every object is tested once. "
-    f"{_SHARED}",
+    f"{_SPLIT_NOTE}",
     _seen_classes,
     _MEASURES,
-    own_photos=True,
+    allows_own_photos=True,
 )
 CHOICES = Protocol(
     "vt60",
@@ -116,26 +126,26 @@ CHOICES = Protocol(
     "02_bottleempty filled. Settings are chosen within the training objects of each fold.",
     _choices,
     _MEASURES,
-    own_photos=True,
+    allows_own_photos=True,
     galleries=_one_of_each_class,
     choices=True,
 )
 RANDOM = Protocol(
     "vt60",
     "VT60: nine random unseen objects",
-    f"Objects are dealt by lot into folds of nine, again for each seed; every object is tested once. {_SHARED}",
+    f"Objects are dealt by lot into folds of nine, again for each seed; every object is tested once. {_SPLIT_NOTE}",
     _random,
     _MEASURES,
-    own_photos=True,
+    allows_own_photos=True,
 )
 CLASSES = Protocol(
     "vt60",
     "VT60: unseen classes",
     "A fold tests all instances of three classes that nothing else has seen, drawn again for each seed; of their "
-    f"objects nine stand in a gallery. {_SHARED}",
+    f"objects nine stand in a gallery. {_SPLIT_NOTE}",
     _classes,
     _MEASURES,
-    own_photos=True,
+    allows_own_photos=True,
 )
 
 
@@ -148,8 +158,8 @@ def _with_references(name: str, protocol: Protocol, entry: str) -> Protocol:
     return replace(
         protocol,
         title=protocol.title.replace("VT60", f"VT60, {called}"),
-        rule=f"As {name}, the catalogue holding {held}. {_PARTED} {_SHARED}",
-        measures=_OF_REFERENCES,
+        rule=f"As {name}, the catalogue holding {held}. {_REFERENCE_SPLIT} {_SPLIT_NOTE}",
+        measures=_REFERENCE_MEASURES,
         entry=entry,
     )
 

@@ -1,6 +1,6 @@
 """X-Capture: which object was touched, of objects that nothing has seen."""
 
-from retrieval.evaluation.real.protocol import Protocol, first_guess, registered
+from retrieval.evaluation.real.protocol import Protocol, registered_metrics, topn_accuracy
 from retrieval.evaluation.real.rct import five_folds
 
 OBJECTS = Protocol(
@@ -9,5 +9,5 @@ OBJECTS = Protocol(
     "Objects are randomly assigned to five folds, again for each seed; all points of an object stay together. A touch "
     "is never shown the photo of its own point.",
     five_folds,
-    {**first_guess(10), **first_guess(5), **registered("pair_auc")},
+    {**topn_accuracy(10), **topn_accuracy(5), **registered_metrics("pair_auc")},
 )

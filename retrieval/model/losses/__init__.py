@@ -16,13 +16,13 @@ LOSSES: "Registry[type[Loss]]" = Registry(
     "loss",
     "losses",
     {
-        "contrastive": "retrieval.model.losses.contrastive:Contrastive",
-        "listwise": "retrieval.model.losses.listwise:Listwise",
-        "sigmoid": "retrieval.model.losses.sigmoid:Sigmoid",
+        "contrastive": "retrieval.model.losses.contrastive:ContrastiveLoss",
+        "listwise": "retrieval.model.losses.listwise:ListwiseLoss",
+        "sigmoid": "retrieval.model.losses.sigmoid:SigmoidLoss",
     },
     error=ConfigError,
     base="retrieval.model.losses.loss:Loss",
 )
 
-OF_LOGITS = frozenset({"listwise"})
+LOGIT_LOSSES = frozenset({"listwise"})
 """Losses of match logits alone. Every other one trains the embeddings by which candidates are searched."""

@@ -11,7 +11,7 @@ LOG_SCALE_INIT = math.log(1 / 0.07)
 LOG_SCALE_MAX = math.log(100.0)
 
 
-class Contrastive(Loss):
+class ContrastiveLoss(Loss):
     """`contrastive_loss` of the embeddings of a batch. Its learnt scale is the matcher's, which checkpoints keep."""
 
     def forward(self, batch: EncodedBatch) -> Tensor:

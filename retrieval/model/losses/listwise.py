@@ -7,12 +7,12 @@ from torch.nn import functional
 from retrieval.model.losses.loss import EncodedBatch, Loss
 
 
-class Listwise(Loss):
+class ListwiseLoss(Loss):
     """`listwise_loss` of the match logits of every touch of a batch with every photo of it."""
 
     def forward(self, batch: EncodedBatch) -> Tensor:
         """Return the loss (scalar) of a batch."""
-        logits = batch.matcher.head(batch.touch.half[:, None], batch.photo.half[None])
+        logits = batch.matcher.head(batch.touch.partial[:, None], batch.photo.partial[None])
         return listwise_loss(logits, batch.touch_objects, batch.photo_objects)
 
 

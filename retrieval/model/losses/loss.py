@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from torch import Tensor, nn
 
 if TYPE_CHECKING:
-    from retrieval.model.fusion import Code, Matcher
+    from retrieval.model.fusion import ImageEncoding, Matcher
 
 
 class EncodedBatch(NamedTuple):
@@ -17,8 +17,8 @@ class EncodedBatch(NamedTuple):
     """
 
     matcher: "Matcher"
-    touch: "Code"
-    photo: "Code"
+    touch: "ImageEncoding"
+    photo: "ImageEncoding"
     touch_objects: Tensor
     photo_objects: Tensor
 

@@ -13,7 +13,7 @@ from retrieval.model.losses.loss import EncodedBatch, Loss
 SIGMOID_LOG_SCALE_INIT, SIGMOID_BIAS_INIT = math.log(10.0), -10.0
 
 
-class Sigmoid(Loss):
+class SigmoidLoss(Loss):
     """`sigmoid_loss` of the embeddings of a batch, with its own learnt scale and bias."""
 
     def __init__(self, embedding_dim: int, objects: int) -> None:

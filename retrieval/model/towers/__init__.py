@@ -2,7 +2,7 @@
 package.
 
 A tower is named by its row, by "module:Class", or by a family and a model: "transformers:facebook/dinov2-small". Names
-joined by `TOGETHER` are backbones side by side (`retrieval.model.towers.side_by_side`), and so are their first weights:
+joined by `TOWER_SEPARATOR` are backbones side by side (`retrieval.model.towers.concatenated`), and so are their first weights:
 tower "mobilenet_v2+mobilenet_v2", init "relief.safetensors+imagenet".
 """
 
@@ -13,7 +13,7 @@ from _touch_retrieval.registry import Registry
 from retrieval.errors import ConfigError
 
 if TYPE_CHECKING:
-    from retrieval.model.towers.base import Tower, TowerFamily
+    from retrieval.model.towers.tower import Tower, TowerFamily
 
 TOWERS: "Registry[type[Tower]]" = Registry(
     "tower",
@@ -23,10 +23,10 @@ TOWERS: "Registry[type[Tower]]" = Registry(
         "resnet18": "retrieval.model.towers.resnet:ResNet18",
         "resnet34": "retrieval.model.towers.resnet:ResNet34",
         "resnet50": "retrieval.model.towers.resnet:ResNet50",
-        "small": "retrieval.model.towers.small:Small",
+        "small": "retrieval.model.towers.small:SmallTower",
     },
     error=ConfigError,
-    base="retrieval.model.towers.base:Tower",
+    base="retrieval.model.towers.tower:Tower",
 )
 FAMILIES: "Registry[type[TowerFamily]]" = Registry(
     "family of towers",
@@ -36,11 +36,11 @@ FAMILIES: "Registry[type[TowerFamily]]" = Registry(
         "transformers": "retrieval.model.towers.transformers_models:TransformersTower",
     },
     error=ConfigError,
-    base="retrieval.model.towers.base:TowerFamily",
+    base="retrieval.model.towers.tower:TowerFamily",
 )
 """Other libraries of backbones; what they build is named "family:model"."""
 
-TOGETHER = "+"
+TOWER_SEPARATOR = "+"
 OUTPUTS = ("classes", "pooled", "stages")
 
 
@@ -58,10 +58,10 @@ def build_tower(name: str, output: str = "pooled", architectures: Mapping[str, A
     Raises:
         ConfigError: For an unknown name or output, or a model whose architecture is not given.
     """
-    if TOGETHER in name:
-        from retrieval.model.towers.side_by_side import SideBySide
+    if TOWER_SEPARATOR in name:
+        from retrieval.model.towers.concatenated import ConcatenatedTowers
 
-        return SideBySide([build_tower(part, output, architectures) for part in name.split(TOGETHER)])
+        return ConcatenatedTowers([build_tower(part, output, architectures) for part in name.split(TOWER_SEPARATOR)])
     if output not in OUTPUTS:
         raise ConfigError(f"tower output must be one of {', '.join(OUTPUTS)}; got {output!r}")
     if (family := _family_of(name)) is None:
@@ -77,7 +77,7 @@ def tower_name(choice: "str | type[Tower]") -> str:
     """Return the name of a tower, or of several, that a user gives. Raises ConfigError for an unknown one."""
     if not isinstance(choice, str):
         return TOWERS.name_of(choice)
-    for part in choice.split(TOGETHER):
+    for part in choice.split(TOWER_SEPARATOR):
         if _family_of(part) is None:
             TOWERS.name_of(part)
     return choice
@@ -88,7 +88,7 @@ def architectures_of(name: str) -> dict[str, Any]:
 
     Raises ConfigError for a model that its family does not know.
     """
-    families = {part: _family_of(part) for part in name.split(TOGETHER)}
+    families = {part: _family_of(part) for part in name.split(TOWER_SEPARATOR)}
     return {
         part: FAMILIES.load(family).architecture(part.partition(":")[2]) for part, family in families.items() if family
     }

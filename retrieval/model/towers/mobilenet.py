@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 from torch import Tensor, nn
 
-from retrieval.model.towers.base import Tower, stage_statistics, unrounded
+from retrieval.model.towers.tower import Tower, stage_statistics, without_autocast
 
 # Expansion, output channels, blocks, first stride: table 2 of the paper.
 _STAGES = (
@@ -18,8 +18,8 @@ _STAGES = (
     (6, 320, 1, 1),
 )
 # Layers that end the stages of 32, 64, 96 and 320 channels, at strides 8, 16, 16 and 32.
-_DESCRIBED = {6: 32, 10: 64, 13: 96, 17: 320}
-_UNROUNDED = 3
+_STAGE_OUTPUTS = {6: 32, 10: 64, 13: 96, 17: 320}
+_FLOAT32_LAYERS = 3
 """Layers of the strides up to 4."""
 
 
@@ -69,7 +69,7 @@ class MobileNetV2(Tower):
                 layers.append(InvertedResidual(inputs, outputs, first_stride if block == 0 else 1, expansion))
                 inputs = outputs
         if output == "stages":
-            self.feature_count = 3 * sum(_DESCRIBED.values())
+            self.feature_count = 3 * sum(_STAGE_OUTPUTS.values())
         else:
             layers.append(_convolution(inputs, 1280, 1))
             self.feature_count = 1000 if output == "classes" else 1280
@@ -84,17 +84,17 @@ class MobileNetV2(Tower):
                 nn.init.zeros_(module.bias)
 
     def _encode(self, images: Tensor) -> Tensor:
-        with unrounded(images):
-            x = self.features[:_UNROUNDED](images)
+        with without_autocast(images):
+            x = self.features[:_FLOAT32_LAYERS](images)
         if self.output == "stages":
             return stage_statistics(self._stages(x))
-        x = nn.functional.adaptive_avg_pool2d(self.features[_UNROUNDED:](x), 1).flatten(1)
+        x = nn.functional.adaptive_avg_pool2d(self.features[_FLOAT32_LAYERS:](x), 1).flatten(1)
         return x if self.classifier is None else self.classifier(x)
 
     def _stages(self, x: Tensor) -> Iterator[Tensor]:
-        for number, layer in enumerate(list(self.features)[_UNROUNDED:], start=_UNROUNDED):
+        for number, layer in enumerate(list(self.features)[_FLOAT32_LAYERS:], start=_FLOAT32_LAYERS):
             x = layer(x)
-            if number in _DESCRIBED:
+            if number in _STAGE_OUTPUTS:
                 yield x
 
     @staticmethod

@@ -8,7 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from retrieval.model.towers.base import Tower, stage_statistics
+from retrieval.model.towers.tower import Tower, stage_statistics
 
 
 class BasicBlock(nn.Module):

@@ -8,26 +8,28 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor, nn
 
-from retrieval.model.towers.base import Tower, stage_statistics, unrounded
+from retrieval.model.towers.tower import Tower, stage_statistics, without_autocast
 
 _WIDTHS = (24, 48, 96, 128)
-_UNROUNDED = 3
+_FLOAT32_LAYERS = 3
 """The first convolution, its norm and rectifier."""
 
 
 class GroupNorm(nn.GroupNorm):
     """In the weights' float32 also where convolutions multiply in bfloat16, as on a GPU: with channels last PyTorch's
-    own for bfloat16 is so slow on a CPU that a step takes 1.4 times as long."""
+    own for bfloat16 is so slow on a CPU that a step takes 1.4 times as long.
+    """
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) in the type of the weights."""
-        with unrounded(x):
+        with without_autocast(x):
             return super().forward(x.to(self.weight.dtype))
 
 
-class Small(Tower):
+class SmallTower(Tower):
     """Four 3 x 3 convolutions of stride 2 (the first 5 x 5); mean and maximum over the last map: 256 features, 888
-    of stages."""
+    of stages.
+    """
 
     optional_prefixes = ("fc.",)
 
@@ -48,16 +50,16 @@ class Small(Tower):
         self.feature_count = {"classes": 1000, "pooled": 2 * inputs, "stages": 3 * sum(_WIDTHS)}[output]
 
     def _encode(self, images: Tensor) -> Tensor:
-        with unrounded(images):
-            first = self.stages[:_UNROUNDED](images)
+        with without_autocast(images):
+            first = self.stages[:_FLOAT32_LAYERS](images)
         if self.output == "stages":
             return stage_statistics([first, *self._maps(first)])
-        x = self.stages[_UNROUNDED:](first).flatten(2)
+        x = self.stages[_FLOAT32_LAYERS:](first).flatten(2)
         x = torch.cat([x.mean(2), x.amax(2)], dim=1)
         return x if self.fc is None else self.fc(x)
 
     def _maps(self, x: Tensor) -> Iterator[Tensor]:
-        for layer in list(self.stages)[_UNROUNDED:]:
+        for layer in list(self.stages)[_FLOAT32_LAYERS:]:
             x = layer(x)
             if isinstance(layer, nn.ReLU):
                 yield x

@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from retrieval.errors import CheckpointError, ConfigError
-from retrieval.model.towers.base import TowerFamily, stage_statistics
+from retrieval.model.towers.tower import TowerFamily, stage_statistics
 from retrieval.model.towers.weights import State
 
 
 class TimmTower(TowerFamily):
     """A model of timm. "pooled" is what it gives without its classifier, "stages" the statistics of its feature
-    maps."""
+    maps.
+    """
 
     def __init__(self, output: str, model: str, architecture: Mapping[str, Any]) -> None:
         super().__init__(output, model, architecture)
@@ -36,7 +37,7 @@ class TimmTower(TowerFamily):
         known = timm.get_pretrained_cfg(model)
         return {"mean": list(known.mean), "std": list(known.std)}
 
-    def published(self) -> State:
+    def published_weights(self) -> State:
         """Return the weights that timm publishes for the model. Raises CheckpointError."""
         timm = _timm()
         options = {"features_only": True} if self.output == "stages" else {"num_classes": self.model.num_classes}

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 
 from retrieval.errors import CheckpointError, ConfigError
-from retrieval.model.towers.base import TowerFamily, stage_statistics
+from retrieval.model.towers.tower import TowerFamily, stage_statistics
 from retrieval.model.towers.weights import State
 
 log = logging.getLogger(__name__)
-DEPTHS = 4
+STAGE_COUNT = 4
 """Of how many layers "stages" takes statistics, evenly chosen: of all stages of a network that has four."""
 
 
@@ -47,13 +47,13 @@ class TransformersTower(TowerFamily):
         try:
             config = models.AutoConfig.from_pretrained(model)
             config = getattr(config, "vision_config", config)
-            seen_by, _ = models.ImageProcessingMixin.get_image_processor_dict(model)
+            processor, _ = models.ImageProcessingMixin.get_image_processor_dict(model)
         except (OSError, ValueError) as error:
             raise ConfigError(f"transformers:{model} must be a model of the Hub or in a folder: {error}") from error
         known = {name: value for name, value in config.to_dict().items() if name != "_name_or_path"}
-        return {"config": known, "mean": seen_by["image_mean"], "std": seen_by["image_std"]}
+        return {"config": known, "mean": processor["image_mean"], "std": processor["image_std"]}
 
-    def published(self) -> State:
+    def published_weights(self) -> State:
         """Return the model's own weights, from its folder or the Hub. Raises CheckpointError."""
         try:
             found, report = _transformers().AutoModel.from_pretrained(
@@ -75,7 +75,7 @@ class TransformersTower(TowerFamily):
         made = model(images, output_hidden_states=self.output == "stages", **self._options)
         if self.output == "stages":
             maps = made.hidden_states[1:]
-            every = max(1, len(maps) // DEPTHS)
+            every = max(1, len(maps) // STAGE_COUNT)
             return stage_statistics([_as_map(each) for each in maps[every - 1 :: every]])
         pooled = getattr(made, "pooler_output", None)
         features: Tensor = _as_map(made.last_hidden_state).mean((2, 3)) if pooled is None else pooled.flatten(1)

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from retrieval.errors import CheckpointError
-from retrieval.model.towers import TOGETHER
+from retrieval.model.towers import TOWER_SEPARATOR
 
 if TYPE_CHECKING:
-    from retrieval.model.towers.base import Tower
+    from retrieval.model.towers.tower import Tower
 
 State = dict[str, Tensor]
 SHIPPED = "shipped"
@@ -24,20 +24,20 @@ log = logging.getLogger(__name__)
 def initialise_tower(tower: "Tower", init: str, shipped: Callable[[], State] | None = None) -> None:
     """Give `tower` its first weights.
 
-    init: "random" leaves it as built, "imagenet" takes the weights that are published for it (`Tower.published`),
+    init: "random" leaves it as built, "imagenet" takes the weights that are published for it (`Tower.published_weights`),
     "shipped" is what the caller knows as that, anything else is the path of a .pth, .pt or .safetensors state dict with
     the tower's key names, which are torchvision's for our own. Towers side by side take one for all of them, or as
     many, joined alike. Raises CheckpointError where a file is missing, damaged or of another architecture.
     """
-    from retrieval.model.towers.side_by_side import SideBySide  # a tower, which imports this module
+    from retrieval.model.towers.concatenated import ConcatenatedTowers  # a tower, which imports this module
 
     if init == "random":
         return
-    if isinstance(tower, SideBySide):
-        inits, count = init.split(TOGETHER), len(tower.parts)
+    if isinstance(tower, ConcatenatedTowers):
+        inits, count = init.split(TOWER_SEPARATOR), len(tower.parts)
         if len(inits) not in (1, count):
             raise CheckpointError(
-                f"{count} towers side by side take first weights for each, joined by {TOGETHER!r}; got {init!r}"
+                f"{count} towers side by side take first weights for each, joined by {TOWER_SEPARATOR!r}; got {init!r}"
             )
         for part, its_init in zip(tower.parts, inits * (count // len(inits)), strict=True):
             initialise_tower(part, its_init, shipped)  # type: ignore[arg-type]
@@ -45,7 +45,7 @@ def initialise_tower(tower: "Tower", init: str, shipped: Callable[[], State] | N
     if init == SHIPPED and shipped is not None:
         load_tower_state(tower, shipped(), "the shipped checkpoint")
         return
-    state = tower.published() if init == "imagenet" else read_state(Path(init))
+    state = tower.published_weights() if init == "imagenet" else read_state(Path(init))
     load_tower_state(tower, state, f"the published {type(tower).__name__}" if init == "imagenet" else init)
 
 
@@ -92,7 +92,8 @@ def read_state(path: Path) -> State:
 
 def download(url: str) -> State:
     """Read a published state dict, fetched once into PyTorch's cache. The eight digits in its name begin its SHA-256,
-    and the download is checked against them. Raises CheckpointError."""
+    and the download is checked against them. Raises CheckpointError.
+    """
     path = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
     if path.is_file():
         return read_state(path)

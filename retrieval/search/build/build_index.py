@@ -10,37 +10,37 @@ from typing import Any
 
 from indexes import load_kind
 from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
-from indexes.kinds.base import VectorIndex
+from indexes.kinds.vector_index import VectorIndex
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation
 from indexes.store.manifest import read_manifest
 from indexes.store.stat_cache import FolderCache
 from indexes.store.tables import Tables
-from indexes.store.writing import RECALL_QUERIES, Chosen
+from indexes.store.writing import RECALL_QUERIES, KindChoice
 from retrieval.data.catalogue import Catalogue
-from retrieval.data.naming import FOLDER, Naming, doubts, per_object
-from retrieval.data.sources import Fetched, list_photos
+from retrieval.data.naming import FOLDER, Naming, count_summary, naming_warnings
+from retrieval.data.sources import RemoteCatalogue, list_photos
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.references import ROWS, WORTH
-from retrieval.model.stored import fingerprint, halves_kept
+from retrieval.model.checkpoint_info import can_reuse_partials, fingerprint
+from retrieval.model.reference_calibration import REFERENCE_CALIBRATION, REFERENCE_ROWS
 from retrieval.search.build.build_report import BuildReport
-from retrieval.search.build.embed import EMBEDDED, REMADE, RENAMED, RESUMED, Embedder, Part
+from retrieval.search.build.embed import EMBEDDED, RE_EMBEDDED, RENAMED, RESUMED, BuildPart, Embedder
 from retrieval.search.build.embed_touches import ReferenceBuild, embed_references
-from retrieval.search.build.looks import Looked, runs
 from retrieval.search.build.measuring import can_measure, query_codes
 from retrieval.search.build.operating import SearchRequirements, choose_operating_point
+from retrieval.search.build.stat_cache import StatCache, unchanged_runs
 from retrieval.version import __version__
 
-UNNOTED = (
+NO_STAT_CACHE = (
     "No earlier build noted sizes and times of the photos' files, as older versions do not, so each was read and "
     "compared."
 )
-TAUGHT_AGAIN = (
+CANDIDATE_ENCODER_CHANGED = (
     "The model finds candidates in another way and judges as before, so unchanged photos kept their halves and were "
     "given new embeddings made of these; none of them was decoded or encoded."
 )
-CHANGED = {
+CHANGE_REASONS = {
     "checkpoint": "the model is another one",
     "preprocessing": "the model wants photos prepared in another way",
 }
@@ -74,7 +74,7 @@ def build_index(
         min_recall: Least winner recall of candidate search (`retrieval.search.build.operating`).
         max_ms: Longest candidate search and reranking of one touch, in milliseconds.
         verify: List every folder and read every file, even if size, times and inode did not change
-            (`retrieval.search.build.looks`).
+            (`retrieval.search.build.stat_cache`).
         quiet: Show no progress.
 
     Returns:
@@ -90,7 +90,7 @@ def build_index(
     >>> report.photos, report.embedded  # the index was there, and no photo changed
     (4, 0)
     """
-    asked, out = SearchRequirements.of(kind, min_recall, max_ms), Path(out)
+    requirements, out = SearchRequirements.of(kind, min_recall, max_ms), Path(out)
     try:
         before = read_manifest(out / IndexStore(out).current()).about
     except IndexesError:
@@ -98,7 +98,7 @@ def build_index(
     naming, note = naming_by(objects_from, before)
     seen = FolderCache(out, known=not verify)
     catalogue = list_photos(folder, naming, seen)
-    report = build_listed(catalogue, checkpoint, out, BuildOptions(naming, asked, quiet, verify, note))
+    report = build_listed(catalogue, checkpoint, out, BuildOptions(naming, requirements, quiet, verify, note))
     seen.write()
     return report
 
@@ -119,7 +119,7 @@ class BuildOptions:
     """
 
     naming: Naming
-    asked: SearchRequirements
+    requirements: SearchRequirements
     quiet: bool = False
     verify: bool = False
     note: str = ""
@@ -130,26 +130,28 @@ class BuildOptions:
 
 def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, options: BuildOptions) -> BuildReport:
     """As `build_index`, of photos that are listed already."""
-    asked, store = options.asked, IndexStore(out)
-    if asked.kind is not None:
-        chosen = load_kind(asked.kind)
-        chosen.resolved(chosen.parameters_type(), len(catalogue.photos), checkpoint.config.matcher.embedding_dim)
+    requirements, store = options.requirements, IndexStore(out)
+    if requirements.kind is not None:
+        chosen = load_kind(requirements.kind)
+        chosen.resolve_parameters(
+            chosen.parameters_type(), len(catalogue.photos), checkpoint.config.matcher.embedding_dim
+        )
     with store.lock():
-        parent, halves, why = _reusable(store, checkpoint)
+        parent, partials, why = _reusable(store, checkpoint)
         references = embed_references(catalogue, checkpoint, parent, options.quiet)
         catalogue = references.shown(catalogue)
         start = time.perf_counter()
-        looked = Looked(catalogue, out, options.verify)
-        known = looked.known(parent)
-        kept = list(runs(catalogue.photos, known, parent))
-        with closing(Embedder(checkpoint, out, parent, options.donors, halves)) as embedder:
-            job = _Job(store, embedder, references, catalogue.where, options)
-            with closing(embedder.parts(catalogue, known, kept, options.quiet)) as parts:
+        stat_cache = StatCache(catalogue, out, options.verify)
+        known = stat_cache.known(parent)
+        unchanged = list(unchanged_runs(catalogue.photos, known, parent))
+        with closing(Embedder(checkpoint, out, parent, options.donors, partials)) as embedder:
+            job = _BuildJob(store, embedder, references, catalogue.where, options)
+            with closing(embedder.parts(catalogue, known, unchanged, options.quiet)) as parts:
                 generation, is_written = job.write(parts)
             embedder.clear()
-        looked.note(generation)
+        stat_cache.note(generation)
         seconds = time.perf_counter() - start - job.choosing_s
-    notes = (options.note, UNNOTED if parent is not None and looked.unnoted else why)
+    notes = (options.note, NO_STAT_CACHE if parent is not None and stat_cache.lacks_records else why)
     manifest, objects, made = generation.manifest, embedder.objects, embedder.made
     names, inside = sorted(objects), out.resolve()
     shown = dict.fromkeys((names[0], names[len(names) // 2], names[-1]))
@@ -161,13 +163,13 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         photos=generation.count,
         objects=len(names),
         objects_from=options.naming.text,
-        per_object=per_object(list(objects.values())),
+        per_object=count_summary(list(objects.values())),
         examples=[(name, catalogue.photos.paths[catalogue.photos.objects.index(name)]) for name in shown],
-        doubts=doubts(objects, options.naming),
+        warnings=naming_warnings(objects, options.naming),
         embedded=made[EMBEDDED],
         reused=objects.total() - made[EMBEDDED],
         renamed=made[RENAMED],
-        remade=made[REMADE],
+        re_embedded=made[RE_EMBEDDED],
         resumed=made[RESUMED],
         removed=embedder.removed,
         unread=int((known >= 0).sum()),
@@ -175,7 +177,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         ignored=[
             name
             for name in catalogue.ignored
-            if isinstance(catalogue, Fetched) or not (catalogue.folder / name).resolve().is_relative_to(inside)
+            if isinstance(catalogue, RemoteCatalogue) or not (catalogue.folder / name).resolve().is_relative_to(inside)
         ],
         without_photo=sorted(set(catalogue.object_ids) - objects.keys()),
         notes=list(catalogue.notes),
@@ -183,13 +185,13 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         reason=" ".join(filter(None, (*notes, manifest.about["reason"]))),
         recall=manifest.recall,
         candidates=manifest.about["candidates"],
-        half_error=embedder.half_error,
+        partial_error=embedder.partial_error,
         seconds=seconds,
-        references=references.summary(manifest.about[WORTH]["by"]) if references.rows else None,
+        references=references.summary(manifest.about[REFERENCE_CALIBRATION]["by"]) if references.rows else None,
     )
 
 
-def naming_by(asked: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]:
+def naming_by(requirements: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]:
     """Return the rule that names objects, and a note where it replaces another one.
 
     Args:
@@ -204,7 +206,7 @@ def naming_by(asked: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]
         known = None if before is None else Naming(before)
     except (BadInput, TypeError):  # of another version
         known = None
-    naming = Naming(asked) if asked is not None else known or Naming(FOLDER)
+    naming = Naming(requirements) if requirements is not None else known or Naming(FOLDER)
     if known is None or known == naming:
         return naming, ""
     return naming, f"Objects are named by {naming.text} now, no longer by {known.text}."
@@ -221,16 +223,16 @@ def _reusable(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | N
     before, now = there.manifest.fingerprint, fingerprint(checkpoint)
     if {name: before.get(name) for name in now} == now:
         return there, None, ""
-    half = (checkpoint.config.matcher.half,)
-    if halves_kept(checkpoint, before) and there.arrays["halves"].shape[1:] == half:
-        return None, there, TAUGHT_AGAIN
-    changed = [said for name, said in CHANGED.items() if before.get(name) != now[name]]
+    partial = (checkpoint.config.matcher.partial_width,)
+    if can_reuse_partials(checkpoint, before) and there.arrays["partials"].shape[1:] == partial:
+        return None, there, CANDIDATE_ENCODER_CHANGED
+    changed = [said for name, said in CHANGE_REASONS.items() if before.get(name) != now[name]]
     written = f"; the index was written by version {there.manifest.software}" if there.manifest.software else ""
     return None, None, f"Every photo was embedded again: {' and '.join(changed)}{written}."
 
 
 @dataclass
-class _Job:
+class _BuildJob:
     """Write a generation from parts, and choose its operating point when all of them are on the disk."""
 
     store: IndexStore
@@ -240,19 +242,21 @@ class _Job:
     options: BuildOptions
     choosing_s: float = 0.0
 
-    def write(self, parts: Iterator[Part]) -> tuple[Generation, bool]:
+    def write(self, parts: Iterator[BuildPart]) -> tuple[Generation, bool]:
         """Return the new generation and True; or the parent and False where the new one would equal it."""
         checkpoint, parent, options = self.embedder.checkpoint, self.embedder.parent, self.options
         about = {
             "checkpoint": str(checkpoint.path.resolve()),
             "catalogue": self.where,
             "objects_from": options.naming.text,
-            "asked": asdict(options.asked),
+            "requirements": asdict(options.requirements),
             **self.references.about,
             **options.about,
         }
         # A catalogue that had references may have none any more.
-        if parent is not None and all(parent.manifest.about.get(key) == about.get(key) for key in (ROWS, *about)):
+        if parent is not None and all(
+            parent.manifest.about.get(key) == about.get(key) for key in (REFERENCE_ROWS, *about)
+        ):
             if (changed := _changed(parent, parts)) is None:
                 return parent, False
             parts = changed
@@ -264,35 +268,36 @@ class _Job:
             about=about,
             parent=parent,
             software=__version__,
-            settle=self._choose,
+            choose_kind=self._choose,
             keep=options.keep,
             queries=query_codes(checkpoint, RECALL_QUERIES)[1] if can_measure(checkpoint) else None,
         )
         return generation, True
 
-    def _choose(self, tables: Tables) -> Chosen:
+    def _choose(self, tables: Tables) -> KindChoice:
         start, embedder = time.perf_counter(), self.embedder
         changed = embedder.made[EMBEDDED] + embedder.made[RESUMED] + embedder.removed
         previous = None if embedder.parent is None else embedder.parent.manifest
         point = choose_operating_point(
-            embedder.checkpoint, tables, self.options.asked, previous, changed, quiet=self.options.quiet
+            embedder.checkpoint, tables, self.options.requirements, previous, changed, quiet=self.options.quiet
         )
         self.choosing_s = time.perf_counter() - start
-        about = {"half_error": embedder.half_error, "reason": point.reason, "candidates": point.candidates}
+        about = {"partial_error": embedder.partial_error, "reason": point.reason, "candidates": point.candidates}
         if self.references.rows:
-            about[WORTH] = self.references.worth(embedder.checkpoint, tables)
-        return Chosen(point.kind, point.parameters, about)
+            about[REFERENCE_CALIBRATION] = self.references.worth(embedder.checkpoint, tables)
+        return KindChoice(point.kind, point.parameters, about)
 
 
-def _changed(parent: Generation, parts: Iterator[Part]) -> Iterator[Part] | None:
+def _changed(parent: Generation, parts: Iterator[BuildPart]) -> Iterator[BuildPart] | None:
     """All parts, or None where they hold the parent's rows, one by one. Parts without codes are held back until one
-    differs."""
-    same: list[Part] = []
+    differs.
+    """
+    same: list[BuildPart] = []
     place = 0
     for part in parts:
         same.append(part)
-        count = len(part.kept) or len(part.rows)
-        is_next = part.kept.start == place if part.kept else parent.rows[place : place + count] == part.rows
+        count = len(part.unchanged) or len(part.rows)
+        is_next = part.unchanged.start == place if part.unchanged else parent.rows[place : place + count] == part.rows
         if part.codes or not is_next:
             return chain(same, parts)
         place += count

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import PurePosixPath
 from typing import Any
 
-from retrieval.data.walking import SkippedPhoto
+from retrieval.data.folder_walk import SkippedPhoto
 
 SHOWN, FEW = 20, 5
 """Lines to show on a terminal of what has a reason each, and of what has not."""
@@ -18,20 +18,20 @@ class BuildReport:
 
     * `written`: False where nothing had changed, so that the generation stayed as it was.
     * `objects_from`: the rule that names objects (`retrieval.data.naming`). `per_object`: least, median and largest
-      number of their photos. `examples`: some objects, each with a photo of it. `doubts`: sentences on what looks wrong
+      number of their photos. `examples`: some objects, each with a photo of it. `warnings`: sentences on what looks wrong
       about the objects.
     * `photos`, `objects`: how many the index holds. Of the photos `embedded` were encoded now and `reused` were not. Of
-      these `renamed` had another name in the index before, `remade` have a new embedding made of their old half, and
+      these `renamed` had another name in the index before, `re_embedded` have a new embedding made of their old half, and
       `resumed` had been embedded by a build that was cut off.
     * `removed`: photos that the index held before and the catalogue no longer does.
     * `unread`: photos whose files were not read, for they look as they did when an earlier build read them
-      (`retrieval.search.build.looks`).
+      (`retrieval.search.build.stat_cache`).
     * `skipped`: pictures that could not be read. `ignored`: files that are no pictures by name. `left_out`: how many of
       both for each reason. `without_photo`: objects all of whose pictures were skipped. `notes`: remarks on metadata.
     * `kind`, `reason`, `recall`, `candidates`: how the index is searched and why (`retrieval.search.build.operating`);
       `candidates` is None where the checkpoint has nothing to measure them with.
-    * `half_error`: largest rounding of a stored half. `seconds`: time of decoding and encoding alone.
-    * `shards`: those of a cluster, as its manifest names them (`indexes.store.cluster`); None for an index folder.
+    * `partial_error`: largest rounding of a stored half. `seconds`: time of decoding and encoding alone.
+    * `shards`: those of a cluster, as its manifest names them (`indexes.store.sharded`); None for an index folder.
     * `references`: how many reference touches of how many objects, how many of these have no photo (`alone`), how many
       touches were encoded now, and who says what they are worth (`by`); None where there are none.
 
@@ -50,12 +50,12 @@ class BuildReport:
     objects_from: str
     per_object: dict[str, float]
     examples: list[tuple[str, str]]
-    doubts: list[str]
+    warnings: list[str]
     embedded: int
     reused: int
     renamed: int
     resumed: int
-    remade: int
+    re_embedded: int
     removed: int
     unread: int
     skipped: list[SkippedPhoto]
@@ -66,7 +66,7 @@ class BuildReport:
     reason: str
     recall: Any
     candidates: dict[str, Any] | None
-    half_error: float
+    partial_error: float
     seconds: float
     shards: list[dict[str, Any]] | None = None
     references: dict[str, Any] | None = None
@@ -91,11 +91,11 @@ class BuildReport:
         rate = f", {self.embedded / self.seconds:.1f} photos per second" if self.embedded else ""
         renamed = f" ({self.renamed} under another name)" if self.renamed else ""
         resumed = f", {self.resumed} from a build that was cut off" if self.resumed else ""
-        remade = f", {self.remade} with new embeddings of their old halves" if self.remade else ""
-        unchanged = self.reused - self.resumed - self.remade
+        re_embedded = f", {self.re_embedded} with new embeddings of their old halves" if self.re_embedded else ""
+        unchanged = self.reused - self.resumed - self.re_embedded
         yield (
             f"{self.index} ({self.generation}): {self.photos} photos of {self.objects} objects; "
-            f"{self.embedded} embedded{resumed}{remade}, {unchanged} unchanged{renamed}, {self.removed} removed{rate}"
+            f"{self.embedded} embedded{resumed}{re_embedded}, {unchanged} unchanged{renamed}, {self.removed} removed{rate}"
         )
         if not self.written:
             yield "nothing changed: the index stays as it is"
@@ -107,7 +107,7 @@ class BuildReport:
         each = " / ".join(f"{self.per_object[name]:g}" for name in ("min", "median", "max"))
         yield f"{self.objects} objects by --objects-from {self.objects_from}; photos of each: {each} (min, median, max)"
         yield from (f"  {name} <- {photo}" for name, photo in self.examples)
-        yield from (f"warning: {doubt}" for doubt in self.doubts)
+        yield from (f"warning: {doubt}" for doubt in self.warnings)
         if told := self.references:
             yield (
                 f"{told['touches']} reference touches of {told['objects']} objects, {told['alone']} of which have no "
@@ -120,7 +120,7 @@ class BuildReport:
         for shard in self.shards or ():
             yield f"  {shard['folder']} ({shard['generation']}): {shard['photos']} photos of {shard['objects']} objects"
         yield f"candidate search: {self.kind}. {self.reason}{measured}"
-        yield f"halves are stored as float16, each within {self.half_error:.2g} of the float32 one"
+        yield f"halves are stored as float16, each within {self.partial_error:.2g} of the float32 one"
         yield from _some("remark(s)", self.notes)
         if self.left_out:
             reasons = ", ".join(f"{count} {reason}" for reason, count in self.left_out.items())

@@ -20,17 +20,17 @@ from indexes.kinds.scores import Slots
 from indexes.store.generation import Generation
 from indexes.store.rows import keys_of
 from indexes.store.tables import Block, Layouts
-from indexes.store.unfinished import Unfinished
+from indexes.store.unfinished import UnfinishedBuild
 from retrieval.console.progress import Bar
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, Photos, decode_photo, read_photo
-from retrieval.data.loading import in_order
-from retrieval.data.walking import SkippedPhoto
-from retrieval.errors import NoPhoto, NumericalError
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoBytes, PhotoTable, decode_photo, read_photo
+from retrieval.data.folder_walk import SkippedPhoto
+from retrieval.data.loading import map_in_order
+from retrieval.errors import NoReadablePhoto, NumericalError
 from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.encode import Image, batches, one_thread
-from retrieval.model.photo_encoder import fastest, on_torch
-from retrieval.model.stored import fingerprint
-from retrieval.search.build.looks import row_of
+from retrieval.model.photo_encoder import fastest_photo_encoder, torch_photo_encoder
+from retrieval.search.build.stat_cache import photo_row
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -38,21 +38,21 @@ R = TypeVar("R")
 BATCH = 16
 READ = 32
 """Files that a thread reads at a time: the overhead of a task is a tenth of the time to read and hash a photo."""
-MANY = 256
+MIN_PHOTOS_TO_TUNE = 256
 """New photos from which on a faster encoder is tried, which takes as long as encoding a hundred."""
-HELD = 256
+MAX_REUSED_PER_PART = 256
 """Reused codes in one part, at most, so that little memory waits between the threads."""
-EMBEDDED, RENAMED, REMADE, RESUMED = "embedded", "renamed", "remade", "resumed"
+EMBEDDED, RENAMED, RE_EMBEDDED, RESUMED = "embedded", "renamed", "re_embedded", "resumed"
 """Origins of a code: encoded now; of a row with the same content; a new embedding of a stored partial activation; left
 by an interrupted build."""
 
 
-class _Code(NamedTuple):
+class _PhotoEncoding(NamedTuple):
     """Embedding (d,) and partial activation (half,) of a photo, its rounding error where it is new, and its origin."""
 
     embedding: NDArray[np.float32]
-    half: NDArray[np.float16]
-    half_error: float
+    partial_activation: NDArray[np.float16]
+    partial_error: float
     origin: str
 
 
@@ -62,11 +62,11 @@ class _Photo:
 
     row: dict[str, Any]
     file: PhotoBytes | None = None
-    code: _Code | None = None
+    code: _PhotoEncoding | None = None
 
 
 @dataclass
-class Part:
+class BuildPart:
     """Consecutive photos of a catalogue, at most one batch of which was encoded.
 
     Attributes:
@@ -78,22 +78,22 @@ class Part:
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
-    codes: list[_Code] = field(default_factory=list)
+    codes: list[_PhotoEncoding] = field(default_factory=list)
     skipped: list[SkippedPhoto] = field(default_factory=list)
-    kept: range = range(0)
+    unchanged: range = range(0)
     objects: Sequence[str] = ()
 
     @property
     def block(self) -> Block | range:
         """What the index writes of this part."""
-        if self.kept or not self.codes:
-            return self.kept or Block(self.rows)
-        halves = np.stack([code.half for code in self.codes])
-        return Block(self.rows, np.stack([code.embedding for code in self.codes]), {"halves": halves})
+        if self.unchanged or not self.codes:
+            return self.unchanged or Block(self.rows)
+        partials = np.stack([code.partial_activation for code in self.codes])
+        return Block(self.rows, np.stack([code.embedding for code in self.codes]), {"partials": partials})
 
 
-_Item: TypeAlias = _Photo | SkippedPhoto
-_Listed: TypeAlias = tuple[CataloguePhoto, int]
+_ReadItem: TypeAlias = _Photo | SkippedPhoto
+_CataloguedPhoto: TypeAlias = tuple[CataloguePhoto, int]
 
 
 class Embedder:
@@ -113,7 +113,7 @@ class Embedder:
         made: Number of codes by origin.
         known: Number of photos whose id the parent has.
         skipped: Photos that could not be read.
-        half_error: Largest rounding error of a stored partial activation.
+        partial_error: Largest rounding error of a stored partial activation.
     """
 
     def __init__(
@@ -122,21 +122,24 @@ class Embedder:
         index: Path,
         parent: Generation | None,
         donors: Sequence[Generation] = (),
-        halves: Generation | None = None,
+        partials: Generation | None = None,
     ) -> None:
-        self.checkpoint, self.parent, self._halves = checkpoint, parent, halves
+        self.checkpoint, self.parent, self._partials = checkpoint, parent, partials
         config = checkpoint.config.matcher
         layouts: Layouts = {
             "embedding": (np.dtype(np.float32), (config.embedding_dim,)),
-            "halves": (np.dtype(np.float16), (config.half,)),
-            "half_error": (np.dtype(np.float32), ()),
+            "partials": (np.dtype(np.float16), (config.partial_width,)),
+            "partial_error": (np.dtype(np.float32), ()),
         }
-        self._unfinished = Unfinished(index, fingerprint(checkpoint), layouts)
-        self._holders = [holder for holder in (parent, *donors, halves) if holder is not None]
+        self._unfinished = UnfinishedBuild(index, fingerprint(checkpoint), layouts)
+        self._holders = [holder for holder in (parent, *donors, partials) if holder is not None]
         self.objects, self.made = Counter[str](), Counter[str]()
         self.skipped: list[SkippedPhoto] = []
-        self.known, self.half_error = 0, 0.0
-        self._encode_photos, self._see = on_torch(checkpoint), checkpoint.config.preprocessing.photo_of
+        self.known, self.partial_error = 0, 0.0
+        self._encode_photos, self._preprocess = (
+            torch_photo_encoder(checkpoint),
+            checkpoint.config.preprocessing.photo_from_bytes,
+        )
 
     def close(self) -> None:
         """Close the file of the codes for an interrupted build."""
@@ -152,8 +155,8 @@ class Embedder:
         return 0 if self.parent is None else self.parent.count - self.known
 
     def parts(
-        self, catalogue: Catalogue, known: Slots, kept: Iterable[slice], quiet: bool
-    ) -> Generator[Part, None, None]:
+        self, catalogue: Catalogue, known: Slots, unchanged: Iterable[slice], quiet: bool
+    ) -> Generator[BuildPart, None, None]:
         """Yield the photos of the catalogue in its order.
 
         Args:
@@ -163,17 +166,19 @@ class Embedder:
             quiet: Show no progress.
 
         Raises:
-            NoPhoto: No photo can be read.
+            NoReadablePhoto: No photo can be read.
             NumericalError: Float16 cannot hold a partial activation.
         """
         self.skipped += catalogue.skipped
         threads = torch.get_num_threads()
         new = len(catalogue.photos) - (self.parent.count if self.parent else 0)
-        if new >= MANY and next(self.checkpoint.matcher.parameters()).device.type == "cpu":
-            self._encode_photos = fastest(self.checkpoint)
-        found = ahead(partial(self._find, catalogue), _steps(catalogue.photos, known, kept), threads, 2 * threads)
+        if new >= MIN_PHOTOS_TO_TUNE and next(self.checkpoint.matcher.parameters()).device.type == "cpu":
+            self._encode_photos = fastest_photo_encoder(self.checkpoint)
+        found = map_ahead(
+            partial(self._find, catalogue), _steps(catalogue.photos, known, unchanged), threads, 2 * threads
+        )
         with Bar("embed", len(catalogue.photos), "photos", quiet=quiet) as bar, one_thread():
-            for part in ahead(self._encode, _full(found), threads, 2 * threads):
+            for part in map_ahead(self._encode, _full_batches(found), threads, 2 * threads):
                 self._count(part)
                 bar.advance(len(part.objects) + len(part.skipped))
                 if part.objects:
@@ -182,66 +187,70 @@ class Embedder:
             raise no_photo(catalogue, self.skipped)
         if self.made[EMBEDDED] + self.made[RESUMED] < self.objects.total():
             # Codes that are reused were rounded when they were made.
-            errors = [holder.manifest.about.get("half_error", 0.0) for holder in self._holders]
-            self.half_error = max(self.half_error, *errors)
+            errors = [holder.manifest.about.get("partial_error", 0.0) for holder in self._holders]
+            self.partial_error = max(self.partial_error, *errors)
 
-    def _find(self, catalogue: Catalogue, step: Part | list[_Listed]) -> Part | list[_Item]:
+    def _find(self, catalogue: Catalogue, step: BuildPart | list[_CataloguedPhoto]) -> BuildPart | list[_ReadItem]:
         """Read files, and keep the bytes of those that must be encoded. Called on threads."""
-        if isinstance(step, Part):
+        if isinstance(step, BuildPart):
             return step
-        items, new = list[_Item](), dict[str, _Photo]()
+        items, new = list[_ReadItem](), dict[str, _Photo]()
         for photo, number in step:
             file = read_photo(catalogue, photo) if number < 0 else None
             if isinstance(file, SkippedPhoto):
                 items.append(file)
             elif file is not None:
-                items.append(new.setdefault(photo.path, _Photo(row_of(photo, file.digest), file)))
+                items.append(new.setdefault(photo.path, _Photo(photo_row(photo, file.digest), file)))
             elif self.parent is not None:
-                items.append(_Photo(row_of(photo, self.parent.rows[number]["digest"])))
+                items.append(_Photo(photo_row(photo, self.parent.rows[number]["digest"])))
         if self.parent is not None:
             for path in self.parent.reusable({path: item.row["digest"] for path, item in new.items()}):
                 new.pop(path).file = None
-        codes = self._made_before([item.row["digest"] for item in new.values()])
+        codes = self._find_encoded([item.row["digest"] for item in new.values()])
         for item in new.values():
             item.code = codes.get(item.row["digest"])
             item.file = item.file if item.code is None else None
         return items
 
-    def _made_before(self, digests: Sequence[str]) -> dict[str, _Code]:
+    def _find_encoded(self, digests: Sequence[str]) -> dict[str, _PhotoEncoding]:
         """Codes of these contents: of generations under any id, or of an interrupted build."""
-        found: dict[str, _Code] = {}
+        found: dict[str, _PhotoEncoding] = {}
         for holder in self._holders:
             if not (wanted := [digest for digest in digests if digest not in found]):
                 break
             numbers = holder.rows.by_digest.find(keys_of(wanted))
             having = [digest for digest, number in zip(wanted, numbers, strict=True) if number >= 0]
             rows = numbers[numbers >= 0]
-            halves, is_remade = holder.arrays["halves"][rows], holder is self._halves
-            embeddings = self._embeddings(halves) if is_remade else holder.embeddings[holder.slots[rows]]
-            for digest, embedding, half in zip(having, embeddings, halves, strict=True):
-                found[digest] = _Code(embedding, half, 0.0, REMADE if is_remade else RENAMED)
+            partials, is_remade = holder.arrays["partials"][rows], holder is self._partials
+            embeddings = self._embeddings(partials) if is_remade else holder.embeddings[holder.slots[rows]]
+            for digest, embedding, partial_activation in zip(having, embeddings, partials, strict=True):
+                found[digest] = _PhotoEncoding(
+                    embedding, partial_activation, 0.0, RE_EMBEDDED if is_remade else RENAMED
+                )
         for digest, record in self._unfinished.find(digest for digest in digests if digest not in found).items():
-            found[digest] = _Code(record["embedding"], record["halves"], float(record["half_error"]), RESUMED)
+            found[digest] = _PhotoEncoding(
+                record["embedding"], record["partials"], float(record["partial_error"]), RESUMED
+            )
         return found
 
     @torch.inference_mode()
-    def _embeddings(self, halves: NDArray[np.float16]) -> NDArray[np.float32]:
+    def _embeddings(self, partials: NDArray[np.float16]) -> NDArray[np.float32]:
         """Embeddings (n, d) that the candidate encoder makes of stored partial activations (n, half)."""
-        pruner = self.checkpoint.matcher.pruner
-        assert pruner is not None
-        read = torch.from_numpy(halves.astype(np.float32)).to(next(pruner.parameters()).device)
-        made: NDArray[np.float32] = pruner.photo(read).cpu().numpy()
+        candidate_encoder = self.checkpoint.matcher.candidate_encoder
+        assert candidate_encoder is not None
+        read = torch.from_numpy(partials.astype(np.float32)).to(next(candidate_encoder.parameters()).device)
+        made: NDArray[np.float32] = candidate_encoder.photo(read).cpu().numpy()
         return made
 
-    def _encode(self, found: Part | list[_Item]) -> Part:
+    def _encode(self, found: BuildPart | list[_ReadItem]) -> BuildPart:
         """Decode and encode the photos that have no code. Called on threads."""
-        if isinstance(found, Part):
+        if isinstance(found, BuildPart):
             return found
-        part, photos, images = Part(), list[_Photo](), list[Image]()
+        part, photos, images = BuildPart(), list[_Photo](), list[Image]()
         for item in found:
-            result: _Item = item
+            result: _ReadItem = item
             if isinstance(item, _Photo) and item.file is not None:
-                image = decode_photo(item.file, self._see)
+                image = decode_photo(item.file, self._preprocess)
                 if isinstance(image, SkippedPhoto):
                     result = image
                 else:
@@ -250,81 +259,87 @@ class Embedder:
                 part.skipped.append(result)
             else:
                 photos.append(result)
-        made = iter(self._encoded([photo.row for photo in photos if photo.file is not None], images) if images else ())
+        made = iter(
+            self._encode_images([photo.row for photo in photos if photo.file is not None], images) if images else ()
+        )
         part.codes = [photo.code or next(made) for photo in photos if photo.code or photo.file]
         part.rows = [photo.row for photo in photos]
         part.objects = [row["object_id"] for row in part.rows]
         return part
 
-    def _encoded(self, rows: Sequence[dict[str, Any]], images: Sequence[Image]) -> list[_Code]:
+    def _encode_images(self, rows: Sequence[dict[str, Any]], images: Sequence[Image]) -> list[_PhotoEncoding]:
         """Encode the images of these rows, and store their codes for the case that the build is interrupted."""
-        halves, embeddings = self._encode_photos(images)
-        largest = np.abs(halves).max(axis=1)
+        partials, embeddings = self._encode_photos(images)
+        largest = np.abs(partials).max(axis=1)
         if len(bad := np.flatnonzero(~(largest <= np.finfo(np.float16).max))):
             raise NumericalError(
                 f"halves are stored as float16 and must stay within 65504; {rows[bad[0]]['id']} gives "
                 f"{largest[bad[0]]}; the model has diverged, train again with a lower learning rate"
             )
-        stored = halves.astype(np.float16)
-        errors = np.abs(stored - halves).max(axis=1)
-        self._unfinished.keep(
-            [row["digest"] for row in rows], {"embedding": embeddings, "halves": stored, "half_error": errors}
+        stored = partials.astype(np.float16)
+        errors = np.abs(stored - partials).max(axis=1)
+        self._unfinished.add(
+            [row["digest"] for row in rows], {"embedding": embeddings, "partials": stored, "partial_error": errors}
         )
         made = zip(embeddings, stored, errors.tolist(), strict=True)
-        return [_Code(*code, EMBEDDED) for code in made]
+        return [_PhotoEncoding(*code, EMBEDDED) for code in made]
 
-    def _count(self, part: Part) -> None:
+    def _count(self, part: BuildPart) -> None:
         self.skipped += part.skipped
         self.objects.update(part.objects)
         self.made.update(code.origin for code in part.codes)
-        self.half_error = max([self.half_error, *(code.half_error for code in part.codes)])
-        self.known += len(part.kept)
+        self.partial_error = max([self.partial_error, *(code.partial_error for code in part.codes)])
+        self.known += len(part.unchanged)
         if self.parent is not None and part.rows:
             self.known += int((self.parent.rows.find([row["id"] for row in part.rows]) >= 0).sum())
 
 
-def no_photo(catalogue: Catalogue, skipped: list[SkippedPhoto]) -> NoPhoto:
+def no_photo(catalogue: Catalogue, skipped: list[SkippedPhoto]) -> NoReadablePhoto:
     """Return the error for a catalogue of which no photo can be read."""
     first = skipped[0]
-    return NoPhoto(f"no photo in {catalogue.where} can be read; the first: {first.path}: {first.reason}", skipped)
+    return NoReadablePhoto(
+        f"no photo in {catalogue.where} can be read; the first: {first.path}: {first.reason}", skipped
+    )
 
 
-def ahead(function: Callable[[T], R], items: Iterable[T], threads: int, window: int) -> Iterator[R]:
+def map_ahead(function: Callable[[T], R], items: Iterable[T], threads: int, window: int) -> Iterator[R]:
     """Yield `map(function, items)`, computed on threads, never more than `window` items ahead of the reader.
 
     Waiting items are dropped when the reader stops or an item fails; running ones are waited for.
     """
     pool = ThreadPoolExecutor(threads)
     try:
-        yield from in_order(pool, function, items, window - 1)
+        yield from map_in_order(pool, function, items, window - 1)
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def _steps(photos: Photos, known: Slots, kept: Iterable[slice]) -> Iterator[Part | list[_Listed]]:
+def _steps(
+    photos: PhotoTable, known: Slots, unchanged: Iterable[slice]
+) -> Iterator[BuildPart | list[_CataloguedPhoto]]:
     """Parts of the parent's rows, and between them lists of photos, each with its row where it is known."""
     done = 0
-    for run in [*kept, slice(len(known), len(known))]:
+    for run in [*unchanged, slice(len(known), len(known))]:
         yield from batches(zip(photos[done : run.start], known[done : run.start].tolist(), strict=True), READ)
         if run.start < run.stop:
             first = int(known[run.start])
-            yield Part(kept=range(first, first + run.stop - run.start), objects=photos[run].objects)
+            yield BuildPart(unchanged=range(first, first + run.stop - run.start), objects=photos[run].objects)
         done = run.stop
 
 
-def _full(found: Iterable[Part | list[_Item]]) -> Iterator[Part | list[_Item]]:
+def _full_batches(found: Iterable[BuildPart | list[_ReadItem]]) -> Iterator[BuildPart | list[_ReadItem]]:
     """Regroup photos: a whole batch to encode in each list, but in the last one and those before rows that are kept."""
-    waiting = list[_Item]()
+    waiting = list[_ReadItem]()
     new = held = 0
     for step in found:
-        for item in [] if isinstance(step, Part) else step:
+        for item in [] if isinstance(step, BuildPart) else step:
             waiting.append(item)
             new += isinstance(item, _Photo) and item.file is not None
             held += isinstance(item, _Photo) and item.code is not None
-            if new == BATCH or held == HELD:
+            if new == BATCH or held == MAX_REUSED_PER_PART:
                 yield waiting
                 waiting, new, held = [], 0, 0
-        if isinstance(step, Part):
+        if isinstance(step, BuildPart):
             if waiting:
                 yield waiting
             yield step

@@ -15,22 +15,28 @@ from indexes.store.generation import Generation
 from indexes.store.rows import keys_of
 from indexes.store.tables import Tables
 from retrieval.console.progress import Bar
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, Photos
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable
+from retrieval.data.catalogue_touches import CatalogueTouch
+from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.images import decode_rgb
-from retrieval.data.touched import CatalogueTouch
-from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import BadInput, ImageError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, touch_features
-from retrieval.model.fusion import judge_of
-from retrieval.model.judge import CONTACT
-from retrieval.model.posterior import JudgedTouches
-from retrieval.model.references import CODES, ROWS, FeltTouches, fit_references, touch_codes
+from retrieval.model.fusion import scorer_of
+from retrieval.model.fusion_scorer import CONTACT
+from retrieval.model.posterior import ScoredTouches
+from retrieval.model.reference_calibration import (
+    REFERENCE_PARTIALS,
+    REFERENCE_ROWS,
+    ReferenceTouches,
+    fit_reference_calibration,
+    touch_embeddings,
+)
 
-Halves = NDArray[np.float16]
-FEWEST = 10
+Partials = NDArray[np.float16]
+MIN_OBJECTS = 10
 """Objects with at least two touches each that are needed to calibrate references, if the model is not calibrated."""
-MOST_ASKED = 600
+MAX_REFERENCE_QUERIES = 600
 """Touches of the catalogue used for that calibration."""
 BATCH = 32
 
@@ -48,21 +54,25 @@ class ReferenceBuild:
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
-    halves: Halves = field(default_factory=lambda: np.empty((0, 0), np.float16))
-    alone: list[str] = field(default_factory=list)
+    partials: Partials = field(default_factory=lambda: np.empty((0, 0), np.float16))
+    touch_only: list[str] = field(default_factory=list)
     skipped: list[SkippedPhoto] = field(default_factory=list)
     encoded: int = 0
 
     @property
     def documents(self) -> dict[str, Any]:
         """Documents of the generation; empty without references."""
-        return {ROWS: {"touches": self.rows, "alone": self.alone}, CODES: self.halves} if self.rows else {}
+        return (
+            {REFERENCE_ROWS: {"touches": self.rows, "touch_only": self.touch_only}, REFERENCE_PARTIALS: self.partials}
+            if self.rows
+            else {}
+        )
 
     @property
     def about(self) -> dict[str, Any]:
         """Entries of the manifest; empty without references."""
-        told = json.dumps([self.rows, self.alone]).encode()
-        return {ROWS: {**self._counts, "sha256": hashlib.sha256(told).hexdigest()}} if self.rows else {}
+        told = json.dumps([self.rows, self.touch_only]).encode()
+        return {REFERENCE_ROWS: {**self._counts, "sha256": hashlib.sha256(told).hexdigest()}} if self.rows else {}
 
     @property
     def _counts(self) -> dict[str, int]:
@@ -70,19 +80,19 @@ class ReferenceBuild:
 
     def summary(self, by: str) -> dict[str, Any]:
         """Return the report's entry. by: the source of their calibration."""
-        return {**self._counts, "alone": len(self.alone), "encoded": self.encoded, "by": by}
+        return {**self._counts, "touch_only": len(self.touch_only), "encoded": self.encoded, "by": by}
 
     def shown(self, catalogue: Catalogue) -> Catalogue:
         """Return the catalogue with the first gel image of each object without photos in place of a photo."""
         first: dict[str, CatalogueTouch] = {}
         for touch in catalogue.touches:
-            if touch.object_id in self.alone:
+            if touch.object_id in self.touch_only:
                 first.setdefault(touch.object_id, touch)
         if not first:
             return catalogue
         pictures = [CataloguePhoto(touch.paths[0], touch.object_id, touch.metadata) for touch in first.values()]
         photos = sorted([*catalogue.photos, *pictures], key=lambda photo: photo.path)
-        return replace(catalogue, photos=Photos.of(photos))
+        return replace(catalogue, photos=PhotoTable.of(photos))
 
     def worth(self, checkpoint: Checkpoint, tables: Tables) -> dict[str, Any]:
         """Return the calibration of the references and its source, for the manifest.
@@ -94,30 +104,30 @@ class ReferenceBuild:
             BadInput: The touches are too few.
         """
         if checkpoint.references is not None:
-            return {"by": "objects that the model was not fitted to", "worth": checkpoint.references.to_dict()}
+            return {"by": "objects that the model was not fitted to", "calibration": checkpoint.references.to_dict()}
         names = np.array([row["object_id"] for row in self.rows])
-        kept = _some_objects(names)
-        codes = touch_codes(self.halves[kept], checkpoint.config.matcher.hidden)
-        photographed = ~np.isin(tables.objects, keys_of(self.alone))
+        kept = _sample_objects(names)
+        codes = touch_embeddings(self.partials[kept], checkpoint.config.matcher.hidden)
+        photographed = ~np.isin(tables.objects, keys_of(self.touch_only))
         asked, owner = np.unique(names[kept], return_inverse=True)
         keys = keys_of(asked.tolist())
         photos = np.flatnonzero(photographed & np.isin(tables.objects, keys))
         order = np.argsort(keys)
         photo_owner = order[np.searchsorted(keys[order], tables.objects[photos])]
-        judge = judge_of(checkpoint.matcher.head)
-        felt, shown = self.halves[kept].astype(np.float32), tables.arrays["halves"][photos]
-        logits = np.stack([judge.logits(half[None], shown) for half in felt])
+        classify = scorer_of(checkpoint.matcher.head)
+        felt, shown = self.partials[kept].astype(np.float32), tables.arrays["partials"][photos]
+        logits = np.stack([classify.logits(partial[None], shown) for partial in felt])
         none = np.zeros(logits.shape, np.bool_)
-        found = fit_references(FeltTouches(JudgedTouches(logits, owner, photo_owner, none), codes))
-        if found is None or (found.beside is None and len(set(names) - set(self.alone))):
-            raise self.too_few()
-        return {"by": "the catalogue's own touches", "worth": found.to_dict()}
+        found = fit_reference_calibration(ReferenceTouches(ScoredTouches(logits, owner, photo_owner, none), codes))
+        if found is None or (found.with_photos is None and len(set(names) - set(self.touch_only))):
+            raise self.too_few_error()
+        return {"by": "the catalogue's own touches", "calibration": found.to_dict()}
 
-    def too_few(self) -> BadInput:
+    def too_few_error(self) -> BadInput:
         """Return the error for touches that are too few to be calibrated."""
         return BadInput(
             f"nothing says what the catalogue's {len(self.rows)} reference touches are worth: the model does not, "
-            f"and {FEWEST} objects with two touches each, and photos where objects have photos, would tell; touch some "
+            f"and {MIN_OBJECTS} objects with two touches each, and photos where objects have photos, would tell; touch some "
             "objects twice, or let `retrieve adapt` fit a model to a recording"
         )
 
@@ -135,36 +145,36 @@ def embed_references(
     if not catalogue.touches:
         return ReferenceBuild()
     _require_fit(checkpoint)
-    known: Mapping[tuple[str, ...], Halves] = {}
-    if parent is not None and ROWS in parent.documents:
-        stored = zip(parent.documents[ROWS]["touches"], parent.documents[CODES], strict=True)
-        known = {tuple(row["digests"]): half for row, half in stored}
+    known: Mapping[tuple[str, ...], Partials] = {}
+    if parent is not None and REFERENCE_ROWS in parent.documents:
+        stored = zip(parent.documents[REFERENCE_ROWS]["touches"], parent.documents[REFERENCE_PARTIALS], strict=True)
+        known = {tuple(row["digests"]): partial for row, partial in stored}
     skipped: list[SkippedPhoto] = []
     rows: list[dict[str, Any]] = []
-    halves: list[Halves] = []
+    partials: list[Partials] = []
     encoded = 0
     with Bar("embed touches", len(catalogue.touches), "touches", quiet=quiet) as bar:
         for some in batches(catalogue.touches, BATCH):
             found = list(_read(catalogue, checkpoint, some, known, skipped))
-            new = [views for _, views, half in found if half is None]
-            made = iter(_encoded(checkpoint, new) if new else ())
-            for row, _, half in found:
-                if half is None:
-                    half, shows = next(made)
+            new = [views for _, views, partial in found if partial is None]
+            made = iter(_encode_touches(checkpoint, new) if new else ())
+            for row, _, partial in found:
+                if partial is None:
+                    partial, shows = next(made)
                     encoded += 1
                     if shows != CONTACT:
                         skipped.append(SkippedPhoto(row["touch"][0], f"{shows}: no touch to compare with"))
                         continue
                 rows.append(row)
-                halves.append(half)
+                partials.append(partial)
             bar.advance(len(some))
     photographed, counts = set(catalogue.photos.objects), Counter(row["object_id"] for row in rows)
-    stacked = np.stack(halves) if halves else np.empty((0, 0), np.float16)
+    stacked = np.stack(partials) if partials else np.empty((0, 0), np.float16)
     references = ReferenceBuild(rows, stacked, sorted(counts.keys() - photographed), skipped, encoded)
     if rows and checkpoint.references is None:  # of touched objects with photos, if there are any
         both = counts.keys() & photographed
-        if sum(count > 1 and (name in both or not both) for name, count in counts.items()) < FEWEST:
-            raise references.too_few()
+        if sum(count > 1 and (name in both or not both) for name, count in counts.items()) < MIN_OBJECTS:
+            raise references.too_few_error()
     return references
 
 
@@ -185,11 +195,12 @@ def _read(
     catalogue: Catalogue,
     checkpoint: Checkpoint,
     touches: list[CatalogueTouch],
-    known: Mapping[tuple[str, ...], Halves],
+    known: Mapping[tuple[str, ...], Partials],
     skipped: list[SkippedPhoto],
-) -> Iterator[tuple[dict[str, Any], list[Image], Halves | None]]:
+) -> Iterator[tuple[dict[str, Any], list[Image], Partials | None]]:
     """Yield the row of each touch, the tower's inputs, and its partial activation if it is known. Add touches that
-    cannot be used to `skipped`."""
+    cannot be used to `skipped`.
+    """
     fingers, see = checkpoint.config.matcher.fingers, checkpoint.config.preprocessing.touch
     for touch in touches:
         if len(touch.paths) != fingers:
@@ -201,30 +212,30 @@ def _read(
             files = [catalogue.read(path) for path in touch.paths]
             digests = [hashlib.sha256(data).hexdigest() for data in files]
             row = {"object_id": touch.object_id, "touch": list(touch.paths), "digests": digests}
-            half = known.get(tuple(digests))
+            partial = known.get(tuple(digests))
             named = zip(files, touch.paths, strict=True)
-            views = [] if half is not None else [see(decode_rgb(data, path), None) for data, path in named]
+            views = [] if partial is not None else [see(decode_rgb(data, path), None) for data, path in named]
         except ImageError as error:
             skipped.append(SkippedPhoto(touch.paths[0], error.reason))
             continue
-        yield row, views, half
+        yield row, views, partial
 
 
 @torch.inference_mode()
-def _encoded(checkpoint: Checkpoint, touches: list[list[Image]]) -> Iterator[tuple[Halves, str]]:
+def _encode_touches(checkpoint: Checkpoint, touches: list[list[Image]]) -> Iterator[tuple[Partials, str]]:
     """Yield the partial activation of each touch, and what it shows."""
     matcher = checkpoint.matcher
     features = touch_features(matcher, touches)
-    halves = matcher.touch_code(features).half.cpu().numpy().astype(np.float16)
+    partials = matcher.touch_encoding(features).partial.cpu().numpy().astype(np.float16)
     readings = matcher.gel_readings(features)
     check = checkpoint.gel_check
-    shows = [CONTACT] * len(touches) if check is None or readings is None else check.judge(readings.cpu().numpy())
-    yield from zip(halves, shows, strict=True)
+    shows = [CONTACT] * len(touches) if check is None or readings is None else check.classify(readings.cpu().numpy())
+    yield from zip(partials, shows, strict=True)
 
 
-def _some_objects(names: NDArray[np.str_]) -> NDArray[np.int64]:
-    """Rows of randomly chosen objects with at least two touches, at most about `MOST_ASKED`, in their order."""
+def _sample_objects(names: NDArray[np.str_]) -> NDArray[np.int64]:
+    """Rows of randomly chosen objects with at least two touches, at most about `MAX_REFERENCE_QUERIES`, in their order."""
     _, owner, counts = np.unique(names, return_inverse=True, return_counts=True)
     drawn = np.random.default_rng(0).permutation(np.flatnonzero(counts > 1))
-    chosen = drawn[: max(FEWEST, int(np.searchsorted(np.cumsum(counts[drawn]), MOST_ASKED)))]
+    chosen = drawn[: max(MIN_OBJECTS, int(np.searchsorted(np.cumsum(counts[drawn]), MAX_REFERENCE_QUERIES)))]
     return np.flatnonzero(np.isin(owner, chosen))

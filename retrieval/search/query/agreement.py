@@ -57,7 +57,7 @@ def agreement(
     """
     if not 1 <= squares <= 32:
         raise BadInput(f"squares must be from 1 to 32; got {squares}")
-    halves = searcher.encode(touches, background=background).halves
+    partials = searcher.encode(touches, background=background).partials
     model = model or load_checkpoint(searcher.checkpoint.path)
     image = read_image(photo, "the photo")
     scale = min(1.0, LONGER_SIDE / max(image.shape[:2]))
@@ -67,7 +67,7 @@ def agreement(
     rows, columns = (np.linspace(0, side, squares + 1).round().astype(int) for side in (height, width))
 
     def judged(photos: list[NDArray[np.uint8]]) -> NDArray[np.float32]:
-        return searcher.judge.logits(halves, embed_photos(photos, model=model).halves)
+        return searcher.scorer.logits(partials, embed_photos(photos, model=model).partials)
 
     logit, falls = judged([whole])[0], []
     for top, bottom in pairwise(rows):  # one row of squares is in memory at once

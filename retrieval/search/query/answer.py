@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
+from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.information import Information, information, unlisted_probability
-from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.posterior import Posterior
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
-CLEAR = 0.5
+CLEAR_PROBABILITY = 0.5
 """A ranking is clear where its first object, given that the catalogue has the object, has a larger probability: it is
 likelier than all others together."""
 EXIT_CODES = {MATCH: 0, UNCALIBRATED: 0, NONE_OF_THESE: 3, NO_CONTACT: 4, NOT_A_GEL: 5}
@@ -38,7 +38,7 @@ class NearestReference:
         return {**asdict(self), "touch": list(self.touch)}
 
 
-_SAID_OF_MATCH = ("rank", "object_id", "logit", "probability", "probability_if_present", "photo", "metadata")
+_MATCH_FIELDS = ("rank", "object_id", "logit", "probability", "probability_if_present", "photo", "metadata")
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Match:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
-        said = {name: getattr(self, name) for name in _SAID_OF_MATCH}
+        said = {name: getattr(self, name) for name in _MATCH_FIELDS}
         return said if self.reference is None else {**said, "reference": self.reference.to_dict()}
 
 
@@ -147,7 +147,8 @@ class QueryResult:
     @property
     def information(self) -> Information | None:
         """What the grasps told, what is left, and what a further grasp is expected to tell; None without
-        probabilities."""
+        probabilities.
+        """
         said, none = self.posterior, self.none_probability
         if said is None or none is None:
             return None
@@ -201,10 +202,10 @@ def _match(said: dict[str, Any], catalogue: Path) -> Match:
 
 def is_clear(probability_if_present: float) -> bool:
     """Whether a ranking whose first object has this probability is clear."""
-    return probability_if_present > CLEAR
+    return probability_if_present > CLEAR_PROBABILITY
 
 
-def in_words(result: QueryResult) -> str:
+def verdict_sentence(result: QueryResult) -> str:
     """The verdict as a sentence for people, and which grasps were left out."""
 
     def grasps(shown: str) -> str:

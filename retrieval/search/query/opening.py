@@ -3,23 +3,23 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from indexes.store.cluster import ClusterManifest, open_shard
 from indexes.store.folder import IndexStore
-from indexes.store.generation import Generation, require_made_by
+from indexes.store.generation import Generation, check_fingerprint
 from indexes.store.manifest import Manifest
-from retrieval.model.stored import Stored, fingerprint, read_judge, read_stored
+from indexes.store.sharded import ShardedManifest, open_shard
+from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info, read_scorer
 from retrieval.search import defaults
-from retrieval.search.query.objects import require_usable
-from retrieval.search.query.shard import Described, FolderShard, Shard, Shards
-from retrieval.search.sharding.object_store import folder_with, is_cluster, read_cluster
+from retrieval.search.query.objects import check_usable
+from retrieval.search.query.shard import FolderShard, IndexInfo, Shard, Shards
+from retrieval.search.sharding.object_store import is_sharded, local_folder, read_sharded_manifest
 
-OpenShards = Callable[[str | Path, ClusterManifest, Stored], Shard]
+OpenShards = Callable[[str | Path, ShardedManifest, CheckpointInfo], Shard]
 """Opens the shards of a sharded index in a folder or behind a URL, wherever they are held."""
 
 
 def open_index(
     index: str | Path, model: str | Path | None, verify: bool, shards: OpenShards | None
-) -> tuple[Shard, Stored]:
+) -> tuple[Shard, CheckpointInfo]:
     """Open the current generation of an index folder or of a sharded index.
 
     Args:
@@ -32,21 +32,21 @@ def open_index(
         IndexesError: The index is missing, damaged, or of another model.
         CheckpointError: The checkpoint is missing or damaged.
     """
-    if not is_cluster(index):
+    if not is_sharded(index):
         generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
-        stored = stored_for(generation.manifest, model)
+        stored = read_checkpoint_of(generation.manifest, model)
         return folder_shard(generation, stored), stored
-    manifest = read_cluster(index)
-    stored = stored_for(manifest, model)
-    return shards(index, manifest, stored) if shards else open_cluster(index, manifest, stored, verify), stored
+    manifest = read_sharded_manifest(index)
+    stored = read_checkpoint_of(manifest, model)
+    return shards(index, manifest, stored) if shards else open_sharded_index(index, manifest, stored, verify), stored
 
 
-def stored_for(manifest: Manifest | ClusterManifest, model: str | Path | None) -> Stored:
+def read_checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path | None) -> CheckpointInfo:
     """Return what the checkpoint of an index says of itself. model: its path, if it was moved.
 
-    Raises CheckpointError for a missing or damaged one; `require_made_by` refuses another one.
+    Raises CheckpointError for a missing or damaged one; `check_fingerprint` refuses another one.
     """
-    stored = read_stored(Path(model) if model else defaults.model_of(manifest))
+    stored = read_checkpoint_info(Path(model) if model else defaults.model_of(manifest))
     if stored.digest != manifest.fingerprint.get("checkpoint"):
         from retrieval.model.checkpoint import load_checkpoint
 
@@ -54,26 +54,28 @@ def stored_for(manifest: Manifest | ClusterManifest, model: str | Path | None) -
     return stored
 
 
-def folder_shard(generation: Generation, stored: Stored) -> FolderShard:
+def folder_shard(generation: Generation, stored: CheckpointInfo) -> FolderShard:
     """Return an opened generation with the scoring layers. Raises MismatchedIndex for another model, CorruptIndex."""
     generation.require(fingerprint(stored))
-    require_usable(generation, stored.config.matcher.half)
-    return FolderShard(generation, read_judge(stored.path), stored.config.has_embeddings)
+    check_usable(generation, stored.config.matcher.partial_width)
+    return FolderShard(generation, read_scorer(stored.path), stored.config.has_embeddings)
 
 
-def open_cluster(cluster: str | Path, manifest: ClusterManifest, stored: Stored, verify: bool = True) -> Shard:
+def open_sharded_index(
+    cluster: str | Path, manifest: ShardedManifest, stored: CheckpointInfo, verify: bool = True
+) -> Shard:
     """Open all shards of a sharded index in this process; those behind a URL are fetched first. Raises IndexesError."""
-    require_made_by(cluster, manifest.fingerprint, fingerprint(stored))
+    check_fingerprint(cluster, manifest.fingerprint, fingerprint(stored))
     opened = (
-        open_shard(folder_with(cluster, entry), entry, manifest.fingerprint, verify=verify, threads=1)
+        open_shard(local_folder(cluster, entry), entry, manifest.fingerprint, verify=verify, threads=1)
         for entry in manifest.shards
     )
-    return Shards([folder_shard(generation, stored) for generation in opened], described_cluster(manifest))
+    return Shards([folder_shard(generation, stored) for generation in opened], sharded_index_info(manifest))
 
 
-def described_cluster(manifest: ClusterManifest) -> Described:
+def sharded_index_info(manifest: ShardedManifest) -> IndexInfo:
     """Return what the manifest says of all shards together."""
-    return Described(
+    return IndexInfo(
         manifest.generation,
         manifest.kind,
         manifest.photos,

@@ -10,28 +10,28 @@ from numpy.typing import NDArray
 
 from indexes.errors import UnsupportedFormat
 from indexes.store.generation import Generation
-from retrieval.data.storage import place_of
+from retrieval.data.storage import url_or_path
 from retrieval.errors import BadInput
-from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, Judge
-from retrieval.model.onnx_encoder import exported
-from retrieval.model.posterior import NONE_PRIOR, Belief, Posterior, require_prior
-from retrieval.model.references import ROWS
-from retrieval.model.stored import Stored, read_judge
+from retrieval.model.checkpoint_info import CheckpointInfo, read_scorer
+from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, FusionScorer
+from retrieval.model.onnx_encoder import find_export
+from retrieval.model.posterior import NONE_PRIOR, Posterior, PosteriorProbabilities, require_prior
+from retrieval.model.reference_calibration import REFERENCE_ROWS
 from retrieval.model.touches import (
     AnyImage,
     AnyTouches,
-    Encoded,
-    Encoder,
-    GivenImage,
+    EncodedTouches,
+    InputImage,
     Stopwatch,
+    TouchEncoder,
     TouchReader,
-    read_grasps,
+    parse_grasps,
 )
 from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult, is_clear
 from retrieval.search.query.objects import Objects
 from retrieval.search.query.opening import OpenShards, open_index
-from retrieval.search.query.references import told_of
-from retrieval.search.query.shard import Felt, FolderShard, Judged, Shard
+from retrieval.search.query.reference_touches import reference_summary
+from retrieval.search.query.shard import FolderShard, Shard, ShardQuery, ShardResult
 
 Floats = NDArray[np.float32]
 
@@ -52,21 +52,23 @@ class Searcher:
     >>> searcher.close()
     """
 
-    def __init__(self, index: str | Path, shard: Shard, checkpoint: Stored, encoder: Encoder, judge: Judge) -> None:
+    def __init__(
+        self, index: str | Path, shard: Shard, checkpoint: CheckpointInfo, encoder: TouchEncoder, scorer: FusionScorer
+    ) -> None:
         self.index, self.shard, self.checkpoint = index, shard, checkpoint
-        self.encoder, self.judge, self.described = encoder, judge, shard.described
+        self.encoder, self.scorer, self.info = encoder, scorer, shard.info
         self.gel_check = checkpoint.gel_check
-        compares = self.gel_check is not None and self.gel_check.level_above is not None
-        self.reader = TouchReader(checkpoint.config, encoder, compares)
+        compares_contact = self.gel_check is not None and self.gel_check.level_above is not None
+        self.reader = TouchReader(checkpoint.config, encoder, compares_contact)
         self.posterior: Posterior | None = None  # where the model was never calibrated
-        if self.described.calibration is not None:
+        if self.info.calibration is not None:
             try:
-                self.posterior = Posterior.from_dict(self.described.calibration)
+                self.posterior = Posterior.from_dict(self.info.calibration)
             except BadInput as error:
                 raise UnsupportedFormat(
                     f"the calibration in {index} is of another version ({error}); run `retrieve build-index` again"
                 ) from error
-        self.catalogue = Path(self.described.about["catalogue"])
+        self.catalogue = Path(self.info.about["catalogue"])
         self._closed = False
 
     @classmethod
@@ -105,13 +107,13 @@ class Searcher:
         True
         """
         shard, stored = open_index(index, model, verify, shards)
-        encoder = exported(stored, threads) or torch_encoder(stored, threads)
-        return cls(place_of(index), shard, stored, encoder, read_judge(stored.path))
+        encoder = find_export(stored, threads) or torch_encoder(stored, threads)
+        return cls(url_or_path(index), shard, stored, encoder, read_scorer(stored.path))
 
     def close(self) -> None:
         """Release index and model; queries in other threads are answered first. Does nothing twice."""
         self._closed = True
-        for name in ("shard", "encoder", "reader", "judge"):
+        for name in ("shard", "encoder", "reader", "scorer"):
             vars(self).pop(name, None)
 
     def __reduce__(self) -> NoReturn:
@@ -132,13 +134,13 @@ class Searcher:
 
     @property
     def _folder(self) -> FolderShard:
-        shard = self._held().shard
+        shard = self._snapshot().shard
         if not isinstance(shard, FolderShard):
             raise BadInput(f"{self.index} is a cluster of index folders, and this wants one; open a shard of it")
         return shard
 
     def __enter__(self) -> "Searcher":
-        return self._held()
+        return self._snapshot()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -176,11 +178,11 @@ class Searcher:
             ImageError: An image cannot be read.
             NumericalError: A logit is not finite.
         """
-        held = self._held()
-        grasps = read_grasps(touches, held.reader.fingers)
+        held = self._snapshot()
+        grasps = parse_grasps(touches, held.reader.fingers)
         return held._answers(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
 
-    def query_growing(
+    def query_cumulative(
         self,
         touches: AnyTouches,
         *,
@@ -192,12 +194,12 @@ class Searcher:
         """Return what `query` answers after the first grasp, after the first two, and so on; each is encoded once.
 
         >>> with retrieval.open("index") as searcher:
-        ...     after_one, after_two = searcher.query_growing([["a.png", "b.png"], ["a2.png", "b2.png"]])
+        ...     after_one, after_two = searcher.query_cumulative([["a.png", "b.png"], ["a2.png", "b2.png"]])
         >>> len(after_one.touches), len(after_two.touches)
         (1, 2)
         """
-        held = self._held()
-        grasps = read_grasps(touches, held.reader.fingers)
+        held = self._snapshot()
+        grasps = parse_grasps(touches, held.reader.fingers)
         spans = [slice(count) for count in range(1, len(grasps) + 1)]
         return held._answers(grasps, spans, background, top, candidates, none_prior)
 
@@ -215,9 +217,9 @@ class Searcher:
         Touches are encoded in batches, so logits are within 1e-4 of those of single queries. If the touches of one
         object cannot be used, the error names it and nothing is answered.
         """
-        held = self._held()
+        held = self._snapshot()
         asked = [
-            read_grasps(touches, held.reader.fingers, of=f"object {number}, ")
+            parse_grasps(touches, held.reader.fingers, of=f"object {number}, ")
             for number, touches in enumerate(objects, 1)
         ]
         ends = np.cumsum([len(grasps) for grasps in asked]).tolist()
@@ -225,22 +227,22 @@ class Searcher:
         every = [grasp for grasps in asked for grasp in grasps]
         return held._answers(every, spans, background, top, candidates, none_prior)
 
-    def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> Encoded:
+    def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> EncodedTouches:
         """Return the unit embeddings (G, embedding_dim) and partial activations (G, half) of G grasps.
 
         The inner product of a grasp's embedding with a photo's (`retrieval.embed_photos`) orders candidates; it is not
-        a probability. Match logits, summed over the grasps, are `searcher.judge.logits(halves, photo_halves)`.
+        a probability. Match logits, summed over the grasps, are `searcher.scorer.logits(partials, photo_partials)`.
 
         Args:
             touches: As `query` takes them.
             background: As `query` takes it.
         """
-        held = self._held()
-        grasps = read_grasps(touches, held.reader.fingers)
-        codes = held.reader.encode(grasps, held.reader.references(background), Stopwatch())
-        return Encoded(codes.embeddings, codes.halves)
+        held = self._snapshot()
+        grasps = parse_grasps(touches, held.reader.fingers)
+        codes = held.reader.encode(grasps, held.reader.no_contact_frames(background), Stopwatch())
+        return EncodedTouches(codes.embeddings, codes.partials)
 
-    def _held(self) -> "Searcher":
+    def _snapshot(self) -> "Searcher":
         """This searcher with all it needs, so that `close` in another thread takes nothing away from a query."""
         held = object.__new__(type(self))
         vars(held).update(vars(self))
@@ -250,7 +252,7 @@ class Searcher:
 
     def _answers(
         self,
-        grasps: Sequence[Sequence[GivenImage]],
+        grasps: Sequence[Sequence[InputImage]],
         spans: Sequence[slice],
         background: Sequence[AnyImage] | None,
         top: int,
@@ -263,126 +265,130 @@ class Searcher:
         if not grasps:
             return []
         clock = Stopwatch()
-        codes = self.reader.encode(grasps, self.reader.references(background), clock)
-        shown = np.full(len(codes.halves), CONTACT)
+        codes = self.reader.encode(grasps, self.reader.no_contact_frames(background), clock)
+        shown = np.full(len(codes.partials), CONTACT)
         if self.gel_check is not None and codes.readings is not None:
-            shown = np.array(self.gel_check.judge(codes.readings, codes.levels))
+            shown = np.array(self.gel_check.classify(codes.readings, codes.levels))
         judged = []
         for its in spans:
             felt = (shown[its] == CONTACT) & (shown[its] != NOT_A_GEL).all()
-            own = Felt(codes.embeddings[its][felt], codes.halves[its][felt])
-            judged.append(self._judged(own, top, candidates, none_prior, clock))
-        timing_ms = clock.finished(len(spans))
+            own = ShardQuery(codes.embeddings[its][felt], codes.partials[its][felt])
+            judged.append(self._score(own, top, candidates, none_prior, clock))
+        timing_ms = clock.finish(len(spans))
         return [
             self._answer(grasps[its], shown[its].tolist(), codes.embeddings[its], timing_ms, found, none_prior)
             for its, found in zip(spans, judged, strict=True)
         ]
 
-    def _judged(
-        self, felt: Felt, top: int, candidates: int | None, none_prior: float, clock: Stopwatch
-    ) -> "_Judged | None":
+    def _score(
+        self, felt: ShardQuery, top: int, candidates: int | None, none_prior: float, clock: Stopwatch
+    ) -> "_ScoredQuery | None":
         """The best objects and their posterior; None without a grasp with contact."""
-        if not len(felt.halves):
+        if not len(felt.partials):
             clock.add({"candidates": 0.0, "rerank": 0.0})
             return None
-        found = self.shard.ask(felt, top, candidates, self.posterior)
+        found = self.shard.search(felt, top, candidates, self.posterior)
         clock.add({stage: found.timing_ms[stage] for stage in ("candidates", "rerank")})
-        belief = None
+        posterior_probabilities = None
         if self.posterior is not None and found.mass is not None:
             logits = [one.logit for one in found.best]
-            belief = self.posterior.share(logits, found.mass, len(felt.halves), none_prior)
-        return _Judged(found, len(felt.halves), belief)
+            posterior_probabilities = self.posterior.probabilities_given(
+                logits, found.mass, len(felt.partials), none_prior
+            )
+        return _ScoredQuery(found, len(felt.partials), posterior_probabilities)
 
     def _answer(
         self,
-        grasps: Sequence[Sequence[GivenImage]],
+        grasps: Sequence[Sequence[InputImage]],
         shown: list[str],
         embeddings: Floats,
         timing_ms: dict[str, float],
-        judged: "_Judged | None",
+        judged: "_ScoredQuery | None",
         none_prior: float,
     ) -> QueryResult:
-        described, belief = self.described, judged.belief if judged else None
-        verdict = _verdict(shown, belief)
-        searched = judged.found.searched if judged else described.photos
-        shares = {"shards": described.shards, "searched": searched / described.photos} if described.shards > 1 else {}
+        info, posterior_probabilities = self.info, judged.posterior_probabilities if judged else None
+        verdict = _verdict(shown, posterior_probabilities)
+        searched = judged.found.searched if judged else info.photos
+        shares = {"shards": info.shards, "searched": searched / info.photos} if info.shards > 1 else {}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
             grasps=shown,
             index={
                 "path": str(self.index),
-                "generation": described.name,
-                "kind": described.kind,
-                "photos": described.photos,
-                "objects": described.objects,
+                "generation": info.name,
+                "kind": info.kind,
+                "photos": info.photos,
+                "objects": info.objects,
                 "scored": judged.found.photos if judged else 0,
                 **shares,
                 "encoder": self.encoder.name,
-                "catalogue": str(described.about["catalogue"]),
+                "catalogue": str(info.about["catalogue"]),
                 "model": str(self.checkpoint.path),
                 "trained_on": self.checkpoint.provenance.get("source", "unknown"),
             },
             timing_ms=timing_ms,
             verdict=verdict,
-            none_probability=belief.none if belief else None,
+            none_probability=posterior_probabilities.none if posterior_probabilities else None,
             posterior=self._formula(judged, none_prior) if judged else None,
             results=self._ranking(judged) if judged else [],
             more_grasps=self._more_grasps(judged, none_prior) if verdict == NONE_OF_THESE and judged else None,
             embeddings=embeddings,
         )
 
-    def _more_grasps(self, judged: "_Judged", none_prior: float) -> int | None:
+    def _more_grasps(self, judged: "_ScoredQuery", none_prior: float) -> int | None:
         """Further grasps after which the verdict is expected to be a match; None where the ranking is not clear."""
-        mass, belief = judged.found.mass, judged.belief
+        mass, posterior_probabilities = judged.found.mass, judged.posterior_probabilities
         if (
             self.posterior is None
-            or belief is None
+            or posterior_probabilities is None
             or mass is None
-            or not is_clear(float(belief.objects_if_present[0]))
+            or not is_clear(float(posterior_probabilities.objects_if_present[0]))
         ):
             return None
         return self.posterior.more_grasps(judged.found.best[0].logit, mass.objects, judged.grasps, none_prior)
 
-    def _ranking(self, judged: "_Judged") -> list[Match]:
-        ranking, base, belief = [], self.catalogue.absolute(), judged.belief
+    def _ranking(self, judged: "_ScoredQuery") -> list[Match]:
+        ranking, base, posterior_probabilities = [], self.catalogue.absolute(), judged.posterior_probabilities
         for rank, (logit, photo, reference) in enumerate(judged.found.best, start=1):
-            probability = None if belief is None else float(belief.objects[rank - 1])
-            if_present = None if belief is None else float(belief.objects_if_present[rank - 1])
+            probability = None if posterior_probabilities is None else float(posterior_probabilities.objects[rank - 1])
+            if_present = (
+                None if posterior_probabilities is None else float(posterior_probabilities.objects_if_present[rank - 1])
+            )
             told = (rank, photo.object_id, logit, probability, photo.path, photo.metadata)
             ranking.append(Match(*told, base / photo.path, reference, if_present))
         return ranking
 
-    def _formula(self, judged: "_Judged", none_prior: float) -> dict[str, Any] | None:
+    def _formula(self, judged: "_ScoredQuery", none_prior: float) -> dict[str, Any] | None:
         """The formula of the probabilities, with the numbers of this answer."""
-        if self.posterior is None or judged.belief is None:
+        if self.posterior is None or judged.posterior_probabilities is None:
             return None
         return {
             **self.posterior.to_dict(),
             "none_prior": none_prior,
             "grasps": judged.grasps,
-            "objects": self.described.objects,
-            "judged_objects": judged.found.objects,
-            "unjudged_probability": judged.belief.unjudged,
-            **({ROWS: told} if (told := told_of(self.described.about)) else {}),
+            "objects": self.info.objects,
+            "scored_objects": judged.found.objects,
+            "unscored_probability": judged.posterior_probabilities.unscored,
+            **({REFERENCE_ROWS: told} if (told := reference_summary(self.info.about)) else {}),
         }
 
 
-class _Judged(NamedTuple):
+class _ScoredQuery(NamedTuple):
     """The result for one object in the hand, the number of its grasps with contact, and the posterior."""
 
-    found: Judged
+    found: ShardResult
     grasps: int
-    belief: Belief | None
+    posterior_probabilities: PosteriorProbabilities | None
 
 
-def _verdict(shown: Sequence[str], belief: Belief | None) -> str:
+def _verdict(shown: Sequence[str], posterior_probabilities: PosteriorProbabilities | None) -> str:
     if NOT_A_GEL in shown:
         return NOT_A_GEL
     if CONTACT not in shown:
         return NO_CONTACT
-    if belief is None:
+    if posterior_probabilities is None:
         return UNCALIBRATED
-    return MATCH if belief.is_match else NONE_OF_THESE
+    return MATCH if posterior_probabilities.is_match else NONE_OF_THESE
 
 
 def require_counts(top: int, candidates: int | None) -> None:
@@ -392,9 +398,9 @@ def require_counts(top: int, candidates: int | None) -> None:
         raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
 
 
-def torch_encoder(stored: Stored, threads: int | None = None) -> Encoder:
+def torch_encoder(stored: CheckpointInfo, threads: int | None = None) -> TouchEncoder:
     """The towers in PyTorch, whose import takes longer than all the rest."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.encode import TorchEncoder
 
-    return TorchEncoder(load_checkpoint(stored.path, known=stored).matcher, threads)
+    return TorchEncoder(load_checkpoint(stored.path, info=stored).matcher, threads)

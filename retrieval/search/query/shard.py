@@ -19,31 +19,31 @@ from numpy.typing import NDArray
 from indexes.store.generation import Generation
 from indexes.store.rows import key_of
 from retrieval.errors import BadInput
-from retrieval.model.judge import Judge
-from retrieval.model.posterior import Mass, Posterior
-from retrieval.model.references import ROWS
+from retrieval.model.fusion_scorer import FusionScorer
+from retrieval.model.posterior import EvidenceMass, Posterior
+from retrieval.model.reference_calibration import REFERENCE_ROWS
 from retrieval.model.touches import Stopwatch
 from retrieval.search.query.answer import NearestReference
-from retrieval.search.query.objects import JudgedObjects, ListedPhoto, Objects, listed_photo
-from retrieval.search.query.references import Near, References
+from retrieval.search.query.objects import ListedPhoto, Objects, ScoredObjects, listed_photo
+from retrieval.search.query.reference_touches import Nearness, References
 
 DEFAULT_CANDIDATES = 1000
-COMPLETED = 20
+MIN_COMPLETED_OBJECTS = 20
 """Objects, at least, of which every photo is judged."""
-CANCELLED = 1e-5
+MIN_SUM_NORM = 1e-5
 """Length of a sum of unit embeddings that is rounding alone."""
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
 
 
-class Felt(NamedTuple):
+class ShardQuery(NamedTuple):
     """Grasps of one object that felt something: embeddings (G, embedding_dim) and halves (G, half), G > 0."""
 
     embeddings: Floats
-    halves: Floats
+    partials: Floats
 
 
-class Ranked(NamedTuple):
+class RankedObject(NamedTuple):
     """An object with its logit, the photo that shows it best, and its nearest reference touch where it has any."""
 
     logit: float
@@ -52,7 +52,7 @@ class Ranked(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Judged:
+class ShardResult:
     """What a shard says of one object in the hand.
 
     photos, objects: how many were judged. best: at most as many objects as asked for, the best first, equals by name.
@@ -62,14 +62,14 @@ class Judged:
 
     photos: int
     objects: int
-    best: list[Ranked]
-    mass: Mass | None
+    best: list[RankedObject]
+    mass: EvidenceMass | None
     searched: int
     timing_ms: Mapping[str, float]
 
 
 @dataclass(frozen=True)
-class Described:
+class IndexInfo:
     """What is known of a shard without asking it.
 
     name: of the generation, or of the whole cluster's. kind: of the candidate search. photos, objects: how many.
@@ -98,10 +98,10 @@ class Shard(Protocol):
     """What a searcher searches. Any number of threads may ask at once."""
 
     @property
-    def described(self) -> Described:
+    def info(self) -> IndexInfo:
         """What is known without asking."""
 
-    def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged:
+    def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
         """The best `top` objects for these grasps, and what all weigh.
 
         candidates: photos that the full classifier judges, in each index folder, `top` at least; None: as many as
@@ -110,11 +110,13 @@ class Shard(Protocol):
 
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
         """The rows of these photos, and of gel images of reference touches, which have `touch`; None for one that is
-        not there."""
+        not there.
+        """
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """Photos in whose object, path and metadata all these words stand, in small letters, and of that object alone
-        where one is named; at most `limit` of them, from the one at `offset`."""
+        where one is named; at most `limit` of them, from the one at `offset`.
+        """
 
 
 class FolderShard:
@@ -125,18 +127,18 @@ class FolderShard:
     without, every photo is judged. Objects with reference touches are judged by these, too. Raises CorruptIndex.
     """
 
-    def __init__(self, generation: Generation, judge: Judge, has_embeddings: bool) -> None:
-        self.generation, self.judge, self.has_embeddings = generation, judge, has_embeddings
+    def __init__(self, generation: Generation, scorer: FusionScorer, has_embeddings: bool) -> None:
+        self.generation, self.scorer, self.has_embeddings = generation, scorer, has_embeddings
         self.objects = Objects(generation)
-        has_references = ROWS in generation.documents
-        self.references = References(generation, self.objects, len(judge.out)) if has_references else None
+        has_references = REFERENCE_ROWS in generation.documents
+        self.references = References(generation, self.objects, len(scorer.out)) if has_references else None
         self._lock = Lock()
 
     @property
-    def described(self) -> Described:
+    def info(self) -> IndexInfo:
         """What is known without asking."""
         manifest = self.generation.manifest
-        return Described(
+        return IndexInfo(
             manifest.generation,
             manifest.kind,
             self.generation.count,
@@ -146,18 +148,20 @@ class FolderShard:
             self.generation.documents.get("calibration"),
         )
 
-    def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged:
-        """As `Shard.ask`. Candidates are some photos of an object: of the best objects the others are judged too."""
+    def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
+        """As `Shard.search`. Candidates are some photos of an object: of the best objects the others are judged too."""
         clock = Stopwatch()
         with clock("candidates"):
             limit = self.limit(top, candidates)
-            near = None if self.references is None else self.references.near(felt.halves)
-            rows = self._candidates(felt.embeddings, near, limit)
+            near = None if self.references is None else self.references.near(query.partials)
+            rows = self._candidates(query.embeddings, near, limit)
         with clock("rerank"):
-            objects, photos = self._judged(felt.halves, rows, top, posterior or Posterior(), near)
-            mass = None if posterior is None else self._mass(felt.halves, objects, posterior, near)
-        best = [self._ranked(objects, place, felt.halves) for place in self.objects.best(objects, top).tolist()]
-        return Judged(photos, len(objects.numbers), best, mass, self.generation.count, clock.finished(1))
+            objects, photos = self._score_objects(query.partials, rows, top, posterior or Posterior(), near)
+            mass = None if posterior is None else self._mass(query.partials, objects, posterior, near)
+        best = [
+            self._ranked_object(objects, place, query.partials) for place in self.objects.best(objects, top).tolist()
+        ]
+        return ShardResult(photos, len(objects.numbers), best, mass, self.generation.count, clock.finish(1))
 
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
         """As `Shard.rows`."""
@@ -196,67 +200,70 @@ class FolderShard:
         measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
         return max(top, int(measured["k"]) if candidates is None else candidates)
 
-    def _candidates(self, embeddings: Floats, near: Near | None, k: int) -> Rows:
+    def _candidates(self, embeddings: Floats, near: Nearness | None, k: int) -> Rows:
         """Rows to score: the k nearest to all grasps together, and the photos of the k objects whose reference touches
-        are nearest; all rows where that would leave nothing out."""
+        are nearest; all rows where that would leave nothing out.
+        """
         if not self.has_embeddings or k >= self.generation.count:
             return np.arange(self.generation.count)
-        rows = np.sort(self.generation.candidates(together(embeddings), k)[0])
+        rows = np.sort(self.generation.candidates(combined_embedding(embeddings), k)[0])
         if self.references is None or near is None or len(rows) == self.generation.count:
             return rows
-        return np.union1d(rows, self.objects.rest_of(self.references.nearest_objects(near, k), rows))
+        return np.union1d(rows, self.objects.remaining_rows(self.references.nearest_objects(near, k), rows))
 
-    def _ranked(self, objects: JudgedObjects, place: int, halves: Floats) -> Ranked:
+    def _ranked_object(self, objects: ScoredObjects, place: int, partials: Floats) -> RankedObject:
         photo, logit = listed_photo(self.generation.rows[int(objects.rows[place])]), float(objects.logits[place])
-        if self.references is None or objects.by_photos is None:
-            return Ranked(logit, photo)
-        number, by_photos = int(objects.numbers[place]), float(objects.by_photos[place])
-        return Ranked(logit, photo, self.references.nearest(number, halves, logit, by_photos))
+        if self.references is None or objects.photo_logits is None:
+            return RankedObject(logit, photo)
+        number, photo_logits = int(objects.numbers[place]), float(objects.photo_logits[place])
+        return RankedObject(logit, photo, self.references.nearest(number, partials, logit, photo_logits))
 
     def _objects_of(
-        self, rows: Rows, logits: Floats, meaning: Posterior, grasps: int, near: Near | None
-    ) -> JudgedObjects:
+        self, rows: Rows, logits: Floats, meaning: Posterior, grasps: int, near: Nearness | None
+    ) -> ScoredObjects:
         """Objects by their photos at these rows, and by their reference touches."""
         objects = self.objects.judged(rows, logits, meaning, grasps)
         if self.references is None or near is None:
             return objects
-        beside = self.references.worth.beside  # the posterior of photos next to references
-        both = None if beside is None else self.objects.judged(rows, logits, beside, grasps)
-        return self.references.added(objects, both, near, meaning, grasps)
+        with_photos = self.references.calibration.with_photos  # the posterior of photos next to references
+        both = None if with_photos is None else self.objects.judged(rows, logits, with_photos, grasps)
+        return self.references.combine(objects, both, near, meaning, grasps)
 
-    def _judged(
-        self, halves: Floats, rows: Rows, top: int, meaning: Posterior, near: Near | None
-    ) -> tuple[JudgedObjects, int]:
+    def _score_objects(
+        self, partials: Floats, rows: Rows, top: int, meaning: Posterior, near: Nearness | None
+    ) -> tuple[ScoredObjects, int]:
         """Objects by their judged photos, and how many photos these are."""
-        logits = self._logits(halves, rows)
-        objects = self._objects_of(rows, logits, meaning, len(halves), near)
+        logits = self._logits(partials, rows)
+        objects = self._objects_of(rows, logits, meaning, len(partials), near)
         if len(rows) == self.generation.count:
             return objects, len(rows)
-        best = objects.numbers[self.objects.best(objects, max(top, COMPLETED))]
-        rest = self.objects.rest_of(best, rows)
+        best = objects.numbers[self.objects.best(objects, max(top, MIN_COMPLETED_OBJECTS))]
+        rest = self.objects.remaining_rows(best, rows)
         if not len(rest):
             return objects, len(rows)
         rows = np.concatenate([rows, rest])
-        logits = self.objects.equal_for_equals(rows, np.concatenate([logits, self._logits(halves, rest)]))
-        return self._objects_of(rows, logits, meaning, len(halves), near), len(rows)
+        logits = self.objects.align_duplicates(rows, np.concatenate([logits, self._logits(partials, rest)]))
+        return self._objects_of(rows, logits, meaning, len(partials), near), len(rows)
 
-    def _mass(self, halves: Floats, objects: JudgedObjects, posterior: Posterior, near: Near | None) -> Mass:
-        unjudged = self.objects.count - len(objects.numbers)
+    def _mass(
+        self, partials: Floats, objects: ScoredObjects, posterior: Posterior, near: Nearness | None
+    ) -> EvidenceMass:
+        unscored = self.objects.count - len(objects.numbers)
         # Without a sample of them, these are taken to be like the least of the judged ones, which candidates are not
         # expected to be.
         sample = objects.logits.min(keepdims=True)
-        if unjudged and len(drawn := self.objects.sample_without(objects.numbers)):
-            sample = self._objects_of(drawn, self._logits(halves, drawn), posterior, len(halves), near).logits
-        return posterior.mass(objects.logits, len(halves), unjudged=unjudged, sample=sample)
+        if unscored and len(drawn := self.objects.sample_rows_without(objects.numbers)):
+            sample = self._objects_of(drawn, self._logits(partials, drawn), posterior, len(partials), near).logits
+        return posterior.mass(objects.logits, len(partials), unscored=unscored, sample=sample)
 
-    def _logits(self, halves: Floats, rows: Rows) -> Floats:
+    def _logits(self, partials: Floats, rows: Rows) -> Floats:
         """Match logits of the rows, summed over grasps."""
         every = len(rows) == self.generation.count
-        logits = self.judge.logits(halves, self.generation.arrays["halves"], None if every else rows)
-        return self.objects.equal_for_equals(rows, logits)
+        logits = self.scorer.logits(partials, self.generation.arrays["partials"], None if every else rows)
+        return self.objects.align_duplicates(rows, logits)
 
 
-def together(embeddings: Floats) -> Floats:
+def combined_embedding(embeddings: Floats) -> Floats:
     """One embedding (1, d) of unit length that stands for several grasps (G, d): its cosines order photos as the sums
     of the grasps' cosines do.
 
@@ -265,7 +272,7 @@ def together(embeddings: Floats) -> Floats:
     """
     total = embeddings.sum(0, keepdims=True, dtype=np.float64)
     length = float(np.linalg.norm(total))
-    return embeddings[:1] if length < CANCELLED else (total / length).astype(np.float32)
+    return embeddings[:1] if length < MIN_SUM_NORM else (total / length).astype(np.float32)
 
 
 class Shards:
@@ -273,40 +280,40 @@ class Shards:
     machines are. described: what is known of all of them together.
     """
 
-    def __init__(self, shards: Sequence[Shard], described: Described) -> None:
-        self.shards, self.described = list(shards), described
+    def __init__(self, shards: Sequence[Shard], info: IndexInfo) -> None:
+        self.shards, self.info = list(shards), info
 
-    def ask(self, felt: Felt, top: int, candidates: int | None, posterior: Posterior | None) -> Judged:
-        """As `Shard.ask`."""
-        return merged([shard.ask(felt, top, candidates, posterior) for shard in self.shards], top)
+    def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
+        """As `Shard.search`."""
+        return merge_results([shard.search(query, top, candidates, posterior) for shard in self.shards], top)
 
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
         """As `Shard.rows`."""
-        return first_rows([shard.rows(ids) for shard in self.shards])
+        return merge_rows([shard.rows(ids) for shard in self.shards])
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """As `Shard.page`; the photos of one shard after those of the other."""
-        return one_page([partial(shard.page, words, object_id) for shard in self.shards], offset, limit)
+        return merge_pages([partial(shard.page, words, object_id) for shard in self.shards], offset, limit)
 
 
-def merged(answers: Sequence[Judged], top: int) -> Judged:
+def merge_results(answers: Sequence[ShardResult], top: int) -> ShardResult:
     """One answer of those of several shards, one at least."""
     if not answers:
         raise BadInput("there is no answer to merge; a cluster needs a shard at least")
     best = sorted((one for answer in answers for one in answer.best), key=lambda one: (-one.logit, one.photo.object_id))
     masses = [answer.mass for answer in answers if answer.mass is not None]
     stages = dict.fromkeys(stage for answer in answers for stage in answer.timing_ms)
-    return Judged(
+    return ShardResult(
         sum(answer.photos for answer in answers),
         sum(answer.objects for answer in answers),
         best[:top],
-        Mass.joined(masses) if masses else None,
+        EvidenceMass.merged(masses) if masses else None,
         sum(answer.searched for answer in answers),
         {stage: max(answer.timing_ms.get(stage, 0.0) for answer in answers) for stage in stages},
     )
 
 
-def one_page(pages: Sequence[Callable[[int, int], Page]], offset: int, limit: int) -> Page:
+def merge_pages(pages: Sequence[Callable[[int, int], Page]], offset: int, limit: int) -> Page:
     """The page of all shards together; each of `pages` gives that of one shard for an offset and a limit."""
     total, rows = 0, list[dict[str, Any]]()
     for page in pages:
@@ -316,7 +323,8 @@ def one_page(pages: Sequence[Callable[[int, int], Page]], offset: int, limit: in
     return Page(total, rows)
 
 
-def first_rows(found: Sequence[Sequence[dict[str, Any] | None]]) -> list[dict[str, Any] | None]:
+def merge_rows(found: Sequence[Sequence[dict[str, Any] | None]]) -> list[dict[str, Any] | None]:
     """The row of each photo, from whichever shard has it: `found` holds what every shard says of the same photos, None
-    where it has none."""
+    where it has none.
+    """
     return [next((row for row in rows if row is not None), None) for rows in zip(*found, strict=True)]

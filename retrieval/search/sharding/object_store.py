@@ -1,6 +1,6 @@
 """A sharded index in an object store: whatever `fsspec` writes to, by its URL.
 
-    CLUSTER.json                               as in a folder (`indexes.store.cluster`); put last, by one request
+    CLUSTER.json                               as in a folder (`indexes.store.sharded`); put last, by one request
     shard-00-of-04/gen-000007-<SHA-256>/       a generation, named by the digest of its manifest
         rows.jsonl, ...
         manifest.json                          put last
@@ -24,43 +24,43 @@ from typing import Any, TypeVar
 
 from _touch_retrieval.files import file_digest, remove_folder, write_atomically
 from indexes.errors import AGAIN, CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
-from indexes.store import cluster as folders
-from indexes.store.cluster import FOLDER, ClusterManifest, ShardEntry, cluster_file
+from indexes.store import sharded as folders
 from indexes.store.folder import IndexStore
-from indexes.store.locking import one_at_a_time
+from indexes.store.locking import exclusive_lock
 from indexes.store.manifest import NAME as MANIFEST
 from indexes.store.manifest import read_manifest
+from indexes.store.sharded import SHARD_FOLDER, ShardedManifest, ShardEntry, sharded_manifest_bytes
 from retrieval.console.files import cache_folder, make_cache_folder
-from retrieval.data.storage import FINAL, file_system, is_url, tried
-from retrieval.errors import BadInput, StorageError
+from retrieval.data.storage import PERMANENT_ERRORS, file_system, is_url, retry
+from retrieval.errors import BadInput, RemoteStorageError
 
 T = TypeVar("T")
 GENERATION = re.compile(r"(gen-\d{6,})-([0-9a-f]{64})")
-MOST_BYTES = 16 * 2**20
+MAX_MANIFEST_BYTES = 16 * 2**20
 """Of a manifest."""
-KEPT = 2
+MAX_FETCHED_GENERATIONS = 2
 """Generations of a shard that stay fetched: one that is searched while the next is."""
 
 
-def is_cluster(where: str | Path) -> bool:
+def is_sharded(where: str | Path) -> bool:
     """Whether this is a sharded index; what lies behind a URL always is."""
-    return is_url(where) or folders.is_cluster(Path(where))
+    return is_url(where) or folders.is_sharded(Path(where))
 
 
-def read_cluster(where: str | Path) -> ClusterManifest:
+def read_sharded_manifest(where: str | Path) -> ShardedManifest:
     """Return the manifest in a folder or behind a URL. Raises IndexesError and StorageError."""
     if not is_url(where):
-        return folders.read_cluster(Path(where))
-    stored = StoredCluster(str(where))
-    return stored.parsed(stored.manifest())
+        return folders.read_sharded_manifest(Path(where))
+    stored = RemoteShardedIndex(str(where))
+    return stored.parse_manifest(stored.manifest())
 
 
-def folder_with(where: str | Path, entry: ShardEntry) -> Path:
+def local_folder(where: str | Path, entry: ShardEntry) -> Path:
     """Return the local folder of the sharded index that holds this shard, which is fetched from a URL."""
-    return StoredCluster(str(where)).fetch(entry) if is_url(where) else Path(where)
+    return RemoteShardedIndex(str(where)).fetch(entry) if is_url(where) else Path(where)
 
 
-class StoredCluster:
+class RemoteShardedIndex:
     """The sharded index behind a URL.
 
     Args:
@@ -92,7 +92,7 @@ class StoredCluster:
         """Return the content of its manifest; None without one. Raises StorageError."""
         return self._try(folders.NAME, self._content)
 
-    def parsed(self, manifest: bytes | None) -> ClusterManifest:
+    def parse_manifest(self, manifest: bytes | None) -> ShardedManifest:
         """Return the manifest of that content. Raises NoIndex for None, CorruptIndex and UnsupportedFormat."""
         if manifest is None:
             raise NoIndex(f"{self.url}: there is no cluster here; run `retrieve build-index --out {self.url}` first")
@@ -100,7 +100,7 @@ class StoredCluster:
         own.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(own, manifest)
         try:
-            return folders.read_cluster(own.parent)
+            return folders.read_sharded_manifest(own.parent)
         except (CorruptIndex, UnsupportedFormat) as error:
             raise type(error)(f"{self.url}: {error}") from error
 
@@ -112,18 +112,19 @@ class StoredCluster:
         own = self._fetched / entry.sha256[:32]
         place = own / entry.folder / entry.generation
         if not place.is_dir():
-            with one_at_a_time(own.with_name(f"{own.name}.lock")):
+            with exclusive_lock(own.with_name(f"{own.name}.lock")):
                 if not place.is_dir():
-                    self._fetch(f"{entry.folder}/{_name(entry)}", entry.sha256, place)
+                    self._fetch(f"{entry.folder}/{_generation_name(entry)}", entry.sha256, place)
             with suppress(OSError):  # another process does the same
                 old = sorted(self._fetched.glob(f"*/{entry.folder}"), key=lambda path: path.stat().st_mtime)
-                for path in old[:-KEPT]:
+                for path in old[:-MAX_FETCHED_GENERATIONS]:
                     remove_folder(path.parent)
         return own
 
     def restore(self, folder: str) -> None:
         """Make the newest complete generation of this shard the current one of the local folder: a build then reuses
-        what another machine embedded. A damaged one is ignored."""
+        what another machine embedded. A damaged one is ignored.
+        """
         name = max((name for name, is_whole in self.generations(folder).items() if is_whole), default=None)
         if name is None:
             return
@@ -141,16 +142,23 @@ class StoredCluster:
     def generations(self, folder: str = "") -> dict[str, bool]:
         """Return {generation: whether its manifest is there} of one shard; or of all, as `<shard>/<generation>`."""
         files = self._sizes(folder)
-        names = {file.rpartition("/")[0] for file in files}
-        found = {name: f"{name}/{MANIFEST}" in files for name in names if GENERATION.fullmatch(name.rpartition("/")[2])}
-        return {name: whole for name, whole in found.items() if folder or FOLDER.fullmatch(name.rpartition("/")[0])}
+        generation_names = {file.rpartition("/")[0] for file in files}
+        found = {
+            name: f"{name}/{MANIFEST}" in files
+            for name in generation_names
+            if GENERATION.fullmatch(name.rpartition("/")[2])
+        }
+        return {
+            name: whole for name, whole in found.items() if folder or SHARD_FOLDER.fullmatch(name.rpartition("/")[0])
+        }
 
     # Writing ---------------------------------------------------------------------------------------------------
 
     def put(self, entry: ShardEntry, verify: bool = False) -> None:
         """Upload a shard from the local folder, except files that are there: with the same size, and with `verify` with
-        the same digest. Raises StorageError."""
-        place, own = f"{entry.folder}/{_name(entry)}", self.work / entry.folder / entry.generation
+        the same digest. Raises StorageError.
+        """
+        place, own = f"{entry.folder}/{_generation_name(entry)}", self.work / entry.folder / entry.generation
         there = self._sizes(place)
         must = {name: seal.sha256 for name, seal in read_manifest(own).files.items()} | {MANIFEST: entry.sha256}
         for name, sha256 in must.items():
@@ -158,7 +166,7 @@ class StoredCluster:
             if there.get(name) != size or (verify and self._try(f"{place}/{name}", self._digest) != sha256):
                 self._put(own / name, f"{place}/{name}")
 
-    def switch(self, before: bytes | None, manifest: ClusterManifest) -> None:
+    def switch(self, before: bytes | None, manifest: ShardedManifest) -> None:
         """Make this manifest the current one.
 
         Args:
@@ -169,7 +177,7 @@ class StoredCluster:
             StorageError: The storage refuses, or another build switched meanwhile; a store with conditional writes
                 refuses even if that happened after the last look.
         """
-        content = cluster_file(manifest)
+        content = sharded_manifest_bytes(manifest)
 
         def put(path: str) -> bool:
             condition = self._unchanged(path)  # first, so that the content below is no older
@@ -190,19 +198,19 @@ class StoredCluster:
             return True
 
         if not self._try(folders.NAME, put):
-            raise StorageError(
+            raise RemoteStorageError(
                 f"{self.url}: another build put its own cluster there meanwhile; run the same command again, which "
                 "embeds nothing twice"
             )
 
-    def discard(self, names: Iterable[str]) -> None:
+    def discard(self, generation_names: Iterable[str]) -> None:
         """Delete generations, named as `generations` names them, each manifest first."""
 
         def delete(path: str) -> None:
             with suppress(FileNotFoundError):  # deleted by a request whose answer was lost
                 self._system.rm_file(path)
 
-        for name in names:
+        for name in generation_names:
             for file in sorted(self._sizes(name), key=lambda file: file != MANIFEST):
                 self._try(f"{name}/{file}", delete)
 
@@ -212,9 +220,9 @@ class StoredCluster:
         """Call `function` with the whole path of `name`, again where the store refuses. Raises StorageError."""
         what = f"{self.url}/{name}".rstrip("/")
         try:
-            return tried(what, lambda: function(f"{self._root}/{name}".rstrip("/")))
-        except FINAL as error:
-            raise StorageError(f"{what}: the storage refuses ({type(error).__name__}: {error})") from error
+            return retry(what, lambda: function(f"{self._root}/{name}".rstrip("/")))
+        except PERMANENT_ERRORS as error:
+            raise RemoteStorageError(f"{what}: the storage refuses ({type(error).__name__}: {error})") from error
 
     def _sizes(self, name: str) -> dict[str, int]:
         """{file below `name`: its bytes}."""
@@ -243,16 +251,17 @@ class StoredCluster:
     def _content(self, path: str) -> bytes | None:
         """The content of a manifest; None without one."""
         try:
-            data: bytes = self._system.cat_file(path, start=0, end=MOST_BYTES + 1)
+            data: bytes = self._system.cat_file(path, start=0, end=MAX_MANIFEST_BYTES + 1)
         except FileNotFoundError:
             return None
-        if len(data) > MOST_BYTES:
-            raise ValueError(f"a manifest has at most {MOST_BYTES} bytes")
+        if len(data) > MAX_MANIFEST_BYTES:
+            raise ValueError(f"a manifest has at most {MAX_MANIFEST_BYTES} bytes")
         return data
 
     def _unchanged(self, path: str) -> dict[str, Any]:
         """Arguments with which `pipe_file` refuses to replace another file than the current one: fsspec's for no file,
-        S3's for a file; none for other stores."""
+        S3's for a file; none for other stores.
+        """
         found = self._info(path)
         if found is None:
             return {"mode": "create"}
@@ -284,8 +293,8 @@ class StoredCluster:
         if file.is_file() and file_digest(file) == sha256:
             return
         size = (self._try(name, self._info) or {}).get("size")
-        if size is None or (size > MOST_BYTES if must is None else size != must):
-            what = "is missing" if size is None else f"has {size} bytes, and not {must or MOST_BYTES}"
+        if size is None or (size > MAX_MANIFEST_BYTES if must is None else size != must):
+            what = "is missing" if size is None else f"has {size} bytes, and not {must or MAX_MANIFEST_BYTES}"
             raise CorruptIndex(f"{self.url}/{name} {what}; {AGAIN}")
 
         def fetch(path: str) -> None:
@@ -299,10 +308,10 @@ class StoredCluster:
             raise CorruptIndex(f"{self.url}/{name} was altered; `retrieve build-index --verify` mends it")
 
 
-def names(entries: Iterable[ShardEntry]) -> set[str]:
-    """Return the names of generations, as in `StoredCluster.generations`."""
-    return {f"{entry.folder}/{_name(entry)}" for entry in entries}
+def generation_names(entries: Iterable[ShardEntry]) -> set[str]:
+    """Return the names of generations, as in `RemoteShardedIndex.generations`."""
+    return {f"{entry.folder}/{_generation_name(entry)}" for entry in entries}
 
 
-def _name(entry: ShardEntry) -> str:
+def _generation_name(entry: ShardEntry) -> str:
     return f"{entry.generation}-{entry.sha256}"

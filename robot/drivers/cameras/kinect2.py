@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Clock
-from robot.drivers.discover import as_text
-from robot.drivers.vendor import MakerCamera, MakerSettings, load, vendor_errors
+from robot.drivers.discover import decode_serial
+from robot.drivers.vendor import VendorCamera, VendorSettings, import_package, vendor_errors
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import RGBD, Intrinsics
 
@@ -36,9 +36,10 @@ _POLL_S = 0.002
 
 
 @dataclass(frozen=True, kw_only=True)
-class Kinect2Settings(MakerSettings):
+class Kinect2Settings(VendorSettings):
     """pipeline: one of PIPELINES, or "auto", the first that this build has. upside_down: it hangs from above; picture
-    and intrinsics are turned by half a turn."""
+    and intrinsics are turned by half a turn.
+    """
 
     pipeline: str = "auto"
     upside_down: bool = False
@@ -50,7 +51,7 @@ class Kinect2Settings(MakerSettings):
             raise RobotConfigError(f"pipeline must be auto or one of {', '.join(PIPELINES)}, got {self.pipeline!r}")
 
 
-class Kinect2(MakerCamera):
+class Kinect2(VendorCamera):
     """A Kinect 2; its keywords are those of Kinect2Settings."""
 
     Settings = Kinect2Settings
@@ -58,7 +59,7 @@ class Kinect2(MakerCamera):
     def __init__(self, *, extrinsics: npt.ArrayLike, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range; touches no device."""
         super().__init__("kinect2", extrinsics, clock=clock)
-        self._asked = Kinect2Settings(**settings)
+        self._options = Kinect2Settings(**settings)
         self._package: Any = None
         self._freenect: Any = None
         self._device: Any = None
@@ -71,40 +72,40 @@ class Kinect2(MakerCamera):
             "build libfreenect2 with shared libraries first (github.com/OpenKinect/libfreenect2), "
             "then run pip install pylibfreenect2"
         )
-        package = self._package = load("pylibfreenect2", "a Kinect 2", install)
+        package = self._package = import_package("pylibfreenect2", "a Kinect 2", install)
         with vendor_errors("kinect2 cannot be started"):
             self._freenect = package.Freenect2()
             count = self._freenect.enumerateDevices()
             serials = list(map(self._freenect.getDeviceSerialNumber, range(count)))  # as the package gives them
-            serial = serials[self._chosen(self._asked.serial, list(map(as_text, serials)))]
+            serial = serials[self._choose_camera(self._options.serial, list(map(decode_serial, serials)))]
             name, pipeline = self._make_pipeline()
             self._device = self._freenect.openDevice(serial, pipeline=pipeline)
             self._listener = package.SyncMultiFrameListener(package.FrameType.Color | package.FrameType.Depth)
             self._device.setColorFrameListener(self._listener)
             self._device.setIrAndDepthFrameListener(self._listener)
             self._device.start()
-            self._learn(as_text(serial), name)
-            for _ in range(self._asked.warmup_frames):
+            self._read_parameters(decode_serial(serial), name)
+            for _ in range(self._options.warmup_frames):
                 self._discard()
 
     def _make_pipeline(self) -> tuple[str, Any]:
         """The first of the wanted pipelines that this build has and this computer can run."""
         failures = []
-        for name in PIPELINES if self._asked.pipeline == "auto" else (self._asked.pipeline,):
+        for name in PIPELINES if self._options.pipeline == "auto" else (self._options.pipeline,):
             try:
                 return name, getattr(self._package, PIPELINES[name])()
             except Exception as error:
                 failures.append(f"{name}: {error}")
-        raise DeviceError(f"kinect2 must compute its depth with {self._asked.pipeline}, but {'; '.join(failures)}")
+        raise DeviceError(f"kinect2 must compute its depth with {self._options.pipeline}, but {'; '.join(failures)}")
 
-    def _learn(self, serial: str, pipeline: str) -> None:
+    def _read_parameters(self, serial: str, pipeline: str) -> None:
         infrared = self._device.getIrCameraParams()
         self._registration = self._package.Registration(infrared, self._device.getColorCameraParams())
         cx, cy = float(infrared.cx), float(infrared.cy)
-        if self._asked.upside_down:
+        if self._options.upside_down:
             cx, cy = WIDTH - 1 - cx, HEIGHT - 1 - cy
         self._intrinsics = Intrinsics(float(infrared.fx), float(infrared.fy), cx, cy)
-        self._has = {"serial": serial, "pipeline": pipeline, "width": WIDTH, "height": HEIGHT}
+        self._reported = {"serial": serial, "pipeline": pipeline, "width": WIDTH, "height": HEIGHT}
 
     def _close(self) -> None:
         device, self._device = self._device, None
@@ -123,11 +124,11 @@ class Kinect2(MakerCamera):
         """A set of frames, released whatever happens. Waiting is ours: not every version of the package can give up."""
         if self._device is None:
             raise DeviceError("kinect2 was stopped by a failed recovery; call recover() again")
-        deadline = time.monotonic() + self._asked.timeout_s
+        deadline = time.monotonic() + self._options.timeout_s
         while not self._listener.hasNewFrame():
             if time.monotonic() > deadline:
                 raise DeviceError(
-                    f"kinect2 must give a picture within {self._asked.timeout_s:g} s, but did not; "
+                    f"kinect2 must give a picture within {self._options.timeout_s:g} s, but did not; "
                     "it needs USB 3 and its own power"
                 )
             time.sleep(_POLL_S)
@@ -150,7 +151,9 @@ class Kinect2(MakerCamera):
                 colour, depth_mm = self._register(frames)
         known = np.isfinite(depth_mm) & (depth_mm > 0)
         depth_m = np.where(known, depth_mm, np.float32(np.nan)) * np.float32(1e-3)
-        return RGBD(self._upright(colour), self._upright(depth_m) if depth else None, self._intrinsics, time_s)
+        return RGBD(
+            self._rotate_upright(colour), self._rotate_upright(depth_m) if depth else None, self._intrinsics, time_s
+        )
 
     def _register(self, frames: Any) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
         """Colour (RGB) of the pixels of the depth, and the depth in mm, both as copies: their memory goes back."""
@@ -160,5 +163,5 @@ class Kinect2(MakerCamera):
         colour = np.array(registered.asarray(np.uint8)[:, :, 2::-1])
         return colour, np.array(undistorted.asarray(np.float32))
 
-    def _upright(self, picture: npt.NDArray[T]) -> npt.NDArray[T]:
-        return np.ascontiguousarray(picture[::-1, ::-1] if self._asked.upside_down else picture)
+    def _rotate_upright(self, picture: npt.NDArray[T]) -> npt.NDArray[T]:
+        return np.ascontiguousarray(picture[::-1, ::-1] if self._options.upside_down else picture)

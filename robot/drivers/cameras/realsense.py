@@ -15,23 +15,23 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Clock
-from robot.drivers.vendor import MakerCamera, MakerSettings, finite, load, vendor_errors
+from robot.drivers.vendor import VendorCamera, VendorSettings, check_finite, import_package, vendor_errors
 from robot.errors import DeviceError
 from robot.readings import RGBD, Intrinsics
-from robot.settings import limited
+from robot.settings import bounded
 
 
 @dataclass(frozen=True, kw_only=True)
-class RealSenseSettings(MakerSettings):
+class RealSenseSettings(VendorSettings):
     """width, height in pixels and fps of both streams."""
 
-    width: int = limited(1, 20_000, 640, unit="pixels")
-    height: int = limited(1, 20_000, 480, unit="pixels")
-    fps: int = limited(1, 1000, 30)
-    warmup_frames: int = limited(0, 1000, 30)
+    width: int = bounded(1, 20_000, 640, unit="pixels")
+    height: int = bounded(1, 20_000, 480, unit="pixels")
+    fps: int = bounded(1, 1000, 30)
+    warmup_frames: int = bounded(0, 1000, 30)
 
 
-class RealSense(MakerCamera):
+class RealSense(VendorCamera):
     """A RealSense depth camera; its keywords are those of RealSenseSettings.
 
     A picture with lens distortion is undistorted by the maker's own model (depth by the nearest pixel, so that none is
@@ -43,7 +43,7 @@ class RealSense(MakerCamera):
     def __init__(self, *, extrinsics: npt.ArrayLike, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range; touches no device."""
         super().__init__("realsense", extrinsics, clock=clock)
-        self._asked = RealSenseSettings(**settings)
+        self._options = RealSenseSettings(**settings)
         self._pipeline: Any = None
         self._align: Any = None
         self._intrinsics: Intrinsics | None = None
@@ -51,35 +51,39 @@ class RealSense(MakerCamera):
         self._undistortion: npt.NDArray[np.float32] | None = None
 
     def _connect(self) -> None:
-        rs = load("pyrealsense2", "a RealSense camera", "run pip install 'touch-retrieval[realsense]'")
+        rs = import_package("pyrealsense2", "a RealSense camera", "run pip install 'touch-retrieval[realsense]'")
         with vendor_errors("realsense cannot be started"):
             found = [str(each.get_info(rs.camera_info.serial_number)) for each in rs.context().query_devices()]
-            serial = found[self._chosen(self._asked.serial, found)]
+            serial = found[self._choose_camera(self._options.serial, found)]
             pipeline = rs.pipeline()
             profile = pipeline.start(self._config(rs, serial))
             self._pipeline = pipeline  # from here on `_close` stops it
             self._align = rs.align(rs.stream.color)
-            self._learn(rs, profile, serial)
-            for _ in range(self._asked.warmup_frames):
+            self._read_parameters(rs, profile, serial)
+            for _ in range(self._options.warmup_frames):
                 self._wait()
 
     def _config(self, rs: Any, serial: str) -> Any:
         config = rs.config()
         config.enable_device(serial)
-        config.enable_stream(rs.stream.depth, self._asked.width, self._asked.height, rs.format.z16, self._asked.fps)
-        config.enable_stream(rs.stream.color, self._asked.width, self._asked.height, rs.format.rgb8, self._asked.fps)
+        config.enable_stream(
+            rs.stream.depth, self._options.width, self._options.height, rs.format.z16, self._options.fps
+        )
+        config.enable_stream(
+            rs.stream.color, self._options.width, self._options.height, rs.format.rgb8, self._options.fps
+        )
         return config
 
-    def _learn(self, rs: Any, profile: Any, serial: str) -> None:
+    def _read_parameters(self, rs: Any, profile: Any, serial: str) -> None:
         """Scale of depth, intrinsics, and how to undo distortion."""
         video = profile.get_stream(rs.stream.color).as_video_stream_profile()
         lens = video.get_intrinsics()
         depth = profile.get_device().first_depth_sensor()
-        (self._scale_m,) = finite("a RealSense's depth scale", [depth.get_depth_scale()])
+        (self._scale_m,) = check_finite("a RealSense's depth scale", [depth.get_depth_scale()])
         self._intrinsics = Intrinsics(lens.fx, lens.fy, lens.ppx, lens.ppy)
-        coefficients = finite("a RealSense's distortion coefficients", lens.coeffs)
+        coefficients = check_finite("a RealSense's distortion coefficients", lens.coeffs)
         self._undistortion = _undistortion(rs, lens) if any(coefficients) else None
-        self._has = {
+        self._reported = {
             "serial": serial,
             "width": int(lens.width),
             "height": int(lens.height),
@@ -96,7 +100,7 @@ class RealSense(MakerCamera):
                 pipeline.stop()
 
     def _wait(self) -> Any:
-        return self._pipeline.wait_for_frames(round(1000 * self._asked.timeout_s))
+        return self._pipeline.wait_for_frames(round(1000 * self._options.timeout_s))
 
     def _read(self, depth: bool) -> RGBD:
         with vendor_errors("realsense gives no picture; is it plugged into USB 3?"):
@@ -107,14 +111,14 @@ class RealSense(MakerCamera):
             time_s = self.clock()
             if depth:
                 frames = self._align.process(frames)
-            colour = _copied(frames.get_color_frame(), "colour")
-            raw = _copied(frames.get_depth_frame(), "depth") if depth else None
-        depth_m = None if raw is None else self._in_metre(raw)
+            colour = _copy_pixels(frames.get_color_frame(), "colour")
+            raw = _copy_pixels(frames.get_depth_frame(), "depth") if depth else None
+        depth_m = None if raw is None else self._to_metres(raw)
         if self._undistortion is not None:
             colour = np.asarray(cv2.remap(colour, self._undistortion, None, cv2.INTER_LINEAR), np.uint8)
         return RGBD(colour, depth_m, self._intrinsics, time_s)
 
-    def _in_metre(self, raw: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
+    def _to_metres(self, raw: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
         """Known depth times the scale, NaN where unknown."""
         if self._undistortion is not None:
             raw = cv2.remap(raw, self._undistortion, None, cv2.INTER_NEAREST, borderValue=0)
@@ -131,7 +135,7 @@ def _undistortion(rs: Any, lens: Any) -> npt.NDArray[np.float32]:
     return found
 
 
-def _copied(frame: Any, what: str) -> npt.NDArray[Any]:
+def _copy_pixels(frame: Any, what: str) -> npt.NDArray[Any]:
     """The picture's own memory goes back to the camera."""
     if not frame:
         raise DeviceError(f"realsense must give {what} with each picture, but did not")

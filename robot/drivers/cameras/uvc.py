@@ -9,9 +9,9 @@ import numpy.typing as npt
 
 from robot.devices import Camera, Clock
 from robot.drivers.video.opencv_stream import CaptureReader, UsbCameraSettings
-from robot.drivers.video.rectify import in_rgb
+from robot.drivers.video.rectify import to_rgb
 from robot.readings import RGBD
-from robot.settings import limited
+from robot.settings import bounded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +20,7 @@ class UvcSettings(UsbCameraSettings):
 
     auto_exposure: bool = True
     auto_white_balance: bool = True
-    keep: int = limited(1, 1000, 1, unit="pictures")
+    keep: int = bounded(1, 1000, 1, unit="pictures")
     upside_down: bool = False
 
 
@@ -33,11 +33,11 @@ class UvcCamera(Camera):
     def __init__(self, *, extrinsics: npt.ArrayLike, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range; touches no device."""
         super().__init__("usb camera", extrinsics, clock=clock)
-        self._asked = UvcSettings(**settings)
-        self._reader = CaptureReader(self, self._asked)
+        self._options = UvcSettings(**settings)
+        self._reader = CaptureReader(self, self._options)
 
     def _connect(self) -> None:
-        self._reader = CaptureReader(self, self._asked)
+        self._reader = CaptureReader(self, self._options)
         self._reader.start()
 
     def _close(self) -> None:
@@ -51,7 +51,7 @@ class UvcCamera(Camera):
 
     def _read(self, depth: bool) -> RGBD:
         frame = self._reader.newest()
-        colour = in_rgb(frame.pixels)
-        if self._asked.upside_down:
+        colour = to_rgb(frame.pixels)
+        if self._options.upside_down:
             colour = np.ascontiguousarray(colour[::-1, ::-1])
         return RGBD(colour, None, None, frame.time_s)

@@ -12,14 +12,15 @@ import numpy as np
 
 from robot.devices import Clock, TactileSensor
 from robot.drivers.video.opencv_stream import CaptureReader, CaptureSettings, UsbCameraSettings
-from robot.drivers.video.rectify import CutSettings, in_rgb, make_rectifier
+from robot.drivers.video.rectify import CropSettings, make_rectifier, to_rgb
 from robot.readings import Frame
 
 
 @dataclass(frozen=True, kw_only=True)
-class GelCameraSettings(UsbCameraSettings, CutSettings):
+class GelCameraSettings(UsbCameraSettings, CropSettings):
     """The camera behind a gel, and what is cut out of its pictures. keep: pictures kept to match the other finger's in
-    time."""
+    time.
+    """
 
 
 class OpencvTactile(TactileSensor):
@@ -37,32 +38,32 @@ class OpencvTactile(TactileSensor):
     def __init__(self, *, finger: str, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range or a calibration file that is none; touches no device."""
         super().__init__(f"gel {finger}", finger, clock=clock)
-        asked, preset = GelCameraSettings(**settings), self.PRESET
-        size = asked if asked.width or asked.height else preset
-        self._asked = replace(
-            asked,
+        options, preset = GelCameraSettings(**settings), self.PRESET
+        size = options if options.width or options.height else preset
+        self._options = replace(
+            options,
             width=size.width,
             height=size.height,
-            fps=asked.fps or preset.fps,
-            fourcc=asked.fourcc or preset.fourcc,
-            led=asked.led or preset.led,
+            fps=options.fps or preset.fps,
+            fourcc=options.fourcc or preset.fourcc,
+            led=options.led or preset.led,
         )
-        self._rectifier = make_rectifier(asked, self.CROP)
-        self._reader = CaptureReader(self, self._asked)
+        self._rectifier = make_rectifier(options, self.CROP)
+        self._reader = CaptureReader(self, self._options)
         self._picture_px: list[int] = []
 
     @property
-    def frames_seen(self) -> int:
+    def frame_count(self) -> int:
         """Pictures taken since it was connected; their number over a while is the rate."""
-        return self._reader.frames_seen
+        return self._reader.frame_count
 
     @property
-    def lost(self) -> int:
+    def lost_count(self) -> int:
         """How often the stream was lost and opened again since it was connected."""
-        return self._reader.lost
+        return self._reader.lost_count
 
     def _connect(self) -> None:
-        self._reader = CaptureReader(self, self._asked)
+        self._reader = CaptureReader(self, self._options)
         self._reader.start()
         height, width = self._read().pixels.shape[:2]  # a calibration for another size is found here
         self._picture_px = [width, height]
@@ -87,7 +88,7 @@ class OpencvTactile(TactileSensor):
         """Turned, the gel alone, and then in RGB: the fewer pixels, the sooner."""
         turns = self.QUARTER_TURNS
         turned = np.ascontiguousarray(np.rot90(frame.pixels, turns)) if turns else frame.pixels
-        return Frame(in_rgb(self._rectifier.apply(turned)), frame.time_s)
+        return Frame(to_rgb(self._rectifier.apply(turned)), frame.time_s)
 
 
 class GelSight(OpencvTactile):
@@ -98,7 +99,8 @@ class GelSight(OpencvTactile):
 
 class GelSightMini(OpencvTactile):
     """GelSight Mini: the size that the maker's software asks for, and the border that it cuts off. The camera's own
-    3280 x 2464 pixels at 25 pictures a second keep a core busy."""
+    3280 x 2464 pixels at 25 pictures a second keep a core busy.
+    """
 
     PRESET = CaptureSettings(width=320, height=240, fps=25.0)
     CROP = (0.15, 0.15, 0.15, 0.15)
@@ -106,7 +108,8 @@ class GelSightMini(OpencvTactile):
 
 class Digit(OpencvTactile):
     """DIGIT, LEDs at full brightness unless `led` says otherwise. Its picture is transposed and turned over before
-    people see it, which is a quarter turn to the left."""
+    people see it, which is a quarter turn to the left.
+    """
 
     PRESET = CaptureSettings(width=320, height=240, fps=60.0, led=(15, 15, 15))
     QUARTER_TURNS = 1

@@ -25,21 +25,21 @@ import numpy as np
 
 from robot.devices import Arm, Clock
 from robot.drivers.sawyer import messages
-from robot.drivers.sawyer.messages import Joints, Mount, newest_joints, stands
-from robot.drivers.sawyer.rosbridge import Arrival, RosbridgeLink
-from robot.drivers.sawyer.straight_line import Schedule, way_points
+from robot.drivers.sawyer.messages import Joints, Mount, is_still, newest_joints
+from robot.drivers.sawyer.rosbridge import ReceivedMessage, RosbridgeLink
+from robot.drivers.sawyer.straight_line import JointTrajectory, waypoints
 from robot.errors import DeviceError
 from robot.readings import Pose, Region
-from robot.settings import TypedSettings, check_range, limited
+from robot.settings import TypedSettings, bounded, check_range
 
 _LOG = logging.getLogger(__name__)
-_READ = (messages.JOINT_STATES, messages.ROBOT_STATE, messages.TIP_STATES, messages.COLLISION)
+_STATE_TOPICS = (messages.JOINT_STATES, messages.ROBOT_STATE, messages.TIP_STATES, messages.COLLISION)
 _SLOW_STATE_AGE_S = 2.0
 """/robot/state and the collision state are slower than the joints; they must still come."""
 _COLLISIONS = "collision state"
-_MOST_LAG_RAD = 0.35
+_MAX_LAG_RAD = 0.35
 """An arm this far behind its commands is blocked; half a second of lag at 0.5 rad/s is 0.25."""
-_MOST_TURN_RAD = 0.5
+_MAX_TURN_RAD = 0.5
 """Joints that turn further between two way-points are another solution of the arm, not the same one further on."""
 _STOP_S = 2.0
 """An arm that was told to hold must stand after so long."""
@@ -61,24 +61,24 @@ class SawyerSettings(TypedSettings):
 
     host: str
     base_xyz_mm: tuple[float, float, float]
-    tool_mm: float = limited(0, 1000)
-    port: int = limited(1, 65535, 9090)
+    tool_mm: float = bounded(0, 1000)
+    port: int = bounded(1, 65535, 9090)
     tip: str = "right_hand"
-    base_yaw_deg: float = limited(-360, 360, 0.0)
-    tool_yaw_deg: float = limited(-360, 360, 0.0)
-    speed_ratio: float = limited(0.01, 1, 0.3)
-    joint_speed_rad_s: float = limited(0.01, 1.5, 0.5)
-    rate_hz: float = limited(20, 1000, 100.0)
-    ramp_s: float = limited(0, 5, 0.3)
-    arrival_rad: float = limited(1e-3, 0.1, 0.01)
-    settle_s: float = limited(0.1, 60, 5.0)
-    command_timeout_s: float = limited(0.05, 1, 0.2)
-    timeout_s: float = limited(0.05, 60, 2.0)
-    ik_retries: int = limited(0, 20, 2)
-    reconnect_tries: int = limited(1, 20, 5)
+    base_yaw_deg: float = bounded(-360, 360, 0.0)
+    tool_yaw_deg: float = bounded(-360, 360, 0.0)
+    speed_ratio: float = bounded(0.01, 1, 0.3)
+    joint_speed_rad_s: float = bounded(0.01, 1.5, 0.5)
+    rate_hz: float = bounded(20, 1000, 100.0)
+    ramp_s: float = bounded(0, 5, 0.3)
+    arrival_rad: float = bounded(1e-3, 0.1, 0.01)
+    settle_s: float = bounded(0.1, 60, 5.0)
+    command_timeout_s: float = bounded(0.05, 1, 0.2)
+    timeout_s: float = bounded(0.05, 60, 2.0)
+    ik_retries: int = bounded(0, 20, 2)
+    reconnect_tries: int = bounded(1, 20, 5)
     enable: bool = False
     max_speed_mm_s: float = 200.0
-    max_state_age_s: float = limited(0.02, 5, 0.5)
+    max_state_age_s: float = bounded(0.02, 5, 0.5)
 
     def __post_init__(self) -> None:
         """Raises RobotConfigError for a setting of the wrong type or out of range."""
@@ -94,24 +94,24 @@ class Sawyer(Arm):
 
     def __init__(self, *, workspace: Region, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range."""
-        asked = self._asked = SawyerSettings(**settings)
-        super().__init__("sawyer", workspace, max_speed_mm_s=asked.max_speed_mm_s, clock=clock)
-        yaw, tool_yaw = math.radians(asked.base_yaw_deg), math.radians(asked.tool_yaw_deg)
-        self._mount = Mount(asked.base_xyz_mm, yaw, asked.tool_mm, tool_yaw)
-        self._url, self._tick_s = f"ws://{asked.host}:{asked.port}", 1.0 / asked.rate_hz
-        self._under_way = self._sees_collisions = False
+        options = self._options = SawyerSettings(**settings)
+        super().__init__("sawyer", workspace, max_speed_mm_s=options.max_speed_mm_s, clock=clock)
+        yaw, tool_yaw = math.radians(options.base_yaw_deg), math.radians(options.tool_yaw_deg)
+        self._mount = Mount(options.base_xyz_mm, yaw, options.tool_mm, tool_yaw)
+        self._url, self._tick_s = f"ws://{options.host}:{options.port}", 1.0 / options.rate_hz
+        self._is_moving = self._sees_collisions = False
         self._link = self._new_link()
 
     def _new_link(self) -> RosbridgeLink:
-        return RosbridgeLink(self._url, timeout_s=self._asked.timeout_s, clock=self.clock)
+        return RosbridgeLink(self._url, timeout_s=self._options.timeout_s, clock=self.clock)
 
     def _connect(self) -> None:
         self._sees_collisions = False
-        self._join()
-        self._look_for_collisions()
+        self._open_link()
+        self._check_collision_topic()
         self._make_ready()
 
-    def _look_for_collisions(self) -> None:
+    def _check_collision_topic(self) -> None:
         """Note it where nothing comes that would report one: a person may do without, and must know."""
         self.refused.pop(_COLLISIONS, None)
         try:
@@ -122,17 +122,17 @@ class Sawyer(Arm):
             self.refused[_COLLISIONS] = "nothing comes: collisions are not seen"
             _LOG.warning("%s: nothing comes on %s: collisions are not seen", self.name, messages.COLLISION[0])
 
-    def _join(self) -> None:
+    def _open_link(self) -> None:
         """A new link on which every state has come once; that of collisions, where it came when connecting."""
         self._link = self._new_link()
         self._link.open()
-        for topic, kind in (*_READ, messages.SPEED_RATIO, messages.COMMAND_TIMEOUT):
+        for topic, kind in (*_STATE_TOPICS, messages.SPEED_RATIO, messages.COMMAND_TIMEOUT):
             self._link.subscribe(topic, kind)
         self._link.advertise(*messages.JOINT_COMMAND)
-        for topic, _ in _READ if self._sees_collisions else _READ[:-1]:
+        for topic, _ in _STATE_TOPICS if self._sees_collisions else _STATE_TOPICS[:-1]:
             self._link.wait_for(topic)
-        self._set("speed_ratio", messages.SPEED_RATIO, self._asked.speed_ratio)
-        self._set("command_timeout_s", messages.COMMAND_TIMEOUT, self._asked.command_timeout_s)
+        self._set("speed_ratio", messages.SPEED_RATIO, self._options.speed_ratio)
+        self._set("command_timeout_s", messages.COMMAND_TIMEOUT, self._options.command_timeout_s)
 
     def _set(self, name: str, topic: tuple[str, str], value: float) -> None:
         """Publish a setting and read it back as the topic shows it; what differs is noted in `refused`."""
@@ -152,11 +152,11 @@ class Sawyer(Arm):
     def _make_ready(self) -> None:
         """Enable the motors where that is all that is missing and allowed. Raises DeviceError."""
         state = self._robot_state()
-        if self._asked.enable and self.may_move and not (state.enabled or state.stopped or state.error):
+        if self._options.enable and self.may_move and not (state.enabled or state.stopped or state.error):
             _LOG.warning("%s: the motors are being enabled", self.name)
             self._link.advertise(*messages.ENABLE)
             self._link.publish(messages.ENABLE[0], {"data": True})
-            deadline = self.clock() + self._asked.timeout_s
+            deadline = self.clock() + self._options.timeout_s
             while not self._robot_state().enabled and self.clock() < deadline:
                 time.sleep(self._tick_s)
         self._check_free()
@@ -164,7 +164,7 @@ class Sawyer(Arm):
     def _close(self) -> None:
         """Hold the arm where another thread still moves it; one that nobody moves from here is left alone."""
         try:
-            if self._under_way:
+            if self._is_moving:
                 with contextlib.suppress(DeviceError):
                     self._command(self._fresh_joints())
         finally:
@@ -173,7 +173,7 @@ class Sawyer(Arm):
     def _settings(self) -> dict[str, Any]:
         return {
             "url": self._url,
-            "tip": self._asked.tip,
+            "tip": self._options.tip,
             "speed_ratio": self._read_back(messages.SPEED_RATIO),
             "command_timeout_s": self._read_back(messages.COMMAND_TIMEOUT),
         }
@@ -191,48 +191,50 @@ class Sawyer(Arm):
             self._collisions()
         except DeviceError as error:
             _LOG.warning("%s: %s; connecting again", self.name, error)
-            self._rejoin()
-        if self._collided_since(-math.inf, newest=True):
+            self._reconnect()
+        if self._has_collided_since(-math.inf, newest=True):
             raise DeviceError(f"{self.name}: recovery is refused: {messages.COLLIDED}")
         self._make_ready()
 
-    def _rejoin(self) -> None:
-        for trial in range(self._asked.reconnect_tries):
+    def _reconnect(self) -> None:
+        for trial in range(self._options.reconnect_tries):
             self._link.close()
             try:
-                return self._join()
+                return self._open_link()
             except DeviceError as error:
-                _LOG.warning("%s: try %d of %d: %s", self.name, trial + 1, self._asked.reconnect_tries, error)
-                if trial + 1 == self._asked.reconnect_tries:
+                _LOG.warning("%s: try %d of %d: %s", self.name, trial + 1, self._options.reconnect_tries, error)
+                if trial + 1 == self._options.reconnect_tries:
                     raise
             time.sleep(min(_BACK_OFF_S * 2**trial, _LONGEST_BACK_OFF_S))
         raise AssertionError("the loop returns or raises")
 
     def _pose(self) -> Pose:
-        return self._pose_since(self.clock() - self._asked.max_state_age_s)
+        return self._pose_since(self.clock() - self._options.max_state_age_s)
 
     def _pose_since(self, since_s: float) -> Pose:
         arrival = self._link.wait_for(messages.TIP_STATES[0], since_s=since_s)
-        return self._mount.pose_of(messages.tip_of(arrival.message, self._asked.tip))
+        return self._mount.pose_of(messages.tip_of(arrival.message, self._options.tip))
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         began = self.clock()
         self._check_free()
-        if self._collided_since(began, newest=True):
+        if self._has_collided_since(began, newest=True):
             raise DeviceError(f"{self.name}: {messages.COLLIDED}")
         start = self._fresh_joints()
-        poses = way_points(self._inside(self._pose()), pose)
+        poses = waypoints(self._check_inside(self._pose()), pose)
         joints = self._solve(poses, start)
-        schedule = Schedule.of(poses, joints, speed_mm_s, self._asked.joint_speed_rad_s, self._asked.ramp_s)
-        self._under_way = True
+        schedule = JointTrajectory.from_waypoints(
+            poses, joints, speed_mm_s, self._options.joint_speed_rad_s, self._options.ramp_s
+        )
+        self._is_moving = True
         try:
             self._follow(schedule, began)
             self._settle(joints[-1], began)
         finally:
-            self._under_way = False
+            self._is_moving = False
         return self._pose_since(self.clock())
 
-    def _inside(self, pose: Pose) -> Pose:
+    def _check_inside(self, pose: Pose) -> Pose:
         """A straight line between two points of a box stays in it; one from elsewhere may pass through anything."""
         if not self.workspace.contains(pose, _MARGIN_MM):
             lower, upper = self.workspace.lower, self.workspace.upper
@@ -252,8 +254,8 @@ class Sawyer(Arm):
     def _solve_one(self, pose: Pose, before: Joints, start: Joints) -> Joints:
         """Ask with other seeds when one fails, at most `ik_retries` times more."""
         tip, seeds = self._mount.tip_of(pose), (before, start, None)
-        for trial in range(self._asked.ik_retries + 1):
-            request = messages.ik_request(tip, self._asked.tip, seeds[trial % len(seeds)])
+        for trial in range(self._options.ik_retries + 1):
+            request = messages.ik_request(tip, self._options.tip, seeds[trial % len(seeds)])
             try:
                 found = messages.ik_answer(self._link.call(messages.IK_SERVICE, request))
             except DeviceError as error:
@@ -261,16 +263,16 @@ class Sawyer(Arm):
                 problem = str(error)
                 continue
             turn = float(np.abs(found - before).max())
-            if turn <= _MOST_TURN_RAD:
+            if turn <= _MAX_TURN_RAD:
                 return found
             problem = f"its solution turns a joint by {turn:.2f} rad at once"
-        tries = self._asked.ik_retries + 1
+        tries = self._options.ik_retries + 1
         raise DeviceError(
             f"{self.name}: the hand must reach {pose}, but after {tries} tries: {problem}; nothing has moved. "
             "Choose a smaller workspace or check base_xyz_mm and tool_mm"
         )
 
-    def _follow(self, schedule: Schedule, began: float) -> None:
+    def _follow(self, schedule: JointTrajectory, began: float) -> None:
         """Command the schedule. Its time goes on by two ticks at most, however long this program was put to sleep."""
         at, last = 0.0, self.clock()
         while True:
@@ -285,34 +287,35 @@ class Sawyer(Arm):
 
     def _settle(self, goal: Joints, began: float) -> None:
         """Wait until every joint is within `arrival_rad` and stands. Raises DeviceError for one that does not arrive
-        in `settle_s`; one that trembles where it should be is let be."""
-        deadline = self.clock() + self._asked.settle_s
+        in `settle_s`; one that trembles where it should be is let be.
+        """
+        deadline = self.clock() + self._options.settle_s
         while True:
             off = float(np.abs(self._watch(goal, began) - goal).max())
             late = self.clock() > deadline
-            if off <= self._asked.arrival_rad and (late or self._stands(began)):
+            if off <= self._options.arrival_rad and (late or self._is_still(began)):
                 return
             if late:
                 raise DeviceError(
-                    f"{self.name}: every joint must come within {self._asked.arrival_rad:g} rad of its goal, after "
-                    f"{self._asked.settle_s:g} s one is {off:.3f} off; is the arm blocked or the load too heavy?"
+                    f"{self.name}: every joint must come within {self._options.arrival_rad:g} rad of its goal, after "
+                    f"{self._options.settle_s:g} s one is {off:.3f} off; is the arm blocked or the load too heavy?"
                 )
             self._command(goal)
             time.sleep(self._tick_s)
 
-    def _stands(self, since_s: float) -> bool:
-        return stands(self._link.history(messages.JOINT_STATES[0]), since_s, self.clock())
+    def _is_still(self, since_s: float) -> bool:
+        return is_still(self._link.history(messages.JOINT_STATES[0]), since_s, self.clock())
 
     def _watch(self, commanded: Joints, began: float) -> Joints:
         """The joints now. Raises DeviceError where anything says that the arm must not go on."""
         self._link.check()
         joints = self._fresh_joints()
         self._check_free()
-        if self._collided_since(began):
+        if self._has_collided_since(began):
             raise DeviceError(f"{self.name}: {messages.COLLIDED}")
-        if (lag := float(np.abs(joints - commanded).max())) > _MOST_LAG_RAD:
+        if (lag := float(np.abs(joints - commanded).max())) > _MAX_LAG_RAD:
             raise DeviceError(
-                f"{self.name}: the arm must follow within {_MOST_LAG_RAD} rad, a joint is {lag:.2f} behind; look what "
+                f"{self.name}: the arm must follow within {_MAX_LAG_RAD} rad, a joint is {lag:.2f} behind; look what "
                 "holds it, and whether another program commands it"
             )
         return joints
@@ -321,7 +324,7 @@ class Sawyer(Arm):
         """Hold the joints where they are now and wait until they stand."""
         self._link.check()
         hold, began = self._fresh_joints(), self.clock()
-        while not self._stands(began):
+        while not self._is_still(began):
             if self.clock() - began > _STOP_S:
                 raise DeviceError(f"{self.name}: the arm was told to hold and still moves; press the emergency stop")
             self._fresh_joints()
@@ -336,29 +339,29 @@ class Sawyer(Arm):
         found, age_s = newest_joints(self._link.history(messages.JOINT_STATES[0])), math.inf
         if found is not None:
             joints, since_s = found
-            if (age_s := self.clock() - since_s) <= self._asked.max_state_age_s:
+            if (age_s := self.clock() - since_s) <= self._options.max_state_age_s:
                 return joints
         self._link.check()
         age = "never came" if found is None else f"is {age_s:.2f} s old"
         raise DeviceError(
-            f"{self.name}: the joint state must be at most {self._asked.max_state_age_s:g} s old, it {age}; without "
-            f"new commands the robot ends its motion after {self._asked.command_timeout_s:g} s by itself"
+            f"{self.name}: the joint state must be at most {self._options.max_state_age_s:g} s old, it {age}; without "
+            f"new commands the robot ends its motion after {self._options.command_timeout_s:g} s by itself"
         )
 
     def _robot_state(self) -> messages.RobotState:
         arrivals = self._link.history(messages.ROBOT_STATE[0])
-        self._check_comes(messages.ROBOT_STATE[0], arrivals, "an emergency stop")
+        self._check_arrives(messages.ROBOT_STATE[0], arrivals, "an emergency stop")
         return messages.robot_state(arrivals[-1].message)
 
-    def _collisions(self) -> Sequence[Arrival]:
+    def _collisions(self) -> Sequence[ReceivedMessage]:
         """What came of the collision state; nothing only where nothing came when connecting either."""
         arrivals = self._link.history(messages.COLLISION[0])
         if arrivals or self._sees_collisions:
-            self._check_comes(messages.COLLISION[0], arrivals, "a collision")
+            self._check_arrives(messages.COLLISION[0], arrivals, "a collision")
         return arrivals
 
-    def _check_comes(self, topic: str, arrivals: Sequence[Arrival], unseen: str) -> None:
-        limit_s = max(self._asked.max_state_age_s, _SLOW_STATE_AGE_S)
+    def _check_arrives(self, topic: str, arrivals: Sequence[ReceivedMessage], unseen: str) -> None:
+        limit_s = max(self._options.max_state_age_s, _SLOW_STATE_AGE_S)
         if not arrivals or self.clock() - arrivals[-1].time_s > limit_s:
             self._link.check()
             raise DeviceError(
@@ -367,11 +370,11 @@ class Sawyer(Arm):
             )
 
     def _check_free(self) -> None:
-        if obstacle := self._robot_state().obstacle:
-            raise DeviceError(f"{self.name}: {obstacle}")
+        if blocking_reason := self._robot_state().blocking_reason:
+            raise DeviceError(f"{self.name}: {blocking_reason}")
 
-    def _collided_since(self, began: float, *, newest: bool = False) -> bool:
+    def _has_collided_since(self, began: float, *, newest: bool = False) -> bool:
         """Whether any message after `began`, or with `newest` the last one, reports a collision."""
         arrivals = self._collisions()
-        asked = arrivals[-1:] if newest else [arrival for arrival in arrivals if arrival.time_s >= began]
-        return any(messages.collided(arrival.message) for arrival in asked)
+        options = arrivals[-1:] if newest else [arrival for arrival in arrivals if arrival.time_s >= began]
+        return any(messages.has_collided(arrival.message) for arrival in options)

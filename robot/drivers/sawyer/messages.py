@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from robot.drivers.sawyer.rosbridge import Arrival
+from robot.drivers.sawyer.rosbridge import ReceivedMessage
 from robot.errors import DeviceError
 from robot.readings import Pose
 
@@ -41,7 +41,7 @@ IK_FAILURES = {
 COLLIDED = "the robot reports a collision, the arm holds: look what it touches and free it by hand before you go on"
 _BUTTON = {0: "not pressed", 1: "pressed", 2: "in an unknown state", 3: "released, but the stop still holds"}
 _SOURCE = {0: "nobody", 1: "the red button", 2: "an unknown source", 3: "a motor controller", 4: "the robot's engine"}
-_MOST_LEAN_RAD = math.radians(10.0)
+_MAX_LEAN_RAD = math.radians(10.0)
 STILL_RAD, STILL_S = 1e-3, 0.1
 """An arm stands when no joint has moved by more in so long."""
 
@@ -77,7 +77,7 @@ class Mount:
         place = np.array([_number(tip, "position", axis) for axis in "xyz"]) * 1000
         turn = _rotation([_number(tip, "orientation", axis) for axis in "xyzw"])
         lean = math.acos(min(1.0, max(-1.0, -float(turn[2, 2]))))
-        if lean > _MOST_LEAN_RAD:
+        if lean > _MAX_LEAN_RAD:
             raise DeviceError(
                 f"the hand must hang straight down, it leans by {math.degrees(lean):.0f} deg; bring it upright above "
                 "the workspace by hand (zero-gravity mode)"
@@ -99,7 +99,7 @@ class RobotState:
     estop_source: int
 
     @property
-    def obstacle(self) -> str | None:
+    def blocking_reason(self) -> str | None:
         """What keeps the arm from moving and what a person must do about it; None where nothing does."""
         if self.stopped:
             source = _SOURCE.get(self.estop_source, "an unknown source")
@@ -125,7 +125,7 @@ def robot_state(message: Mapping[str, Any]) -> RobotState:
     )
 
 
-def collided(message: Mapping[str, Any]) -> bool:
+def has_collided(message: Mapping[str, Any]) -> bool:
     """Read intera_core_msgs/CollisionDetectionState."""
     return _flag(message, "collision_state")
 
@@ -147,9 +147,10 @@ def stamp_of(message: Mapping[str, Any]) -> Any:
     return header.get("stamp") if isinstance(header, dict) else None
 
 
-def newest_joints(arrivals: Sequence[Arrival]) -> tuple[Joints, float] | None:
+def newest_joints(arrivals: Sequence[ReceivedMessage]) -> tuple[Joints, float] | None:
     """The newest joints and since when they have been said: one repeated with its old time stamp is as old as its first
-    copy. None where none came."""
+    copy. None where none came.
+    """
     found, since_s = None, -math.inf
     for arrival in reversed(arrivals):
         if found is None:
@@ -163,7 +164,7 @@ def newest_joints(arrivals: Sequence[Arrival]) -> tuple[Joints, float] | None:
     return None if found is None else (found, since_s)
 
 
-def stands(arrivals: Sequence[Arrival], since_s: float, now_s: float) -> bool:
+def is_still(arrivals: Sequence[ReceivedMessage], since_s: float, now_s: float) -> bool:
     """Whether the joint states of the last STILL_S, none from before `since_s`, are of an arm that stands."""
     recent = [
         joints

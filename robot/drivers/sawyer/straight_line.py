@@ -17,7 +17,7 @@ STEP_MM, STEP_RAD = 10.0, math.radians(5.0)
 0.1 mm and is at most 1 % faster than asked (an arm of 0.8 m; a test measures both)."""
 
 
-def way_points(start: Pose, goal: Pose) -> list[Pose]:
+def waypoints(start: Pose, goal: Pose) -> list[Pose]:
     """Poses from `start` to `goal`, both among them; the yaw turns the shorter way."""
     turn = math.remainder(goal.yaw_rad - start.yaw_rad, math.tau)
     length = math.dist(start.as_tuple()[:3], goal.as_tuple()[:3])
@@ -32,18 +32,19 @@ def _between(start: Pose, goal: Pose, turn: float, share: float) -> Pose:
 
 
 @dataclass(frozen=True)
-class Schedule:
+class JointTrajectory:
     """Joint angles (N, 7) and the times (N,) in s at which full speed would reach them; `ramp_s` to that speed and
-    from it, in which the hand speeds up and slows down evenly and never goes faster."""
+    from it, in which the hand speeds up and slows down evenly and never goes faster.
+    """
 
     joints: Joints
     times: npt.NDArray[np.float64]
     ramp_s: float
 
     @classmethod
-    def of(
+    def from_waypoints(
         cls, poses: Sequence[Pose], joints: Joints, speed_mm_s: float, joint_speed_rad_s: float, ramp_s: float
-    ) -> "Schedule":
+    ) -> "JointTrajectory":
         """As fast as the hand's and the joints' speeds allow."""
         lengths = [math.dist(a.as_tuple()[:3], b.as_tuple()[:3]) for a, b in pairwise(poses)]
         turns = np.abs(np.diff(joints, axis=0)).max(1)

@@ -22,7 +22,7 @@ from robot.drivers import discover
 from robot.drivers.video.frames import FrameReader, ReaderSettings
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Frame
-from robot.settings import TypedSettings, limited
+from robot.settings import TypedSettings, bounded
 
 _GRAB_LIMIT_S = 1
 _DAMAGED_IN_A_ROW = 10
@@ -32,7 +32,7 @@ _STAMP_S = (-0.05, 1.0)
 """A picture's own time is believed where it is so much older than now; else it is on another clock."""
 
 _NUMBERED = re.compile(r"/dev/video\d+")
-_MAY_BE_LEFT = ("exposure_ms", "white_balance_k", "gain")
+_ZERO_ALLOWED = ("exposure_ms", "white_balance_k", "gain")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,14 +46,14 @@ class CaptureSettings(TypedSettings):
 
     width: int = 0
     height: int = 0
-    fps: float = limited(0, 1000, 0.0)
+    fps: float = bounded(0, 1000, 0.0)
     fourcc: str = ""
     auto_exposure: bool = False
-    exposure_ms: float | None = limited(0, 1e9, None)
+    exposure_ms: float | None = bounded(0, 1e9, None)
     auto_white_balance: bool = False
-    white_balance_k: float | None = limited(0, 1e9, None)
-    gain: float | None = limited(0, 1e9, None)
-    buffer: int = limited(0, 10, 0, unit="pictures")
+    white_balance_k: float | None = bounded(0, 1e9, None)
+    gain: float | None = bounded(0, 1e9, None)
+    buffer: int = bounded(0, 10, 0, unit="pictures")
     led: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -68,20 +68,21 @@ class CaptureSettings(TypedSettings):
             _require(f"{name} must be left out where it is automatic", value, not automatic or value is None)
         _require("led must be three numbers, 0 to 15", led, len(led) in (0, 3) and all(0 <= each <= 15 for each in led))
 
-    def asked(self) -> dict[str, Any]:
+    def requested(self) -> dict[str, Any]:
         """Settings to write, in the order in which to write them."""
         values = {name: getattr(self, name) for name in _PROPERTIES}
         return {
             name: value
             for name, value in values.items()
-            if value is not None and (value or isinstance(value, bool) or name in _MAY_BE_LEFT)
+            if value is not None and (value or isinstance(value, bool) or name in _ZERO_ALLOWED)
         }
 
 
 @dataclass(frozen=True, kw_only=True)
 class UsbCameraSettings(CaptureSettings, ReaderSettings):
     """A USB camera named by `device`, a path in /dev/v4l/by-id (or by-path: the socket), what is asked of it and how it
-    is read. allow_index: let `device` be a number or /dev/video0."""
+    is read. allow_index: let `device` be a number or /dev/video0.
+    """
 
     device: str
     allow_index: bool = False
@@ -101,10 +102,10 @@ class _Property:
     from_camera: Callable[[float], Any] = float
     slack: float = 0.0
 
-    def is_taken(self, asked: Any, has: Any) -> bool:
-        if isinstance(asked, str | bool | Sequence):
-            return bool(has == (list(asked) if isinstance(asked, tuple) else asked))
-        return has is not None and abs(float(has) - float(asked)) <= self.slack
+    def is_applied(self, requested: Any, has: Any) -> bool:
+        if isinstance(requested, str | bool | Sequence):
+            return bool(has == (list(requested) if isinstance(requested, tuple) else requested))
+        return has is not None and abs(float(has) - float(requested)) <= self.slack
 
 
 _PROPERTIES: Mapping[str, _Property] = {
@@ -176,14 +177,14 @@ class CaptureStream:
         return stamp if _STAMP_S[0] <= now - stamp <= _STAMP_S[1] else now
 
     def _write(self, settings: CaptureSettings) -> dict[str, Any]:
-        asked = settings.asked()
-        for name, value in asked.items():
+        requested = settings.requested()
+        for name, value in requested.items():
             self._capture.set(_PROPERTIES[name].number, _PROPERTIES[name].to_camera(value))
-        has = {name: self._read(each) for name, each in _PROPERTIES.items() if name != "led" or name in asked}
-        for name, value in asked.items():
-            if not _PROPERTIES[name].is_taken(value, has[name]):
-                said = "no such setting" if has[name] is None else _words(has[name])
-                self.refused[name] = f"asked {_words(value)}, has {said}"
+        has = {name: self._read(each) for name, each in _PROPERTIES.items() if name != "led" or name in requested}
+        for name, value in requested.items():
+            if not _PROPERTIES[name].is_applied(value, has[name]):
+                reported = "no such setting" if has[name] is None else _format_value(has[name])
+                self.refused[name] = f"asked {_format_value(value)}, has {reported}"
         return has
 
     def _read(self, each: _Property) -> Any:
@@ -204,28 +205,28 @@ class CaptureReader(FrameReader):
     `refused` is the owner's dictionary, kept up to date.
     """
 
-    def __init__(self, owner: Device, asked: UsbCameraSettings) -> None:
+    def __init__(self, owner: Device, requested: UsbCameraSettings) -> None:
         """Raises RobotConfigError for a `device` that may be another camera tomorrow; opens nothing."""
-        super().__init__(owner.name, self._open_camera, asked, clock=owner.clock)
-        self.asked, self.refused = asked, owner.refused
-        self._path = stable_path(asked.device, asked.allow_index)
+        super().__init__(owner.name, self._open_camera, requested, clock=owner.clock)
+        self.requested, self.refused = requested, owner.refused
+        self._path = stable_path(requested.device, requested.allow_index)
         self.camera: dict[str, Any] = {}
 
     def _open_camera(self) -> CaptureStream:
         """Also called by the thread, when the stream was lost: settings are written and read back again."""
-        stream = CaptureStream(self._path, self.asked, self.clock)
+        stream = CaptureStream(self._path, self.requested, self.clock)
         self.refused.clear()
         self.refused.update(stream.refused)
-        self.camera = {"device": self.asked.device, **stream.settings}
+        self.camera = {"device": self.requested.device, **stream.settings}
         return stream
 
     def recover(self) -> None:
         """A lost stream is opened again without being asked: have it be now, and wait for a picture."""
-        self.hurry()
+        self.reopen_now()
         self.after(self.clock())
 
 
-def _words(value: Any) -> str:
+def _format_value(value: Any) -> str:
     if isinstance(value, bool):
         return "on" if value else "off"
     return f"{value:g}" if isinstance(value, int | float) else str(value)
@@ -235,26 +236,30 @@ def open_capture(device: str) -> Any:
     """OpenCV's capture of the camera at a path: the number behind a stable name changes when it is plugged in again."""
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(_GRAB_LIMIT_S))
     if not Path(device).exists():
-        raise DeviceError(f"{device} must be there, but is not; is the camera plugged in?{_known()}")
+        raise DeviceError(f"{device} must be there, but is not; is the camera plugged in?{_connected_cameras()}")
     return cv2.VideoCapture(os.path.realpath(device), cv2.CAP_V4L2)
 
 
 def stable_path(device: str, allow_index: bool) -> str:
     """The path to open for a `device` from a rig's file. Raises RobotConfigError for one that is no path, or that may
-    be another camera tomorrow, unless `allow_index`."""
+    be another camera tomorrow, unless `allow_index`.
+    """
     path = f"/dev/video{device}" if device.isascii() and device.isdigit() else device
     if not os.path.isabs(path):
-        raise RobotConfigError(f"a camera must be named by its whole path, got {device!r}.{_known()}")
+        raise RobotConfigError(f"a camera must be named by its whole path, got {device!r}.{_connected_cameras()}")
     if allow_index or not _NUMBERED.fullmatch(os.path.normpath(path)):
         return path
-    known = _known() or " This system makes no such names: set allow_index = true if only one camera is ever plugged in"
+    known = (
+        _connected_cameras()
+        or " This system makes no such names: set allow_index = true if only one camera is ever plugged in"
+    )
     raise RobotConfigError(
         "a camera must be named by what stays the same, a path in /dev/v4l/by-id, "
         f"got {device!r}, a number that another camera may have tomorrow.{known}"
     )
 
 
-def _known() -> str:
+def _connected_cameras() -> str:
     names = discover.camera_names(discover.DEV)
-    note = discover.note_on(names)
+    note = discover.shared_name_note(names)
     return f" Connected: {', '.join(names)}{note and f' ({note})'}" if names else ""

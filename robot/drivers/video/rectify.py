@@ -28,22 +28,23 @@ import numpy.typing as npt
 
 from robot.errors import DeviceError, RobotConfigError
 from robot.settings import TypedSettings, build
-from robot.storage import content_of, object_of
+from robot.storage import parse_object, read_content
 
 Picture = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CutSettings(TypedSettings):
+class CropSettings(TypedSettings):
     """How a sensor's pictures are cut to the gel: `crop`, shares at left, top, right and bottom, or a calibration file;
-    output_px: width and height of the result, counts before the file's."""
+    output_px: width and height of the result, counts before the file's.
+    """
 
     crop: tuple[float, ...] = ()
     calibration: str = ""
     output_px: tuple[int, ...] = ()
 
 
-_MOST_PX = 20_000
+_MAX_PX = 20_000
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,8 @@ class Rectifier(TypedSettings):
             raise RobotConfigError("a picture is cut by crop or by corners_px; give one of them")
         for name in ("image_px", "output_px"):
             size = getattr(self, name)
-            if size and (len(size) != 2 or not all(1 <= each <= _MOST_PX for each in size)):
-                raise RobotConfigError(f"{name} must be width and height, 1 to {_MOST_PX} pixels, got {list(size)}")
+            if size and (len(size) != 2 or not all(1 <= each <= _MAX_PX for each in size)):
+                raise RobotConfigError(f"{name} must be width and height, 1 to {_MAX_PX} pixels, got {list(size)}")
         if self.crop:
             _check_crop(self.crop)
         if self.corners_px:
@@ -75,16 +76,16 @@ class Rectifier(TypedSettings):
         size = (picture.shape[1], picture.shape[0])
         if self.image_px and size != self.image_px:
             raise DeviceError(
-                f"a picture must be {_by(self.image_px)} pixels, as in the calibration file, got {_by(size)}; "
+                f"a picture must be {_format_size(self.image_px)} pixels, as in the calibration file, got {_format_size(size)}; "
                 "set that width and height, or calibrate again"
             )
         if not self.corners_px:
-            return _resized(self._cut(picture), self.output_px)
+            return _resize(self._crop(picture), self.output_px)
         size, matrix = self._map
         straight = np.asarray(cv2.warpPerspective(picture, matrix, size, flags=cv2.INTER_LINEAR), dtype=np.uint8)
-        return _resized(straight, self.output_px)
+        return _resize(straight, self.output_px)
 
-    def _cut(self, picture: Picture) -> Picture:
+    def _crop(self, picture: Picture) -> Picture:
         if not self.crop:
             return picture
         height, width = picture.shape[:2]
@@ -102,7 +103,7 @@ class Rectifier(TypedSettings):
         return (width, height), cv2.getPerspectiveTransform(corners, target)
 
 
-def _resized(picture: Picture, size: tuple[int, ...]) -> Picture:
+def _resize(picture: Picture, size: tuple[int, ...]) -> Picture:
     """Means of areas where it shrinks, so that no marks of the gel turn into others; between pixels where it grows."""
     if not size or size == (picture.shape[1], picture.shape[0]):
         return np.ascontiguousarray(picture)
@@ -120,7 +121,7 @@ def check_colours(picture: npt.NDArray[Any]) -> None:
         )
 
 
-def in_rgb(picture: Picture) -> Picture:
+def to_rgb(picture: Picture) -> Picture:
     """OpenCV's BGR to RGB, contiguous: 0.1 ms for 896 x 672 pixels, where turning the axis and copying takes 6 ms.
 
     Raises DeviceError for what has not three colours.
@@ -129,7 +130,7 @@ def in_rgb(picture: Picture) -> Picture:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
-def make_rectifier(settings: CutSettings, default_crop: Sequence[float] = ()) -> Rectifier:
+def make_rectifier(settings: CropSettings, default_crop: Sequence[float] = ()) -> Rectifier:
     """From a driver's settings. Raises RobotConfigError, also for both a calibration file and `crop`."""
     size = tuple(settings.output_px)
     if not settings.calibration:
@@ -142,9 +143,9 @@ def make_rectifier(settings: CutSettings, default_crop: Sequence[float] = ()) ->
 
 def load_rectifier(path: str | Path) -> Rectifier:
     """Read a calibration file. Raises RobotConfigError with the file's name."""
-    data = content_of(path, RobotConfigError)
+    data = read_content(path, RobotConfigError)
     try:
-        found = object_of(data, RobotConfigError)
+        found = parse_object(data, RobotConfigError)
         if not found.get("image_px") or ("crop" in found) == ("corners_px" in found):
             raise RobotConfigError("it must have image_px, and one of corners_px and crop")
         return build(Rectifier, {name: value for name, value in found.items() if name != "note"})
@@ -175,5 +176,5 @@ def _check_corners(corners: tuple[tuple[float, float], ...], image_px: tuple[int
         raise RobotConfigError(f"corners_px must lie inside image_px {list(image_px)}, got {list(corners)}")
 
 
-def _by(size: Sequence[int]) -> str:
+def _format_size(size: Sequence[int]) -> str:
     return " x ".join(map(str, size))

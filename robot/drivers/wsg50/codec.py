@@ -59,7 +59,7 @@ def checksum(data: bytes | bytearray, start: int = 0xFFFF) -> int:
     return value
 
 
-class _Sums:
+class _PrefixChecksums:
     """Check sums of many stretches of one buffer, going through each of its bytes once.
 
     A stream of packets that break off claims every byte up to 44 times. The sum is linear: that of a stretch follows
@@ -69,7 +69,7 @@ class _Sums:
     def __init__(self, buffer: bytes | bytearray, first: int) -> None:
         self._buffer, self._first, self._up_to = buffer, first, [0]
 
-    def of(self, start: int, stop: int) -> int:
+    def checksum_of(self, start: int, stop: int) -> int:
         """As `checksum` of buffer[start:stop]; no byte before `first`."""
         value = self._up_to[-1]
         for byte in self._buffer[self._first + len(self._up_to) - 1 : stop]:
@@ -85,10 +85,10 @@ def _after_zeros(value: int, count: int) -> int:
     return functools.reduce(operator.xor, (column[bit] for bit in range(16) if value >> bit & 1), 0)
 
 
-def _zeros(most: int) -> tuple[tuple[int, ...], ...]:
-    """Of each number of zeros up to `most`: what they make of each bit of a sum."""
+def _zeros(max_count: int) -> tuple[tuple[int, ...], ...]:
+    """Of each number of zeros up to `max_count`: what they make of each bit of a sum."""
     columns = [tuple(1 << bit for bit in range(16))]
-    for _ in range(most):
+    for _ in range(max_count):
         columns.append(tuple(_TABLE[value & 0xFF] ^ (value >> 8) for value in columns[-1]))
     return tuple(columns)
 
@@ -109,19 +109,19 @@ def decode(buffer: bytes | bytearray) -> tuple[int, Packet | None]:
     packet that has begun is not yet whole, its bytes stay: where none come any more, drop one and decode again.
     """
     at = buffer.find(PREAMBLE)
-    sums = _Sums(buffer, at)
+    sums = _PrefixChecksums(buffer, at)
     while at >= 0:
-        size = _claimed(buffer, at)
+        size = _claimed_size(buffer, at)
         if size is None or (size and len(buffer) < at + size):
             return at, None
-        if size and sums.of(at, at + size) == 0:
+        if size and sums.checksum_of(at, at + size) == 0:
             payload = bytes(buffer[at + _HEADER : at + size - _CHECK])
             return at + size, Packet(buffer[at + 3], payload)
         at = buffer.find(PREAMBLE, at + 1)
-    return len(buffer) - _preamble_begun(buffer), None
+    return len(buffer) - _partial_preamble_size(buffer), None
 
 
-def _claimed(buffer: bytes | bytearray, at: int) -> int | None:
+def _claimed_size(buffer: bytes | bytearray, at: int) -> int | None:
     """Bytes of the packet that begins here, 0 if it can be none, None where that is not yet known."""
     if len(buffer) > at + 3 and buffer[at + 3] == _NO_ID:
         return 0
@@ -131,6 +131,6 @@ def _claimed(buffer: bytes | bytearray, at: int) -> int | None:
     return 0 if length > MAX_PAYLOAD else _HEADER + length + _CHECK
 
 
-def _preamble_begun(buffer: bytes | bytearray) -> int:
+def _partial_preamble_size(buffer: bytes | bytearray) -> int:
     """How many bytes at the end may be the beginning of a preamble."""
     return next(size for size in (2, 1, 0) if size == 0 or buffer[-size:] == PREAMBLE[:size])

@@ -5,7 +5,7 @@ is SUCCESS. A command that moves is answered by PENDING first, and by a second p
 An automatic update is a reply that nobody asked for.
 
 Facts: as in robot.drivers.wsg50.codec; commands that the driver does not use are left out. Lengths in mm, speeds in
-mm/s, accelerations in mm/s^2, forces in N as the gripper counts them (WSG50Settings.on_finger says what they are).
+mm/s, accelerations in mm/s^2, forces in N as the gripper counts them (WSG50Settings.to_finger_force says what they are).
 Whatever cannot be raises WireError.
 """
 
@@ -123,7 +123,7 @@ class GraspingState(enum.IntEnum):
 
 
 @dataclass(frozen=True)
-class Info:
+class GripperInfo:
     """What the gripper is. kind: the vendor's number of the type. firmware: as sent, a nibble a digit."""
 
     kind: int
@@ -174,7 +174,7 @@ def acknowledge() -> Packet:
     return Packet(CommandId.ACKNOWLEDGE, b"ack")
 
 
-def ask(command: CommandId) -> Packet:
+def query(command: CommandId) -> Packet:
     """Ask for a value; of an UPDATING one this also ends its automatic updates."""
     return Packet(command, bytes(3) if command in UPDATING else b"")
 
@@ -191,12 +191,12 @@ def update(command: CommandId, period_ms: int) -> Packet:
 def reply(packet: Packet) -> tuple[Status, bytes]:
     """Status and parameters of a reply. Raises WireError."""
     if len(packet.payload) < 2:
-        raise WireError(f"the reply {name_of(packet.id)} must hold a status of 2 bytes, got {len(packet.payload)}")
+        raise WireError(f"the reply {command_name(packet.id)} must hold a status of 2 bytes, got {len(packet.payload)}")
     number = int.from_bytes(packet.payload[:2], "little")
     try:
         return Status(number), packet.payload[2:]
     except ValueError as error:
-        raise WireError(f"the reply {name_of(packet.id)} has the unknown status {number}") from error
+        raise WireError(f"the reply {command_name(packet.id)} has the unknown status {number}") from error
 
 
 def number(parameters: bytes) -> float:
@@ -215,9 +215,9 @@ def limits(parameters: bytes) -> GripperLimits:
     return GripperLimits(*_numbers("<8f", parameters))
 
 
-def info(parameters: bytes) -> Info:
+def info(parameters: bytes) -> GripperInfo:
     """What the gripper is."""
-    return Info(*_unpack("<BBHI", parameters))
+    return GripperInfo(*_unpack("<BBHI", parameters))
 
 
 def system_state(parameters: bytes) -> SystemState:
@@ -234,7 +234,7 @@ def grasping_state(parameters: bytes) -> GraspingState:
         raise WireError(f"a state of the grasp must be from 0 to {max(GraspingState)}, got {number}") from error
 
 
-def name_of(command_id: int) -> str:
+def command_name(command_id: int) -> str:
     """Words for an id, as in "GRASP (25h)"."""
     name = CommandId(command_id).name if command_id in list(CommandId) else "to an unknown command"
     return f"{name} ({command_id:02X}h)"

@@ -18,14 +18,13 @@ from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import Packet
 from robot.drivers.wsg50.commands import CommandId, GraspingState, Status, SystemState
 from robot.drivers.wsg50.link import LinkLost, NoReply
-from robot.drivers.wsg50.motion import Done, Reading, causes, check_ready, read
-from robot.drivers.wsg50.setup import TYPICAL, Setup, WSG50Settings
+from robot.drivers.wsg50.motion import GripperReading, IsDone, check_ready, fault_names, read
+from robot.drivers.wsg50.setup import TYPICAL_LIMITS, GripperSetup, WSG50Settings
 from robot.errors import DeviceError
-from robot.readings import GripperState
-from robot.readings import Status as Word
+from robot.readings import GripperState, GripperStatus
 
 _log = logging.getLogger(__name__)
-_WORDS: dict[GraspingState, Word] = {
+_STATUS_OF: dict[GraspingState, GripperStatus] = {
     GraspingState.IDLE: "idle",
     GraspingState.GRASPING: "moving",
     GraspingState.NO_PART: "no_part",
@@ -34,7 +33,7 @@ _WORDS: dict[GraspingState, Word] = {
     GraspingState.RELEASING: "moving",
     GraspingState.POSITIONING: "moving",
 }
-_CLOSED_ON = {GraspingState.HOLDING, GraspingState.NO_PART, GraspingState.PART_LOST}
+_CLOSED_STATES = {GraspingState.HOLDING, GraspingState.NO_PART, GraspingState.PART_LOST}
 """States that only RELEASE leaves; GRASP is refused in them."""
 
 _REACHED_MM, _SAME_MM = 1.0, 0.1
@@ -58,16 +57,16 @@ class WSG50(Gripper):
 
     def __init__(self, *, clock: Clock = time.monotonic, **settings: Any) -> None:
         """Raises RobotConfigError for a setting out of range."""
-        wanted = self._wanted = WSG50Settings(**settings)
+        options = self._options = WSG50Settings(**settings)
         super().__init__(
             "WSG-50",
-            stroke_mm=TYPICAL.stroke_mm,
-            min_force_n=wanted.on_finger(TYPICAL.min_force_n),
-            max_force_n=min(wanted.max_force_n, wanted.on_finger(TYPICAL.max_force_n)),
-            max_speed_mm_s=wanted.max_speed_mm_s,
+            stroke_mm=TYPICAL_LIMITS.stroke_mm,
+            min_force_n=options.to_finger_force(TYPICAL_LIMITS.min_force_n),
+            max_force_n=min(options.max_force_n, options.to_finger_force(TYPICAL_LIMITS.max_force_n)),
+            max_speed_mm_s=options.max_speed_mm_s,
             clock=clock,
         )
-        self._setup = Setup(self.name, wanted, self.refused)
+        self._setup = GripperSetup(self.name, options, self.refused)
         self._link, self._motions = self._setup.link, self._setup.motions
 
     @property
@@ -84,18 +83,18 @@ class WSG50(Gripper):
 
     def _close(self) -> None:
         """Announced is only the end of a line to jaws that stand: unannounced it makes the gripper FAST STOP (TCP)."""
-        if not (self._link.has_echoed or self._motions.unsettled):  # closed, or nobody there: nothing was begun
+        if not (self._link.has_echoed or self._motions.may_be_moving):  # closed, or nobody there: nothing was begun
             self._link.close()
             return
         try:
             if self._link.is_open:
-                self._setup.stop_if_it_moves(self._stop)
+                self._setup.stop_if_moving(self._stop)
             else:  # the line was lost after a motion was begun: a serial one tells the jaws nothing
                 self._stop()
             try:
-                self._motions.quiet()
+                self._motions.stop_updates()
             finally:
-                self._link.tell(Packet(CommandId.DISCONNECT))
+                self._link.send(Packet(CommandId.DISCONNECT))
         finally:
             self._link.close()
 
@@ -104,14 +103,14 @@ class WSG50(Gripper):
 
     def _recover(self) -> None:
         """Get the line back, then the gripper: reference and settings as on connecting."""
-        for number in range(1, self._wanted.reconnect_tries + 1):
-            self._setup.reach()
+        for number in range(1, self._options.reconnect_tries + 1):
+            self._setup.reconnect()
             try:
                 self._set_up()
                 return
             except (LinkLost, NoReply):
                 self._stop_quietly()
-                if number == self._wanted.reconnect_tries:
+                if number == self._options.reconnect_tries:
                     raise
             except BaseException:
                 self._stop_quietly()
@@ -119,8 +118,8 @@ class WSG50(Gripper):
 
     def _stop(self) -> None:
         if not self._link.is_open:
-            self._setup.open_again()
-        for left in reversed(range(self._wanted.reconnect_tries)):
+            self._setup.reopen()
+        for left in reversed(range(self._options.reconnect_tries)):
             try:
                 self._motions.stop()
                 return
@@ -128,27 +127,27 @@ class WSG50(Gripper):
                 if not left:
                     raise
             _log.warning("%s: the line was lost while it may have moved: opening it again to stop it", self.name)
-            self._setup.open_again()
+            self._setup.reopen()
 
     def _state(self) -> GripperState:
         return self._as_state(read(self._link))
 
     def _open(self, opening_mm: float) -> GripperState:
-        reading = self._ready()
-        if reading.grasping in _CLOSED_ON:
-            reading = self._release(max(opening_mm, self._further(reading)))
+        reading = self._read_ready()
+        if reading.grasping in _CLOSED_STATES:
+            reading = self._release(max(opening_mm, self._wider_opening(reading)))
         if abs(reading.opening_mm - opening_mm) > _SAME_MM:
             reading = self._move(opening_mm, closing=opening_mm < reading.opening_mm)
         return self._as_state(reading)
 
     def _grasp(self, force_n: float, speed_mm_s: float) -> GripperState:
-        reading = self._ready()
-        if reading.grasping in _CLOSED_ON:
-            self._release(self._further(reading))
+        reading = self._read_ready()
+        if reading.grasping in _CLOSED_STATES:
+            self._release(self._wider_opening(reading))
         self._setup.set_force(force_n)
-        width = max(self._wanted.grasp_width_mm, self._setup.openings[0])
+        width = max(self._options.grasp_width_mm, self._setup.opening_range[0])
         packet = commands.packet(CommandId.GRASP, width, speed_mm_s)
-        return self._as_state(self._run(packet, speed_mm_s, lambda reading, _: reading.grasping in _CLOSED_ON))
+        return self._as_state(self._run(packet, speed_mm_s, lambda reading, _: reading.grasping in _CLOSED_STATES))
 
     # More than the contract.
 
@@ -162,12 +161,12 @@ class WSG50(Gripper):
     def _set_up(self) -> None:
         """Bring the gripper to its settings, and learn what it can do, below the ceilings."""
         self._setup.run(may_home=self.may_move)
-        limits, wanted = self._setup.limits, self._wanted
-        self.min_opening_mm, self.stroke_mm = self._setup.openings
-        self.min_force_n = wanted.on_finger(limits.min_force_n)
-        self.max_force_n = min(wanted.max_force_n, wanted.on_finger(limits.max_force_n))
+        limits, options = self._setup.limits, self._options
+        self.min_opening_mm, self.stroke_mm = self._setup.opening_range
+        self.min_force_n = options.to_finger_force(limits.min_force_n)
+        self.max_force_n = min(options.max_force_n, options.to_finger_force(limits.max_force_n))
         self.min_speed_mm_s = limits.min_speed_mm_s
-        self.max_speed_mm_s = min(wanted.max_speed_mm_s, limits.max_speed_mm_s)
+        self.max_speed_mm_s = min(options.max_speed_mm_s, limits.max_speed_mm_s)
 
     def _stop_quietly(self) -> None:
         try:
@@ -175,44 +174,46 @@ class WSG50(Gripper):
         except DeviceError as error:
             _log.warning("%s: while it was stopped: %s", self.name, error)
 
-    def _ready(self) -> Reading:
+    def _read_ready(self) -> GripperReading:
         reading = read(self._link)
         check_ready(reading)
         return reading
 
-    def _further(self, reading: Reading) -> float:
+    def _wider_opening(self, reading: GripperReading) -> float:
         """A little wider than it is, to let go."""
-        return min(reading.opening_mm + _REGRIP_MM, self._setup.openings[1])
+        return min(reading.opening_mm + _REGRIP_MM, self._setup.opening_range[1])
 
-    def _release(self, width_mm: float) -> Reading:
-        speed = self._speed_of_opening()
+    def _release(self, width_mm: float) -> GripperReading:
+        speed = self._opening_speed()
         return self._run(commands.packet(CommandId.RELEASE, width_mm, speed), speed, _is_at(width_mm))
 
-    def _move(self, width_mm: float, *, closing: bool) -> Reading:
+    def _move(self, width_mm: float, *, closing: bool) -> GripperReading:
         """Pre-position; when that closes the jaws, with no more than the least force."""
         if closing:
             self._setup.set_force(self.min_force_n)
-        speed = self._speed_of_opening()
+        speed = self._opening_speed()
         return self._run(commands.move(width_mm, speed), speed, _is_at(width_mm))
 
-    def _run(self, packet: Packet, speed_mm_s: float, done: Done) -> Reading:
-        seconds = self._setup.limits.stroke_mm / speed_mm_s + _SLACK_S + self._wanted.timeout_s
+    def _run(self, packet: Packet, speed_mm_s: float, done: IsDone) -> GripperReading:
+        seconds = self._setup.limits.stroke_mm / speed_mm_s + _SLACK_S + self._options.timeout_s
         return self._motions.run(packet, seconds, done)
 
-    def _speed_of_opening(self) -> float:
-        return min(max(self._wanted.opening_speed_mm_s, self._setup.limits.min_speed_mm_s), self.max_speed_mm_s)
+    def _opening_speed(self) -> float:
+        return min(max(self._options.opening_speed_mm_s, self._setup.limits.min_speed_mm_s), self.max_speed_mm_s)
 
-    def _as_state(self, reading: Reading) -> GripperState:
-        if reading.system & SystemState.FAST_STOP or reading.grasping not in _WORDS:
-            raise DeviceError(f"{self.name} is in FAST STOP: {causes(reading.system)}; look why, then call recover()")
-        word = _WORDS[reading.grasping]
-        if word == "holding" and reading.opening_mm < self._wanted.least_part_mm:
+    def _as_state(self, reading: GripperReading) -> GripperState:
+        if reading.system & SystemState.FAST_STOP or reading.grasping not in _STATUS_OF:
+            raise DeviceError(
+                f"{self.name} is in FAST STOP: {fault_names(reading.system)}; look why, then call recover()"
+            )
+        word = _STATUS_OF[reading.grasping]
+        if word == "holding" and reading.opening_mm < self._options.min_part_mm:
             word = "no_part"
-        return GripperState(reading.opening_mm, self._wanted.on_finger(reading.force_n), word)
+        return GripperState(reading.opening_mm, self._options.to_finger_force(reading.force_n), word)
 
 
-def _is_at(width_mm: float) -> Done:
-    def done(reading: Reading, _: Status | None) -> bool:
+def _is_at(width_mm: float) -> IsDone:
+    def done(reading: GripperReading, _: Status | None) -> bool:
         return reading.grasping is GraspingState.IDLE and abs(reading.opening_mm - width_mm) <= _REACHED_MM
 
     return done

@@ -21,22 +21,22 @@ from typing import Any, TypeVar
 
 from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import MAX_PAYLOAD, Packet, WireError, decode, encode
-from robot.drivers.wsg50.commands import CommandId, Status, name_of
+from robot.drivers.wsg50.commands import CommandId, Status, command_name
 from robot.errors import DeviceError
 
 _T = TypeVar("_T")
 _TRIES = 3
-_GAP_SHARE = 0.25
+_GAP_FRACTION = 0.25
 """Share of the time-out after which a packet that has begun is given up: the rest of it is not coming."""
 
 _PADDING = bytes(MAX_PAYLOAD + 8)
 """Ends any packet that the gripper may still be waiting for the rest of, and can begin none."""
 
-_MOST_LOOKS = 6
+_MAX_READS = 6
 """So often, 4096 bytes at a time, is taken in what has come by the end of a wait: more than gathers in ten seconds in
 which this program is held up. A peer that sends without end, if byte by byte, must not hold it up for longer."""
 
-_PATIENCE = 3.0
+_MAX_TIMEOUTS = 3.0
 """So many time-outs after a question was first asked it is not asked again."""
 
 _CHUNK = 4096
@@ -59,7 +59,7 @@ class CommandFailed(DeviceError):
     """The gripper answered with another status than SUCCESS."""
 
     def __init__(self, command_id: int, status: Status) -> None:
-        super().__init__(f"the gripper answered {name_of(command_id)} with {status.name} (status {int(status)})")
+        super().__init__(f"the gripper answered {command_name(command_id)} with {status.name} (status {int(status)})")
         self.status = status
 
 
@@ -90,7 +90,7 @@ class Port:
             self._serial.reset_input_buffer = lambda: None  # pyserial's does not end while a socket's peer sends
             self._serial.open()
         except Exception as error:  # pyserial lets termios.error, ValueError and others out
-            raise LinkLost(f"the gripper's port {name} cannot be opened: {_words(error)}") from error
+            raise LinkLost(f"the gripper's port {name} cannot be opened: {_first_line(error)}") from error
 
     def read(self, timeout_s: float) -> bytes:
         """What has come, waiting for the first byte at most `timeout_s`; empty at the end of that."""
@@ -101,7 +101,7 @@ class Port:
             return data
         except (OSError, ValueError, TypeError) as error:  # a closed one is None to select
             raise LinkLost(
-                f"the gripper's port {self.name} is gone: {_words(error)}; see to its cable and power, "
+                f"the gripper's port {self.name} is gone: {_first_line(error)}; see to its cable and power, "
                 "recover() opens it again"
             ) from error
 
@@ -112,7 +112,7 @@ class Port:
                 data = data[self._serial.write(data) :]
         except (OSError, ValueError, TypeError) as error:
             raise LinkLost(
-                f"the gripper's port {self.name} takes no bytes: {_words(error)}; see to its cable and power, "
+                f"the gripper's port {self.name} takes no bytes: {_first_line(error)}; see to its cable and power, "
                 "recover() opens it again"
             ) from error
 
@@ -139,7 +139,7 @@ class Port:
         return True
 
 
-def _words(error: Exception) -> str:
+def _first_line(error: Exception) -> str:
     return (str(error) or type(error).__name__).splitlines()[0]
 
 
@@ -147,8 +147,8 @@ class Link:
     """A line to one gripper. port, baud, stop_bits: as Port takes them. timeout_s: of each answer, an echo's too.
     Raises LinkLost, NoReply, CommandFailed, WireError, all of them DeviceError.
 
-    Whatever comes or does not come, `poll` and `pump` end when told to, `urgent` after one time-out, `sync` after 3,
-    `call` after 4, and `tell` and `ask`, which may ask three times, after 7 at the latest.
+    Whatever comes or does not come, `poll` and `pump` end when told to, `send_urgent` after one time-out, `sync` after 3,
+    `call` after 4, and `send` and `query`, which may ask three times, after 7 at the latest.
 
     counts: what went wrong, by kind. updates: of each command that updates itself, its parameters and when they came
     (s of time.monotonic).
@@ -163,7 +163,7 @@ class Link:
         self._port: Port | None = None
         self._buffer = bytearray()
         self._last_byte_s = 0.0
-        self._in_doubt = True
+        self._needs_sync = True
         self._tokens = itertools.count(int.from_bytes(os.urandom(6), "little"))
 
     @property
@@ -177,7 +177,7 @@ class Link:
             self._port = Port(self.name, baud=self.baud, stop_bits=self.stop_bits, write_timeout_s=self.timeout_s)
             self._buffer.clear()
             self.updates.clear()
-            self._in_doubt = True
+            self._needs_sync = True
 
     def close(self) -> None:
         """Close the port, if it is open; never raises."""
@@ -190,13 +190,13 @@ class Link:
         self.begin(packet)
         return self._result(packet.id)
 
-    def tell(self, packet: Packet) -> None:
+    def send(self, packet: Packet) -> None:
         """Send a command that may be said twice: it is said again where no sound reply comes."""
-        self.ask(packet, bytes)
+        self.query(packet, bytes)
 
-    def ask(self, packet: Packet, parse: Callable[[bytes], _T]) -> _T:
-        """As `tell`; returns what its reply holds. A reply that cannot be parsed is not sound."""
-        until = time.monotonic() + _PATIENCE * self.timeout_s
+    def query(self, packet: Packet, parse: Callable[[bytes], _T]) -> _T:
+        """As `send`; returns what its reply holds. A reply that cannot be parsed is not sound."""
+        until = time.monotonic() + _MAX_TIMEOUTS * self.timeout_s
         for left in reversed(range(_TRIES)):
             try:
                 return parse(self.call(packet))
@@ -205,16 +205,16 @@ class Link:
             except (NoReply, WireError):
                 if not left or time.monotonic() > until:
                     raise
-                self.counts["asked again"] += 1
-                self._in_doubt = True
+                self.counts["retried"] += 1
+                self._needs_sync = True
         raise AssertionError("the loop returns or raises")
 
     def begin(self, packet: Packet) -> None:
         """Send a command whose replies `poll` fetches; clears the line first if it is in doubt."""
         self.pump(0.0)
-        if self._in_doubt:
+        if self._needs_sync:
             self.sync()
-        self._in_doubt = True
+        self._needs_sync = True
         self._write(packet)
 
     def poll(self, command_id: int, timeout_s: float) -> Status | None:
@@ -224,13 +224,13 @@ class Link:
                 return reply[0]
         return None
 
-    def urgent(self, packet: Packet) -> None:
+    def send_urgent(self, packet: Packet) -> None:
         """Send at once, whatever is under way, and wait for a reply: for stops, of which an older reply does."""
         try:
             self._write(packet)
             self._result(packet.id)
         finally:
-            self._in_doubt = True
+            self._needs_sync = True
 
     def sync(self) -> None:
         """Have a fresh token echoed, and drop whatever comes before it."""
@@ -239,26 +239,26 @@ class Link:
                 self.pad()
             token = next(self._tokens).to_bytes(8, "little")
             self._write(Packet(CommandId.LOOP, token))
-            if self._echoed(Packet(CommandId.LOOP, bytes(2) + token)):
-                self._in_doubt, self.has_echoed = False, True
+            if self._wait_for_echo(Packet(CommandId.LOOP, bytes(2) + token)):
+                self._needs_sync, self.has_echoed = False, True
                 return
             self.counts["no echo"] += 1
         raise NoEcho(f"the gripper at {self.name} must answer within {self.timeout_s:g} s; is it on, and connected?")
 
     def pad(self) -> None:
         """Free the gripper of a packet whose damaged length swallows what it is told next: before saying it again."""
-        self._guarded(lambda port: port.write(_PADDING))
+        self._use_port(lambda port: port.write(_PADDING))
 
-    def doubt(self) -> None:
+    def require_sync(self) -> None:
         """Have the line cleared before the next command."""
-        self._in_doubt = True
+        self._needs_sync = True
 
     def pump(self, seconds: float) -> None:
         """Note what comes within `seconds`; 0 for what has come."""
         for packet in self._packets(seconds):
             self._note(packet, None)
 
-    def _echoed(self, echo: Packet) -> bool:
+    def _wait_for_echo(self, echo: Packet) -> bool:
         for packet in self._packets(self.timeout_s):
             if packet == echo:
                 return True
@@ -271,13 +271,15 @@ class Link:
             reply = self._reply(packet) if self._note(packet, command_id) else None
             if reply is None or reply[0] is Status.CMD_PENDING:
                 continue
-            self._in_doubt = False
+            self._needs_sync = False
             if reply[0] is Status.CHECKSUM_ERROR:
-                raise NoReply(f"the gripper must hear {name_of(command_id)} undamaged, and did not (CHECKSUM_ERROR)")
+                raise NoReply(
+                    f"the gripper must hear {command_name(command_id)} undamaged, and did not (CHECKSUM_ERROR)"
+                )
             if reply[0] is not Status.SUCCESS:
                 raise CommandFailed(command_id, reply[0])
             return reply[1]
-        raise NoReply(f"the gripper must answer {name_of(command_id)} within {self.timeout_s:g} s, and did not")
+        raise NoReply(f"the gripper must answer {command_name(command_id)} within {self.timeout_s:g} s, and did not")
 
     def _note(self, packet: Packet, command_id: int | None) -> bool:
         """Keep an update; says whether the packet is of the command that is waited for. Any other raises doubt."""
@@ -286,7 +288,7 @@ class Link:
                 self.updates[packet.id] = (packet.payload[2:], time.monotonic())
         elif packet.id != command_id:
             self.counts["unexpected"] += 1
-            self._in_doubt = True
+            self._needs_sync = True
         return packet.id == command_id
 
     def _reply(self, packet: Packet) -> tuple[Status, bytes] | None:
@@ -300,41 +302,41 @@ class Link:
         """What comes within `seconds`, and then what has come by then. A packet that stops half-way is given up."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
-            if packet := self._decoded():
+            if packet := self._next_packet():
                 yield packet
             else:
                 self._wait(deadline)
-        for _ in range(_MOST_LOOKS):
+        for _ in range(_MAX_READS):
             if not self._fill(0.0):
                 break
-        while packet := self._decoded():
+        while packet := self._next_packet():
             yield packet
 
-    def _decoded(self) -> Packet | None:
+    def _next_packet(self) -> Packet | None:
         used, packet = decode(self._buffer)
         del self._buffer[:used]
         return packet
 
     def _wait(self, deadline: float) -> None:
         """Take in bytes as soon as they come, or give up a packet whose rest does not."""
-        given_up_s = self._last_byte_s + _GAP_SHARE * self.timeout_s if self._buffer else deadline
+        given_up_s = self._last_byte_s + _GAP_FRACTION * self.timeout_s if self._buffer else deadline
         came = self._fill(min(deadline, given_up_s) - time.monotonic())
         if not came and self._buffer and time.monotonic() >= given_up_s:
-            self.counts["given up"] += 1
+            self.counts["abandoned"] += 1
             del self._buffer[:1]
 
     def _fill(self, seconds: float) -> bool:
         """Take in bytes; False where none come within `seconds`."""
-        data = self._guarded(lambda port: port.read(seconds))
+        data = self._use_port(lambda port: port.read(seconds))
         if data:
             self._buffer += data
             self._last_byte_s = time.monotonic()
         return bool(data)
 
     def _write(self, packet: Packet) -> None:
-        self._guarded(lambda port: port.write(encode(packet)))
+        self._use_port(lambda port: port.write(encode(packet)))
 
-    def _guarded(self, use: Callable[[Port], _T]) -> _T:
+    def _use_port(self, use: Callable[[Port], _T]) -> _T:
         """Use the port, and close it where it is gone."""
         if self._port is None:
             raise LinkLost(

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.sim.compiled import compiled_sums
 from robot.sim.contact.kernels import Floats, Operator
+from robot.sim.jit import jit_reassociated
 
 # The contact conditions are held tighter than the pressure: a displacement is seen, a pressure is not.
 GAP_WEIGHT = 20.0
@@ -48,14 +48,14 @@ class ContactProblem:
 
     def solve(self, start: Floats, tolerance: float, max_iterations: int) -> Solution:
         """From `start`, a pressure of the right sum that is zero wherever the gap is infinite."""
-        run = _Run(self, start)
+        run = _Descent(self, start)
         for iteration in range(max_iterations):
             if run.residual <= tolerance:
                 return run.solution(iteration, True)
             run.step()
         return run.solution(max_iterations, run.residual <= tolerance)
 
-    def guess(self) -> Floats:
+    def initial_pressure(self) -> Floats:
         """A pressure to start from when nothing better is known: as springs would carry it."""
         if self.load is None:
             return np.maximum(self.depth - self.gap, 0.0) / self.operator.bound
@@ -68,13 +68,13 @@ class ContactProblem:
         return np.asarray(springs * (self.load / springs.sum()))
 
 
-class _Run:
+class _Descent:
     """One descent: the pressure, what follows from it, and the direction last gone along."""
 
     def __init__(self, problem: ContactProblem, start: Floats) -> None:
         self.problem = problem
         self.change = np.inf  # relative, of the pressure in the last step
-        self.direction, self.went, self.conjugate = np.zeros_like(start), 1.0, False
+        self.direction, self.previous_squares, self.conjugate = np.zeros_like(start), 1.0, False
         self._accept(*self._measure(np.ascontiguousarray(start), problem.operator(start)))
 
     def _measure(self, pressure: Floats, displacement: Floats) -> tuple[Floats, Floats, float]:
@@ -88,7 +88,7 @@ class _Run:
         self.pressure, self.displacement, self.energy = pressure, displacement, energy
         self.distance, self.inside = np.empty_like(pressure), np.empty_like(pressure)
         by_load, depth = self.problem.load is not None, self.problem.depth
-        self.approach, self.count, self.squares, beside, largest = _look(
+        self.approach, self.count, self.squares, beside, largest = _contact_state(
             pressure, displacement, self.problem.gap, by_load, depth, self.distance, self.inside
         )
         # What of the largest displacement would be rounding counts for nothing.
@@ -105,23 +105,23 @@ class _Run:
             self.conjugate = False
             pressure = self._safe_step()
             reached = self._measure(pressure, self.problem.operator(pressure))
-        self.change = _change(before, reached[0])
+        self.change = _relative_change(before, reached[0])
         self._accept(*reached)
 
     def _conjugate_step(self) -> tuple[Floats, Floats]:
         """Along the direction to the least energy, then to pressures that are allowed and to the load."""
-        beta = self.squares / self.went if self.conjugate and self.went > 0.0 else 0.0
+        beta = self.squares / self.previous_squares if self.conjugate and self.previous_squares > 0.0 else 0.0
         direction = np.empty_like(self.direction)
-        slope, total = _turn(self.inside, self.pressure, self.direction, beta, direction)
-        self.direction, self.went = direction, self.squares
+        slope, total = _conjugate_direction(self.inside, self.pressure, self.direction, beta, direction)
+        self.direction, self.previous_squares = direction, self.squares
         moved = self.problem.operator(direction)
-        bend, raised = _bend(moved, direction, self.pressure)
+        bend, raised = _curvature(moved, direction, self.pressure)
         if self.problem.load is not None:
             bend -= raised / self.count * total
         # 1/bound where the energy does not bend.
         length = slope / bend if bend > 0.0 and slope > 0.0 else 1.0 / self.problem.operator.bound
         pressure = np.empty_like(self.pressure)
-        leaving, entering, total = _go(self.pressure, direction, self.distance, length, pressure)
+        leaving, entering, total = _project_step(self.pressure, direction, self.distance, length, pressure)
         self.conjugate = not entering
         # Back to the load; nothing brings it back if no pressure is left, and the safe step follows.
         factor = 1.0 if self.problem.load is None or total <= 0.0 else self.problem.load / total
@@ -137,14 +137,14 @@ class _Run:
         if self.problem.load is None:
             return np.maximum(wanted, 0.0)
         pressure = np.zeros_like(wanted)
-        pressure[there] = nearest_of_sum(wanted[there], self.problem.load)
+        pressure[there] = project_to_simplex(wanted[there], self.problem.load)
         return pressure
 
     def solution(self, iterations: int, converged: bool) -> Solution:
         return Solution(self.pressure, self.displacement, self.approach, iterations, float(self.residual), converged)
 
 
-def nearest_of_sum(values: Floats, total: float) -> Floats:
+def project_to_simplex(values: Floats, total: float) -> Floats:
     """The point nearest to `values` (n,) among those >= 0 that add up to `total` > 0 (Held, Wolfe & Crowder 1974)."""
     falling = np.sort(values)[::-1]
     excess = (np.cumsum(falling) - total) / np.arange(1, values.size + 1)
@@ -155,7 +155,7 @@ def nearest_of_sum(values: Floats, total: float) -> Floats:
 # One pass over the pixels each ------------------------------------------------------------------------------
 
 
-@compiled_sums
+@jit_reassociated
 def _energy(pressure, displacement, gap):  # type: ignore[no-untyped-def]
     """The energy but for the depth's share, and the sum of pressures; where the gap is infinite there is none."""
     energy, total = 0.0, 0.0
@@ -167,8 +167,8 @@ def _energy(pressure, displacement, gap):  # type: ignore[no-untyped-def]
     return energy, total
 
 
-@compiled_sums
-def _look(pressure, displacement, gap, by_load, depth, distance, inside):  # type: ignore[no-untyped-def]
+@jit_reassociated
+def _contact_state(pressure, displacement, gap, by_load, depth, distance, inside):  # type: ignore[no-untyped-def]
     """Fill `distance` (inf where nothing is) and what of it lies `inside` the contact.
 
     Returns the approach (by load, what makes the mean distance inside 0), the number of pixels inside (at least 1), the
@@ -197,10 +197,11 @@ def _look(pressure, displacement, gap, by_load, depth, distance, inside):  # typ
     return approach, count, squares, -lowest, largest
 
 
-@compiled_sums
-def _turn(inside, pressure, before, beta, direction):  # type: ignore[no-untyped-def]
+@jit_reassociated
+def _conjugate_direction(inside, pressure, before, beta, direction):  # type: ignore[no-untyped-def]
     """Fill `direction` with `inside` + beta times the one before, within the contact; the energy's slope along it, and
-    its sum."""
+    its sum.
+    """
     slope, total = 0.0, 0.0
     for row in range(pressure.shape[0]):
         for i in range(pressure.shape[1]):
@@ -211,8 +212,8 @@ def _turn(inside, pressure, before, beta, direction):  # type: ignore[no-untyped
     return slope, total
 
 
-@compiled_sums
-def _bend(moved, direction, pressure):  # type: ignore[no-untyped-def]
+@jit_reassociated
+def _curvature(moved, direction, pressure):  # type: ignore[no-untyped-def]
     """How the energy bends along the direction, and the sum of the displacement by it within the contact."""
     bend, raised = 0.0, 0.0
     for row in range(pressure.shape[0]):
@@ -222,10 +223,11 @@ def _bend(moved, direction, pressure):  # type: ignore[no-untyped-def]
     return bend, raised
 
 
-@compiled_sums
-def _go(before, direction, distance, length, pressure):  # type: ignore[no-untyped-def]
+@jit_reassociated
+def _project_step(before, direction, distance, length, pressure):  # type: ignore[no-untyped-def]
     """Fill `pressure` with what lies a step ahead and is allowed; whether pixels leave and enter the contact, and its
-    sum."""
+    sum.
+    """
     leaving, entering, total = 0, 0, 0.0
     for row in range(before.shape[0]):
         for i in range(before.shape[1]):
@@ -240,8 +242,8 @@ def _go(before, direction, distance, length, pressure):  # type: ignore[no-untyp
     return leaving > 0, entering > 0, total
 
 
-@compiled_sums
-def _change(before, pressure):  # type: ignore[no-untyped-def]
+@jit_reassociated
+def _relative_change(before, pressure):  # type: ignore[no-untyped-def]
     """Of the pressure, relative."""
     change, total = 0.0, 0.0
     for row in range(before.shape[0]):

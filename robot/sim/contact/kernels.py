@@ -154,7 +154,8 @@ def _sampled_influence(shape: Quadrant, thickness: float, poisson: float) -> Flo
 
 def periodic_influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
     """(rows, cols) displacement of a periodic surface by unit pressure on pixel (0, 0): the closed form at the wave
-    numbers of scipy.fft.rfft2."""
+    numbers of scipy.fft.rfft2.
+    """
     q = 2.0 * np.pi * np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1]))
     return np.asarray(scipy.fft.irfft2(layer_compliance(q, thickness, poisson), shape))
 
@@ -163,20 +164,26 @@ class Operator:
     """Displacement (rows, cols) of a pressure (rows, cols): one real FFT each way, rows of zeros left out.
 
     `periodic` wraps around at the border of `shape`; otherwise `table` is a quadrant at least as large as `shape`.
-    `bound` is not below the largest eigenvalue, `peak` is the displacement of a loaded pixel itself. `single`: by
+    `bound` is not below the largest eigenvalue, `peak` is the displacement of a loaded pixel itself. `single_precision`: by
     FFT in float32, right to some 1e-7 of the largest displacement; `rounding` is by how much an energy may err.
     """
 
     def __init__(
-        self, table: Floats, shape: Quadrant, *, periodic: bool = False, workers: int = 1, single: bool = False
+        self,
+        table: Floats,
+        shape: Quadrant,
+        *,
+        periodic: bool = False,
+        workers: int = 1,
+        single_precision: bool = False,
     ) -> None:
-        self.shape, self.workers, self.single = shape, workers, single
-        self.rounding = 1e-6 if single else 1e-12
+        self.shape, self.workers, self.single_precision = shape, workers, single_precision
+        self.rounding = 1e-6 if single_precision else 1e-12
         self._size = shape if periodic else tuple(scipy.fft.next_fast_len(2 * n - 1, real=True) for n in shape)
         whole = table if periodic else _mirrored(table, shape, self._size)
         # The influence is even, so its transform is real.
         transform = np.ascontiguousarray(scipy.fft.rfft2(whole, workers=workers).real)
-        self._transform = transform.astype(np.float32) if single else transform
+        self._transform = transform.astype(np.float32) if single_precision else transform
         self.bound, self.peak = _largest(transform), float(table[0, 0])
 
     def plus(self, other: "Operator", weight: float) -> "Operator":
@@ -188,7 +195,7 @@ class Operator:
 
     def __call__(self, pressure: Floats) -> Floats:
         (rows, cols), (high, wide) = self.shape, self._size
-        given = pressure.astype(np.float32) if self.single else pressure
+        given = pressure.astype(np.float32) if self.single_precision else pressure
         wave = scipy.fft.rfft(given, wide, axis=1, workers=self.workers)
         wave = scipy.fft.fft(wave, high, axis=0, overwrite_x=True, workers=self.workers)
         wave *= self._transform

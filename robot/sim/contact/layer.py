@@ -16,10 +16,10 @@ import numpy.typing as npt
 from robot.errors import RobotConfigError, SceneError
 from robot.sim.contact.constrained_cg import Solution
 from robot.sim.contact.kernels import Floats
-from robot.sim.contact.scaled_problem import ElasticSurface, Task
+from robot.sim.contact.scaled_problem import ElasticSurface, ScaledProblem
 
 STRAIN_LIMIT = 0.5  # of displacement over thickness, and of slope, that linear elasticity may claim
-SINGLE_FROM = 5e-3  # a tolerance: products in float32 err by thousands of times less
+SINGLE_PRECISION_TOLERANCE = 5e-3  # a tolerance: products in float32 err by thousands of times less
 _SCALED_RANGE = (1e-100, 1e100)  # of force / (E* pixel^2) and depth / pixel
 
 
@@ -95,23 +95,23 @@ def press(
     """
     _check_settings(pixel_mm, tolerance, max_iterations)
     _check_elastic("an object's", object_modulus_mpa, object_poisson)
-    gap = _checked_gap(gap_mm)
+    gap = _validate_gap(gap_mm)
     _check_load(force_n, depth_mm)
     lowest = float(gap.min())
     if math.isinf(lowest) or force_n == 0.0 or (depth_mm is not None and depth_mm <= lowest):
-        return _untouched(gap, force_n or 0.0, depth_mm, ())
+        return _no_contact(gap, force_n or 0.0, depth_mm, ())
     softness = layer.plane_modulus_mpa * (1.0 - object_poisson**2) / object_modulus_mpa
     # Of a plane on a periodic surface nothing is left but what float32 rounds away.
-    single = padded and tolerance >= SINGLE_FROM
-    surface = ElasticSurface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded, single)
-    if depth_mm is not None and not surface.loses_volume() and depth_mm > gap.mean():
-        return _untouched(gap, math.inf, depth_mm, ("rigid_volume",))
+    single_precision = padded and tolerance >= SINGLE_PRECISION_TOLERANCE
+    surface = ElasticSurface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded, single_precision)
+    if depth_mm is not None and not surface.can_change_volume() and depth_mm > gap.mean():
+        return _no_contact(gap, math.inf, depth_mm, ("rigid_volume",))
     scale = _scale(pixel_mm, layer.plane_modulus_mpa, force_n, 0.0 if depth_mm is None else depth_mm - lowest)
     with np.errstate(over="ignore"):  # what is that far away is not there
         scaled = (gap - lowest) / pixel_mm / scale
         scaled[scaled > _SCALED_RANGE[1]] = math.inf
     load = None if force_n is None else 1.0
-    solution = Task(surface, scaled, load, 1.0, tolerance, max_iterations).solve()
+    solution = ScaledProblem(surface, scaled, load, 1.0, tolerance, max_iterations).solve()
     return _contact(solution, surface, layer, pixel_mm, scale, lowest)
 
 
@@ -126,7 +126,7 @@ def _scale(pixel_mm: float, modulus_mpa: float, force_n: float | None, depth_mm:
     return scale
 
 
-def _untouched(gap: Floats, force_n: float, depth_mm: float | None, flags: tuple[str, ...]) -> Contact:
+def _no_contact(gap: Floats, force_n: float, depth_mm: float | None, flags: tuple[str, ...]) -> Contact:
     """No pressure anywhere; not converged if a force was to be carried."""
     lowest = float(gap.min())
     approach = depth_mm if depth_mm is not None else lowest if math.isfinite(lowest) else 0.0
@@ -141,7 +141,7 @@ def _contact(
     """Back in the caller's units, with flags."""
     pressure, displacement = solution.pressure, solution.displacement
     if surface.softness > 0.0:
-        displacement = surface.gel(pressure.shape, pressure.shape)(pressure)
+        displacement = surface.gel_operator(pressure.shape, pressure.shape)(pressure)
     touching = pressure > 0.0
     displacement_mm = displacement * (scale * pixel_mm)
     flags = {
@@ -149,7 +149,7 @@ def _contact(
         "unresolved": _is_narrow(touching),
         "at_border": bool(touching[[0, -1]].any() or touching[:, [0, -1]].any()),
         "large_strain": float(displacement_mm.max()) > STRAIN_LIMIT * layer.thickness_mm,
-        "steep": _steepest(displacement * scale) > STRAIN_LIMIT,
+        "steep": _max_slope(displacement * scale) > STRAIN_LIMIT,
         "iteration_cap": not solution.converged,
     }
     return Contact(
@@ -172,7 +172,7 @@ def _is_narrow(touching: npt.NDArray[np.bool_]) -> bool:
     return bool(touching.any()) and not bool((touching & around).any())
 
 
-def _steepest(height: Floats) -> float:
+def _max_slope(height: Floats) -> float:
     """Largest slope by central differences, both in pixels."""
     slopes = [np.gradient(height, axis=axis) for axis in (0, 1) if height.shape[axis] > 1]
     return float(np.sqrt(sum((slope**2 for slope in slopes), np.zeros(1))).max())
@@ -197,7 +197,7 @@ def _check_settings(pixel_mm: float, tolerance: float, max_iterations: int) -> N
         raise RobotConfigError(f"max_iterations must be at least 1, got {max_iterations}; a press takes 10 to 100")
 
 
-def _checked_gap(gap_mm: npt.ArrayLike) -> Floats:
+def _validate_gap(gap_mm: npt.ArrayLike) -> Floats:
     try:
         gap = np.asarray(gap_mm, np.float64)
     except (TypeError, ValueError) as error:

@@ -36,7 +36,8 @@ Matrix = NDArray[np.float64]
 @dataclass(frozen=True)
 class FittedLimits(TypedSettings):
     """What the fitted presses showed; everything is held inside. steepest: of |n|, the sine of the tilt. lowest,
-    highest: of each smoothed map."""
+    highest: of each smoothed map.
+    """
 
     steepest: float
     left: float
@@ -91,7 +92,7 @@ class FittedOptics(TypedSettings, Optics):
         return out
 
     def _tilts(self, slopes: tuple[Array, Array]) -> tuple[Array, Array]:
-        """nx and ny, no steeper than the limit."""
+        """Nx and ny, no steeper than the limit."""
         slope_x, slope_y = slopes
         square = slope_x * slope_x + slope_y * slope_y
         steepest = np.float32(min(self.limits.steepest, 1))
@@ -193,13 +194,13 @@ def optics_from_json(content: dict[str, Any]) -> FittedOptics:
 
 def optics_to_json(optics: FittedOptics) -> dict[str, Any]:
     """What optics_from_json() reads back, with six digits of each number."""
-    found: dict[str, Any] = _short(asdict(optics))
+    found: dict[str, Any] = _round_numbers(asdict(optics))
     return found
 
 
-def _short(value: Any) -> Any:
+def _round_numbers(value: Any) -> Any:
     if isinstance(value, dict):
-        return {name: _short(each) for name, each in value.items()}
+        return {name: _round_numbers(each) for name, each in value.items()}
     if isinstance(value, tuple):
-        return [_short(each) for each in value]
+        return [_round_numbers(each) for each in value]
     return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -60,11 +60,11 @@ def _specks(rng: np.random.Generator, count: int, field: Field) -> Array:
     out = np.ones((field.rows, field.cols), np.float32)
     radii, values = rng.uniform(0.03, 0.12, count), rng.uniform(0.5, 0.9, count)
     for place, radius, value in zip(_places(rng, count), radii, values, strict=True):
-        _dot(out, place, radius, float(value), field)
+        _draw_dot(out, place, radius, float(value), field)
     return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.7))
 
 
-def _dot(image: Array, place: NDArray[Any], radius_mm: float, value: float, field: Field) -> None:
+def _draw_dot(image: Array, place: NDArray[Any], radius_mm: float, value: float, field: Field) -> None:
     scale = 1 << _SUBPIXEL
     x = round(((place[0] + 0.5) * field.cols - 0.5) * scale)
     y = round(((place[1] + 0.5) * field.rows - 0.5) * scale)
@@ -122,7 +122,7 @@ class Markers:
 
 def marker_positions(markers: Markers, surface: Surface) -> Array:
     """(count, 2): x, y of the dots in mm from the middle of the field, moved by the surface."""
-    at_rest = _at_rest(markers, surface.field)
+    at_rest = _rest_positions(markers, surface.field)
     heights = surface.coarse(4)
     height, width = surface.field.size_mm
     steps = np.array([width / heights.shape[1], height / heights.shape[0]])
@@ -138,7 +138,7 @@ def marker_positions(markers: Markers, surface: Surface) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _at_rest(markers: Markers, field: Field) -> Array:
+def _rest_positions(markers: Markers, field: Field) -> Array:
     height, width = field.size_mm
     axes = [(np.arange(int(size / markers.pitch_mm)) + 0.5) * markers.pitch_mm for size in (width, height)]
     middles = [axis - axis.mean() if axis.size else np.zeros(1) for axis in axes]
@@ -151,5 +151,5 @@ def marker_darkening(markers: Markers, surface: Surface) -> Array:
     out = np.ones((field.rows, field.cols), np.float32)
     height, width = field.size_mm
     for place in marker_positions(markers, surface) / np.array([width, height], np.float32):
-        _dot(out, place, markers.radius_mm, 1 - markers.darkness, field)
+        _draw_dot(out, place, markers.radius_mm, 1 - markers.darkness, field)
     return np.asarray(cv2.GaussianBlur(out, (0, 0), 0.8))

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from robot.errors import RobotConfigError
-from robot.sim.gel.pixels import lit_by_bars
+from robot.sim.gel.pixels import shade_by_bars
 from robot.sim.gel.surface import Array, Field, Surface, resized
 
 Triple = tuple[float, float, float]
@@ -70,7 +70,7 @@ class LedBar:
 
 
 @dataclass(frozen=True)
-class Glow:
+class GaussianBackdrop:
     """One channel of the unpressed gel: floor + span * exp(-(x-x0)^2/wx^2 - (y-y0)^2/wy^2), plus a slant.
 
     Grey levels; x and y run from -1 to 1 over the field.
@@ -95,10 +95,10 @@ class Glow:
 
 # Like a GelSight Mini: blue from above, red from below on the left, green from the right; a pink middle.
 MINI_BARS = (LedBar(math.radians(234)), LedBar(math.radians(346)), LedBar(math.radians(122)))
-MINI_GLOWS = (
-    Glow(64, 99, 0.0, -0.12, 1.09, 0.98, 0.0, -6.0),
-    Glow(50, 76, 0.2, -0.13, 1.4, 1.9, -14.0, -1.0),
-    Glow(28, 133, 0.03, 0.13, 0.88, 0.85, 0.0, 9.0),
+MINI_BACKDROPS = (
+    GaussianBackdrop(64, 99, 0.0, -0.12, 1.09, 0.98, 0.0, -6.0),
+    GaussianBackdrop(50, 76, 0.2, -0.13, 1.4, 1.9, -14.0, -1.0),
+    GaussianBackdrop(28, 133, 0.03, 0.13, 0.88, 0.85, 0.0, 9.0),
 )
 # How much of each channel (rows) comes from each bar (columns); the rows add up to 1.
 MINI_MIX = ((0.76, 0.19, 0.05), (0.23, 0.69, 0.08), (0.07, 0.07, 0.86))
@@ -114,7 +114,7 @@ class LedOptics(Optics):
     """
 
     bars: tuple[LedBar, LedBar, LedBar] = MINI_BARS
-    glows: tuple[Glow, Glow, Glow] = MINI_GLOWS
+    backdrops: tuple[GaussianBackdrop, GaussianBackdrop, GaussianBackdrop] = MINI_BACKDROPS
     mix: tuple[Triple, Triple, Triple] = MINI_MIX
     ambient: float = 0.38
     shadow: float = 0.25
@@ -126,7 +126,7 @@ class LedOptics(Optics):
             raise RobotConfigError(f"each row of mix must be shares that add up to 1, got {self.mix}")
 
     def backdrop(self, field: Field) -> Array:
-        return _backdrop(self.glows, field)
+        return _backdrop(self.backdrops, field)
 
     def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
         field = surface.field
@@ -137,21 +137,22 @@ class LedOptics(Optics):
                 shade -= np.float32(self.shadow) * cast
         axes, mix, ambient = (x.ravel(), y.ravel()), np.array(self.mix, np.float32), np.float32(self.ambient)
         out = np.empty((field.rows, field.cols, 3), np.float32)
-        lit_by_bars(np.stack(slopes), leds, strengths, axes, shades, mix, ambient, self.backdrop(field), out)
+        shade_by_bars(np.stack(slopes), leds, strengths, axes, shades, mix, ambient, self.backdrop(field), out)
         return out
 
 
 @lru_cache(maxsize=16)
-def _backdrop(glows: tuple[Glow, ...], field: Field) -> Array:
-    whole = np.stack([glow(field) for glow in glows], axis=-1)
+def _backdrop(backdrops: tuple[GaussianBackdrop, ...], field: Field) -> Array:
+    whole = np.stack([glow(field) for glow in backdrops], axis=-1)
     whole.flags.writeable = False
     return whole
 
 
 @lru_cache(maxsize=16)
 def _leds(bars: tuple[LedBar, ...], field: Field) -> tuple[Array, Array]:
-    """Places (bars, points, 3) of the LEDs, and what each gives to a facet (bars, points, rows, cols), for lit_by_bars;
-    of a bar with fewer points than the longest the rest give nothing."""
+    """Places (bars, points, 3) of the LEDs, and what each gives to a facet (bars, points, rows, cols), for shade_by_bars;
+    of a bar with fewer points than the longest the rest give nothing.
+    """
     points = max(bar.points for bar in bars)
     places = np.zeros((len(bars), points, 3), np.float32)
     strengths = np.zeros((len(bars), points, field.rows, field.cols), np.float32)
@@ -163,7 +164,8 @@ def _leds(bars: tuple[LedBar, ...], field: Field) -> tuple[Array, Array]:
 
 def led_strengths(bar: LedBar, field: Field) -> Array:
     """(points, rows, cols): the factor by which the product of a normal and the way to an LED is its share of
-    w / w_flat."""
+    w / w_flat.
+    """
     middle = np.array([0.0, 0.0, 0.0])
     x, y = (axis.astype(np.float64) for axis in field.positions())
     strengths, flat = [], np.zeros((field.rows, field.cols))
@@ -190,9 +192,9 @@ def cast_shadows(surface: Surface, bars: tuple[LedBar, ...]) -> list[Array]:
     heights = surface.coarse(_SHADOW_STEP)
     full = (surface.field.rows, surface.field.cols)
     out = []
-    for looks in _shadow_looks(bars, surface.field, heights.shape):
+    for samples in _shadow_samples(bars, surface.field, heights.shape):
         over = np.zeros_like(heights)
-        for map_x, map_y, rise in looks:
+        for map_x, map_y, rise in samples:
             towards = cv2.remap(heights, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             np.maximum(over, towards - heights - rise, out=over)
         shade = np.minimum(over / np.float32(_PENUMBRA_MM), 1)
@@ -201,7 +203,7 @@ def cast_shadows(surface: Surface, bars: tuple[LedBar, ...]) -> list[Array]:
 
 
 @lru_cache(maxsize=6)
-def _shadow_looks(
+def _shadow_samples(
     bars: tuple[LedBar, ...], field: Field, shape: tuple[int, int]
 ) -> tuple[list[tuple[Array, Array, Array]], ...]:
     """For each bar and reach: where to look (x, y maps) and how high the light's ray is there (mm)."""
@@ -214,7 +216,7 @@ def _shadow_looks(
         led_x, led_y, led_z = bar.positions().mean(axis=0)
         away = np.hypot(led_x - x, led_y - y)
         unit_x, unit_y = (led_x - x) / away, (led_y - y) / away
-        looks = [
+        samples = [
             (
                 (columns + reach / steps[0] * unit_x).astype(np.float32),
                 (rows + reach / steps[1] * unit_y).astype(np.float32),
@@ -222,5 +224,5 @@ def _shadow_looks(
             )
             for reach in _REACHES_MM
         ]
-        out.append(looks)
+        out.append(samples)
     return tuple(out)

@@ -3,13 +3,13 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.sim.compiled import compiled
+from robot.sim.jit import jit
 
 Array = NDArray[np.float32]
 
 
-@compiled
-def lit_by_bars(slopes, leds, strengths, axes, shades, mix, ambient, backdrop, out):  # type: ignore[no-untyped-def]
+@jit
+def shade_by_bars(slopes, leds, strengths, axes, shades, mix, ambient, backdrop, out):  # type: ignore[no-untyped-def]
     """The picture (rows, cols, 3) of LedOptics into `out`, which is of float32 as everything here.
 
     slopes: of the surface, (2, rows, cols). leds (bars, points, 3) mm and strengths (bars, points, rows, cols): what an
@@ -42,8 +42,8 @@ def lit_by_bars(slopes, leds, strengths, axes, shades, mix, ambient, backdrop, o
                 out[row, i, channel] = backdrop[row, i, channel] * (ambient + (one - ambient) * mixed)
 
 
-@compiled
-def exposed(clean, noise, read, shot, out):  # type: ignore[no-untyped-def]
+@jit
+def add_camera_noise(clean, noise, read, shot, out):  # type: ignore[no-untyped-def]
     """Grey levels (rows, cols, 3) plus noise, given with variance 1, of variance read^2 + shot * level; rounded."""
     square = read * read
     for row in range(out.shape[0]):

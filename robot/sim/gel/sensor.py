@@ -23,8 +23,8 @@ from robot.gel_settings import GelSettings
 from robot.sim.contact.layer import Layer
 from robot.sim.gel.fitted_optics import load_fitted
 from robot.sim.gel.marks import Flaws, Markers, flaw_maps, marker_darkening
-from robot.sim.gel.optics import MINI_BARS, MINI_GLOWS, Glow, LedBar, LedOptics, Optics, Triple
-from robot.sim.gel.pixels import exposed
+from robot.sim.gel.optics import MINI_BACKDROPS, MINI_BARS, GaussianBackdrop, LedBar, LedOptics, Optics, Triple
+from robot.sim.gel.pixels import add_camera_noise
 from robot.sim.gel.surface import Array, Field, Surface
 
 Picture = NDArray[np.uint8]
@@ -42,7 +42,7 @@ class Noise:
     shot: float = 0.006
 
 
-_PLAIN_LED, _PLAIN_NOISE, _ANY_GEL = LedOptics(), Noise(), GelSettings()
+_PLAIN_LED, _PLAIN_NOISE, _UNKNOWN_GEL = LedOptics(), Noise(), GelSettings()
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class GelSensor:
 
     def background(self, seed: int) -> Picture:
         """The untouched gel: (rows, cols, 3) uint8 RGB; the same as render() of no displacement."""
-        return self.taken(_untouched(self), seed)
+        return self.capture(_no_contact_image(self), seed)
 
     def render(self, displacement_mm: NDArray[Any], seed: int) -> Picture:
         """The picture of a pressed gel: (rows, cols, 3) uint8 RGB.
@@ -93,14 +93,14 @@ class GelSensor:
         `displacement_mm`: (r, c), inwards, on any grid that covers the field. `seed` makes the noise alone.
         Raises SceneError for a map that is empty, has another number of axes, or is not finite.
         """
-        return self.taken(self.lit(displacement_mm), seed)
+        return self.capture(self.render_clean(displacement_mm), seed)
 
-    def lit(self, displacement_mm: NDArray[Any]) -> Array:
+    def render_clean(self, displacement_mm: NDArray[Any]) -> Array:
         """Grey levels (rows, cols, 3) before noise and clipping, with which all pictures of one press begin."""
         surface = Surface(displacement_mm, self.field)
-        return self._clean(surface) if surface.displacement_mm.any() else _untouched(self)
+        return self._render_surface(surface) if surface.displacement_mm.any() else _no_contact_image(self)
 
-    def _clean(self, surface: Surface) -> Array:
+    def _render_surface(self, surface: Surface) -> Array:
         slope_x, slope_y = surface.slopes
         dark: Array | None = None
         if self.flaws is not None:
@@ -115,12 +115,12 @@ class GelSensor:
         image *= np.array(self.tint, np.float32) * np.float32(self.exposure)
         return cv2.GaussianBlur(image, (0, 0), self.blur_px) if self.blur_px > 0 else image
 
-    def taken(self, clean: Array, seed: int) -> Picture:
-        """The picture that the camera takes of what `lit` gives: with noise, rounded and clipped to 0..255."""
+    def capture(self, clean: Array, seed: int) -> Picture:
+        """The picture that the camera takes of what `render_clean` gives: with noise, rounded and clipped to 0..255."""
         if self.noise.read == 0 and self.noise.shot == 0:
             return np.clip(np.rint(clean), 0, 255).astype(np.uint8)
         out = np.empty(clean.shape, np.uint8)
-        exposed(
+        add_camera_noise(
             clean,
             _noise_tile(self.rows, self.cols, seed),
             np.float32(self.noise.read),
@@ -131,8 +131,8 @@ class GelSensor:
 
 
 @lru_cache(maxsize=8)
-def _untouched(sensor: GelSensor) -> Array:
-    return sensor._clean(Surface(np.zeros((1, 1)), sensor.field))
+def _no_contact_image(sensor: GelSensor) -> Array:
+    return sensor._render_surface(Surface(np.zeros((1, 1)), sensor.field))
 
 
 _TILE_MARGIN = 64
@@ -161,7 +161,7 @@ def _noise_tile(rows: int, cols: int, seed: int) -> Array:
 # Drawing sensors -------------------------------------------------------------------------------------------
 
 
-def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings = _ANY_GEL) -> GelSensor:
+def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings = _UNKNOWN_GEL) -> GelSensor:
     """A sensor as one comes from the factory, and after some use: its own gel, lamps, tint and dust.
 
     The same seed, finger and optics give the same sensor. `optics`: led, grey, or the name of a fitted sensor. `gel`:
@@ -211,10 +211,10 @@ def _draw_led(rng: np.random.Generator) -> LedOptics:
     """Lamps a little askew (5 degrees, a millimetre) and of unequal power (4 %)."""
     power = np.exp(0.04 * rng.standard_normal(3))
     bars = tuple(_draw_bar(bar, rng) for bar in MINI_BARS)
-    glows = tuple(_draw_glow(glow, float(gain), rng) for glow, gain in zip(MINI_GLOWS, power, strict=True))
+    backdrops = tuple(_draw_backdrop(glow, float(gain), rng) for glow, gain in zip(MINI_BACKDROPS, power, strict=True))
     return LedOptics(
         bars,  # type: ignore[arg-type]
-        glows,  # type: ignore[arg-type]
+        backdrops,  # type: ignore[arg-type]
         ambient=float(rng.uniform(0.33, 0.43)),
         shadow=float(rng.uniform(0.15, 0.35)),
     )
@@ -223,7 +223,7 @@ def _draw_led(rng: np.random.Generator) -> LedOptics:
 def _draw_grey(rng: np.random.Generator) -> LedOptics:
     """Another maker's sensor: white lamps in other places, seen by a grey camera; hence three equal channels."""
     bars = tuple(_draw_bar(replace(bar, angle_rad=bar.angle_rad + math.radians(40)), rng) for bar in MINI_BARS)
-    glow = _draw_glow(MINI_GLOWS[1], float(np.exp(0.04 * rng.standard_normal())), rng)
+    glow = _draw_backdrop(MINI_BACKDROPS[1], float(np.exp(0.04 * rng.standard_normal())), rng)
     share = 0.55, 0.3, 0.15
     return LedOptics(bars, (glow,) * 3, (share,) * 3, ambient=0.45, shadow=0.2)  # type: ignore[arg-type]
 
@@ -239,11 +239,11 @@ def _draw_bar(bar: LedBar, rng: np.random.Generator) -> LedBar:
     )
 
 
-def _draw_glow(glow: Glow, gain: float, rng: np.random.Generator) -> Glow:
+def _draw_backdrop(glow: GaussianBackdrop, gain: float, rng: np.random.Generator) -> GaussianBackdrop:
     """The same glow by a lamp of `gain` times the power, moved, wider or narrower, and slanted a little."""
     x, y, slant_x, slant_y = rng.standard_normal(4) * (0.05, 0.05, 2.5, 2.5)
     wide = np.exp(0.06 * rng.standard_normal(2))
-    return Glow(
+    return GaussianBackdrop(
         glow.floor * gain,
         glow.span * gain,
         float(glow.x0 + x),

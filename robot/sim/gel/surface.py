@@ -19,8 +19,8 @@ Array = NDArray[np.float32]
 
 # The camera looks straight down: beyond a slope of 1000 (89.94 degrees) a facet shows nothing but its edge, and
 # the square of 1000 is far from float32's end. What is deeper than a metre is no gel.
-STEEPEST = 1e3
-_DEEPEST_MM = 1e3
+MAX_SLOPE = 1e3
+_MAX_DEPTH_MM = 1e3
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Field:
         return self.rows * self.pixel_mm, self.cols * self.pixel_mm
 
     def positions(self) -> tuple[Array, Array]:
-        """x (1, cols) and y (rows, 1) of the pixels' middles from the middle of the field, in mm."""
+        """X (1, cols) and y (rows, 1) of the pixels' middles from the middle of the field, in mm."""
         return _positions(self)
 
     def unit_positions(self) -> tuple[Array, Array]:
@@ -73,7 +73,7 @@ class Surface:
 
     def __init__(self, displacement_mm: NDArray[Any], field: Field) -> None:
         self.field = field
-        self.displacement_mm = _checked(displacement_mm)
+        self.displacement_mm = _validate_displacement(displacement_mm)
 
     @cached_property
     def slopes(self) -> tuple[Array, Array]:
@@ -89,7 +89,7 @@ class Surface:
         return resized(self.displacement_mm, shape)
 
     def _at_pixels(self, slope: Array) -> Array:
-        return np.clip(resized(slope, (self.field.rows, self.field.cols)), -STEEPEST, STEEPEST)
+        return np.clip(resized(slope, (self.field.rows, self.field.cols)), -MAX_SLOPE, MAX_SLOPE)
 
 
 def resized(image: Array, shape: tuple[int, int]) -> Array:
@@ -110,7 +110,7 @@ def _differences(heights: Array) -> tuple[Array, Array]:
     return out[0], out[1]
 
 
-def _checked(displacement_mm: NDArray[Any]) -> Array:
+def _validate_displacement(displacement_mm: NDArray[Any]) -> Array:
     given = np.asarray(displacement_mm)
     if given.ndim != 2 or given.size == 0 or given.dtype.kind not in "fiu":
         raise SceneError(
@@ -122,4 +122,4 @@ def _checked(displacement_mm: NDArray[Any]) -> Array:
         raise SceneError(
             f"displacement_mm must be finite, got {count} values of {given.size} that are not; see Contact.flags"
         )
-    return np.asarray(np.clip(given, -_DEEPEST_MM, _DEEPEST_MM), np.float32)
+    return np.asarray(np.clip(given, -_MAX_DEPTH_MM, _MAX_DEPTH_MM), np.float32)

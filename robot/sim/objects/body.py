@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import SceneError
-from robot.sim.objects.boxes import clipped
-from robot.sim.objects.formula import record
-from robot.sim.objects.packets import Formula, Rays, Worn, first_hits, gradients, hits
+from robot.sim.objects.boxes import clip_to_box
+from robot.sim.objects.formula import trace_formula
+from robot.sim.objects.packets import DisplacedSolid, Formula, Rays, first_hits, gradients, hits
 from robot.sim.objects.relief import Relief
-from robot.sim.objects.shapes.base import Floats, Points, Shape
-from robot.sim.objects.wall import Level, Wall, bake
+from robot.sim.objects.shapes.shape import Floats, Points, Shape
+from robot.sim.objects.wall import ReliefLevel, ReliefLevels, bake
 
 Vectors = NDArray[np.float64]
 GEL_STEP_MM = 0.1
@@ -27,7 +27,8 @@ GEL_STEP_MM = 0.1
 @dataclass(frozen=True)
 class ClippedRays:
     """Rays (N, 3) and where they enter and leave the bounding box; one that passes it by enters after it leaves.
-    `step_mm` is the finest detail that matters."""
+    `step_mm` is the finest detail that matters.
+    """
 
     origins: Vectors
     directions: Vectors
@@ -36,7 +37,7 @@ class ClippedRays:
     step_mm: float
 
     @property
-    def ways(self) -> Rays:
+    def arrays(self) -> Rays:
         """All but the detail."""
         return self.origins, self.directions, self.near_mm, self.far_mm
 
@@ -54,22 +55,22 @@ class Body(ABC):
         `step_mm`: the finest detail that matters; a camera gives the size of its pixel on the object, and is served
         faster. Raises SceneError.
         """
-        return self._cast(self._clipped(origins, directions, step_mm))
+        return self._cast(self._clip_rays(origins, directions, step_mm))
 
     def hit(self, origins: Points, directions: Points, step_mm: float = GEL_STEP_MM) -> NDArray[np.bool_]:
         """Which rays hit, (N,), as by `cast`; where they do is left out. Raises SceneError."""
-        return self._hit(self._clipped(origins, directions, step_mm))
+        return self._hit(self._clip_rays(origins, directions, step_mm))
 
-    def _clipped(self, origins: Points, directions: Points, step_mm: float) -> ClippedRays:
-        start, along = _plain(origins), _plain(directions)
+    def _clip_rays(self, origins: Points, directions: Points, step_mm: float) -> ClippedRays:
+        start, along = _contiguous(origins), _contiguous(directions)
         if start.ndim != 2 or start.shape[1] != 3 or start.shape != along.shape:
             raise SceneError(f"rays must be two arrays of shape (N, 3), got {start.shape} and {along.shape}")
-        near, far = clipped(start, along, self.lower, self.upper)
+        near, far = clip_to_box(start, along, self.lower, self.upper)
         return ClippedRays(start, along, near, far, step_mm)
 
     def normals(self, points: Points, step_mm: float = GEL_STEP_MM) -> Vectors:
         """Outward unit normals (N, 3) at points (N, 3) on the surface, relief included, smoothed over `step_mm`."""
-        array = _plain(points)
+        array = _contiguous(points)
         if array.ndim != 2 or array.shape[1] != 3:
             raise SceneError(f"points must be an array of shape (N, 3), got {array.shape}")
         gradient = self._normals(array, step_mm)
@@ -93,7 +94,7 @@ class Body(ABC):
         """Outward normals of any length."""
 
 
-def _plain(array: Points) -> Vectors:
+def _contiguous(array: Points) -> Vectors:
     """In one layout, so that packets are compiled for one."""
     return np.require(array, np.float64, ["C", "W"])
 
@@ -108,60 +109,66 @@ class SdfBody(Body):
         self.lower, self.upper = shape.lower - outwards, shape.upper + outwards
 
     @cached_property
-    def wall(self) -> Wall | None:
+    def wall(self) -> ReliefLevels | None:
         """The baked relief; None for a bare shape. Drawn when first used, not pickled."""
         return bake(self.shape, self.relief)
 
     @cached_property
-    def _place(self) -> Formula:
-        return record(self.located, 3)
+    def _chart_formula(self) -> Formula:
+        return trace_formula(self.chart_coordinates, 3)
 
-    def located(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
+    def chart_coordinates(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
         """Where on the wall a point is, and how much relief there belongs on it."""
         mask = self.shape.mask(x, y, z)
         return *self.shape.chart.locate(x, y, z), np.full_like(x, 1.0) if mask is None else mask
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("wall", "_place")}
+        return {key: value for key, value in self.__dict__.items() if key not in ("wall", "_chart_formula")}
 
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
         """Counted on a grid of 28^3 cells, relief left out: within some 3 % of the true volume."""
-        axes = [low + (high - low) * (np.arange(28) + 0.5) / 28 for low, high in zip(*self._bare, strict=True)]
+        axes = [low + (high - low) * (np.arange(28) + 0.5) / 28 for low, high in zip(*self._shape_bounds, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         distance = self.shape.distance(grid)
-        cell = float(np.prod(self._bare[1] - self._bare[0])) / len(grid)
+        cell = float(np.prod(self._shape_bounds[1] - self._shape_bounds[0])) / len(grid)
         return cell * int((distance < 0).sum()), cell * int(((distance < 0) & (distance > -shell_mm)).sum())
 
     @property
-    def _bare(self) -> tuple[Vectors, Vectors]:
+    def _shape_bounds(self) -> tuple[Vectors, Vectors]:
         return self.shape.lower, self.shape.upper
 
     def field(self, x: Floats, y: Floats, z: Floats, step_mm: float = GEL_STEP_MM) -> Floats:
-        """f in mm at points in float32: below 0 inside, above 0 outside; near the surface close to the distance.
+        """F in mm at points in float32: below 0 inside, above 0 outside; near the surface close to the distance.
 
         In plain numpy, what rays meet by compiled formulas of the same functions.
         """
         base = self.shape.distance_xyz(x, y, z)
         if self.wall is None:
             return base
-        s, t, weight = self.located(x, y, z)
+        s, t, weight = self.chart_coordinates(x, y, z)
         return base - self.wall.level(step_mm).at(s, t) * weight
 
-    def worn(self, step_mm: float) -> Worn:
+    def displaced_solid(self, step_mm: float) -> DisplacedSolid:
         """The body as rays see it that ask for detail of `step_mm`."""
-        level = self.wall.level(step_mm) if self.wall else _BARE
-        return Worn(
-            self.shape.formula, self._place, level.height_mm, level.per_s, level.per_t, level.highest_mm, level.slope
+        level = self.wall.level(step_mm) if self.wall else _NO_RELIEF
+        return DisplacedSolid(
+            self.shape.formula,
+            self._chart_formula,
+            level.height_mm,
+            level.per_s,
+            level.per_t,
+            level.max_height_mm,
+            level.slope,
         )
 
     def _normals(self, points: Vectors, step_mm: float) -> Vectors:
-        return gradients(self.worn(step_mm), points, step_mm)
+        return gradients(self.displaced_solid(step_mm), points, step_mm)
 
     def _cast(self, rays: ClippedRays) -> Vectors:
-        return first_hits(self.worn(rays.step_mm), rays.ways, rays.step_mm)
+        return first_hits(self.displaced_solid(rays.step_mm), rays.arrays, rays.step_mm)
 
     def _hit(self, rays: ClippedRays) -> NDArray[np.bool_]:
-        return hits(self.worn(rays.step_mm), rays.ways, rays.step_mm)
+        return hits(self.displaced_solid(rays.step_mm), rays.arrays, rays.step_mm)
 
 
-_BARE = Level(np.zeros((0, 0), np.float32), 1.0, 1.0, 0.0, 0.0, math.inf)
+_NO_RELIEF = ReliefLevel(np.zeros((0, 0), np.float32), 1.0, 1.0, 0.0, 0.0, math.inf)

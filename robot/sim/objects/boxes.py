@@ -4,12 +4,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import SceneError
-from robot.sim.compiled import compiled
+from robot.sim.jit import jit
 
 Vectors = NDArray[np.float64]
 
 
-def clipped(origins: Vectors, directions: Vectors, lower: Vectors, upper: Vectors) -> tuple[Vectors, Vectors]:
+def clip_to_box(origins: Vectors, directions: Vectors, lower: Vectors, upper: Vectors) -> tuple[Vectors, Vectors]:
     """Where rays (n, 3) enter and leave a box, (n,) each, at least 0; a miss enters after it leaves.
 
     Raises SceneError for an origin that is not finite, or a direction that is not of unit length.
@@ -21,7 +21,7 @@ def clipped(origins: Vectors, directions: Vectors, lower: Vectors, upper: Vector
     return near, far
 
 
-@compiled
+@jit
 def _clip(origins, directions, lower, upper, near, far):  # type: ignore[no-untyped-def]
     """Fill near and far; what is wrong with a ray, if anything is."""
     for number in range(len(near)):

@@ -13,17 +13,17 @@ from typing import Any
 import numpy as np
 
 from robot.errors import RobotConfigError, UnknownName
+from robot.sim.objects.appearance import Appearance, draw_appearance
 from robot.sim.objects.body import Body, SdfBody
-from robot.sim.objects.looks import Looks, draw_looks
 from robot.sim.objects.materials import ObjectMaterial, draw_material
 from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
 from robot.sim.objects.shapes import SHAPES
 
 STROKE_MM = 110.0  # of the simulated gripper, into which every object fits
 SHELL_MM = 3.0
-HEAVY_KG = 0.6
+MAX_SOLID_KG = 0.6
 # Streams of random numbers; a new purpose takes a new number, and no other object changes.
-_SHAPE, _RELIEF, _MATERIAL, _LOOKS, _FAMILY_DECK, _RELIEF_DECK = range(6)
+_SHAPE, _RELIEF, _MATERIAL, _APPEARANCE, _FAMILY_ORDER, _RELIEF_ORDER = range(6)
 
 
 @dataclass(frozen=True)
@@ -34,14 +34,14 @@ class SimObject:
     family: str
     relief: Relief
     material: ObjectMaterial
-    looks: Looks
+    appearance: Appearance
     body: Body = field(repr=False)
 
     @cached_property
     def mass_kg(self) -> float:
         """Solid while that weighs at most 0.6 kg; beyond, hollow with a wall of 3 mm, as bottles and castings are."""
         solid, shell = (volume * 1e-9 * self.material.density_kg_m3 for volume in self.body.volumes_mm3(SHELL_MM))
-        return solid if solid <= HEAVY_KG else min(solid, shell)
+        return solid if solid <= MAX_SOLID_KG else min(solid, shell)
 
     def labels(self) -> dict[str, float | bool | str]:
         """What is known of shape and relief, in plain values: what touch can feel and a photo can show."""
@@ -72,25 +72,25 @@ def draw_object(seed: int, index: int, *, family: str | None = None, relief: str
     for name, value in (("seed", seed), ("index", index)):
         if not isinstance(value, int | np.integer) or value < 0:
             raise RobotConfigError(f"{name} must be a whole number from 0, got {value!r}")
-    chosen = _named_or_next(SHAPES, family, "family", seed, index, _FAMILY_DECK)
-    worn = _named_or_next(RELIEFS, relief, "relief", seed, index, _RELIEF_DECK)
+    chosen = _choose_name(SHAPES, family, "family", seed, index, _FAMILY_ORDER)
+    relief_name = _choose_name(RELIEFS, relief, "relief", seed, index, _RELIEF_ORDER)
     shape = SHAPES[chosen](np.random.default_rng([seed, index, _SHAPE]))
-    pattern = draw_relief(worn, np.random.default_rng([seed, index, _RELIEF]), shape.relief_limit_mm)
+    pattern = draw_relief(relief_name, np.random.default_rng([seed, index, _RELIEF]), shape.relief_limit_mm)
     return SimObject(
-        object_id=f"{chosen}-{worn}-{seed:04d}-{index:05d}",
+        object_id=f"{chosen}-{relief_name}-{seed:04d}-{index:05d}",
         family=chosen,
         relief=pattern,
         material=draw_material(np.random.default_rng([seed, index, _MATERIAL])),
-        looks=draw_looks(np.random.default_rng([seed, index, _LOOKS])),
+        appearance=draw_appearance(np.random.default_rng([seed, index, _APPEARANCE])),
         body=SdfBody(shape, pattern),
     )
 
 
-def _named_or_next(table: Mapping[str, Any], name: str | None, what: str, seed: int, index: int, stream: int) -> str:
+def _choose_name(table: Mapping[str, Any], name: str | None, what: str, seed: int, index: int, stream: int) -> str:
     """The name asked for, or the next card of the deck."""
     if name is None:
-        deck, place = divmod(index, len(table))
-        return list(table)[int(np.random.default_rng([seed, deck, stream]).permutation(len(table))[place])]
+        round_number, place = divmod(index, len(table))
+        return list(table)[int(np.random.default_rng([seed, round_number, stream]).permutation(len(table))[place])]
     if name not in table:
         raise UnknownName(f"{what} must be one of {', '.join(table)}; got {name!r}")
     return name

@@ -1,7 +1,7 @@
 """Formulas: what a function does to numpy arrays, written down once so that compiled code can do it to many points.
 
 A shape says its distance in plain numpy, a few dozen operations over arrays. Run on whole arrays each of them goes
-through memory; `record` runs the function on symbols instead and keeps the list of its operations, which
+through memory; `trace_formula` runs the function on symbols instead and keeps the list of its operations, which
 `robot.sim.objects.packets` carries out on a few points at a time, in the processor's cache and at the width of its
 vector unit. The function stays the one place where the shape is described, and plain numpy the oracle of its formula.
 """
@@ -35,7 +35,7 @@ _UFUNCS = {
 }
 
 
-def record(function: Callable[..., Any], operands: int) -> Formula:
+def trace_formula(function: Callable[..., Any], operands: int) -> Formula:
     """The formula of `function(*arrays)` of so many float32 arrays, which returns an array or a tuple of them.
 
     It must be made of numpy's elementwise functions (`OPERATIONS`), and choose by `np.where`, not by `if`, what
@@ -86,12 +86,12 @@ class _Tape:
         self._number: dict[tuple[Any, ...], int] = {value: number for number, value in enumerate(self._values)}
 
     def write(self, operation: str, inputs: Sequence[Any]) -> _Symbol:
-        return _Symbol(self, self._enter((operation, *map(self.number_of, inputs))))
+        return _Symbol(self, self._intern((operation, *map(self.number_of, inputs))))
 
     def number_of(self, value: Any) -> int:
-        return value.number if isinstance(value, _Symbol) else self._enter(("constant", float(np.float32(value))))
+        return value.number if isinstance(value, _Symbol) else self._intern(("constant", float(np.float32(value))))
 
-    def _enter(self, value: tuple[Any, ...]) -> int:
+    def _intern(self, value: tuple[Any, ...]) -> int:
         """What was worked out before is not worked out again."""
         number = self._number.setdefault(value, len(self._values))
         if number == len(self._values):

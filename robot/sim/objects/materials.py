@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from robot.errors import UnknownName
-from robot.settings import TypedSettings, limited
+from robot.settings import TypedSettings, bounded
 
 
 @dataclass(frozen=True)
@@ -18,12 +18,12 @@ class ObjectMaterial(TypedSettings):
     """Isotropic linear elasticity, density, friction against gel, and two numbers for shading (0 to 1)."""
 
     name: str
-    modulus_mpa: float = limited(1e-3, 1e6)
-    poisson: float = limited(-1.0, 0.5)
-    density_kg_m3: float = limited(1.0, 25000.0)
-    friction: float = limited(0.0, 5.0)
-    gloss: float = limited(0.0, 1.0)
-    roughness: float = limited(0.0, 1.0)
+    modulus_mpa: float = bounded(1e-3, 1e6)
+    poisson: float = bounded(-1.0, 0.5)
+    density_kg_m3: float = bounded(1.0, 25000.0)
+    friction: float = bounded(0.0, 5.0)
+    gloss: float = bounded(0.0, 1.0)
+    roughness: float = bounded(0.0, 1.0)
 
 
 _TABLE = (

@@ -18,20 +18,20 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from robot.errors import SceneError
+from robot.sim.objects.appearance import draw_appearance
 from robot.sim.objects.body import Body, ClippedRays, Vectors
 from robot.sim.objects.draw import SimObject
-from robot.sim.objects.looks import draw_looks
 from robot.sim.objects.materials import draw_material
 from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
-from robot.sim.objects.resting import UP, turn_up
-from robot.sim.objects.shapes.base import Cylindrical, Floats, relief_limit
-from robot.sim.objects.wall import Wall, bake_plain, ends_weight, smoothstep
+from robot.sim.objects.resting import UP, rotation_to_up
+from robot.sim.objects.shapes.shape import CylindricalChart, Floats, relief_limit
+from robot.sim.objects.wall import ReliefLevels, bake_plain, ends_weight, smoothstep
 
 FORMATS = ("stl", "obj", "ply")
-THINNEST_MM = 2.0
-_METRES_BELOW = 2.0
+MIN_THICKNESS_MM = 2.0
+_MAX_METRE_EXTENT = 2.0
 _CREASE_COSINE = 0.77
-_BACK_MM = 1.0
+_RAY_OFFSET_MM = 1.0
 Faces = NDArray[np.int64]
 
 
@@ -98,9 +98,9 @@ class Mesh:
         a, b, c = (self.corners - self.vertices.mean(axis=0)).transpose(1, 0, 2)
         return a, np.cross(b, c)
 
-    def resting(self, up: Vectors) -> "Mesh":
+    def rest_on_table(self, up: Vectors) -> "Mesh":
         """Turned until the unit direction `up` points up, its foot on z = 0, centred."""
-        vertices = self.vertices if up is UP else self.vertices @ turn_up(up).T
+        vertices = self.vertices if up is UP else self.vertices @ rotation_to_up(up).T
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         return Mesh(vertices - [*(low + high)[:2] / 2, low[2]], self.faces)
 
@@ -125,20 +125,20 @@ class MeshBody(Body):
         outwards = np.array([out, out, 0.0])
         self.lower, self.upper = mesh.vertices.min(axis=0) - outwards, mesh.vertices.max(axis=0) + outwards
         radius = float(np.mean(self.upper[:2] - self.lower[:2])) / 2
-        self.chart = Cylindrical(radius, float(self.upper[2]))
+        self.chart = CylindricalChart(radius, float(self.upper[2]))
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in self.__dict__.items() if key not in ("wall", "_caster", "_samples")}
 
     @cached_property
-    def wall(self) -> Wall | None:
+    def wall(self) -> ReliefLevels | None:
         """The relief on a cylinder round the mesh."""
         return bake_plain(self.chart, self.relief)
 
     @cached_property
     def _caster(self) -> Any:
         """Embree's tree over the faces; it casts on one thread."""
-        trimesh, intersector = _packages()
+        trimesh, intersector = _import_packages()
         return intersector(trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False))
 
     @cached_property
@@ -160,7 +160,7 @@ class MeshBody(Body):
         ahead = np.flatnonzero(rays.near_mm <= rays.far_mm)
         origins, directions, near = rays.origins[ahead], rays.directions[ahead], rays.near_mm[ahead]
         # A face that lies in the bounding box would be missed by rays that start on it.
-        start = near - np.minimum(near, _BACK_MM)
+        start = near - np.minimum(near, _RAY_OFFSET_MM)
         face, distance = self.first_faces(origins + start[:, None] * directions, directions)
         hit = np.flatnonzero(face >= 0)
         result = np.full(len(ahead), np.inf)
@@ -209,7 +209,7 @@ class MeshBody(Body):
 
     def _normals(self, points: Vectors, step_mm: float) -> Vectors:
         """The mesh's normal n, tilted by the relief: n - (grad h - n (n . grad h))."""
-        normals = self._bare_normals(points)
+        normals = self._mesh_normals(points)
         if self.wall is None:
             return normals
         sides = np.eye(3) * step_mm / 2
@@ -219,10 +219,10 @@ class MeshBody(Body):
         gradient = np.stack(columns, axis=1) / step_mm
         return np.asarray(normals - gradient + normals * np.einsum("ij,ij->i", gradient, normals)[:, None])
 
-    def _bare_normals(self, points: Vectors) -> Vectors:
+    def _mesh_normals(self, points: Vectors) -> Vectors:
         """Smoothed normals of the faces under the points, found from just outside."""
-        guess = self._guess(points)
-        reach = self.relief.amplitude_mm + 2 * _BACK_MM
+        guess = self._nearest_sample_normals(points)
+        reach = self.relief.amplitude_mm + 2 * _RAY_OFFSET_MM
         face, distance = self.first_faces(points + reach * guess, -guess)
         found = np.flatnonzero(face >= 0)
         depth = reach - distance
@@ -232,7 +232,7 @@ class MeshBody(Body):
         guess[found] = self.mesh.normals_at(face, place)
         return guess
 
-    def _guess(self, points: Vectors) -> Vectors:
+    def _nearest_sample_normals(self, points: Vectors) -> Vectors:
         """Normal of the nearest sample that does not have the point behind it, as the far side of a thin wall has."""
         tree, places, normals = self._samples
         apart, nearest = tree.query(points, k=6)
@@ -252,7 +252,7 @@ def read_mesh(path: str | Path) -> Mesh:
     SceneError for a file that is no closed solid, and SceneError naming the extra where its packages are missing.
     """
     file = Path(path)
-    return _stand(_read(file), file)
+    return _place_on_table(_read(file), file)
 
 
 def mesh_object(
@@ -263,16 +263,16 @@ def mesh_object(
     Raises UnknownName.
     """
     stream = [seed, zlib.crc32(file.stem.encode())]
-    worn = str(np.random.default_rng([*stream, 0]).choice(list(RELIEFS))) if relief is None else relief
-    limit = relief_limit(min(_narrowest(mesh.vertices), 94.0), 3.0)
-    pattern = draw_relief(worn, np.random.default_rng([*stream, 1]), limit)
+    relief_name = str(np.random.default_rng([*stream, 0]).choice(list(RELIEFS))) if relief is None else relief
+    limit = relief_limit(min(_min_width(mesh.vertices), 94.0), 3.0)
+    pattern = draw_relief(relief_name, np.random.default_rng([*stream, 1]), limit)
     return SimObject(
-        object_id=f"{object_prefix(file)}{worn}-{seed:04d}",
+        object_id=f"{object_prefix(file)}{relief_name}-{seed:04d}",
         family="mesh",
         relief=pattern,
         material=draw_material(np.random.default_rng([*stream, 2]), material),
-        looks=draw_looks(np.random.default_rng([*stream, 3])),
-        body=MeshBody(mesh.resting(up), pattern),
+        appearance=draw_appearance(np.random.default_rng([*stream, 3])),
+        body=MeshBody(mesh.rest_on_table(up), pattern),
     )
 
 
@@ -281,8 +281,8 @@ def object_prefix(file: Path) -> str:
     return f"mesh.{re.sub(r'[^A-Za-z0-9._]+', '_', file.stem)}-"
 
 
-def _packages() -> tuple[Any, Any]:
-    """trimesh and its ray caster on embree. Raises SceneError where one is missing."""
+def _import_packages() -> tuple[Any, Any]:
+    """Trimesh and its ray caster on embree. Raises SceneError where one is missing."""
     try:
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector
@@ -299,7 +299,7 @@ def _read(file: Path) -> Mesh:
     kind = file.suffix.lower().lstrip(".")
     if kind not in FORMATS:
         raise SceneError(f"a mesh must be a file of {', '.join(FORMATS)}, got {file.name!r}")
-    trimesh, _ = _packages()
+    trimesh, _ = _import_packages()
     try:
         data = file.read_bytes()
         # From memory and without a resolver: the reader cannot open what the file names.
@@ -311,7 +311,7 @@ def _read(file: Path) -> Mesh:
         reason = "it is neither whole nor text" if isinstance(error, ImportError) else error  # a guesser of encodings
         raise SceneError(f"{file} must be a mesh in {kind.upper()}, and cannot be read as one: {reason}") from error
     _check_arrays(file, vertices, faces)
-    return _merged(vertices, faces)
+    return _merge_vertices(vertices, faces)
 
 
 def _check_arrays(file: Path, vertices: Vectors, faces: Faces) -> None:
@@ -323,7 +323,7 @@ def _check_arrays(file: Path, vertices: Vectors, faces: Faces) -> None:
         raise SceneError(f"{file} must have finite vertices, and some are NaN or infinite; export it again")
 
 
-def _merged(vertices: Vectors, faces: Faces) -> Mesh:
+def _merge_vertices(vertices: Vectors, faces: Faces) -> Mesh:
     """One vertex for each place, and no face that has lost its area by that."""
     size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()) or 1.0
     _, first, number = np.unique(np.rint(vertices / (1e-7 * size)), axis=0, return_index=True, return_inverse=True)
@@ -332,15 +332,15 @@ def _merged(vertices: Vectors, faces: Faces) -> Mesh:
     return Mesh(vertices[first], faces[whole])
 
 
-def _stand(mesh: Mesh, file: Path) -> Mesh:
+def _place_on_table(mesh: Mesh, file: Path) -> Mesh:
     """The mesh in mm, foot on z = 0, centred, faces outwards, after all checks. Raises SceneError."""
     _check_closed(mesh, file)
-    scale = 1000.0 if np.ptp(mesh.vertices, axis=0).max() < _METRES_BELOW else 1.0
-    standing = Mesh(mesh.vertices * scale, mesh.faces).resting(UP)
+    scale = 1000.0 if np.ptp(mesh.vertices, axis=0).max() < _MAX_METRE_EXTENT else 1.0
+    standing = Mesh(mesh.vertices * scale, mesh.faces).rest_on_table(UP)
     thin = np.ptp(standing.vertices, axis=0).min()
-    if thin < THINNEST_MM:
+    if thin < MIN_THICKNESS_MM:
         hint = f"at {scale:g} mm a unit; export it in mm or m, with z up"
-        raise SceneError(f"{file} must be at least {THINNEST_MM:g} mm thick, got {thin:.3g} mm {hint}")
+        raise SceneError(f"{file} must be at least {MIN_THICKNESS_MM:g} mm thick, got {thin:.3g} mm {hint}")
     if standing.volume_mm3 < 0:
         standing = Mesh(standing.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
     if standing.volume_mm3 < 1.0:
@@ -364,7 +364,7 @@ def _check_closed(mesh: Mesh, file: Path) -> None:
         raise SceneError(f"{file} must have all faces turned outwards; set them right with trimesh.repair.fix_normals")
 
 
-def _narrowest(vertices: Vectors) -> float:
+def _min_width(vertices: Vectors) -> float:
     """Smallest horizontal width, over the directions square to the sides of the outline's convex hull."""
     flat = vertices[:, :2]
     try:

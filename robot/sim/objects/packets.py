@@ -1,5 +1,5 @@
 """Formulas at work: rays and points in packets of `LANES`, by compiled code. All that it calls stands here (see
-robot.sim.compiled).
+robot.sim.jit).
 """
 
 from typing import NamedTuple
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.sim.compiled import compiled
+from robot.sim.jit import jit
 
 Floats = NDArray[np.float32]
 Vectors = NDArray[np.float64]
@@ -15,7 +15,7 @@ Vectors = NDArray[np.float64]
 LANES = 256
 """Points in a packet."""
 
-MOST_STEPS = 600
+MAX_STEPS = 600
 OPERATIONS = (
     *("add", "subtract", "multiply", "divide", "maximum", "minimum", "absolute", "sqrt", "rint"),
     *("floor", "copysign", "greater", "sin", "cos", "exp", "log", "log1p", "where"),
@@ -39,11 +39,11 @@ class Formula(NamedTuple):
     results: NDArray[np.int64]
 
 
-class Worn(NamedTuple):
+class DisplacedSolid(NamedTuple):
     """A solid under relief: f = distance(x, y, z) - height(s, t) * mask, in mm.
 
     distance: formula of (x, y, z). place: formula of (x, y, z) to map coordinates s, t and the mask. height_mm: the map
-    (rows, columns), empty for none; per_s, per_t: its pixels per mm; highest_mm: of its points; slope: how fast
+    (rows, columns), empty for none; per_s, per_t: its pixels per mm; max_height_mm: of its points; slope: how fast
     relief can change, mm per mm.
     """
 
@@ -52,15 +52,15 @@ class Worn(NamedTuple):
     height_mm: Floats
     per_s: float
     per_t: float
-    highest_mm: float
+    max_height_mm: float
     slope: float
 
 
-def run(formula: Formula, *operands: Floats) -> tuple[Floats, ...]:
+def evaluate_formula(formula: Formula, *operands: Floats) -> tuple[Floats, ...]:
     """What the function of the formula returns for arrays (n,) of float32."""
     given = np.stack(operands)
     results = np.empty((len(formula.results), given.shape[1]), np.float32)
-    _run_all(formula.code, _rows(formula), formula.results, given, results)
+    _evaluate_all(formula.code, _rows(formula), formula.results, given, results)
     return tuple(results)
 
 
@@ -68,21 +68,21 @@ def _rows(formula: Formula) -> Floats:
     return np.repeat(formula.start[:, None], LANES, axis=1)
 
 
-@compiled
-def _run_all(code, rows, places, given, results):  # type: ignore[no-untyped-def]
+@jit
+def _evaluate_all(code, rows, places, given, results):  # type: ignore[no-untyped-def]
     for first in range(0, given.shape[1], LANES):
         count = min(LANES, given.shape[1] - first)
         for row in range(given.shape[0]):
             for i in range(count):
                 rows[row, i] = given[row, first + i]
-        _run(code, rows)
+        _evaluate(code, rows)
         for number in range(len(places)):
             for i in range(count):
                 results[number, first + i] = rows[places[number], i]
 
 
-@compiled
-def _run(code, r):  # type: ignore[no-untyped-def]
+@jit
+def _evaluate(code, r):  # type: ignore[no-untyped-def]
     """Carry out the code on all lanes of the rows."""
     for line in range(len(code)):
         name, d, a, b, c = code[line, 0], code[line, 1], code[line, 2], code[line, 3], code[line, 4]
@@ -146,17 +146,17 @@ def _run(code, r):  # type: ignore[no-untyped-def]
 # A solid under relief ----------------------------------------------------------------------------------------
 
 
-def heights(height_mm: Floats, u: Floats, v: Floats) -> Floats:
+def interpolate_heights(height_mm: Floats, u: Floats, v: Floats) -> Floats:
     """The map (rows, columns) between its pixels at columns u and rows v, (n,) each; beyond its border as on it."""
     out = np.empty(len(u), np.float32)
-    _heights(height_mm, u, v, out)
+    _interpolate_heights(height_mm, u, v, out)
     return out
 
 
-def gradients(worn: Worn, points: Vectors, step_mm: float) -> Vectors:
+def gradients(solid: DisplacedSolid, points: Vectors, step_mm: float) -> Vectors:
     """Differences of f, (n, 3), over the corners of a tetrahedron of that size: four evaluations instead of six."""
     out = np.zeros(points.shape)
-    _gradients(worn, _rows_of(worn), points, np.float32(step_mm / 2), out)
+    _gradients(solid, _rows_of(solid), points, np.float32(step_mm / 2), out)
     return out
 
 
@@ -164,34 +164,35 @@ Rays = tuple[Vectors, Vectors, Vectors, Vectors]
 """Origins and directions (n, 3); from where to where along them a hit is looked for, (n,) mm each."""
 
 
-def first_hits(worn: Worn, rays: Rays, step_mm: float, most_steps: int = MOST_STEPS) -> Vectors:
+def first_hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int = MAX_STEPS) -> Vectors:
     """Distance (n,) along each ray to the first place where f is 0; inf: none. `step_mm` is the finest detail that
-    matters; a ray that has found nothing after `most_steps` is a miss."""
+    matters; a ray that has found nothing after `max_steps` is a miss.
+    """
     origins, directions, near, _ = rays
-    rows, found = _rows_of(worn), _crossed(worn, rays, step_mm, most_steps)
+    rows, found = _rows_of(solid), _find_crossings(solid, rays, step_mm, max_steps)
     out = np.full(len(near), np.inf)
-    _refine(worn, rows, origins, directions, near, found, out)
+    _refine(solid, rows, origins, directions, near, found, out)
     return out
 
 
-def hits(worn: Worn, rays: Rays, step_mm: float, most_steps: int = MOST_STEPS) -> NDArray[np.bool_]:
+def hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int = MAX_STEPS) -> NDArray[np.bool_]:
     """Which rays have such a first hit, (n,)."""
-    return np.asarray(np.isfinite(_crossed(worn, rays, step_mm, most_steps)[0]))
+    return np.asarray(np.isfinite(_find_crossings(solid, rays, step_mm, max_steps)[0]))
 
 
-def _crossed(worn: Worn, rays: Rays, step_mm: float, most_steps: int) -> Floats:
+def _find_crossings(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int) -> Floats:
     """What `_march` finds, (4, n)."""
     found = np.full((4, len(rays[0])), np.inf, np.float32)
-    _march(worn, _rows_of(worn), *rays, np.float32(0.5 * step_mm), most_steps, found)
+    _march(solid, _rows_of(solid), *rays, np.float32(0.5 * step_mm), max_steps, found)
     return found
 
 
-def _rows_of(worn: Worn) -> tuple[Floats, Floats]:
+def _rows_of(solid: DisplacedSolid) -> tuple[Floats, Floats]:
     """Rows of the two formulas, to work on."""
-    return _rows(worn.distance), _rows(worn.place)
+    return _rows(solid.distance), _rows(solid.place)
 
 
-@compiled
+@jit
 def _bilinear(height, u, v):  # type: ignore[no-untyped-def]
     last_row, last_column = height.shape[0] - 1, height.shape[1] - 1
     u = min(max(u, np.float32(0)), np.float32(last_column))
@@ -205,39 +206,39 @@ def _bilinear(height, u, v):  # type: ignore[no-untyped-def]
     return upper + q * (lower - upper)
 
 
-@compiled
-def _heights(height, u, v, out):  # type: ignore[no-untyped-def]
+@jit
+def _interpolate_heights(height, u, v, out):  # type: ignore[no-untyped-def]
     for i in range(len(u)):
         out[i] = _bilinear(height, u[i], v[i])
 
 
-@compiled
-def _lifts(worn, rows, count):  # type: ignore[no-untyped-def]
+@jit
+def _relief_heights(solid, rows, count):  # type: ignore[no-untyped-def]
     """Relief at the points in the rows, into the first row."""
-    _run(worn.place.code, rows)
-    s, t, mask = worn.place.results[0], worn.place.results[1], worn.place.results[2]
-    per_s, per_t = np.float32(worn.per_s), np.float32(worn.per_t)
+    _evaluate(solid.place.code, rows)
+    s, t, mask = solid.place.results[0], solid.place.results[1], solid.place.results[2]
+    per_s, per_t = np.float32(solid.per_s), np.float32(solid.per_t)
     for i in range(count):
-        rows[0, i] = _bilinear(worn.height_mm, rows[s, i] * per_s, rows[t, i] * per_t) * rows[mask, i]
+        rows[0, i] = _bilinear(solid.height_mm, rows[s, i] * per_s, rows[t, i] * per_t) * rows[mask, i]
 
 
-@compiled
-def _fields(worn, rows, count):  # type: ignore[no-untyped-def]
-    """f at the points in the first rows of rows[0], into its row of results."""
-    base, wear = rows
-    if worn.height_mm.size:
+@jit
+def _evaluate_field(solid, rows, count):  # type: ignore[no-untyped-def]
+    """F at the points in the first rows of rows[0], into its row of results."""
+    base, relief_rows = rows
+    if solid.height_mm.size:
         for row in range(3):
             for i in range(count):
-                wear[row, i] = base[row, i]
-    _run(worn.distance.code, base)
-    if worn.height_mm.size:
-        _lifts(worn, wear, count)
+                relief_rows[row, i] = base[row, i]
+    _evaluate(solid.distance.code, base)
+    if solid.height_mm.size:
+        _relief_heights(solid, relief_rows, count)
         for i in range(count):
-            base[worn.distance.results[0], i] -= wear[0, i]
+            base[solid.distance.results[0], i] -= relief_rows[0, i]
 
 
-@compiled
-def _gradients(worn, rows, points, half, out):  # type: ignore[no-untyped-def]
+@jit
+def _gradients(solid, rows, points, half, out):  # type: ignore[no-untyped-def]
     for first in range(0, len(out), LANES):
         count = min(LANES, len(out) - first)
         for corner in range(4):
@@ -246,11 +247,11 @@ def _gradients(worn, rows, points, half, out):  # type: ignore[no-untyped-def]
                 side = half if corner == 0 or corner == axis + 1 else -half
                 for i in range(count):
                     rows[0][axis, i] = np.float32(points[first + i, axis]) + side
-            _fields(worn, rows, count)
+            _evaluate_field(solid, rows, count)
             for axis in range(3):
                 sign = 1.0 if corner == 0 or corner == axis + 1 else -1.0
                 for i in range(count):
-                    out[first + i, axis] += sign * rows[0][worn.distance.results[0], i]
+                    out[first + i, axis] += sign * rows[0][solid.distance.results[0], i]
 
 
 # Rays --------------------------------------------------------------------------------------------------------
@@ -258,18 +259,18 @@ def _gradients(worn, rows, points, half, out):  # type: ignore[no-untyped-def]
 _ORIGIN, _DIRECTION, _T, _BEFORE, _F_BEFORE, _ROOM, _STEPS, _LANE_ROWS = 0, 3, 6, 7, 8, 9, 10, 11
 
 
-@compiled
-def _march(worn, rows, origins, directions, near, far, finest, most_steps, found):  # type: ignore[no-untyped-def]
+@jit
+def _march(solid, rows, origins, directions, near, far, finest, max_steps, found):  # type: ignore[no-untyped-def]
     """Sphere tracing until f changes sign: `found` is t and f just inside (inf: a miss), t and f just outside.
 
     Outside the shell that relief can reach, the step is the distance to it. Within, f / L is safe (L bounds the
     slope of f), and no step is shorter than a stride: `finest`, and up to four times that for rays that graze for
     long. A lane whose ray has ended takes the next ray, so that packets stay full.
     """
-    base, wear = rows
-    result, worn_out = worn.distance.results[0], worn.height_mm.size > 0
-    highest = np.float32(worn.highest_mm)
-    bound = np.float32(1 + worn.slope) if worn_out else np.float32(1)
+    base, relief_rows = rows
+    result, has_relief = solid.distance.results[0], solid.height_mm.size > 0
+    highest = np.float32(solid.max_height_mm)
+    bound = np.float32(1 + solid.slope) if has_relief else np.float32(1)
     lanes = np.zeros((_LANE_ROWS, LANES), np.float32)
     gaps = np.empty(LANES, np.float32)
     ray, low = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
@@ -292,26 +293,26 @@ def _march(worn, rows, origins, directions, near, far, finest, most_steps, found
             for i in range(LANES):
                 base[axis, i] = lanes[_ORIGIN + axis, i] + lanes[_T, i] * lanes[_DIRECTION + axis, i]
         touched = 0
-        if worn_out:
+        if has_relief:
             for axis in range(3):
                 for i in range(LANES):
-                    wear[axis, i] = base[axis, i]
-        _run(worn.distance.code, base)
+                    relief_rows[axis, i] = base[axis, i]
+        _evaluate(solid.distance.code, base)
         for i in range(LANES):
             gaps[i] = base[result, i] - highest
-        if worn_out:
+        if has_relief:
             for i in range(count):
                 if gaps[i] <= 0:
                     low[touched] = i
                     for axis in range(3):
-                        wear[axis, touched] = wear[axis, i]
+                        relief_rows[axis, touched] = relief_rows[axis, i]
                     touched += 1
             if touched:
-                _lifts(worn, wear, touched)
+                _relief_heights(solid, relief_rows, touched)
         for i in range(LANES):
             base[0, i] = gaps[i]
         for k in range(touched):
-            base[0, low[k]] = gaps[low[k]] + highest - wear[0, k]
+            base[0, low[k]] = gaps[low[k]] + highest - relief_rows[0, k]
         for i in range(count):
             if base[0, i] <= 0:
                 found[0, ray[i]], found[1, ray[i]] = lanes[_T, i], base[0, i]
@@ -329,7 +330,7 @@ def _march(worn, rows, origins, directions, near, far, finest, most_steps, found
         end = count
         count = 0
         for i in range(end):
-            if base[0, i] > 0 and lanes[_BEFORE, i] <= lanes[_ROOM, i] and lanes[_STEPS, i] < most_steps:
+            if base[0, i] > 0 and lanes[_BEFORE, i] <= lanes[_ROOM, i] and lanes[_STEPS, i] < max_steps:
                 if count < i:
                     ray[count] = ray[i]
                     for row in range(_LANE_ROWS):
@@ -337,10 +338,10 @@ def _march(worn, rows, origins, directions, near, far, finest, most_steps, found
                 count += 1
 
 
-@compiled
-def _refine(worn, rows, origins, directions, near, found, out):  # type: ignore[no-untyped-def]
+@jit
+def _refine(solid, rows, origins, directions, near, found, out):  # type: ignore[no-untyped-def]
     """Close in on the zero between a point outside and one inside, by false position, twice and once more."""
-    base, result = rows[0], worn.distance.results[0]
+    base, result = rows[0], solid.distance.results[0]
     ray = np.empty(LANES, np.int64)
     upcoming = 0
     while upcoming < len(near):
@@ -353,26 +354,26 @@ def _refine(worn, rows, origins, directions, near, found, out):  # type: ignore[
         for turn in range(3):
             for i in range(count):
                 number = ray[i]
-                t = _between(found, number) if turn else found[2, number]
+                t = _zero_crossing(found, number) if turn else found[2, number]
                 for axis in range(3):
                     start = origins[number, axis] + near[number] * directions[number, axis]
                     base[axis, i] = np.float32(start) + t * np.float32(directions[number, axis])
-            _fields(worn, rows, count)
+            _evaluate_field(solid, rows, count)
             for i in range(count):
                 number, f = ray[i], base[result, i]
                 if turn == 0:
                     if found[3, number] == 0:
                         found[3, number] = f
                 elif f > 0:
-                    found[2, number], found[3, number] = _between(found, number), f
+                    found[2, number], found[3, number] = _zero_crossing(found, number), f
                 else:
-                    found[0, number], found[1, number] = _between(found, number), f
+                    found[0, number], found[1, number] = _zero_crossing(found, number), f
         for i in range(count):
-            out[ray[i]] = near[ray[i]] + _between(found, ray[i])
+            out[ray[i]] = near[ray[i]] + _zero_crossing(found, ray[i])
 
 
-@compiled
-def _between(found, number):  # type: ignore[no-untyped-def]
+@jit
+def _zero_crossing(found, number):  # type: ignore[no-untyped-def]
     """Where the chord from f > 0 before to f <= 0 at the hit meets 0."""
     high, f_high, low, f_low = found[0, number], found[1, number], found[2, number], found[3, number]
     share = f_low / max(f_low - f_high, np.float32(1e-9))

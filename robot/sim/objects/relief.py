@@ -36,7 +36,7 @@ class Relief:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        known_relief(self.name)
+        check_relief_name(self.name)
         if not (0 <= self.amplitude_mm <= 6 and 1 <= self.pitch_mm <= 30 and self.aspect >= 1):
             raise RobotConfigError(
                 f"a relief must have an amplitude of 0 to 6 mm, a pitch of 1 to 30 mm and an aspect of at least 1, got "
@@ -117,7 +117,7 @@ def _crest(wave: Floats, sharpness: float) -> Floats:
     return np.asarray(np.float32(0.5) + np.tanh(wave * gain) / np.float32(2 * np.tanh(gain)))
 
 
-def _edge(relief: Relief) -> float:
+def _edge_blur_mm(relief: Relief) -> float:
     """Blur in mm of a step's edge: no steeper than a mould or a tool leaves it."""
     return 0.1 + 0.25 * (1 - relief.sharpness) + 0.2 * relief.amplitude_mm
 
@@ -215,7 +215,7 @@ def scratches(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
         cv2.line(
             canvas, one.tolist(), two.tolist(), int(rng.integers(90, 256)), int(rng.integers(1, 4)), cv2.LINE_AA, 4
         )
-    return np.float32(1.5) * sheet.blur(_wrapped(canvas, sheet), 0.12)
+    return np.float32(1.5) * sheet.blur(_fold_seam(canvas, sheet), 0.12)
 
 
 def layers(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
@@ -241,7 +241,7 @@ def glyphs(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
             text = text[:-1]
         place = (int((2 + row % 2 * 9) * size), int(line))
         cv2.putText(canvas, text, place, font, size, 255, thick, cv2.LINE_AA)
-    return sheet.blur(_wrapped(np.ascontiguousarray(canvas[::-1]), sheet), _edge(relief))
+    return sheet.blur(_fold_seam(np.ascontiguousarray(canvas[::-1]), sheet), _edge_blur_mm(relief))
 
 
 def scales(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
@@ -253,7 +253,7 @@ def scales(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
         x = u + np.float32(shift) - np.floor(u + np.float32(shift)) - np.float32(0.5)
         y = (v + np.float32(shift * 2) + np.float32(2.2) * x * x) / 2
         height = np.maximum(height, 1 - (y - np.floor(y)) - np.float32(0.9) * np.abs(x))
-    return sheet.blur(height, _edge(relief))
+    return sheet.blur(height, _edge_blur_mm(relief))
 
 
 def waffle(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
@@ -284,7 +284,7 @@ def _canvas(sheet: Sheet) -> NDArray[np.uint8]:
     return np.zeros((sheet.rows, 2 * sheet.columns), np.uint8)
 
 
-def _wrapped(canvas: NDArray[np.uint8], sheet: Sheet) -> Floats:
+def _fold_seam(canvas: NDArray[np.uint8], sheet: Sheet) -> Floats:
     folded = np.maximum(canvas[:, : sheet.columns], canvas[:, sheet.columns :])
     return np.asarray(folded / np.float32(255))
 
@@ -321,7 +321,7 @@ _RANGES: Mapping[str, tuple[float, float, float, float, float, float]] = Mapping
 )
 
 
-def known_relief(name: str) -> str:
+def check_relief_name(name: str) -> str:
     """The name, if there is such a family. Raises UnknownName."""
     if name not in RELIEFS:
         raise UnknownName(f"relief must be one of {', '.join(RELIEFS)}; got {name!r}")
@@ -330,7 +330,7 @@ def known_relief(name: str) -> str:
 
 def draw_relief(name: str, rng: Rng, limit_mm: float) -> Relief:
     """An instance of the family, no higher than the shape allows (`limit_mm`). Raises UnknownName."""
-    short, long, low, high, steep, chance = _RANGES[known_relief(name)]
+    short, long, low, high, steep, chance = _RANGES[check_relief_name(name)]
     pitch = float(np.exp(rng.uniform(np.log(short), np.log(long))))
     top = max(min(high, steep * pitch, limit_mm), min(low, limit_mm))
     amplitude = float(min(low, top) * (top / max(min(low, top), 1e-9)) ** rng.uniform())

@@ -13,8 +13,8 @@ from scipy.spatial import ConvexHull, QhullError
 Array = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
 
-_TOUCHES_MM = 1.0
-_STEADY = math.radians(4.0)
+_CONTACT_TOLERANCE_MM = 1.0
+_MIN_TIPPING_RAD = math.radians(4.0)
 """A solid that falls over when it is tilted by less does not rest."""
 
 _SAME_COSINE = math.cos(math.radians(20.0))
@@ -23,7 +23,7 @@ _SAME_COSINE = math.cos(math.radians(20.0))
 _MAX_POSES = 6
 
 
-def resting_ups(vertices: Array, centre_of_mass: Array) -> list[Array]:
+def stable_up_directions(vertices: Array, centre_of_mass: Array) -> list[Array]:
     """Directions (3,) of the solid that point up when it rests: its own z first or one near it, then the steadiest.
 
     vertices (V, 3). A solid that rests nowhere stands as it is.
@@ -37,7 +37,7 @@ def resting_ups(vertices: Array, centre_of_mass: Array) -> list[Array]:
     _, first = np.unique(np.rint(hull.equations[:, :3] / 0.02), axis=0, return_index=True)
     tried = [UP, *-hull.equations[np.sort(first), :3]]
     angles = [tipping_angle(corners, -up) for up in tried]
-    steady = sorted((number == 0, angle, number) for number, angle in enumerate(angles) if angle > _STEADY)
+    steady = sorted((number == 0, angle, number) for number, angle in enumerate(angles) if angle > _MIN_TIPPING_RAD)
     poses: list[Array] = []
     for up in (tried[number] for *_, number in reversed(steady)):
         if all(up @ other < _SAME_COSINE for other in poses):
@@ -53,7 +53,7 @@ def tipping_angle(corners: Array, down: Array) -> float:
     """
     depth = corners @ down
     height = float(depth.max())
-    touching = corners[depth >= height - _TOUCHES_MM] @ turn_up(-down).T
+    touching = corners[depth >= height - _CONTACT_TOLERANCE_MM] @ rotation_to_up(-down).T
     try:
         edges = ConvexHull(touching[:, :2]).equations if len(touching) > 2 else None
     except QhullError:  # they lie in a line
@@ -61,7 +61,7 @@ def tipping_angle(corners: Array, down: Array) -> float:
     return -1.0 if edges is None else math.atan2(-float(edges[:, 2].max()), height)
 
 
-def turn_up(up: Array) -> Array:
+def rotation_to_up(up: Array) -> Array:
     """(3, 3): the shortest rotation that brings the unit direction `up` (3,) to z."""
     x, y, z = up
     if z < -1 + 1e-9:

@@ -10,93 +10,93 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from robot.sim.objects.packets import heights
+from robot.sim.objects.packets import interpolate_heights
 from robot.sim.objects.relief import Relief, Sheet
-from robot.sim.objects.shapes.base import Chart, Floats, Points, Shape
+from robot.sim.objects.shapes.shape import Chart, Floats, Points, Shape
 
-FINEST_MM = 0.14
-_MOST_NODES = 1.2e6
+MIN_PIXEL_MM = 0.14
+_MAX_NODES = 1.2e6
 _LEVELS = 4
 _CELL_MM = 1.5
 
 
 @dataclass(frozen=True)
-class Level:
+class ReliefLevel:
     """One height map in mm, with its highest point and how fast relief can change with place (mm per mm)."""
 
     height_mm: Floats
     per_s: float
     per_t: float
-    highest_mm: float
+    max_height_mm: float
     slope: float
     pixel_mm: float
 
     def at(self, s: Floats, t: Floats) -> Floats:
         """Heights at map coordinates in mm, (N,) each."""
-        return heights(self.height_mm, s * np.float32(self.per_s), t * np.float32(self.per_t))
+        return interpolate_heights(self.height_mm, s * np.float32(self.per_s), t * np.float32(self.per_t))
 
 
 @dataclass(frozen=True)
-class Wall:
+class ReliefLevels:
     """The baked relief of a shape, in levels of halved resolution."""
 
-    levels: tuple[Level, ...]
+    levels: tuple[ReliefLevel, ...]
 
-    def level(self, step_mm: float) -> Level:
+    def level(self, step_mm: float) -> ReliefLevel:
         """The coarsest level whose pixels are not wider than `step_mm` (or the finest)."""
         fitting = [level for level in self.levels if level.pixel_mm <= step_mm]
         return fitting[-1] if fitting else self.levels[0]
 
 
-def bake(shape: Shape, relief: Relief) -> Wall | None:
+def bake(shape: Shape, relief: Relief) -> ReliefLevels | None:
     """Draw relief and the shape's own pattern on its wall; None for a bare shape."""
     sheet = _sheet(shape.chart)
-    height, macro = relief.height(sheet), shape.macro(sheet.s, sheet.t)
-    if height is None and macro is None:
+    height, wall_pattern = relief.height(sheet), shape.wall_pattern(sheet.s, sheet.t)
+    if height is None and wall_pattern is None:
         return None
-    weight, stretch = _fit(shape, sheet, relief.amplitude_mm)
-    total = np.asarray(sum(part for part in (height, macro) if part is not None) * weight, np.float32)
-    return Wall(tuple(_levels(total, sheet, stretch, shape.mask_slope)))
+    weight, stretch = _relief_weights(shape, sheet, relief.amplitude_mm)
+    total = np.asarray(sum(part for part in (height, wall_pattern) if part is not None) * weight, np.float32)
+    return ReliefLevels(tuple(_levels(total, sheet, stretch, shape.mask_slope)))
 
 
-def bake_plain(chart: Chart, relief: Relief) -> Wall | None:
+def bake_plain(chart: Chart, relief: Relief) -> ReliefLevels | None:
     """Relief alone, everywhere; None for a smooth one."""
     sheet = _sheet(chart)
     height = relief.height(sheet)
-    return None if height is None else Wall(tuple(_levels(height, sheet, np.ones(2, np.float32), 0.0)))
+    return None if height is None else ReliefLevels(tuple(_levels(height, sheet, np.ones(2, np.float32), 0.0)))
 
 
 def _sheet(chart: Chart) -> Sheet:
     """Nodes for a wall; columns and rows can be halved `_LEVELS` times."""
     width, height = chart.width_mm, chart.height_mm
-    pixel = max(FINEST_MM, np.sqrt(width * height / _MOST_NODES))
+    pixel = max(MIN_PIXEL_MM, np.sqrt(width * height / _MAX_NODES))
     block = 2 ** (_LEVELS - 1)
     return Sheet(
         width, height, block * int(np.ceil(height / pixel / block)) + 1, block * int(np.ceil(width / pixel / block))
     )
 
 
-def _levels(height: Floats, sheet: Sheet, stretch: Floats, mask_slope: float) -> list[Level]:
+def _levels(height: Floats, sheet: Sheet, stretch: Floats, mask_slope: float) -> list[ReliefLevel]:
     levels = []
     for number in range(_LEVELS):
         if number:
-            height = np.ascontiguousarray(_halved(height))
+            height = np.ascontiguousarray(_downsample(height))
         rows, columns = height.shape
         per_s, per_t = columns / sheet.width_mm, (rows - 1) / sheet.height_mm
         padded = np.concatenate([height, height[:, :2]], axis=1)
-        slope = _steepest(padded, per_s, per_t, stretch) + mask_slope * float(np.abs(height).max())
-        levels.append(Level(padded, per_s, per_t, float(height.max()), slope, max(1 / per_s, 1 / per_t)))
+        slope = _max_slope(padded, per_s, per_t, stretch) + mask_slope * float(np.abs(height).max())
+        levels.append(ReliefLevel(padded, per_s, per_t, float(height.max()), slope, max(1 / per_s, 1 / per_t)))
     return levels
 
 
-def _halved(height: Floats) -> Floats:
+def _downsample(height: Floats) -> Floats:
     """Every other node after a binomial blur; the blur is periodic along s and keeps the ends of t."""
     wide = cv2.copyMakeBorder(height, 0, 0, 2, 2, cv2.BORDER_WRAP)
     kernel = np.array([1, 4, 6, 4, 1], np.float32) / 16
     return np.asarray(cv2.sepFilter2D(wide, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)[::2, 2:-2:2])
 
 
-def _steepest(padded: Floats, per_s: float, per_t: float, stretch: Floats) -> float:
+def _max_slope(padded: Floats, per_s: float, per_t: float, stretch: Floats) -> float:
     """The largest slope of the bilinear surface, measured on the object and not on the map."""
     across = cv2.absdiff(padded[:, 1:], padded[:, :-1]).max(axis=1) * per_s
     rows = np.linspace(0, len(stretch) - 1, len(across)).round().astype(int)
@@ -107,7 +107,7 @@ def _steepest(padded: Floats, per_s: float, per_t: float, stretch: Floats) -> fl
 # Where relief belongs ----------------------------------------------------------------------------------------
 
 
-def _fit(shape: Shape, sheet: Sheet, amplitude_mm: float) -> tuple[Floats, Floats]:
+def _relief_weights(shape: Shape, sheet: Sheet, amplitude_mm: float) -> tuple[Floats, Floats]:
     """Weight of relief at each node (rows, columns), and how much the map is stretched, by coarse row.
 
     The wall is looked at from outside, along the chart's rays, on a coarse grid.
@@ -116,17 +116,17 @@ def _fit(shape: Shape, sheet: Sheet, amplitude_mm: float) -> tuple[Floats, Float
     columns = max(int(sheet.width_mm / _CELL_MM), 24)
     coarse = Sheet(sheet.width_mm, sheet.height_mm, rows, columns)
     s, t = np.meshgrid(coarse.s, coarse.t)
-    points, hit, facing, gain = _look(shape, s.ravel(), t.ravel())
+    points, hit, facing, gain = _cast_chart_rays(shape, s.ravel(), t.ravel())
     place = np.where(hit[:, None], points, np.nan).reshape(rows, columns, 3)
     step = np.linalg.norm(np.roll(place, -1, axis=1) - np.roll(place, 1, axis=1), axis=2) / (2 * coarse.pixel_mm[1])
     room = np.nan_to_num(step, nan=0.0).clip(0.05, 1)
     weight = (smoothstep(facing, 0.35, 0.8) * gain).reshape(rows, columns) * np.clip(2.2 * room - 0.2, 0, 1)
     weight *= ends_weight(coarse.t, coarse.height_mm, max(1.5, 0.8 * amplitude_mm))[:, None]
     used = np.where(weight > 0.02, room, 1).min(axis=1)
-    return _spread(weight.astype(np.float32), coarse, sheet, amplitude_mm), np.asarray(1 / used, np.float32)
+    return _upsample_weights(weight.astype(np.float32), coarse, sheet, amplitude_mm), np.asarray(1 / used, np.float32)
 
 
-def _look(shape: Shape, s: Floats, t: Floats) -> tuple[Points, NDArray[np.bool_], Points, Points]:
+def _cast_chart_rays(shape: Shape, s: Floats, t: Floats) -> tuple[Points, NDArray[np.bool_], Points, Points]:
     """What the chart's rays meet: points, hits, cosine to the ray, and the distance's own slope there."""
     origins, directions = shape.chart.rays(s, t)
     p, d = origins.astype(np.float32), directions.astype(np.float32)
@@ -161,7 +161,7 @@ def ends_weight(t: Points, height_mm: float, fade_mm: float) -> Points:
     return smoothstep(np.minimum(t, height_mm - t), 0.3, 0.3 + fade_mm)
 
 
-def _spread(weight: Floats, coarse: Sheet, sheet: Sheet, amplitude_mm: float) -> Floats:
+def _upsample_weights(weight: Floats, coarse: Sheet, sheet: Sheet, amplitude_mm: float) -> Floats:
     """Weights on the fine nodes, drawn back from where they end and softened."""
     wide = cv2.copyMakeBorder(weight, 0, 0, 4, 4, cv2.BORDER_WRAP)
     calm = cv2.erode(wide, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)

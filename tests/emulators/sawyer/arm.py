@@ -30,7 +30,7 @@ class SawyerModel:
         self.velocity = np.zeros(7)
         self.enabled, self.stopped, self.error = True, False, False
         self.estop_button = self.estop_source = 0
-        self.collided = False
+        self.has_collided = False
         self.speed_ratio, self.command_timeout_s = 0.3, 0.2
         self._target: Joints | None = None
         self._command_age_s = 0.0

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from tests.emulators.faults import Faults
+from tests.emulators.faults import FaultInjector
 from tests.emulators.interrupts import until_interrupted
 from tests.emulators.sawyer.arm import SawyerModel, forward, inverse
 
@@ -28,14 +28,14 @@ MESSAGE_FAULTS = ("dropped", "duplicated", "corrupted")
 REPLY_FAULTS = (*MESSAGE_FAULTS, "delayed", "wrong_id", "ik_failed", "disconnected")
 
 
-class MessageFaults(Faults):
+class MessageFaults(FaultInjector):
     """What the server sends is dropped, duplicated, corrupted (cut short); a reply of a service is besides delayed,
     sent with a wrong_id, ik_failed, or the connection is disconnected instead; a command is command_dropped."""
 
     KINDS = (*REPLY_FAULTS, "command_dropped")
 
 
-class Client:
+class RosbridgeClient:
     """One connection: what it subscribed to and advertised, and how to send to it."""
 
     def __init__(self, connection: Any) -> None:
@@ -72,9 +72,9 @@ class EmulatedSawyer:
         self.commands: deque[tuple[float, list[float]]] = deque(maxlen=5000)
         self.calls = 0
         self._lock = threading.RLock()
-        self._clients: set[Client] = set()
+        self._clients: set[RosbridgeClient] = set()
         self._latched: dict[str, Mapping[str, Any]] = {}
-        self._later: list[tuple[float, Client, str]] = []
+        self._later: list[tuple[float, RosbridgeClient, str]] = []
         self._ended = threading.Event()
         self._now = time.monotonic()
 
@@ -97,7 +97,7 @@ class EmulatedSawyer:
 
     def handle(self, connection: Any) -> None:
         """Serve one connection until it ends."""
-        client = Client(connection)
+        client = RosbridgeClient(connection)
         with self._lock:
             self._clients.add(client)
         try:
@@ -142,7 +142,10 @@ class EmulatedSawyer:
             "/robot/joint_states": self._joint_states,
             "/robot/state": self._robot_state,
             LIMB + "tip_states": self._tip_states,
-            LIMB + "collision_detection_state": lambda: {"header": _header(), "collision_state": self.model.collided},
+            LIMB + "collision_detection_state": lambda: {
+                "header": _header(),
+                "collision_state": self.model.has_collided,
+            },
         }
 
     def _joint_states(self) -> Mapping[str, Any]:
@@ -172,7 +175,7 @@ class EmulatedSawyer:
         pose = {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
         return {"header": _header(), "names": [TIP], "states": [{"header": _header(), "pose": pose}]}
 
-    def _take(self, client: Client, text: str | bytes) -> None:
+    def _take(self, client: RosbridgeClient, text: str | bytes) -> None:
         try:
             operation = json.loads(text)
             name = operation["op"]
@@ -188,13 +191,13 @@ class EmulatedSawyer:
         except (KeyError, TypeError, ValueError, IndexError) as error:
             client.send(json.dumps({"op": "status", "level": "error", "msg": f"not understood: {error!r}"}))
 
-    def _subscribe(self, client: Client, operation: Mapping[str, Any]) -> None:
+    def _subscribe(self, client: RosbridgeClient, operation: Mapping[str, Any]) -> None:
         topic = operation["topic"]
         client.subscribed.add(topic)
         if topic in self._latched:
             client.send(json.dumps({"op": "publish", "topic": topic, "msg": self._latched[topic]}))
 
-    def _published(self, client: Client, operation: Mapping[str, Any]) -> None:
+    def _published(self, client: RosbridgeClient, operation: Mapping[str, Any]) -> None:
         """Act on what is published and pass it on to who subscribed to it."""
         topic, message = operation["topic"], operation["msg"]
         if topic not in client.advertised:
@@ -223,14 +226,14 @@ class EmulatedSawyer:
             self.model.command(target)
             self.commands.append((self._now, target))
 
-    def _called(self, client: Client, operation: Mapping[str, Any]) -> None:
+    def _called(self, client: RosbridgeClient, operation: Mapping[str, Any]) -> None:
         self.calls += 1
         good = operation["service"] == IK_SERVICE
         values = self._solve(operation["args"]) if good else f"Service {operation['service']} does not exist"
         reply = {"op": "service_response", "service": operation["service"], "values": values, "result": good}
         self._reply(client, reply | {"id": operation.get("id")})
 
-    def _reply(self, client: Client, reply: dict[str, Any]) -> None:
+    def _reply(self, client: RosbridgeClient, reply: dict[str, Any]) -> None:
         fault = self.faults.draw(REPLY_FAULTS)
         if fault == "disconnected":
             client.drop()
@@ -274,7 +277,7 @@ class EmulatedSawyer:
         places = dict(zip(seed["name"], seed["position"], strict=True))
         return [float(places[name]) for name in JOINT_NAMES]
 
-    def _send(self, client: Client, text: str, possible: Sequence[str]) -> None:
+    def _send(self, client: RosbridgeClient, text: str, possible: Sequence[str]) -> None:
         for part in _damaged(text, self.faults.draw(possible)):
             client.send(part)
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from robot.drivers.wsg50.codec import Packet, WireError, encode
-from tests.emulators.faults import Faults
+from tests.emulators.faults import FaultInjector
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Piece:
     pause_s: float = 0.0
 
 
-class LineFaults(Faults):
+class LineFaults(FaultInjector):
     """Damages packets. delay_s: how late a delayed packet is, and the pause within a split one."""
 
     KINDS = ("dropped", "duplicated", "corrupted", "delayed", "split", "wrong id", "disconnect")

@@ -32,7 +32,7 @@ STOPPED_BIT, REACHED_BIT, FORCE_BIT, FAST_STOP_BIT = 6, 7, 9, 12
 SPEEDS, ACCELERATIONS, FORCES = (5.0, 420.0), (100.0, 5000.0), (5.0, 80.0)
 LENGTHS = {0x20: 1, 0x21: 9, 0x24: 3, 0x25: 8, 0x26: 8, 0x30: 4, 0x32: 4, 0x34: 8}
 
-_MOST_HEARD = 100_000
+_MAX_RECEIVED = 100_000
 _HOMING_MM_S = 100.0
 _CLAMPING_MM = 3.0
 """Clamping travel: how far beyond the nominal width the fingers look for a part."""
@@ -68,7 +68,7 @@ class EmulatedWSG50:
         self.answers_bad_checksum, self.error_on_disconnect = False, True
         self.next_status: dict[int, int] = {}
         self.keeps_force_n: float | None = None
-        self.heard: list[int] = []
+        self.received: list[int] = []
         self.grasping, self._bits = IDLE, {REFERENCED_BIT} if referenced else set()
         self.force_limit_n = 40.0
         self.soft_limits: tuple[float, float] | None = None
@@ -148,8 +148,8 @@ class EmulatedWSG50:
         """Do a command; returns what it answers at once."""
         with self._lock:
             self._advance()
-            self.heard.append(packet.id)
-            del self.heard[:-_MOST_HEARD]
+            self.received.append(packet.id)
+            del self.received[:-_MAX_RECEIVED]
             forced = self.next_status.pop(packet.id, None)
             answer = self._answer(packet.id, packet.payload) if forced is None else forced
             if not isinstance(answer, int) and len(answer) > MAX_PAYLOAD - 2:

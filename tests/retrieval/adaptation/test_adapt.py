@@ -10,22 +10,30 @@ import torch
 
 import retrieval
 from retrieval.adaptation import folds
-from retrieval.adaptation.curve import AS_IT_IS, BLURRED, BOTH, PUBLISHED, TAUGHT, learning_curve, write_curve
+from retrieval.adaptation.curve import (
+    ADAPTED,
+    LOW_PASS,
+    PUBLISHED_TOWERS,
+    START_TOWERS,
+    UNADAPTED,
+    learning_curve,
+    write_curve,
+)
+from retrieval.adaptation.data import PUBLISHED_TOWER, config_for, load_adaptation_data, load_start_weights
 from retrieval.adaptation.estimate import Estimate
-from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, tell_apart
-from retrieval.adaptation.material import BESIDE, config_for, encode, take_over
+from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, score_accuracy
 from retrieval.adaptation.recipe import adapt
 from retrieval.commands.main import main
 from retrieval.commands.options import training_config
 from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.methods import cca_towers
-from retrieval.methods.cca_towers import GRID, Affine, CcaSettings, choose, fit_codes
+from retrieval.methods.cca_towers import GRID, AffineMap, CcaSettings, fit_projections, select_settings
 from retrieval.methods.selection import Validator
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers import build_tower
-from retrieval.model.towers.small import Small
+from retrieval.model.towers.small import SmallTower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.features import Features
 from retrieval.training.train import build_matcher
@@ -37,7 +45,7 @@ def unchecked(monkeypatch):
     monkeypatch.setattr("retrieval.adaptation.fitting.with_verdicts", lambda made, *_, **__: made)
 
 
-def seen_alike(objects=30, grasps=6, seed=0):
+def correlated_features(objects=30, grasps=6, seed=0):
     """Features of touches (n, 12) and photos (n, 10) that share five numbers of their object, with noise, and whose
     each grasp is (n,)."""
     rng = np.random.default_rng(seed)
@@ -48,35 +56,35 @@ def seen_alike(objects=30, grasps=6, seed=0):
     return touch.astype(np.float32), photo[:, :10].astype(np.float32), owner
 
 
-def first_rank(codes, touch, photo, owner):
-    best = owner[codes.cosines(touch, photo).argmax(1)]
+def top1_accuracy(projections, touch, photo, owner):
+    best = owner[projections.cosines(touch, photo).argmax(1)]
     return float((best == owner).mean())
 
 
-def test_codes_tell_objects_that_no_fit_saw():
-    touch, photo, owner = seen_alike()
-    other = seen_alike(seed=1)
-    codes = dict(fit_codes(touch, photo, owner, ([12], [10])))
-    assert set(codes) == set(GRID)
-    assert all(first_rank(found, *other) > 0.9 for found in codes.values())  # chance 1 / 30
+def test_codes_distinguish_unseen_objects():
+    touch, photo, owner = correlated_features()
+    other = correlated_features(seed=1)
+    projections = dict(fit_projections(touch, photo, owner, ([12], [10])))
+    assert set(projections) == set(GRID)
+    assert all(top1_accuracy(found, *other) > 0.9 for found in projections.values())  # chance 1 / 30
     dealt = np.random.default_rng(2).permutation(30)[owner]  # photos of other objects
-    nothing = dict(fit_codes(touch, photo[np.argsort(dealt, kind="stable")], owner, ([12], [10])))
-    assert all(first_rank(found, *other) < 0.2 for found in nothing.values())
+    nothing = dict(fit_projections(touch, photo[np.argsort(dealt, kind="stable")], owner, ([12], [10])))
+    assert all(top1_accuracy(found, *other) < 0.2 for found in nothing.values())
 
 
 def test_towers_side_by_side_weigh_the_same_whatever_their_unit():
-    touch, photo, owner = seen_alike()
+    touch, photo, owner = correlated_features()
     louder = touch * np.where(np.arange(12) < 4, 1000, 1).astype(np.float32)
-    plain, loud = (dict(fit_codes(x, photo, owner, ([4, 8], [10])))[CcaSettings()] for x in (touch, louder))
+    plain, loud = (dict(fit_projections(x, photo, owner, ([4, 8], [10])))[CcaSettings()] for x in (touch, louder))
     assert np.allclose(plain.cosines(touch, photo), loud.cosines(louder, photo), atol=1e-4)
 
 
 def test_a_map_and_another_after_it_are_one():
     rng = np.random.default_rng(0)
-    first = Affine(rng.standard_normal((4, 3)), rng.standard_normal(3))
-    second = Affine(rng.standard_normal((3, 2)), rng.standard_normal(2))
+    first = AffineMap(rng.standard_normal((4, 3)), rng.standard_normal(3))
+    second = AffineMap(rng.standard_normal((3, 2)), rng.standard_normal(2))
     x = rng.standard_normal((5, 4))
-    assert np.allclose(first.then(second)(x), second(first(x)))
+    assert np.allclose(first.compose(second)(x), second(first(x)))
 
 
 def test_every_object_is_left_out_once_and_objects_of_one_sequence_together(recording):
@@ -96,7 +104,7 @@ def test_every_object_is_left_out_once_and_objects_of_one_sequence_together(reco
         draw_folds(few, 0)
 
 
-def hidden_in(features, names, seed):
+def with_noise(features, names, seed):
     """The same grasps, those of `names` replaced by noise."""
     rng, rows = np.random.default_rng(seed), np.isin(features.object_ids, names)
     touch, photo = features.touch.copy(), features.photo.copy()
@@ -105,35 +113,35 @@ def hidden_in(features, names, seed):
 
 
 def test_a_fold_that_is_left_out_chooses_no_settings_and_teaches_nothing(monkeypatch):
-    touch, photo, owner = seen_alike(objects=24)
+    touch, photo, owner = correlated_features(objects=24)
     names = tuple(f"object-{number:02}" for number in owner)
     features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
-    material = SimpleNamespace(grasps=[], kind_of=None, blocks=([12], [10]))
+    data = SimpleNamespace(grasps=[], kind_of=None, blocks=([12], [10]))
     drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
     asked = []
-    monkeypatch.setattr(folds, "choose", lambda *given: asked.append(given) or choose(*given))
+    monkeypatch.setattr(folds, "select_settings", lambda *given: asked.append(given) or select_settings(*given))
 
     def fit(shown):
-        return list(folds.fit_folds(shown, drawn, material, seed=0, what="touches", quiet=True))
+        return list(folds.fit_folds(shown, drawn, data, seed=0, label="touches", quiet=True))
 
     for fold, (shown, _, inner) in zip(fit(features), asked, strict=False):
         assert not set(fold.left_out.object_ids) & {*shown.object_ids, *(name for part in inner for name in part)}
     first = fit(features)[0]
-    noise, other = (fit(hidden_in(features, drawn[0], seed))[0] for seed in range(2))
+    noise, other = (fit(with_noise(features, drawn[0], seed))[0] for seed in range(2))
     for found in (noise, other):
         assert found.settings == first.settings
-        np.testing.assert_array_equal(found.codes.touch.weight, first.codes.touch.weight)
+        np.testing.assert_array_equal(found.projections.touch.weight, first.projections.touch.weight)
     # The objects that do teach matter, so that the same assertion can fail.
-    taught = fit(hidden_in(features, drawn[1], 0))[0]
-    assert not np.array_equal(taught.codes.touch.weight, first.codes.touch.weight)
+    taught = fit(with_noise(features, drawn[1], 0))[0]
+    assert not np.array_equal(taught.projections.touch.weight, first.projections.touch.weight)
 
 
 def test_a_setting_that_is_best_on_the_left_out_fold_alone_is_not_chosen(monkeypatch):
     """Planted: one setting ranks the objects of one fold perfectly and all others not at all."""
-    touch, photo, owner = seen_alike(objects=24)
+    touch, photo, owner = correlated_features(objects=24)
     names = tuple(f"object-{number:02}" for number in owner)
     features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
-    material = SimpleNamespace(grasps=[], kind_of=None, blocks=([12], [10]))
+    data = SimpleNamespace(grasps=[], kind_of=None, blocks=([12], [10]))
     drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
     planted, plain = GRID[0], GRID[-1]
     current = []
@@ -146,10 +154,10 @@ def test_a_setting_that_is_best_on_the_left_out_fold_alone_is_not_chosen(monkeyp
             current[-1] == planted if set(self.features.object_ids) <= set(drawn[0]) else current[-1] == plain
         ),
     )
-    found = list(folds.fit_folds(features, drawn, material, seed=0, what="touches", quiet=True))
+    found = list(folds.fit_folds(features, drawn, data, seed=0, label="touches", quiet=True))
     assert found[0].settings == plain
     # Had the fold been asked, the planted setting would have been chosen.
-    assert choose(features, ([12], [10]), drawn[:1]).settings == planted
+    assert select_settings(features, ([12], [10]), drawn[:1]).settings == planted
 
 
 def test_places_of_hand_made_scores():
@@ -158,12 +166,12 @@ def test_places_of_hand_made_scores():
     )
     # Of a's touches the own photo is of the other grasp: 1 is shown photo 4, and 4 photo 1.
     scores = np.array([[9, 2, 3, 4], [5, 5, 1, 5], [0, 1, 2, 3], [2, 2, 1, 9]], np.float32)
-    found = tell_apart(scores, features)
+    found = score_accuracy(scores, features)
     assert found.objects == 3
-    assert found.first.tolist() == [1.0, 0.5, found.first[2], 0.5]
-    assert found.below.tolist()[:2] == [1.0, 0.75]
-    assert measure([found], "first").chance.tolist() == [pytest.approx(1 / 3)]
-    by_object = [np.mean([1.0, 0.75]), 0.75, found.below[2]]
+    assert found.top1.tolist() == [1.0, 0.5, found.top1[2], 0.5]
+    assert found.pair_accuracy.tolist()[:2] == [1.0, 0.75]
+    assert measure([found], "top1").chance.tolist() == [pytest.approx(1 / 3)]
+    by_object = [np.mean([1.0, 0.75]), 0.75, found.pair_accuracy[2]]
     assert pair_accuracy([found]) == pytest.approx(np.mean(by_object))
 
 
@@ -174,10 +182,10 @@ def test_the_preset_makes_the_towers_that_adapt_makes_of_the_shipped_model(tmp_p
     preset = training_config("adapt", None, init=str(weights))
     preset = dataclasses.replace(preset, matcher=dataclasses.replace(preset.matcher, fingers=1))
     start = load_checkpoint(retrieval.shipped_model(1))
-    wanted = Matcher(config_for(start, 1, BESIDE, seed=0).matcher, 2)
+    wanted = Matcher(config_for(start, 1, PUBLISHED_TOWER, seed=0).matcher, 2)
     made = build_matcher(preset)
     for side in ("touch_tower", "photo_tower"):
-        take_over(getattr(wanted, side), getattr(start.matcher, side), str(weights))
+        load_start_weights(getattr(wanted, side), getattr(start.matcher, side), str(weights))
         for name, tensor in getattr(wanted, side).state_dict().items():
             assert torch.equal(getattr(made, side).state_dict()[name], tensor), name
     said = preset.without_paths()["training"]
@@ -186,18 +194,18 @@ def test_the_preset_makes_the_towers_that_adapt_makes_of_the_shipped_model(tmp_p
 
 @pytest.mark.slow
 def test_the_adapted_checkpoint_is_one_like_any_other(recording, model, catalogue, touch, tmp_path, monkeypatch):
-    monkeypatch.setattr(Estimate, "keeps_the_model", False)
+    monkeypatch.setattr(Estimate, "is_baseline_better", False)
     out = tmp_path / "own.safetensors"
-    material = adapt(recording, out, load_checkpoint(model), init="none", quiet=True).material
+    data = adapt(recording, out, load_checkpoint(model), init="none", quiet=True).data
     made = load_checkpoint(out)
     assert set(made.split.train) == {grasp.object_id for grasp in load_grasps(recording)}
     assert made.posterior is not None
-    # The logit is the scaled cosine of codes and nothing else.
-    matcher, features = made.matcher, material.features
+    # The logit is the scaled cosine of projections and nothing else.
+    matcher, features = made.matcher, data.features
     with torch.inference_mode():
-        felt = matcher.touch_code(torch.from_numpy(features.touch).flatten(1))
-        seen = matcher.photo_code(torch.from_numpy(features.photo))
-        logits = matcher.head(felt.half, seen.half)
+        felt = matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1))
+        seen = matcher.photo_encoding(torch.from_numpy(features.photo))
+        logits = matcher.head(felt.partial, seen.partial)
         cosines = (felt.embedding * seen.embedding).sum(1)
     assert torch.allclose(logits, matcher.cosine_scale.item() * cosines + matcher.head.out.bias.item(), atol=1e-4)
     assert matcher.cosine_scale > 0
@@ -207,15 +215,13 @@ def test_the_adapted_checkpoint_is_one_like_any_other(recording, model, catalogu
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_a_model_that_knows_more_than_a_fit_is_kept_and_its_probabilities_are_fitted(
-    recording, model, tmp_path, monkeypatch
-):
+def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model, tmp_path, monkeypatch):
     start = load_checkpoint(model)
     estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True).estimate
-    assert estimate.keeps_the_model == (
-        estimate.known_below.by_object()[1].mean() >= estimate.below.by_object()[1].mean()
+    assert estimate.is_baseline_better == (
+        estimate.baseline_pair_accuracy.by_object()[1].mean() >= estimate.pair_accuracy.by_object()[1].mean()
     )
-    monkeypatch.setattr(Estimate, "keeps_the_model", True)
+    monkeypatch.setattr(Estimate, "is_baseline_better", True)
     estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True).estimate
     made = load_checkpoint(tmp_path / "own.safetensors")
     assert "it is kept" in estimate.lines()[-1]
@@ -225,25 +231,25 @@ def test_a_model_that_knows_more_than_a_fit_is_kept_and_its_probabilities_are_fi
     assert made.posterior != start.posterior
     assert set(made.provenance["adapted_to"]) == {"source", "data_digest"}
     other = dataclasses.replace(estimate, folds=estimate.folds)
-    object.__setattr__(other.known.start.config.matcher, "fingers", 1)
+    object.__setattr__(other.baseline.start.config.matcher, "fingers", 1)
     monkeypatch.undo()
-    assert not other.keeps_the_model  # of another number of fingers
+    assert not other.is_baseline_better  # of another number of fingers
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_test_objects_of_a_split_are_left_out_of_everything(recording, model, tmp_path, monkeypatch):
-    monkeypatch.setattr(Estimate, "keeps_the_model", False)
+    monkeypatch.setattr(Estimate, "is_baseline_better", False)
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     split = Split(0, tuple(names[3:]), (), tuple(names[:3]))
-    material = adapt(
+    data = adapt(
         recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=split, quiet=True
-    ).material
-    assert set(material.features.object_ids) == set(names[3:])
+    ).data
+    assert set(data.features.object_ids) == set(names[3:])
     assert set(load_checkpoint(tmp_path / "own.safetensors").split.train) == set(names[3:])
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_too_few_objects_to_be_judged_give_a_checkpoint_that_claims_nothing(recording, model, tmp_path, capsys):
+def test_too_few_objects_give_a_checkpoint_without_probabilities(recording, model, tmp_path, capsys):
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     split = Split(0, tuple(names[:4]), (), tuple(names[4:]))
     estimate = adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=split).estimate
@@ -266,9 +272,9 @@ def beside(tmp_path_factory):
 
 def test_features_of_towers_side_by_side_are_those_of_each(model, beside):
     start = load_checkpoint(model)
-    config = config_for(start, 2, BESIDE, seed=0)
+    config = config_for(start, 2, PUBLISHED_TOWER, seed=0)
     matcher = Matcher(config.matcher, 2).eval()
-    take_over(matcher.touch_tower, start.matcher.touch_tower, str(beside))
+    load_start_weights(matcher.touch_tower, start.matcher.touch_tower, str(beside))
     own, published = start.matcher.touch_tower, build_tower("mobilenet_v2", "pooled").eval()
     initialise_tower(published, str(beside))
     images = torch.rand(2, 3, 64, 64)
@@ -280,7 +286,7 @@ def test_features_of_towers_side_by_side_are_those_of_each(model, beside):
 def test_the_published_tower_is_chosen_by_name_or_as_a_class(model):
     start = load_checkpoint(model)
     assert config_for(start, 2, "resnet18", seed=0).matcher.tower == "small+resnet18"
-    assert config_for(start, 2, Small, seed=0).matcher.tower == "small+small"
+    assert config_for(start, 2, SmallTower, seed=0).matcher.tower == "small+small"
     assert config_for(start, 2, None, seed=0).matcher.tower == "small"
 
 
@@ -297,11 +303,20 @@ def test_the_curve_holds_fits_on_less_and_what_they_are_compared_with(recording,
     monkeypatch.setattr("retrieval.adaptation.curve.OBJECTS", (4, 1000))
     monkeypatch.setattr("retrieval.adaptation.curve.TOUCHES", (1, 100))
     start = load_checkpoint(model)
-    material = encode(recording, start, init=str(beside), split=None, cache=None, seed=0, quiet=True)
-    points = learning_curve(material, start, quiet=True)
-    assert [point.what for point in points] == [AS_IT_IS, BOTH, BOTH, BOTH, BOTH, BLURRED, TAUGHT, PUBLISHED]
+    data = load_adaptation_data(recording, start, init=str(beside), split=None, cache=None, seed=0, quiet=True)
+    points = learning_curve(data, start, quiet=True)
+    assert [point.label for point in points] == [
+        UNADAPTED,
+        ADAPTED,
+        ADAPTED,
+        ADAPTED,
+        ADAPTED,
+        LOW_PASS,
+        START_TOWERS,
+        PUBLISHED_TOWERS,
+    ]
     assert [(point.objects, point.touches) for point in points[1:5]] == [(4, 1), (4, 3), (6, 1), (6, 3)]
-    assert all(low <= value <= high for point in points for value, low, high in (point.first, point.pairs))
+    assert all(low <= value <= high for point in points for value, low, high in (point.top1, point.pair_accuracy))
     text = write_curve(tmp_path / "curve", points).read_text()
     assert text.count("\n| ") == len(points) + 1
     assert len(json.loads((tmp_path / "curve" / "curve.json").read_text())["points"]) == len(points)

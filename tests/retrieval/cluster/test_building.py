@@ -11,12 +11,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from indexes.store.cluster import read_cluster
+from indexes.store.sharded import read_sharded_manifest
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build import measuring
 from retrieval.search.build.build_index import build_index
-from retrieval.search.sharding.build_cluster import build_cluster
-from tests import referenced
+from retrieval.search.sharding.build_sharded import build_sharded
+from tests import reference_model
 from tests.retrieval.search.test_operating import checkpoint_of
 
 pytestmark = [
@@ -42,17 +42,17 @@ def fetched(monkeypatch):
     return shapes
 
 
-def test_photos_and_touches_are_encoded_where_the_model_lies(touched, tmp_path, fetched):
-    model = referenced.a_model(tmp_path / "felt.safetensors")
+def test_photos_and_touches_are_encoded_where_the_model_lies(catalogue_with_touches, tmp_path, fetched):
+    model = reference_model.write_reference_model(tmp_path / "felt.safetensors")
     model.matcher.to("meta")
-    report = build_index(touched, model, tmp_path / "index", quiet=True)
+    report = build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
     assert (report.embedded, report.references["touches"]) == (22, 8)
-    half = model.config.matcher.half
-    assert sum(shape[0] for shape in fetched if shape[1:] == (half,)) == 22 + 8
+    partial = model.config.matcher.partial_width
+    assert sum(shape[0] for shape in fetched if shape[1:] == (partial,)) == 22 + 8
 
 
 def test_what_is_measured_is_measured_wherever_the_model_lies(catalogue, tmp_path, fetched, monkeypatch):
-    monkeypatch.setattr(measuring, "FIRST", 5)
+    monkeypatch.setattr(measuring, "EXHAUSTIVE_LIMIT", 5)
     checkpoint = checkpoint_of()
     checkpoint.matcher.to("meta")
     report = build_index(catalogue, checkpoint, tmp_path / "index", min_recall=0.5, max_ms=1000.0, quiet=True)
@@ -78,43 +78,43 @@ def nodes(*resources):
 
 
 def test_there_are_as_many_processes_as_cards_else_as_processors(capsys):
-    from retrieval.cluster.building import pool_of
+    from retrieval.cluster.building import ray_worker_pool
 
-    assert pool_of(nodes({"CPU": 4.0}, {"CPU": 8.0})()) == (12, 1, 0)
-    assert pool_of(nodes({"memory": 1.0})()) == (1, 1, 0)
+    assert ray_worker_pool(nodes({"CPU": 4.0}, {"CPU": 8.0})()) == (12, 1, 0)
+    assert ray_worker_pool(nodes({"memory": 1.0})()) == (1, 1, 0)
     mixed = nodes({"CPU": 64.0}, {"CPU": 16.0, "GPU": 2.0}, {"CPU": 30.0, "GPU": 4.0})
-    assert pool_of(mixed()) == (6, 7, 1)  # of the machine with the fewest processors for a card
-    assert pool_of(nodes({"CPU": 2.0, "GPU": 8.0})()) == (8, 1, 1)
+    assert ray_worker_pool(mixed()) == (6, 7, 1)  # of the machine with the fewest processors for a card
+    assert ray_worker_pool(nodes({"CPU": 2.0, "GPU": 8.0})()) == (8, 1, 1)
     assert not capsys.readouterr().err
-    assert pool_of(mixed(sees=False)) == (110, 1, 0)
+    assert ray_worker_pool(mixed(sees=False)) == (110, 1, 0)
     assert "PyTorch cannot use them there: processors embed" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_each_process_of_the_pool_asks_ray_for_a_card_of_its_own(catalogue, model, tmp_path, monkeypatch, capsys):
     from retrieval.cluster import building
-    from retrieval.cluster.session import connected
+    from retrieval.cluster.session import ray_session
 
     told = tmp_path / "told"
     told.mkdir()
 
-    class Telling(building.ShardBuilder):
+    class Telling(building.ShardBuildWorker):
         def _answer(self, job):
             import ray
 
-            cards = ray.get_runtime_context().get_accelerator_ids()["GPU"]
-            (told / job.folder).write_text(f"{cards} {os.environ['CUDA_VISIBLE_DEVICES']} {torch.get_num_threads()}")
+            gpus = ray.get_runtime_context().get_accelerator_ids()["GPU"]
+            (told / job.folder).write_text(f"{gpus} {os.environ['CUDA_VISIBLE_DEVICES']} {torch.get_num_threads()}")
             return super()._answer(job)
 
     monkeypatch.delenv("OMP_NUM_THREADS")
     monkeypatch.setenv("RAY_OVERRIDE_RESOURCES", '{"CPU": 4, "GPU": 2}')
     checkpoint = load_checkpoint(model)
-    with connected() as ray:
-        assert (ray.cluster_resources()["GPU"], building.pool_of(ray)) == (2, (4, 1, 0))
+    with ray_session() as ray:
+        assert (ray.cluster_resources()["GPU"], building.ray_worker_pool(ray)) == (2, (4, 1, 0))
         assert "PyTorch cannot use them there" in capsys.readouterr().err
-        monkeypatch.setattr(building, "_sees_card", lambda: True)
-        monkeypatch.setattr(building, "ShardBuilder", Telling)
-        report = build_cluster(catalogue, checkpoint, tmp_path / "c", 4, quiet=True, run=building.by_ray())
+        monkeypatch.setattr(building, "_has_gpu", lambda: True)
+        monkeypatch.setattr(building, "ShardBuildWorker", Telling)
+        report = build_sharded(catalogue, checkpoint, tmp_path / "c", 4, quiet=True, run=building.ray_runner())
     assert (report.photos, report.embedded) == (24, 24)
-    names = [entry.folder for entry in read_cluster(tmp_path / "c").shards]
+    names = [entry.folder for entry in read_sharded_manifest(tmp_path / "c").shards]
     assert {(told / name).read_text() for name in names} <= {"['0'] 0 2", "['1'] 1 2"}

@@ -20,16 +20,16 @@ import numpy as np
 import pytest
 
 import retrieval
-from indexes.store.cluster import read_cluster
 from indexes.store.folder import IndexStore
+from indexes.store.sharded import read_sharded_manifest
 from retrieval.data.catalogue import list_catalogue
-from retrieval.errors import BadInput, TooManyBad, Unanswered
+from retrieval.errors import BadInput, IncompleteSearch, TooManyUnreadable
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
 from retrieval.search.query.searcher import Searcher
-from retrieval.search.sharding.build_cluster import build_cluster
-from tests import on_ray, referenced, serving, synthetic
-from tests.waiting import first_line, running, until
+from retrieval.search.sharding.build_sharded import build_sharded
+from tests import ray_processes, reference_model, serving, synthetic
+from tests.waiting import first_line, run_process, wait_until
 
 pytestmark = [
     pytest.mark.slow,
@@ -44,18 +44,18 @@ SHARD, WORKER = r"ray::ServeReplica:shard-", r"ray::MapWorker"
 
 @pytest.fixture(scope="module")
 def ray():
-    from retrieval.cluster.session import connected
+    from retrieval.cluster.session import ray_session
 
-    with connected(2) as module:
+    with ray_session(2) as module:
         yield module
         for made in MADE:
             made.close()
 
 
 def deployments(ray, **held):
-    from retrieval.cluster.serving import Deployments, Held
+    from retrieval.cluster.serving import Deployments, ReplicaSettings
 
-    MADE.append(Deployments(ray, Held(cpus=0.1, **held)))
+    MADE.append(Deployments(ray, ReplicaSettings(cpus=0.1, **held)))
     return MADE[-1]
 
 
@@ -87,7 +87,7 @@ def test_answers_are_those_of_the_folder(count, held, searcher, grasps):
         ours, theirs = held.query(own[:count]), searcher.query(own[:count])
         assert names(ours) == names(theirs)
         assert numbers(ours) == pytest.approx(numbers(theirs), abs=1e-5)
-        assert (ours.verdict, ours.posterior["judged_objects"]) == (theirs.verdict, 8)
+        assert (ours.verdict, ours.posterior["scored_objects"]) == (theirs.verdict, 8)
         assert (ours.index["shards"], ours.index["searched"]) == (4, 1.0)
 
 
@@ -103,27 +103,27 @@ def test_photos_are_found_and_listed_wherever_they_lie(held, searcher):
     assert held.shard.page([name], None, 0, 2).rows == [row for row in rows if row["object_id"] == name][:2]
 
 
-def test_reference_touches_answer_over_ray_as_in_the_folder(ray, touched, touches, tmp_path):
-    model = referenced.a_model(tmp_path / "felt.safetensors")
-    build_index(touched, model, tmp_path / "index", quiet=True)
-    build_cluster(touched, model, tmp_path / "cluster", 2, quiet=True)
+def test_reference_touches_answer_over_ray_as_in_the_folder(ray, catalogue_with_touches, touches, tmp_path):
+    model = reference_model.write_reference_model(tmp_path / "felt.safetensors")
+    build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
+    build_sharded(catalogue_with_touches, model, tmp_path / "cluster", 2, quiet=True)
     with (
         Searcher.open(tmp_path / "cluster", shards=deployments(ray, wait_s=120.0).open) as ours,
         Searcher.open(tmp_path / "index") as theirs,
     ):
-        for name in referenced.NAMES[:3]:
+        for name in reference_model.NAMES[:3]:
             mine, whole = (one.query(touches[name][2], top=8) for one in (ours, theirs))
             assert names(mine) == names(whole)
             assert numbers(mine) == pytest.approx(numbers(whole), abs=1e-5)
             for one, other in zip(mine.results, whole.results, strict=True):
                 assert (one.reference and one.reference.touch) == (other.reference and other.reference.touch)
-        gel = f"{referenced.NAMES[0]}/touch_1_b.png"
+        gel = f"{reference_model.NAMES[0]}/touch_1_b.png"
         assert ours.shard.rows([gel, "absent"]) == theirs.shard.rows([gel, "absent"])
 
 
 def test_everything_listens_on_this_machine_alone(held, touch):
     held.query(touch)
-    found = on_ray.listening()
+    found = ray_processes.listening_addresses()
     assert found
     assert found <= LOOPBACK
 
@@ -131,10 +131,10 @@ def test_everything_listens_on_this_machine_alone(held, touch):
 REPLICA = """
 import sys
 from pathlib import Path
-from indexes.store.cluster import read_cluster
+from indexes.store.sharded import read_sharded_manifest
 from retrieval.cluster.serving import ShardReplica
 from threadpoolctl import threadpool_info
-manifest = read_cluster(Path(sys.argv[1]))
+manifest = read_sharded_manifest(Path(sys.argv[1]))
 replica = ShardReplica(sys.argv[1], manifest.shards[0], dict(manifest.fingerprint), sys.argv[2], False)
 print(*(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
 """
@@ -142,7 +142,7 @@ print(*(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] ==
 
 def test_a_shard_leaves_the_processors_to_others_between_two_queries(cluster):
     """Idle threads of OpenBLAS spin on for a while: a query over Ray took 40 ms where it takes 6."""
-    model = read_cluster(cluster).about["checkpoint"]
+    model = read_sharded_manifest(cluster).about["checkpoint"]
     environment = os.environ | {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
     command = [sys.executable, "-c", REPLICA, str(cluster), str(model)]
     said = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
@@ -156,8 +156,8 @@ def test_one_that_ends_leaves_the_shards_of_another(ray, cluster, held, grasps):
     assert names(searcher.query(grasps[0])) == names(held.query(grasps[0]))
     before = set(ray.serve.status().applications)
     other.close()
-    until = time.monotonic() + 60
-    while len(before & set(ray.serve.status().applications)) > 4 and time.monotonic() < until:
+    wait_until = time.monotonic() + 60
+    while len(before & set(ray.serve.status().applications)) > 4 and time.monotonic() < wait_until:
         time.sleep(0.1)
     assert len(before) == 8
     assert len(ray.serve.status().applications) == 4
@@ -179,14 +179,14 @@ with connected() as ray:
 def test_shards_of_a_process_that_was_killed_are_deleted_by_the_next(ray, cluster, held, grasps, monkeypatch):
     before = set(ray.serve.status().applications)
     monkeypatch.setenv("RAY_ADDRESS", ray.get_runtime_context().gcs_address)
-    with running([sys.executable, "-W", "ignore", "-c", HOLDING, str(cluster)]) as process:
+    with run_process([sys.executable, "-W", "ignore", "-c", HOLDING, str(cluster)]) as process:
         assert first_line(process, 240) == "held\n"
         left = set(ray.serve.status().applications) - before
         process.kill()
         process.wait(60)
     assert len(left) == 4
-    until = time.monotonic() + 120  # until Ray has noticed
-    while left & set(ray.serve.status().applications) and time.monotonic() < until:
+    wait_until = time.monotonic() + 120  # until Ray has noticed
+    while left & set(ray.serve.status().applications) and time.monotonic() < wait_until:
         deployments(ray).close()
         time.sleep(0.5)
     assert not left & set(ray.serve.status().applications)
@@ -200,7 +200,7 @@ def test_shards_of_a_process_that_was_killed_are_deleted_by_the_next(ray, cluste
 def test_a_shard_that_is_killed_is_started_again_and_every_answer_is_whole(held, grasps):
     expected = names(held.query(grasps[0]))
     for turn in range(20):
-        process = on_ray.called(SHARD)[turn % len(on_ray.called(SHARD))]
+        process = ray_processes.processes_named(SHARD)[turn % len(ray_processes.processes_named(SHARD))]
         os.kill(process, signal.SIGKILL)
         answer = held.query(grasps[0])
         assert names(answer) == expected
@@ -213,7 +213,7 @@ def stopped():
     done = []
 
     def stop():
-        for process in on_ray.called(f"{SHARD}00-of-04"):
+        for process in ray_processes.processes_named(f"{SHARD}00-of-04"):
             os.kill(process, signal.SIGSTOP)
             done.append(process)
 
@@ -225,22 +225,22 @@ def stopped():
             continue
 
 
-def test_a_shard_that_hangs_is_told_and_never_passed_over_in_silence(ray, cluster, grasps, stopped):
+def test_a_shard_that_hangs_is_reported(ray, cluster, grasps, stopped):
     whole = deployments(ray, wait_s=2.0)
-    part = deployments(ray, wait_s=2.0, least_share=0.1)
+    part = deployments(ray, wait_s=2.0, min_share=0.1)
     strict, lenient = Searcher.open(cluster, shards=whole.open), Searcher.open(cluster, shards=part.open)
     expected = strict.query(grasps[0], top=8)
     stopped()
-    with pytest.raises(Unanswered, match=r"no answer within 2 s from shard-0\d-of-04: 0\.\d+ of the catalogue"):
+    with pytest.raises(IncompleteSearch, match=r"no answer within 2 s from shard-0\d-of-04: 0\.\d+ of the catalogue"):
         strict.query(grasps[0])
     found = []
 
     def answered():  # of a busy machine the other shards may be late too
-        with suppress(Unanswered):
+        with suppress(IncompleteSearch):
             found.append(lenient.query(grasps[0], top=8))
         return found
 
-    until(answered, 60)
+    wait_until(answered, 60)
     [answer] = found
     if answer.index["searched"] == 1.0:  # Ray has replaced it already
         return
@@ -248,19 +248,19 @@ def test_a_shard_that_hangs_is_told_and_never_passed_over_in_silence(ray, cluste
     kept = [match for match in expected.results if match.object_id in {one.object_id for one in answer.results}]
     assert [match.object_id for match in kept] == [match.object_id for match in answer.results]
     shown = math.fsum(match.probability for match in answer.results)
-    assert answer.posterior["unjudged_probability"] > 0
-    assert answer.none_probability + shown + answer.posterior["unjudged_probability"] == pytest.approx(1, abs=1e-9)
+    assert answer.posterior["unscored_probability"] > 0
+    assert answer.none_probability + shown + answer.posterior["unscored_probability"] == pytest.approx(1, abs=1e-9)
 
 
 @pytest.mark.parametrize(
     "field",
-    [{"replicas": 0}, {"replicas": 3, "most_replicas": 2}, {"least_share": 0.0}, {"least_share": 1.5}, {"wait_s": 0.0}],
+    [{"replicas": 0}, {"replicas": 3, "max_replicas": 2}, {"least_share": 0.0}, {"least_share": 1.5}, {"wait_s": 0.0}],
 )
 def test_settings_that_are_none_are_refused(field):
-    from retrieval.cluster.serving import Held
+    from retrieval.cluster.serving import ReplicaSettings
 
     with pytest.raises(BadInput):
-        Held(**field)
+        ReplicaSettings(**field)
 
 
 def test_a_new_generation_is_taken_up_while_queries_go_on(ray, catalogue, cluster, model, grasps, tmp_path):
@@ -279,12 +279,12 @@ def test_a_new_generation_is_taken_up_while_queries_go_on(ray, catalogue, cluste
     try:
         name = min(path.name for path in (tmp_path / "catalog").iterdir())
         shutil.copy(next(catalogue.glob("*/2.jpg")), tmp_path / "catalog" / name / "new.jpg")
-        build_cluster(tmp_path / "catalog", load_checkpoint(model), tmp_path / "cluster", 4, quiet=True)
+        build_sharded(tmp_path / "catalog", load_checkpoint(model), tmp_path / "cluster", 4, quiet=True)
         before = current[0]
         current[0] = Searcher.open(tmp_path / "cluster", shards=held.open)
         del before
-        count, until = len(told), time.monotonic() + 120
-        while len(told) < count + 3 and time.monotonic() < until:
+        count, wait_until = len(told), time.monotonic() + 120
+        while len(told) < count + 3 and time.monotonic() < wait_until:
             time.sleep(0.05)
     finally:
         stop.set()
@@ -294,7 +294,7 @@ def test_a_new_generation_is_taken_up_while_queries_go_on(ray, catalogue, cluste
 
 
 def test_replicas_grow_while_requests_wait(ray, cluster, grasps, held):
-    grown = deployments(ray, wait_s=120.0, most_replicas=2, ongoing=2)
+    grown = deployments(ray, wait_s=120.0, max_replicas=2, max_ongoing_requests=2)
     expected, stop, found = names(held.query(grasps[0])), threading.Event(), set()
     with Searcher.open(cluster, shards=grown.open) as searcher:
         own = [name for name in ray.serve.status().applications if name.endswith(grown._own)]
@@ -312,8 +312,8 @@ def test_replicas_grow_while_requests_wait(ray, cluster, grasps, held):
             assert replicas() == 4
             for thread in threads:
                 thread.start()
-            until = time.monotonic() + 240
-            while replicas() <= 4 and time.monotonic() < until:
+            wait_until = time.monotonic() + 240
+            while replicas() <= 4 and time.monotonic() < wait_until:
                 time.sleep(0.2)
             assert 4 < replicas() <= 8
         finally:
@@ -331,7 +331,7 @@ from retrieval.cluster.serving import Deployments, Held
 from retrieval.cluster.session import connected
 from retrieval.search.query.searcher import Searcher
 with connected(2) as ray:
-    held = Deployments(ray, Held(cpus=0.1, wait_s=240.0, most_replicas=2))
+    held = Deployments(ray, Held(cpus=0.1, wait_s=240.0, max_replicas=2))
     with Searcher.open(sys.argv[1], shards=held.open) as searcher, ThreadPoolExecutor(12) as threads:
         print(set(threads.map(lambda _: str(searcher.shard.rows(["nothing"])), range(12))), flush=True)
     held.close()
@@ -354,34 +354,37 @@ def test_after_the_end_nothing_speaks_to_ray_or_starts_another(cluster):
 def halves_of(cluster):
     """{photo: its half}, of all shards."""
     found = {}
-    for entry in read_cluster(cluster).shards:
+    for entry in read_sharded_manifest(cluster).shards:
         generation = IndexStore(cluster / entry.folder).open(name=entry.generation)
         found |= {
-            row["id"]: half.tobytes() for row, half in zip(generation.rows, generation.arrays["halves"], strict=True)
+            row["id"]: partial.tobytes()
+            for row, partial in zip(generation.rows, generation.arrays["partials"], strict=True)
         }
     return found
 
 
 def test_shards_built_by_ray_are_those_built_here(ray, catalogue, cluster, model, tmp_path):
-    from retrieval.cluster.building import by_ray
+    from retrieval.cluster.building import ray_runner
 
-    report = build_cluster(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=by_ray())
+    report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=ray_runner())
     assert (report.photos, report.embedded, len(report.shards)) == (24, 24, 4)
     assert ray.is_initialized()  # it was before, and others may use it
     ours, theirs = halves_of(tmp_path / "c"), halves_of(cluster)
     assert ours.keys() == theirs.keys()
-    for name, half in ours.items():
-        np.testing.assert_allclose(np.frombuffer(half, np.float16), np.frombuffer(theirs[name], np.float16), atol=2e-3)
+    for name, partial in ours.items():
+        np.testing.assert_allclose(
+            np.frombuffer(partial, np.float16), np.frombuffer(theirs[name], np.float16), atol=2e-3
+        )
 
 
 def test_what_is_wrong_with_a_catalogue_is_a_sentence_from_afar_too(ray, catalogue, model, tmp_path):
-    from retrieval.cluster.building import by_ray
+    from retrieval.cluster.building import ray_runner
 
     shutil.copytree(catalogue, tmp_path / "catalog")
     for photo in list((tmp_path / "catalog").glob("*/2.jpg"))[:4]:
         photo.write_bytes(b"no picture")
-    with pytest.raises(TooManyBad, match="4 of 24 photos cannot be read"):
-        build_cluster(tmp_path / "catalog", load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=by_ray())
+    with pytest.raises(TooManyUnreadable, match="4 of 24 photos cannot be read"):
+        build_sharded(tmp_path / "catalog", load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=ray_runner())
 
 
 @pytest.fixture
@@ -401,21 +404,21 @@ def many(tmp_path):
 
 def test_a_worker_killed_while_it_embeds_loses_nothing_and_repeats_little(ray, many, model, tmp_path):
     """Codes are kept as they are made: what is embedded twice is what the killed process had in work."""
-    from retrieval.cluster.building import by_ray
+    from retrieval.cluster.building import ray_runner
 
     done = {}
 
     def build():
-        done["report"] = build_cluster(
-            many, load_checkpoint(model), tmp_path / "c", 3, quiet=True, run=by_ray(workers=1), bad_share=0
+        done["report"] = build_sharded(
+            many, load_checkpoint(model), tmp_path / "c", 3, quiet=True, run=ray_runner(workers=1), max_unreadable=0
         )
 
     thread = threading.Thread(target=build)
     thread.start()
-    until, killed = time.monotonic() + 240, 0
-    while thread.is_alive() and killed < 2 and time.monotonic() < until:
+    wait_until, killed = time.monotonic() + 240, 0
+    while thread.is_alive() and killed < 2 and time.monotonic() < wait_until:
         records = sum(path.stat().st_size for path in (tmp_path / "c").glob("shard-*/unfinished.sqlite"))
-        if records and (workers := on_ray.called(WORKER)):
+        if records and (workers := ray_processes.processes_named(WORKER)):
             os.kill(workers[0], signal.SIGKILL)
             killed += 1
             time.sleep(2)
@@ -441,12 +444,12 @@ def test_the_service_over_a_cluster_is_that_over_the_folder_and_lives_again_afte
             assert {item["id"] for item in found["items"]} == {row["id"] for row in searcher.generation.rows}
             assert httpx.get(f"{address}/v1/photos/{answer.top.photo}").status_code == 200
             assert httpx.get(f"{address}/v1/nearest/{answer.top.photo}").status_code == 422
-            below = on_ray.descendants(process.pid)
-            assert on_ray.listening(process.pid) <= LOOPBACK
+            below = ray_processes.descendants(process.pid)
+            assert ray_processes.listening_addresses(process.pid) <= LOOPBACK
             process.send_signal(how)
             assert process.wait(120) == (0 if how == signal.SIGTERM else -signal.SIGKILL)
-        until = time.monotonic() + 240  # an agent of Ray asks once in a while whether its raylet lives
-        while (left := set(below) & set(on_ray.parents())) and time.monotonic() < until:
+        wait_until = time.monotonic() + 240  # an agent of Ray asks once in a while whether its raylet lives
+        while (left := set(below) & set(ray_processes.parents())) and time.monotonic() < wait_until:
             time.sleep(0.2)
         assert not left
 

@@ -13,7 +13,7 @@ from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.training.state import state_path
 from retrieval.training.train import train
-from tests import on_ray
+from tests import ray_processes
 from tests.conftest import TINY
 from tests.retrieval.training.test_train import with_training
 
@@ -24,17 +24,17 @@ pytestmark = [
 RANK = r"ray::RayTrainWorker|ray::_RayTrainWorker|ray::RayTrainWorker__execute"
 
 
-def train_by_ray(*words, **how):
-    from retrieval.cluster.training import train_by_ray as by_ray
+def train_on_ray(*words, **how):
+    from retrieval.cluster.training import train_on_ray as ray_runner
 
-    return by_ray(*words, cpus=2, **how)
+    return ray_runner(*words, cpus=2, **how)
 
 
 @pytest.mark.slow
 def test_two_ranks_of_ray_train_what_one_process_does(recording, tmp_path):
     config = with_training(TINY, freeze_towers=True)  # see tests/retrieval/training/test_ranks.py
     one = train(recording, tmp_path / "one.safetensors", config, quiet=True)
-    two = train_by_ray(recording, tmp_path / "two.safetensors", config, workers=2)
+    two = train_on_ray(recording, tmp_path / "two.safetensors", config, workers=2)
     assert two.provenance["step"] == one.provenance["step"]
     assert two.provenance["metrics"] == pytest.approx(one.provenance["metrics"], abs=1e-3)
     assert not state_path(tmp_path / "two.safetensors").exists()
@@ -47,13 +47,13 @@ def test_a_rank_that_is_killed_costs_the_steps_since_the_last_state(recording, t
     expected = train(recording, tmp_path / "calm.safetensors", config, quiet=True)
 
     def work():
-        done["made"] = train_by_ray(recording, out, config, workers=2)
+        done["made"] = train_on_ray(recording, out, config, workers=2)
 
     thread, killed = threading.Thread(target=work), 0
     thread.start()
     until = time.monotonic() + 400
     while thread.is_alive() and not killed and time.monotonic() < until:
-        if state_path(out).exists() and (ranks := on_ray.called(RANK)):
+        if state_path(out).exists() and (ranks := ray_processes.processes_named(RANK)):
             os.kill(ranks[-1], signal.SIGKILL)
             killed += 1
         time.sleep(0.005)
@@ -68,16 +68,16 @@ def test_a_rank_that_is_killed_costs_the_steps_since_the_last_state(recording, t
 def test_what_is_wrong_with_a_training_is_a_sentence_from_afar_too(recording, tmp_path):
     config = with_training(TINY, init=str(tmp_path / "nothing.pth"))
     with pytest.raises(BadInput, match=r"nothing\.pth"):
-        train_by_ray(recording, tmp_path / "m.safetensors", config, workers=1)
+        train_on_ray(recording, tmp_path / "m.safetensors", config, workers=1)
 
 
 def test_an_unfinished_training_is_not_overwritten_and_workers_are_one_or_more(recording, tmp_path):
     out = tmp_path / "m.safetensors"
     with pytest.raises(BadInput, match="workers must be 1 or more; got 0"):
-        train_by_ray(recording, out, TINY, workers=0)
+        train_on_ray(recording, out, TINY, workers=0)
     state_path(out).touch()
     with pytest.raises(CheckpointError, match="go on with --resume"):
-        train_by_ray(recording, out, TINY)
+        train_on_ray(recording, out, TINY)
 
 
 @pytest.mark.parametrize("options", [["--cluster", "--task", "relief"], ["--workers", "2"]])

@@ -133,7 +133,7 @@ def test_json_is_the_only_thing_on_stdout_and_has_the_documented_keys(workplace,
     assert document["query"] == {"touches": touches, "grasps": ["contact", "contact"]}
     assert set(document["posterior"]) == {
         *("formula", "slope", "offset", "dependence", "tests"),
-        *("none_prior", "grasps", "objects", "judged_objects", "unjudged_probability"),
+        *("none_prior", "grasps", "objects", "scored_objects", "unscored_probability"),
     }
     assert set(document["timing_ms"]) == {"decode", "encode", "candidates", "rerank", "total"}
     assert [match["rank"] for match in document["results"]] == [1, 2, 3]
@@ -558,9 +558,9 @@ def test_a_gate_takes_no_option_of_matchers(option, workplace, capsys):
     [
         (["collect", "--out", "r", "--dry-run", "--preview"], "--preview is of a collection; --dry-run moves and"),
         (["serve", "--index", "i", "--replicas", "2"], "--replicas is for shards that Ray holds; give --cluster too"),
-        (["serve", "--index", "i", "--least-share", "0"], "--least-share is for shards that Ray holds"),
+        (["serve", "--index", "i", "--min-share", "0"], "--min-share is for shards that Ray holds"),
         (["serve", "--index", "i", "--no-history", "--history", "h"], "--history names where to keep what"),
-        (["build-index", "catalog/", "--bad-share", "0.1"], "give --shards too"),
+        (["build-index", "catalog/", "--max-unreadable", "0.1"], "give --shards too"),
         (["build-index", "catalog/", "--cluster"], "give --shards too"),
     ],
 )

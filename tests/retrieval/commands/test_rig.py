@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from retrieval.commands.main import main
-from robot.drivers.discover import Found
+from robot.drivers.discover import DiscoveredDevice
 
 
 @pytest.fixture(autouse=True)
@@ -16,7 +16,7 @@ def here(tmp_path, monkeypatch):
 
 
 def test_a_check_prints_a_line_for_each_device(capsys, monkeypatch):
-    monkeypatch.setattr("robot.rig_check.WATCHED_S", 0.2)
+    monkeypatch.setattr("robot.rig_check.MEASURE_S", 0.2)
     assert main(["rig", "check", "--rig", "tests.fake_rig:FakeRig"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[:2] for line in lines] == [
@@ -38,7 +38,9 @@ def test_a_check_with_a_device_that_fails_leaves_with_1_and_names_it(capsys, mon
 
 
 def test_without_a_rig_what_is_connected_is_listed_as_lines_for_its_file(capsys, monkeypatch):
-    found = [Found("camera", "/dev/v4l/by-id/x", "GelSight Mini R0B", '[sensors.a]\ndriver = "gelsight_mini"')]
+    found = [
+        DiscoveredDevice("camera", "/dev/v4l/by-id/x", "GelSight Mini R0B", '[sensors.a]\ndriver = "gelsight_mini"')
+    ]
     monkeypatch.setattr("robot.drivers.discover.discover", lambda: found)
     assert main(["rig", "check"]) == 0
     said = capsys.readouterr()

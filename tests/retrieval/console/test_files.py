@@ -114,7 +114,7 @@ def test_a_link_in_a_circle_is_an_error_of_that_file(tmp_path):
     assert told.value.filename == str(tmp_path / "a")
 
 
-def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+def test_a_full_disk_error_names_the_file(tmp_path):
     path = tmp_path / "page.html"
     path.write_bytes(b"old")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -7,7 +7,7 @@ import numpy as np
 from retrieval.data.images import to_float
 from retrieval.data.preprocessing import Preprocessing, subtract_background
 from retrieval.data.resize import resize
-from tests.hard_case import HardCase, refused
+from tests.hard_case import HardCase, error_of
 
 _BACKGROUND, _RESIZE = "background", "resize"
 
@@ -57,5 +57,5 @@ def _nan_picture() -> HardCase:
     touch = np.full((8, 8, 3), 0.5, np.float32)
     touch[3, 4, 0] = np.nan
     naive = float(touch.mean())
-    ours, holds = refused(lambda: Preprocessing(touch_px=8).touch(touch), "touch", "NaN")
+    ours, holds = error_of(lambda: Preprocessing(touch_px=8).touch(touch), "touch", "NaN")
     return HardCase("samples", "one sample is NaN", "refused", f"mean {naive}", ours, holds, bool(np.isfinite(naive)))

@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from retrieval.data import catalogue as module
-from retrieval.data.catalogue import CataloguePhoto, Photos, decode_photo, list_catalogue, read_photo
+from retrieval.data.catalogue import CataloguePhoto, PhotoTable, decode_photo, list_catalogue, read_photo
+from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import Naming
-from retrieval.data.walking import SkippedPhoto
 from retrieval.errors import DatasetError
 
 
@@ -188,7 +188,7 @@ def test_photos_in_columns_are_the_photos_that_they_were():
         CataloguePhoto("a/2.png", "a", {"price": 5}),
         CataloguePhoto("b.png", "b"),
     ]
-    held = Photos.of(photos)
+    held = PhotoTable.of(photos)
     assert (list(held), len(held), held[-1], list(held[1:])) == (photos, 3, photos[2], photos[1:])
     assert (held.paths, held.objects) == (("a/1.png", "a/2.png", "b.png"), ("a", "a", "b"))
 

@@ -110,7 +110,7 @@ def test_a_missing_file_is_named(broken, column):
     assert one(broken.findings()) == ("error", "broken", f"images/{path.name}: no such file")
 
 
-def test_a_missing_frame_of_the_untouched_gel_is_named(recording, tmp_path):
+def test_a_missing_no_contact_frame_is_named(recording, tmp_path):
     broken = Broken(recording, tmp_path / "r")
     path = broken.file(4, "touch_a_before")
     path.unlink()

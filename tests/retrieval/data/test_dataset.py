@@ -335,7 +335,7 @@ def test_a_batch_depends_on_seed_and_step_and_not_on_what_was_asked_before(seed,
     sampler = PairSampler(grasps, seed=seed)
     in_order = [contents(PairSampler(grasps, seed=seed).batch(step, 4)) for step in range(5)]
     for step in steps:
-        sampler.every_touch()
+        sampler.evaluation_pairs()
         assert contents(sampler.batch(step, 4)) == in_order[step]
 
 
@@ -362,7 +362,7 @@ def test_positives_are_drawn_without_repeats_where_the_object_has_enough_photos(
 
 def test_a_photo_shared_by_grasps_of_one_object_counts_as_one():
     grasps = [grasp("mug", number, photo="mug-0.jpg") for number in range(3)] + grasps_of(2)
-    batch = PairSampler(grasps, seed=0).every_touch()
+    batch = PairSampler(grasps, seed=0).evaluation_pairs()
     assert Counter(str(photo).rsplit("-", 1)[0] for photo in batch.photos) == {"mug": 1, "object-00": 2}
 
 
@@ -417,15 +417,15 @@ def test_a_batch_of_one_object_finds_its_negatives_outside():
 
 
 def test_the_pairs_for_evaluation_hold_every_touch_once_are_never_shared_and_are_the_same_each_time():
-    """Shared or not, as every checkpoint so far was chosen on these."""
+    """SharedImage or not, as every checkpoint so far was chosen on these."""
     grasps = grasps_of(3, 1, 5)
     sampler = PairSampler(grasps, seed=0)
-    batch = sampler.every_touch()
+    batch = sampler.evaluation_pairs()
     assert [item.grasp_id for item in batch.grasps] == [item.grasp_id for item in grasps]
     assert Counter(batch.touch_index.tolist()) == dict.fromkeys(range(9), 8)
     sampler.batch(0, 5)
     for again in (sampler, PairSampler(grasps, seed=0, share_photos=True)):
-        assert contents(again.every_touch()) == contents(batch)
+        assert contents(again.evaluation_pairs()) == contents(batch)
 
 
 @pytest.mark.parametrize("grasps", [[], grasps_of(5)], ids=["none", "one object"])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from retrieval.data.labelled import pair_by_label
+from retrieval.data.labelled_pictures import pair_by_label
 from retrieval.errors import DatasetError
 
 RIBS = {"relief": "ribs", "shape": "tube", "pitch_mm": 4.0, "amplitude_mm": 1.0, "aspect": 1.5, "sharpness": 0.3}
@@ -67,7 +67,7 @@ def test_two_presses_with_one_photo_are_grasps_of_one_object(tmp_path):
     assert len({grasp.grasp_id for grasp in found}) == 2
 
 
-def test_what_looks_like_nothing_pressed_and_what_one_finger_missed_is_left_out(tmp_path):
+def test_what_looks_like_no_pressed_object_and_what_one_finger_missed_is_left_out(tmp_path):
     found = pairs(tmp_path, [{}, {"relief": "layers"}], [{}, {"relief": "waves"}, {"fingers": "b"}])
     assert names(found) == {("0", "0")}
 

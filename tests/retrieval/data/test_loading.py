@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from retrieval.data.dataset import PairSampler, load_grasps
-from retrieval.data.loading import ahead, in_order, worker_count
+from retrieval.data.loading import map_in_order, prefetch, worker_count
 from retrieval.errors import ConfigError
 from retrieval.model.config import Config, load_config
 from retrieval.training.batches import TrainedFeatures
@@ -54,7 +54,7 @@ def test_results_come_in_order_while_so_many_later_ones_are_prepared(depth):
         done.set_result(number)
         return done
 
-    for number, result in enumerate(ahead(map(work, range(6)), depth)):
+    for number, result in enumerate(prefetch(map(work, range(6)), depth)):
         assert result == number
         assert begun == list(range(min(6, number + depth + 1)))
 
@@ -62,7 +62,7 @@ def test_results_come_in_order_while_so_many_later_ones_are_prepared(depth):
 def test_as_many_workers_as_are_set_load_at_once():
     together = threading.Barrier(3, timeout=10)
     with ThreadPoolExecutor(3) as pool:
-        assert list(in_order(pool, lambda item: (together.wait(), item)[1], range(6))) == list(range(6))
+        assert list(map_in_order(pool, lambda item: (together.wait(), item)[1], range(6))) == list(range(6))
 
 
 def test_auto_is_a_worker_for_each_core_of_a_rank(monkeypatch):

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from retrieval.data.naming import Naming, doubts, per_object
+from retrieval.data.naming import Naming, count_summary, naming_warnings
 from retrieval.errors import BadInput
 
 BY_RULE = {
@@ -90,34 +90,36 @@ def test_any_text_is_a_rule_or_refused_and_an_object_is_a_part_of_the_path(rule,
 
 @pytest.mark.parametrize("name", ["train", "Test", "VAL", "images", "photos", "data"])
 def test_a_folder_called_train_is_warned_of(name):
-    (said,) = doubts({name: 40, "mug": 3}, Naming())
+    (said,) = naming_warnings({name: 40, "mug": 3}, Naming())
     assert said.startswith(f"{name} is taken for the name of an object, with 40 photo(s)")
     assert "--objects-from '{split}/{object}/{photo}'" in said
 
 
 def test_names_that_differ_by_a_number_only_are_warned_of_the_harder_where_each_has_one_photo():
-    (said,) = doubts({"mug_0": 1, "mug_1": 1, "cup (1)": 1, "cup (2)": 1, "ball": 1}, Naming())
+    (said,) = naming_warnings({"mug_0": 1, "mug_1": 1, "cup (1)": 1, "cup (2)": 1, "ball": 1}, Naming())
     assert said.startswith(
         "every object has one photo, and 4 of 5 objects have names that differ from another's by a number only: "
         "cup (1), cup (2), mug_0 and 1 more"
     )
-    (said,) = doubts({"mug_0": 3, "mug_1": 1, "ball": 1}, Naming())
+    (said,) = naming_warnings({"mug_0": 3, "mug_1": 1, "ball": 1}, Naming())
     assert said.startswith("2 of 3 objects have names that differ")
-    (said,) = doubts({"mug": 1, "mug (2)": 1}, Naming())
+    (said,) = naming_warnings({"mug": 1, "mug (2)": 1}, Naming())
     assert "2 of 2" in said
 
 
 def test_one_object_for_many_photos_is_warned_of():
-    assert doubts({"set": 12}, Naming()) == ["all 12 photos are taken for photos of one object, set"]
-    assert doubts({"mug": 1}, Naming()) == []
+    assert naming_warnings({"set": 12}, Naming()) == ["all 12 photos are taken for photos of one object, set"]
+    assert naming_warnings({"mug": 1}, Naming()) == []
 
 
 def test_what_looks_right_is_not_doubted():
-    assert doubts({"mug": 3, "cup": 3, "trainer": 1}, Naming()) == []
-    assert doubts({"1": 3, "2": 3}, Naming()) == []  # a number is a name as good as any
-    assert doubts({"slab-knurl-20000-00010": 3, "cone-ribs-20000-00015": 3}, Naming()) == []
-    assert doubts({"mug_1": 2, "mug_2": 2}, Naming("stem")) == []  # the numbers of mug_1_5.jpg are gone already
+    assert naming_warnings({"mug": 3, "cup": 3, "trainer": 1}, Naming()) == []
+    assert naming_warnings({"1": 3, "2": 3}, Naming()) == []  # a number is a name as good as any
+    assert naming_warnings({"slab-knurl-20000-00010": 3, "cone-ribs-20000-00015": 3}, Naming()) == []
+    assert (
+        naming_warnings({"mug_1": 2, "mug_2": 2}, Naming("stem")) == []
+    )  # the numbers of mug_1_5.jpg are gone already
 
 
 def test_numbers_of_photos_are_told_by_least_median_and_most():
-    assert per_object([4, 1, 1, 2]) == {"min": 1, "median": 1.5, "max": 4}
+    assert count_summary([4, 1, 1, 2]) == {"min": 1, "median": 1.5, "max": 4}

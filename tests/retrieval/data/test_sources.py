@@ -10,14 +10,14 @@ import pytest
 
 from retrieval.data import sources, storage
 from retrieval.data.catalogue import PhotoBytes, list_catalogue, read_photo
+from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import Naming
 from retrieval.data.sources import list_photos
-from retrieval.data.walking import SkippedPhoto
-from retrieval.errors import BadInput, DatasetError, StorageError
+from retrieval.errors import BadInput, DatasetError, RemoteStorageError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
 from retrieval.search.query.searcher import Searcher
-from retrieval.search.sharding.build_cluster import build_cluster
+from retrieval.search.sharding.build_sharded import build_sharded
 from tests import s3
 
 pyarrow = pytest.importorskip("pyarrow")
@@ -25,7 +25,7 @@ pyarrow = pytest.importorskip("pyarrow")
 
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch):
-    monkeypatch.setattr(storage, "WAITS_S", (0.0,) * 5)
+    monkeypatch.setattr(storage, "RETRY_WAITS_S", (0.0,) * 5)
     sources._read_group.cache_clear()
 
 
@@ -238,7 +238,7 @@ def test_a_storage_that_refuses_one_request_of_twenty_loses_nothing(catalogue, m
     assert (report.photos, report.skipped) == (24, [])
     with Searcher.open(tmp_path / "index") as ours, Searcher.open(index) as theirs:
         assert list(ours.generation.rows) == list(theirs.generation.rows)
-        np.testing.assert_array_equal(ours.generation.arrays["halves"], theirs.generation.arrays["halves"])
+        np.testing.assert_array_equal(ours.generation.arrays["partials"], theirs.generation.arrays["partials"])
 
 
 def test_a_storage_that_goes_on_refusing_ends_the_build_which_goes_on_later(
@@ -248,11 +248,11 @@ def test_a_storage_that_goes_on_refusing_ends_the_build_which_goes_on_later(
     refused.update(every=40, times=21)
     listed = list_photos("memory://bucket/catalog")
     assert len(listed.photos) == 24
-    with pytest.raises(StorageError, match=r"the storage refused 6 times \(OSError: 503 Slow Down\)"):
+    with pytest.raises(RemoteStorageError, match=r"the storage refused 6 times \(OSError: 503 Slow Down\)"):
         read_photo(listed, listed.photos[0])
     checkpoint = load_checkpoint(model)
     refused.update(every=10**9, times=0)
-    build_cluster("memory://bucket/catalog", checkpoint, tmp_path / "c", 2, quiet=True)
+    build_sharded("memory://bucket/catalog", checkpoint, tmp_path / "c", 2, quiet=True)
     assert sum(embedded) == 24
 
 
@@ -264,7 +264,7 @@ def test_a_photo_that_is_gone_or_broken_is_left_out_and_named(catalogue, model, 
     assert isinstance(read_photo(listed, listed.photos[1]), PhotoBytes)
     torn = listed.photos[1].path
     memory.pipe_file(f"/bucket/catalog/{torn}", memory.cat_file(f"/bucket/catalog/{torn}")[:100])
-    report = build_cluster("memory://bucket/catalog", load_checkpoint(model), tmp_path / "c", 2, quiet=True)
+    report = build_sharded("memory://bucket/catalog", load_checkpoint(model), tmp_path / "c", 2, quiet=True)
     assert ([item.path for item in report.skipped], report.photos) == ([torn], 22)
     assert report.embedded == 22
 
@@ -280,7 +280,7 @@ def test_a_catalogue_on_s3_is_built_as_one_on_the_disk(s3_server, catalogue, mod
     assert (report.photos, report.skipped) == (24, [])
     with Searcher.open(tmp_path / "index") as ours, Searcher.open(index) as theirs:
         assert list(ours.generation.rows) == list(theirs.generation.rows)
-        assert ours.described.about["catalogue"] == "s3://photos/catalog"
+        assert ours.info.about["catalogue"] == "s3://photos/catalog"
     for path in catalogue.rglob("1.jpg"):
         fsspec.filesystem("s3").rm_file(f"photos/catalog/{path.relative_to(catalogue)}")
     fsspec.filesystem("s3").invalidate_cache()

@@ -9,15 +9,15 @@ import pytest
 
 from retrieval.data.catalogue import list_catalogue
 from retrieval.data.sources import list_photos
-from retrieval.data.text import is_utf8, utf8_of
+from retrieval.data.text import is_utf8, replace_surrogates
 from retrieval.errors import DatasetError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
 from retrieval.search.query.objects import listed_photo
-from retrieval.serve.errors import Problem
+from retrieval.serve.errors import HttpProblem
 from robot.errors import RecordingError
 from robot.recording.folder import RecordingWriter, read_recording
-from tests.retrieval.serve.test_history import ask, say
+from tests.retrieval.serve.test_history import add_feedback, ask
 from tests.serving import INFO, service
 
 HALF = "\ud83d"  # the first half of an emoji
@@ -33,17 +33,17 @@ NAME = "mug\udcff"  # the byte ff in a file name
         (r'{"object_id": "mug", "deep": [{"a": ["\udfff"]}]}', "lone surrogate"),
     ],
 )
-def test_half_of_a_character_in_the_metadata_of_a_catalogue_is_refused_with_its_line(own, line, told):
-    (own / "metadata.jsonl").write_text('{"object_id": "a", "note": "\\ud83d\\ude00"}\n' + line + "\n")
+def test_half_of_a_character_in_the_metadata_of_a_catalogue_is_refused_with_its_line(catalogue_copy, line, told):
+    (catalogue_copy / "metadata.jsonl").write_text('{"object_id": "a", "note": "\\ud83d\\ude00"}\n' + line + "\n")
     with pytest.raises(DatasetError, match=rf"metadata.jsonl, line 2: it holds half of a character .*{told}") as raised:
-        list_catalogue(own)
+        list_catalogue(catalogue_copy)
     assert "\n" not in str(raised.value)
 
 
-def test_a_whole_character_of_two_escapes_is_taken(own):
-    name = sorted(path.name for path in own.iterdir())[0]
-    (own / "metadata.jsonl").write_text(json.dumps({"object_id": name, "note": "\U0001f600"}) + "\n")
-    assert list_catalogue(own).photos[0].metadata == {"note": "\U0001f600"}
+def test_a_whole_character_of_two_escapes_is_taken(catalogue_copy):
+    name = sorted(path.name for path in catalogue_copy.iterdir())[0]
+    (catalogue_copy / "metadata.jsonl").write_text(json.dumps({"object_id": name, "note": "\U0001f600"}) + "\n")
+    assert list_catalogue(catalogue_copy).photos[0].metadata == {"note": "\U0001f600"}
 
 
 def test_half_of_a_character_in_an_archive_is_refused_with_its_member(tmp_path):
@@ -84,20 +84,20 @@ def test_rows_of_an_older_index_are_shown_with_a_mark_in_place_of_what_utf8_cann
 
 def test_text_that_utf8_can_hold_stays_the_same_object():
     document = {"a": ["é", "\U0001f600", 1.5, None]}
-    assert utf8_of(document) is document
+    assert replace_surrogates(document) is document
     assert not is_utf8({HALF: 1})
 
 
 def test_a_problem_that_names_a_file_of_unknown_coding_is_a_document():
-    body = Problem("unknown", f"{NAME}.jpg is gone").response().body
+    body = HttpProblem("unknown", f"{NAME}.jpg is gone").response().body
     assert json.loads(body)["detail"] == "mug\ufffd.jpg is gone"
 
 
-def test_no_answer_over_an_older_index_with_half_a_character_fails(own, touch, model, tmp_path, monkeypatch):
-    name = sorted(path.name for path in own.iterdir())[0]
-    (own / "metadata.jsonl").write_text(json.dumps({"object_id": name, "note": HALF}) + "\n")
+def test_no_answer_over_an_older_index_with_half_a_character_fails(catalogue_copy, touch, model, tmp_path, monkeypatch):
+    name = sorted(path.name for path in catalogue_copy.iterdir())[0]
+    (catalogue_copy / "metadata.jsonl").write_text(json.dumps({"object_id": name, "note": HALF}) + "\n")
     monkeypatch.setattr("retrieval.data.catalogue.require_utf8", lambda row: None)  # as older versions did
-    build_index(own, load_checkpoint(model), tmp_path / "index", quiet=True)
+    build_index(catalogue_copy, load_checkpoint(model), tmp_path / "index", quiet=True)
     folder = tmp_path / "history"
     with (
         RecordingWriter(folder / "recording", INFO) as writer,
@@ -110,7 +110,7 @@ def test_no_answer_over_an_older_index_with_half_a_character_fails(own, touch, m
         assert [item["metadata"] for item in items] == [{"note": "\ufffd"}] * 3
         assert client.get(f"/v1/history/{query}").json()["answer"] == answer
         assert client.get("/v1/history").json()["items"][0]["id"] == query
-        assert say(client, query, "object", name).status_code == 201
+        assert add_feedback(client, query, "object", name).status_code == 201
 
 
 def test_a_catalogue_in_a_folder_whose_name_is_not_utf8_is_served(catalogue, touch, model, tmp_path):

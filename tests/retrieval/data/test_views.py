@@ -12,7 +12,7 @@ from retrieval.commands.main import main
 from retrieval.data import views
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.data.resize import resize
-from retrieval.data.views import VIEWS, Box, find_object, square, strip
+from retrieval.data.views import VIEWS, PixelBox, crop_square, find_object, tile_views
 from retrieval.errors import ConfigError
 from retrieval.model.config import Config, MatcherConfig
 from retrieval.model.fusion import Matcher
@@ -74,7 +74,7 @@ def test_any_photo_has_a_box_inside_it(image):
     box = find_object(image)
     assert 0 <= box.left < box.right <= image.shape[1]
     assert 0 <= box.top < box.bottom <= image.shape[0]
-    assert np.isfinite(strip(image, list(VIEWS), 8)).all()
+    assert np.isfinite(tile_views(image, list(VIEWS), 8)).all()
 
 
 def fitted(values, ring=6):
@@ -96,7 +96,7 @@ def test_the_ground_is_the_plane_of_least_squares_through_what_of_the_border_sca
     slope = np.linspace(0, 0.2, 128)[None, :, None] * [1, -1, 0.5, 0]
     maps = (1 + slope + rng.normal(0, [0.01, 0.02, 0.03, 0.0], (128, 128, 4))).astype(np.float32).transpose(2, 0, 1)
     maps[:, 100:, 40:90] += 0.7  # a thing that lies across the border
-    off, scatter = views._off_the_ground(maps)
+    off, scatter = views._ground_residuals(maps)
     for one, found, by in zip(maps, off, scatter, strict=True):
         expected, spread = fitted(one.astype(np.float64))
         np.testing.assert_allclose(found, expected, atol=1e-6)
@@ -109,7 +109,7 @@ def test_the_ground_is_the_plane_of_least_squares_through_what_of_the_border_sca
 @pytest.mark.parametrize("middle", [(0, 0), (19, 0), (0, 9), (19, 9), (8, 4)])
 def test_a_square_is_cut_out_pixel_by_pixel_wherever_it_lies(side, middle):
     image = np.random.default_rng(0).random((10, 20, 3)).astype(np.float32)
-    found = square(image, Box(*middle, middle[0] + 1, middle[1] + 1), side)
+    found = crop_square(image, PixelBox(*middle, middle[0] + 1, middle[1] + 1), side)
     left, top = (round(each + 0.5 - side / 2) for each in middle)
     for row in range(side):
         for column in range(side):
@@ -119,20 +119,20 @@ def test_a_square_is_cut_out_pixel_by_pixel_wherever_it_lies(side, middle):
 
 def test_the_grey_view_is_the_zoom_without_its_colours_to_the_bit():
     image = photo()
-    zoom = VIEWS["zoom"](image, Box(90, 80, 140, 150))
+    zoom = VIEWS["zoom"](image, PixelBox(90, 80, 140, 150))
     expected = resize(np.repeat(zoom.mean(axis=2, keepdims=True), 3, axis=2), (48, 48))
-    np.testing.assert_array_equal(strip(image, ("grey",), 48, Box(90, 80, 140, 150)), expected)
+    np.testing.assert_array_equal(tile_views(image, ("grey",), 48, PixelBox(90, 80, 140, 150)), expected)
 
 
 def test_a_square_goes_on_with_the_edges_pixels():
     image = np.arange(12, dtype=np.float32).reshape(3, 4, 1).repeat(3, 2)
-    found = square(image, Box(0, 0, 1, 1), 3)[..., 0]
+    found = crop_square(image, PixelBox(0, 0, 1, 1), 3)[..., 0]
     np.testing.assert_array_equal(found, [[0, 0, 1], [0, 0, 1], [4, 4, 5]])
 
 
 def test_views_stand_side_by_side():
     image = photo()
-    seen = strip(image, ("whole", "crop", "zoom", "grey"), 64)
+    seen = tile_views(image, ("whole", "crop", "zoom", "grey"), 64)
     assert seen.shape == (64, 256, 3)
     np.testing.assert_array_equal(seen[:, :64], Preprocessing(photo_px=64).photo(image))
     crop, zoom, grey = seen[:, 64:128], seen[:, 128:192], seen[:, 192:]
@@ -146,7 +146,7 @@ def test_the_zoom_has_one_scale_whatever_the_objects_size():
         image = photo(box=box)
         left, top, right, bottom = box
         image[top:bottom, left:right:8] = 1
-        return strip(image, ("zoom",), 112)
+        return tile_views(image, ("zoom",), 112)
 
     small, large = stripes((110, 90, 150, 170)), stripes((70, 20, 190, 230))
     middle = slice(40, 72)
@@ -183,7 +183,7 @@ def test_a_photos_features_are_those_of_its_views_side_by_side():
         found = matcher.photo_features(photos)
         expected = torch.cat([matcher.photo_tower(photos[..., :32]), matcher.photo_tower(photos[..., 32:])], dim=1)
     torch.testing.assert_close(found, expected)
-    assert matcher.head.photo_half.in_features == found.shape[1]
+    assert matcher.head.photo_partial.in_features == found.shape[1]
 
 
 def test_a_sheet_shows_what_the_model_sees_of_a_catalogue(tmp_path, model, catalogue, capsys):

@@ -11,7 +11,7 @@ from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import ImageError
 from retrieval.evaluation.audit import audit
 from tests import synthetic
-from tests.retrieval.data.test_doubts import COPIES, GENTLE
+from tests.retrieval.data.test_appearance_checks import COPIES, GENTLE
 
 
 @pytest.fixture(scope="module")
@@ -55,9 +55,9 @@ def test_a_clean_recording_is_said_to_be_clean(recording):
     assert found["grasps"] == {"train": 15, "validation": 6, "test": 9}
     assert list(found["frames"]) == ["photo", "touch a", "touch b"]
     for frames in found["frames"].values():
-        assert (frames["test"], frames["seen"], frames["close"]) == (9, 21, 0)
-        assert frames["to_seen"] == sorted(frames["to_seen"])
-        assert frames["to_seen"][0] > 0.1
+        assert (frames["test"], frames["train_validation"], frames["near_copies"]) == (9, 21, 0)
+        assert frames["to_train_validation"] == sorted(frames["to_train_validation"])
+        assert frames["to_train_validation"][0] > 0.1
     checked = [found["frames"][kind]["checked"] for kind in ("photo", "touch a", "touch b")]
     assert checked[0] >= 7
     assert f"{checked[0]} of 9 (photo), {checked[1]} of 9 (touch a), {checked[2]} of 9 (touch b)" in found["verdict"]
@@ -82,10 +82,10 @@ def test_a_copy_encoded_again_made_brighter_moved_or_flipped_is_found(recording,
         cv2.imwrite(str(copy), COPIES[how](cv2.imread(str(source))))
     found = judge(recording)
     for kind in ("photo", "touch a", "touch b") if how in GENTLE else ("photo",):
-        assert found["frames"][kind]["close"] == 1
+        assert found["frames"][kind]["near_copies"] == 1
         assert f"1 of 9 test frames ({kind})" in found["verdict"]
     nearest = found["frames"]["photo"]["nearest"][0]
-    assert (nearest["test"], nearest["seen"]) == (test.grasp_id, train.grasp_id)
+    assert (nearest["test"], nearest["train_validation"]) == (test.grasp_id, train.grasp_id)
 
 
 def test_bytes_alone_and_whole_numbers_alone_would_miss_it(recording):
@@ -106,7 +106,7 @@ def test_a_copy_of_a_validation_frame_counts_too(recording):
     _, validation, test = one_of_each(recording)
     shutil.copy(validation.photo, test.photo)
     found = judge(recording)
-    assert found["identical"]["count"] == found["frames"]["photo"]["close"] == 1
+    assert found["identical"]["count"] == found["frames"]["photo"]["near_copies"] == 1
 
 
 def test_shared_objects_and_sequences_are_said(recording):
@@ -123,7 +123,7 @@ def test_objects_outside_the_split_are_left_out(recording):
     whole = split_of(grasps)
     found = judge(recording, Split(seed=0, train=whole.train[:2], validation=(), test=whole.test))
     assert found["grasps"] == {"train": 6, "validation": 0, "test": 9}
-    assert found["frames"]["photo"]["seen"] == 6
+    assert found["frames"]["photo"]["train_validation"] == 6
 
 
 def test_without_frames_on_one_side_there_is_nothing_to_compare(recording):
@@ -131,12 +131,12 @@ def test_without_frames_on_one_side_there_is_nothing_to_compare(recording):
     grasps = load_grasps(recording)
     names = tuple(sorted({grasp.object_id for grasp in grasps}))
     found = judge(recording, Split(seed=0, train=(), validation=(), test=names))
-    assert found["frames"]["photo"]["to_seen"] is None
+    assert found["frames"]["photo"]["to_train_validation"] is None
     assert found["frames"]["photo"]["nearest"] == []
     assert found["clean"]
     assert "no frames of both sides to compare" in found["verdict"]
     nothing = judge(recording, Split(seed=0, train=names, validation=(), test=()))["frames"]["photo"]
-    assert (nothing["test"], nothing["to_seen"], nothing["within_object"]) == (0, None, None)
+    assert (nothing["test"], nothing["to_train_validation"], nothing["within_object"]) == (0, None, None)
 
 
 def test_a_damaged_image_is_named(recording):
@@ -150,7 +150,7 @@ def test_two_runs_agree_to_the_last_digit(recording):
     assert judge(recording) == judge(recording)
 
 
-def test_touches_that_hardly_differ_from_the_untouched_gel_are_not_checked_and_said_not_to_be(recording):
+def test_low_contact_touches_are_reported_as_unchecked(recording):
     """Of the untouched gel, with noise of its own, no copy can be told: the verdict does not call it checked."""
     rng = np.random.default_rng(0)
     gel = cv2.imread(str(load_grasps(recording)[0].touches[0]))
@@ -159,6 +159,6 @@ def test_touches_that_hardly_differ_from_the_untouched_gel_are_not_checked_and_s
         cv2.imwrite(str(grasp.touches[0]), noisy)
     found = judge(recording)
     frames = found["frames"]["touch a"]
-    assert (frames["checked"], frames["close"], frames["nearest"]) == (0, 0, [])
+    assert (frames["checked"], frames["near_copies"], frames["nearest"]) == (0, 0, [])
     assert "0 of 9 (touch a)" in found["verdict"]
     assert "the others show too little to tell a copy by" in found["verdict"]

@@ -12,10 +12,10 @@ from retrieval.evaluation.calibrate import (
     KWayTest,
     calibrate,
     calibrate_pairs,
-    drawn_choices,
-    drawn_pairs,
+    draw_k_way_tests,
+    draw_pairs,
     pair_rule,
-    questions,
+    posterior_questions,
     reliability,
 )
 from retrieval.metrics.pairs import fit_calibration, reliability_bins
@@ -57,7 +57,7 @@ def test_no_threshold_is_fitted_on_fewer_than_ten_objects_and_the_reason_is_said
     assert found.to_dict() == {
         "at": None,
         "from": None,
-        "why_not": "pair accuracy needs a threshold: a checkpoint's own, or one fitted on 10 validation objects; "
+        "reason": "pair accuracy needs a threshold: a checkpoint's own, or one fitted on 10 validation objects; "
         "there are 9",
     }
 
@@ -73,7 +73,7 @@ def test_of_ten_objects_a_threshold_is_fitted_where_the_log_odds_are_0():
 def test_a_checkpoints_own_threshold_goes_before_one_that_validation_objects_would_give():
     for objects in (2, 20):
         found = pair_rule({"pair_threshold": 1.5}, planted(objects=objects))
-        assert found.to_dict() == {"at": 1.5, "from": "the checkpoint", "why_not": None}
+        assert found.to_dict() == {"at": 1.5, "from": "the checkpoint", "reason": None}
         # By hand: a match scores above 1.5, exactly 1.5 is a coin.
         table = table_of([[9, 2.0], [1.5, 1]], [0, 1], own=np.zeros((2, 2), bool))
         assert pair_accuracy(table, found.rule).values.ravel().tolist() == [(1 + 0) / 2, (0 + 0.5) / 2]
@@ -86,7 +86,7 @@ def test_drawn_pairs_are_even_in_every_row_and_hold_no_own_photo():
     """Scores name row and column, so every pair can be told."""
     owner = np.repeat([0, 1, 2], [3, 4, 12])
     table = table_of(np.arange(19 * 19).reshape(19, 19), owner)
-    scores, labels = drawn_pairs(table, seed=0)
+    scores, labels = draw_pairs(table, seed=0)
     rows, columns = np.divmod(scores.astype(int), 19)
     assert (rows != columns).all()
     np.testing.assert_array_equal(labels, owner[rows] == owner[columns])
@@ -98,13 +98,13 @@ def test_drawn_pairs_are_even_in_every_row_and_hold_no_own_photo():
 
 def test_the_object_of_a_false_pair_is_drawn_before_its_photo():
     owner = np.repeat([0, 1, 2], [9, 2, 90])
-    scores, labels = drawn_pairs(table_of(np.tile(owner, (101, 1)), owner), seed=0)
+    scores, labels = draw_pairs(table_of(np.tile(owner, (101, 1)), owner), seed=0)
     assert np.mean(scores[labels == 0][:72] == 1) == pytest.approx(0.5, abs=0.2)  # naively, by photos, 2 / 92
 
 
 def test_drawn_choices_have_the_true_object_first_and_rivals_without_replacement():
     owner = np.repeat(np.arange(7), 3)
-    scores = drawn_choices(table_of(np.tile(owner, (21, 1)), owner), KWayTest(4, photos=2), seed=0)
+    scores = draw_k_way_tests(table_of(np.tile(owner, (21, 1)), owner), KWayTest(4, photos=2), seed=0)
     assert scores.shape == (4 * 21, 4)
     np.testing.assert_array_equal(scores[:21, 0], owner)
     assert all(len(set(row)) == 4 for row in scores.tolist())
@@ -113,11 +113,11 @@ def test_drawn_choices_have_the_true_object_first_and_rivals_without_replacement
 
 
 def test_with_few_objects_a_choice_is_among_those_that_there_are():
-    assert drawn_choices(planted(objects=3), KWayTest(10), seed=0).shape[1] == 3
+    assert draw_k_way_tests(planted(objects=3), KWayTest(10), seed=0).shape[1] == 3
     with pytest.raises(BadInput, match="two objects at least; got 1"):
-        drawn_choices(table_of(np.zeros((2, 2)), [0, 0]), KWayTest(5), seed=0)
+        draw_k_way_tests(table_of(np.zeros((2, 2)), [0, 0]), KWayTest(5), seed=0)
     with pytest.raises(BadInput, match="two objects at least; got 1"):
-        drawn_pairs(table_of(np.zeros((2, 2)), [0, 0]), seed=0)
+        draw_pairs(table_of(np.zeros((2, 2)), [0, 0]), seed=0)
 
 
 # Pairs and sums --------------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ def test_sums_of_grasps_that_err_alike_get_a_smaller_slope_than_the_sum_of_log_o
         assert fitted.slope == pytest.approx(slope, rel=0.15)
     # Naively, by one grasp's calibration, a sum of alike ones is far too sure of itself.
     sums = sets_of(one, 5, 1.0, seed=1)
-    scores, labels = drawn_pairs(sums, seed=0)
+    scores, labels = draw_pairs(sums, seed=0)
     single = calibrate_pairs(one)
     added = expit(single.slope * scores + 5 * single.intercept)
     said = (added, calibrate_pairs(sets_of(one, 5, 1.0)).probability(scores))
@@ -176,11 +176,11 @@ def test_a_candidate_is_shown_by_what_the_posterior_makes_of_its_photos():
     """Photos of 3 and 0, and none is another's: log of the mean of e^3 and 1, where the mean is 1.5."""
     owner = np.repeat([0, 1], 2)
     table = table_of(np.tile([3.0, 0.0, 0.0, 3.0], (4, 1)), owner, own=np.zeros((4, 4), dtype=bool))
-    pooled = drawn_choices(table, KWayTest(2, photos=2), 0, Posterior())
+    pooled = draw_k_way_tests(table, KWayTest(2, photos=2), 0, Posterior())
     assert pooled == pytest.approx(np.full((16, 2), math.log((math.exp(3) + 1) / 2)))
-    assert drawn_choices(table, KWayTest(2, photos=2), 0) == pytest.approx(np.full((16, 2), 1.5))
+    assert draw_k_way_tests(table, KWayTest(2, photos=2), 0) == pytest.approx(np.full((16, 2), 1.5))
     np.testing.assert_allclose(
-        drawn_choices(table, KWayTest(2), 0, Posterior()), drawn_choices(table, KWayTest(2), 0), atol=1e-12
+        draw_k_way_tests(table, KWayTest(2), 0, Posterior()), draw_k_way_tests(table, KWayTest(2), 0), atol=1e-12
     )
 
 
@@ -189,7 +189,7 @@ def test_choices_that_never_err_have_a_finite_slope_and_a_doubt():
     table = table_of(np.where(owner[:, None] == owner, 3.0, 0.0), owner)
     fitted = calibrate({1: table}).posteriors[1]
     assert SLOPE_BOUNDS[0] < fitted.slope < 5
-    assert 0.001 < 1 - fitted.believe([3.0, 0, 0, 0, 0]).objects[0] < 0.1
+    assert 0.001 < 1 - fitted.probabilities([3.0, 0, 0, 0, 0]).objects[0] < 0.1
 
 
 @pytest.mark.parametrize("value", [0.0, 1e6, -1e6, 3e38])
@@ -198,7 +198,7 @@ def test_constant_scores_say_nothing_and_get_even_chances(value):
     for photos in (1, 3):
         found = reliability(calibrate({1: table}), {1: table}, [KWayTest(5, photos=photos)])
         assert found["k5"]["ece"] == pytest.approx(0, abs=1e-12)
-        only = {"probability": pytest.approx(0.2), "share": pytest.approx(0.2), "count": 4 * 24}
+        only = {"probability": pytest.approx(0.2), "frequency": pytest.approx(0.2), "count": 4 * 24}
         assert found["k5"]["bins"] == [only]
         assert found["pairs"]["ece"] == pytest.approx(0, abs=1e-12)
 
@@ -216,12 +216,12 @@ def test_a_score_that_is_not_finite_never_reaches_a_posterior(bad):
         table_of(scores, np.repeat([0, 1, 2], 2))
 
 
-def test_scores_that_say_the_opposite_are_hardly_believed():
+def test_inverted_scores_get_low_probabilities():
     """The smaller the slope the better: every candidate is about as likely."""
     owner = np.repeat(np.arange(6), 4)
     fitted = calibrate({1: table_of(np.where(owner[:, None] == owner, -3.0, 0.0), owner)}).posteriors[1]
     assert fitted.slope < 0.02
-    assert fitted.believe([-3.0, 0, 0, 0, 0], none_prior=0).objects[0] == pytest.approx(0.2, abs=0.02)
+    assert fitted.probabilities([-3.0, 0, 0, 0, 0], none_prior=0).objects[0] == pytest.approx(0.2, abs=0.02)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6, 1e37])
@@ -239,7 +239,7 @@ def test_two_objects_leave_the_posterior_out_and_pairs_in():
     assert fitted.posteriors == {}
     assert set(reliability(fitted, {1: planted(objects=2)}, [KWayTest(2)])) == {"pairs"}
     with pytest.raises(BadInput, match="three objects at least"):
-        questions(planted(objects=2))
+        posterior_questions(planted(objects=2))
 
 
 # Reliability -----------------------------------------------------------------------------------------------
@@ -249,15 +249,15 @@ def test_bins_and_their_error_by_hand():
     """Bins of a 15th: .1 alone; .30 and .32 in one, half of them true; 1.0 in the last."""
     found = reliability_bins([0.1, 0.3, 0.32, 1.0], [0, 1, 0, 1])
     assert found["bins"] == [
-        {"probability": pytest.approx(0.1), "share": 0, "count": 1},
-        {"probability": pytest.approx(0.31), "share": 0.5, "count": 2},
-        {"probability": 1.0, "share": 1, "count": 1},
+        {"probability": pytest.approx(0.1), "frequency": 0, "count": 1},
+        {"probability": pytest.approx(0.31), "frequency": 0.5, "count": 2},
+        {"probability": 1.0, "frequency": 1, "count": 1},
     ]
     assert found["ece"] == pytest.approx((0.1 + 2 * 0.19 + 0) / 4)
 
 
 def test_the_error_is_that_which_the_fit_of_a_checkpoint_states():
-    scores, labels = drawn_pairs(planted(), seed=0)
+    scores, labels = draw_pairs(planted(), seed=0)
     fitted = fit_calibration(scores, labels)
     assert reliability_bins(fitted.probability(scores), labels)["ece"] == pytest.approx(fitted.ece_after, abs=1e-12)
 

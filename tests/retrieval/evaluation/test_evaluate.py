@@ -12,23 +12,23 @@ import torch
 
 from retrieval.commands.main import main
 from retrieval.data.dataset import Grasp, Split, load_grasps, make_split
-from retrieval.errors import BadInput, ConfigError, DatasetError, Interrupted
-from retrieval.evaluation.controls import CEILINGS, ceiling_experiments, score_beside, thinned
+from retrieval.errors import BadInput, ConfigError, DatasetError, JobInterrupted
+from retrieval.evaluation.controls import CEILINGS, ceiling_experiments, score_control, thin_grasps
 from retrieval.evaluation.evaluate import evaluate
-from retrieval.evaluation.experiment import Experiment, _shuffled
+from retrieval.evaluation.experiment import Experiment, _permute_touches
 from retrieval.evaluation.queries import draw_queries
-from retrieval.methods.base import Method
+from retrieval.methods.method import Method
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.report.evaluation import write_report
 from retrieval.training.features import Features
 from retrieval.training.train import Trainer, train
 from tests import synthetic
 from tests.conftest import TINY
-from tests.labelled import label_recording
+from tests.labelled_pictures import label_recording
 
 TRAINING = dataclasses.replace(TINY.training, freeze_towers=True, validation_fraction=0.2, test_fraction=0.34)
 CONFIG = dataclasses.replace(TINY, training=TRAINING)
-FEW = ("late_fusion", "prune_rerank", "cca", "constant")
+FEW = ("late_fusion", "retrieve_rerank", "cca", "constant")
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def no_fits(monkeypatch):
     monkeypatch.setattr(Trainer, "run", lambda *_: pytest.fail("trained"))
 
 
-def test_results_say_what_was_judged_on_what(made, grasped):
+def test_results_describe_data_and_settings(made, grasped):
     results = made[0]
     assert results["recording"]["objects"] == 18
     assert results["recording"]["grasps"] == 72
@@ -74,14 +74,14 @@ def test_results_say_what_was_judged_on_what(made, grasped):
     assert results["setting"]["features"] | {"digest": ""} == features
     assert [len(results["split"][part]) for part in ("train", "validation", "test")] == [8, 4, 6]
     assert list(results["methods"]) == list(FEW)
-    assert set(results["controls"]) == {"shuffled", "before", "blurred"}
+    assert set(results["controls"]) == {"shuffled", "no_contact", "low_pass"}
     assert set(results["ceilings"]) == {"touch_to_touch", "photo_to_photo"}
     assert {(one["a"], one["b"]) for one in results["comparisons"]} == {("late_fusion", name) for name in FEW[1:]}
     assert results["audit"]["clean"]
-    assert set(results["faint"]["methods"]) == set(FEW)
-    assert results["faint"]["touches"] == 1  # a twentieth of 24
-    assert results["faint"]["methods"]["late_fusion"]["others"]["guesses_k5"]["queries"] == 23
-    summary = results["methods"]["late_fusion"]["measures"]["guesses_k5"]
+    assert set(results["low_contact"]["methods"]) == set(FEW)
+    assert results["low_contact"]["touches"] == 1  # a twentieth of 24
+    assert results["low_contact"]["methods"]["late_fusion"]["others"]["topn_k5"]["queries"] == 23
+    summary = results["methods"]["late_fusion"]["measures"]["topn_k5"]
     assert (summary["objects"], summary["queries"], len(summary["value"])) == (6, 24, 5)
 
 
@@ -99,8 +99,8 @@ class Loudest(Method):
     def _encode_photo(self, photo):
         return photo.max(1, keepdims=True)
 
-    def _score(self, touch_codes, photo_codes):
-        return touch_codes @ photo_codes.T
+    def _score(self, touch_encodings, photo_encodings):
+        return touch_encodings @ photo_encodings.T
 
 
 def test_a_method_of_ones_own_stands_in_the_report_beside_ours(run, tmp_path, grasped, monkeypatch):
@@ -142,8 +142,8 @@ def test_labelled_pairs_are_fitted_on_beside_the_training_objects_and_judged_by_
 
 def test_each_measure_has_its_interval_and_ten_candidates_need_ten_objects(made):
     for method in made[0]["methods"].values():
-        assert {"pair_auc", "guesses_k5", "guesses_k5_g1_p3", "map", "paired_top1"} <= set(method["measures"])
-        assert "guesses_k10" not in method["measures"]
+        assert {"pair_auc", "topn_k5", "topn_k5_g1_p3", "map", "paired_top1"} <= set(method["measures"])
+        assert "topn_k10" not in method["measures"]
         for summary in method["measures"].values():
             parts = {"value", "low", "high", "chance", "queries", "objects", "few_objects", "gallery", "by_seed"}
             assert parts == set(summary)
@@ -154,7 +154,7 @@ def test_four_validation_objects_give_no_threshold_and_pair_accuracy_is_missing_
     why = "one fitted on 10 validation objects; there are 4"
     for method in results["methods"].values():
         assert "pair_accuracy" not in method["measures"]
-        assert method["pair_threshold"]["why_not"].endswith(why)
+        assert method["pair_threshold"]["reason"].endswith(why)
     assert not any("pair_accuracy" in one["measures"] for one in results["controls"].values())
     write_report(folder, None)
     assert f"{why}." in (folder / "report.md").read_text()
@@ -194,12 +194,12 @@ def match_logits(matcher, grasps):
     table = np.empty((len(grasps), len(grasps)))
     with torch.inference_mode():
         fingers = [torch.tensor(np.array([load.load_touch(path) for path in grasp.touches])) for grasp in grasps]
-        touches = [matcher.touch_code(matcher.touch_features(touch.permute(0, 3, 1, 2)[None])) for touch in fingers]
+        touches = [matcher.touch_encoding(matcher.touch_features(touch.permute(0, 3, 1, 2)[None])) for touch in fingers]
         pictures = [torch.tensor(load.load_photo(grasp.photo)).permute(2, 0, 1)[None] for grasp in grasps]
-        photos = [matcher.photo_code(matcher.photo_features(picture)) for picture in pictures]
+        photos = [matcher.photo_encoding(matcher.photo_features(picture)) for picture in pictures]
         for row, touch in enumerate(touches):
             for column, photo in enumerate(photos):
-                table[row, column] = matcher.head(touch.half, photo.half).item()
+                table[row, column] = matcher.head(touch.partial, photo.partial).item()
     return table
 
 
@@ -233,7 +233,7 @@ def test_two_runs_give_the_same_results_to_the_byte_and_no_paths_or_times(made, 
     assert set(times["methods"]["cca"]) == {
         "fit_s", "encode_touch_ms", "encode_photo_ms", "score_us_per_photo", "query_ms"
     }  # fmt: skip
-    assert times["methods"]["prune_rerank"]["fit_s"] == times["methods"]["late_fusion"]["fit_s"]
+    assert times["methods"]["retrieve_rerank"]["fit_s"] == times["methods"]["late_fusion"]["fit_s"]
 
 
 def test_a_second_run_fits_nothing_and_another_method_is_added(made, run, monkeypatch):
@@ -248,7 +248,7 @@ def test_a_second_run_fits_nothing_and_another_method_is_added(made, run, monkey
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(run, tmp_path, monkeypatch, made):
     fitted = []
-    real = Experiment._fitted
+    real = Experiment._fit
 
     def stopping(self, name, seed):
         if name == "cca":
@@ -257,11 +257,11 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(run, tmp_path, monkeypatch,
         return real(self, name, seed)
 
     with monkeypatch.context() as during:
-        during.setattr(Experiment, "_fitted", stopping)
+        during.setattr(Experiment, "_fit", stopping)
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path / "out", seeds=2)
-    assert fitted == ["late_fusion", "late_fusion", "prune_rerank", "prune_rerank"]
-    monkeypatch.setattr(Experiment, "_fitted", lambda self, *job: fitted.append(job[0]) or real(self, *job))
+    assert fitted == ["late_fusion", "late_fusion", "retrieve_rerank", "retrieve_rerank"]
+    monkeypatch.setattr(Experiment, "_fit", lambda self, *job: fitted.append(job[0]) or real(self, *job))
     assert run(tmp_path / "out", seeds=2) == made[0]
     assert fitted[4:6] == ["cca", "constant"]
     assert fitted[6:] == [*["late_fusion"] * 3, "cca", "cca"]  # the controls and the ceilings
@@ -275,14 +275,14 @@ def test_ctrl_c_while_a_head_trains_says_how_to_go_on(run, tmp_path, monkeypatch
         return loss(self, loaded)
 
     monkeypatch.setattr(Trainer, "loss", interrupted)
-    with pytest.raises(Interrupted, match="the same command goes on with it"):
+    with pytest.raises(JobInterrupted, match="the same command goes on with it"):
         run(tmp_path / "out", methods=("late_fusion",))
 
 
 def test_shuffled_touches_stay_in_their_part_and_photos_where_they_are():
     touch = np.arange(40, dtype=np.float32).reshape(20, 1, 2)
     features = Features(tuple(map(str, range(20))), ("a",) * 10 + ("b",) * 10, touch, touch[:, 0])
-    permuted = _shuffled(features, 0)
+    permuted = _permute_touches(features, 0)
     assert sorted(permuted.touch[:, 0, 0]) == sorted(touch[:, 0, 0])
     assert (permuted.touch != touch).any()
     np.testing.assert_array_equal(permuted.photo, features.photo)
@@ -292,7 +292,7 @@ def test_shuffled_touches_stay_in_their_part_and_photos_where_they_are():
 def test_a_control_is_left_out_where_the_frames_for_it_were_not_recorded(run, tmp_path):
     bare = synthetic.write_recording(tmp_path / "bare", synthetic.make_objects(12), 3, before=False)
     results = run(tmp_path / "out", recording=bare, methods=("chance",))
-    assert set(results["controls"]) == {"shuffled", "blurred"}
+    assert set(results["controls"]) == {"shuffled", "low_pass"}
     assert len(results["split"]["validation"]) == 2  # too few for a posterior
     assert results["methods"]["chance"]["reject"] is None
     assert set(results["methods"]["chance"]["reliability"]) == {"pairs"}
@@ -313,8 +313,8 @@ def test_a_side_that_knows_the_object_reaches_its_ceiling_and_one_that_does_not_
     experiment = Experiment(tmp_path, CONFIG, split, features, None, asked, None, shuffled=False, quiet=True)
     found = {}
     for name, ceiling in ceiling_experiments(experiment).items():
-        entry = score_beside(CEILINGS[name], "cca", ceiling, 0, draws=100)
-        found[name] = entry["measures"]["guesses_k5"]["value"][0]
+        entry = score_control(CEILINGS[name], "cca", ceiling, 0, draws=100)
+        found[name] = entry["measures"]["topn_k5"]["value"][0]
     assert found["photo_to_photo"] > 0.99
     assert found["touch_to_touch"] < 0.4  # chance is .2
 
@@ -328,9 +328,9 @@ def test_objects_with_one_photo_have_no_ceiling_of_photos():
 
 def test_grasps_are_thinned_evenly(grasped):
     grasps = load_grasps(grasped)
-    kept = thinned(grasps, 2)
+    kept = thin_grasps(grasps, 2)
     assert [grasps.index(grasp) % 4 for grasp in kept] == [0, 3] * 18
-    assert thinned(grasps, 9) == grasps
+    assert thin_grasps(grasps, 9) == grasps
 
 
 @pytest.fixture(scope="module")
@@ -345,7 +345,7 @@ def model(grasped, tmp_path_factory):
     )
 
 
-def test_a_model_is_judged_as_it_is_on_the_objects_that_it_never_saw(model, run, tmp_path, monkeypatch):
+def test_a_checkpoint_is_evaluated_on_its_unseen_objects(model, run, tmp_path, monkeypatch):
     no_fits_of_heads = []
     real = Method.fit
     monkeypatch.setattr(
@@ -356,11 +356,11 @@ def test_a_model_is_judged_as_it_is_on_the_objects_that_it_never_saw(model, run,
     assert results["split"] == {**model.split.to_dict(), "from": "the model's own"}
     assert results["setting"]["model"] == model.digest
     own = -model.posterior.offset / model.posterior.slope  # where slope * logit + offset is 0
-    assert results["methods"]["late_fusion"]["chosen"] == [
+    assert results["methods"]["late_fusion"]["best_params"] == [
         {"step": model.provenance["step"], **model.provenance["metrics"], "pair_threshold": pytest.approx(own)}
     ]
     assert results["methods"]["late_fusion"]["pair_threshold"] == {
-        "at": pytest.approx(own), "from": "the checkpoint", "why_not": None
+        "at": pytest.approx(own), "from": "the checkpoint", "reason": None
     }  # fmt: skip
     assert "pair_accuracy" in results["methods"]["late_fusion"]["measures"]
     assert results["methods"]["cca"]["pair_threshold"]["from"] is None  # there are four validation objects
@@ -371,7 +371,7 @@ def test_a_model_is_judged_as_it_is_on_the_objects_that_it_never_saw(model, run,
     assert times["cca"]["fit_s"] > 0
 
 
-def test_a_model_of_another_recording_is_judged_on_a_fresh_split(model, run, tmp_path):
+def test_a_checkpoint_of_another_recording_gets_a_new_split(model, run, tmp_path):
     other = synthetic.write_recording(tmp_path / "other", synthetic.make_objects(12, seed=50), 3)
     results = run(tmp_path / "out", recording=other, model=model.path, methods=("late_fusion",))
     assert results["split"]["from"] == "drawn; the model has seen none of its objects"
@@ -390,11 +390,11 @@ def test_a_preset_that_trains_its_towers_trains_them_first_and_late_fusion_is_th
     run, model, tmp_path, monkeypatch
 ):
     config = dataclasses.replace(CONFIG, training=dataclasses.replace(TRAINING, freeze_towers=False))
-    results = run(tmp_path / "out", config=config, methods=("late_fusion", "prune_rerank"))
+    results = run(tmp_path / "out", config=config, methods=("late_fusion", "retrieve_rerank"))
     made = load_checkpoint(tmp_path / "out" / "model.safetensors")
     assert results["setting"]["model"] == made.digest == model.digest  # what `retrieve train` makes
     no_fits(monkeypatch)
-    assert run(tmp_path / "out", config=config, methods=("late_fusion", "prune_rerank")) == results
+    assert run(tmp_path / "out", config=config, methods=("late_fusion", "retrieve_rerank")) == results
 
 
 def test_wrong_use_is_said_before_anything_is_read(run, tmp_path):

@@ -9,8 +9,8 @@ import pytest
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import DatasetError
 from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
-from retrieval.evaluation.queries import MOST_GRASPS, SET_SIZES, SETS_OF_AN_OBJECT, draw_queries
-from retrieval.methods.base import Setting
+from retrieval.evaluation.queries import MAX_GRASPS, SET_SIZES, SETS_OF_AN_OBJECT, draw_queries
+from retrieval.methods.method import MethodSettings
 from retrieval.methods.trivial import Chance
 from retrieval.model.checkpoint import write_tensors
 from retrieval.training.features import Features
@@ -33,10 +33,10 @@ GRASPS = recorded({"a": 20, "b": 3, "c": 20, "d": 6, "e": 24, "f": 2, "left out"
 QUERIES = draw_queries(GRASPS, SPLIT, 0)
 
 
-def test_every_grasp_of_a_test_object_is_judged_and_some_of_the_others():
+def test_queries_hold_all_test_grasps_and_some_of_the_others():
     names, counts = np.unique([GRASPS[row].object_id for row in QUERIES.touches], return_counts=True)
     assert dict(zip(names.tolist(), counts.tolist(), strict=True)) == {
-        "a": MOST_GRASPS["train"], "b": 3, "c": MOST_GRASPS["validation"], "d": 6, "e": 24, "f": 2,
+        "a": MAX_GRASPS["train"], "b": 3, "c": MAX_GRASPS["validation"], "d": 6, "e": 24, "f": 2,
     }  # fmt: skip
     assert len(set(QUERIES.touches.tolist())) == len(QUERIES.touches)
 
@@ -90,7 +90,7 @@ def features():
 
 
 def fitted(cls, features):
-    method = cls(Setting(TINY))
+    method = cls(MethodSettings(TINY))
     method.fit(features.of_objects(SPLIT.train), features.of_objects(SPLIT.validation))
     return method
 
@@ -98,8 +98,8 @@ def fitted(cls, features):
 class Largest(Chance):
     """Fuses a set by its largest score."""
 
-    def _score_sets(self, touch_codes, photo_codes, sets):
-        return self._score(touch_codes, photo_codes)[sets].max(1)
+    def _score_sets(self, touch_encodings, photo_encodings, sets):
+        return self._score(touch_encodings, photo_encodings)[sets].max(1)
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +144,7 @@ def test_what_was_written_is_read(predictions, tmp_path):
     assert list(found.set_scores) == list(predictions.set_scores) == sorted(SET_SIZES)
     for size, scores in predictions.set_scores.items():
         np.testing.assert_array_equal(found.set_scores[size], scores)
-    assert (found.chosen, found.seconds) == (predictions.chosen, predictions.seconds)
+    assert (found.best_params, found.seconds) == (predictions.best_params, predictions.seconds)
 
 
 @pytest.mark.parametrize("key", [*MADE_BY, "model"])

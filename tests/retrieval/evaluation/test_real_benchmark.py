@@ -10,14 +10,14 @@ import pytest
 from retrieval.commands.main import main
 from retrieval.evaluation.real import PROTOCOLS, vt60
 from retrieval.evaluation.real import benchmark as real_benchmark
-from retrieval.evaluation.real.measuring import Measured, read_measured, write_measured
-from retrieval.methods.base import Method
+from retrieval.evaluation.real.fold_measures import FoldMeasures, read_fold_measures, write_fold_measures
+from retrieval.methods.method import Method
 from retrieval.metrics.measure import Measure
 from tests import real_data_sets
 from tests.data import touch_data
 
 TINY = ["--preset", "tiny", "--iterations", "2", "--seeds", "2", "--methods", "cca_pca,chance"]
-ASKED = ("vt60-random", "billets-places")
+MAX_QUERIES = ("vt60-random", "billets-places")
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def benchmark(data, out, *more, methods=TINY):
 def out(data, tmp_path_factory):
     """The report of two protocols. Copy it before changing it."""
     folder = tmp_path_factory.mktemp("made") / "report"
-    assert benchmark(data, folder, "--protocols", ",".join(ASKED)) == 0
+    assert benchmark(data, folder, "--protocols", ",".join(MAX_QUERIES)) == 0
     return folder
 
 
@@ -46,48 +46,48 @@ def results(out):
     return json.loads((out / "results.json").read_text())
 
 
-def test_every_row_has_its_blurred_control_and_a_verdict_and_chance_has_neither(results):
-    assert list(results["protocols"]) == sorted(ASKED)
+def test_trained_rows_have_a_low_pass_control_and_a_verdict(results):
+    assert list(results["protocols"]) == sorted(MAX_QUERIES)
     for entry in results["protocols"].values():
         assert set(entry["rows"]) == {"cca_pca", "chance"}
         row, nothing = entry["rows"]["cca_pca"], entry["rows"]["chance"]
-        assert set(row["measures"]) == set(row["blurred"]) == set(row["differences"])
-        difference = row["differences"][entry["main"]]
+        assert set(row["measures"]) == set(row["low_pass"]) == set(row["low_pass_differences"])
+        difference = row["low_pass_differences"][entry["main"]]
         against_order = row["order_differences"][entry["main"]]
         assert row["verdict"]["counts_as_touch"] == (difference["low"] > 0 and against_order["low"] > 0)
         order = entry["controls"]["order"]["measures"][entry["main"]]["value"][0]
         by_hand = row["measures"][entry["main"]]["value"][0] - order
         assert against_order["difference"] == pytest.approx(by_hand)
-        by_hand = row["measures"][entry["main"]]["value"][0] - row["blurred"][entry["main"]]["value"][0]
+        by_hand = row["measures"][entry["main"]]["value"][0] - row["low_pass"][entry["main"]]["value"][0]
         assert difference["difference"] == pytest.approx(by_hand)
-        assert (nothing["blurred"], nothing["verdict"]) == (None, None)
+        assert (nothing["low_pass"], nothing["verdict"]) == (None, None)
 
 
 def test_a_seed_asks_every_object_and_chance_is_that_of_the_gallery(results):
-    summary = results["protocols"]["vt60-random"]["rows"]["cca_pca"]["measures"]["guesses_k9"]
+    summary = results["protocols"]["vt60-random"]["rows"]["cca_pca"]["measures"]["topn_k9"]
     assert (summary["objects"], summary["queries"], len(summary["by_seed"])) == (18, 18 * 4, 2)
     assert summary["chance"][0] == pytest.approx(1 / 9)
 
 
 def test_a_gallery_of_billets_holds_the_places_of_one_and_right_answers_are_counted(results):
     entry = results["protocols"]["billets-places"]
-    summary = entry["rows"]["cca_pca"]["measures"]["guesses_k4"]
+    summary = entry["rows"]["cca_pca"]["measures"]["topn_k4"]
     assert (entry["unit"], summary["objects"], summary["queries"]) == ("sequence", 3, 48)
     assert summary["few_objects"]
     assert "4 test objects, 4 photos" in summary["gallery"]
-    counted = entry["rows"]["cca_pca"]["counted"]
-    assert counted["asked"] == 48
+    counted = entry["rows"]["cca_pca"]["correct_counts"]
+    assert counted["queries"] == 48
     assert np.mean(counted["right"]) / 48 == pytest.approx(summary["value"][0])
     assert counted["low"] < summary["value"][0] < counted["high"]
 
 
 def test_controls_say_what_was_done_and_why_one_is_not_there(results):
     for entry in results["protocols"].values():
-        assert list(entry["controls"]) == ["background", "dealt", "order", "untouched"]
-        assert all(control["what"] for control in entry["controls"].values())
-    assert "one untouched frame serves all" in results["protocols"]["vt60-random"]["controls"]["untouched"]["why_not"]
-    assert "lacks untouched" in results["protocols"]["billets-places"]["controls"]["untouched"]["why_not"]
-    dealt = results["protocols"]["vt60-random"]["controls"]["dealt"]["measures"]["guesses_k9"]
+        assert list(entry["controls"]) == ["background", "permuted", "order", "no_contact"]
+        assert all(control["description"] for control in entry["controls"].values())
+    assert "one untouched frame serves all" in results["protocols"]["vt60-random"]["controls"]["no_contact"]["reason"]
+    assert "lacks untouched" in results["protocols"]["billets-places"]["controls"]["no_contact"]["reason"]
+    dealt = results["protocols"]["vt60-random"]["controls"]["permuted"]["measures"]["topn_k9"]
     assert dealt["low"][0] < 1 / 9 < dealt["high"][0]
 
 
@@ -106,19 +106,19 @@ def test_the_report_says_the_verdict_in_words_and_shows_tables_and_queries(out, 
         assert f"figures/{name}" in text
 
 
-def test_a_catalogue_of_reference_touches_is_asked_blurred_on_both_sides_and_its_clock_knows_all(data, out, tmp_path):
+def test_reference_catalogue_has_low_pass_control_on_both_sides(data, out, tmp_path):
     again = tmp_path / "again"
     shutil.copytree(out, again)
     assert benchmark(data, again, "--protocols", "vt60-references,vt60-references-photos", "--seeds", "1") == 0
     for entry in json.loads((again / "results.json").read_text())["protocols"].values():
         assert set(entry["rows"]) == {"cca_pca", "chance"}
-        assert entry["rows"]["cca_pca"]["blurred"]
-        assert entry["controls"]["background"]["why_not"] == "an object is shown by touches"
-        assert entry["controls"]["order"]["measures"]["guesses_k9"]["value"][0] > 0.5
+        assert entry["rows"]["cca_pca"]["low_pass"]
+        assert entry["controls"]["background"]["reason"] == "an object is shown by touches"
+        assert entry["controls"]["order"]["measures"]["topn_k9"]["value"][0] > 0.5
     assert "reference touch of each object" in (again / "report.md").read_text()
 
 
-def test_over_choices_each_fold_is_a_value_and_stated_probabilities_and_contact_are_told(tmp_path, monkeypatch):
+def test_choices_report_each_fold_with_confidences_and_contact(tmp_path, monkeypatch):
     monkeypatch.setattr(vt60, "DRAWN_CHOICES", 1)
     real_data_sets.write_vt60(tmp_path / "data" / "vt60", instances=3)
     asked = ["--preset", "tiny", "--seeds", "2", "--methods", "cca_towers,chance", "--protocols", "vt60-choices"]
@@ -126,16 +126,16 @@ def test_over_choices_each_fold_is_a_value_and_stated_probabilities_and_contact_
     entry = json.loads((tmp_path / "out" / "results.json").read_text())["protocols"]["vt60-choices"]
     assert (entry["unit"], len(entry["folds"]), len(entry["folds"][0])) == ("choice", 1, 4)  # once, for any seeds
     row = entry["rows"]["cca_towers"]
-    summary = row["measures"]["guesses_k9"]
-    by_choice = [one[0] for one in summary["by_choice"]]
+    summary = row["measures"]["topn_k9"]
+    by_choice = [one[0] for one in summary["by_split"]]
     assert len(by_choice) == 4
     assert summary["value"][0] == pytest.approx(np.mean(by_choice))
-    assert (summary["least"][0], summary["most"][0]) == (min(by_choice), max(by_choice))
+    assert (summary["min"][0], summary["max"][0]) == (min(by_choice), max(by_choice))
     assert summary["low"][0] <= summary["value"][0] <= summary["high"][0]
-    quartiles = [row["measures"][f"guesses_k9_contact{number}"] for number in (1, 2, 3, 4)]
+    quartiles = [row["measures"][f"topn_k9_contact{number}"] for number in (1, 2, 3, 4)]
     assert [one["queries"] for one in quartiles] == [4 * 18] * 4  # one touch of four of each object and choice
     assert sum(one["count"] for one in row["reliability"]["gallery"]) == 4 * 4 * 18 * 4  # drawn four times each
-    assert set(row["chosen"][0][0]) >= {"ridge", "photo_ridge", "directions", "power", "posterior"}
+    assert set(row["best_params"][0][0]) >= {"ridge", "photo_ridge", "directions", "power", "posterior"}
     text = re.sub(r"\\", "", (tmp_path / "out" / "report.md").read_text())
     for words in ("over choices", "strongest quarter", "mean stated", "the order of capture", "4 choice(s) each"):
         assert words in text
@@ -154,7 +154,7 @@ def test_what_is_made_is_not_made_again_and_comes_out_the_same_to_the_byte(data,
     again = tmp_path / "again"
     shutil.copytree(out, again)
     monkeypatch.setattr(Method, "fit", lambda *_: pytest.fail("fitted"))
-    assert benchmark(data, again, "--protocols", ",".join(ASKED)) == 0
+    assert benchmark(data, again, "--protocols", ",".join(MAX_QUERIES)) == 0
     for name in ("results.json", "report.md"):
         assert (again / name).read_bytes() == (out / name).read_bytes()
 
@@ -174,25 +174,25 @@ def test_a_stopped_run_goes_on(data, out, tmp_path, monkeypatch, capsys):
         fit(self, *parts)
 
     monkeypatch.setattr(Method, "fit", stopping)
-    assert benchmark(data, again, "--protocols", ",".join(ASKED)) == 1
+    assert benchmark(data, again, "--protocols", ",".join(MAX_QUERIES)) == 1
     assert "goes on with it" in capsys.readouterr().err
-    assert benchmark(data, again, "--protocols", ",".join(ASKED)) == 0
+    assert benchmark(data, again, "--protocols", ",".join(MAX_QUERIES)) == 0
     assert len(fitted) == 3
     assert (again / "results.json").read_bytes() == (out / "results.json").read_bytes()
 
 
 def test_measures_of_other_settings_and_damaged_ones_are_not_taken(tmp_path):
-    path, made_by = tmp_path / "kept.safetensors", {"seed": 0, "split": {"test": ("a", "b")}}
+    path, cache_key = tmp_path / "kept.safetensors", {"seed": 0, "split": {"test": ("a", "b")}}
     values, owner = np.array([[1.0], [0.5]]), np.array([0, 1])
-    measured = Measured({"k9": Measure(values, owner, np.array([0.1]), "nine")}, {"power": 1}, {"best": []}, {})
-    write_measured(path, measured, made_by)
-    kept = read_measured(path, made_by)
+    measured = FoldMeasures({"k9": Measure(values, owner, np.array([0.1]), "nine")}, {"power": 1}, {"best": []}, {})
+    write_fold_measures(path, measured, cache_key)
+    kept = read_fold_measures(path, cache_key)
     np.testing.assert_array_equal(kept.measures["k9"].values, values)
-    assert (kept.measures["k9"].gallery, kept.chosen, kept.examples) == ("nine", {"power": 1}, {"best": []})
-    assert read_measured(path, made_by | {"seed": 1}) is None
-    assert read_measured(tmp_path / "none.safetensors", made_by) is None
+    assert (kept.measures["k9"].gallery, kept.best_params, kept.examples) == ("nine", {"power": 1}, {"best": []})
+    assert read_fold_measures(path, cache_key | {"seed": 1}) is None
+    assert read_fold_measures(tmp_path / "none.safetensors", cache_key) is None
     path.write_bytes(path.read_bytes()[:-9])
-    assert read_measured(path, made_by) is None
+    assert read_fold_measures(path, cache_key) is None
 
 
 def test_no_scores_and_no_fits_are_left_on_the_disk(out):
@@ -259,11 +259,11 @@ def test_every_protocol_runs_on_its_miniature(tmp_path):
     assert benchmark(data, tmp_path / "out", "--seeds", "1", "--methods", methods) == 0
     entries = json.loads((tmp_path / "out" / "results.json").read_text())["protocols"]
     assert set(entries) == set(PROTOCOLS)
-    assert entries["feeling-of-success"]["controls"]["untouched"]["measures"]
+    assert entries["feeling-of-success"]["controls"]["no_contact"]["measures"]
     measured = entries["feeling-of-success"]["rows"]["cca_pca"]["measures"]
     assert "pair_auc" in measured
     assert "pair_accuracy" not in measured  # the miniature has too few validation objects to fit a threshold on
-    assert any("64.3" in anchor for anchor in entries["feeling-of-success"]["anchors"])
+    assert any("64.3" in anchor for anchor in entries["feeling-of-success"]["published_results"])
     for name, entry in entries.items():
         if name == "physiclear":
             assert set(entry["rows"]) == {"frozen-difference", "frozen-common-frame"}
@@ -273,7 +273,7 @@ def test_every_protocol_runs_on_its_miniature(tmp_path):
 
 
 @pytest.mark.slow
-def test_real_bottles_and_balls_are_told_better_by_touch_than_by_its_blur(tmp_path, monkeypatch):
+def test_real_bottles_and_balls_beat_the_low_pass_control(tmp_path, monkeypatch):
     """VT60, seen classes: the number of docs/real.md, with one seed."""
     weights = touch_data("weights/mobilenet_v2_imagenet_features.pt")
     data = touch_data("vt60").parent
@@ -282,9 +282,9 @@ def test_real_bottles_and_balls_are_told_better_by_touch_than_by_its_blur(tmp_pa
     assert benchmark(data, tmp_path, methods=asked) == 0
     entry = json.loads((tmp_path / "results.json").read_text())["protocols"]["vt60-seen-classes"]
     row = entry["rows"]["cca_pca"]
-    assert row["measures"]["guesses_k9"]["value"][0] > 0.55
-    assert row["differences"]["guesses_k9"]["difference"] > 0.04
-    assert entry["controls"]["dealt"]["measures"]["guesses_k9"]["value"][0] < 0.2
+    assert row["measures"]["topn_k9"]["value"][0] > 0.55
+    assert row["low_pass_differences"]["topn_k9"]["difference"] > 0.04
+    assert entry["controls"]["permuted"]["measures"]["topn_k9"]["value"][0] < 0.2
 
 
 @pytest.mark.slow
@@ -294,7 +294,7 @@ def test_real_billets_never_seen_are_about_chance(tmp_path):
     asked = ["--protocols", "billets-unseen", "--seeds", "1", "--methods", "cca_pca", "--init", str(weights)]
     assert benchmark(data, tmp_path, methods=asked) == 0
     entry = json.loads((tmp_path / "results.json").read_text())["protocols"]["billets-unseen"]
-    counted = entry["rows"]["cca_pca"]["counted"]
-    assert counted["asked"] == 80
+    counted = entry["rows"]["cca_pca"]["correct_counts"]
+    assert counted["queries"] == 80
     assert counted["low"] < 0.25
     assert (tmp_path / "report.html").is_file()

@@ -9,14 +9,19 @@ import pytest
 from retrieval.data.dataset import Grasp, Split
 from retrieval.errors import BadInput, ConfigError, DatasetError
 from retrieval.evaluation.real import PROTOCOLS
-from retrieval.evaluation.real.lines import by_clock, clock, why_not_untouched
-from retrieval.evaluation.real.measuring import contact_quartiles
-from retrieval.evaluation.real.protocol import Facts
-from retrieval.evaluation.real.references import ASKED, references_of, shown_by_references, with_references
+from retrieval.evaluation.real.conditions import clock_features, missing_no_contact_reason, with_clock_touches
+from retrieval.evaluation.real.fold_measures import contact_quartiles
+from retrieval.evaluation.real.protocol import RecordingFacts
+from retrieval.evaluation.real.reference_rows import (
+    MAX_QUERIES,
+    assign_references,
+    features_with_references,
+    replace_photos_by_references,
+)
 from retrieval.evaluation.real.touch_to_touch import TouchToTouch
 from retrieval.evaluation.real.verdict import reliability_entry, verdict
-from retrieval.metrics.choices import compare_choices, summarise_choices
 from retrieval.metrics.measure import Measure, pooled
+from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
 from retrieval.training.features import Features
 
 
@@ -26,7 +31,7 @@ def facts(sequence_of, about=None, splits=None):
         for name, sequence in sequence_of.items()
         for turn in range(2)
     ]
-    return Facts("drawn", grasps, about or {}, splits or {})
+    return RecordingFacts("drawn", grasps, about or {}, splits or {})
 
 
 def vt60(instances=4):
@@ -215,7 +220,7 @@ def touched(counts):
 
 
 def test_the_first_quarter_of_an_objects_touches_are_references_and_the_last_half_asks():
-    found = references_of(touched({"mug": 8, "tin": 5}))
+    found = assign_references(touched({"mug": 8, "tin": 5}))
     assert {asked: reference.grasp_id for asked, reference in found.items()} == {
         "mug-4": "mug-0",
         "mug-5": "mug-1",
@@ -225,19 +230,19 @@ def test_the_first_quarter_of_an_objects_touches_are_references_and_the_last_hal
         "tin-3": "tin-0",
         "tin-4": "tin-0",
     }
-    shown = with_references(touched({"mug": 8}))
+    shown = replace_photos_by_references(touched({"mug": 8}))
     assert [(one.grasp_id, one.photo.name) for one in shown][:2] == [("mug-4", "mug-gel-0"), ("mug-5", "mug-gel-1")]
 
 
 def test_of_many_touches_some_ask_evenly_spaced_from_the_first_to_the_last():
-    found = list(references_of(touched({"mug": 400})))
-    assert len(found) == ASKED
+    found = list(assign_references(touched({"mug": 400})))
+    assert len(found) == MAX_QUERIES
     assert (found[0], found[-1]) == ("mug-200", "mug-399")
 
 
 def test_an_object_of_three_touches_has_no_references():
     with pytest.raises(DatasetError, match="four touches of it; tin has 3"):
-        references_of(touched({"mug": 8, "tin": 3}))
+        assign_references(touched({"mug": 8, "tin": 3}))
 
 
 def test_entries_are_the_references_own_features_and_never_those_of_the_query():
@@ -250,8 +255,8 @@ def test_entries_are_the_references_own_features_and_never_those_of_the_query():
         -rows[:, None],
     )
     row_of = {name: row for row, name in enumerate(features.grasp_ids)}
-    references = references_of(grasps)
-    touches, both = (shown_by_references(features, references, entry) for entry in ("reference", "both"))
+    references = assign_references(grasps)
+    touches, both = (features_with_references(features, references, entry) for entry in ("reference", "both"))
     assert touches.grasp_ids == both.grasp_ids == tuple(references)
     for row, name in enumerate(touches.grasp_ids):
         reference = row_of[references[name].grasp_id]
@@ -264,7 +269,7 @@ def test_entries_are_the_references_own_features_and_never_those_of_the_query():
 
 
 def test_places_near_in_the_order_of_capture_are_alike_and_far_ones_are_not():
-    found = clock(100)
+    found = clock_features(100)
     assert found.shape == (100, 84)
     steps = np.linalg.norm(found - found[50], axis=1)
     assert (np.diff(steps[50:56]) > 0).all()
@@ -275,15 +280,15 @@ def test_the_clock_stands_in_for_the_touch_alone():
     features = Features(
         ("a", "b"), ("mug", "tin"), np.zeros((2, 3, 5), np.float32), np.arange(4, dtype=np.float32).reshape(2, 2)
     )
-    made = by_clock(features)
-    np.testing.assert_array_equal(made.touch[:, 0], clock(2))
+    made = with_clock_touches(features)
+    np.testing.assert_array_equal(made.touch[:, 0], clock_features(2))
     np.testing.assert_array_equal(made.photo, features.photo)
     assert made.object_ids == features.object_ids
 
 
-def test_one_untouched_frame_for_all_and_none_at_all_cannot_stand_in_for_touches():
+def test_no_contact_control_needs_one_frame_per_grasp():
     grasps = MADE["rct"].grasps[:4]
-    assert "lacks" in why_not_untouched(grasps)
+    assert "lacks" in missing_no_contact_reason(grasps)
 
     def with_frames(names):
         return [
@@ -291,8 +296,8 @@ def test_one_untouched_frame_for_all_and_none_at_all_cannot_stand_in_for_touches
             for one, name in zip(grasps, names, strict=True)
         ]
 
-    assert "one untouched frame" in why_not_untouched(with_frames("xxxx"))
-    assert why_not_untouched(with_frames("xxxy")) is None
+    assert "one untouched frame" in missing_no_contact_reason(with_frames("xxxx"))
+    assert missing_no_contact_reason(with_frames("xxxy")) is None
 
 
 ABOVE = {"difference": 0.1, "low": 0.01, "high": 0.2}
@@ -334,22 +339,22 @@ def of_choices(*values):
 
 
 def test_an_interval_over_choices_is_that_of_the_corrected_resampled_t_test():
-    found = summarise_choices(of_choices(0.5, 0.6, 0.7), ratio=1.0)
+    found = summarise_splits(of_choices(0.5, 0.6, 0.7), ratio=1.0)
     # s^2 = .01; (1 / 3 + 1) s^2 = .01333; t of 2 degrees of freedom at .975: 4.30265
     half = 4.30265 * np.sqrt((1 / 3 + 1) * 0.01)
     assert found["value"] == [pytest.approx(0.6)]
     assert found["low"] == [pytest.approx(0.6 - half, abs=1e-5)]
     assert found["high"] == [1.0]  # .6 + .4968, but a share
-    assert (found["least"], found["most"]) == ([pytest.approx(0.5)], [pytest.approx(0.7)])
+    assert (found["min"], found["max"]) == ([pytest.approx(0.5)], [pytest.approx(0.7)])
     assert (found["objects"], found["queries"], found["few_objects"]) == (3, 9, True)
-    difference = compare_choices(of_choices(0.5, 0.6, 0.7), of_choices(0.4, 0.4, 0.4), ratio=1.0)
+    difference = compare_splits(of_choices(0.5, 0.6, 0.7), of_choices(0.4, 0.4, 0.4), ratio=1.0)
     assert difference["difference"] == pytest.approx(0.2)
     assert difference["low"] == pytest.approx(0.2 - half, abs=1e-5)
-    assert (difference["least"], difference["most"]) == (pytest.approx(0.1), pytest.approx(0.3))
+    assert (difference["min"], difference["max"]) == (pytest.approx(0.1), pytest.approx(0.3))
     # t = .2 / sqrt(.01333) = 1.7321; of 2 degrees of freedom both tails beyond it hold 1 - t / sqrt(t^2 + 2)
     assert difference["p"] == pytest.approx(1 - 1.7320508 / np.sqrt(5))
     with pytest.raises(BadInput, match="needs two choices at least; got 1"):
-        summarise_choices(of_choices(0.5, 0.6, 0.7)[:1], ratio=1.0)
+        summarise_splits(of_choices(0.5, 0.6, 0.7)[:1], ratio=1.0)
 
 
 def test_quartiles_of_contact_are_of_each_object_and_equals_go_by_their_order():
@@ -360,17 +365,17 @@ def test_quartiles_of_contact_are_of_each_object_and_equals_go_by_their_order():
 
 
 def test_reliability_is_counted_in_bins_of_a_tenth():
-    stated = [
+    confidences = [
         {"gallery": np.array([[0.72, 1.0], [0.78, 0.0]]), "all": np.array([[1.0, 1.0]])},
         {"gallery": np.array([[0.7, 0.5], [0.05, 0.0]])},
     ]
-    found = reliability_entry(stated)
+    found = reliability_entry(confidences)
     assert list(found) == ["gallery", "all"]
     low, high = found["gallery"]
-    assert (low["from"], low["count"], low["true"]) == (0.0, 1, 0.0)
+    assert (low["from"], low["count"], low["accuracy"]) == (0.0, 1, 0.0)
     assert (high["from"], high["to"], high["count"]) == (0.7, 0.8, 3)
-    assert (high["stated"], high["true"]) == (pytest.approx(2.2 / 3), pytest.approx(0.5))
-    assert found["all"] == [{"from": 0.9, "to": 1.0, "stated": 1.0, "true": 1.0, "count": 1}]
+    assert (high["confidence"], high["accuracy"]) == (pytest.approx(2.2 / 3), pytest.approx(0.5))
+    assert found["all"] == [{"from": 0.9, "to": 1.0, "confidence": 1.0, "accuracy": 1.0, "count": 1}]
 
 
 def test_pooled_galleries_hold_every_query_of_each_under_its_unit():

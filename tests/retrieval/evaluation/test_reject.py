@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput
-from retrieval.evaluation.calibrate import questions
+from retrieval.evaluation.calibrate import posterior_questions
 from retrieval.evaluation.reject import _false_accepts, galleries, reject, statistic
 from retrieval.metrics.intervals import summarise
 from retrieval.metrics.measure import object_means
 from retrieval.metrics.table import ScoreTable
-from retrieval.model.posterior import Posterior, fit_questions
+from retrieval.model.posterior import Posterior, fit_posterior_to_trials
 
 
 def table_of(scores, owner):
@@ -28,10 +28,10 @@ def planted(objects=12, grasps=8, gap=3.0, seed=0, scale=1.0):
 
 
 def fit(table):
-    return fit_questions([questions(table)])
+    return fit_posterior_to_trials([posterior_questions(table)])
 
 
-def judged(gap, **more):
+def scored(gap, **more):
     return reject(fit(planted(gap=gap, seed=1, **more)), planted(gap=gap, seed=2, **more))
 
 
@@ -45,11 +45,11 @@ def value(measure):
 
 
 def test_a_scorer_that_knows_is_always_right_and_one_that_knows_nothing_is_at_chance():
-    knowing = judged(gap=50)
+    knowing = scored(gap=50)
     assert value(knowing.auroc) == pytest.approx(1)
     assert value(knowing.balanced_accuracy) == 1
     assert value(knowing.false_accepts_at_95) == pytest.approx(0, abs=1e-12)
-    blind = judged(gap=0, grasps=40)
+    blind = scored(gap=0, grasps=40)
     assert value(blind.auroc) == pytest.approx(0.5, abs=0.04)
     assert value(blind.false_accepts_at_95) == pytest.approx(0.95, abs=0.03)
     assert blind.auroc.chance.tolist() == blind.balanced_accuracy.chance.tolist() == [0.5]
@@ -121,12 +121,12 @@ def by_hand(posterior, table):
 
 def test_the_decision_is_that_of_a_query_at_even_prior():
     posterior, table = fit(planted(gap=1.5, seed=1)), planted(gap=1.5, seed=2, objects=5, grasps=2)
-    ratios = questions(table).log_ratios(posterior)
+    ratios = posterior_questions(table).log_ratios(posterior)
     true = table.touch_owner[:, None] == table.objects
     for gallery in galleries(ratios, true):
         for row, said in zip(gallery, statistic(gallery), strict=True):
             logits = (row[np.isfinite(row)] - posterior.offset) / posterior.slope
-            none = posterior.believe(logits, none_prior=0.5).none
+            none = posterior.probabilities(logits, none_prior=0.5).none
             assert said == pytest.approx(np.log((1 - none) / none))
 
 
@@ -134,7 +134,7 @@ def test_false_accepts_are_those_of_the_threshold_that_accepts_95_in_100_with_th
     """Of 200 queries the 190th of the sorted is the last that is let in."""
     posterior, table = Posterior(), planted(objects=100, grasps=2, gap=1.5)
     found = reject(posterior, table)
-    ratios, true = questions(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
+    ratios, true = posterior_questions(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
     present, absent = statistics(ratios, true)
     threshold = sorted(present, reverse=True)[190 - 1]
     assert value(found.false_accepts_at_95) == pytest.approx(np.mean(absent >= threshold))
@@ -143,7 +143,7 @@ def test_false_accepts_are_those_of_the_threshold_that_accepts_95_in_100_with_th
 def test_the_risk_is_that_of_a_loop_over_the_surest_answers():
     posterior, table = fit(planted(gap=1.5, seed=1)), planted(gap=1.5, seed=2, objects=5, grasps=3)
     found = np.array(reject(posterior, table).risk_coverage)
-    ratios, true = questions(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
+    ratios, true = posterior_questions(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
     answers = []
     for gallery in galleries(ratios, true):
         for row, own in zip(gallery, true, strict=True):
@@ -167,7 +167,7 @@ def test_equally_sure_answers_are_given_together_and_of_equal_guesses_each_is_as
 
 
 def test_the_curve_runs_from_corner_to_corner_and_has_the_area_that_is_said():
-    found = judged(gap=1.5, grasps=5)
+    found = scored(gap=1.5, grasps=5)
     alarms, hits = np.array(found.roc).T
     assert found.roc[0] == [0, 0]
     assert found.roc[-1] == [pytest.approx(1), pytest.approx(1)]
@@ -179,7 +179,7 @@ def test_the_curve_runs_from_corner_to_corner_and_has_the_area_that_is_said():
 
 
 def test_a_long_curve_is_thinned_and_keeps_its_area():
-    found = judged(gap=1.5, objects=15, grasps=30)
+    found = scored(gap=1.5, objects=15, grasps=30)
     alarms, hits = np.array(found.roc).T
     assert len(found.roc) == 200
     assert np.trapezoid(hits, alarms) == pytest.approx(value(found.auroc), abs=0.002)
@@ -228,8 +228,8 @@ def test_the_decision_comes_from_validation_objects_alone():
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6, 1e30])
-def test_scores_of_any_size_are_judged(scale):
-    found = judged(gap=50, scale=scale)
+def test_rejection_works_at_any_score_scale(scale):
+    found = scored(gap=50, scale=scale)
     assert 0.5 <= value(found.auroc) <= 1
     assert 0 <= value(found.false_accepts_at_95) <= 0.95
     assert np.isfinite(found.risk_coverage).all()

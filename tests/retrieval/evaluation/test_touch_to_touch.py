@@ -183,14 +183,17 @@ def test_each_representation_has_its_low_pass_and_three_controls_that_decide(out
     for row in entry["rows"].values():
         assert (row["measures"]["recall_1"]["queries"], row["measures"]["recall_1"]["objects"]) == (6, 2)
         assert row["measures"]["recall_1"]["chance"][0] == pytest.approx(2 / 5)  # two of five other videos
-        lows = [row[key]["recall_1"]["low"] for key in ("differences", "order_differences", "untouched_differences")]
+        lows = [
+            row[key]["recall_1"]["low"]
+            for key in ("low_pass_differences", "order_differences", "no_contact_differences")
+        ]
         assert row["verdict"]["counts_as_touch"] == all(low > 0 for low in lows)
         assert "the no-contact frame alone" in row["verdict"]["words"]
         assert row["tower_differences"] is None
-    assert set(entry["controls"]) == {"untouched", "order", "permuted"}
+    assert set(entry["controls"]) == {"no_contact", "order", "permuted"}
     assert len(entry["controls"]["permuted"]["measures"]["recall_1"]["by_seed"]) == 2
     # Gels of each part's own colour: the untouched frame finds the part, and so does a clock within it.
-    assert entry["controls"]["untouched"]["measures"]["recall_1"]["value"][0] == 1.0
+    assert entry["controls"]["no_contact"]["measures"]["recall_1"]["value"][0] == 1.0
     assert entry["controls"]["order"]["measures"]["recall_1"]["value"][0] >= 2 / 3
 
 

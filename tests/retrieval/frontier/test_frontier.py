@@ -12,16 +12,23 @@ from retrieval.errors import ConfigError, DatasetError
 from retrieval.frontier import APPROXIMATIONS, load_approximation
 from retrieval.frontier import measure as measuring_module
 from retrieval.frontier.candidates import default_k, ranks
-from retrieval.frontier.clock import timed
+from retrieval.frontier.clock import time_points
 from retrieval.frontier.formats import FORMATS, encoders
 from retrieval.frontier.pixels import load_touch
-from retrieval.frontier.points import Panel, Row, Tradeoff, duration, missed, number
+from retrieval.frontier.points import (
+    ApproximationResult,
+    Panel,
+    Tradeoff,
+    format_duration,
+    format_number,
+    miss_rate_point,
+)
 from retrieval.frontier.sample import Sample, Scale, blend
-from retrieval.metrics.guesses import binomial_interval
+from retrieval.metrics.k_way import binomial_interval
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import encode_touches
-from retrieval.search.build.measuring import WinnerBench
-from retrieval.search.build.operating import SearchRequirements, settle
+from retrieval.search.build.measuring import ExhaustiveBench
+from retrieval.search.build.operating import SearchRequirements, choose_by_agreement
 from tests import synthetic
 
 TINY = Scale(photos=700, queries=6, touches=6, repeats=1, quick=True)
@@ -80,32 +87,32 @@ def test_a_line_says_whether_the_default_is_the_recommended():
 
 
 def test_a_share_comes_in_percent_with_its_exact_interval():
-    point = missed("a", "b", [True, False, False, False])
+    point = miss_rate_point("a", "b", [True, False, False, False])
     low, high = binomial_interval(1, 4)
     assert (point.error, point.low, point.high) == (25.0, 100 * low, 100 * high)
 
 
 def test_a_row_survives_json():
-    row = Row("title", "text", (panel((1, 5), (2, 0.5)),), None)
-    assert Row.from_dict(json.loads(json.dumps(row.to_dict()))) == row
+    row = ApproximationResult("title", "text", (panel((1, 5), (2, 0.5)),), None)
+    assert ApproximationResult.from_dict(json.loads(json.dumps(row.to_dict()))) == row
 
 
 @pytest.mark.parametrize(
     ("value", "text"), [(0, "0"), (0.5, "0.5"), (1.2345, "1.23"), (1234.0, "1.23e+03"), (1e-7, "1.0e-07")]
 )
 def test_numbers_are_short(value, text):
-    assert number(value) == text
+    assert format_number(value) == text
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(2.0, "2 s"), (0.0123, "12.3 ms"), (4.5e-5, "45 us")])
 def test_times_have_the_unit_that_reads_best(seconds, text):
-    assert duration(seconds) == text
+    assert format_duration(seconds) == text
 
 
 def test_works_take_turns_so_that_a_busy_moment_slows_all_of_them():
     calls = []
     points = panel((0, 1), (0, 2)).points
-    made = timed(
+    made = time_points(
         points, [lambda: (calls.append("a"), time.sleep(0.006)), lambda: (calls.append("b"), time.sleep(0.006))], 3
     )
     assert calls == ["a", "b"] * 4
@@ -154,14 +161,14 @@ class WithQueries:
 
     def __init__(self, sample):
         self.matcher, self.config = sample.checkpoint.matcher, sample.checkpoint.config
-        self.queries = sample.queries["half"].astype(np.float16)
+        self.queries = sample.queries["partial"].astype(np.float16)
 
 
 def test_the_default_number_of_candidates_is_the_one_that_build_index_writes(pruning_sample):
     photos = pruning_sample.catalogue
-    slots = np.arange(len(photos.halves))
-    bench = WinnerBench(WithQueries(pruning_sample), photos.embeddings["pruner"], slots, photos.halves)
-    settled = settle(bench, SearchRequirements())
+    slots = np.arange(len(photos.partials))
+    bench = ExhaustiveBench(WithQueries(pruning_sample), photos.embeddings["candidate encoder"], slots, photos.partials)
+    settled = choose_by_agreement(bench, SearchRequirements())
     assert default_k(pruning_sample) == settled.candidates["k"]
     kinds = load_approximation("index_kinds")(pruning_sample)
     assert all(one.default.series == settled.kind for one in kinds.panels)
@@ -169,15 +176,17 @@ def test_the_default_number_of_candidates_is_the_one_that_build_index_writes(pru
 
 @pytest.fixture(scope="module")
 def pruning_sample(sample):
-    """The sample with a pruner that knows nothing."""
+    """The sample with a candidate_encoder that knows nothing."""
     import torch
 
-    from retrieval.model.pruner import Pruner
+    from retrieval.model.candidate_encoder import CandidateEncoder
 
     matcher = load_checkpoint(sample.model).matcher
     torch.manual_seed(0)
-    config = dataclasses.replace(sample.checkpoint.config, matcher=dataclasses.replace(matcher.config, pruner_width=8))
-    matcher.pruner = Pruner(matcher.config.half, 8, matcher.config.embedding_dim).eval()
+    config = dataclasses.replace(
+        sample.checkpoint.config, matcher=dataclasses.replace(matcher.config, candidate_width=8)
+    )
+    matcher.candidate_encoder = CandidateEncoder(matcher.config.partial_width, 8, matcher.config.embedding_dim).eval()
     other = dataclasses.replace(sample)
     other.__dict__["checkpoint"] = dataclasses.replace(sample.checkpoint, matcher=matcher, config=config)
     return other
@@ -187,7 +196,7 @@ def test_touches_are_encoded_by_the_default_of_the_towers(sample):
     settings, matcher = sample.checkpoint.config.preprocessing, sample.checkpoint.matcher
     images = [load_touch(settings, sample.grasps[sample.touch_rows[0]])]
     default = next(encode for _, encode, is_default in encoders(sample.checkpoint) if is_default)
-    assert np.array_equal(default(images), encode_touches(matcher, images).half.numpy())
+    assert np.array_equal(default(images), encode_touches(matcher, images).partial.numpy())
 
 
 def test_measuring_towers_leaves_the_model_in_evaluation_mode(rows, sample):
@@ -195,12 +204,12 @@ def test_measuring_towers_leaves_the_model_in_evaluation_mode(rows, sample):
     assert not any(module.training for module in sample.checkpoint.matcher.modules())
 
 
-def test_an_index_keeps_halves_in_the_default_format(catalogue, model, tmp_path):
+def test_an_index_stores_partials_in_the_default_format(catalogue, model, tmp_path):
     from indexes.store.folder import IndexStore
     from retrieval.search.build.build_index import build_index
 
     build_index(catalogue, load_checkpoint(model), tmp_path / "index", quiet=True)
-    kept = IndexStore(tmp_path / "index").open().arrays["halves"]
+    kept = IndexStore(tmp_path / "index").open().arrays["partials"]
     assert [name for name, _, _, is_default in FORMATS if is_default] == [str(np.asarray(kept[:1]).dtype)]
 
 
@@ -245,27 +254,27 @@ def test_blends_lie_between_two_rows_nearer_to_the_first():
         assert np.count_nonzero(row) <= 2
 
 
-def test_ranks_count_the_photos_that_are_nearer_than_the_winner():
+def test_ranks_count_the_photos_nearer_than_the_exhaustive_top1():
     embeddings = np.array([[1, 0], [0, 1], [0.6, 0.8]], np.float32)
     queries = np.array([[1, 0], [0, 1]], np.float32)
     assert ranks(queries, embeddings, np.array([0, 0])).tolist() == [0, 2]
     assert ranks(queries, embeddings, np.array([2, 2])).tolist() == [1, 1]
 
 
-def test_winners_are_the_photos_of_the_highest_logit_and_are_found_once(sample, monkeypatch):
-    halves = sample.catalogue.halves.astype(np.float32)
-    table = np.array([sample.logits(half, halves) for half in sample.queries["half"]])
-    assert sample.winners.tolist() == table.argmax(1).tolist()
+def test_exhaustive_top1_is_the_highest_logit_and_is_cached(sample, monkeypatch):
+    partials = sample.catalogue.partials.astype(np.float32)
+    table = np.array([sample.logits(partial_activation, partials) for partial_activation in sample.queries["partial"]])
+    assert sample.exhaustive_top1.tolist() == table.argmax(1).tolist()
     again = dataclasses.replace(sample)
-    monkeypatch.setattr(Sample, "_find_winners", nobody)
-    assert again.winners.tolist() == sample.winners.tolist()
+    monkeypatch.setattr(Sample, "_find_exhaustive_top1", nobody)
+    assert again.exhaustive_top1.tolist() == sample.exhaustive_top1.tolist()
 
 
 # Run -------------------------------------------------------------------------------------------------------
 
 
 TABLE = {"one": "nowhere:one", "other": "nowhere:other"}
-measure = partial(measuring_module.measure, table=TABLE, need_no_model=TABLE)
+measure = partial(measuring_module.measure, table=TABLE, model_free=TABLE)
 
 
 def nobody():
@@ -280,7 +289,7 @@ def bare(model, tmp_path, monkeypatch):
     def measuring(name, table):
         if name not in TABLE:
             return load_approximation(name, table)
-        return lambda sample: calls.append(name) or Row(name, "text", (panel((1e-3, 2)),))
+        return lambda sample: calls.append(name) or ApproximationResult(name, "text", (panel((1e-3, 2)),))
 
     monkeypatch.setattr(measuring_module, "load_approximation", measuring)
     return Sample(model, nobody, tmp_path / "features", TINY, quiet=True), calls

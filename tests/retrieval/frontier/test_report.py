@@ -9,12 +9,12 @@ from benchmarks.frontier import APPROXIMATIONS as KERNELS
 from retrieval.commands.frontier import _recording as collected
 from retrieval.commands.main import main
 from retrieval.frontier import APPROXIMATIONS
-from retrieval.frontier.points import Panel, Row, Tradeoff
+from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff
 from retrieval.frontier.report import figure, write_frontier
 
 
 def document(*panels, skipped=None):
-    row = Row("Candidates", "What is measured.", panels, skipped)
+    row = ApproximationResult("Candidates", "What is measured.", panels, skipped)
     return {
         "software": "1",
         "machine": {"processor": "a <fast> one", "cores": 2, "system": "Linux"},
@@ -65,9 +65,9 @@ def test_labels_of_points_that_stand_together_stand_above_and_below():
 
 def test_the_command_writes_a_page_and_says_a_line_for_each_panel(model, recording, tmp_path, capsys):
     command = ["frontier", "--out", str(tmp_path), "--model", str(model), "--recording", str(recording), "--quick"]
-    assert main([*command, "--only", "halves", "--json"]) == 0
+    assert main([*command, "--only", "partials", "--json"]) == 0
     said = capsys.readouterr()
-    assert json.loads(said.out)["rows"].keys() == {"halves"}
+    assert json.loads(said.out)["rows"].keys() == {"partials"}
     assert "halves: largest error of a match logit (against halves in float32)" in said.err
     assert (tmp_path / "figures" / "halves.png").is_file()
     assert (tmp_path / "frontier.html").is_file()

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.methods.base import Setting
-from retrieval.methods.cca import Canonical, canonical, cosine, decompose, unit_rows
+from retrieval.methods.cca import CanonicalCorrelations, canonical_correlations, cosine, decompose, unit_rows
+from retrieval.methods.method import MethodSettings
 from retrieval.methods.plsca import Plsca
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config
 from retrieval.training.features import Features
-from tests.hard_case import HardCase, refused
+from tests.hard_case import HardCase, error_of
 
 Matrix = NDArray[np.float64]
 _CCA, _COSINE = "CCA", "cosine"
@@ -49,8 +49,8 @@ def naive_correlations(touch: Matrix, photo: Matrix) -> Matrix:
     return np.asarray(np.sort(np.sqrt(np.linalg.eigvals(product).real))[::-1])
 
 
-def _correlations(touch: Matrix, photo: Matrix) -> Canonical:
-    return canonical(decompose(touch), decompose(photo), np.arange(len(touch)))
+def _correlations(touch: Matrix, photo: Matrix) -> CanonicalCorrelations:
+    return canonical_correlations(decompose(touch), decompose(photo), np.arange(len(touch)))
 
 
 def _tried(work: Callable[[], Matrix]) -> Matrix:
@@ -138,7 +138,7 @@ def _nan_feature() -> HardCase:
     touch, photo = _views(20, 4)
     touch[3, 1] = np.nan
     naive = _tried(lambda: naive_correlations(touch, photo))
-    ours, holds = refused(lambda: decompose(touch), "NaN")
+    ours, holds = error_of(lambda: decompose(touch), "NaN")
     return HardCase(_CCA, "one feature is NaN", "refused", _text(naive), ours, holds, bool(np.isfinite(naive).all()))
 
 
@@ -168,15 +168,15 @@ def _partial_least_squares() -> HardCase:
     photo = (touch[:, :1] + rng.normal(size=(40, 8))).astype(np.float32)
     naive = naive_pls(touch.astype(np.float64), photo.astype(np.float64), 4)
     features = Features(tuple(map(str, range(40))), tuple(map(str, objects)), touch[:, None], photo)
-    method = Plsca(Setting(Config()))
+    method = Plsca(MethodSettings(Config()))
     method.fit(features.of_objects(map(str, range(8))), features.of_objects(["8", "9"]))
-    codes, kept = method.encode_touch(touch[:, None]), int(method.chosen["most_components"])
-    finite = bool(np.isfinite(codes).all())
+    encodings, columns = method.encode_touch(touch[:, None]), int(method.best_params["max_components"])
+    finite = bool(np.isfinite(encodings).all())
     wanted = "1 component, codes that are finite"
     words = f"4 components: {_text(naive[0])}"
-    said = f"{kept} component, codes {'finite' if finite else 'NaN'}"
+    said = f"{columns} component, codes {'finite' if finite else 'NaN'}"
     return HardCase(
-        "PLS", "4 components of rank 1", wanted, words, said, finite and kept == 1, bool(np.isfinite(naive).all())
+        "PLS", "4 components of rank 1", wanted, words, said, finite and columns == 1, bool(np.isfinite(naive).all())
     )
 
 
@@ -191,7 +191,7 @@ def _thin_direction() -> HardCase:
     # Of one standard deviation in every feature, so that standardising changes nothing but the mean.
     x = (x - x.mean(0)) / x.std(0)
     view = decompose(x)
-    found = (whitened_by_eigenvectors(x), view.left / view.damped(0.0) * view.singular)
+    found = (whitened_by_eigenvectors(x), view.left / view.regularised_deviations(0.0) * view.singular)
     error = [float(np.abs(one.T @ one - np.eye(5) * (one.T @ one)[0, 0]).max() / (one.T @ one)[0, 0]) for one in found]
     naive, ours = (f"off by {value:.1e}" for value in error)
     wanted = "covariance 1 to 1e-9"
@@ -203,11 +203,11 @@ def _constant_feature() -> HardCase:
     x = np.random.default_rng([15]).normal(size=(50, 2)).astype(np.float32)
     x[:, 1] = np.float32(0.1) * (1 + np.float32(6e-8) * (np.arange(50) % 2))
     naive = float(np.abs((x - x.mean(0)) / x.std(0)).max(0)[1])
-    kept = Standardiser.fit(x).kept.tolist()
+    columns = Standardiser.fit(x).columns.tolist()
     wanted = "dropped"
     words = f"its last digit blown up to {naive:.3g} deviations"
     return HardCase(
-        "standardising", "a feature of 0.1 + rounding", wanted, words, f"kept: {kept}", kept == [0], naive < 1e-3
+        "standardising", "a feature of 0.1 + rounding", wanted, words, f"kept: {columns}", columns == [0], naive < 1e-3
     )
 
 

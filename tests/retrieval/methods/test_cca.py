@@ -9,10 +9,10 @@ from sklearn.cross_decomposition import CCA
 
 from retrieval.errors import BadInput, NumericalError
 from retrieval.methods import cca
-from retrieval.methods.base import Setting
-from retrieval.methods.cca import Canonical, Cca, canonical, cosine, decompose, unit_rows
+from retrieval.methods.cca import CanonicalCorrelations, Cca, canonical_correlations, cosine, decompose, unit_rows
+from retrieval.methods.method import MethodSettings
 from retrieval.methods.plsca import Plsca
-from retrieval.methods.selection import neighbours
+from retrieval.methods.selection import next_rows_of_object
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config
 from retrieval.training.features import Features
@@ -29,8 +29,8 @@ def linked(rhos, n=200, touch=12, photo=10, seed=0):
     return first @ rng.standard_normal((touch, touch)), second @ rng.standard_normal((photo, photo))
 
 
-def paired(x, y, ridge=0.0) -> Canonical:
-    return canonical(decompose(x), decompose(y), np.arange(len(x)), ridge)
+def paired(x, y, ridge=0.0) -> CanonicalCorrelations:
+    return canonical_correlations(decompose(x), decompose(y), np.arange(len(x)), ridge)
 
 
 def variates(found, x, y):
@@ -79,7 +79,7 @@ def test_many_items_of_few_directions_give_what_the_whole_decomposition_gives(mo
     x, y = linked([0.95, 0.9, 0.8, 0.3])
     x, y = np.column_stack([x, x[:, :3]]), np.column_stack([y, np.ones(len(y))])  # 12 and 10 directions of 15 and 11
     whole = paired(x, y, ridge)
-    monkeypatch.setattr(cca, "MOST_ROWS", 100)
+    monkeypatch.setattr(cca, "MAX_ROWS", 100)
     found = paired(x, y, ridge)
     np.testing.assert_allclose(found.correlations, whole.correlations, atol=1e-6)
     for mine, theirs in zip(variates(found, x, y), variates(whole, x, y), strict=True):
@@ -96,7 +96,7 @@ def test_of_a_view_the_widest_directions_are_kept_where_so_many_are_asked():
 
 def test_fewer_items_than_features_give_the_same_widest_directions_as_the_whole_decomposition():
     x = np.random.default_rng(3).standard_normal((30, 80)) * np.linspace(3, 1, 80)
-    left, singular, right = cca.leading(x, 5)
+    left, singular, right = cca.leading_svd(x, 5)
     whole = np.linalg.svd(x, full_matrices=False)
     np.testing.assert_allclose(singular, whole[1][:5])
     np.testing.assert_allclose((left * singular) @ right, (whole[0][:, :5] * whole[1][:5]) @ whole[2][:5], atol=1e-10)
@@ -105,17 +105,17 @@ def test_fewer_items_than_features_give_the_same_widest_directions_as_the_whole_
 def test_photos_may_have_a_ridge_of_their_own():
     x, y = linked((0.9, 0.6))
     views, owner = (decompose(x), decompose(y)), np.arange(len(x))
-    both, one = canonical(*views, owner, 0.5), canonical(*views, owner, 0.1, 0.5)
-    assert np.allclose(canonical(*views, owner, 0.5, 0.5).correlations, both.correlations)
-    turned = canonical(*views[::-1], owner, 0.5, 0.1)
+    both, one = canonical_correlations(*views, owner, 0.5), canonical_correlations(*views, owner, 0.1, 0.5)
+    assert np.allclose(canonical_correlations(*views, owner, 0.5, 0.5).correlations, both.correlations)
+    turned = canonical_correlations(*views[::-1], owner, 0.5, 0.1)
     assert np.allclose(one.correlations, turned.correlations)
     assert not np.allclose(one.correlations, both.correlations)
     with pytest.raises(BadInput, match="got ridge -1"):
-        canonical(*views, owner, 0.1, -1)
+        canonical_correlations(*views, owner, 0.1, -1)
 
 
 def test_of_many_items_only_the_widest_directions_are_kept(monkeypatch):
-    monkeypatch.setattr(cca, "MOST_ROWS", 100)
+    monkeypatch.setattr(cca, "MAX_ROWS", 100)
     monkeypatch.setattr(cca, "LEADING", 3)
     x = np.random.default_rng(0).standard_normal((200, 3)) @ np.random.default_rng(1).standard_normal((3, 8))
     x += 1e-3 * np.random.default_rng(2).standard_normal(x.shape)
@@ -148,7 +148,7 @@ def test_pairing_by_object_is_what_every_pair_enumerated_gives(ridge):
     owner = np.repeat(np.arange(9), [1, 2, 3, 6, 4, 4, 2, 5, 6])[rng.permutation(33)]
     latent = rng.standard_normal((9, 3))[owner]
     x, y = (latent @ rng.standard_normal((3, d)) + rng.standard_normal((33, d)) for d in (4, 5))
-    found = canonical(decompose(x), decompose(y), owner, ridge)
+    found = canonical_correlations(decompose(x), decompose(y), owner, ridge)
     x, y = Standardiser.fit(x)(x), Standardiser.fit(y)(y)
     cross, touch_own, photo_own = np.zeros((4, 5)), np.zeros((4, 4)), np.zeros((5, 5))
     for i in range(33):
@@ -276,9 +276,9 @@ def test_values_that_are_not_finite_are_refused(bad):
 def test_a_negative_ridge_and_rows_without_an_owner_are_refused():
     x, y = (decompose(view) for view in linked([0.5]))
     with pytest.raises(BadInput, match="ridge -1"):
-        canonical(x, y, np.arange(200), -1.0)
+        canonical_correlations(x, y, np.arange(200), -1.0)
     with pytest.raises(BadInput, match="199 owners"):
-        canonical(x, y, np.arange(199))
+        canonical_correlations(x, y, np.arange(199))
 
 
 def test_where_the_fast_decomposition_fails_the_slow_one_answers(monkeypatch):
@@ -330,22 +330,22 @@ def features(objects, each, seed, name, touch=8, photo=10, noise=0.3):
 
 @pytest.mark.parametrize("method", [Cca, Plsca])
 def test_what_was_chosen_is_said_and_never_exceeds_what_there_is(method):
-    fitted = method(Setting(Config()))
+    fitted = method(MethodSettings(Config()))
     fitted.fit(features(6, 5, 0, "train"), features(4, 5, 1, "validation"))
-    chosen = fitted.chosen
-    assert 1 <= chosen["components"] <= chosen["most_components"]
-    assert chosen["validation_auc"] > 0.8
+    best_params = fitted.best_params
+    assert 1 <= best_params["components"] <= best_params["max_components"]
+    assert best_params["validation_auc"] > 0.8
     if method is Cca:
-        assert chosen["most_components"] == 5  # one less than the training objects
-        assert chosen["rank"] == {"touch": 16, "photo": 10}
+        assert best_params["max_components"] == 5  # one less than the training objects
+        assert best_params["rank"] == {"touch": 16, "photo": 10}
 
 
 def test_one_grasp_for_each_object_is_plain_canonical_correlation_and_can_be_fitted():
-    fitted = Cca(Setting(Config()))
+    fitted = Cca(MethodSettings(Config()))
     fitted.fit(features(30, 1, 0, "train"), features(5, 1, 1, "validation"))
-    assert fitted.chosen["validation_auc"] > 0.8
+    assert fitted.best_params["validation_auc"] > 0.8
 
 
 def test_a_touch_is_paired_with_the_photo_of_the_next_grasp():
     owner = np.array([0, 1, 0, 0, 2, 1])
-    assert neighbours(owner, 2)[:, 1].tolist() == [2, 5, 3, 0, 4, 1]
+    assert next_rows_of_object(owner, 2)[:, 1].tolist() == [2, 5, 3, 0, 4, 1]

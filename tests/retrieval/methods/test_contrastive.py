@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from retrieval.methods import contrastive as module
-from retrieval.methods.base import Setting
-from retrieval.methods.contrastive import Contrastive, ContrastiveSigmoid, Projections, SigmoidProjections
-from retrieval.methods.draws import ObjectDraws, seeded
+from retrieval.methods.contrastive import ContrastiveEmbedding, Projections, SigmoidEmbedding, SigmoidProjections
+from retrieval.methods.method import MethodSettings
+from retrieval.methods.object_sampler import ObjectSampler, seeded_generator
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.losses.contrastive import LOG_SCALE_MAX
 from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT
@@ -34,28 +34,28 @@ def planted(objects, seed, each=6):
 TRAIN, VALIDATION, TEST = planted(10, 0), planted(4, 1), planted(5, 2)
 
 
-@pytest.mark.parametrize("method", [Contrastive, ContrastiveSigmoid])
+@pytest.mark.parametrize("method", [ContrastiveEmbedding, SigmoidEmbedding])
 def test_scores_are_scaled_cosines_with_the_learned_bias(method):
-    fitted = method(Setting(CONFIG))
+    fitted = method(MethodSettings(CONFIG))
     fitted.fit(TRAIN, VALIDATION)
     touch, photo = fitted.encode_touch(TEST.touch), fitted.encode_photo(TEST.photo)
     np.testing.assert_allclose(np.linalg.norm(touch, axis=1), 1, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(photo, axis=1), 1, atol=1e-6)
-    scores, scale, bias = fitted.score(touch, photo), fitted.chosen["scale"], fitted.chosen["bias"]
+    scores, scale, bias = fitted.score(touch, photo), fitted.best_params["scale"], fitted.best_params["bias"]
     for i in range(len(touch)):
         for j in range(len(photo)):
             assert scores[i, j] == pytest.approx(scale * float(touch[i] @ photo[j]) + bias, abs=1e-4)
-    assert (bias == 0) == (method is Contrastive)
+    assert (bias == 0) == (method is ContrastiveEmbedding)
     assert 1 <= scale <= 100
 
 
 @pytest.mark.slow
 def test_what_was_chosen_is_among_what_was_tried():
-    fitted = Contrastive(Setting(CONFIG))
+    fitted = ContrastiveEmbedding(MethodSettings(CONFIG))
     fitted.fit(TRAIN, VALIDATION)
-    assert (fitted.chosen["dropout"], fitted.chosen["weight_decay"]) in module.REGULARISATIONS
-    assert fitted.chosen["steps"] in (40, 80)
-    assert fitted.chosen["validation_auc"] > 0.7
+    assert (fitted.best_params["dropout"], fitted.best_params["weight_decay"]) in module.REGULARISATIONS
+    assert fitted.best_params["steps"] in (40, 80)
+    assert fitted.best_params["validation_auc"] > 0.7
 
 
 def test_the_sigmoid_loss_starts_from_its_own_scale_and_bias():
@@ -85,12 +85,12 @@ def test_fitting_leaves_the_random_stream_of_others_alone():
     torch.manual_seed(3)
     expected = torch.rand(4)
     torch.manual_seed(3)
-    Contrastive(Setting(CONFIG)).fit(TRAIN, VALIDATION)
+    ContrastiveEmbedding(MethodSettings(CONFIG)).fit(TRAIN, VALIDATION)
     assert torch.equal(torch.rand(4), expected)
 
 
 def draws(owner, seed=0):
-    return ObjectDraws(torch.tensor(owner), torch.Generator().manual_seed(seed))
+    return ObjectSampler(torch.tensor(owner), torch.Generator().manual_seed(seed))
 
 
 def test_rows_are_drawn_of_the_asked_objects_and_each_row_alike():
@@ -129,8 +129,8 @@ def test_sets_hold_distinct_grasps_of_one_object_of_every_size_it_allows():
 
 
 def test_one_seed_draws_alike():
-    with seeded(4) as one:
+    with seeded_generator(4) as one:
         first = torch.rand(3, generator=one), torch.rand(3)
-    with seeded(4) as other:
+    with seeded_generator(4) as other:
         second = torch.rand(3, generator=other), torch.rand(3)
     assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from retrieval.methods.selection import by_looks, held_out_folds
+from retrieval.methods.selection import appearance_order, held_out_folds
 from retrieval.training.features import Features
 
 KINDS = [[f"{kind}{number}" for number in range(4)] for kind in "abcdefghi"]
@@ -39,7 +39,7 @@ def test_half_of_each_kind_is_held_out_together_though_nobody_names_the_kinds(na
 
 
 def test_objects_that_look_alike_are_neighbours():
-    order = by_looks(photographed(KINDS))
+    order = appearance_order(photographed(KINDS))
     assert sorted(order) == NAMES
     assert sum(one[0] != other[0] for one, other in pairwise(order)) == len(KINDS) - 1
 

@@ -7,14 +7,14 @@ import pytest
 import torch
 
 from retrieval.data.dataset import load_grasps, make_split
-from retrieval.errors import BadInput, Interrupted
-from retrieval.methods.base import Setting
+from retrieval.errors import BadInput, JobInterrupted
 from retrieval.methods.late_fusion import LateFusion
-from retrieval.methods.prune_rerank import PruneRerank, candidates
+from retrieval.methods.method import MethodSettings
+from retrieval.methods.retrieve_rerank import RetrieveRerank, nearest_photos
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import one_thread
 from retrieval.training.features import Features, encode_recording
-from retrieval.training.state import state_path, unfinished
+from retrieval.training.state import state_path, unfinished_path
 from retrieval.training.train import Trainer, build_matcher, train
 from tests.conftest import TINY
 
@@ -47,12 +47,12 @@ def fitted(parts, tmp_path_factory):
 
 
 def fit(method, parts, folder, config=FROZEN):
-    made = method(Setting(config, folder=folder))
+    made = method(MethodSettings(config, folder=folder))
     made.fit(*parts[:2])
     return made
 
 
-def codes(method, part):
+def encodings(method, part):
     return method.encode_touch(part.touch), method.encode_photo(part.photo)
 
 
@@ -66,20 +66,20 @@ def two_loops(matcher, part):
     table = np.empty((len(part), len(part)))
     for row, touch in enumerate(part.touch):
         for column, photo in enumerate(part.photo):
-            touched = matcher.touch_code(torch.from_numpy(touch).reshape(1, -1))
-            seen = matcher.photo_code(torch.from_numpy(photo)[None])
-            table[row, column] = matcher.head(touched.half, seen.half).item()
+            touched = matcher.touch_encoding(torch.from_numpy(touch).reshape(1, -1))
+            seen = matcher.photo_encoding(torch.from_numpy(photo)[None])
+            table[row, column] = matcher.head(touched.partial, seen.partial).item()
     return table
 
 
 def test_scores_are_the_match_logits_of_every_pair(fitted, parts):
-    matcher = load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors").matcher
+    matcher = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors").matcher
     expected = two_loops(matcher, parts[2])
-    np.testing.assert_allclose(fitted.score(*codes(fitted, parts[2])), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(fitted.score(*encodings(fitted, parts[2])), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_a_set_of_grasps_scores_the_sum_of_its_logits(fitted, parts):
-    touch, photo = codes(fitted, parts[2])
+    touch, photo = encodings(fitted, parts[2])
     sets = np.array([[0, 1], [4, 2]])
     single = fitted.score(touch, photo).astype(np.float64)
     expected = np.array([single[0] + single[1], single[4] + single[2]])
@@ -87,7 +87,7 @@ def test_a_set_of_grasps_scores_the_sum_of_its_logits(fitted, parts):
 
 
 def test_the_harness_trains_what_the_command_line_trains(recording, split, fitted, tmp_path):
-    ours = load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors")
+    ours = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors")
     theirs = train(recording, tmp_path / "m.safetensors", FROZEN, split=split, quiet=True)
     assert (ours.provenance["step"], ours.config) == (theirs.provenance["step"], theirs.config)
     for name, weight in theirs.matcher.state_dict().items():
@@ -99,27 +99,27 @@ def test_a_fit_leaves_a_checkpoint_that_an_index_is_built_with(fitted, catalogue
     from retrieval.search.build.build_index import build_index
 
     report = build_index(
-        catalogue, load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors"), tmp_path / "index"
+        catalogue, load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors"), tmp_path / "index"
     )
     assert report.to_dict()["photos"] == 24
 
 
 def test_what_is_finished_is_not_trained_again(fitted, parts, monkeypatch):
     no_training(monkeypatch)
-    again = fit(LateFusion, parts, fitted.setting.folder)
-    assert again.chosen == fitted.chosen
-    np.testing.assert_array_equal(again.score(*codes(again, parts[2])), fitted.score(*codes(fitted, parts[2])))
-    assert fit(PruneRerank, parts, fitted.setting.folder).chosen["step"] == fitted.chosen["step"]
+    again = fit(LateFusion, parts, fitted.settings.folder)
+    assert again.best_params == fitted.best_params
+    np.testing.assert_array_equal(again.score(*encodings(again, parts[2])), fitted.score(*encodings(fitted, parts[2])))
+    assert fit(RetrieveRerank, parts, fitted.settings.folder).best_params["step"] == fitted.best_params["step"]
 
 
 def test_another_setting_or_other_features_are_trained_anew(parts, tmp_path):
     first = fit(LateFusion, parts, tmp_path)
     slower = with_training(FROZEN, learning_rate=1e-4)
-    assert fit(LateFusion, parts, tmp_path, slower).chosen != first.chosen
+    assert fit(LateFusion, parts, tmp_path, slower).best_params != first.best_params
     back = fit(LateFusion, parts, tmp_path)
-    assert back.chosen == first.chosen
+    assert back.best_params == first.best_params
     moved = dataclasses.replace(parts[0], touch=parts[0].touch + 1)
-    assert fit(LateFusion, (moved, *parts[1:]), tmp_path).chosen != first.chosen
+    assert fit(LateFusion, (moved, *parts[1:]), tmp_path).best_params != first.best_params
 
 
 LOSS = """
@@ -150,14 +150,14 @@ def stopped(parts, folder, monkeypatch, config=FROZEN):
 
     def failing(self, loaded):
         if self.step == 3:
-            raise Interrupted("power cut")
+            raise JobInterrupted("power cut")
         return loss(self, loaded)
 
     with monkeypatch.context() as during:
         during.setattr(Trainer, "loss", failing)
-        with pytest.raises(Interrupted):
+        with pytest.raises(JobInterrupted):
             fit(LateFusion, parts, folder, config)
-    assert state_path(unfinished(folder / "late_fusion-0.safetensors")).is_file()
+    assert state_path(unfinished_path(folder / "late_fusion-0.safetensors")).is_file()
     assert not (folder / "late_fusion-0.safetensors").exists()
 
 
@@ -165,36 +165,38 @@ def test_a_fit_that_was_stopped_goes_on_and_ends_bit_for_bit_alike(fitted, parts
     stopped(parts, tmp_path, monkeypatch)
     fit(LateFusion, parts, tmp_path)
     done = tmp_path / "late_fusion-0.safetensors"
-    assert done.read_bytes() == (fitted.setting.folder / done.name).read_bytes()
-    assert not state_path(unfinished(done)).exists()
+    assert done.read_bytes() == (fitted.settings.folder / done.name).read_bytes()
+    assert not state_path(unfinished_path(done)).exists()
 
 
 def test_what_another_fit_left_unfinished_makes_room(fitted, parts, tmp_path, monkeypatch):
     stopped(parts, tmp_path, monkeypatch, with_training(FROZEN, learning_rate=1e-4))
-    assert fit(LateFusion, parts, tmp_path).chosen == fitted.chosen
+    assert fit(LateFusion, parts, tmp_path).best_params == fitted.best_params
 
 
 def test_no_folder_keeps_nothing_and_comes_out_alike(fitted, parts):
     alone = fit(LateFusion, parts, None)
-    np.testing.assert_array_equal(alone.score(*codes(alone, parts[2])), fitted.score(*codes(fitted, parts[2])))
+    np.testing.assert_array_equal(alone.score(*encodings(alone, parts[2])), fitted.score(*encodings(fitted, parts[2])))
 
 
 def test_seeds_come_out_apart(parts, tmp_path):
-    methods = [LateFusion(Setting(FROZEN, seed=seed, folder=tmp_path)) for seed in (0, 1)]
+    methods = [LateFusion(MethodSettings(FROZEN, seed=seed, folder=tmp_path)) for seed in (0, 1)]
     for method in methods:
         method.fit(*parts[:2])
-    first, second = (method.score(*codes(method, parts[2])) for method in methods)
+    first, second = (method.score(*encodings(method, parts[2])) for method in methods)
     assert np.abs(first - second).max() > 1e-3
     assert {path.name for path in tmp_path.glob("*.safetensors")} == {f"late_fusion-{n}.safetensors" for n in (0, 1)}
 
 
-@pytest.mark.parametrize("method", [LateFusion, PruneRerank])
+@pytest.mark.parametrize("method", [LateFusion, RetrieveRerank])
 def test_a_method_of_a_checkpoint_needs_no_fit_and_scores_alike(method, fitted, parts, monkeypatch):
     no_training(monkeypatch)
-    checkpoint = load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors")
-    given = method.of_checkpoint(checkpoint, Setting(FROZEN))
-    expected = fit(method, parts, fitted.setting.folder)
-    np.testing.assert_array_equal(given.score(*codes(given, parts[2])), expected.score(*codes(expected, parts[2])))
+    checkpoint = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors")
+    given = method.of_checkpoint(checkpoint, MethodSettings(FROZEN))
+    expected = fit(method, parts, fitted.settings.folder)
+    np.testing.assert_array_equal(
+        given.score(*encodings(given, parts[2])), expected.score(*encodings(expected, parts[2]))
+    )
     with pytest.raises(BadInput, match="as fitted on"):
         given.encode_touch(parts[2].touch[:, :1])
 
@@ -226,39 +228,41 @@ def test_pruning_ranks_candidates_by_logit_and_the_rest_behind_by_embedding(gras
         np.concatenate([parts[0].touch, parts[2].touch]),
         np.concatenate([parts[0].photo, parts[2].photo]),
     )
-    method = fit(PruneRerank, parts, fitted.setting.folder)
-    matcher = load_checkpoint(fitted.setting.folder / "late_fusion-0.safetensors").matcher
+    method = fit(RetrieveRerank, parts, fitted.settings.folder)
+    matcher = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors").matcher
     with torch.inference_mode():
-        touch = matcher.touch_code(torch.from_numpy(every.touch).flatten(1)).embedding
-        nearness = (touch @ matcher.photo_code(torch.from_numpy(every.photo)).embedding.T).numpy()
-    logits = fitted.score(*codes(fitted, every))
+        touch = matcher.touch_encoding(torch.from_numpy(every.touch).flatten(1)).embedding
+        nearness = (touch @ matcher.photo_encoding(torch.from_numpy(every.photo)).embedding.T).numpy()
+    logits = fitted.score(*encodings(fitted, every))
     sets = np.arange(4 * grasps).reshape(4, grasps)
-    scores = method.score_sets(*codes(method, every), sets)
+    scores = method.score_sets(*encodings(method, every), sets)
     count = round(0.25 * len(every))
-    for row, chosen in enumerate(sets):
+    for row, best_params in enumerate(sets):
         ranked = np.argsort(-scores[row], kind="stable").tolist()
-        assert ranked == expected_pruned(logits[chosen].sum(0, dtype=np.float64), nearness[chosen], count)
+        assert ranked == expected_pruned(logits[best_params].sum(0, dtype=np.float64), nearness[best_params], count)
     if grasps == 1:
-        np.testing.assert_allclose(method.score(*codes(method, every))[:4], scores, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(method.score(*encodings(method, every))[:4], scores, rtol=1e-4, atol=1e-5)
 
 
 def test_judging_every_photo_is_late_fusion(fitted, parts):
-    method = PruneRerank(fitted.setting, share=1.0)
+    method = RetrieveRerank(fitted.settings, reranked_fraction=1.0)
     method.fit(*parts[:2])
-    np.testing.assert_array_equal(method.score(*codes(method, parts[2])), fitted.score(*codes(fitted, parts[2])))
+    np.testing.assert_array_equal(
+        method.score(*encodings(method, parts[2])), fitted.score(*encodings(fitted, parts[2]))
+    )
 
 
 def test_a_model_without_trained_embeddings_judges_every_photo(parts, tmp_path):
-    method = fit(PruneRerank, parts, tmp_path, with_training(FROZEN, weights={}))
-    assert method.chosen["judged_share"] == 1.0
+    method = fit(RetrieveRerank, parts, tmp_path, with_training(FROZEN, weights={}))
+    assert method.best_params["reranked_fraction"] == 1.0
     late = fit(LateFusion, parts, tmp_path, with_training(FROZEN, weights={}))
-    np.testing.assert_array_equal(method.score(*codes(method, parts[2])), late.score(*codes(late, parts[2])))
+    np.testing.assert_array_equal(method.score(*encodings(method, parts[2])), late.score(*encodings(late, parts[2])))
 
 
 def test_equally_near_photos_are_taken_by_row():
     nearness = np.array([[0.5, 0.25, 0.5, 0.75], [0.25, 0.5, 0.25, 0.25]], dtype=np.float32)
-    assert candidates(nearness, 2).tolist() == [0, 3]
-    assert candidates(nearness[1:], 2).tolist() == [0, 1]
+    assert nearest_photos(nearness, 2).tolist() == [0, 3]
+    assert nearest_photos(nearness[1:], 2).tolist() == [0, 1]
 
 
 def test_steps_on_features_are_computed_on_one_thread_and_others_are_not():
@@ -274,5 +278,5 @@ def test_a_matcher_of_several_views_is_fitted_on_the_features_of_all(recording, 
     features = encode_recording(load_grasps(recording), build_matcher(seen), seen, None, quiet=True)
     both = tuple(features.of_objects(part) for part in (split.train, split.validation, split.test))
     made = fit(LateFusion, both, tmp_path, seen)
-    touches, photos = codes(made, both[2])
+    touches, photos = encodings(made, both[2])
     assert made.score(touches, photos).shape == (len(both[2]), len(both[2]))

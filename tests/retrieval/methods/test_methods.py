@@ -8,15 +8,15 @@ import pytest
 
 from retrieval.errors import BadInput, ConfigError, NumericalError
 from retrieval.methods import METHODS, cca_towers
-from retrieval.methods.base import Method, Setting
-from retrieval.methods.cca_towers import GRID, CcaSettings, blocks_of, choose, fit_codes
-from retrieval.methods.selection import Validator, judged_rows, neighbours, ranking_auc
+from retrieval.methods.cca_towers import GRID, CcaSettings, fit_projections, select_settings, tower_widths
+from retrieval.methods.method import Method, MethodSettings
+from retrieval.methods.selection import Validator, next_rows_of_object, ranking_auc, validation_rows
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.training.features import Features
 
-KNOWS_NOTHING = {"chance", "constant"}
-LEARNS = [name for name in METHODS if name not in KNOWS_NOTHING]
+TRIVIAL = {"chance", "constant"}
+LEARNS = [name for name in METHODS if name not in TRIVIAL]
 FEATURES = 256  # what the small tower gives
 CONFIG = Config(
     matcher=MatcherConfig(
@@ -57,12 +57,12 @@ TRAIN, VALIDATION, TEST = planted(12, 0), planted(4, 1), planted(6, 2)
 
 @lru_cache
 def fitted(name, seed=0) -> Method:
-    method = METHODS.load(name)(Setting(CONFIG, seed=seed))
+    method = METHODS.load(name)(MethodSettings(CONFIG, seed=seed))
     method.fit(TRAIN, VALIDATION)
     return method
 
 
-def codes(method, features=TEST):
+def encodings(method, features=TEST):
     return method.encode_touch(features.touch), method.encode_photo(features.photo)
 
 
@@ -71,7 +71,7 @@ every_method = pytest.mark.parametrize("name", METHODS)
 
 @every_method
 def test_every_touch_gets_a_finite_score_with_every_photo(name):
-    touch, photo = codes(fitted(name))
+    touch, photo = encodings(fitted(name))
     scores = fitted(name).score(touch, photo[:17])
     assert scores.shape == (len(TEST), 17)
     assert scores.dtype == np.float32
@@ -82,29 +82,30 @@ def test_every_touch_gets_a_finite_score_with_every_photo(name):
     "name", [pytest.param(name, marks=pytest.mark.slow if name.startswith("contrastive") else ()) for name in METHODS]
 )
 def test_two_fits_with_one_seed_score_alike_bit_for_bit(name):
-    again = METHODS.load(name)(Setting(CONFIG))
+    again = METHODS.load(name)(MethodSettings(CONFIG))
     again.fit(TRAIN, VALIDATION)
-    np.testing.assert_array_equal(again.score(*codes(again)), fitted(name).score(*codes(fitted(name))))
-    assert again.chosen == fitted(name).chosen
+    np.testing.assert_array_equal(again.score(*encodings(again)), fitted(name).score(*encodings(fitted(name))))
+    assert again.best_params == fitted(name).best_params
 
 
 @pytest.mark.parametrize("name", LEARNS)
 def test_photos_of_the_touched_object_score_higher(name):
-    assert Validator.of(TEST).touches(fitted(name).score(*codes(fitted(name)))) > 0.8
+    assert Validator.of(TEST).touch_auc(fitted(name).score(*encodings(fitted(name)))) > 0.8
 
 
 def test_the_constant_is_exactly_chance_and_chance_is_about_chance():
-    assert Validator.of(TEST).touches(fitted("constant").score(*codes(fitted("constant")))) == 0.5
+    assert Validator.of(TEST).touch_auc(fitted("constant").score(*encodings(fitted("constant")))) == 0.5
     values = [
-        Validator.of(TEST).touches(fitted("chance", seed).score(*codes(fitted("chance", seed)))) for seed in range(12)
+        Validator.of(TEST).touch_auc(fitted("chance", seed).score(*encodings(fitted("chance", seed))))
+        for seed in range(12)
     ]
     assert np.mean(values) == pytest.approx(0.5, abs=4 * np.std(values) / np.sqrt(len(values)))
 
 
 # Pruning looks at the whole gallery.
-@pytest.mark.parametrize("name", [name for name in METHODS if name != "prune_rerank"])
+@pytest.mark.parametrize("name", [name for name in METHODS if name != "retrieve_rerank"])
 def test_a_score_depends_on_its_touch_and_photo_only(name):
-    touch, photo = codes(fitted(name))
+    touch, photo = encodings(fitted(name))
     whole = fitted(name).score(touch, photo)
     alone = np.concatenate([fitted(name).encode_touch(TEST.touch[row : row + 1]) for row in (5, 3)])
     part = fitted(name).score(alone, photo[10:14])
@@ -113,7 +114,7 @@ def test_a_score_depends_on_its_touch_and_photo_only(name):
 
 @every_method
 def test_the_order_of_the_grasps_of_a_set_does_not_matter(name):
-    touch, photo = codes(fitted(name))
+    touch, photo = encodings(fitted(name))
     sets = np.array([[0, 1, 2, 3, 4], [9, 8, 15, 10, 11]])
     turned = fitted(name).score_sets(touch, photo, sets[:, [3, 0, 4, 2, 1]])
     np.testing.assert_allclose(turned, fitted(name).score_sets(touch, photo, sets), rtol=1e-5, atol=1e-5)
@@ -121,7 +122,7 @@ def test_the_order_of_the_grasps_of_a_set_does_not_matter(name):
 
 @every_method
 def test_a_set_of_one_grasp_scores_as_the_grasp(name):
-    touch, photo = codes(fitted(name))
+    touch, photo = encodings(fitted(name))
     sets = np.array([[7], [0], [40]])
     scores = fitted(name).score(touch, photo)[sets[:, 0]]
     np.testing.assert_allclose(fitted(name).score_sets(touch, photo, sets), scores, rtol=1e-5, atol=1e-5)
@@ -129,7 +130,7 @@ def test_a_set_of_one_grasp_scores_as_the_grasp(name):
 
 @pytest.mark.parametrize("name", ["late_fusion", "contrastive", "contrastive_sigmoid", "cca", "plsca", "chance"])
 def test_a_set_scores_the_sum_over_its_grasps(name):
-    touch, photo = codes(fitted(name))
+    touch, photo = encodings(fitted(name))
     scores = fitted(name).score(touch, photo).astype(np.float64)
     expected = [[scores[0, n] + scores[3, n] + scores[5, n] for n in range(len(photo))]]
     got = fitted(name).score_sets(touch, photo, np.array([[0, 3, 5]]))
@@ -139,17 +140,17 @@ def test_a_set_scores_the_sum_over_its_grasps(name):
 @pytest.mark.parametrize("name", LEARNS)
 def test_five_grasps_tell_more_than_one(name):
     noisy = planted(6, 2, noise=6.0)
-    judged = Validator.of(noisy)
-    touch, photo = codes(fitted(name), noisy)
+    validator = Validator.of(noisy)
+    touch, photo = encodings(fitted(name), noisy)
     rows = np.arange(len(TEST))
     sets = rows[:, None] // 8 * 8 + (rows[:, None] + np.arange(5)) % 8
-    single = judged.sets(fitted(name).score(touch, photo), rows[:, None])
-    assert judged.sets(fitted(name).score_sets(touch, photo, sets), sets) > single
+    single = validator.set_auc(fitted(name).score(touch, photo), rows[:, None])
+    assert validator.set_auc(fitted(name).score_sets(touch, photo, sets), sets) > single
 
 
 @every_method
 def test_it_must_be_fitted_before_use(name):
-    method = METHODS.load(name)(Setting(CONFIG))
+    method = METHODS.load(name)(MethodSettings(CONFIG))
     with pytest.raises(BadInput, match="fitted before"):
         method.encode_touch(TEST.touch)
     with pytest.raises(BadInput, match="fitted before"):
@@ -183,43 +184,43 @@ def test_features_of_another_shape_than_fitted_on_are_refused(name):
 def test_too_few_objects_and_objects_in_both_parts_are_refused():
     first_object = TRAIN.select(np.arange(8))
     with pytest.raises(BadInput, match="at least 2 training objects; got 1"):
-        METHODS.load("constant")(Setting(CONFIG)).fit(first_object, VALIDATION)
+        METHODS.load("constant")(MethodSettings(CONFIG)).fit(first_object, VALIDATION)
     with pytest.raises(BadInput, match="at least 2 validation objects; got 1"):
-        METHODS.load("constant")(Setting(CONFIG)).fit(TRAIN, VALIDATION.select(np.arange(8)))
+        METHODS.load("constant")(MethodSettings(CONFIG)).fit(TRAIN, VALIDATION.select(np.arange(8)))
     with pytest.raises(BadInput, match="'object-0-00' is in both"):
-        METHODS.load("constant")(Setting(CONFIG)).fit(TRAIN, TRAIN)
+        METHODS.load("constant")(MethodSettings(CONFIG)).fit(TRAIN, TRAIN)
 
 
 @pytest.mark.parametrize("sets", [np.array([0, 1]), np.zeros((2, 0), np.int64), np.array([[0.0]])])
 def test_sets_of_another_shape_are_refused(sets):
     with pytest.raises(BadInput, match="shape"):
-        fitted("constant").score_sets(*codes(fitted("constant")), sets)
+        fitted("constant").score_sets(*encodings(fitted("constant")), sets)
 
 
 @pytest.mark.parametrize("row", [-1, len(TEST)])
 def test_sets_that_name_no_touch_are_refused(row):
     with pytest.raises(BadInput, match="rows of the 48 touch codes"):
-        fitted("constant").score_sets(*codes(fitted("constant")), np.array([[0, row]]))
+        fitted("constant").score_sets(*encodings(fitted("constant")), np.array([[0, row]]))
 
 
 def test_a_method_whose_scores_are_not_finite_or_of_another_shape_is_caught():
     class Broken(type(fitted("constant"))):
-        def _score(self, touch_codes, photo_codes):
+        def _score(self, touch_encodings, photo_encodings):
             return self.answer
 
-    broken = Broken(Setting(CONFIG))
+    broken = Broken(MethodSettings(CONFIG))
     broken.fit(TRAIN, VALIDATION)
     broken.answer = np.full((48, 48), np.nan)
     with pytest.raises(NumericalError, match=r"scores must be finite; got nan at \(0, 0\)"):
-        broken.score(*codes(broken))
+        broken.score(*encodings(broken))
     broken.answer = np.zeros((48, 47))
     with pytest.raises(BadInput, match=r"shape \(48, 48\)"):
-        broken.score(*codes(broken))
+        broken.score(*encodings(broken))
 
 
 def test_an_unknown_method_is_told_the_known_ones():
     with pytest.raises(ConfigError, match=r"late_fusion, set_fusion, .*, constant; got 'oracle'"):
-        METHODS.load("oracle")(Setting(CONFIG))
+        METHODS.load("oracle")(MethodSettings(CONFIG))
 
 
 def test_the_worth_of_scores_is_what_loops_count():
@@ -249,67 +250,69 @@ def test_a_worth_is_never_made_of_scores_that_are_not_finite(bad):
 
 def test_every_object_has_its_share_of_the_grasps_to_choose_by():
     features = planted(5, 3, each=40)
-    rows = judged_rows(features, most=50)
+    rows = validation_rows(features, most=50)
     assert np.bincount(features.owner[rows]).tolist() == [10] * 5
     assert len(np.unique(rows)) == 50
-    assert np.bincount(features.owner[judged_rows(features, most=3)]).tolist() == [2] * 5
+    assert np.bincount(features.owner[validation_rows(features, most=3)]).tolist() == [2] * 5
 
 
 def test_features_are_standardised_by_the_training_grasps_and_constant_ones_left_out():
     x = np.array([[1.0, 5.0, 1e4], [3.0, 5.0, 1e4 + 1e-3], [5.0, 5.0, 1e4]], dtype=np.float32)
     standardise = Standardiser.fit(x)
-    assert standardise.kept.tolist() == [0]  # the last one varies by its float32 rounding only
+    assert standardise.columns.tolist() == [0]  # the last one varies by its float32 rounding only
     np.testing.assert_allclose(standardise(np.array([[3.0, 9.0, 0.0]])), [[0.0]])
     np.testing.assert_allclose(standardise(x).std(0), 1.0)
 
 
 def settings_of(method):
-    return CcaSettings(*(method.chosen[name] for name in CcaSettings._fields))
+    return CcaSettings(*(method.best_params[name] for name in CcaSettings._fields))
 
 
 def test_once_settings_are_chosen_towers_side_by_side_are_fitted_on_validation_objects_too():
-    both = TRAIN.joined(VALIDATION)
-    method = METHODS.load("cca_towers")(Setting(CONFIG, all_teach=True))
+    both = TRAIN.concatenate(VALIDATION)
+    method = METHODS.load("cca_towers")(MethodSettings(CONFIG, fit_on_validation=True))
     method.fit(TRAIN, VALIDATION)
-    blocks = blocks_of(CONFIG, TRAIN)
+    blocks = tower_widths(CONFIG, TRAIN)
     assert blocks == ([FEATURES, FEATURES], [FEATURES])
-    chosen = settings_of(method)
-    codes_of = dict(fit_codes(both.touch.reshape(len(both), -1), both.photo, both.owner, blocks, [chosen]))
-    wanted = codes_of[chosen].cosines(TEST.touch.reshape(len(TEST), -1), TEST.photo)
-    np.testing.assert_array_equal(method.score(*codes(method)), wanted)
+    best_params = settings_of(method)
+    codes_of = dict(fit_projections(both.touch.reshape(len(both), -1), both.photo, both.owner, blocks, [best_params]))
+    wanted = codes_of[best_params].cosines(TEST.touch.reshape(len(TEST), -1), TEST.photo)
+    np.testing.assert_array_equal(method.score(*encodings(method)), wanted)
 
 
 @pytest.mark.parametrize("name", ["cca", "cca_pca"])
 def test_where_all_objects_teach_cca_is_fitted_on_validation_objects_too(name):
-    alone, taught = fitted(name), METHODS.load(name)(Setting(CONFIG, all_teach=True))
+    alone, taught = fitted(name), METHODS.load(name)(MethodSettings(CONFIG, fit_on_validation=True))
     taught.fit(TRAIN, VALIDATION)
-    assert {**taught.chosen, "rank": None, "most_components": None} == {
-        **alone.chosen, "rank": None, "most_components": None
+    assert {**taught.best_params, "rank": None, "max_components": None} == {
+        **alone.best_params, "rank": None, "max_components": None
     }  # fmt: skip
-    assert taught.chosen["most_components"] == 12 + 4 - 1 > alone.chosen["most_components"]
+    assert taught.best_params["max_components"] == 12 + 4 - 1 > alone.best_params["max_components"]
 
 
-@pytest.mark.parametrize("all_teach", [False, True])
-def test_settings_are_chosen_by_objects_that_are_held_out_of_the_fit_and_by_no_others(all_teach, monkeypatch):
+@pytest.mark.parametrize("fit_on_validation", [False, True])
+def test_settings_are_chosen_by_objects_that_are_held_out_of_the_fit_and_by_no_others(fit_on_validation, monkeypatch):
     calls = []
-    monkeypatch.setattr(cca_towers, "choose", lambda *asked: calls.append(asked) or choose(*asked))
-    method = METHODS.load("cca_towers")(Setting(CONFIG, all_teach=all_teach))
+    monkeypatch.setattr(cca_towers, "select_settings", lambda *asked: calls.append(asked) or select_settings(*asked))
+    method = METHODS.load("cca_towers")(MethodSettings(CONFIG, fit_on_validation=fit_on_validation))
     method.fit(TRAIN, VALIDATION)
     ((features, _, folds),) = calls
     known = {*TRAIN.object_ids, *VALIDATION.object_ids}
     assert set(features.object_ids) == known
     held = [name for fold in folds for name in fold]
     assert len(held) == len(set(held))
-    assert set(held) == (known if all_teach else set(VALIDATION.object_ids))
-    assert method.chosen["validation_auc"] == pytest.approx(choose(features, blocks_of(CONFIG, TRAIN), folds).auc)
+    assert set(held) == (known if fit_on_validation else set(VALIDATION.object_ids))
+    assert method.best_params["validation_auc"] == pytest.approx(
+        select_settings(features, tower_widths(CONFIG, TRAIN), folds).auc
+    )
 
 
 def test_the_setting_that_ranks_held_out_objects_best_is_chosen_not_the_one_that_fits_best():
     hard = planted(12, 7, noise=4.0)
     folds = [tuple(sorted(set(hard.object_ids)))[start::2] for start in range(2)]
-    blocks = blocks_of(CONFIG, hard)
-    alone = {one: choose(hard, blocks, folds, [one]).auc for one in GRID}
-    choice = choose(hard, blocks, folds)
+    blocks = tower_widths(CONFIG, hard)
+    alone = {one: select_settings(hard, blocks, folds, [one]).auc for one in GRID}
+    choice = select_settings(hard, blocks, folds)
     assert choice.auc == pytest.approx(max(alone.values()))
     assert alone[choice.settings] == pytest.approx(choice.auc)
     assert len({round(one, 6) for one in alone.values()}) > 1
@@ -317,32 +320,32 @@ def test_the_setting_that_ranks_held_out_objects_best_is_chosen_not_the_one_that
 
 def with_references(features):
     """Each photo with the touch of the next grasp of its object behind it."""
-    beside = neighbours(features.owner, 2)[:, 1]
+    beside = next_rows_of_object(features.owner, 2)[:, 1]
     touches = features.touch[beside].reshape(len(features), -1)
     return replace(features, photo=np.concatenate([features.photo, touches], axis=1))
 
 
 def test_a_reference_touch_behind_a_photo_is_encoded_as_a_touch_and_weighed_by_validation_objects():
     train, validation, test = (with_references(part) for part in (TRAIN, VALIDATION, TEST))
-    method = METHODS.load("cca_towers")(Setting(CONFIG))
+    method = METHODS.load("cca_towers")(MethodSettings(CONFIG))
     method.fit(train, validation)
     alone = fitted("cca_towers")
-    assert method.chosen["ridge"] == alone.chosen["ridge"]
-    weights = method.chosen["photo_weight"], method.chosen["reference_weight"]
+    assert method.best_params["ridge"] == alone.best_params["ridge"]
+    weights = method.best_params["photo_weight"], method.best_params["reference_weight"]
     assert min(weights) >= 0 < max(weights)
     felt = alone.encode_touch(test.touch)
     references = alone.encode_touch(test.photo[:, TEST.photo.shape[1] :].reshape(test.touch.shape))
-    wanted = weights[0] * alone.score(*codes(alone)) + weights[1] * (felt @ references.T)
+    wanted = weights[0] * alone.score(*encodings(alone)) + weights[1] * (felt @ references.T)
     found = method.score(method.encode_touch(test.touch), method.encode_photo(test.photo))
     np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-4)  # float32 sums of some hundred terms
 
 
 def test_touches_in_place_of_photos_are_taken_too():
     touches = replace(TRAIN, photo=TRAIN.touch.reshape(len(TRAIN), -1))
-    assert blocks_of(CONFIG, touches) == ([FEATURES, FEATURES], [FEATURES, FEATURES])
+    assert tower_widths(CONFIG, touches) == ([FEATURES, FEATURES], [FEATURES, FEATURES])
 
 
 def test_towers_side_by_side_take_features_of_their_own_alone():
     other = Features(TRAIN.grasp_ids, TRAIN.object_ids, TRAIN.touch, TRAIN.photo[:, 1:])
     with pytest.raises(BadInput, match=r"towers small \(pooled\), 512 of a touch and 256 of a photo; got 512 and 255"):
-        blocks_of(CONFIG, other)
+        tower_widths(CONFIG, other)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from retrieval.methods import set_fusion
-from retrieval.methods.selection import neighbours
+from retrieval.methods.selection import next_rows_of_object
 from retrieval.methods.set_fusion import SetHead
 from retrieval.model.fusion import FusionHead
 
@@ -20,27 +20,27 @@ def head(hidden=16, seed=0):
     return made.requires_grad_(False)
 
 
-def pooled(made, halves):
-    return made.pool(halves[None], torch.ones(1, len(halves), dtype=torch.bool))[0]
+def pooled(made, partials):
+    return made.pool(partials[None], torch.ones(1, len(partials), dtype=torch.bool))[0]
 
 
 def test_pooling_is_what_the_formula_says():
-    made, halves = head(), torch.randn(3, 16, generator=torch.Generator().manual_seed(1))
-    scores = [float((made.attention.weight[0] * h.relu()).sum() + made.attention.bias) for h in halves]
+    made, partials = head(), torch.randn(3, 16, generator=torch.Generator().manual_seed(1))
+    scores = [float((made.attention.weight[0] * h.relu()).sum() + made.attention.bias) for h in partials]
     shares = [np.exp(score) / sum(np.exp(scores)) for score in scores]
-    attended = sum(share * h for share, h in zip(shares, halves, strict=True))
-    mean = (halves[0] + halves[1] + halves[2]) / 3
-    largest = torch.maximum(torch.maximum(halves[0], halves[1]), halves[2])
+    attended = sum(share * h for share, h in zip(shares, partials, strict=True))
+    mean = (partials[0] + partials[1] + partials[2]) / 3
+    largest = torch.maximum(torch.maximum(partials[0], partials[1]), partials[2])
     expected = mean + made.attended.weight @ (attended - mean) + made.largest.weight @ (largest - mean)
     expected = expected + np.log(3) * made.size
-    torch.testing.assert_close(pooled(made, halves), expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(pooled(made, partials), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_the_order_of_grasps_does_not_matter():
-    made, halves = head(), torch.randn(6, 16, generator=torch.Generator().manual_seed(2))
+    made, partials = head(), torch.randn(6, 16, generator=torch.Generator().manual_seed(2))
     for seed in range(5):
         order = torch.randperm(6, generator=torch.Generator().manual_seed(seed))
-        torch.testing.assert_close(pooled(made, halves[order]), pooled(made, halves), rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(pooled(made, partials[order]), pooled(made, partials), rtol=1e-5, atol=1e-5)
 
 
 def test_a_set_of_one_is_judged_as_late_fusion_judges_a_touch():
@@ -48,31 +48,31 @@ def test_a_set_of_one_is_judged_as_late_fusion_judges_a_touch():
     plain = FusionHead(10, 7, 16, 0.5).eval()
     plain.load_state_dict(made.state_dict(), strict=False)
     generator = torch.Generator().manual_seed(3)
-    touch, photo = made.touch_half(torch.randn(4, 10, generator=generator)), made.photo_half(torch.randn(4, 7))
+    touch, photo = made.touch_partial(torch.randn(4, 10, generator=generator)), made.photo_partial(torch.randn(4, 7))
     one = made.pool(touch[:, None], torch.ones(4, 1, dtype=torch.bool))
     torch.testing.assert_close(made(one, photo), plain(touch, photo))
 
 
 def test_an_untrained_pooling_is_the_mean():
-    made, halves = SetHead(10, 7, 16, 0.5), torch.randn(5, 16)
-    torch.testing.assert_close(pooled(made, halves), halves.mean(0))
+    made, partials = SetHead(10, 7, 16, 0.5), torch.randn(5, 16)
+    torch.testing.assert_close(pooled(made, partials), partials.mean(0))
 
 
 @pytest.mark.parametrize("padding", [0.0, 1e6, -1e6, float("nan")])
 def test_padding_changes_nothing_whatever_stands_there(padding):
     made, generator = head(), torch.Generator().manual_seed(4)
     sets = [torch.randn(size, 16, generator=generator) for size in (1, 8, 3)]
-    batch, held = torch.full((3, 8, 16), padding), torch.zeros(3, 8, dtype=torch.bool)
-    for place, halves in enumerate(sets):
-        batch[place, : len(halves)], held[place, : len(halves)] = halves, True
-    alone = torch.stack([pooled(made, halves) for halves in sets])
-    torch.testing.assert_close(made.pool(batch, held), alone, rtol=1e-5, atol=1e-5)
+    batch, counted = torch.full((3, 8, 16), padding), torch.zeros(3, 8, dtype=torch.bool)
+    for place, partials in enumerate(sets):
+        batch[place, : len(partials)], counted[place, : len(partials)] = partials, True
+    alone = torch.stack([pooled(made, partials) for partials in sets])
+    torch.testing.assert_close(made.pool(batch, counted), alone, rtol=1e-5, atol=1e-5)
 
 
 def test_padding_has_no_part_in_the_gradient():
-    made, held = head(), torch.tensor([[True, True, False]])
-    halves = torch.randn(1, 3, 16, generator=torch.Generator().manual_seed(5), requires_grad=True)
-    (gradient,) = torch.autograd.grad(made.pool(halves, held).sum(), halves)
+    made, counted = head(), torch.tensor([[True, True, False]])
+    partials = torch.randn(1, 3, 16, generator=torch.Generator().manual_seed(5), requires_grad=True)
+    (gradient,) = torch.autograd.grad(made.pool(partials, counted).sum(), partials)
     assert torch.isfinite(gradient).all()
     assert not gradient[0, 2].any()
     assert gradient[0, :2].abs().min() > 0
@@ -91,5 +91,5 @@ def test_scores_in_blocks_are_the_scores_of_each_pair(monkeypatch):
 
 
 def test_neighbours_are_of_the_same_object_round():
-    assert neighbours(np.array([0, 1, 0, 0, 1]), 2).tolist() == [[0, 2], [1, 4], [2, 3], [3, 0], [4, 1]]
-    assert neighbours(np.array([0, 1, 1]), 3).tolist() == [[0, 0, 0], [1, 2, 1], [2, 1, 2]]
+    assert next_rows_of_object(np.array([0, 1, 0, 0, 1]), 2).tolist() == [[0, 2], [1, 4], [2, 3], [3, 0], [4, 1]]
+    assert next_rows_of_object(np.array([0, 1, 1]), 3).tolist() == [[0, 0, 0], [1, 2, 1], [2, 1, 2]]

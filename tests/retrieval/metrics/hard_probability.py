@@ -9,8 +9,8 @@ from scipy.special import expit, log_expit, softmax
 
 from retrieval.evaluation.reject import galleries, statistic
 from retrieval.metrics.pairs import fit_calibration, reliability_bins
-from retrieval.model.posterior import JudgedTouches, Posterior, fit_posterior
-from tests.hard_case import HardCase, refused
+from retrieval.model.posterior import Posterior, ScoredTouches, fit_posterior
+from tests.hard_case import HardCase, error_of
 
 Matrix = NDArray[np.float64]
 _LOGITS, _CALIBRATION = "logits", "calibration"
@@ -62,7 +62,7 @@ def _many_grasps() -> HardCase:
     """Eight grasps of two objects, the second a little less unlikely: e^0.8 to 1 that it is that one."""
     logits = np.array([[-100.0] * 8, [-99.9] * 8])
     naive = expit(logits.astype(np.float32)).prod(axis=1)
-    ours = _ADDING.believe(logits.sum(axis=1), grasps=8, none_prior=0).objects
+    ours = _ADDING.probabilities(logits.sum(axis=1), grasps=8, none_prior=0).objects
     said = f"probabilities {ours[0]:.3f} and {ours[1]:.3f}"
     products = f"products {naive[0]:g} and {naive[1]:g}"
     must = float(expit(0.8))
@@ -114,7 +114,7 @@ def _far_from_zero() -> HardCase:
 def _one_class() -> HardCase:
     logits, labels = np.linspace(-1, 1, 20), np.ones(20, np.int64)
     intercept = naive_fit(logits, labels)[1]
-    ours, holds = refused(lambda: fit_calibration(logits, labels), "both classes")
+    ours, holds = error_of(lambda: fit_calibration(logits, labels), "both classes")
     naive = f"every pair a match, intercept {intercept:.3g}"
     return HardCase(_CALIBRATION, "true pairs only", "refused", naive, ours, holds, False)
 
@@ -122,7 +122,7 @@ def _one_class() -> HardCase:
 def _nan_logit() -> HardCase:
     logits, labels = np.array([0.2, np.nan, 0.9, -1.0]), np.array([1, 1, 0, 0])
     naive = naive_fit(logits, labels)[0]
-    ours, holds = refused(lambda: fit_calibration(logits, labels), "pair 1")
+    ours, holds = error_of(lambda: fit_calibration(logits, labels), "pair 1")
     wanted = "refused, the pair named"
     return HardCase(_CALIBRATION, "one logit is NaN", wanted, f"slope {naive}", ours, holds, False)
 
@@ -145,19 +145,19 @@ def naive_slope(scores: Matrix) -> float:
 def _choices_that_never_err() -> HardCase:
     """Thirty choices among five, all right: the larger the factor the likelier, until the arithmetic ends."""
     scores = np.tile([2.0, 1.0, 0.0, -1.0, -2.0], (30, 1))
-    fitted = fit_posterior(judged_choices(scores))
-    shares = [softmax(naive_slope(scores) * scores[0]), fitted.believe(scores[0]).objects]
+    fitted = fit_posterior(scored_choices(scores))
+    shares = [softmax(naive_slope(scores) * scores[0]), fitted.probabilities(scores[0]).objects]
     wrong = [float(1 - share[0]) for share in shares]
     naive, ours = (f"wrong with probability {share:.2g}" for share in wrong)
     wanted = "wrong once in 100, or more often"
     return HardCase("softmax", "30 of 30 choices right", wanted, naive, ours, wrong[1] > 0.01, wrong[0] > 0.01)
 
 
-def judged_choices(scores: Matrix) -> JudgedTouches:
+def scored_choices(scores: Matrix) -> ScoredTouches:
     """The choices (Q, k), the true one first, as touches of k objects with one photo each; objects take turns."""
     owner = np.arange(len(scores)) % scores.shape[1]
     logits = np.stack([np.roll(row, place) for row, place in zip(scores, owner, strict=True)])
-    return JudgedTouches(logits, owner, np.arange(scores.shape[1]), np.zeros(logits.shape, dtype=bool))
+    return ScoredTouches(logits, owner, np.arange(scores.shape[1]), np.zeros(logits.shape, dtype=bool))
 
 
 def _odds_of_a_gallery() -> HardCase:
@@ -172,10 +172,10 @@ def _odds_of_a_gallery() -> HardCase:
     )
 
 
-def naive_bins(probability: Matrix, came_true: Matrix) -> Matrix:
+def naive_bins(probability: Matrix, outcomes: Matrix) -> Matrix:
     """Sums of probability less truth in 15 equal bins."""
     sums = np.zeros(15)
-    np.add.at(sums, (probability * 15).astype(int), probability - came_true)
+    np.add.at(sums, (probability * 15).astype(int), probability - outcomes)
     return sums
 
 

@@ -9,23 +9,23 @@ from scipy import special
 from torch import nn
 
 from retrieval.methods.selection import ranking_auc
-from retrieval.metrics.guesses import binomial_interval, guess_curve
 from retrieval.metrics.intervals import bootstrap_interval, sign_flip_p
+from retrieval.metrics.k_way import binomial_interval, k_way_accuracy
 from retrieval.metrics.pairs import pair_auc
 from retrieval.metrics.ranking import average_precision, first_relevant, recall_at, reciprocal_rank
 from retrieval.metrics.table import ScoreTable
-from retrieval.model.fusion import FusionHead, score_halves
-from tests.hard_case import HardCase, refused
+from retrieval.model.fusion import FusionHead, score_partials
+from tests.hard_case import HardCase, error_of
 
-_TOP, _MEASURES, _HALVES, _INTERVALS = "top k", "rank measures", "halves", "intervals"
+_TOP, _MEASURES, _HALVES, _INTERVALS = "top k", "rank measures", "partials", "intervals"
 
 
 def hard_cases() -> Iterator[HardCase]:
     """Cases of rankings."""
-    yield _nan_half()
+    yield _nan_partial()
     yield _nan_score()
-    yield _sum_of_halves()
-    yield _subnormal_halves()
+    yield _sum_of_partials()
+    yield _subnormal_partials()
     yield _constant_scorer()
     yield _constant_scorer_by_area()
     yield _many_rivals()
@@ -34,7 +34,7 @@ def hard_cases() -> Iterator[HardCase]:
     yield _equal_differences()
 
 
-# Halves ----------------------------------------------------------------------------------------------------
+# Partials ----------------------------------------------------------------------------------------------------
 
 
 def _adding_head(hidden: int) -> FusionHead:
@@ -48,11 +48,11 @@ def _adding_head(hidden: int) -> FusionHead:
     return head.eval()
 
 
-def _nan_half() -> HardCase:
-    halves = np.array([[1.0], [np.nan], [2.0]], np.float16)
-    logits = np.maximum(halves[:, 0], 0)
+def _nan_partial() -> HardCase:
+    partials = np.array([[1.0], [np.nan], [2.0]], np.float16)
+    logits = np.maximum(partials[:, 0], 0)
     naive = np.argsort(logits)[::-1]
-    ours, holds = refused(lambda: score_halves(_adding_head(1), torch.zeros(1, 1), halves), "photo row 1")
+    ours, holds = error_of(lambda: score_partials(_adding_head(1), torch.zeros(1, 1), partials), "photo row 1")
     words = f"photos {', '.join(map(str, naive))}: the NaN is best"
     return HardCase(_TOP, "one of three halves is NaN", "refused, the row named", words, ours, holds, naive[0] == 2)
 
@@ -61,24 +61,24 @@ def _nan_score() -> HardCase:
     scores = np.array([[0.2, np.nan, 0.9]], np.float32)
     owners = np.array([2]), np.arange(3)
     naive = torch.topk(torch.from_numpy(scores), 3).indices[0].tolist()
-    ours, holds = refused(lambda: ScoreTable(scores, *owners, np.zeros((1, 3), bool)), "row 0, column 1")
+    ours, holds = error_of(lambda: ScoreTable(scores, *owners, np.zeros((1, 3), bool)), "row 0, column 1")
     words = f"torch.topk: photos {', '.join(map(str, naive))}"
     return HardCase(_TOP, "one score is NaN", "refused, and named", words, ours, holds, naive[0] == 2)
 
 
-def _sum_of_halves() -> HardCase:
+def _sum_of_partials() -> HardCase:
     """40000 + 40000 in float16 is infinite; stored so and added in float32 it is 80000."""
-    halves, touch = np.array([[4e4]], np.float16), torch.tensor([[4e4]])
-    naive = float((halves + touch.numpy().astype(np.float16))[0, 0])
-    ours = float(score_halves(_adding_head(1), touch, halves)[0])
+    partials, touch = np.array([[4e4]], np.float16), torch.tensor([[4e4]])
+    naive = float((partials + touch.numpy().astype(np.float16))[0, 0])
+    ours = float(score_partials(_adding_head(1), touch, partials)[0])
     return HardCase(_HALVES, "two halves of 40000", "logit 80000", f"{naive:g}", f"{ours:g}", ours == 8e4, naive == 8e4)
 
 
-def _subnormal_halves() -> HardCase:
-    """Halves of 1e-6 to 8e-6, below float16's normal numbers, beside a touch of 1: added in float16 all photos tie."""
-    halves, touch = (np.arange(1, 9)[:, None] * 2.0**-20).astype(np.float16), torch.ones(1, 1)
-    naive = (halves + np.float16(1))[:, 0]
-    ours = score_halves(_adding_head(1), touch, halves)
+def _subnormal_partials() -> HardCase:
+    """Partials of 1e-6 to 8e-6, below float16's normal numbers, beside a touch of 1: added in float16 all photos tie."""
+    partials, touch = (np.arange(1, 9)[:, None] * 2.0**-20).astype(np.float16), torch.ones(1, 1)
+    naive = (partials + np.float16(1))[:, 0]
+    ours = score_partials(_adding_head(1), touch, partials)
     words, said = (f"{len(np.unique(scores))} distinct" for scores in (naive, ours))
     holds, tied = ours.tolist() == [1 + row * 2.0**-20 for row in range(1, 9)], len(np.unique(naive)) < 8
     wanted = "8 distinct logits, 1e-6 apart"
@@ -126,7 +126,7 @@ def _many_rivals() -> HardCase:
     """Of 5000 photos two score higher; 999 rivals are drawn, in more ways than float64's 1e308."""
     scores = np.repeat([1.0, -1.0], [2, 4998])
     naive = float(special.comb(4998, 999) / special.comb(5000, 999))
-    ours = float(guess_curve(0.0, scores, 1000)[0])
+    ours = float(k_way_accuracy(0.0, scores, 1000)[0])
     must = 4001 * 4000 / (5000 * 4999)  # neither of the two is drawn
     right = [abs(value - must) < 1e-12 for value in (naive, ours)]
     said, wanted = f"{ours:.6g}", f"{must:.6g}"

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.metrics.guesses import binomial_interval, grouped_interval, guess_curve, guess_curves
+from retrieval.metrics.k_way import binomial_interval, grouped_interval, k_way_accuracies, k_way_accuracy
 
 
 def curve_by_enumeration(true_score, others, k):
@@ -27,33 +27,33 @@ def curve_by_enumeration(true_score, others, k):
 @given(st.integers(0, 3), st.lists(st.integers(0, 3), min_size=3, max_size=5), st.integers(1, 4))
 def test_the_curve_is_what_every_draw_and_every_order_of_equals_gives(true_score, others, k):
     np.testing.assert_allclose(
-        guess_curve(true_score, others, k), curve_by_enumeration(true_score, others, k), atol=1e-12
+        k_way_accuracy(true_score, others, k), curve_by_enumeration(true_score, others, k), atol=1e-12
     )
 
 
 @pytest.mark.parametrize("k", [1, 5, 10])
 def test_a_constant_scorer_is_exactly_chance(k):
-    np.testing.assert_allclose(guess_curve(0.0, np.zeros(40), k), np.arange(1, k + 1) / k)
+    np.testing.assert_allclose(k_way_accuracy(0.0, np.zeros(40), k), np.arange(1, k + 1) / k)
 
 
 def test_the_best_and_the_worst_photo():
-    assert guess_curve(1.0, np.zeros(9), 5).tolist() == [1, 1, 1, 1, 1]
-    assert guess_curve(-1.0, np.zeros(9), 5).tolist() == [0, 0, 0, 0, 1]
+    assert k_way_accuracy(1.0, np.zeros(9), 5).tolist() == [1, 1, 1, 1, 1]
+    assert k_way_accuracy(-1.0, np.zeros(9), 5).tolist() == [0, 0, 0, 0, 1]
 
 
 def test_curves_of_many_queries_are_those_of_each():
     rng = np.random.default_rng(0)
     scores = rng.integers(0, 4, (30, 9))
     higher, equal = (scores[:, 1:] > scores[:, :1]).sum(1), (scores[:, 1:] == scores[:, :1]).sum(1)
-    expected = [guess_curve(row[0], row[1:], 4) for row in scores]
-    np.testing.assert_array_equal(guess_curves(higher, equal, 8, 4), expected)
+    expected = [k_way_accuracy(row[0], row[1:], 4) for row in scores]
+    np.testing.assert_array_equal(k_way_accuracies(higher, equal, 8, 4), expected)
 
 
 def test_too_few_rivals_and_scores_that_are_not_finite_are_refused():
     with pytest.raises(BadInput, match="needs k >= 1 and 4 rivals; got 3"):
-        guess_curve(0.0, np.zeros(3), 5)
+        k_way_accuracy(0.0, np.zeros(3), 5)
     with pytest.raises(NumericalError):
-        guess_curve(np.nan, np.zeros(9), 5)
+        k_way_accuracy(np.nan, np.zeros(9), 5)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,14 @@ from retrieval.metrics.protocols import (
     reciprocal_rank,
     true_ranks,
 )
-from retrieval.metrics.registry import METRICS, SET_SIZES, Scored, of_grasps, of_photos, take
+from retrieval.metrics.registry import (
+    METRICS,
+    SET_SIZES,
+    MethodScoreTables,
+    compute,
+    grasps_metric_name,
+    photos_metric_name,
+)
 from retrieval.metrics.table import ScoreTable, object_scores
 
 EVEN = Calibration(1.0, 0.0, 0.0, 1, 1, 0.0, 0.0, 0.0, 0.0)
@@ -292,7 +299,7 @@ def test_a_paired_batch_needs_one_photo_for_each_touch():
 
 def test_every_metric_is_taken_of_scores_that_can_be_asked_all_of_them():
     table = knowing(objects=10, grasps=21)
-    taken = take(Scored(table, table, dict.fromkeys(SET_SIZES, table), EVEN, seed=0))
+    taken = compute(MethodScoreTables(table, table, dict.fromkeys(SET_SIZES, table), EVEN, seed=0))
     assert list(taken) == list(METRICS)
     labels = [(metric.section, metric.column) for metric in METRICS.values()]
     assert len(set(labels)) == len(labels)
@@ -303,21 +310,21 @@ def test_a_metric_that_cannot_be_asked_is_left_out():
     table = knowing(objects=4, grasps=4)
     shared = table.select(np.arange(16), np.arange(0, 16, 2))
     shared.own[np.arange(1, 16, 2), np.arange(8)] = True
-    taken = set(take(Scored(shared, shared, {}, EVEN, seed=0)))
+    taken = set(compute(MethodScoreTables(shared, shared, {}, EVEN, seed=0)))
     assert {"pair_accuracy", "recall_1", "photo_to_touch_map"} <= taken
-    left_out = {"guesses_k5", "guesses_k10", "all_objects_k5", "paired_top1", "paired_top5"}
-    assert not taken & (left_out | set(map(of_grasps, SET_SIZES)))
+    left_out = {"topn_k5", "topn_k10", "topn_k5_all_objects", "paired_top1", "paired_top5"}
+    assert not taken & (left_out | set(map(grasps_metric_name, SET_SIZES)))
 
 
 def test_so_many_photos_of_a_candidate_are_shown_only_where_every_candidate_has_them_beside_a_rows_own():
     table = knowing(objects=6, grasps=4)
-    assert table.fewest_photos == 3
-    assert table.with_own().fewest_photos == 4
-    taken = take(Scored(table, table, {}, EVEN, seed=0))
-    assert {of_photos(1), of_photos(2), of_photos(3)} <= set(taken)
-    assert of_photos(5) not in taken
+    assert table.min_photos == 3
+    assert table.with_own().min_photos == 4
+    taken = compute(MethodScoreTables(table, table, {}, EVEN, seed=0))
+    assert {photos_metric_name(1), photos_metric_name(2), photos_metric_name(3)} <= set(taken)
+    assert photos_metric_name(5) not in taken
     fewer = table.select(np.arange(24), np.delete(np.arange(24), [4, 5]))
-    assert fewer.fewest_photos == 1  # of the second object, of whose two photos a row's own is left out
+    assert fewer.min_photos == 1  # of the second object, of whose two photos a row's own is left out
 
 
 # Chance and certainty --------------------------------------------------------------------------------------

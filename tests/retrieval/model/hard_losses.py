@@ -12,8 +12,8 @@ from retrieval.model.losses.contrastive import contrastive_loss
 from retrieval.model.losses.listwise import listwise_loss
 from retrieval.model.losses.match import match_loss
 from retrieval.model.losses.sigmoid import sigmoid_loss
-from retrieval.model.towers.base import stage_statistics
-from retrieval.training.distil import order_loss
+from retrieval.model.towers.tower import stage_statistics
+from retrieval.training.distil import distillation_loss
 from tests.hard_case import HardCase
 
 _ONE = torch.tensor([0])
@@ -181,10 +181,12 @@ def _taught_order() -> HardCase:
         return (taught * (taught / learnt).log()).sum(1).mean()
 
     def ours(scores: Tensor) -> Tensor:
-        return order_loss(scores, teacher)
+        return distillation_loss(scores, teacher)
 
     must = 1e4 + 0.3 * 2, [1.0, -1.0]
-    return _case("pruner loss", "student opposite to logits of 1e4", torch.tensor([[0.0, -1e4]]), naive, ours, must)
+    return _case(
+        "candidate_encoder loss", "student opposite to logits of 1e4", torch.tensor([[0.0, -1e4]]), naive, ours, must
+    )
 
 
 def _runaway_scale() -> HardCase:

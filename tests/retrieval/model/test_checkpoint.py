@@ -26,16 +26,18 @@ from retrieval.model.checkpoint import (
     store_checkpoint,
     write_tensors,
 )
+from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.model.fusion import GelHead, Matcher
-from retrieval.model.judge import GelCheck
+from retrieval.model.fusion_scorer import GelCheck
 from retrieval.model.posterior import Posterior
-from retrieval.model.stored import read_stored
 from retrieval.version import __version__
 from tests.conftest import TINY
 
 SPLIT = Split(seed=3, train=("cup", "mug"), validation=("jar", "pan"), test=("red ball", "Töpfchen"))
 POSTERIOR = Posterior(slope=1.25, offset=-0.5, dependence=0.375, tests=40)
-GEL_CHECK = GelCheck(foreign_above=1.5, contact_above=-2.0, level_above=None, shares={"touches_called_foreign": 0.0625})
+GEL_CHECK = GelCheck(
+    foreign_above=1.5, contact_above=-2.0, level_above=None, rates={"touches_rejected_as_foreign": 0.0625}
+)
 PROVENANCE = {
     "step": 4,
     "source": "a rig",
@@ -93,7 +95,7 @@ def test_every_tensor_and_everything_said_comes_back(tmp_path):
 def test_float16_halves_the_file_and_gives_nearly_the_same_logits(tmp_path):
     matcher = save(tmp_path / "whole.safetensors").eval()
     save(tmp_path / "half.safetensors", float16=True)
-    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("whole", "half")]
+    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("whole", "partial")]
     assert sizes[1] < 0.55 * sizes[0]
     again = load_checkpoint(tmp_path / "half.safetensors").matcher
     assert {tensor.dtype for tensor in again.state_dict().values()} <= {torch.float32, torch.int64}
@@ -124,7 +126,7 @@ def test_the_check_of_gel_images_comes_back_with_its_layer_and_is_known_without_
     loaded = load_checkpoint(path)
     assert torch.equal(loaded.matcher.gel_head.kinds.weight, layer.weight)
     assert torch.equal(loaded.matcher.gel_head.kinds.bias, layer.bias)
-    assert loaded.gel_check == read_stored(path).gel_check == GEL_CHECK
+    assert loaded.gel_check == read_checkpoint_info(path).gel_check == GEL_CHECK
 
 
 def test_a_checkpoint_of_before_there_were_posteriors_ranks_and_has_none(saved):
@@ -138,7 +140,7 @@ def test_a_checkpoint_of_before_there_were_posteriors_ranks_and_has_none(saved):
 
 
 def test_what_is_held_is_stored_as_it_was_read(tmp_path):
-    queries = np.ones((2, TINY.matcher.half), np.float16)
+    queries = np.ones((2, TINY.matcher.partial_width), np.float16)
     save(tmp_path / "a.safetensors", gel_check=GEL_CHECK, queries=queries)
     store_checkpoint(load_checkpoint(tmp_path / "a.safetensors"), tmp_path / "b.safetensors")
     assert (tmp_path / "a.safetensors").read_bytes() == (tmp_path / "b.safetensors").read_bytes()
@@ -173,7 +175,7 @@ def test_tensors_of_every_kind_come_back(tmp_path):
     state = {
         "scalar": torch.tensor(3),
         "empty": torch.zeros(0, 4),
-        "half": torch.arange(3, dtype=torch.bfloat16),
+        "partial": torch.arange(3, dtype=torch.bfloat16),
         "double": torch.tensor([1e300], dtype=torch.float64),
         "strided": torch.arange(6.0).view(2, 3).T.contiguous(),
         "flags": torch.tensor([True, False]),
@@ -365,7 +367,7 @@ def test_the_state_of_a_training_is_not_a_checkpoint(saved, name):
             {"posterior": POSTERIOR.to_dict() | {"dependence": 1.5}},
             "posterior.dependence must be a number <= 1.0, got 1.5",
         ),
-        ({"gel_check": {"shares": {}}}, "gel_check must hold foreign_above, contact_above, level_above"),
+        ({"gel_check": {"rates": {}}}, "gel_check must hold foreign_above, contact_above, level_above"),
         (
             {"gel_check": GEL_CHECK.to_dict() | {"level_above": "1"}},
             "gel_check.level_above must be a number or nothing, got '1'",

@@ -12,9 +12,9 @@ import pytest
 import retrieval
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
-from retrieval.model.config import LOADER, Config, MatcherConfig, TrainingConfig, load_config, preset_names
+from retrieval.model.config import LOADER_SETTINGS, Config, MatcherConfig, TrainingConfig, load_config, preset_names
 from retrieval.model.losses import LOSSES
-from retrieval.model.towers import OUTPUTS, TOGETHER, TOWERS
+from retrieval.model.towers import OUTPUTS, TOWER_SEPARATOR, TOWERS
 
 TABLES = Config().to_dict()
 """Tables of a configuration: settings and their defaults."""
@@ -32,7 +32,7 @@ def test_the_presets_are_the_files_that_come_with_the_package():
 @pytest.mark.parametrize("name", preset_names())
 def test_every_preset_loads_and_names_a_tower_that_exists(name):
     config = load_config(name)
-    assert set(config.matcher.tower.split(TOGETHER)) <= set(TOWERS)
+    assert set(config.matcher.tower.split(TOWER_SEPARATOR)) <= set(TOWERS)
     assert config.matcher.tower_output in OUTPUTS
     assert Config.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
@@ -60,8 +60,8 @@ def test_the_preset_paper_holds_the_papers_numbers():
 
 def test_the_defaults_are_the_papers_which_has_no_pruner():
     paper = load_config("paper")
-    assert paper.matcher.pruner_width > 0
-    assert Config() == dataclasses.replace(paper, matcher=dataclasses.replace(paper.matcher, pruner_width=0))
+    assert paper.matcher.candidate_width > 0
+    assert Config() == dataclasses.replace(paper, matcher=dataclasses.replace(paper.matcher, candidate_width=0))
 
 
 def test_paper_exact_sets_back_what_the_table_of_differences_says_can_be():
@@ -69,9 +69,14 @@ def test_paper_exact_sets_back_what_the_table_of_differences_says_can_be():
     training = dataclasses.replace(
         paper.training, validation_fraction=0.0, negatives="dataset", precision="float32", distil_steps=600
     )
-    assert exact == dataclasses.replace(paper.without_pruner(), training=training)
+    assert exact == dataclasses.replace(paper.without_candidate_encoder(), training=training)
     table = (Path(__file__).parents[3] / "docs" / "paper.md").read_text("utf-8")
-    for setting in ("validation_fraction = 0.0", 'negatives = "dataset"', 'precision = "float32"', "pruner_width = 0"):
+    for setting in (
+        "validation_fraction = 0.0",
+        'negatives = "dataset"',
+        'precision = "float32"',
+        "candidate_width = 0",
+    ):
         assert f"`{setting}`" in table
 
 
@@ -80,7 +85,7 @@ def test_every_preset_but_that_of_the_paper_alone_has_embeddings_to_search_candi
     config = load_config(name)
     assert config.has_embeddings
     # What `adapt` makes judges by its embeddings, and what `benchmark real` fits is never searched.
-    assert (config.matcher.pruner_width > 0) == (name not in ("adapt", "real"))
+    assert (config.matcher.candidate_width > 0) == (name not in ("adapt", "real"))
 
 
 # Files -----------------------------------------------------------------------------------------------------
@@ -135,7 +140,7 @@ def test_an_unknown_table_is_refused_with_the_known_ones():
 
 @pytest.mark.parametrize("table", TABLES)
 def test_an_unknown_key_is_refused_with_the_known_ones(table):
-    known = ", ".join(sorted({*TABLES[table], *(LOADER if table == "training" else ())}))
+    known = ", ".join(sorted({*TABLES[table], *(LOADER_SETTINGS if table == "training" else ())}))
     with pytest.raises(ConfigError, match=rf"{table} has no setting 'colour'; it knows {known}"):
         Config.from_dict({table: {"colour": 1}})
 

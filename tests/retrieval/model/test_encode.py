@@ -31,7 +31,7 @@ SMALL = MatcherConfig(tower="small", tower_output="pooled", hidden=8)
 def matcher_with_statistics(tower, output):
     """A matcher in evaluation mode whose batch normalisations have seen pictures, and scale and shift."""
     torch.manual_seed(0)
-    matcher = Matcher(MatcherConfig(tower=tower, tower_output=output, hidden=16, standardise=True, pruner_width=8))
+    matcher = Matcher(MatcherConfig(tower=tower, tower_output=output, hidden=16, standardise=True, candidate_width=8))
     for module in matcher.modules():
         if isinstance(module, nn.BatchNorm2d):
             nn.init.uniform_(module.weight, 0.5, 1.5)
@@ -71,9 +71,12 @@ def test_every_output_of_a_tower_and_a_touch_of_two_fingers_stay_the_same(output
 def test_the_shipped_model_gives_the_halves_and_embeddings_of_its_plain_towers():
     matcher = load_checkpoint(shipped_model()).matcher
     photos = smooth_pictures()
-    plain, ours = matcher.photo_entry(matcher.photo_features(to_batch(photos))), encode_photos(matcher, photos)
+    plain, ours = (
+        matcher.photo_search_encoding(matcher.photo_features(to_batch(photos))),
+        encode_photos(matcher, photos),
+    )
     # Quiet features are scaled up fifty times, and with them what single precision rounds off their large means.
-    assert float((ours.half - plain.half).abs().max() / plain.half.abs().max()) <= 1e-4
+    assert float((ours.partial - plain.partial).abs().max() / plain.partial.abs().max()) <= 1e-4
     assert float((ours.embedding - plain.embedding).abs().max()) <= 1e-4
 
 
@@ -151,11 +154,11 @@ def test_a_head_or_pruner_that_changes_is_used_at_once():
     matcher = matcher_with_statistics("small", "pooled")
     before = encode_touches(matcher, [images(2)])
     with torch.no_grad():
-        matcher.head.touch_half.bias += 1
-    torch.testing.assert_close(encode_touches(matcher, [images(2)]).half, before.half + 1)
-    matcher.pruner = None
+        matcher.head.touch_partial.bias += 1
+    torch.testing.assert_close(encode_touches(matcher, [images(2)]).partial, before.partial + 1)
+    matcher.candidate_encoder = None
     with torch.inference_mode():
-        expected = matcher.touch_code(touch_features(matcher, [images(2)])).embedding
+        expected = matcher.touch_encoding(touch_features(matcher, [images(2)])).embedding
     assert torch.equal(encode_touches(matcher, [images(2)]).embedding, expected)
 
 
@@ -174,7 +177,7 @@ def test_the_code_does_not_depend_on_the_batch():
     photos = images(7)
     ways = [encode_photos(matcher, photos, batch) for batch in (1, 3, 7)]
     for way in ways[1:]:
-        torch.testing.assert_close(way.half, ways[0].half, rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(way.partial, ways[0].partial, rtol=1e-5, atol=1e-5)
         torch.testing.assert_close(way.embedding, ways[0].embedding, rtol=1e-5, atol=1e-5)
 
 

@@ -16,8 +16,8 @@ from indexes.store.folder import IndexStore
 from retrieval.commands.main import main
 from retrieval.errors import BadInput, CheckpointError, ConfigError
 from retrieval.model.checkpoint import load_checkpoint, read_tensors, require_writable, write_tensors
+from retrieval.model.checkpoint_info import read_checkpoint_info, read_scorer
 from retrieval.model.config import load_config
-from retrieval.model.stored import read_judge, read_stored
 from retrieval.search.query.objects import listed_photo
 from retrieval.training.gate import load_gate
 from tests.retrieval.model.test_checkpoint import rewrite, save
@@ -54,7 +54,7 @@ def with_settings(path, part="matcher", **changes):
     return path
 
 
-@pytest.mark.parametrize("name", ["hidden", "embedding_dim", "fingers", "pruner_width"])
+@pytest.mark.parametrize("name", ["hidden", "embedding_dim", "fingers", "candidate_width"])
 @pytest.mark.parametrize("size", [10**9, 2**70])
 def test_weights_are_compared_with_the_settings_before_memory_is_asked_for(saved, name, size):
     with_settings(saved, **{name: size})
@@ -86,7 +86,7 @@ def test_any_part_of_a_header_may_be_forged(kept, part, value):
     forged = kept.with_name("forged.safetensors")
     state, header = read_tensors(kept)
     write_tensors(forged, state, header | {part: value})
-    for read in (load_checkpoint, read_stored, load_gate):
+    for read in (load_checkpoint, read_checkpoint_info, load_gate):
         with contextlib.suppress(BadInput):
             read(forged)
 
@@ -109,9 +109,9 @@ def test_any_setting_in_a_header_may_be_forged(kept, part, key, value):
 @pytest.mark.parametrize(
     "tensors",
     [
-        {"queries.touch_halves": torch.zeros(3, 5, dtype=torch.float16)},
-        {"queries.touch_halves": torch.zeros(3, dtype=torch.float16)},
-        {"queries.touch_halves": torch.zeros(3, 8, dtype=torch.bfloat16)},
+        {"queries.touch_partials": torch.zeros(3, 5, dtype=torch.float16)},
+        {"queries.touch_partials": torch.zeros(3, dtype=torch.float16)},
+        {"queries.touch_partials": torch.zeros(3, 8, dtype=torch.bfloat16)},
         pytest.param({"head.out.bias": torch.zeros(1, dtype=torch.complex64)}, marks=needs_complex),
         {"head.out.bias": torch.zeros(1).to(torch.float8_e4m3fn)},
         {"head.out.bias": torch.zeros(())},
@@ -140,14 +140,14 @@ def test_a_forged_judge_is_refused(saved, tensors):
     state = {name: tensor for name, tensor in {**state, **tensors}.items() if tensor is not None}
     write_tensors(saved, state, header)
     with pytest.raises(CheckpointError):
-        read_judge(saved)
+        read_scorer(saved)
 
 
 def test_a_checkpoint_that_is_no_file_is_refused_without_being_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "zero").symlink_to("/dev/zero")
     for name in ("pipe", "zero", "."):
-        for read in (load_checkpoint, read_stored, load_gate):
+        for read in (load_checkpoint, read_checkpoint_info, load_gate):
             with pytest.raises(CheckpointError, match=r"is a (pipe|device|folder), not a"):
                 read(tmp_path / name)
 
@@ -207,11 +207,11 @@ def test_a_row_of_a_photo_outside_the_catalogue_or_without_its_parts_is_refused(
 def test_an_index_whose_rows_name_no_object_is_of_no_rig(tmp_path):
     """`serve` looks for the simulated rig's objects before the index is opened to be searched, which says what is
     wrong."""
-    from retrieval.serve.rig import of_index
+    from retrieval.serve.rig import simulated_live_rig
 
     vectors = np.eye(2, dtype=np.float32)
     IndexStore(tmp_path).write([{"id": "a"}, {"id": "b"}], vectors, fingerprint={})
-    assert of_index(tmp_path) is None
+    assert simulated_live_rig(tmp_path) is None
 
 
 # Commands ---------------------------------------------------------------------------------------------------

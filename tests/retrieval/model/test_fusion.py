@@ -8,9 +8,9 @@ import torch
 from torch.nn import functional
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.model import judge
+from retrieval.model import fusion_scorer
 from retrieval.model.config import MatcherConfig
-from retrieval.model.fusion import FusionHead, Matcher, Standardise, score_halves
+from retrieval.model.fusion import FusionHead, Matcher, Standardise, score_partials
 from retrieval.model.towers import TOWERS
 
 
@@ -19,8 +19,8 @@ def concatenated_forward(matcher, touches, photos):
     fingers = [matcher.touch_tower(touches[:, finger]) for finger in range(touches.shape[1])]
     features = torch.cat([*fingers, matcher.photo_tower(photos)], dim=1)
     head = matcher.head
-    weight = torch.cat([head.touch_half.weight, head.photo_half.weight], dim=1)
-    hidden = functional.relu(functional.linear(features, weight, head.touch_half.bias))
+    weight = torch.cat([head.touch_partial.weight, head.photo_partial.weight], dim=1)
+    hidden = functional.relu(functional.linear(features, weight, head.touch_partial.bias))
     hidden = functional.relu(head.second(head.dropout(hidden)))
     return head.out(hidden)[:, 0]
 
@@ -32,9 +32,9 @@ def test_the_logit_from_halves_equals_the_concatenated_forward(name, output):
     matcher = Matcher(MatcherConfig(tower=name, tower_output=output, hidden=64)).eval()
     touches, photos = torch.rand(3, 2, 3, 64, 64), torch.rand(3, 3, 64, 64)
     with torch.inference_mode():
-        touch = matcher.touch_code(matcher.touch_features(touches))
-        photo = matcher.photo_code(matcher.photo_features(photos))
-        ours, naive = matcher.head(touch.half, photo.half), concatenated_forward(matcher, touches, photos)
+        touch = matcher.touch_encoding(matcher.touch_features(touches))
+        photo = matcher.photo_encoding(matcher.photo_features(photos))
+        ours, naive = matcher.head(touch.partial, photo.partial), concatenated_forward(matcher, touches, photos)
     # 1e-5 relative to the size of what is summed in the last layer, float32.
     torch.testing.assert_close(ours, naive, rtol=1e-5, atol=1e-5 * float(naive.abs().max()))
     torch.testing.assert_close(matcher(touches, photos), ours, rtol=1e-4, atol=1e-4 * float(naive.abs().max()))
@@ -46,18 +46,18 @@ def test_the_cosine_of_the_embeddings_adds_to_the_logit_and_travels_in_the_halve
     matcher = Matcher(config).eval()
     touches, photos = torch.rand(3, 2, 3, 64, 64), torch.rand(3, 3, 64, 64)
     with torch.inference_mode():
-        touch = matcher.touch_code(matcher.touch_features(touches))
-        photo = matcher.photo_code(matcher.photo_features(photos))
+        touch = matcher.touch_encoding(matcher.touch_features(touches))
+        photo = matcher.photo_encoding(matcher.photo_features(photos))
         alone, cosine = concatenated_forward(matcher, touches, photos), (touch.embedding * photo.embedding).sum(1)
         expected = alone + matcher.cosine_scale * cosine
-        assert touch.half.shape == photo.half.shape == (3, config.half) == (3, 64 + 16)
+        assert touch.partial.shape == photo.partial.shape == (3, config.partial_width) == (3, 64 + 16)
         torch.testing.assert_close(matcher(touches, photos), expected, rtol=1e-5, atol=1e-5)
-        two = score_halves(matcher.head, touch.half[:2], photo.half.numpy())
-        by_pair = matcher.head(touch.half[:2, None], photo.half[None]).sum(0)
+        two = score_partials(matcher.head, touch.partial[:2], photo.partial.numpy())
+        by_pair = matcher.head(touch.partial[:2, None], photo.partial[None]).sum(0)
         torch.testing.assert_close(torch.from_numpy(two), by_pair, rtol=1e-5, atol=1e-5)
         matcher.cosine_scale.fill_(-1.0)  # a match is never what lies apart
-        touch, photo = matcher.touch_code(torch.rand(3, 512)), matcher.photo_code(torch.rand(3, 256))
-        assert not touch.half[:, 64:].any()
+        touch, photo = matcher.touch_encoding(torch.rand(3, 512)), matcher.photo_encoding(torch.rand(3, 256))
+        assert not touch.partial[:, 64:].any()
 
 
 def test_a_feature_that_hardly_varies_is_not_scaled_up_where_plain_scaling_follows_its_rounding():
@@ -84,9 +84,9 @@ def test_quiet_features_are_left_quiet_in_training_too():
 
 def test_the_paper_configuration_has_the_papers_layers():
     matcher = Matcher(MatcherConfig())
-    assert matcher.head.touch_half.weight.shape == (1024, 2000)
-    assert matcher.head.photo_half.weight.shape == (1024, 1000)
-    assert matcher.head.photo_half.bias is None
+    assert matcher.head.touch_partial.weight.shape == (1024, 2000)
+    assert matcher.head.photo_partial.weight.shape == (1024, 1000)
+    assert matcher.head.photo_partial.bias is None
     assert matcher.head.second.weight.shape == (1024, 1024)
     assert matcher.head.out.weight.shape == (1, 1024)
     towers = [
@@ -99,7 +99,7 @@ def test_the_halves_start_as_one_layer_over_the_concatenation_would():
     torch.manual_seed(0)
     head = FusionHead(2000, 1000, 1024, 0.5)
     bound = 1 / math.sqrt(3000)
-    for weight in (head.touch_half.weight, head.photo_half.weight):
+    for weight in (head.touch_partial.weight, head.photo_partial.weight):
         assert bound * 0.99 < float(weight.detach().abs().max()) <= bound
 
 
@@ -120,7 +120,7 @@ def test_another_number_of_gel_images_is_a_clear_error():
 
 def test_embeddings_have_norm_one_even_for_a_black_image():
     matcher = Matcher(MatcherConfig(tower="small", tower_output="pooled", hidden=8)).eval()
-    code = matcher.photo_code(matcher.photo_features(torch.zeros(2, 3, 64, 64)))
+    code = matcher.photo_encoding(matcher.photo_features(torch.zeros(2, 3, 64, 64)))
     torch.testing.assert_close(code.embedding.norm(dim=1), torch.ones(2), rtol=0, atol=1e-6)
 
 
@@ -131,28 +131,28 @@ def small_head(hidden=32, seed=0):
 
 @pytest.mark.parametrize("block", [1, 5, 37, 1000])
 def test_scores_of_many_photos_are_the_logits_of_the_pairs_one_by_one_whatever_the_block(block, monkeypatch):
-    monkeypatch.setattr(judge, "BLOCK", block)
+    monkeypatch.setattr(fusion_scorer, "BLOCK", block)
     head, photos = small_head().eval(), np.random.default_rng(0).normal(size=(37, 32)).astype(np.float32)
     touches = torch.randn(3, 32)
     with torch.inference_mode():
         expected = [
             sum(float(head(touch[None], torch.from_numpy(photo[None]))) for touch in touches) for photo in photos
         ]
-    np.testing.assert_allclose(score_halves(head, touches, photos), expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(score_partials(head, touches, photos), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_scoring_ignores_dropout_and_picks_the_asked_rows():
     head, photos = small_head(), np.random.default_rng(0).normal(size=(9, 32)).astype(np.float32)
     touch, rows = torch.randn(1, 32), np.array([7, 0, 3])
-    everything = score_halves(head.train(), touch, photos)
-    np.testing.assert_allclose(score_halves(head.eval(), touch, photos, rows), everything[rows], rtol=1e-6)
+    everything = score_partials(head.train(), touch, photos)
+    np.testing.assert_allclose(score_partials(head.eval(), touch, photos, rows), everything[rows], rtol=1e-6)
 
 
 def test_float16_halves_change_a_logit_by_less_than_the_rounding_they_carry():
     head = small_head(hidden=256).eval()
     photos = np.random.default_rng(1).normal(size=(200, 256)).astype(np.float32)
     touch = torch.randn(1, 256)
-    exact, stored = score_halves(head, touch, photos), score_halves(head, touch, photos.astype(np.float16))
+    exact, stored = score_partials(head, touch, photos), score_partials(head, touch, photos.astype(np.float16))
     # Float16 keeps 11 bits: a relative error of 2^-11 in each half, averaged down by the sum over 256 of them.
     assert np.abs(exact - stored).max() < 2**-11 * np.abs(photos).max()
     assert not np.array_equal(exact, stored)
@@ -164,7 +164,7 @@ def test_a_logit_that_is_not_finite_is_an_error_where_sorting_would_rank_it_firs
     photos = np.zeros((3, 32), dtype=np.float32)
     photos[1] = np.inf
     with pytest.raises(NumericalError, match="photo row 1"):
-        score_halves(small_head(), torch.randn(1, 32), photos)
+        score_partials(small_head(), torch.randn(1, 32), photos)
 
 
 def test_views_of_a_photo_reach_the_tower_one_by_one_with_channels_last():

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput
-from retrieval.model.judge import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
-from retrieval.training.foreign import DRAWN, draw_foreign
-from retrieval.training.judgement import Pictures, contact_threshold, fit_gel_check, fit_gel_head
+from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
+from retrieval.training.foreign_images import SYNTHETIC_KINDS, draw_foreign
+from retrieval.training.verdicts import GelCheckFeatures, contact_threshold, fit_gel_check, fit_gel_head
 
-CHECK = GelCheck(foreign_above=1.0, contact_above=0.5, level_above=4.0, shares={"touches_called_foreign": 0.0})
+CHECK = GelCheck(foreign_above=1.0, contact_above=0.5, level_above=4.0, rates={"touches_rejected_as_foreign": 0.0})
 
 
 def readings(*grasps):
@@ -22,43 +22,43 @@ def readings(*grasps):
 
 
 def test_one_finger_in_contact_is_a_contact_and_one_foreign_picture_is_none():
-    felt, untouched, foreign = (-3, 2), (-3, -2), (5, 2)
-    judged = CHECK.judge(
-        readings((felt, felt), (untouched, felt), (untouched, untouched), (felt, foreign), (foreign, untouched))
+    felt, no_contact, foreign = (-3, 2), (-3, -2), (5, 2)
+    judged = CHECK.classify(
+        readings((felt, felt), (no_contact, felt), (no_contact, no_contact), (felt, foreign), (foreign, no_contact))
     )
     assert judged == [CONTACT, CONTACT, NO_CONTACT, NOT_A_GEL, NOT_A_GEL]
 
 
 def test_what_lies_at_a_threshold_is_a_gel_in_contact():
-    assert CHECK.judge(readings(((1.0, 0.5), (1.0, 0.5)))) == [CONTACT]
+    assert CHECK.classify(readings(((1.0, 0.5), (1.0, 0.5)))) == [CONTACT]
 
 
 def test_a_no_contact_frame_decides_over_what_the_features_say():
     said_felt, said_untouched = ((-3, 2), (-3, 2)), ((-3, -2), (-3, -2))
     levels = np.array([[0.9, 1.1], [0.8, 30.0]], dtype=np.float32)
-    assert CHECK.judge(readings(said_felt, said_untouched), levels) == [NO_CONTACT, CONTACT]
+    assert CHECK.classify(readings(said_felt, said_untouched), levels) == [NO_CONTACT, CONTACT]
 
 
 def test_what_the_recording_could_not_teach_refuses_nothing():
     blind = GelCheck(None, None, None, {})
-    assert blind.judge(readings(((9, -9), (9, -9)))) == [CONTACT]
+    assert blind.classify(readings(((9, -9), (9, -9)))) == [CONTACT]
 
 
 def test_the_level_is_the_largest_difference_of_block_means_in_grey_levels():
-    untouched = np.full((32, 32, 3), 0.5, dtype=np.float32)
-    touch = untouched.copy()
+    no_contact = np.full((32, 32, 3), 0.5, dtype=np.float32)
+    touch = no_contact.copy()
     touch[4:6, 8:10, 1] += 20 / 255  # a whole block of 2 x 2
     touch[20, 20, 0] -= 40 / 255  # a quarter of one
-    assert contact_level(touch, untouched) == pytest.approx(20, abs=1e-3)
-    assert contact_level(untouched, untouched) == 0
+    assert contact_level(touch, no_contact) == pytest.approx(20, abs=1e-3)
+    assert contact_level(no_contact, no_contact) == 0
     # The two files may have different sizes.
-    assert contact_level(touch, untouched[:16]) == pytest.approx(20, abs=1e-3)
+    assert contact_level(touch, no_contact[:16]) == pytest.approx(20, abs=1e-3)
 
 
 def test_contact_begins_above_untouched_gels_and_as_far_up_as_it_costs_few_touches():
-    untouched, touches = np.arange(201.0), np.arange(500.0, 601.0)
-    assert contact_threshold(untouched, touches) == pytest.approx(502)  # 2 % of the touches lie below
-    assert contact_threshold(untouched, np.arange(101.0)) == pytest.approx(199)  # .5 % of the untouched lie above
+    no_contact, touches = np.arange(201.0), np.arange(500.0, 601.0)
+    assert contact_threshold(no_contact, touches) == pytest.approx(502)  # 2 % of the touches lie below
+    assert contact_threshold(no_contact, np.arange(101.0)) == pytest.approx(199)  # .5 % of the untouched lie above
 
 
 def test_it_is_written_and_read_back():
@@ -72,9 +72,9 @@ def test_it_is_written_and_read_back():
         {"foreign_above": math.nan},
         {"contact_above": "0"},
         {"level_above": 1e300},
-        {"shares": []},
-        {"shares": {"a": math.inf}},
-        {"shares": {"a": None}},
+        {"rates": []},
+        {"rates": {"a": math.inf}},
+        {"rates": {"a": None}},
         {"more": 1},
     ],
 )
@@ -95,7 +95,7 @@ def test_whatever_stands_in_the_file_is_refused_in_a_sentence(data):
 def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_again():
     photo, gel = np.full((40, 60, 3), 0.4, dtype=np.float32), np.full((30, 40, 3), 0.6, dtype=np.float32)
     drawn = list(draw_foreign(21, 16, [photo], [gel], seed=3))
-    assert [name for name, _ in drawn[:7]] == [*DRAWN, "photo", "false colours"]
+    assert [name for name, _ in drawn[:7]] == [*SYNTHETIC_KINDS, "photo", "false colours"]
     for _, picture in drawn:
         assert picture.shape == (16, 16, 3)
         assert picture.dtype == np.float32
@@ -103,7 +103,7 @@ def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_again():
         assert (picture <= 1).all()
     again = list(draw_foreign(21, 16, [photo], [gel], seed=3))
     assert all((one == other).all() for (_, one), (_, other) in zip(drawn, again, strict=True))
-    assert {name for name, _ in draw_foreign(9, 16, [], [])} == set(DRAWN)
+    assert {name for name, _ in draw_foreign(9, 16, [], [])} == set(SYNTHETIC_KINDS)
 
 
 @pytest.mark.parametrize(("count", "px"), [(0, 16), (5, 4)])
@@ -115,7 +115,7 @@ def test_nothing_and_specks_are_not_drawn(count, px):
 # Fitting ---------------------------------------------------------------------------------------------------
 
 
-def pictures(seed, untouched=60):
+def pictures(seed, no_contact=60):
     """Features (8) around three far places: touches, untouched gels, foreign pictures, half of these in false colours
     and lying among the touches."""
     rng = np.random.default_rng(seed)
@@ -125,35 +125,35 @@ def pictures(seed, untouched=60):
 
     places = np.eye(8)[:3] * 9
     foreign = torch.cat([around(places[2], 40), around(places[0], 40)])
-    plainly = np.repeat([True, False], 40)
-    return Pictures(around(places[0], 80, 2), around(places[1], untouched, 2), foreign, plainly)
+    is_plainly_foreign = np.repeat([True, False], 40)
+    return GelCheckFeatures(around(places[0], 80, 2), around(places[1], no_contact, 2), foreign, is_plainly_foreign)
 
 
 def test_kinds_that_lie_apart_are_told_apart_on_others_of_their_kind():
     head = fit_gel_head(pictures(0))
     check = fit_gel_check(head, pictures(1), levels=([0.5, 0.7, 0.9], [12.0, 30.0]))
-    assert check.shares["foreign_called_so"] == 1
-    assert check.shares["touches_called_foreign"] <= 0.02
-    assert check.shares["touches_called_untouched"] == 0.025  # 2 of 80, as many as may be lost
-    assert check.shares["untouched_called_touches"] == 0
+    assert check.rates["foreign_rejected"] == 1
+    assert check.rates["touches_rejected_as_foreign"] <= 0.02
+    assert check.rates["touches_rejected_as_no_contact"] == 0.025  # 2 of 80, as many as may be lost
+    assert check.rates["no_contact_accepted"] == 0
     assert check.level_above == pytest.approx(12.36)  # 2 % of the way from 12 to 30
     with torch.inference_mode():
         others = pictures(2)
-        assert check.judge(head(others.touch).numpy()).count(CONTACT) >= 78
-        assert check.judge(head(others.untouched).numpy()).count(NO_CONTACT) >= 58
+        assert check.classify(head(others.touch).numpy()).count(CONTACT) >= 78
+        assert check.classify(head(others.no_contact).numpy()).count(NO_CONTACT) >= 58
 
 
 def test_where_nothing_was_recorded_before_a_contact_every_gel_counts_as_touched():
-    head = fit_gel_head(pictures(0, untouched=0))
-    check = fit_gel_check(head, pictures(1, untouched=0), levels=([], []))
+    head = fit_gel_head(pictures(0, no_contact=0))
+    check = fit_gel_check(head, pictures(1, no_contact=0), levels=([], []))
     assert (check.contact_above, check.level_above) == (None, None)
     with torch.inference_mode():
-        assert set(check.judge(head(pictures(2).touch).numpy())) <= {CONTACT, NOT_A_GEL}
-    assert check.shares["foreign_called_so"] == 1
+        assert set(check.classify(head(pictures(2).touch).numpy())) <= {CONTACT, NOT_A_GEL}
+    assert check.rates["foreign_rejected"] == 1
 
 
 def test_a_feature_that_never_varies_gives_no_infinite_weight():
     lesson = pictures(0)
-    for part in (lesson.touch, lesson.untouched, lesson.foreign):
+    for part in (lesson.touch, lesson.no_contact, lesson.foreign):
         part[..., 7] = 3.0
-    assert bool(torch.isfinite(fit_gel_head(lesson).kinds.weight).all())
+    assert bool(torch.isfinite(fit_gel_head(lesson).classifier.weight).all())

@@ -5,12 +5,12 @@ import math
 import pytest
 import torch
 
-from retrieval.model.fusion import Code
+from retrieval.model.fusion import ImageEncoding
 from retrieval.model.losses.contrastive import LOG_SCALE_MAX, contrastive_loss
 from retrieval.model.losses.listwise import listwise_loss, pick_loss
 from retrieval.model.losses.loss import EncodedBatch
 from retrieval.model.losses.match import match_loss
-from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT, SIGMOID_LOG_SCALE_INIT, Sigmoid, sigmoid_loss
+from retrieval.model.losses.sigmoid import SIGMOID_BIAS_INIT, SIGMOID_LOG_SCALE_INIT, SigmoidLoss, sigmoid_loss
 
 
 def unit(*shape, seed=0):
@@ -136,8 +136,8 @@ def test_the_sigmoid_loss_starts_near_what_calling_every_pair_false_costs():
 
 def test_a_sigmoid_loss_of_its_own_parameters_is_that_of_the_function_and_its_scale_ends_at_100():
     objects, touch, photo = torch.arange(3), unit(3, 4).float(), unit(3, 4, seed=1).float()
-    loss = Sigmoid(embedding_dim=4, objects=3)
-    batch = EncodedBatch(None, Code(touch, touch), Code(photo, photo), objects, objects)
+    loss = SigmoidLoss(embedding_dim=4, objects=3)
+    batch = EncodedBatch(None, ImageEncoding(touch, touch), ImageEncoding(photo, photo), objects, objects)
     scale, bias = torch.tensor(SIGMOID_LOG_SCALE_INIT), torch.tensor(SIGMOID_BIAS_INIT)
     assert torch.equal(loss(batch), sigmoid_loss(touch, photo, objects, objects, scale, bias))
     loss(batch).backward()

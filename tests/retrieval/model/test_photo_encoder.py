@@ -6,7 +6,7 @@ import pytest
 from indexes.store.folder import IndexStore
 from retrieval.model import photo_encoder
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.model.photo_encoder import PhotoCodes, fastest, on_onnx, on_torch
+from retrieval.model.photo_encoder import PhotoEncodings, fastest_photo_encoder, onnx_photo_encoder, torch_photo_encoder
 from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
 
@@ -20,27 +20,31 @@ def pictures(checkpoint, count=3):
 def test_both_give_the_same_halves_and_embeddings_of_several_views():
     pytest.importorskip("onnxruntime")
     shipped = load_checkpoint(shipped_model())
-    ours, theirs = (make(shipped)(pictures(shipped)) for make in (on_torch, on_onnx))
-    assert np.abs(ours.half - theirs.half).max() <= photo_encoder.TOLERANCE * np.abs(ours.half).max()
+    ours, theirs = (make(shipped)(pictures(shipped)) for make in (torch_photo_encoder, onnx_photo_encoder))
+    assert np.abs(ours.partial - theirs.partial).max() <= photo_encoder.TOLERANCE * np.abs(ours.partial).max()
     assert np.allclose(ours.embedding, theirs.embedding, atol=1e-4)
 
 
 def test_pytorch_encodes_where_the_other_is_missing_slower_or_wrong(model, monkeypatch, caplog):
     checkpoint = load_checkpoint(model)
     images = pictures(checkpoint)
-    right = on_torch(checkpoint)(images)
+    right = torch_photo_encoder(checkpoint)(images)
     monkeypatch.setattr(photo_encoder, "find_spec", lambda name: None)
-    assert on_onnx(checkpoint) is None
-    assert np.array_equal(fastest(checkpoint)(images).half, right.half)
-    ours = on_torch(checkpoint)
-    monkeypatch.setattr(photo_encoder, "on_onnx", lambda _: lambda given: PhotoCodes(ours(given).half + 1, None))
-    assert np.array_equal(fastest(checkpoint)(images).half, right.half)
+    assert onnx_photo_encoder(checkpoint) is None
+    assert np.array_equal(fastest_photo_encoder(checkpoint)(images).partial, right.partial)
+    ours = torch_photo_encoder(checkpoint)
+    monkeypatch.setattr(
+        photo_encoder, "onnx_photo_encoder", lambda _: lambda given: PhotoEncodings(ours(given).partial + 1, None)
+    )
+    assert np.array_equal(fastest_photo_encoder(checkpoint)(images).partial, right.partial)
     assert "gives other halves" in caplog.text
-    monkeypatch.setattr(photo_encoder, "on_onnx", lambda _: lambda given: ours(given)._replace(embedding=None))
+    monkeypatch.setattr(
+        photo_encoder, "onnx_photo_encoder", lambda _: lambda given: ours(given)._replace(embedding=None)
+    )
     for seconds, expected in (((1.0, 2.0), "torch"), ((2.0, 1.0), "onnx")):
         turns = iter(seconds * photo_encoder.ROUNDS)
         monkeypatch.setattr(photo_encoder, "_seconds", lambda encode, images, turns=turns: next(turns))
-        chosen = fastest(checkpoint)
+        chosen = fastest_photo_encoder(checkpoint)
         assert (chosen(images).embedding is None) == (expected == "onnx")
 
 
@@ -49,11 +53,13 @@ def test_a_long_build_by_either_gives_the_same_index(catalogue, model, tmp_path,
     checkpoint = load_checkpoint(model)
     build_index(catalogue, checkpoint, tmp_path / "torch", quiet=True)
     asked = []
-    monkeypatch.setattr("retrieval.search.build.embed.MANY", 1)
-    monkeypatch.setattr("retrieval.search.build.embed.fastest", lambda made: asked.append(1) or on_onnx(made))
+    monkeypatch.setattr("retrieval.search.build.embed.MIN_PHOTOS_TO_TUNE", 1)
+    monkeypatch.setattr(
+        "retrieval.search.build.embed.fastest_photo_encoder", lambda made: asked.append(1) or onnx_photo_encoder(made)
+    )
     build_index(catalogue, checkpoint, tmp_path / "onnx", quiet=True)
     assert asked == [1]  # once a build
     ours, theirs = (IndexStore(tmp_path / name).open() for name in ("torch", "onnx"))
     assert [row["id"] for row in ours.rows] == [row["id"] for row in theirs.rows]
-    halves = [np.asarray(each.arrays["halves"], np.float32) for each in (ours, theirs)]
-    assert np.allclose(*halves, atol=2e-3 * np.abs(halves[0]).max())
+    partials = [np.asarray(each.arrays["partials"], np.float32) for each in (ours, theirs)]
+    assert np.allclose(*partials, atol=2e-3 * np.abs(partials[0]).max())

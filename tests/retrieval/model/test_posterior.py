@@ -8,34 +8,34 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from retrieval.errors import BadInput, NumericalError
-from retrieval.model.posterior import MAX_GRASPS, SLOPE_BOUNDS, JudgedTouches, Mass, Posterior, fit_posterior
+from retrieval.model.posterior import MAX_GRASPS, SLOPE_BOUNDS, EvidenceMass, Posterior, ScoredTouches, fit_posterior
 
 ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 
 
 def test_logits_of_nothing_leave_the_prior():
-    belief = ADDING.believe([0.0, 0.0], none_prior=0.5)
+    belief = ADDING.probabilities([0.0, 0.0], none_prior=0.5)
     assert belief.none == pytest.approx(0.5)
     assert belief.objects == pytest.approx([0.25, 0.25])
-    assert belief.unjudged == 0
+    assert belief.unscored == 0
 
 
 def test_probabilities_are_those_reckoned_by_hand():
     # Weights: none 1/2; objects 1/4 * 3 and 1/4; together 3/2.
-    belief = ADDING.believe([math.log(3), 0.0], none_prior=0.5)
+    belief = ADDING.probabilities([math.log(3), 0.0], none_prior=0.5)
     assert belief.none == pytest.approx(1 / 3)
     assert belief.objects == pytest.approx([1 / 2, 1 / 6])
     # A prior of 1/5: 1/5, 4/10 * 3 and 4/10; together 9/5.
-    belief = ADDING.believe([math.log(3), 0.0], none_prior=0.2)
+    belief = ADDING.probabilities([math.log(3), 0.0], none_prior=0.2)
     assert (belief.none, *belief.objects) == pytest.approx((1 / 9, 6 / 9, 2 / 9))
 
 
 def test_what_was_not_judged_keeps_its_share():
     # Four objects, two of them judged: 1/8 * 4 and 1/8; the two others like the sample, whose ratios 1 and 3 mean 2.
-    belief = ADDING.believe([math.log(4), 0.0], none_prior=0.5, unjudged=2, sample=[0.0, math.log(3)])
+    belief = ADDING.probabilities([math.log(4), 0.0], none_prior=0.5, unscored=2, sample=[0.0, math.log(3)])
     total = 4 / 8 + 4 / 8 + 1 / 8 + 2 * 2 / 8
     assert belief.none == pytest.approx(0.5 / total)
-    assert belief.unjudged == pytest.approx(0.5 / total)
+    assert belief.unscored == pytest.approx(0.5 / total)
     assert belief.objects == pytest.approx([0.5 / total, 0.125 / total])
 
 
@@ -47,8 +47,8 @@ def test_what_was_not_judged_keeps_its_share():
 )
 def test_all_that_may_be_adds_up_to_one_and_ranks_as_the_logits_do(logits, prior, grasps, sample):
     posterior = Posterior(slope=0.7, offset=-0.3, dependence=0.6)
-    belief = posterior.believe(logits, grasps, none_prior=prior, unjudged=7 if sample else 0, sample=sample)
-    assert belief.none + belief.unjudged + belief.objects.sum() == pytest.approx(1)
+    belief = posterior.probabilities(logits, grasps, none_prior=prior, unscored=7 if sample else 0, sample=sample)
+    assert belief.none + belief.unscored + belief.objects.sum() == pytest.approx(1)
     order = np.argsort(logits)
     assert (np.diff(belief.objects[order]) >= 0).all()
 
@@ -58,39 +58,39 @@ def test_large_logits_are_right_where_the_obvious_formula_is_not_a_number():
     with np.errstate(over="ignore", invalid="ignore"):
         naive = np.exp(logits) / (np.exp(logits).sum() + 1)
     assert np.isnan(naive).all()
-    belief = ADDING.believe(logits, none_prior=0.5)
+    belief = ADDING.probabilities(logits, none_prior=0.5)
     assert belief.objects == pytest.approx([1 / (1 + math.exp(-1)), math.exp(-1) / (1 + math.exp(-1))])
-    assert ADDING.believe(-logits, none_prior=0.5).none == 1.0
+    assert ADDING.probabilities(-logits, none_prior=0.5).none == 1.0
 
 
 def test_the_probability_if_present_is_that_reckoned_by_hand_whatever_the_prior_and_the_offset():
     # Weights 3 and 1, together 4.
     for offset, prior in ((0.0, 0.5), (-3.0, 0.9), (2.0, 0.0)):
-        belief = Posterior(1.0, offset, 0.0).believe([math.log(3), 0.0], none_prior=prior)
+        belief = Posterior(1.0, offset, 0.0).probabilities([math.log(3), 0.0], none_prior=prior)
         assert belief.objects_if_present == pytest.approx([3 / 4, 1 / 4])
     # Four objects, two of them judged: weights 4 and 1; the two others weigh 2 each, the mean of the sample.
-    belief = ADDING.believe([math.log(4), 0.0], unjudged=2, sample=[0.0, math.log(3)])
+    belief = ADDING.probabilities([math.log(4), 0.0], unscored=2, sample=[0.0, math.log(3)])
     assert belief.objects_if_present == pytest.approx([4 / 9, 1 / 9])
     # Two grasps: w = 1 / 1.5, so that logits of 1.5 log 3 and 0 weigh 3 and 1.
-    belief = Posterior(1.0, 0.0, 0.5).believe([1.5 * math.log(3), 0.0], 2)
+    belief = Posterior(1.0, 0.0, 0.5).probabilities([1.5 * math.log(3), 0.0], 2)
     assert belief.objects_if_present == pytest.approx([3 / 4, 1 / 4])
 
 
 def test_parts_of_a_catalogue_joined_give_the_probability_if_present_of_the_whole():
     # Weights 4, 1 | 3, 8: 16 together. The parts' largest logits differ.
     parts = [ADDING.mass([math.log(4), 0.0]), ADDING.mass([math.log(3), math.log(8)])]
-    belief = ADDING.share([math.log(8), math.log(4)], Mass.joined(parts))
+    belief = ADDING.probabilities_given([math.log(8), math.log(4)], EvidenceMass.merged(parts))
     assert belief.objects_if_present == pytest.approx([1 / 2, 1 / 4])
 
 
 def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_quotient_is_not_a_number():
-    belief = ADDING.believe([-1000.0, -1001.0])
+    belief = ADDING.probabilities([-1000.0, -1001.0])
     assert belief.none == 1.0
     with np.errstate(invalid="ignore"):
         assert np.isnan(belief.objects / (1 - belief.none)).all()
     assert belief.objects_if_present == pytest.approx([1 / (1 + math.exp(-1)), 1 / (1 + math.e)])
     # Short of that, the quotient has lost its digits: 1 - P(none) is a multiple of 1e-16.
-    belief = ADDING.believe([-32.0, -33.0])
+    belief = ADDING.probabilities([-32.0, -33.0])
     exact = 1 / (1 + math.exp(-1))
     assert belief.objects[0] / (1 - belief.none) != pytest.approx(exact, rel=1e-3)
     assert belief.objects_if_present[0] == pytest.approx(exact)
@@ -124,7 +124,7 @@ def test_after_the_further_grasps_and_no_fewer_the_best_object_is_likelier_than_
     """Where these are like those so far."""
     posterior = Posterior(1.0, offset, dependence)
     totals = range(grasps, MAX_GRASPS + 1)
-    beliefs = [posterior.believe([logit * n / grasps, -1e6, -1e6], n, none_prior=prior) for n in totals]
+    beliefs = [posterior.probabilities([logit * n / grasps, -1e6, -1e6], n, none_prior=prior) for n in totals]
     gaps = [belief.objects[0] - belief.none for belief in beliefs]
     assume(gaps[0] <= 0 and min(map(abs, gaps)) > 1e-9)  # else rounding decides
     matches = [more for more, gap in enumerate(gaps) if gap > 0]
@@ -167,11 +167,11 @@ def normal_logits(objects, touches, photos, apart, alike, seed=0):
     common = rng.normal(size=(objects, len(photo_owner)))[owner]
     noise = math.sqrt(alike) * common + math.sqrt(1 - alike) * rng.normal(size=same.shape)
     logits = apart * (noise + np.where(same, apart / 2, -apart / 2))
-    return JudgedTouches(logits, owner, photo_owner, np.zeros(same.shape, dtype=bool))
+    return ScoredTouches(logits, owner, photo_owner, np.zeros(same.shape, dtype=bool))
 
 
-def changed(judged, scale, shift):
-    return JudgedTouches(scale * judged.logits + shift, judged.touch_owner, judged.photo_owner, judged.own)
+def changed(scored, scale, shift):
+    return ScoredTouches(scale * scored.logits + shift, scored.touch_owner, scored.photo_owner, scored.own)
 
 
 def test_the_fit_finds_planted_numbers_again():
@@ -193,68 +193,68 @@ def test_independent_grasps_are_found_to_be_so_and_equal_ones_too():
 
 @pytest.mark.parametrize(("touches", "unit", "shift"), [(2, 20, 0), (2, 0.05, 0), (1, 20, 1000), (1, 1, -300)])
 def test_the_unit_of_the_logits_makes_no_difference_and_for_one_grasp_neither_does_their_middle(touches, unit, shift):
-    judged = normal_logits(60, touches, 1, apart=2, alike=0.3)
-    plain, other = fit_posterior(judged), fit_posterior(changed(judged, unit, shift))
+    scored = normal_logits(60, touches, 1, apart=2, alike=0.3)
+    plain, other = fit_posterior(scored), fit_posterior(changed(scored, unit, shift))
     assert other.slope == pytest.approx(plain.slope / unit, rel=1e-2)
     assert other.dependence == pytest.approx(plain.dependence, abs=0.02)
     for logit in (-2.0, 0.0, 3.0):
-        ours, theirs = plain.believe([logit]).none, other.believe([unit * logit + shift]).none
+        ours, theirs = plain.probabilities([logit]).none, other.probabilities([unit * logit + shift]).none
         assert ours == pytest.approx(theirs, abs=5e-3)
 
 
 def test_logits_that_never_err_have_a_finite_slope():
     owner = np.arange(20)
-    judged = JudgedTouches(np.where(np.eye(20, dtype=bool), 5.0, -5.0), owner, owner, np.zeros((20, 20), dtype=bool))
-    found = fit_posterior(judged)
+    scored = ScoredTouches(np.where(np.eye(20, dtype=bool), 5.0, -5.0), owner, owner, np.zeros((20, 20), dtype=bool))
+    found = fit_posterior(scored)
     assert SLOPE_BOUNDS[0] < found.slope < 3
-    assert 0.5 < found.believe([5.0] + [-5.0] * 18).objects[0] < 1
+    assert 0.5 < found.probabilities([5.0] + [-5.0] * 18).objects[0] < 1
 
 
 def test_logits_that_say_nothing_leave_the_prior():
     owner = np.arange(20)
     for noise in (0.0, 1.0):
         scores = noise * np.random.default_rng(0).normal(size=(20, 20))
-        found = fit_posterior(JudgedTouches(scores, owner, owner, np.zeros((20, 20), dtype=bool)))
-        assert found.believe(scores[0][:10]).none == pytest.approx(0.5, abs=0.12)
+        found = fit_posterior(ScoredTouches(scores, owner, owner, np.zeros((20, 20), dtype=bool)))
+        assert found.probabilities(scores[0][:10]).none == pytest.approx(0.5, abs=0.12)
 
 
 def test_a_photo_of_the_touchs_own_grasp_is_never_counted():
-    judged = normal_logits(30, 2, 2, apart=2, alike=0)
-    own = np.zeros_like(judged.own)
+    scored = normal_logits(30, 2, 2, apart=2, alike=0)
+    own = np.zeros_like(scored.own)
     own[np.arange(60), np.arange(60)] = True
-    with_secret = np.where(own, 1e6, judged.logits)
-    hidden = JudgedTouches(with_secret, judged.touch_owner, judged.photo_owner, own)
-    plain = JudgedTouches(np.where(own, 0.0, judged.logits), judged.touch_owner, judged.photo_owner, own)
+    with_secret = np.where(own, 1e6, scored.logits)
+    hidden = ScoredTouches(with_secret, scored.touch_owner, scored.photo_owner, own)
+    plain = ScoredTouches(np.where(own, 0.0, scored.logits), scored.touch_owner, scored.photo_owner, own)
     assert fit_posterior(hidden) == fit_posterior(plain)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_logit_that_is_no_number_is_refused(bad):
     with pytest.raises(NumericalError, match="every logit must be finite"):
-        ADDING.believe([0.0, bad])
+        ADDING.probabilities([0.0, bad])
 
 
 @pytest.mark.parametrize("prior", [-0.1, 1.0, math.nan])
 def test_a_prior_that_is_none_is_refused(prior):
     with pytest.raises(BadInput, match="must be at least 0 and less than 1"):
-        ADDING.believe([0.0], none_prior=prior)
+        ADDING.probabilities([0.0], none_prior=prior)
 
 
 def test_without_a_sample_what_was_not_judged_cannot_be_estimated():
     with pytest.raises(BadInput, match="a sample where others were not judged"):
-        ADDING.believe([0.0], unjudged=3)
+        ADDING.probabilities([0.0], unscored=3)
 
 
 def test_two_objects_are_too_few_to_fit_on():
     owner = np.array([0, 1])
     with pytest.raises(BadInput, match="three objects at least"):
-        fit_posterior(JudgedTouches(np.eye(2), owner, owner, np.zeros((2, 2), dtype=bool)))
+        fit_posterior(ScoredTouches(np.eye(2), owner, owner, np.zeros((2, 2), dtype=bool)))
 
 
 def test_touches_without_another_photo_of_their_object_are_nothing_to_fit_on():
     owner = np.arange(3)
     with pytest.raises(BadInput, match="another photo of theirs; got 3 objects and 0 such touches"):
-        fit_posterior(JudgedTouches(np.eye(3), owner, owner, np.ones((3, 3), dtype=bool)))
+        fit_posterior(ScoredTouches(np.eye(3), owner, owner, np.ones((3, 3), dtype=bool)))
 
 
 def test_it_is_written_and_read_back():

@@ -10,17 +10,17 @@ from PIL import Image
 
 from retrieval.data import images
 from retrieval.errors import BadInput, ImageError
-from retrieval.model.touches import read_grasps, read_image
+from retrieval.model.touches import parse_grasps, read_image
 
 GREY = np.full((4, 6, 3), 128, dtype=np.uint8)
 
 
 def names(given, fingers=2):
-    return [[image.name for image in grasp] for grasp in read_grasps(given, fingers)]
+    return [[image.name for image in grasp] for grasp in parse_grasps(given, fingers)]
 
 
 def counts(given, fingers=2):
-    return [len(grasp) for grasp in read_grasps(given, fingers)]
+    return [len(grasp) for grasp in parse_grasps(given, fingers)]
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def test_for_one_finger_an_image_alone_is_a_grasp():
 
 def test_two_images_for_one_finger_are_never_taken_for_two_grasps():
     with pytest.raises(BadInput, match=r"takes 1 gel image\(s\) for one touch; got 2: a\.png, b\.png \(one grasp is a"):
-        read_grasps(["a.png", "b.png"], 1)
+        parse_grasps(["a.png", "b.png"], 1)
 
 
 def test_an_array_of_more_axes_is_a_list_of_those_below_it():
@@ -87,7 +87,7 @@ def test_what_is_no_file_is_named_by_its_place():
 )
 def test_whatever_else_is_refused_in_a_sentence(given, said):
     with pytest.raises(BadInput, match=said):
-        read_grasps(given, 2)
+        parse_grasps(given, 2)
 
 
 # Reading -----------------------------------------------------------------------------------------------------------

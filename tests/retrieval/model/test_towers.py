@@ -10,7 +10,7 @@ from torch import nn
 
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
 from retrieval.model.towers import TOWERS, build_tower, tower_name
-from retrieval.model.towers.base import Tower, stage_statistics
+from retrieval.model.towers.tower import Tower, stage_statistics
 from retrieval.model.towers.weights import initialise_tower, load_tower_state, read_state
 from tests.data import touch_data
 

@@ -5,7 +5,7 @@ import pytest
 from retrieval.report.evaluation import write_report
 from tests import synthetic
 from tests.browser import chromium, page, serious
-from tests.made_up_evaluation import write_made_up
+from tests.synthetic_evaluation import write_synthetic_results
 
 pytestmark = pytest.mark.slow
 
@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 def opened(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     recording = synthetic.write_recording(folder / "recording", synthetic.make_objects(12), 3)
-    out = write_made_up(recording, folder / "out", ("late_fusion", "cca", "plsca", "chance"))
+    out = write_synthetic_results(recording, folder / "out", ("late_fusion", "cca", "plsca", "chance"))
     write_report(out, recording)
     with chromium() as browser, page(browser, (out / "report.html").as_uri(), offline=True) as found:
         yield found

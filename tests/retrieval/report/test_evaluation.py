@@ -12,11 +12,11 @@ from retrieval.errors import BadInput, DatasetError
 from retrieval.model.posterior import FORMULA
 from retrieval.report.document import Details, Document, Listing, Picture, Section, Table, Text, to_html, to_markdown
 from retrieval.report.evaluation import write_report
-from retrieval.report.results import at_start, number, percent, short, with_interval
+from retrieval.report.results import capitalized, format_number, percent, shortened, with_interval
 from retrieval.report.tables import probability
 from tests import synthetic
-from tests.made_up_evaluation import write_made_up
-from tests.pages import Page
+from tests.pages import HtmlPage
+from tests.synthetic_evaluation import write_synthetic_results
 
 FEW = ("late_fusion", "cca", "chance")
 
@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def made(folder, tmp_path_factory):
     """(files, folder) of a whole report."""
-    out = write_made_up(folder, tmp_path_factory.mktemp("out") / "report", FEW)
+    out = write_synthetic_results(folder, tmp_path_factory.mktemp("out") / "report", FEW)
     return write_report(out, folder), out
 
 
@@ -73,7 +73,7 @@ def test_it_writes_what_it_says_and_every_figure_opens(made):
 
 def test_the_page_needs_nothing_outside_itself_and_every_picture_has_words(made):
     files, out = made
-    page = Page((out / "report.html").read_text("utf-8"))
+    page = HtmlPage((out / "report.html").read_text("utf-8"))
     assert {tag for tag, _ in page.tags}.isdisjoint({"link", "iframe", "object"})
     assert page.all("script") == [{}]  # our own, inside
     figures = [image for image in page.all("img") if "data-name" not in image]  # the others wait for a click
@@ -88,7 +88,7 @@ def test_the_page_needs_nothing_outside_itself_and_every_picture_has_words(made)
 def test_every_measure_of_every_method_is_printed_with_interval_chance_and_basis(made):
     _, out = made
     results = json.loads((out / "results.json").read_text())
-    page, text = Page((out / "report.html").read_text("utf-8")).text, (out / "report.md").read_text("utf-8")
+    page, text = HtmlPage((out / "report.html").read_text("utf-8")).text, (out / "report.md").read_text("utf-8")
     for method in results["methods"].values():
         for summary in method["measures"].values():
             cell = f"{100 * summary['value'][0]:.1f} [{100 * summary['low'][0]:.1f}, {100 * summary['high'][0]:.1f}]"
@@ -139,7 +139,11 @@ def test_the_papers_figure_stands_beside_as_its_own_and_simulation_is_named(made
 @pytest.mark.usefixtures("words_only")
 def test_a_control_says_whether_chance_lies_in_its_interval(made, tmp_path):
     def change(results):
-        results["controls"]["before"]["measures"]["pair_accuracy"] |= {"low": [0.51], "chance": [0.5], "high": [0.6]}
+        results["controls"]["no_contact"]["measures"]["pair_accuracy"] |= {
+            "low": [0.51],
+            "chance": [0.5],
+            "high": [0.6],
+        }
         results["controls"]["shuffled"]["measures"]["pair_accuracy"] |= {"low": [0.49], "chance": [0.5], "high": [0.6]}
 
     rows = remake(made, tmp_path, change=change)[1].splitlines()
@@ -155,7 +159,7 @@ def test_the_decision_is_shown_with_the_formula_and_by_number_of_grasps(made, tm
         found["by_grasps"]["3"]["auroc"] |= {"value": [0.9119], "low": [0.85], "high": [0.95]}
 
     page, text, _ = remake(made, tmp_path, change=change)
-    words = Page(page).text
+    words = HtmlPage(page).text
     assert "81.2 [70.0, 90.0]" in words
     assert "91.2 [85.0, 95.0]" in words
     assert FORMULA in words
@@ -227,10 +231,10 @@ def test_touches_that_hardly_press_are_shown_apart(made, tmp_path):
 def test_what_was_not_measured_is_left_out(made, tmp_path):
     def change(results):
         for method in results["methods"].values():
-            for what in ("per_object", "confusions", "reliability", "calibration", "reject", "examples", "chosen"):
+            for what in ("per_object", "confusions", "reliability", "calibration", "reject", "examples", "best_params"):
                 method.pop(what)
             method["measures"] = {"pair_accuracy": method["measures"]["pair_accuracy"]}
-        results |= {"controls": {}, "ceilings": {}, "faint": None, "comparisons": []}
+        results |= {"controls": {}, "ceilings": {}, "low_contact": None, "comparisons": []}
         results.pop("audit")
 
     _, text, files = remake(made, tmp_path, change=change)
@@ -264,7 +268,7 @@ def test_a_recording_of_few_objects_has_no_shares_by_object(made, tmp_path):
 def test_values_that_could_not_be_taken_are_dashes(made, tmp_path):
     def change(results):
         results["methods"]["cca"]["measures"].pop("pair_auc")
-        results["methods"]["cca"]["measures"]["guesses_k5"] |= {key: [None] * 5 for key in ("value", "low", "high")}
+        results["methods"]["cca"]["measures"]["topn_k5"] |= {key: [None] * 5 for key in ("value", "low", "high")}
 
     rows = remake(made, tmp_path, change=change)[1].splitlines()
     cca = next(row for row in rows if row.startswith("| CCA |")).split(" | ")
@@ -285,7 +289,7 @@ def test_a_method_and_a_measure_that_the_report_does_not_know_are_shown_under_th
 
 @pytest.mark.parametrize("methods", [("chance",), ("late_fusion",), ("chance", "constant")])
 def test_one_method_is_enough(folder, tmp_path, methods):
-    out = write_made_up(folder, tmp_path, methods)
+    out = write_synthetic_results(folder, tmp_path, methods)
     assert write_report(out, None)
 
 
@@ -300,8 +304,8 @@ def test_any_name_of_an_object_is_harmless(made, tmp_path, name):
     results = json.loads((made[1] / "results.json").read_text())
     changed = rename(results, results["split"]["test"][0], name)
     page, text, _ = remake(made, tmp_path, change=lambda results: (results.clear(), results.update(changed)))
-    assert Page(page).all("script") == [{}]
-    assert name in Page(page).text
+    assert HtmlPage(page).all("script") == [{}]
+    assert name in HtmlPage(page).text
     for line in text.splitlines():
         assert not re.search(r"(?<!\\)<script", line)
 
@@ -345,7 +349,7 @@ def test_missing_results_and_a_missing_recording_are_clear_errors(made, tmp_path
 
 
 def test_numbers_are_written_for_readers():
-    assert [number(value) for value in (None, 0.0, 3.0, 4.004, 0.0361, 99.95, 123.4, 12345.6)] == [
+    assert [format_number(value) for value in (None, 0.0, 3.0, 4.004, 0.0361, 99.95, 123.4, 12345.6)] == [
         *("–", "0", "3", "4.00", "0.0361", "100", "123", "12,346")
     ]
     assert [percent(0.71249), percent(None), percent(0.5, 0)] == ["71.2", "–", "50"]
@@ -355,9 +359,9 @@ def test_numbers_are_written_for_readers():
 
 
 def test_a_long_name_keeps_both_ends():
-    assert short("abcdef", 6) == "abcdef"
-    assert short("abcdefgh", 5) == "ab…gh"
-    assert [at_start("late fusion"), at_start("CCA"), at_start("")] == ["Late fusion", "CCA", ""]
+    assert shortened("abcdef", 6) == "abcdef"
+    assert shortened("abcdefgh", 5) == "ab…gh"
+    assert [capitalized("late fusion"), capitalized("CCA"), capitalized("")] == ["Late fusion", "CCA", ""]
 
 
 def test_markdown_and_html_say_the_same(tmp_path):

@@ -16,9 +16,9 @@ from retrieval.model.posterior import Posterior
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
 from retrieval.search.build.build_index import build_index
-from retrieval.search.query.answer import Match, NearestReference, QueryResult, in_words
+from retrieval.search.query.answer import Match, NearestReference, QueryResult, verdict_sentence
 from retrieval.search.query.searcher import Searcher
-from tests.pages import Page
+from tests.pages import HtmlPage
 
 SCRIPT = "<script>alert(1)</script>"
 ESCAPED = "&lt;script&gt;alert(1)&lt;/script&gt;"
@@ -28,12 +28,12 @@ POSTERIOR = Posterior(slope=0.75, offset=-1.25, dependence=0.5, tests=9).to_dict
     "none_prior": 0.5,
     "grasps": 1,
     "objects": 1,
-    "judged_objects": 1,
-    "unjudged_probability": 0.0,
+    "scored_objects": 1,
+    "unscored_probability": 0.0,
 }
 
 
-def made_up(
+def synthetic_results(
     *matches, touches=(("a.png", "b.png"),), verdict="match", none=0.2, posterior=POSTERIOR, grasps=None, more=None
 ):
     """A result with these (object, logit, probability, photo, metadata)."""
@@ -74,7 +74,7 @@ def test_the_page_needs_nothing_outside_itself(answer):
     page = query_html(*answer)
     for word in ("http:", "https:", "file:", "//cdn", "@import", "url("):
         assert word not in page
-    parsed = Page(page)
+    parsed = HtmlPage(page)
     assert {tag for tag, _ in parsed.tags}.isdisjoint({"script", "link", "iframe", "object", "a"})
     assert len(parsed.all("img")) == 4 + 5
     assert all(image["src"].startswith("data:image/jpeg;base64,") for image in parsed.all("img"))
@@ -85,7 +85,7 @@ def test_the_pictures_are_thumbnails_in_their_own_shape_and_colours(tmp_path):
     picture = np.zeros((300, 1200, 3), np.uint8)
     picture[..., 2] = 200  # red, in OpenCV's order
     cv2.imwrite(str(tmp_path / "wide.png"), picture)
-    page = Page(query_html(made_up(("mug", 1.5, 0.8, "wide.png", {})), tmp_path))
+    page = HtmlPage(query_html(synthetic_results(("mug", 1.5, 0.8, "wide.png", {})), tmp_path))
     data = base64.b64decode(page.all("img")[0]["src"].split(",")[1])
     decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     assert decoded.shape == (80, 320, 3)
@@ -94,7 +94,7 @@ def test_the_pictures_are_thumbnails_in_their_own_shape_and_colours(tmp_path):
 
 def test_the_page_names_rank_probability_logit_photo_and_metadata(answer):
     result, catalogue = answer
-    text = Page(query_html(result, catalogue)).text
+    text = HtmlPage(query_html(result, catalogue)).text
     for match in result.results:
         for words in (f"{match.rank}. {match.object_id}", f"{match.logit:+.2f}", match.photo, "shelf: B4"):
             assert words in text
@@ -102,9 +102,9 @@ def test_the_page_names_rank_probability_logit_photo_and_metadata(answer):
     assert "several grasps of one object are known to be alike" in text
 
 
-def test_the_page_tells_the_formula_its_numbers_and_what_was_not_judged(tmp_path):
-    posterior = POSTERIOR | {"grasps": 2, "objects": 500, "judged_objects": 80, "unjudged_probability": 0.125}
-    text = Page(query_html(made_up(ONE, posterior=posterior), tmp_path)).text
+def test_page_shows_formula_parameters_and_unscored_objects(tmp_path):
+    posterior = POSTERIOR | {"grasps": 2, "objects": 500, "scored_objects": 80, "unscored_probability": 0.125}
+    text = HtmlPage(query_html(synthetic_results(ONE, posterior=posterior), tmp_path)).text
     assert POSTERIOR["formula"] in text
     assert "slope 0.750, offset -1.250, dependence 0.500, grasps 2, none_prior 0.5, objects 500" in text
     assert "420 of 500 objects, which share 12.5 %" in text
@@ -115,21 +115,21 @@ def test_the_page_tells_the_formula_its_numbers_and_what_was_not_judged(tmp_path
 def test_names_and_metadata_cannot_inject_markup(place, tmp_path):
     parts = {name: SCRIPT if name == place else name for name in ("object", "photo", "key", "value", "touch")}
     match = (parts["object"], 1.5, 0.8, parts["photo"], {parts["key"]: parts["value"]})
-    page = query_html(made_up(match, touches=[[parts["touch"], "b.png"]]), tmp_path)
+    page = query_html(synthetic_results(match, touches=[[parts["touch"], "b.png"]]), tmp_path)
     assert "<script" not in page
-    assert (SCRIPT.split("/")[-1] if place == "touch" else SCRIPT) in Page(page).text
+    assert (SCRIPT.split("/")[-1] if place == "touch" else SCRIPT) in HtmlPage(page).text
 
 
 def test_a_quote_in_a_name_cannot_leave_its_attribute(tmp_path, touch):
     shutil.copy(touch[0], tmp_path / "1.png")
-    page = Page(query_html(made_up(('" onerror="alert(1)', 1.5, 0.8, "1.png", {})), tmp_path))
+    page = HtmlPage(query_html(synthetic_results(('" onerror="alert(1)', 1.5, 0.8, "1.png", {})), tmp_path))
     assert [set(image) for image in page.all("img")] == [{"class", "src", "alt"}]
     assert page.all("img")[0]["alt"] == 'photo of " onerror="alert(1)'
 
 
 def test_metadata_of_any_json_kind_is_shown(tmp_path):
     metadata = {"n": 3, "none": None, "list": [SCRIPT, 1], "deep": {"a": {"b": SCRIPT}}, "": "empty key"}
-    page = query_html(made_up((*ONE[:4], metadata)), tmp_path)
+    page = query_html(synthetic_results((*ONE[:4], metadata)), tmp_path)
     assert "<script" not in page
     assert page.count(ESCAPED) == 2
 
@@ -140,14 +140,14 @@ def test_a_vanished_or_broken_photo_leaves_a_blank_and_the_rest_stands(answer, t
     (own / result.results[0].photo).unlink()
     broken = own / result.results[1].photo
     broken.write_bytes(broken.read_bytes()[:300])
-    page = Page(query_html(result, own))
+    page = HtmlPage(query_html(result, own))
     assert len(page.all("img")) == 4 + 3
     assert page.text.count("no picture at its place") == 2
     assert result.results[0].object_id in page.text
 
 
 def test_vanished_gel_images_leave_blanks_too(tmp_path):
-    page = Page(query_html(made_up(ONE, touches=[["gone_a.png", "gone_b.png"]]), tmp_path))
+    page = HtmlPage(query_html(synthetic_results(ONE, touches=[["gone_a.png", "gone_b.png"]]), tmp_path))
     assert page.all("img") == []
     assert page.text.count("no picture at its place") == 3
 
@@ -157,17 +157,17 @@ def test_vanished_gel_images_leave_blanks_too(tmp_path):
     [(1.0, "over 99.9 %"), (0.99934, "over 99.9 %"), (0.5, "50.0 %"), (0.013, "1.3 %"), (1e-9, "under 0.1 %")],
 )
 def test_a_probability_is_never_shown_as_certain(probability, words, tmp_path):
-    text = Page(query_html(made_up(("mug", 1.5, probability, "1.jpg", {})), tmp_path)).text
+    text = HtmlPage(query_html(synthetic_results(("mug", 1.5, probability, "1.jpg", {})), tmp_path)).text
     assert words in text
     assert "100.0 %" not in text
 
 
 def test_the_verdict_is_said(tmp_path):
-    accepted = Page(query_html(made_up(ONE), tmp_path))
+    accepted = HtmlPage(query_html(synthetic_results(ONE), tmp_path))
     assert "Most likely mug, probability 80.0 %; none of these: 20.0 %." in accepted.text
     assert firsts(accepted)
     one = ("mug", 1.5, 0.08, "mug/1.jpg", {})
-    rejected = Page(query_html(made_up(one, verdict="none of these", none=0.9), tmp_path))
+    rejected = HtmlPage(query_html(synthetic_results(one, verdict="none of these", none=0.9), tmp_path))
     assert "None of these, most likely: the catalogue lacks the object with probability 90.0 %." in rejected.text
     assert "If it has the object, this is mug with probability 80.0 %." in rejected.text
     assert "Reference touches of mug would help." in rejected.text
@@ -178,7 +178,7 @@ def test_the_verdict_is_said(tmp_path):
 
 
 UNCLEAR = ("mug", 1.5, 0.04, "mug/1.jpg", {})
-CLEAR = ("mug", 1.5, 0.08, "mug/1.jpg", {})
+CLEAR_PROBABILITY = ("mug", 1.5, 0.08, "mug/1.jpg", {})
 
 
 @pytest.mark.parametrize(
@@ -186,35 +186,35 @@ CLEAR = ("mug", 1.5, 0.08, "mug/1.jpg", {})
     [
         (UNCLEAR, 1, None, "The ranking is not clear. Reference touches of its first objects would help."),
         (
-            CLEAR,
+            CLEAR_PROBABILITY,
             1,
             None,
             "The ranking is clear, but more grasps would hardly change the verdict. Reference touches of mug",
         ),
-        (CLEAR, 1, 1, 'Another grasp would help: 1 more like this one would make the verdict "match".'),
-        (CLEAR, 2, 3, 'Another grasp would help: 3 more like these would make the verdict "match".'),
+        (CLEAR_PROBABILITY, 1, 1, 'Another grasp would help: 1 more like this one would make the verdict "match".'),
+        (CLEAR_PROBABILITY, 2, 3, 'Another grasp would help: 3 more like these would make the verdict "match".'),
     ],
 )
 def test_the_advice_names_what_would_help(match, grasps, more, advice, tmp_path):
     touches = [["a.png", "b.png"]] * grasps
-    result = made_up(match, touches=touches, verdict="none of these", none=0.9, more=more)
+    result = synthetic_results(match, touches=touches, verdict="none of these", none=0.9, more=more)
     assert result.advice.startswith(advice)
     assert result.to_dict()["advice"] == result.advice
     assert QueryResult.from_dict(result.to_dict()) == result
-    assert advice in Page(query_html(result, tmp_path)).text
-    assert in_words(result).endswith(result.advice)
-    assert made_up(ONE).advice is None
+    assert advice in HtmlPage(query_html(result, tmp_path)).text
+    assert verdict_sentence(result).endswith(result.advice)
+    assert synthetic_results(ONE).advice is None
 
 
 def test_the_advice_for_an_object_with_reference_touches_asks_for_more():
-    result = made_up(CLEAR, verdict="none of these", none=0.9)
+    result = synthetic_results(CLEAR_PROBABILITY, verdict="none of these", none=0.9)
     match = dataclasses.replace(result.top, reference=NearestReference(("mug/touch_0_a.png",), 0.9, 0.1))
     assert "More reference touches of mug would help." in dataclasses.replace(result, results=[match]).advice
 
 
 def test_a_document_of_before_there_was_advice_is_still_read():
     """The history of a service holds such."""
-    document = made_up(ONE).to_dict()
+    document = synthetic_results(ONE).to_dict()
     for name in ("more_grasps", "advice"):
         del document[name]
     del document["results"][0]["probability_if_present"]
@@ -237,8 +237,8 @@ def firsts(page):
 def test_where_nothing_was_ranked_the_page_says_why_marks_the_grasps_and_shows_no_photo(verdict, words, tmp_path):
     touches = [["a.png", "b.png"], ["c.png", "d.png"]]
     shown = [verdict, "contact" if verdict == "not a gel image" else verdict]
-    result = made_up(touches=touches, verdict=verdict, none=None, posterior=None, grasps=shown)
-    page = Page(query_html(result, tmp_path))
+    result = synthetic_results(touches=touches, verdict=verdict, none=None, posterior=None, grasps=shown)
+    page = HtmlPage(query_html(result, tmp_path))
     assert words in page.text
     assert f"grasp 1: {verdict}, not judged" in page.text
     assert ("grasp 2: " in page.text) == (verdict == "no contact")
@@ -248,8 +248,8 @@ def test_where_nothing_was_ranked_the_page_says_why_marks_the_grasps_and_shows_n
 
 
 def test_a_model_without_calibration_shows_no_probability(tmp_path):
-    result = made_up(("mug", 1.5, None, "1.jpg", {}), verdict="uncalibrated", none=None, posterior=None)
-    page = Page(query_html(result, tmp_path))
+    result = synthetic_results(("mug", 1.5, None, "1.jpg", {}), verdict="uncalibrated", none=None, posterior=None)
+    page = HtmlPage(query_html(result, tmp_path))
     assert "Most likely mug." in page.text
     assert "never calibrated" in page.text
     assert "none of these" not in page.text
@@ -289,12 +289,12 @@ def test_the_table_has_a_line_for_each_object(answer, stdout):
 
 
 def test_no_table_is_printed_where_nothing_was_ranked(capsys):
-    print_table(made_up(verdict="no contact", none=None, posterior=None, grasps=["no contact"]))
+    print_table(synthetic_results(verdict="no contact", none=None, posterior=None, grasps=["no contact"]))
     assert capsys.readouterr().out == ""
 
 
 def test_a_model_without_calibration_has_no_line_for_none_of_these(capsys):
-    print_table(made_up(("mug", 1.5, None, "1.jpg", {}), verdict="uncalibrated", none=None, posterior=None))
+    print_table(synthetic_results(("mug", 1.5, None, "1.jpg", {}), verdict="uncalibrated", none=None, posterior=None))
     out = capsys.readouterr().out
     assert "mug" in out
     assert "none of these" not in out
@@ -302,7 +302,7 @@ def test_a_model_without_calibration_has_no_line_for_none_of_these(capsys):
 
 @pytest.mark.parametrize("name", ["[bold]mug[/bold]", "[/red]", ":smile:", "[link=x]y"])
 def test_names_are_printed_as_they_are_whatever_markup_they_look_like(name, stdout):
-    print_table(made_up((name, 1.5, None, f"{name}.jpg", {})))
+    print_table(synthetic_results((name, 1.5, None, f"{name}.jpg", {})))
     out = stdout()
     assert f" {name} " in out
     assert f"{name}.jpg" in out
@@ -311,7 +311,9 @@ def test_names_are_printed_as_they_are_whatever_markup_they_look_like(name, stdo
 def test_a_piped_table_is_plain_and_uncut(capsys):
     """Rich had folded names at 80 columns in a pipe, and drawn frames around them."""
     long = "slab-knurl-with-a-long-name-20000-00010"
-    print_table(made_up((long, 1.5, 0.72, f"{long}/1.jpg", {}), ("mug", -0.25, 0.08, "a very/" + "deep/" * 20, {})))
+    print_table(
+        synthetic_results((long, 1.5, 0.72, f"{long}/1.jpg", {}), ("mug", -0.25, 0.08, "a very/" + "deep/" * 20, {}))
+    )
     name = f"{'object':<39}"
     assert capsys.readouterr().out == (
         f"rank  {name}  probability  if present  logit  photo\n"

@@ -18,8 +18,8 @@ from retrieval.model.encode import encode_photos, for_inference
 from retrieval.model.fusion import Matcher
 from retrieval.search.build import measuring, operating
 from retrieval.search.build.build_index import build_index
-from retrieval.search.build.embed import ahead
-from retrieval.search.build.measuring import NeighbourBench, WinnerBench
+from retrieval.search.build.embed import map_ahead
+from retrieval.search.build.measuring import ExhaustiveBench, NeighbourBench
 from retrieval.search.query.searcher import Searcher
 from retrieval.version import __version__
 from tests import synthetic
@@ -30,8 +30,8 @@ def index(tmp_path):
     return tmp_path / "index"
 
 
-def first_photo(own):
-    return sorted(own.rglob("*.jpg"))[0]
+def first_photo(catalogue_copy):
+    return sorted(catalogue_copy.rglob("*.jpg"))[0]
 
 
 def other_picture(path, seed=77):
@@ -57,142 +57,149 @@ PROVENANCE = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics":
 # What is embedded --------------------------------------------------------------------------------------------
 
 
-def test_a_first_build_embeds_every_photo_once_in_batches(own, checkpoint, index, embedded):
-    report = build_index(own, checkpoint, index, quiet=True)
+def test_a_first_build_embeds_every_photo_once_in_batches(catalogue_copy, checkpoint, index, embedded):
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert sorted(embedded) == [8, 16]
     assert (report.photos, report.objects, report.embedded, report.reused, report.removed) == (24, 8, 24, 0, 0)
     assert report.skipped == []
     rows = IndexStore(index).open().rows
-    assert [row["id"] for row in rows] == [photo.path for photo in list_catalogue(own).photos]
+    assert [row["id"] for row in rows] == [photo.path for photo in list_catalogue(catalogue_copy).photos]
     assert set(rows[0]) == {"id", "object_id", "path", "digest", "metadata"}
 
 
-def test_a_rebuild_with_nothing_changed_writes_nothing_and_says_so(own, checkpoint, index, embedded):
-    first = build_index(own, checkpoint, index, quiet=True)
+def test_a_rebuild_with_nothing_changed_writes_nothing_and_says_so(catalogue_copy, checkpoint, index, embedded):
+    first = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert first.written
     embedded.clear()
-    (own / "note.txt").write_text("no photo")
-    (own / "broken.png").write_bytes(b"no photo either")
+    (catalogue_copy / "note.txt").write_text("no photo")
+    (catalogue_copy / "broken.png").write_bytes(b"no photo either")
     left = {"LOCK", "files.stat", "folders.stat"}  # how files and folders look is noted when they have settled
     before = {path: path.stat().st_mtime_ns for path in index.rglob("*") if path.name not in left}
-    report = build_index(own, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (embedded, report.embedded, report.reused, report.generation) == ([], 0, 24, "gen-000001")
-    assert (report.written, report.half_error) == (False, first.half_error)
+    assert (report.written, report.partial_error) == (False, first.partial_error)
     assert {path: path.stat().st_mtime_ns for path in index.rglob("*") if path.name not in left} == before
     assert "nothing changed: the index stays as it is" in list(report.lines())
     assert (report.ignored, [item.path for item in report.skipped]) == (["note.txt"], ["broken.png"])
 
 
-def test_another_wish_or_another_place_is_written_though_nothing_is_embedded(own, checkpoint, index, embedded):
-    build_index(own, checkpoint, index, quiet=True)
+def test_another_wish_or_another_place_is_written_though_nothing_is_embedded(
+    catalogue_copy, checkpoint, index, embedded
+):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
     embedded.clear()
-    assert build_index(own, checkpoint, index, kind="hnsw", quiet=True).written
-    assert not build_index(own, checkpoint, index, kind="hnsw", quiet=True).written
-    moved = own.rename(own.with_name("elsewhere"))
+    assert build_index(catalogue_copy, checkpoint, index, kind="hnsw", quiet=True).written
+    assert not build_index(catalogue_copy, checkpoint, index, kind="hnsw", quiet=True).written
+    moved = catalogue_copy.rename(catalogue_copy.with_name("elsewhere"))
     assert build_index(moved, checkpoint, index, kind="hnsw", quiet=True).written
     assert Searcher.open(index).catalogue == moved
     assert embedded == []
 
 
-def test_a_rebuild_embeds_only_changed_and_new_photos(own, checkpoint, index, embedded):
-    build_index(own, checkpoint, index, quiet=True)
+def test_a_rebuild_embeds_only_changed_and_new_photos(catalogue_copy, checkpoint, index, embedded):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
     before = IndexStore(index).open()
     embedded.clear()
-    changed = first_photo(own)
+    changed = first_photo(catalogue_copy)
     other_picture(changed)
-    other_picture(own / "newcomer" / "1.jpg", seed=78)
-    report = build_index(own, checkpoint, index, quiet=True)
+    other_picture(catalogue_copy / "newcomer" / "1.jpg", seed=78)
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert embedded == [2]
     assert (report.photos, report.embedded, report.reused, report.removed) == (25, 2, 23, 0)
     after = IndexStore(index).open()
-    name = changed.relative_to(own).as_posix()
+    name = changed.relative_to(catalogue_copy).as_posix()
     for row_id in [row["id"] for row in before.rows]:
-        old, new = (part.arrays["halves"][part.row_number(row_id)] for part in (before, after))
+        old, new = (part.arrays["partials"][part.row_number(row_id)] for part in (before, after))
         assert np.array_equal(old, new) == (row_id != name)
 
 
-def test_a_rebuild_gives_what_a_build_from_nothing_gives(own, checkpoint, index, tmp_path):
-    build_index(own, checkpoint, index, quiet=True)
-    other_picture(first_photo(own))
-    shutil.rmtree(sorted(own.iterdir())[3])
-    build_index(own, checkpoint, index, quiet=True)
-    build_index(own, checkpoint, tmp_path / "fresh", quiet=True)
+def test_a_rebuild_gives_what_a_build_from_nothing_gives(catalogue_copy, checkpoint, index, tmp_path):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    other_picture(first_photo(catalogue_copy))
+    shutil.rmtree(sorted(catalogue_copy.iterdir())[3])
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, tmp_path / "fresh", quiet=True)
     again, fresh = (IndexStore(path).open() for path in (index, tmp_path / "fresh"))
     assert again.rows == fresh.rows
     # Another batch of the tower sums in another order: 1e-5 in float32, then one step of float16.
-    np.testing.assert_allclose(again.arrays["halves"], fresh.arrays["halves"], rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(again.arrays["partials"], fresh.arrays["partials"], rtol=2e-3, atol=2e-3)
     np.testing.assert_allclose(again.embeddings[again.slots], fresh.embeddings[fresh.slots], atol=1e-5)
 
 
-def test_photos_that_are_removed_or_broke_since_vanish_and_are_counted(own, checkpoint, index):
-    build_index(own, checkpoint, index, quiet=True)
-    first_photo(own).unlink()
-    broken = first_photo(own)
+def test_photos_that_are_removed_or_broke_since_vanish_and_are_counted(catalogue_copy, checkpoint, index):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    first_photo(catalogue_copy).unlink()
+    broken = first_photo(catalogue_copy)
     broken.write_bytes(broken.read_bytes()[:500])
-    shutil.rmtree(sorted(own.iterdir())[-1])
-    report = build_index(own, checkpoint, index, quiet=True)
+    shutil.rmtree(sorted(catalogue_copy.iterdir())[-1])
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (report.photos, report.objects, report.embedded, report.removed) == (19, 7, 0, 5)
-    assert [item.path for item in report.skipped] == [broken.relative_to(own).as_posix()]
+    assert [item.path for item in report.skipped] == [broken.relative_to(catalogue_copy).as_posix()]
     broken.unlink()
-    assert set(rows_of(index)) == {path.relative_to(own).as_posix() for path in own.rglob("*.jpg")}
+    assert set(rows_of(index)) == {
+        path.relative_to(catalogue_copy).as_posix() for path in catalogue_copy.rglob("*.jpg")
+    }
 
 
-def test_a_renamed_photo_is_a_new_photo_that_is_not_embedded_again(own, checkpoint, index, embedded):
-    build_index(own, checkpoint, index, quiet=True)
+def test_a_renamed_photo_is_a_new_photo_that_is_not_embedded_again(catalogue_copy, checkpoint, index, embedded):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
     before = IndexStore(index).open()
     embedded.clear()
-    photo = first_photo(own)
-    moved = photo.rename(sorted(own.iterdir())[1] / "moved.jpg")
-    report = build_index(own, checkpoint, index, quiet=True)
+    photo = first_photo(catalogue_copy)
+    moved = photo.rename(sorted(catalogue_copy.iterdir())[1] / "moved.jpg")
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert embedded == []
     assert (report.photos, report.embedded, report.reused, report.renamed, report.removed) == (24, 0, 24, 1, 1)
     assert "24 unchanged (1 under another name), 1 removed" in next(report.lines())
     after = IndexStore(index).open()
-    old, new = (part.row_number(path.relative_to(own).as_posix()) for part, path in ((before, photo), (after, moved)))
+    old, new = (
+        part.row_number(path.relative_to(catalogue_copy).as_posix()) for part, path in ((before, photo), (after, moved))
+    )
     assert after.rows[new]["object_id"] == moved.parent.name
-    np.testing.assert_array_equal(after.arrays["halves"][new], before.arrays["halves"][old])
+    np.testing.assert_array_equal(after.arrays["partials"][new], before.arrays["partials"][old])
     np.testing.assert_array_equal(after.embeddings[after.slots[new]], before.embeddings[before.slots[old]])
-    assert report.half_error == before.manifest.about["half_error"]
+    assert report.partial_error == before.manifest.about["partial_error"]
 
 
-def test_the_same_picture_under_two_objects_is_two_rows_with_one_vector(own, checkpoint, index):
-    (own / "twin").mkdir()
-    shutil.copy(first_photo(own), own / "twin" / "1.jpg")
-    assert build_index(own, checkpoint, index, quiet=True).photos == 25
+def test_the_same_picture_under_two_objects_is_two_rows_with_one_vector(catalogue_copy, checkpoint, index):
+    (catalogue_copy / "twin").mkdir()
+    shutil.copy(first_photo(catalogue_copy), catalogue_copy / "twin" / "1.jpg")
+    assert build_index(catalogue_copy, checkpoint, index, quiet=True).photos == 25
     generation = IndexStore(index).open()
     twin, original = (
-        generation.row_number(name) for name in ("twin/1.jpg", first_photo(own).relative_to(own).as_posix())
+        generation.row_number(name)
+        for name in ("twin/1.jpg", first_photo(catalogue_copy).relative_to(catalogue_copy).as_posix())
     )
     assert generation.slots[twin] == generation.slots[original]
     assert len(generation.embeddings) == 24
 
 
-def test_new_metadata_alone_embeds_nothing_and_stands_in_the_rows(own, checkpoint, index, embedded):
-    build_index(own, checkpoint, index, quiet=True)
+def test_new_metadata_alone_embeds_nothing_and_stands_in_the_rows(catalogue_copy, checkpoint, index, embedded):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
     embedded.clear()
-    name = first_photo(own).parent.name
-    (own / "metadata.jsonl").write_text(json.dumps({"object_id": name, "price": 3}) + "\n")
-    assert build_index(own, checkpoint, index, quiet=True).reused == 24
+    name = first_photo(catalogue_copy).parent.name
+    (catalogue_copy / "metadata.jsonl").write_text(json.dumps({"object_id": name, "price": 3}) + "\n")
+    assert build_index(catalogue_copy, checkpoint, index, quiet=True).reused == 24
     assert embedded == []
     assert {row["object_id"] for row in rows_of(index).values() if row["metadata"] == {"price": 3}} == {name}
 
 
-def test_a_changed_model_embeds_everything_and_says_so(own, checkpoint, index, embedded, tmp_path):
-    build_index(own, checkpoint, index, quiet=True)
+def test_a_changed_model_embeds_everything_and_says_so(catalogue_copy, checkpoint, index, embedded, tmp_path):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
     embedded.clear()
     other = changed_model(checkpoint, tmp_path / "other.safetensors")
-    report = build_index(own, other, index, quiet=True)
+    report = build_index(catalogue_copy, other, index, quiet=True)
     assert (sum(embedded), report.embedded, report.reused) == (24, 24, 0)
     assert report.reason.startswith(
         f"Every photo was embedded again: the model is another one; the index was written by version {__version__}."
     )
 
 
-def test_a_damaged_index_is_built_anew_and_says_so(own, checkpoint, index):
-    build_index(own, checkpoint, index, quiet=True)
-    halves = index / "gen-000001" / "halves.npy"
-    halves.write_bytes(halves.read_bytes()[:-1])
-    report = build_index(own, checkpoint, index, quiet=True)
+def test_a_damaged_index_is_built_anew_and_says_so(catalogue_copy, checkpoint, index):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    partials = index / "gen-000001" / "partials.npy"
+    partials.write_bytes(partials.read_bytes()[:-1])
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert report.embedded == 24
     assert "not usable, so every photo was embedded again" in report.reason
     assert Searcher.open(index).generation.count == 24
@@ -201,14 +208,16 @@ def test_a_damaged_index_is_built_anew_and_says_so(own, checkpoint, index):
 # What cannot be used -----------------------------------------------------------------------------------------
 
 
-def test_broken_photos_among_many_are_skipped_and_listed_and_stop_nothing(own, checkpoint, index):
-    photos = sorted(own.rglob("*.jpg"))
+def test_broken_photos_among_many_are_skipped_and_listed_and_stop_nothing(catalogue_copy, checkpoint, index):
+    photos = sorted(catalogue_copy.rglob("*.jpg"))
     photos[0].write_bytes(b"")
     photos[7].write_bytes(photos[7].read_bytes()[:900])
     photos[23].write_bytes(b"this is no picture")
-    report = build_index(own, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (report.photos, report.embedded) == (21, 21)
-    assert [item.path for item in report.skipped] == [photos[n].relative_to(own).as_posix() for n in (0, 7, 23)]
+    assert [item.path for item in report.skipped] == [
+        photos[n].relative_to(catalogue_copy).as_posix() for n in (0, 7, 23)
+    ]
     assert all(item.reason for item in report.skipped)
     text = "\n".join(report.lines())
     assert "3 photo(s) skipped:" in text
@@ -216,12 +225,12 @@ def test_broken_photos_among_many_are_skipped_and_listed_and_stop_nothing(own, c
     assert len(json.loads(json.dumps(report.to_dict()))["skipped"]) == 3
 
 
-def test_long_lists_are_cut_for_people_and_whole_in_json(own, checkpoint, index):
+def test_long_lists_are_cut_for_people_and_whole_in_json(catalogue_copy, checkpoint, index):
     for number in range(30):
-        (own / f"broken{number:02}.png").write_bytes(b"x")
-        (own / f"note{number:02}.txt").write_text("x")
-    (own / "metadata.jsonl").write_text('{"object_id": "nobody", "price": 3}\n')
-    report = build_index(own, checkpoint, index, quiet=True)
+        (catalogue_copy / f"broken{number:02}.png").write_bytes(b"x")
+        (catalogue_copy / f"note{number:02}.txt").write_text("x")
+    (catalogue_copy / "metadata.jsonl").write_text('{"object_id": "nobody", "price": 3}\n')
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     lines = list(report.lines())
     assert "  metadata.jsonl speaks of nobody, which is not in the catalogue" in lines
     assert "  and 10 more (--json lists them all)" in lines
@@ -229,12 +238,12 @@ def test_long_lists_are_cut_for_people_and_whole_in_json(own, checkpoint, index)
     assert len(report.to_dict()["skipped"]) == len(report.to_dict()["ignored"]) == 30
 
 
-def test_a_catalogue_of_broken_photos_alone_is_an_error_and_the_old_index_stays(own, checkpoint, index):
-    build_index(own, checkpoint, index, quiet=True)
-    for path in own.rglob("*.jpg"):
+def test_a_catalogue_of_broken_photos_alone_is_an_error_and_the_old_index_stays(catalogue_copy, checkpoint, index):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    for path in catalogue_copy.rglob("*.jpg"):
         path.write_bytes(b"broken")
     with pytest.raises(DatasetError, match=r"no photo in .*catalog can be read; the first: .*1\.jpg: not a PNG"):
-        build_index(own, checkpoint, index, quiet=True)
+        build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert len(rows_of(index)) == 24
 
 
@@ -243,135 +252,141 @@ BAD_NUMBERS = [
     ("photo_tower", float("inf")),
     ("photo_projection", float("nan")),
     ("photo_projection", float("inf")),
-    ("head.photo_half", float("nan")),
-    ("head.photo_half", 1e6),  # more than float16 holds
+    ("head.photo_partial", float("nan")),
+    ("head.photo_partial", 1e6),  # more than float16 holds
 ]
 
 
 @pytest.mark.parametrize(("part", "value"), BAD_NUMBERS)
-def test_a_nan_or_overflow_never_reaches_an_index(part, value, own, checkpoint, index):
+def test_a_nan_or_overflow_never_reaches_an_index(part, value, catalogue_copy, checkpoint, index):
     """A module gives a bad number for the fourth photo: that photo is named, and the old index stays."""
-    build_index(own, checkpoint, index, quiet=True)
-    for path in own.rglob("*.jpg"):
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
+    for path in catalogue_copy.rglob("*.jpg"):
         path.write_bytes(path.read_bytes() + b"other content, the same picture")
 
     def spoil(module, inputs, output):
         return output.index_fill(0, torch.tensor([3]), value) if len(output) == 16 else output
 
     for_inference(checkpoint.matcher).get_submodule(part).register_forward_hook(spoil)
-    with pytest.raises((NumericalError, VectorError), match=list_catalogue(own).photos[3].path):
-        build_index(own, checkpoint, index, quiet=True)
+    with pytest.raises((NumericalError, VectorError), match=list_catalogue(catalogue_copy).photos[3].path):
+        build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert IndexStore(index).current() == "gen-000001"
-    assert np.isfinite(IndexStore(index).open().arrays["halves"]).all()
+    assert np.isfinite(IndexStore(index).open().arrays["partials"]).all()
 
 
-def test_what_cannot_be_built_is_refused_before_anything_is_embedded(own, checkpoint, index, embedded):
+def test_what_cannot_be_built_is_refused_before_anything_is_embedded(catalogue_copy, checkpoint, index, embedded):
     with pytest.raises(ParameterError, match="flat"):
-        build_index(own, checkpoint, index, kind="tree", quiet=True)
+        build_index(catalogue_copy, checkpoint, index, kind="tree", quiet=True)
     with pytest.raises(ParameterError, match="ivf_pq needs 624 or more vectors to train its codes; got 24"):
-        build_index(own, checkpoint, index, kind="ivf_pq", quiet=True)
+        build_index(catalogue_copy, checkpoint, index, kind="ivf_pq", quiet=True)
     for recall in (0, -0.1, 1.01, float("nan")):
         with pytest.raises(BadInput, match="least winner recall"):
-            build_index(own, checkpoint, index, min_recall=recall, quiet=True)
+            build_index(catalogue_copy, checkpoint, index, min_recall=recall, quiet=True)
     for budget in (0, -1, float("nan")):
         with pytest.raises(BadInput, match="must be above 0 ms"):
-            build_index(own, checkpoint, index, max_ms=budget, quiet=True)
+            build_index(catalogue_copy, checkpoint, index, max_ms=budget, quiet=True)
     assert embedded == []
 
 
-def test_a_second_writer_is_refused(own, checkpoint, index, embedded):
+def test_a_second_writer_is_refused(catalogue_copy, checkpoint, index, embedded):
     with IndexStore(index).lock(), pytest.raises(LockedIndex):
-        build_index(own, checkpoint, index, quiet=True)
+        build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert embedded == []
 
 
 # What is said of the result ------------------------------------------------------------------------------------
 
 
-def test_the_error_of_float16_halves_is_stated_and_small(own, checkpoint, index):
-    report = build_index(own, checkpoint, index, quiet=True)
+def test_the_error_of_float16_partials_is_stated_and_small(catalogue_copy, checkpoint, index):
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     generation = IndexStore(index).open()
     load = checkpoint.config.preprocessing.load_photo
-    exact = encode_photos(checkpoint.matcher, [load(own / row["path"]) for row in generation.rows]).half.numpy()
-    stored = np.asarray(generation.arrays["halves"])
+    exact = encode_photos(
+        checkpoint.matcher, [load(catalogue_copy / row["path"]) for row in generation.rows]
+    ).partial.numpy()
+    stored = np.asarray(generation.arrays["partials"])
     assert stored.dtype == np.float16
     error = float(np.abs(stored - exact).max())
-    assert report.half_error == pytest.approx(error, abs=1e-5)  # the tower's batches were others
-    assert 0 < report.half_error <= 2**-11 * np.abs(exact).max()  # half a step of 11 bits
-    assert generation.manifest.about["half_error"] == report.half_error
-    assert f"within {report.half_error:.2g} of" in "\n".join(report.lines())
+    assert report.partial_error == pytest.approx(error, abs=1e-5)  # the tower's batches were others
+    assert 0 < report.partial_error <= 2**-11 * np.abs(exact).max()  # half a step of 11 bits
+    assert generation.manifest.about["partial_error"] == report.partial_error
+    assert f"within {report.partial_error:.2g} of" in "\n".join(report.lines())
 
 
-def test_exact_search_is_the_default_and_vectors_are_measured_only_for_a_budget(own, checkpoint, index, monkeypatch):
+def test_exact_search_is_the_default_and_vectors_are_measured_only_for_a_budget(
+    catalogue_copy, checkpoint, index, monkeypatch
+):
     measured = []
     monkeypatch.setattr(
         operating, "NeighbourBench", lambda vectors: measured.append(len(vectors)) or NeighbourBench(vectors)
     )
-    assert build_index(own, checkpoint, index, quiet=True).kind == "flat"
+    assert build_index(catalogue_copy, checkpoint, index, quiet=True).kind == "flat"
     assert measured == []
-    report = build_index(own, checkpoint, index, max_ms=1e-9, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index, max_ms=1e-9, quiet=True)
     assert (measured, report.candidates) == ([24], None)
     assert "reaches 1e-09 ms; this is the nearest" in report.reason
     assert "keeps no touches to measure candidates with, so recall is that of nearest neighbours" in report.reason
-    assert "hnsw" in "\n".join(build_index(own, checkpoint, index, kind="hnsw", quiet=True).lines())
+    assert "hnsw" in "\n".join(build_index(catalogue_copy, checkpoint, index, kind="hnsw", quiet=True).lines())
     assert Searcher.open(index).generation.manifest.kind == "hnsw"
 
 
-def test_few_photos_are_all_judged_and_nothing_is_measured(own, queried, index, monkeypatch):
-    monkeypatch.setattr(operating, "WinnerBench", None)
-    report = build_index(own, queried, index, quiet=True)
+def test_few_photos_are_all_scored_without_a_measurement(catalogue_copy, queried, index, monkeypatch):
+    monkeypatch.setattr(operating, "ExhaustiveBench", None)
+    report = build_index(catalogue_copy, queried, index, quiet=True)
     assert (report.candidates["k"], report.candidates["queries"]) == (24, 0)
     assert "candidate search: flat. The classifier judges all 24 photos." in list(report.lines())
 
 
 @pytest.fixture
 def queried(checkpoint, tmp_path):
-    """A checkpoint with a pruner, and touches to measure with."""
+    """A checkpoint with a candidate_encoder, and touches to measure with."""
     config = dataclasses.replace(
-        checkpoint.config, matcher=dataclasses.replace(checkpoint.config.matcher, pruner_width=8)
+        checkpoint.config, matcher=dataclasses.replace(checkpoint.config.matcher, candidate_width=8)
     )
     torch.manual_seed(3)
     matcher = Matcher(config.matcher)
     matcher.load_state_dict(checkpoint.matcher.state_dict(), strict=False)
-    halves = np.random.default_rng(3).normal(size=(30, config.matcher.hidden)).astype(np.float16)
+    partials = np.random.default_rng(3).normal(size=(30, config.matcher.hidden)).astype(np.float16)
     path = tmp_path / "queried.safetensors"
-    save_checkpoint(path, matcher, config, split=None, provenance=PROVENANCE, queries=halves)
+    save_checkpoint(path, matcher, config, split=None, provenance=PROVENANCE, queries=partials)
     return load_checkpoint(path)
 
 
-def test_the_measured_operating_point_stands_in_the_manifest_and_is_said(own, queried, index, monkeypatch):
-    monkeypatch.setattr(measuring, "FIRST", 4)
-    report = build_index(own, queried, index, min_recall=0.5, quiet=True)
+def test_the_measured_operating_point_is_in_manifest_and_report(catalogue_copy, queried, index, monkeypatch):
+    monkeypatch.setattr(measuring, "EXHAUSTIVE_LIMIT", 4)
+    report = build_index(catalogue_copy, queried, index, min_recall=0.5, quiet=True)
     record = IndexStore(index).open().manifest.about["candidates"]
     assert record == report.candidates
-    assert (record["queries"], record["photos"], record["asked"]["min_recall"]) == (30, 24, 0.5)
-    assert record["winner_recall"] >= 0.5
+    assert (record["queries"], record["photos"], record["requirements"]["min_recall"]) == (30, 24, 0.5)
+    assert record["top1_agreement"] >= 0.5
     assert "validation touches (95 % interval" in "\n".join(report.lines())
 
 
-def test_newcomers_and_old_photos_are_measured_together_once_enough_changed(own, queried, index, monkeypatch):
-    monkeypatch.setattr(measuring, "FIRST", 4)
+def test_newcomers_and_old_photos_are_measured_together_once_enough_changed(
+    catalogue_copy, queried, index, monkeypatch
+):
+    monkeypatch.setattr(measuring, "EXHAUSTIVE_LIMIT", 4)
     benches = []
     monkeypatch.setattr(
-        operating, "WinnerBench", lambda *made, **how: benches.append(made[1:]) or WinnerBench(*made, **how)
+        operating, "ExhaustiveBench", lambda *made, **how: benches.append(made[1:]) or ExhaustiveBench(*made, **how)
     )
-    build_index(own, queried, index, quiet=True)
-    other_picture(own / "newcomer" / "1.jpg", seed=78)
-    assert build_index(own, queried, index, quiet=True).candidates["changed"] == 1
-    other_picture(own / "newcomer" / "2.jpg", seed=79)
-    other_picture(own / "newcomer" / "3.jpg", seed=80)
-    assert build_index(own, queried, index, quiet=True).candidates["photos"] == 27
-    assert [len(halves) for *_, halves in benches] == [24, 27]
-    generation, (vectors, slots, halves) = IndexStore(index).open(), benches[1]
-    np.testing.assert_array_equal(halves[:], generation.arrays["halves"][:])
+    build_index(catalogue_copy, queried, index, quiet=True)
+    other_picture(catalogue_copy / "newcomer" / "1.jpg", seed=78)
+    assert build_index(catalogue_copy, queried, index, quiet=True).candidates["changed"] == 1
+    other_picture(catalogue_copy / "newcomer" / "2.jpg", seed=79)
+    other_picture(catalogue_copy / "newcomer" / "3.jpg", seed=80)
+    assert build_index(catalogue_copy, queried, index, quiet=True).candidates["photos"] == 27
+    assert [len(partials) for *_, partials in benches] == [24, 27]
+    generation, (vectors, slots, partials) = IndexStore(index).open(), benches[1]
+    np.testing.assert_array_equal(partials[:], generation.arrays["partials"][:])
     np.testing.assert_array_equal(vectors[slots], generation.embeddings[generation.slots])
 
 
 def test_the_recall_of_neighbours_is_measured_with_touches_where_the_checkpoint_keeps_some(
-    own, checkpoint, queried, index, tmp_path
+    catalogue_copy, checkpoint, queried, index, tmp_path
 ):
-    build_index(own, queried, index, kind="hnsw", quiet=True)
-    build_index(own, checkpoint, tmp_path / "other", kind="hnsw", quiet=True)
+    build_index(catalogue_copy, queried, index, kind="hnsw", quiet=True)
+    build_index(catalogue_copy, checkpoint, tmp_path / "other", kind="hnsw", quiet=True)
     with_touches, without = (IndexStore(path).open().manifest.recall for path in (index, tmp_path / "other"))
     assert (with_touches["queries"], with_touches["how"]) == (30, "measured on the queries that were given")
     assert without["how"] == "measured on moved own vectors"
@@ -392,7 +407,7 @@ def test_looking_ahead_keeps_the_order_and_never_runs_further_than_its_window():
         time.sleep(0.002 if number % 7 == 0 else 0)
         return number
 
-    for place, number in enumerate(ahead(slow, items(), threads=3, window=5)):
+    for place, number in enumerate(map_ahead(slow, items(), threads=3, window=5)):
         assert number == place
         assert len(taken) <= place + 5
 
@@ -401,7 +416,7 @@ def test_an_error_on_a_thread_comes_out_where_the_item_would():
     def fail(number):
         return 1 / (number - 3)
 
-    results = ahead(fail, range(9), threads=2, window=4)
+    results = map_ahead(fail, range(9), threads=2, window=4)
     assert [next(results) for _ in range(3)] == [-1 / 3, -1 / 2, -1]
     with pytest.raises(ZeroDivisionError):
         next(results)

@@ -42,7 +42,7 @@ def test_it_says_how_many_photos_each_object_has_and_shows_three(tmp_path, photo
     lines = list(report.lines())
     assert "3 objects by --objects-from folder; photos of each: 1 / 2 / 3 (min, median, max)" in lines
     assert "  mug <- mug/0.jpg" in lines
-    assert report.doubts == []
+    assert report.warnings == []
 
 
 def test_a_data_sets_layout_is_warned_of_and_a_pattern_puts_it_right(tmp_path, photos, checkpoint, index):
@@ -53,16 +53,16 @@ def test_a_data_sets_layout_is_warned_of_and_a_pattern_puts_it_right(tmp_path, p
     assert any(line.startswith("warning: test, train are taken for the name of an object") for line in report.lines())
     report = build_index(own, checkpoint, index, objects_from="{split}/{object}/{photo}", quiet=True)
     assert set(objects(index).values()) == {"mug", "cup"}
-    assert (report.written, report.embedded, report.doubts) == (True, 0, [])
+    assert (report.written, report.embedded, report.warnings) == (True, 0, [])
 
 
 def test_numbered_files_are_warned_of_and_stem_puts_them_right(tmp_path, photos, checkpoint, index):
     """Every photo had become an object of its own, silently."""
     own = laid_out(tmp_path / "own", photos, "mug_0.jpg", "mug_1.jpg", "cup-1.jpg", "cup-2.jpg")
     report = build_index(own, checkpoint, index, quiet=True)
-    assert "every object has one photo, and 4 of 4" in report.doubts[0]
+    assert "every object has one photo, and 4 of 4" in report.warnings[0]
     report = build_index(own, checkpoint, index, objects_from="stem", quiet=True)
-    assert (report.objects, report.doubts) == (2, [])
+    assert (report.objects, report.warnings) == (2, [])
 
 
 def test_the_index_keeps_the_rule_and_says_when_it_changes(tmp_path, photos, checkpoint, index):

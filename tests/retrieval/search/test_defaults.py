@@ -10,7 +10,7 @@ import pytest
 from _touch_retrieval.files import file_digest
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput, CheckpointError
-from retrieval.model.stored import read_stored
+from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.search import defaults
 
 AT_IMPORT = defaults._state_file()
@@ -43,9 +43,9 @@ def of_a_fixture():
 
 def test_nothing_that_these_tests_make_is_remembered_for_the_user(of_a_fixture, monkeypatch):
     """A slow test's training was the default of the next run's fixtures."""
-    own = defaults._state_file()
+    catalogue_copy = defaults._state_file()
     monkeypatch.delenv("XDG_STATE_HOME")
-    assert len({AT_IMPORT, of_a_fixture, own, defaults._state_file()}) == 4
+    assert len({AT_IMPORT, of_a_fixture, catalogue_copy, defaults._state_file()}) == 4
 
 
 def test_what_is_given_is_taken_even_if_it_is_not_there():
@@ -63,7 +63,7 @@ def test_shipped_models_are_named_by_the_fingers_that_they_take():
     assert defaults.find_model("shipped")[0] == defaults.shipped_model()
     assert defaults.find_model("shipped-one-finger")[0] == defaults.shipped_model(1)
     for fingers in (1, 2):
-        assert read_stored(defaults.shipped_model(fingers)).config.matcher.fingers == fingers
+        assert read_checkpoint_info(defaults.shipped_model(fingers)).config.matcher.fingers == fingers
     with pytest.raises(BadInput, match="1 and of 2 gel images"):
         defaults.shipped_model(3)
 
@@ -113,14 +113,14 @@ def test_what_was_made_from_another_folder_is_never_taken(tmp_path, monkeypatch)
 
 def test_an_index_in_the_folder_knows_its_own_model(tmp_path, monkeypatch):
     shipped_in(tmp_path, monkeypatch)
-    own, newer = tmp_path / "own.safetensors", tmp_path / "newer.safetensors"
-    own.write_bytes(b"own")
+    catalogue_copy, newer = tmp_path / "own.safetensors", tmp_path / "newer.safetensors"
+    catalogue_copy.write_bytes(b"own")
     newer.write_bytes(b"newer")
-    index_built_with(own, tmp_path / "index")
-    assert defaults.find_model(None) == (own, "the one that index was built with")
+    index_built_with(catalogue_copy, tmp_path / "index")
+    assert defaults.find_model(None) == (catalogue_copy, "the one that index was built with")
     defaults.remember("model", newer)
     assert defaults.find_model(None) == (
-        own,
+        catalogue_copy,
         f"the one that index was built with; {newer} was trained in this folder too: name it to take it",
     )
     assert defaults.find_model(None, Path("elsewhere"))[0] == newer  # no index is there to know better
@@ -145,7 +145,7 @@ def test_a_damaged_index_names_no_model(tmp_path, monkeypatch):
 
 
 def test_only_so_many_folders_are_remembered(tmp_path, monkeypatch):
-    monkeypatch.setattr(defaults, "MOST_FOLDERS", 2)
+    monkeypatch.setattr(defaults, "MAX_FOLDERS", 2)
     for name in "abac":
         (tmp_path / name).mkdir(exist_ok=True)
         monkeypatch.chdir(tmp_path / name)

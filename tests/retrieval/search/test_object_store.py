@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 
 from indexes.errors import CorruptIndex, NoIndex
-from indexes.store.cluster import cluster_file, read_cluster
+from indexes.store.sharded import read_sharded_manifest, sharded_manifest_bytes
 from retrieval.commands.main import main
 from retrieval.console.files import cache_folder
 from retrieval.data import storage
-from retrieval.errors import BadInput, StorageError
+from retrieval.errors import BadInput, RemoteStorageError
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.query.searcher import Searcher
-from retrieval.search.sharding import build_cluster as building
+from retrieval.search.sharding import build_sharded as building
 from retrieval.search.sharding import object_store
-from retrieval.search.sharding.build_cluster import build_cluster
-from retrieval.search.sharding.object_store import StoredCluster
+from retrieval.search.sharding.build_sharded import build_sharded
+from retrieval.search.sharding.object_store import RemoteShardedIndex
 from tests import s3
 from tests.retrieval.search.test_shards import same_answers
 
@@ -32,7 +32,7 @@ URL = "memory://bucket/cluster"
 
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch):
-    monkeypatch.setattr(storage, "WAITS_S", (0.0,) * 5)
+    monkeypatch.setattr(storage, "RETRY_WAITS_S", (0.0,) * 5)
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def build(catalogue, model):
     """Builds the catalogue, or another one, in four shards behind the URL."""
 
     def built(folder=catalogue, shards=4, **how):
-        return build_cluster(folder, load_checkpoint(model), URL, shards, quiet=True, **how)
+        return build_sharded(folder, load_checkpoint(model), URL, shards, quiet=True, **how)
 
     return built
 
@@ -72,7 +72,7 @@ def changed(catalogue, folder, times=1):
 # Building and searching -----------------------------------------------------------------------------------------------
 
 
-def test_answers_are_those_of_the_cluster_in_a_folder(build, store, searcher, grasps):
+def test_answers_equal_those_of_the_sharded_index_in_a_folder(build, store, searcher, grasps):
     report = build()
     assert (report.index, report.photos, report.embedded, len(report.shards)) == (URL, 24, 24, 4)
     another_machine()
@@ -102,9 +102,9 @@ def test_a_changed_catalogue_puts_the_shards_that_changed_and_keeps_the_generati
     assert first <= set(store)
     second = set(store)
     build(changed(catalogue, tmp_path / "c", 2))
-    third = StoredCluster(URL)
-    entries = third.parsed(third.manifest()).shards
-    assert third.generations().keys() == {*object_store.names(entries), *_generations(second - first)}
+    third = RemoteShardedIndex(URL)
+    entries = third.parse_manifest(third.manifest()).shards
+    assert third.generations().keys() == {*object_store.generation_names(entries), *_generations(second - first)}
 
 
 def _generations(paths):
@@ -131,7 +131,7 @@ def test_what_was_fetched_stays_and_old_generations_go(build, store, catalogue, 
         build(changed(catalogue, tmp_path / "c", times))
         Searcher.open(URL).close()
     kept = list((cache_folder() / "shards").glob("*/*/shard-*/gen-*"))
-    assert len(kept) == 4 * object_store.KEPT
+    assert len(kept) == 4 * object_store.MAX_FETCHED_GENERATIONS
 
 
 # Faults ---------------------------------------------------------------------------------------------------------------
@@ -195,7 +195,7 @@ def test_killed_at_any_request_one_cluster_or_the_other_answers_and_nothing_is_e
             build(folder)
         requests.rule = None
         with Searcher.open(URL) as opened:
-            seen.append(opened.described.photos)
+            seen.append(opened.info.photos)
             if seen[-1] == 24:
                 same_answers(opened.query(touch), expected)
         report = build(folder)
@@ -217,7 +217,7 @@ def test_killed_before_the_first_switch_there_is_no_cluster_and_another_machine_
     requests.rule = None
     with pytest.raises(NoIndex, match="there is no cluster here"):
         Searcher.open(URL)
-    whole = [name for name, is_whole in StoredCluster(URL).generations().items() if is_whole]
+    whole = [name for name, is_whole in RemoteShardedIndex(URL).generations().items() if is_whole]
     assert 1 <= len(whole) < 4
     embedded.clear()
     another_machine()
@@ -267,13 +267,13 @@ def test_a_store_that_refuses_one_request_of_twenty_loses_nothing(build, store, 
     assert len(refused) >= 5
 
 
-def test_a_store_that_goes_on_refusing_is_told_and_the_work_is_kept(build, store, requests, embedded):
+def test_a_store_that_keeps_refusing_is_an_error_and_the_work_is_stored(build, store, requests, embedded):
     def refuse(name, *_):
         if name == "put_file":
             raise OSError("503 Slow Down")
 
     requests.rule = refuse
-    with pytest.raises(StorageError, match=r"memory://bucket/cluster/shard-0.*: the storage refused 6 times"):
+    with pytest.raises(RemoteStorageError, match=r"memory://bucket/cluster/shard-0.*: the storage refused 6 times"):
         build()
     requests.rule = None
     assert sum(embedded) > 0
@@ -281,7 +281,7 @@ def test_a_store_that_goes_on_refusing_is_told_and_the_work_is_kept(build, store
     assert sum(embedded) == 24
 
 
-@pytest.mark.parametrize("what", ["halves.npy", "manifest.json", "rows.jsonl"])
+@pytest.mark.parametrize("what", ["partials.npy", "manifest.json", "rows.jsonl"])
 @pytest.mark.parametrize("how", ["torn", "altered", "gone"])
 def test_damage_in_the_store_is_named_and_mended(what, how, build, store, touch):
     build()
@@ -311,28 +311,28 @@ def test_damage_that_another_machine_finds_is_embedded_again(build, store, embed
     assert 0 < report.embedded == sum(embedded) < 24
     another_machine()
     with Searcher.open(URL) as opened:
-        assert opened.described.photos == 24
+        assert opened.info.photos == 24
 
 
-def test_of_two_builds_at_once_the_second_is_told_and_embeds_nothing_twice(
+def test_the_second_of_two_concurrent_builds_fails_and_embeds_nothing_twice(
     build, store, catalogue, tmp_path, monkeypatch, touch, embedded
 ):
     build()
-    run = building.one_after_another
+    run = building.build_in_process
     other = changed(catalogue, tmp_path / "other", 2)
 
     def meanwhile(jobs, checkpoint):
         found = list(run(jobs, checkpoint))
-        monkeypatch.setattr(building, "one_after_another", run)
+        monkeypatch.setattr(building, "build_in_process", run)
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))  # another machine
         build(other)
         return found
 
-    monkeypatch.setattr(building, "one_after_another", meanwhile)
-    with pytest.raises(StorageError, match="another build put its own cluster there meanwhile"):
+    monkeypatch.setattr(building, "build_in_process", meanwhile)
+    with pytest.raises(RemoteStorageError, match="another build put its own cluster there meanwhile"):
         build(changed(catalogue, tmp_path / "c"))
     with Searcher.open(URL) as opened:
-        assert opened.described.photos == 26
+        assert opened.info.photos == 26
         assert opened.query(touch).index["searched"] == 1.0
     embedded.clear()
     assert (build(changed(catalogue, tmp_path / "c")).photos, embedded) == (25, [])
@@ -343,33 +343,35 @@ def test_of_two_builds_at_once_the_second_is_told_and_embeds_nothing_twice(
 
 def test_a_forged_digest_leads_nowhere(build, store, cluster):
     build()
-    manifest = read_cluster(cluster)
+    manifest = read_sharded_manifest(cluster)
     entry = dataclasses.replace(manifest.shards[0], sha256="../../../elsewhere")
     forged = dataclasses.replace(manifest, shards=[entry])
-    fsspec.filesystem("memory").pipe_file("/bucket/cluster/CLUSTER.json", cluster_file(forged))
+    fsspec.filesystem("memory").pipe_file("/bucket/cluster/CLUSTER.json", sharded_manifest_bytes(forged))
     with pytest.raises(CorruptIndex, match=r"memory://bucket/cluster: .*shards\[0\]\.sha256 must be"):
         Searcher.open(URL)
 
 
-@pytest.mark.parametrize("content", [b"", b"{}", b"no JSON", b"[" * 100_000, b"x" * (object_store.MOST_BYTES + 1)])
+@pytest.mark.parametrize(
+    "content", [b"", b"{}", b"no JSON", b"[" * 100_000, b"x" * (object_store.MAX_MANIFEST_BYTES + 1)]
+)
 def test_a_manifest_that_is_none_is_refused_in_a_sentence(content, store):
     fsspec.filesystem("memory").pipe_file("/bucket/cluster/CLUSTER.json", content)
-    with pytest.raises((CorruptIndex, StorageError), match="memory://bucket/cluster"):
+    with pytest.raises((CorruptIndex, RemoteStorageError), match="memory://bucket/cluster"):
         Searcher.open(URL)
 
 
 def test_urls_that_are_none_are_refused(tmp_path):
     with pytest.raises(BadInput, match="is a folder of this machine"):
-        StoredCluster(f"file://{tmp_path}")
+        RemoteShardedIndex(f"file://{tmp_path}")
     with pytest.raises(BadInput, match="cannot be opened"):
-        StoredCluster("nosuch://bucket/cluster")
+        RemoteShardedIndex("nosuch://bucket/cluster")
 
 
 def test_commands_take_a_url(store, catalogue, model, touch, capsys):
     build = ["build-index", str(catalogue), "--model", str(model), "--out", URL]
     assert main([*build, "--preview"]) == 2
     assert main(build) == 0
-    assert len(StoredCluster(URL).generations()) == 1
+    assert len(RemoteShardedIndex(URL).generations()) == 1
     assert main([*build, "--shards", "3"]) == 0
     assert main(build) == 0
     capsys.readouterr()
@@ -394,7 +396,7 @@ def test_photos_on_s3_become_a_cluster_on_s3_whatever_it_refuses_and_tears(
     s3.put(catalogue, "photos/catalog")
     s3_server.refuse, s3_server.tear = 20, 7
     url = "s3://photos/cluster"
-    report = build_cluster("s3://photos/catalog", load_checkpoint(model), url, 4, quiet=True)
+    report = build_sharded("s3://photos/catalog", load_checkpoint(model), url, 4, quiet=True)
     assert (report.photos, report.embedded, report.skipped) == (24, 24, [])
     assert s3_server.refused
     assert s3_server.torn
@@ -403,7 +405,7 @@ def test_photos_on_s3_become_a_cluster_on_s3_whatever_it_refuses_and_tears(
         for own in grasps:
             ours, theirs = opened.query(own), searcher.query(own)
             assert [match.photo for match in ours.results] == [match.photo for match in theirs.results]
-    again = build_cluster("s3://photos/catalog", load_checkpoint(model), url, 4, quiet=True)
+    again = build_sharded("s3://photos/catalog", load_checkpoint(model), url, 4, quiet=True)
     assert (again.written, again.embedded) == (False, 0)
 
 
@@ -413,11 +415,11 @@ def switches(s3_server, cluster):
     function that has the first switch, the second doing so between the first one's last look and its request."""
     s3_server.refuse = s3_server.tear = None
     s3.put(cluster, "photos/else")
-    manifest = read_cluster(cluster)
+    manifest = read_sharded_manifest(cluster)
     mine, theirs = (dataclasses.replace(manifest, about={"catalogue": name}) for name in ("mine", "theirs"))
 
     def switch(url, before):
-        first, second = StoredCluster(url), StoredCluster(url)
+        first, second = RemoteShardedIndex(url), RemoteShardedIndex(url)
         if before:
             first.switch(None, manifest)
         seen, put, left = first.manifest(), first._system.pipe_file, [theirs]
@@ -442,9 +444,9 @@ def test_of_two_that_both_looked_the_store_lets_one_switch(before, switches, s3_
         pytest.importorskip("moto", "5.1.5", reason="this moto replaces a file whatever the condition")
     switch, _, theirs = switches
     url = f"s3://photos/raced-{before}"
-    with pytest.raises(StorageError, match=rf"{url}: another build put its own cluster there meanwhile"):
+    with pytest.raises(RemoteStorageError, match=rf"{url}: another build put its own cluster there meanwhile"):
         switch(url, before)
-    assert StoredCluster(url).manifest() == cluster_file(theirs)
+    assert RemoteShardedIndex(url).manifest() == sharded_manifest_bytes(theirs)
     assert s3_server.conditional >= 2
 
 
@@ -457,9 +459,9 @@ def test_a_store_without_conditional_writes_is_looked_at_before_the_switch(condi
     s3_server.conditions = conditions
     url = f"s3://photos/{conditions}"
     switch(url, True)
-    stored = StoredCluster(url)
-    assert stored.manifest() == cluster_file(mine)
-    with pytest.raises(StorageError, match="another build put its own cluster there meanwhile"):
+    stored = RemoteShardedIndex(url)
+    assert stored.manifest() == sharded_manifest_bytes(mine)
+    with pytest.raises(RemoteStorageError, match="another build put its own cluster there meanwhile"):
         stored.switch(b"an older one", theirs)
 
 
@@ -467,7 +469,7 @@ def test_a_store_without_conditional_writes_is_looked_at_before_the_switch(condi
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 def test_a_switch_that_was_torn_or_not_answered_is_made_again(switches, s3_server):
     _, mine, theirs = switches
-    stored = StoredCluster("s3://photos/torn")
+    stored = RemoteShardedIndex("s3://photos/torn")
     stored.switch(None, theirs)
     seen, put, failures = stored.manifest(), stored._system.pipe_file, ["torn", "not answered"]
 
@@ -480,7 +482,7 @@ def test_a_switch_that_was_torn_or_not_answered_is_made_again(switches, s3_serve
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stored._system, "pipe_file", failing)
         stored.switch(seen, mine)
-    assert (stored.manifest(), failures) == (cluster_file(mine), [])
+    assert (stored.manifest(), failures) == (sharded_manifest_bytes(mine), [])
 
 
 @pytest.mark.slow
@@ -488,18 +490,18 @@ def test_a_switch_that_was_torn_or_not_answered_is_made_again(switches, s3_serve
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `cluster`")
 def test_ray_builds_into_and_holds_a_cluster_on_s3(s3_server, catalogue, model, searcher, grasps):
     """Whoever holds a shard fetches it."""
-    from retrieval.cluster.building import by_ray
-    from retrieval.cluster.serving import Deployments, Held
-    from retrieval.cluster.session import connected
+    from retrieval.cluster.building import ray_runner
+    from retrieval.cluster.serving import Deployments, ReplicaSettings
+    from retrieval.cluster.session import ray_session
 
     s3_server.refuse = s3_server.tear = None
     s3.put(catalogue, "photos/catalog")
-    with connected(2) as ray:
+    with ray_session(2) as ray:
         url, checkpoint = "s3://photos/by-ray", load_checkpoint(model)
-        report = build_cluster("s3://photos/catalog", checkpoint, url, 2, quiet=True, run=by_ray(workers=1))
+        report = build_sharded("s3://photos/catalog", checkpoint, url, 2, quiet=True, run=ray_runner(workers=1))
         assert (report.photos, report.embedded) == (24, 24)
         another_machine()
-        held = Deployments(ray, Held(cpus=0.1, wait_s=120.0))
+        held = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=120.0))
         with Searcher.open(url, shards=held.open) as opened:
             for own in grasps:
                 ours, theirs = opened.query(own), searcher.query(own)

@@ -14,15 +14,15 @@ from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import Matcher
 from retrieval.search.build import measuring
-from retrieval.search.build.measuring import NeighbourBench, Point, WinnerBench, can_measure, query_codes
+from retrieval.search.build.measuring import ExhaustiveBench, NeighbourBench, SearchPoint, can_measure, query_codes
 from retrieval.search.build.operating import (
     SearchRequirements,
-    all_judged,
-    carried_over,
-    needs_measuring,
-    sentence,
-    settle,
-    settle_by_neighbours,
+    carry_over,
+    choose_by_agreement,
+    choose_by_neighbours,
+    exhaustive_record,
+    needs_measurement,
+    operating_point_sentence,
 )
 from tests import plugins
 from tests.conftest import TINY
@@ -30,13 +30,13 @@ from tests.conftest import TINY
 PHOTOS, TOUCHES = 70, 40
 
 
-def checkpoint_of(pruner_width=8, queries=TOUCHES):
+def checkpoint_of(candidate_width=8, queries=TOUCHES):
     """A matcher with random weights whose queries are random halves."""
     torch.manual_seed(0)
-    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, pruner_width=pruner_width))
-    halves = np.random.default_rng(1).normal(size=(queries, config.matcher.half)).astype(np.float16)
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, candidate_width=candidate_width))
+    partials = np.random.default_rng(1).normal(size=(queries, config.matcher.partial_width)).astype(np.float16)
     matcher = Matcher(config.matcher).eval()
-    return Checkpoint(Path("m"), "0" * 64, config, {}, gel_check=None, matcher=matcher, split=None, queries=halves)
+    return Checkpoint(Path("m"), "0" * 64, config, {}, gel_check=None, matcher=matcher, split=None, queries=partials)
 
 
 @pytest.fixture
@@ -48,28 +48,31 @@ def checkpoint():
 def gallery(checkpoint):
     """Distinct vectors, each photo's place among them, and halves; the last ten photos are copies of the first ten, and
     the first vector is nobody's."""
-    halves = np.random.default_rng(2).normal(size=(PHOTOS, checkpoint.config.matcher.half)).astype(np.float16)
-    halves[-10:] = halves[:10]
+    partials = (
+        np.random.default_rng(2).normal(size=(PHOTOS, checkpoint.config.matcher.partial_width)).astype(np.float16)
+    )
+    partials[-10:] = partials[:10]
     with torch.inference_mode():
-        embeddings = checkpoint.matcher.pruner.photo(torch.from_numpy(halves.astype(np.float32))).numpy()
+        embeddings = checkpoint.matcher.candidate_encoder.photo(torch.from_numpy(partials.astype(np.float32))).numpy()
     slots = np.concatenate([np.arange(PHOTOS - 10), np.arange(10)]) + 1
-    return np.concatenate([embeddings[50:51], embeddings[:-10]]), slots, halves
+    return np.concatenate([embeddings[50:51], embeddings[:-10]]), slots, partials
 
 
 @pytest.fixture(autouse=True)
 def _short_ladder(monkeypatch):
-    monkeypatch.setattr(measuring, "FIRST", 4)
+    monkeypatch.setattr(measuring, "EXHAUSTIVE_LIMIT", 4)
 
 
-def winners_found(checkpoint, vectors, slots, halves, k):
+def top1_found(checkpoint, vectors, slots, partials, k):
     """By plain loops: of how many touches the best photo, or its copy, has fewer than k distinct better embeddings."""
     embeddings, found = vectors[slots], 0
     for touch in torch.from_numpy(checkpoint.queries.astype(np.float32)):
         with torch.inference_mode():
             logits = [
-                float(checkpoint.matcher.head(touch, torch.from_numpy(half))) for half in halves.astype(np.float32)
+                float(checkpoint.matcher.head(touch, torch.from_numpy(partial)))
+                for partial in partials.astype(np.float32)
             ]
-            query = checkpoint.matcher.pruner.touch(touch).numpy()
+            query = checkpoint.matcher.candidate_encoder.touch(touch).numpy()
         best = embeddings[int(np.argmax(logits))]
         better = {row.tobytes() for row in embeddings if row @ query > best @ query}
         found += len(better) < k
@@ -77,47 +80,50 @@ def winners_found(checkpoint, vectors, slots, halves, k):
 
 
 @pytest.mark.parametrize("k", [4, 8, 16, 32])
-def test_the_winner_recall_is_that_of_two_plain_loops(k, checkpoint, gallery):
-    bench = WinnerBench(checkpoint, *gallery)
+def test_top1_agreement_equals_two_plain_loops(k, checkpoint, gallery):
+    bench = ExhaustiveBench(checkpoint, *gallery)
     point = bench.point(bench.built("flat"), k)
-    assert (point.found, point.queries) == (winners_found(checkpoint, *gallery, k), TOUCHES)
+    assert (point.found, point.queries) == (top1_found(checkpoint, *gallery, k), TOUCHES)
 
 
-def test_judging_every_photo_finds_every_winner_and_searches_nothing(checkpoint, gallery, monkeypatch):
-    bench = WinnerBench(checkpoint, *gallery)
+def test_scoring_every_photo_finds_every_top1_without_search(checkpoint, gallery, monkeypatch):
+    bench = ExhaustiveBench(checkpoint, *gallery)
     index = bench.built("flat")
     monkeypatch.setattr(index, "search", None)
     point = bench.point(index, PHOTOS)
-    assert (point.recall, point.search_ms, point.judge_ms) == (1.0, 0.0, bench.exhaustive_ms)
+    assert (point.recall, point.search_ms, point.rerank_ms) == (1.0, 0.0, bench.exhaustive_ms)
 
 
 def test_by_default_exact_search_takes_the_least_k_of_the_ladder_with_the_recall(checkpoint, gallery):
-    settled = settle(WinnerBench(checkpoint, *gallery), SearchRequirements())
-    enough = [k for k in (4, 8, 16, 32, 64) if winners_found(checkpoint, *gallery, k) >= 0.99 * TOUCHES]
+    settled = choose_by_agreement(ExhaustiveBench(checkpoint, *gallery), SearchRequirements())
+    enough = [k for k in (4, 8, 16, 32, 64) if top1_found(checkpoint, *gallery, k) >= 0.99 * TOUCHES]
     assert settled.kind == "flat"
     assert settled.candidates["k"] == min([*enough, PHOTOS])
-    assert settled.candidates["winner_recall"] >= 0.99
-    assert settled.candidates["interval"][0] < settled.candidates["winner_recall"]
+    assert settled.candidates["top1_agreement"] >= 0.99
+    assert settled.candidates["interval"][0] < settled.candidates["top1_agreement"]
 
 
 def test_a_lower_recall_takes_fewer_candidates(checkpoint, gallery):
-    bench = WinnerBench(checkpoint, *gallery)
-    low, high = (settle(bench, SearchRequirements("flat", min_recall=recall)).candidates["k"] for recall in (0.3, 1.0))
+    bench = ExhaustiveBench(checkpoint, *gallery)
+    low, high = (
+        choose_by_agreement(bench, SearchRequirements("flat", min_recall=recall)).candidates["k"]
+        for recall in (0.3, 1.0)
+    )
     assert low < high
 
 
 def test_fewer_touches_are_asked_of_more_photos_but_never_too_few(checkpoint, gallery, monkeypatch):
     one = 2.0 * PHOTOS * checkpoint.config.matcher.hidden**2
-    monkeypatch.setattr(measuring, "LEAST_QUERIES", 5)
+    monkeypatch.setattr(measuring, "MIN_QUERIES", 5)
     for flops, queries in ((1e12, TOUCHES), (20 * one, 20), (one, 5)):
-        monkeypatch.setattr(measuring, "MEASURING", flops)
-        assert WinnerBench(checkpoint, *gallery).queries == queries
+        monkeypatch.setattr(measuring, "MEASUREMENT_FLOPS", flops)
+        assert ExhaustiveBench(checkpoint, *gallery).queries == queries
 
 
-def test_times_are_medians_of_the_search_and_of_the_judging_each_in_its_own_place(checkpoint, gallery, monkeypatch):
+def test_times_are_medians_of_search_and_rerank(checkpoint, gallery, monkeypatch):
     """By a clock that the search and the judging put forward: 9, 1, 2 ms and 4, 6, 100 ms."""
     now = [0.0]
-    bench = WinnerBench(checkpoint, *gallery, clock=lambda: now[0])
+    bench = ExhaustiveBench(checkpoint, *gallery, clock=lambda: now[0])
     index, judged = bench.built("flat"), []
     search, searching, judging = index.candidates, iter((9, 1, 2)), iter((4, 6, 100))
 
@@ -125,13 +131,13 @@ def test_times_are_medians_of_the_search_and_of_the_judging_each_in_its_own_plac
         now[0] += next(searching) / 1e3
         return search(queries, k)
 
-    def slow_judge(head, touch, halves, rows):
+    def slow_scorer(head, touch, partials, rows):
         now[0] += next(judging) / 1e3
         judged.append(rows.tolist())
 
-    monkeypatch.setattr(measuring, "TIMED", 3)
+    monkeypatch.setattr(measuring, "TIMED_QUERIES", 3)
     monkeypatch.setattr(index, "candidates", slow_search)
-    monkeypatch.setattr(measuring, "score_halves", slow_judge)
+    monkeypatch.setattr(measuring, "score_partials", slow_scorer)
     assert bench.times(index, 8) == pytest.approx((2.0, 6.0))
     for rows in judged:  # eight different photos, in the order in which they lie on the disk
         assert rows == sorted(set(rows))
@@ -144,7 +150,7 @@ class Built:
 
     kind: str
 
-    def along_ladder(self):
+    def search_variants(self):
         yield self
 
 
@@ -160,16 +166,16 @@ class Scripted:
         self.built_kinds.append(kind)
         return Built(kind)
 
-    def tried(self):
+    def kinds_to_try(self):
         return ["ivf_sq8", "hnsw"]
 
     def point(self, index, k):
         found, search, judge = (100, 0.0, 50.0) if k >= self.count else self.points.get((index.kind, k), (0, 1.0, 1.0))
-        return Point(index.kind, load_kind("flat").parameters_type(), k, found, 100, search, judge)
+        return SearchPoint(index.kind, load_kind("flat").parameters_type(), k, found, 100, search, judge)
 
     def times(self, index, k):
         point = self.point(index, k)
-        return point.search_ms, point.judge_ms
+        return point.search_ms, point.rerank_ms
 
 
 EXACT = {("flat", 250): (97, 2.0, 1.0), ("flat", 500): (99, 2.0, 2.5), ("flat", 100): (90, 2.0, 0.5)}
@@ -177,7 +183,7 @@ QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.
 
 
 @pytest.mark.parametrize(
-    ("asked", "points", "kind", "k", "said"),
+    ("requirements", "points", "kind", "k", "said"),
     [
         (SearchRequirements(), QUICK, "flat", 500, ""),
         (SearchRequirements(min_recall=0.95), EXACT | {("ivf_sq8", 500): (99, 0.1, 2.0)}, "ivf_sq8", 500, ""),
@@ -194,7 +200,7 @@ QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.
     ],
 )
 def test_what_was_asked_for_decides(asked, points, kind, k, said):
-    settled = settle(Scripted(points), asked)
+    settled = choose_by_agreement(Scripted(points), asked)
     assert (settled.kind, settled.candidates["k"]) == (kind, k)
     assert said in settled.reason
     assert bool(said) == ("nearest" in settled.reason)
@@ -207,36 +213,36 @@ def test_an_approximate_kind_is_built_only_where_exact_search_does_not_do():
         (SearchRequirements(max_ms=4), {"flat", "ivf_sq8"}),
     ):
         bench = Scripted(QUICK)
-        settle(bench, asked)
+        choose_by_agreement(bench, asked)
         assert set(bench.built_kinds) == built
 
 
-def test_few_photos_are_all_judged_unless_that_may_be_too_slow():
-    assert not needs_measuring(4, SearchRequirements())
-    assert not needs_measuring(4, SearchRequirements(min_recall=1.0))
-    assert needs_measuring(5, SearchRequirements())
-    assert needs_measuring(4, SearchRequirements(max_ms=5))
-    assert sentence(all_judged(4, SearchRequirements())) == "The classifier judges all 4 photos."
+def test_few_photos_are_all_scored_unless_that_may_be_too_slow():
+    assert not needs_measurement(4, SearchRequirements())
+    assert not needs_measurement(4, SearchRequirements(min_recall=1.0))
+    assert needs_measurement(5, SearchRequirements())
+    assert needs_measurement(4, SearchRequirements(max_ms=5))
+    assert operating_point_sentence(exhaustive_record(4, SearchRequirements())) == "The classifier judges all 4 photos."
 
 
 def test_a_measurement_stands_until_a_tenth_of_the_photos_changed(checkpoint, gallery):
-    made = settle(WinnerBench(checkpoint, *gallery), SearchRequirements()).candidates
-    assert carried_over(made, SearchRequirements(), PHOTOS, 0) == made
-    after = carried_over(made, SearchRequirements(), PHOTOS + 4, 4)
+    made = choose_by_agreement(ExhaustiveBench(checkpoint, *gallery), SearchRequirements()).candidates
+    assert carry_over(made, SearchRequirements(), PHOTOS, 0) == made
+    after = carry_over(made, SearchRequirements(), PHOTOS + 4, 4)
     assert after == {**made, "changed": 4}
-    assert carried_over(after, SearchRequirements(), PHOTOS + 7, 3)["changed"] == 7
-    assert carried_over(after, SearchRequirements(), PHOTOS + 8, 4) is None
-    assert carried_over(made, SearchRequirements(min_recall=0.5), PHOTOS, 0) is None
-    assert carried_over(all_judged(4, SearchRequirements()), SearchRequirements(), 5, 1) is None
-    assert carried_over(None, SearchRequirements(), PHOTOS, 0) is None
-    exhaustive = {**all_judged(1000, SearchRequirements()), "queries": 50}
-    assert carried_over(exhaustive, SearchRequirements(), 1001, 1)["k"] == 1001
+    assert carry_over(after, SearchRequirements(), PHOTOS + 7, 3)["changed"] == 7
+    assert carry_over(after, SearchRequirements(), PHOTOS + 8, 4) is None
+    assert carry_over(made, SearchRequirements(min_recall=0.5), PHOTOS, 0) is None
+    assert carry_over(exhaustive_record(4, SearchRequirements()), SearchRequirements(), 5, 1) is None
+    assert carry_over(None, SearchRequirements(), PHOTOS, 0) is None
+    exhaustive = {**exhaustive_record(1000, SearchRequirements()), "queries": 50}
+    assert carry_over(exhaustive, SearchRequirements(), 1001, 1)["k"] == 1001
 
 
-def test_a_point_is_told_in_one_sentence_with_its_interval():
-    record = {"k": 500, "winner_recall": 0.99, "interval": [0.9455, 0.9997], "queries": 100, "ms": 4.5}
-    record |= {"exhaustive_ms": 50.0, "asked": dataclasses.asdict(SearchRequirements()), "photos": 1000}
-    assert sentence(record) == (
+def test_a_point_is_described_in_one_sentence_with_its_interval():
+    record = {"k": 500, "top1_agreement": 0.99, "interval": [0.9455, 0.9997], "queries": 100, "ms": 4.5}
+    record |= {"exhaustive_ms": 50.0, "requirements": dataclasses.asdict(SearchRequirements()), "photos": 1000}
+    assert operating_point_sentence(record) == (
         "The classifier judges the best 500 of 1000 photos: these hold its winner for 99 of 100 validation touches "
         "(95 % interval 0.946 to 1.000), in 4.5 ms against 50 ms for all."
     )
@@ -244,10 +250,10 @@ def test_a_point_is_told_in_one_sentence_with_its_interval():
 
 def test_measuring_needs_touches_and_embeddings_that_are_made_from_them():
     assert can_measure(checkpoint_of())
-    assert not can_measure(checkpoint_of(pruner_width=0))
+    assert not can_measure(checkpoint_of(candidate_width=0))
     assert not can_measure(checkpoint_of(queries=0))
     with pytest.raises(BadInput, match="must keep touches to measure with"):
-        query_codes(checkpoint_of(pruner_width=0))
+        query_codes(checkpoint_of(candidate_width=0))
 
 
 # By neighbours ------------------------------------------------------------------------------------------------------
@@ -260,10 +266,10 @@ def unit(count, dim=16):
 
 def test_without_a_bound_on_the_time_exact_search_is_taken_and_no_vector_is_read():
     for asked in (SearchRequirements(), SearchRequirements(min_recall=0.9)):
-        settled = settle_by_neighbours(None, None, asked)
+        settled = choose_by_neighbours(None, None, asked)
         assert (settled.kind, settled.candidates) == ("flat", None)
         assert "no time budget was asked for" in settled.reason
-    assert settle_by_neighbours(None, None, SearchRequirements("hnsw", max_ms=1.0)).kind == "hnsw"
+    assert choose_by_neighbours(None, None, SearchRequirements("hnsw", max_ms=1.0)).kind == "hnsw"
 
 
 @pytest.fixture
@@ -289,7 +295,7 @@ def timed(monkeypatch):
 def test_the_first_kind_within_the_time_that_finds_the_neighbours_is_taken(ms, kind, said, timed):
     timed[0].update(ms)
     vectors = np.repeat(unit(900), 2, axis=0)  # copies are left out of the measurement
-    settled = settle_by_neighbours(vectors, np.repeat(np.arange(900), 2) * 2, SearchRequirements(max_ms=5))
+    settled = choose_by_neighbours(vectors, np.repeat(np.arange(900), 2) * 2, SearchRequirements(max_ms=5))
     assert settled.kind == kind
     assert set(timed[1]) == set(ms)
     assert said in settled.reason
@@ -300,19 +306,19 @@ def test_the_first_kind_within_the_time_that_finds_the_neighbours_is_taken(ms, k
 
 
 def test_a_kind_that_needs_more_vectors_is_not_tried():
-    assert NeighbourBench(unit(700)).tried() == ["ivf_sq8", "hnsw"]
-    assert NeighbourBench(unit(600)).tried() == ["hnsw"]
+    assert NeighbourBench(unit(700)).kinds_to_try() == ["ivf_sq8", "hnsw"]
+    assert NeighbourBench(unit(600)).kinds_to_try() == ["hnsw"]
 
 
 class Newcomer(FlatIndex):
     """A kind as somebody adds one: a class that says what is to be known of it."""
 
-    kind, exact, tried, fewest = "newcomer", False, True, 5
+    kind, exact, tried, min_vectors = "newcomer", False, True, 5
 
 
 def test_a_new_kind_is_a_class_that_an_installed_package_names(monkeypatch, tmp_path):
     plugins.install(tmp_path / "site", monkeypatch, indexes={"newcomer": f"{__name__}:Newcomer"})
-    assert NeighbourBench(unit(700)).tried() == ["ivf_sq8", "hnsw", "newcomer"]
+    assert NeighbourBench(unit(700)).kinds_to_try() == ["ivf_sq8", "hnsw", "newcomer"]
     assert SearchRequirements("newcomer").kind == "newcomer"
     rows = [{"id": str(number)} for number in range(20)]
     IndexStore(tmp_path).write(rows, unit(20), fingerprint={}, kind="newcomer")
@@ -323,5 +329,5 @@ def test_a_new_kind_is_a_class_that_an_installed_package_names(monkeypatch, tmp_
 def test_the_time_of_a_search_among_neighbours_is_measured_on_this_machine():
     bench = NeighbourBench(unit(100))
     point = bench.point(bench.built("flat"), 10)
-    assert (point.recall, point.judge_ms) == (1.0, 0.0)
+    assert (point.recall, point.rerank_ms) == (1.0, 0.0)
     assert point.search_ms > 0

@@ -51,75 +51,77 @@ def killed(catalogue, model, index, call):
 def same(one, other):
     """Both generations hold the same rows, and what is made of them; another batch sums in another order."""
     assert one.rows == other.rows
-    np.testing.assert_allclose(one.arrays["halves"][:], other.arrays["halves"][:], rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(one.arrays["partials"][:], other.arrays["partials"][:], rtol=2e-3, atol=2e-3)
     np.testing.assert_allclose(one.embeddings[one.slots], other.embeddings[other.slots], atol=1e-5)
 
 
 @pytest.mark.parametrize("call", [1, 2, 6])
-def test_a_first_build_that_was_killed_goes_on_where_it_was(call, own, model, tmp_path, embedded):
+def test_a_first_build_that_was_killed_goes_on_where_it_was(call, catalogue_copy, model, tmp_path, embedded):
     index, checkpoint = tmp_path / "index", load_checkpoint(model)
-    killed(own, model, index, call)
+    killed(catalogue_copy, model, index, call)
     assert not (index / "CURRENT").exists()
     left = BATCH * (call - 1)
-    report = build_index(own, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert sum(embedded) == PHOTOS - left
     assert (report.embedded, report.resumed, report.reused) == (PHOTOS - left, left, left)
     assert not (index / NAME).exists()
     assert list(index.glob("*.tmp-*")) == []
-    whole = build_index(own, checkpoint, tmp_path / "whole", quiet=True)
+    whole = build_index(catalogue_copy, checkpoint, tmp_path / "whole", quiet=True)
     same(IndexStore(index).open(), IndexStore(tmp_path / "whole").open())
-    assert report.half_error == pytest.approx(whole.half_error, rel=0.05)  # the batches were others
+    assert report.partial_error == pytest.approx(whole.partial_error, rel=0.05)  # the batches were others
 
 
-def test_two_kills_one_after_the_other_lose_nothing_though_photos_are_renamed_between(own, model, tmp_path, embedded):
+def test_two_kills_one_after_the_other_lose_nothing_though_photos_are_renamed_between(
+    catalogue_copy, model, tmp_path, embedded
+):
     index = tmp_path / "index"
-    killed(own, model, index, 3)
-    for number, photo in enumerate(sorted(own.rglob("*.jpg"))):
+    killed(catalogue_copy, model, index, 3)
+    for number, photo in enumerate(sorted(catalogue_copy.rglob("*.jpg"))):
         photo.rename(photo.with_name(f"again{number}.jpg"))
-    killed(own, model, index, 3)
-    report = build_index(own, load_checkpoint(model), index, quiet=True)
+    killed(catalogue_copy, model, index, 3)
+    report = build_index(catalogue_copy, load_checkpoint(model), index, quiet=True)
     assert (sum(embedded), report.resumed) == (PHOTOS - 4 * BATCH, 4 * BATCH)
 
 
-def test_a_killed_rebuild_leaves_the_old_index_and_what_it_had_embedded(own, model, tmp_path, embedded):
+def test_a_killed_rebuild_leaves_the_old_index_and_what_it_had_embedded(catalogue_copy, model, tmp_path, embedded):
     index, checkpoint = tmp_path / "index", load_checkpoint(model)
-    objects = sorted(own.iterdir())
+    objects = sorted(catalogue_copy.iterdir())
     away = shutil.move(objects[0], tmp_path / "away")
-    build_index(own, checkpoint, index, quiet=True)
+    build_index(catalogue_copy, checkpoint, index, quiet=True)
     shutil.move(away, objects[0])
     for path in objects[1].iterdir():
         path.write_bytes(path.read_bytes() + b"other content, the same picture")
-    killed(own, model, index, 2)
+    killed(catalogue_copy, model, index, 2)
     assert IndexStore(index).open().count == PHOTOS - 3
     embedded.clear()
-    report = build_index(own, checkpoint, index, quiet=True)
+    report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (sum(embedded), report.embedded, report.resumed, report.reused) == (2, 2, 4, 22)
     assert "2 embedded, 4 from a build that was cut off, 18 unchanged, 0 removed" in next(report.lines())
 
 
-def test_what_another_model_left_is_not_taken(own, model, tmp_path, embedded):
+def test_what_another_model_left_is_not_taken(catalogue_copy, model, tmp_path, embedded):
     index, other = tmp_path / "index", tmp_path / "other.safetensors"
-    killed(own, model, index, 4)
+    killed(catalogue_copy, model, index, 4)
     from tests.retrieval.search.test_build import changed_model
 
-    report = build_index(own, changed_model(load_checkpoint(model), other), index, quiet=True)
+    report = build_index(catalogue_copy, changed_model(load_checkpoint(model), other), index, quiet=True)
     assert (sum(embedded), report.resumed) == (PHOTOS, 0)
     assert not (index / NAME).exists()
 
 
-def test_ctrl_c_keeps_what_was_embedded_and_says_so(own, model, tmp_path, embedded, monkeypatch, capsys):
-    index, keep = tmp_path / "index", embed.Unfinished.keep
+def test_ctrl_c_keeps_what_was_embedded_and_says_so(catalogue_copy, model, tmp_path, embedded, monkeypatch, capsys):
+    index, keep = tmp_path / "index", embed.UnfinishedBuild.add
 
     def interrupted(self, *arguments):
         keep(self, *arguments)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr(embed.Unfinished, "keep", interrupted)
-    command = ["build-index", str(own), "--model", str(model), "--out", str(index)]
+    monkeypatch.setattr(embed.UnfinishedBuild, "add", interrupted)
+    command = ["build-index", str(catalogue_copy), "--model", str(model), "--out", str(index)]
     assert main(command) == 1
     assert f"what was embedded is kept in {index}; the same command goes on with it" in capsys.readouterr().err
     done = sum(embedded)
-    monkeypatch.setattr(embed.Unfinished, "keep", keep)
+    monkeypatch.setattr(embed.UnfinishedBuild, "add", keep)
     assert main(command) == 0
     assert sum(embedded) == PHOTOS
     assert done >= 16

@@ -19,9 +19,9 @@ from retrieval.model.encode import to_batch, touch_batch
 from retrieval.model.posterior import Posterior
 from retrieval.search import defaults
 from retrieval.search.build.build_index import build_index
-from retrieval.search.query.objects import JudgedObjects
+from retrieval.search.query.objects import ScoredObjects
 from retrieval.search.query.searcher import Searcher
-from retrieval.search.query.shard import together
+from retrieval.search.query.shard import combined_embedding
 from tests import synthetic
 
 HALF_STEP = 2**-11
@@ -120,8 +120,8 @@ def half_tolerance(searcher, grasps):
 
     Neither does a log mean exp: an object's logit moves no further than its photos'.
     """
-    moved = np.abs(np.asarray(searcher.generation.arrays["halves"], np.float32)).max(axis=0) * HALF_STEP
-    return grasps * float(np.abs(searcher.judge.out) @ (np.abs(searcher.judge.second) @ moved)) + 1e-5
+    moved = np.abs(np.asarray(searcher.generation.arrays["partials"], np.float32)).max(axis=0) * HALF_STEP
+    return grasps * float(np.abs(searcher.scorer.out) @ (np.abs(searcher.scorer.second) @ moved)) + 1e-5
 
 
 # The ranking ---------------------------------------------------------------------------------------------------
@@ -146,7 +146,7 @@ def test_the_ranking_is_that_of_the_full_network_on_every_pair(count, meaning, s
         assert photos[match.photo] == pytest.approx(photos[best[match.object_id]], abs=2 * tolerance)
 
 
-def test_with_exact_halves_the_order_is_exactly_the_oracles(
+def test_with_exact_partials_the_order_equals_the_oracle(
     meaning, searcher, matcher, grasps, oracle, catalogue, monkeypatch
 ):
     """The rounding taken away, what is left is ranking: no tie, no tolerance."""
@@ -157,8 +157,8 @@ def test_with_exact_halves_the_order_is_exactly_the_oracles(
     photos = [checkpoint.config.preprocessing.load_photo(catalogue / row["path"]) for row in rows]
     with torch.inference_mode():
         images = torch.from_numpy(np.stack(photos)).permute(0, 3, 1, 2)
-        halves = matcher.photo_code(matcher.photo_features(images)).half.numpy()
-    monkeypatch.setitem(searcher.generation.arrays, "halves", halves)
+        partials = matcher.photo_encoding(matcher.photo_features(images)).partial.numpy()
+    monkeypatch.setitem(searcher.generation.arrays, "partials", partials)
     result = searcher.query(grasps[:1])
     assert [(match.object_id, match.photo) for match in result.results] == [item[:2] for item in expected]
     np.testing.assert_allclose([match.logit for match in result.results], logits, atol=1e-5)
@@ -268,12 +268,12 @@ def test_the_candidates_are_the_photos_nearest_to_all_grasps_together(
 ):
     """Plain loops: the best sums of inner products, the full network on these, and on the other photos of the objects
     that come first by them."""
-    monkeypatch.setattr("retrieval.search.query.shard.COMPLETED", completed)
+    monkeypatch.setattr("retrieval.search.query.shard.MIN_COMPLETED_OBJECTS", completed)
     checkpoint, generation = searcher.checkpoint, searcher.generation
     load, products = checkpoint.config.preprocessing.load_touch, np.zeros(24)
     for grasp in grasps:
         touch = matcher.touch_features(touch_batch([[load(path) for path in grasp]]))
-        products += generation.embeddings[generation.slots] @ matcher.touch_entry(touch).embedding[0].numpy()
+        products += generation.embeddings[generation.slots] @ matcher.touch_search_encoding(touch).embedding[0].numpy()
     near = {generation.rows[row]["path"] for row in np.argsort(-products)[:candidates]}
     logits = oracle(grasps)
     first = best_by_object({photo: logits[photo] for photo in near}, meaning, 3)
@@ -282,7 +282,7 @@ def test_the_candidates_are_the_photos_nearest_to_all_grasps_together(
     expected = best_by_object(judged, meaning, 3)
     result = searcher.query(grasps, candidates=candidates, top=2)
     assert result.index["scored"] == len(judged) < 24
-    assert result.posterior["judged_objects"] == len(expected) < 8
+    assert result.posterior["scored_objects"] == len(expected) < 8
     assert [(match.object_id, match.photo) for match in result.results] == [item[:2] for item in expected[:2]]
 
 
@@ -290,14 +290,14 @@ def test_grasps_name_candidates_by_the_sum_of_their_cosines_and_by_the_first_whe
     """A photo between two grasps is nearer to both together than the photo that is nearest to either."""
     grasps = np.array([[1, 0, 0], [0, 1, 0]], dtype=np.float32)
     between = np.sqrt(0.5) * grasps.sum(0)
-    np.testing.assert_allclose(together(grasps), [between], atol=1e-7)
-    np.testing.assert_allclose(together(grasps[[0, 0, 1]]), np.array([[2, 1, 0]]) / np.sqrt(5), atol=1e-7)
+    np.testing.assert_allclose(combined_embedding(grasps), [between], atol=1e-7)
+    np.testing.assert_allclose(combined_embedding(grasps[[0, 0, 1]]), np.array([[2, 1, 0]]) / np.sqrt(5), atol=1e-7)
     photos = np.array([[0.9, np.sqrt(0.19), 0], [np.sqrt(0.19), 0.9, 0], between], dtype=np.float32)
     assert (grasps @ photos.T).argmax(1).tolist() == [0, 1]
-    assert (together(grasps) @ photos.T).argmax() == (grasps @ photos.T).sum(0).argmax() == 2
+    assert (combined_embedding(grasps) @ photos.T).argmax() == (grasps @ photos.T).sum(0).argmax() == 2
     grasp = np.array([[0.6, 0.8]], dtype=np.float32)
     for off in (0, 1e-6):  # the sum's direction would be that of its rounding, or 0 / 0
-        np.testing.assert_array_equal(together(np.concatenate([grasp, off - grasp])), grasp)
+        np.testing.assert_array_equal(combined_embedding(np.concatenate([grasp, off - grasp])), grasp)
 
 
 # Probability and verdict -----------------------------------------------------------------------------------------
@@ -344,7 +344,7 @@ def test_more_grasps_are_named_where_the_ranking_is_clear_and_so_few_suffice(
     missing, scale, more, searcher, touch, monkeypatch
 ):
     """The best object has logit 100, and `missing` is the evidence that a match needs."""
-    head = searcher.judge
+    head = searcher.scorer
     scaled = dataclasses.replace(head, out=scale * head.out, out_bias=scale * head.out_bias)
     monkeypatch.setattr(searcher.shard, "judge", scaled)
     monkeypatch.setattr(searcher, "posterior", Posterior(1.0, math.log(8) - missing, dependence=0.5))
@@ -361,20 +361,20 @@ def test_the_answer_says_by_what_numbers_its_probabilities_came_about(searcher, 
     said = searcher.query(grasps, none_prior=0.25).to_dict()["posterior"]
     assert said.pop("formula").startswith("P(o) ~ (1 - none_prior) / objects * exp(w * logit + offset)")
     numbers = {"slope": 2.0, "offset": -1.5, "dependence": 0.25, "tests": 1}
-    about = {"none_prior": 0.25, "grasps": 3, "objects": 8, "judged_objects": 8, "unjudged_probability": 0.0}
+    about = {"none_prior": 0.25, "grasps": 3, "objects": 8, "scored_objects": 8, "unscored_probability": 0.0}
     assert said == numbers | about
 
 
 def test_objects_with_equal_probabilities_are_still_ranked_by_logit(searcher, touch, monkeypatch):
     """float64 shares of logits that lie 745 behind all equal 0: ranked by probability, they would be one tie."""
-    head, halves = searcher.judge, searcher.encode(touch).halves
+    head, partials = searcher.scorer, searcher.encode(touch).partials
     larger = dataclasses.replace(head, out=10_000 * head.out, out_bias=10_000 * head.out_bias)
     monkeypatch.setattr(searcher.shard, "judge", larger)
     monkeypatch.setattr(searcher, "posterior", Posterior(slope=100.0))
     result = searcher.query([touch])
     assert [match.probability for match in result.results[-2:]] == [0.0, 0.0]
     # With so large a slope an object's logit is its best photo's, less log 3 / 100 for each alike.
-    best, logits = {}, head.logits(halves, searcher.generation.arrays["halves"])
+    best, logits = {}, head.logits(partials, searcher.generation.arrays["partials"])
     for row, logit in zip(searcher.generation.rows, logits, strict=True):
         best[row["object_id"]] = max(float(logit), best.get(row["object_id"], -math.inf))
     assert [match.object_id for match in result.results] == sorted(best, key=best.get, reverse=True)
@@ -567,22 +567,22 @@ def test_the_best_objects_are_those_of_a_plain_sort(top, levels, searcher):
     made_up, names = made_up_objects(searcher, rng)
     numbers = np.sort(rng.choice(40, 30, replace=False))
     logits = rng.integers(0, levels, 30).astype(np.float64)
-    judged = JudgedObjects(numbers, logits, numbers)  # the photo of row n is one of object n
+    judged = ScoredObjects(numbers, logits, numbers)  # the photo of row n is one of object n
     expected = sorted(range(30), key=lambda place: (-logits[place], names[numbers[place]]))
     assert made_up.best(judged, top).tolist() == expected[:top]
 
 
-def test_photos_of_equal_bytes_get_the_logit_of_the_first_of_them_among_the_judged(searcher):
+def test_equal_photos_get_the_logit_of_the_first_scored_one(searcher):
     made_up = copy.copy(searcher.objects)
     made_up._original = np.array([0, 1, 0, 1, 4, 0, *range(6, 24)])
     rows, logits = np.array([2, 3, 4, 5]), np.array([0.25, 0.5, 0.75, 0.26], dtype=np.float32)
-    assert made_up.equal_for_equals(rows, logits).tolist() == [0.25, 0.5, 0.75, 0.25]
+    assert made_up.align_duplicates(rows, logits).tolist() == [0.25, 0.5, 0.75, 0.25]
 
 
 @pytest.mark.parametrize(
-    ("measured", "expected"), [({"k": 5, "winner_recall": 0.99}, [5]), (None, []), ({"k": 24}, [])]
+    ("measured", "expected"), [({"k": 5, "top1_agreement": 0.99}, [5]), (None, []), ({"k": 24}, [])]
 )
-def test_the_index_says_how_many_candidates_are_judged_unless_the_query_does(
+def test_the_index_sets_the_number_of_candidates_unless_the_query_does(
     measured, expected, searcher, touch, searches, monkeypatch
 ):
     about = searcher.generation.manifest.about

@@ -19,8 +19,8 @@ import retrieval
 from retrieval.errors import BadInput, ImageError
 from retrieval.model import touches as model_touches
 from retrieval.model.checkpoint import load_checkpoint
-from retrieval.model.export import graph_of
-from retrieval.model.onnx_encoder import sealed
+from retrieval.model.export import touch_encoder_to_onnx
+from retrieval.model.onnx_encoder import with_checksum
 from retrieval.search.build.build_index import build_index
 from retrieval.search.query.searcher import Searcher
 from tests import synthetic
@@ -156,16 +156,16 @@ def test_the_inner_product_of_the_two_embeddings_is_the_score_of_the_candidates(
         np.testing.assert_allclose(own[numbers], theirs, atol=1e-5)  # a photo's batch rounds in another order
 
 
-def test_the_judge_gives_the_logits_of_the_two_halves(searcher, grasps, catalogue, model):
+def test_the_scorer_gives_the_logits_of_two_partials(searcher, grasps, catalogue, model):
     answer = searcher.query(grasps[0])
     photos = retrieval.embed_photos([match.photo_path for match in answer.results], model=load_checkpoint(model))
-    shown = np.asarray(searcher.judge.logits(searcher.encode(grasps[0]).halves, photos.halves))
+    shown = np.asarray(searcher.scorer.logits(searcher.encode(grasps[0]).partials, photos.partials))
     meant = searcher.posterior.object_logits(shown, np.arange(len(shown)), np.ones(len(shown), dtype=int))
     # The photos shown are the best of each object; the mean likelihood of all is no larger than the best one's.
     assert (meant + 0.01 >= [match.logit for match in answer.results]).all()
     rows = [photo["path"] for photo in searcher.generation.rows]
     places = np.array([rows.index(match.photo) for match in answer.results])
-    stored = searcher.judge.logits(searcher.encode(grasps[0]).halves, searcher.generation.arrays["halves"], places)
+    stored = searcher.scorer.logits(searcher.encode(grasps[0]).partials, searcher.generation.arrays["partials"], places)
     np.testing.assert_allclose(shown, stored, atol=0.01)  # stored as float16
 
 
@@ -263,7 +263,7 @@ def test_a_process_forks_when_no_touch_is_being_read_and_threads_that_did_are_go
     for _ in range(3):
         with ThreadPoolExecutor(8) as threads:
             list(threads.map(searcher.query, [touch] * 24))
-        ended = model_touches._forks._threads - {thread.native_id for thread in threading.enumerate()}
+        ended = model_touches._fork_guard._threads - {thread.native_id for thread in threading.enumerate()}
         assert len(ended) >= 8
         found.append(in_fork(lambda: ranking(searcher.query(touch))))
         assert not any(Path(f"/proc/self/task/{one}").exists() for one in ended)
@@ -315,7 +315,7 @@ def test_a_fork_of_a_process_that_computed_on_several_threads_computes_on_one(se
 def test_a_fork_opens_the_export_again_and_lets_go_of_its_parents(catalogue, model, touch, tmp_path):
     pytest.importorskip("onnx")
     own = Path(shutil.copy(model, tmp_path / "m.safetensors"))
-    own.with_suffix(".onnx").write_bytes(sealed(graph_of(load_checkpoint(own))))
+    own.with_suffix(".onnx").write_bytes(with_checksum(touch_encoder_to_onnx(load_checkpoint(own))))
     build_index(catalogue, load_checkpoint(own), tmp_path / "index", quiet=True)
     searcher = Searcher.open(tmp_path / "index")
     expected = ranking(searcher.query(touch))

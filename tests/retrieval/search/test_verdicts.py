@@ -10,9 +10,9 @@ from PIL import Image
 
 from retrieval.commands.main import main
 from retrieval.data.dataset import load_grasps
-from retrieval.model.stored import read_stored
+from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.search.defaults import SHIPPED, shipped_model
-from retrieval.search.query.answer import EXIT_CODES, in_words
+from retrieval.search.query.answer import EXIT_CODES, verdict_sentence
 from retrieval.search.query.searcher import Searcher
 from robot.collection import CollectSettings, collect
 from robot.rig import load_rig
@@ -54,7 +54,7 @@ def picture(kind):
     return samples[kind].astype(np.uint8)
 
 
-def test_a_touch_is_judged_and_all_that_may_be_adds_up_to_one(searcher, grasps):
+def test_a_touch_is_scored_and_probabilities_add_up_to_one(searcher, grasps):
     results = {grasp.grasp_id: searcher.query(grasp.touches, top=99) for grasp in grasps}
     refused = [name for name, result in results.items() if result.grasps != ["contact"]]
     assert len(refused) <= 1, refused  # a finger that hardly presses a smooth object may feel nothing
@@ -64,12 +64,12 @@ def test_a_touch_is_judged_and_all_that_may_be_adds_up_to_one(searcher, grasps):
         assert result.verdict == ("match" if best > result.none_probability else "none of these")
 
 
-def test_untouched_gels_name_nobody(searcher, grasps):
+def test_no_contact_frames_match_no_object(searcher, grasps):
     for grasp in grasps:
         result = searcher.query(grasp.backgrounds)
         assert (result.verdict, result.results, result.none_probability) == ("no contact", [], None)
         assert result.top is None
-        assert in_words(result).startswith("no contact: the gels look untouched")
+        assert verdict_sentence(result).startswith("no contact: the gels look untouched")
 
 
 @pytest.mark.parametrize("kind", ["black", "white", "noise"])
@@ -82,10 +82,10 @@ def test_one_foreign_picture_among_good_grasps_refuses_them_all_and_is_named(sea
     good = grasps[0].touches
     result = searcher.query([good, (good[0], picture("black"))])
     assert (result.verdict, result.grasps) == ("not a gel image", ["contact", "not a gel image"])
-    assert "grasp 2 does not look like a gel" in in_words(result)
+    assert "grasp 2 does not look like a gel" in verdict_sentence(result)
 
 
-def test_a_grasp_that_felt_nothing_is_left_out_of_the_others(searcher, grasps):
+def test_a_grasp_without_contact_is_left_out(searcher, grasps):
     grasp = grasps[0]
     alone, with_air = searcher.query(grasp.touches), searcher.query([grasp.touches, grasp.backgrounds])
     assert with_air.grasps == ["contact", "no contact"]
@@ -93,7 +93,7 @@ def test_a_grasp_that_felt_nothing_is_left_out_of_the_others(searcher, grasps):
     assert [match.logit for match in with_air.results] == pytest.approx(
         [match.logit for match in alone.results], abs=1e-4
     )
-    assert "left out: 2" in in_words(with_air)
+    assert "left out: 2" in verdict_sentence(with_air)
 
 
 def test_a_no_contact_frame_tells_contact_by_itself(searcher, grasps):
@@ -126,20 +126,20 @@ def test_the_command_says_the_verdict_by_its_exit_code_in_json_and_on_the_page(i
         assert "Most likely" not in page.read_text("utf-8")
 
 
-def test_objects_that_were_not_judged_keep_their_share(index, grasps):
+def test_unscored_objects_keep_their_probability(index, grasps):
     """With two candidates the answer is near the one that judges every photo, as the rest is estimated."""
     with Searcher.open(index) as searcher:
         whole, pruned = (searcher.query(grasps[0].touches, candidates=count, top=2) for count in (99, 2))
-        assert pruned.posterior["judged_objects"] < whole.posterior["judged_objects"] == 4
+        assert pruned.posterior["scored_objects"] < whole.posterior["scored_objects"] == 4
         assert pruned.none_probability == pytest.approx(whole.none_probability, abs=0.05)
         total = pruned.none_probability + sum(match.probability for match in pruned.results)
-        assert total + pruned.posterior["unjudged_probability"] == pytest.approx(1)
+        assert total + pruned.posterior["unscored_probability"] == pytest.approx(1)
 
 
 @pytest.mark.parametrize("fingers", SHIPPED)
 def test_the_card_of_a_shipped_checkpoint_is_its_own_and_says_how_often_its_check_errs(fingers):
     path = shipped_model(fingers)
-    stored, card = read_stored(path), path.with_suffix(".md").read_text("utf-8")
+    stored, card = read_checkpoint_info(path), path.with_suffix(".md").read_text("utf-8")
     assert card.startswith(f"# {path.name}")
     assert stored.provenance["data_digest"][:16] in card
-    assert f"touches called foreign {stored.gel_check.shares['touches_called_foreign']:.3f}" in card
+    assert f"touches rejected as foreign {stored.gel_check.rates['touches_rejected_as_foreign']:.3f}" in card

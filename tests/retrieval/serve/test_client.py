@@ -55,11 +55,11 @@ def test_arrays_bytes_and_pillow_images_give_the_same_ranking(client, searcher, 
         assert found.touches == expected.touches
 
 
-def test_several_objects_and_growing_queries_are_answered_alike(client, searcher, touch):
+def test_client_batch_and_cumulative_queries_match_the_searcher(client, searcher, touch):
     many, growing = [touch, [touch, touch]], [touch, touch]
     for found, expected in zip(client.query_many(many), searcher.query_many(many), strict=True):
         assert compared(found) == compared(expected)
-    for found, expected in zip(client.query_growing(growing), searcher.query_growing(growing), strict=True):
+    for found, expected in zip(client.query_cumulative(growing), searcher.query_cumulative(growing), strict=True):
         assert compared(found) == compared(expected)
     assert client.query_many([]) == []
 

@@ -10,7 +10,7 @@ import pytest
 from retrieval.serve import connections
 from retrieval.serve.connections import MAX_CONNECTIONS, MAX_CONNECTIONS_OF_ADDRESS, MAX_HEADER_BYTES
 from tests.serving import listening
-from tests.waiting import until
+from tests.waiting import wait_until
 
 HALF = b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\nx-a: "
 
@@ -120,7 +120,7 @@ def test_half_sent_headers_of_512_connections_shut_nobody_out(service_at):
     with opened(address, MAX_CONNECTIONS) as lines:
         assert lives(url, "127.0.0.2") < 5
         assert lives(url) < 5  # from the same address, too
-        until(lambda: sum(map(is_closed, lines)) >= MAX_CONNECTIONS - MAX_CONNECTIONS_OF_ADDRESS)
+        wait_until(lambda: sum(map(is_closed, lines)) >= MAX_CONNECTIONS - MAX_CONNECTIONS_OF_ADDRESS)
         assert [is_closed(line) for line in (lines[0], lines[-1])] == [True, False]  # the oldest are closed
 
 

@@ -18,16 +18,16 @@ import pytest
 from PIL import Image
 
 from retrieval.data.images import MAX_PIXELS, decode
-from retrieval.data.resize import resized
+from retrieval.data.resize import resize_unchecked
 from retrieval.errors import ImageError, RetrievalError
 from retrieval.serve import decoders
 from retrieval.serve.decode_process import frame
 from retrieval.serve.decoders import SMALL_PIXELS, Decoders
-from retrieval.serve.errors import Problem
+from retrieval.serve.errors import HttpProblem
 from tests import decoding
 from tests.hostile_pictures import jpeg_of_scans, jpeg_of_segments, png_of_zeros
 from tests.serving import command, listening, problem
-from tests.waiting import until
+from tests.waiting import wait_until
 
 LARGE = png_of_zeros(2000, 1500)
 assert SMALL_PIXELS < 2000 * 1500
@@ -51,21 +51,21 @@ async def opened():
         await both.close()
 
 
-def read(*named, compares=False, timeout=120):
+def read(*named, compares_contact=False, timeout=120):
     async def run():
         async with asyncio.timeout(timeout):
             async with opened() as both:
-                return await both.read(named, 32, compares)
+                return await both.read(named, 32, compares_contact)
 
     return asyncio.run(run())
 
 
 def test_images_come_in_their_order_with_the_numbers_that_this_process_makes_of_them():
     grey = saved(np.full((20, 40), 7, np.uint8))
-    found = read(("a", LARGE), ("b", SMALL), ("c", grey), compares=True)
+    found = read(("a", LARGE), ("b", SMALL), ("c", grey), compares_contact=True)
     for image, data in zip(found, (LARGE, SMALL, grey), strict=True):
-        assert np.array_equal(image.touch, resized(decode(data, "x"), (32, 32)))
-        assert np.array_equal(image.blocks, resized(decode(data, "x"), (16, 16)))
+        assert np.array_equal(image.touch, resize_unchecked(decode(data, "x"), (32, 32)))
+        assert np.array_equal(image.blocks, resize_unchecked(decode(data, "x"), (16, 16)))
         assert image.file_bytes == len(data)
     assert read(("b", SMALL))[0].blocks is None
 
@@ -76,7 +76,7 @@ def test_the_first_picture_that_cannot_be_used_is_told():
     assert (error.value.path, error.value.reason[:9]) == ("b", "not a PNG")
     with pytest.raises(ImageError, match="a: more than 50 JPEG scans"):
         read(("a", jpeg_of_scans(4472, 40_000)))
-    with pytest.raises(Problem, match="the large ones have 120,000,000"):
+    with pytest.raises(HttpProblem, match="the large ones have 120,000,000"):
         read(*[("a", png_of_zeros(4000, 5000))] * 6)
 
 
@@ -168,7 +168,7 @@ decode_process.serve_pictures()
 )
 def test_a_process_ends_itself_beyond_its_processor_time_and_refuses_what_takes_more_memory(seconds, size, said):
     line = [sys.executable, "-c", LIMITS, str(seconds), str(size)]
-    asked = frame({"name": "x", "px": 32, "compares": False, "most": MAX_PIXELS}, LARGE)
+    asked = frame({"name": "x", "px": 32, "compares_contact": False, "most": MAX_PIXELS}, LARGE)
     done = subprocess.run(line, input=asked * (1 if said else 200), capture_output=True, check=False, timeout=300)
     if said is None:
         assert done.returncode == -signal.SIGXCPU
@@ -185,7 +185,7 @@ def body_of(*images):
 
 def test_a_query_whose_picture_is_abandoned_at_its_deadline_holds_up_nobody(index, touch, monkeypatch, tmp_path):
     monkeypatch.setattr(decoders, "PROGRAM", decoding.HANG)
-    monkeypatch.setattr("retrieval.serve.uploads.Pictures.named", _named_in(tmp_path))
+    monkeypatch.setattr("retrieval.serve.uploads.RequestPictures.named_files", _named_in(tmp_path))
     honest = body_of(*(path.read_bytes() for path in touch))
     with listening(index, deadline_s=8) as (url, parts):
         assert httpx.post(f"{url}/v1/query", json=honest, timeout=60).status_code == 200
@@ -194,13 +194,13 @@ def test_a_query_whose_picture_is_abandoned_at_its_deadline_holds_up_nobody(inde
             target=lambda: answers.append(httpx.post(f"{url}/v1/query", json=body_of(LARGE, LARGE), timeout=60))
         )
         attack.start()
-        until(lambda: list(tmp_path.iterdir()))
+        wait_until(lambda: list(tmp_path.iterdir()))
         assert [httpx.post(f"{url}/v1/query", json=honest, timeout=60).status_code for _ in range(3)] == [200] * 3
         attack.join(60)
         problem(answers[0], 504, "late")
-        until(lambda: parts.queue.held == 0)
+        wait_until(lambda: parts.queue.in_flight == 0)
         process = int(next(tmp_path.iterdir()).read_text())
-        until(lambda: not is_running(process))
+        wait_until(lambda: not is_running(process))
 
 
 def _named_in(folder):

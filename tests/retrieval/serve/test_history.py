@@ -10,11 +10,11 @@ import pytest
 
 from retrieval.data.check.recording import check_recording
 from retrieval.data.dataset import load_grasps
-from retrieval.serve.store import Store
+from retrieval.serve.store import HistoryStore
 from robot.recording.folder import RecordingWriter
 from tests import synthetic
-from tests.serving import INFO, keeping, problem, service
-from tests.waiting import until
+from tests.serving import INFO, problem, service, with_history
+from tests.waiting import wait_until
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def client(index, folder):
-    with keeping(index, folder) as opened:
+    with with_history(index, folder) as opened:
         yield opened
 
 
@@ -42,37 +42,37 @@ def ask(client, grasps, **more):
     return response.headers["x-query-id"], response.json()
 
 
-def say(client, query, said, object_id=None):
-    return client.post("/v1/feedback", json={"query": query, "said": said, "object_id": object_id})
+def add_feedback(client, query, said, object_id=None):
+    return client.post("/v1/feedback", json={"query": query, "feedback": said, "object_id": object_id})
 
 
-def test_a_query_is_kept_with_its_answer_and_its_gel_images(client, touches):
+def test_history_stores_a_query_with_answer_and_gel_images(client, touches):
     grasps = next(iter(touches.values()))
     query, answer = ask(client, grasps)
     entry = client.get(f"/v1/history/{query}").json()
     assert entry["answer"] == answer
-    assert (entry["id"], entry["said"], entry["best"]) == (query, None, answer["results"][0]["object_id"])
+    assert (entry["id"], entry["feedback"], entry["best"]) == (query, None, answer["results"][0]["object_id"])
     assert [[client.get(path).content for path in paths] for paths in entry["touches"]] == grasps
 
 
 def test_the_history_is_paged_from_the_newest_and_searched(client, touches):
     asked = [ask(client, grasps[:1])[0] for grasps in touches.values()]
-    say(client, asked[0], "object", sorted(touches)[0])
+    add_feedback(client, asked[0], "object", sorted(touches)[0])
     first = client.get("/v1/history", params={"limit": 2}).json()
     rest = client.get("/v1/history", params={"limit": 2, "offset": first["next"]}).json()
     assert [item["id"] for item in first["items"] + rest["items"]] == asked[::-1]
     assert (first["total"], rest["next"]) == (3, None)
     words = {"search": f"object {sorted(touches)[0].upper()}"}
     assert [item["id"] for item in client.get("/v1/history", params=words).json()["items"]] == asked[:1]
-    for said, found in (("nothing", asked[:0:-1]), ("object", asked[:1]), ("none", [])):
-        assert [item["id"] for item in client.get("/v1/history", params={"said": said}).json()["items"]] == found
+    for said, found in (("missing", asked[:0:-1]), ("object", asked[:1]), ("none", [])):
+        assert [item["id"] for item in client.get("/v1/history", params={"feedback": said}).json()["items"]] == found
 
 
-def test_what_people_said_is_a_recording_that_training_and_the_check_read(client, touches, folder, catalogue):
+def test_feedback_becomes_a_readable_recording(client, touches, folder, catalogue):
     names = sorted(touches)
     for name, grasps in touches.items():
         query, _ = ask(client, grasps)
-        response = say(client, query, "object", name)
+        response = add_feedback(client, query, "object", name)
         assert (response.status_code, response.json()["recorded"]) == (201, True)
     recorded = load_grasps(folder / "recording")
     assert sorted(grasp.object_id for grasp in recorded) == sorted(names * 2)
@@ -86,35 +86,40 @@ def test_what_people_said_is_a_recording_that_training_and_the_check_read(client
 def test_the_right_answer_is_recorded_as_the_object_that_was_found(client, touches, folder):
     query, answer = ask(client, next(iter(touches.values())), none_prior=0.001)
     assert answer["verdict"] in ("match", "uncalibrated")
-    said = say(client, query, "right").json()
-    assert said == {"query": query, "said": "right", "object_id": answer["results"][0]["object_id"], "recorded": True}
+    said = add_feedback(client, query, "right").json()
+    assert said == {
+        "query": query,
+        "feedback": "right",
+        "object_id": answer["results"][0]["object_id"],
+        "recorded": True,
+    }
     assert load_grasps(folder / "recording")[0].object_id == answer["results"][0]["object_id"]
 
 
-def test_what_was_said_once_is_kept_once_and_not_changed(client, touches, folder):
+def test_feedback_is_stored_once_and_not_changed(client, touches, folder):
     query, _ = ask(client, next(iter(touches.values())))
     name = sorted(touches)[0]
-    assert [say(client, query, "object", name).status_code for _ in range(3)] == [201, 200, 200]
-    assert "said already: object" in problem(say(client, query, "none"), 409, "conflict")
+    assert [add_feedback(client, query, "object", name).status_code for _ in range(3)] == [201, 200, 200]
+    assert "said already: object" in problem(add_feedback(client, query, "none"), 409, "conflict")
     assert len(load_grasps(folder / "recording")) == 2
 
 
-def test_an_object_that_the_catalogue_lacks_is_kept_but_in_no_recording(client, touches, folder):
+def test_feedback_on_an_uncatalogued_object_is_stored_but_not_recorded(client, touches, folder):
     query, _ = ask(client, next(iter(touches.values())))
-    assert say(client, query, "none", "a new mug").json()["recorded"] is False
+    assert add_feedback(client, query, "none", "a new mug").json()["recorded"] is False
     assert client.get(f"/v1/history/{query}").json()["object_id"] == "a new mug"
     assert (folder / "recording" / "metadata.jsonl").read_bytes() == b""
 
 
 def test_words_that_mean_nothing_are_refused(client, touches):
     query, _ = ask(client, next(iter(touches.values())))
-    problem(say(client, "no such query", "none"), 404, "unknown")
-    assert "must name it" in problem(say(client, query, "object"), 422, "bad-input")
-    assert "the index has no object" in problem(say(client, query, "object", "nobody's"), 422, "bad-input")
-    assert "names no object" in problem(say(client, query, "right", "x"), 422, "bad-input")
+    problem(add_feedback(client, "no such query", "none"), 404, "unknown")
+    assert "must name it" in problem(add_feedback(client, query, "object"), 422, "bad-input")
+    assert "the index has no object" in problem(add_feedback(client, query, "object", "nobody's"), 422, "bad-input")
+    assert "names no object" in problem(add_feedback(client, query, "right", "x"), 422, "bad-input")
 
 
-def test_what_was_said_and_not_recorded_yet_is_recorded_at_the_next_start(index, touches, folder):
+def test_unrecorded_feedback_is_recorded_at_the_next_start(index, touches, folder):
     class Full(RecordingWriter):
         def append(self, *args, **fields):
             raise OSError("the disk is full")
@@ -122,11 +127,11 @@ def test_what_was_said_and_not_recorded_yet_is_recorded_at_the_next_start(index,
     name, grasps = next(iter(touches.items()))
     with Full(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as client:
         query, _ = ask(client, grasps)
-        said = say(client, query, "object", name)
+        said = add_feedback(client, query, "object", name)
         assert (said.status_code, said.json()["recorded"]) == (201, False)
-        assert b'retrieve_unrecorded_total{what="said"} 1.0' in client.get("/metrics").content
-    with keeping(index, folder):  # in a thread of its own, which the end of the service does not wait for
-        until(lambda: (folder / "recording" / "metadata.jsonl").read_text().count("\n") == 2)
+        assert b'retrieve_history_failures_total{what="said"} 1.0' in client.get("/metrics").content
+    with with_history(index, folder):  # in a thread of its own, which the end of the service does not wait for
+        wait_until(lambda: (folder / "recording" / "metadata.jsonl").read_text().count("\n") == 2)
     assert [grasp.object_id for grasp in load_grasps(folder / "recording")] == [name, name]
 
 
@@ -140,30 +145,30 @@ def test_the_nearest_touch_of_a_touch_is_its_copy(client, touches):
     assert copy not in [item["id"] for item in near["items"]]
 
 
-def test_the_oldest_queries_of_which_nothing_was_said_go(index, touches, tmp_path, searcher):
-    store = Store(tmp_path / "h.sqlite", keep=2, keep_bytes=2**40)
+def test_oldest_queries_without_feedback_are_deleted(index, touches, tmp_path, searcher):
+    store = HistoryStore(tmp_path / "h.sqlite", keep=2, keep_bytes=2**40)
     result = searcher.query(next(iter(touches.values())))
     for number in range(40):
         store.keep(f"{number:03}", [[b"a"]], None, result, "m")
         if number == 3:
-            store.say("003", "none", None, None)
+            store.add_feedback("003", "none", None, None)
     assert store.names() == ["003", *(f"{number:03}" for number in range(30, 40))]
     store.close()
-    small = Store(tmp_path / "h.sqlite", keep=1000, keep_bytes=3)
+    small = HistoryStore(tmp_path / "h.sqlite", keep=1000, keep_bytes=3)
     for number in range(40, 72):
         small.keep(f"{number:03}", [[b"a"]], None, result, "m")
     assert small.names() == ["003", "069", "070", "071"]
     small.close()
 
 
-def test_nothing_can_be_said_of_a_query_that_went_meanwhile(client, touches, monkeypatch):
+def test_feedback_on_a_deleted_query_is_refused(client, touches, monkeypatch):
     name, _ = ask(client, next(iter(touches.values())))
     assert client.get(f"/v1/history/{name}").status_code == 200  # it is written
-    store = client.app.state.service.keeping.store
+    store = client.app.state.service.with_history.store
     read = iter([store.query(name)])  # as the request finds it, just before it goes
     store._database.execute("DELETE FROM queries")
     monkeypatch.setattr(store, "query", lambda name: next(read, None))
-    assert "the oldest are left out" in problem(say(client, name, "none"), 404, "unknown")
+    assert "the oldest are left out" in problem(add_feedback(client, name, "none"), 404, "unknown")
 
 
 def test_a_file_of_another_program_is_no_history(tmp_path):
@@ -171,14 +176,14 @@ def test_a_file_of_another_program_is_no_history(tmp_path):
 
     (tmp_path / "x").write_bytes(b"not a database, for sure" * 100)
     with pytest.raises(BadInput, match="must be the history of a service"):
-        Store(tmp_path / "x", 1, 1)
+        HistoryStore(tmp_path / "x", 1, 1)
 
 
 def test_the_export_holds_the_recording_and_every_query(client, touches, tmp_path):
     asked = []
     for name, grasps in touches.items():
         query, _ = ask(client, grasps)
-        say(client, query, "object", name)
+        add_feedback(client, query, "object", name)
         asked.append(query)
     archive = zipfile.ZipFile(io.BytesIO(client.get("/v1/export.zip").content))
     assert archive.testzip() is None
@@ -188,7 +193,7 @@ def test_the_export_holds_the_recording_and_every_query(client, touches, tmp_pat
     assert [json.loads(line)["id"] for line in lines] == asked
 
 
-def test_a_service_that_keeps_nothing_says_so(index, touches):
+def test_service_without_history_reports_it(index, touches):
     with service(index) as client:
         encoded = [[base64.b64encode(image).decode() for image in next(iter(touches.values()))[0]]]
         assert "x-query-id" not in client.post("/v1/query", json={"touches": encoded}).headers
@@ -203,7 +208,7 @@ def test_a_service_that_keeps_nothing_says_so(index, touches):
 def examined(index, folder, tmp_path):
     """A service with a recording of twelve objects that the model never saw."""
     unseen = synthetic.write_recording(tmp_path / "unseen", synthetic.make_objects(12, seed=500), 2)
-    with keeping(index, folder, unseen) as opened:
+    with with_history(index, folder, unseen) as opened:
         yield opened
 
 
@@ -221,11 +226,11 @@ def test_a_trial_shows_one_photo_of_the_object_and_nine_of_others(examined):
     ]
 
 
-def test_a_series_counts_the_persons_choices_beside_the_models(examined):
+def test_trial_run_counts_human_and_model_choices(examined):
     assert examined.get("/v1/trials").json()["objects"] == 12
-    run = examined.post("/v1/trials", json={"count": 4, "who": "Ada", "seed": 3}).json()
+    run = examined.post("/v1/trials", json={"count": 4, "participant": "Ada", "seed": 3}).json()
     where, right, model = f"/v1/trials/{run['id']}", 0, 0
-    assert (run["next"], run["human"]["share"], run["chance"]) == (1, None, 0.1)
+    assert (run["next"], run["human_baseline"]["accuracy"], run["chance"]) == (1, None, 0.1)
     for number in (1, 2, 3):
         trial = examined.get(f"{where}/{number}").json()
         assert (trial["truth"], trial["model"], len(trial["touches"]), len(trial["photos"])) == (None, None, 2, 10)
@@ -236,16 +241,22 @@ def test_a_series_counts_the_persons_choices_beside_the_models(examined):
     problem(examined.post(f"{where}/1", json={"choice": 1}), 409, "conflict")
     problem(examined.post(f"{where}/5", json={"choice": 1}), 404, "unknown")
     state = examined.get(where).json()
-    assert (state["answered"], state["next"]) == (3, 4)
-    assert (state["human"]["right"], state["model"]["right"]) == (right, model)
-    assert state["human"]["trials"] == state["model"]["trials"] == 3
-    assert 0 <= state["human"]["low"] <= state["human"]["share"] <= state["human"]["high"] <= 1
+    assert (state["completed"], state["next"]) == (3, 4)
+    assert (state["human_baseline"]["right"], state["model"]["right"]) == (right, model)
+    assert state["human_baseline"]["trials"] == state["model"]["trials"] == 3
+    assert (
+        0
+        <= state["human_baseline"]["low"]
+        <= state["human_baseline"]["accuracy"]
+        <= state["human_baseline"]["high"]
+        <= 1
+    )
 
 
 def test_too_few_unseen_objects_are_told(index, folder, recording, tmp_path):
     """The model was trained on most objects of that recording."""
     shutil.copytree(recording, tmp_path / "seen")
-    with keeping(index, folder, tmp_path / "seen") as client:
+    with with_history(index, folder, tmp_path / "seen") as client:
         assert "needs 10 objects that the model was not trained on" in problem(
             client.post("/v1/trials", json={}), 422, "bad-input"
         )

@@ -1,4 +1,4 @@
-"""Many at once, askers who leave, deadlines, queries answered together, new generations of the index, and the end."""
+"""Many at once, client_threads who leave, deadlines, queries answered together, new generations of the index, and the end."""
 
 import shutil
 import signal
@@ -20,10 +20,10 @@ from retrieval.serve.service import LiveRig
 from retrieval.serve.settings import ServiceSettings
 from tests import synthetic
 from tests.serving import command, listening, problem, service
-from tests.waiting import until
+from tests.waiting import wait_until
 
 
-class Held:
+class BlockingEncoder:
     """An encoder that waits until it may go on, and counts the grasps of each call."""
 
     def __init__(self, encoder):
@@ -42,11 +42,11 @@ class Held:
 @contextmanager
 def held(index, **settings):
     """A service whose encoder is held: its address, the encoder, and its parts."""
-    with listening(index, **settings) as (url, parts), ThreadPoolExecutor(16) as askers:
+    with listening(index, **settings) as (url, parts), ThreadPoolExecutor(16) as client_threads:
         searcher = parts.generations.current.searcher
-        encoder = searcher.reader.encoder = Held(searcher.reader.encoder)
+        encoder = searcher.reader.encoder = BlockingEncoder(searcher.reader.encoder)
         try:
-            yield url, encoder, parts, askers
+            yield url, encoder, parts, client_threads
         finally:
             encoder.go.set()
 
@@ -57,46 +57,46 @@ def value(url, name):
     return next((float(line.rsplit(" ", 1)[1]) for line in lines if line.startswith(f"{name} ")), 0.0)
 
 
-def asked(url, body, **more):
+def post_query(url, body, **more):
     return httpx.post(f"{url}/v1/query", json={**body, **more}, timeout=60)
 
 
 def test_beyond_the_queue_requests_are_told_to_come_again_and_the_others_are_answered(index, body):
-    with held(index, queue=3) as (url, encoder, parts, askers):
-        first = [askers.submit(asked, url, body) for _ in range(3)]
-        until(lambda: parts.queue.held == 3)
+    with held(index, queue=3) as (url, encoder, parts, client_threads):
+        first = [client_threads.submit(post_query, url, body) for _ in range(3)]
+        wait_until(lambda: parts.queue.held == 3)
         for _ in range(4):
-            refused = asked(url, body)
+            refused = post_query(url, body)
             assert problem(refused, 429, "busy") == "3 requests are held already; come again"
             assert refused.headers["retry-after"] == "1"
         assert httpx.get(f"{url}/readyz").status_code == 200  # who does not ask the model is not held up
         encoder.go.set()
         assert [one.result().status_code for one in first] == [200] * 3
-        assert asked(url, body).status_code == 200
+        assert post_query(url, body).status_code == 200
         assert value(url, 'retrieve_dropped_total{why="busy"}') == 4
 
 
 def test_who_has_left_or_waited_too_long_is_not_worked_on(index, body):
-    with held(index) as (url, encoder, parts, askers):
-        first = askers.submit(asked, url, body)
-        until(lambda: encoder.calls == [1])
-        assert problem(asked(url, body, deadline_ms=50), 504, "late") == "no answer within 50 ms"
+    with held(index) as (url, encoder, parts, client_threads):
+        first = client_threads.submit(post_query, url, body)
+        wait_until(lambda: encoder.calls == [1])
+        assert problem(post_query(url, body, deadline_ms=50), 504, "late") == "no answer within 50 ms"
         with pytest.raises(httpx.ReadTimeout):  # the client closes its connection then
             httpx.post(f"{url}/v1/query", json=body, timeout=0.5)
-        until(lambda: value(url, 'retrieve_dropped_total{why="left"}') == 1)
-        last = askers.submit(asked, url, body)
-        until(lambda: parts.queue.held == 2)
+        wait_until(lambda: value(url, 'retrieve_dropped_total{why="left"}') == 1)
+        last = client_threads.submit(post_query, url, body)
+        wait_until(lambda: parts.queue.held == 2)
         encoder.go.set()
         assert (first.result().status_code, last.result().status_code) == (200, 200)
         assert encoder.calls == [1, 1]
 
 
 def test_queries_that_wait_are_encoded_together_and_get_the_answers_that_they_would_get_alone(index, body):
-    with held(index, queue=6, batch_most=3) as (url, encoder, parts, askers):
-        first = askers.submit(asked, url, body)
-        until(lambda: encoder.calls == [1])
-        waiting = [askers.submit(asked, url, body) for _ in range(5)]
-        until(lambda: len(parts.queue._jobs) == 5)  # whose pictures are read
+    with held(index, queue=6, max_batch=3) as (url, encoder, parts, client_threads):
+        first = client_threads.submit(post_query, url, body)
+        wait_until(lambda: encoder.calls == [1])
+        waiting = [client_threads.submit(post_query, url, body) for _ in range(5)]
+        wait_until(lambda: len(parts.queue._jobs) == 5)  # whose pictures are read
         encoder.go.set()
         alone, *others = [one.result().json()["results"] for one in (first, *waiting)]
         assert encoder.calls == [1, 3, 2]
@@ -107,15 +107,15 @@ def test_queries_that_wait_are_encoded_together_and_get_the_answers_that_they_wo
 
 def test_queries_within_the_window_are_encoded_together_and_a_bad_one_spoils_none(index, body):
     short = {"touches": [body["touches"][0][:1]]}  # a finger too few
-    with held(index, batch_ms=1000, batch_most=3) as (url, encoder, _, askers):
+    with held(index, batch_ms=1000, max_batch=3) as (url, encoder, _, client_threads):
         encoder.go.set()
-        good = [askers.submit(asked, url, body) for _ in range(3)]
+        good = [client_threads.submit(post_query, url, body) for _ in range(3)]
         assert [one.result().status_code for one in good] == [200] * 3
         assert sorted(encoder.calls) == [3]
-        mixed = [askers.submit(asked, url, one) for one in (body, short, body)]
+        mixed = [client_threads.submit(post_query, url, one) for one in (body, short, body)]
         assert [one.result().status_code for one in mixed] == [200, 422, 200]
         assert value(url, "retrieve_batch_queries_count") == 2
-        other = [askers.submit(asked, url, body, top=top) for top in (2, 3)]
+        other = [client_threads.submit(post_query, url, body, top=top) for top in (2, 3)]
         assert [len(one.result().json()["results"]) for one in other] == [2, 3]
 
 
@@ -156,7 +156,7 @@ def test_a_new_generation_is_taken_up_and_no_answer_is_of_two(grown, body):
 
     def ask(url):
         while not ended.is_set():
-            response = asked(url, body, top=100)
+            response = post_query(url, body, top=100)
             document = response.json()
             seen = document["index"]["generation"], document["index"]["objects"], len(document["results"])
             if response.status_code != 200 or seen[1] != seen[2]:
@@ -164,12 +164,12 @@ def test_a_new_generation_is_taken_up_and_no_answer_is_of_two(grown, body):
             answers.add(seen[:2])
 
     answers = set()
-    with listening(own, poll_s=0.05) as (url, _), ThreadPoolExecutor(2) as askers:
-        asking = [askers.submit(ask, url) for _ in range(2)]
+    with listening(own, poll_s=0.05) as (url, _), ThreadPoolExecutor(2) as client_threads:
+        asking = [client_threads.submit(ask, url) for _ in range(2)]
         for number in (2, 3):
             build()
             objects[f"gen-{number:06}"] = 9 if number == 2 else 8
-            until(lambda: any(seen[0] == f"gen-{number:06}" for seen in list(answers)), 60)  # noqa: B023
+            wait_until(lambda: any(seen[0] == f"gen-{number:06}" for seen in list(answers)), 60)  # noqa: B023
         ended.set()
         for one in asking:
             one.result()
@@ -181,12 +181,12 @@ def test_one_that_cannot_be_opened_leaves_the_old_one_answering(grown, body):
     own, build = grown
     with listening(own, poll_s=0.05) as (url, _):
         build()
-        until(lambda: asked(url, body).json()["index"]["generation"] == "gen-000002", 60)
+        wait_until(lambda: post_query(url, body).json()["index"]["generation"] == "gen-000002", 60)
         (own / "CURRENT").write_text("gen-000009\n")
-        until(lambda: value(url, "retrieve_reload_failures_total") == 1, 60)
+        wait_until(lambda: value(url, "retrieve_reload_failures_total") == 1, 60)
         time.sleep(0.5)  # ten polls
         assert value(url, "retrieve_reload_failures_total") == 1  # and one line in the log, not one for each poll
-        assert asked(url, body).json()["index"]["generation"] == "gen-000002"
+        assert post_query(url, body).json()["index"]["generation"] == "gen-000002"
 
 
 @pytest.mark.slow
@@ -204,9 +204,9 @@ def test_an_index_that_is_none_is_told_at_the_start(tmp_path):
 def test_what_is_in_flight_when_it_is_told_to_end_is_answered(index, body, sign, tmp_path):
     with (
         command("--index", index, "--port", "0", "--queue", "40", "--history", tmp_path / "kept") as (process, url, _),
-        ThreadPoolExecutor(12) as askers,
+        ThreadPoolExecutor(12) as client_threads,
     ):
-        asked(url, body)
+        post_query(url, body)
         connected = threading.Semaphore(0)
 
         def ask():
@@ -221,10 +221,10 @@ def test_what_is_in_flight_when_it_is_told_to_end_is_answered(index, body, sign,
                     data += more
                 return data
 
-        answers = [askers.submit(ask) for _ in range(12)]
+        answers = [client_threads.submit(ask) for _ in range(12)]
         for _ in answers:
             connected.acquire(timeout=30)
-        held_now = value(url, "retrieve_held_requests")
+        held_now = value(url, "retrieve_requests_in_flight")
         process.send_signal(sign)
         found = [one.result(timeout=60) for one in answers]
         assert process.wait(60) == 0
@@ -266,7 +266,7 @@ def test_more_streams_than_places_are_refused_and_a_place_is_free_again(index):
             with httpx.stream("GET", address, timeout=30) as refused:
                 refused.read()
             problem(refused, 429, "busy")
-        until(lambda: status(address) == 200)
+        wait_until(lambda: status(address) == 200)
         assert httpx.get(f"{url}/v1/sensors/a/frame").content == b"picture"
         assert problem(httpx.get(f"{url}/v1/sensors/b/frame"), 500, "failed") == "sensor b: division by zero"
         problem(httpx.get(f"{url}/v1/sensors/c/frame"), 404, "unknown")

@@ -10,41 +10,41 @@ from schemathesis import GenerationMode
 from schemathesis.specs.openapi import checks
 
 from retrieval.serve.errors import KINDS
-from tests.serving import keeping, listening
+from tests.serving import listening, with_history
 
 CHECKS = (checks.status_code_conformance, checks.content_type_conformance, checks.response_schema_conformance)
 
 
 @pytest.fixture(scope="module")
-def asked(index, tmp_path_factory):
-    with keeping(index, tmp_path_factory.mktemp("kept"), serve=listening) as (url, _):
+def service_with_everything(index, tmp_path_factory):
+    with with_history(index, tmp_path_factory.mktemp("kept"), serve=listening) as (url, _):
         yield schemathesis.openapi.from_url(f"{url}/openapi.json").exclude(path_regex="stream$")
 
 
 @pytest.fixture(scope="module")
-def told(client):
+def openapi_document(client):
     return client.get("/openapi.json").json()
 
 
-def test_every_body_has_an_example_and_every_reference_leads_somewhere(told):
+def test_every_body_has_an_example_and_every_reference_leads_somewhere(openapi_document):
     bodies = [
         body["schema"]
-        for path in told["paths"].values()
+        for path in openapi_document["paths"].values()
         for operation in path.values()
         for body in operation.get("requestBody", {}).get("content", {}).values()
     ]
     assert len(bodies) > 6
-    names = set(told["components"]["schemas"])
-    text = str(told)
+    names = set(openapi_document["components"]["schemas"])
+    text = str(openapi_document)
     referred = {part.split("'")[0] for part in text.split("#/components/schemas/")[1:]}
     assert referred <= names
     for name in ("QueryBody", "BatchBody", "QueryDocument"):
-        assert told["components"]["schemas"][name]["examples"]
+        assert openapi_document["components"]["schemas"][name]["examples"]
 
 
-def test_every_problem_that_a_path_names_is_a_problem_document(told):
+def test_every_problem_that_a_path_names_is_a_problem_document(openapi_document):
     statuses = {status for status, _ in KINDS.values()}
-    for path in told["paths"].values():
+    for path in openapi_document["paths"].values():
         for operation in path.values():
             for status, response in operation["responses"].items():
                 if int(status) >= 400 and int(status) in statuses:
@@ -53,9 +53,9 @@ def test_every_problem_that_a_path_names_is_a_problem_document(told):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", list(GenerationMode), ids=lambda mode: mode.name.lower())
-def test_whatever_is_sent_the_answer_is_one_that_the_document_names(asked, mode):
+def test_whatever_is_sent_the_answer_is_one_that_the_document_names(service_with_everything, mode):
     wrong, seen = {}, Counter()
-    for found in asked.get_all_operations():
+    for found in service_with_everything.get_all_operations():
         operation = found.ok()
 
         @given(operation.as_strategy(generation_mode=mode))

@@ -9,7 +9,7 @@ import pytest
 
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
-from retrieval.serve.service import Grasped, LiveRig
+from retrieval.serve.service import GraspResult, LiveRig
 from tests import synthetic
 from tests.browser import address, ask, choose, page, serious
 
@@ -31,7 +31,7 @@ def rig(touches):
 
     def close(names):
         name = names[0] if len(names) == 1 else next(drawn)
-        return Grasped(name, list(touches[name][0].values()))
+        return GraspResult(name, list(touches[name][0].values()))
 
     return LiveRig({"a": lambda: JPEG, "b": lambda: JPEG}, close)
 

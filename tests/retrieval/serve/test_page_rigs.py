@@ -9,13 +9,13 @@ import pytest
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
-from retrieval.serve.rig import of_index, of_rig
+from retrieval.serve.rig import load_live_rig, simulated_live_rig
 from retrieval.training.train import train
 from robot.sim.rig import SimRig
 from tests.browser import address, page
 from tests.conftest import TINY
 from tests.replay_rig import replay_file
-from tests.serving import keeping
+from tests.serving import with_history
 
 pytestmark = pytest.mark.slow
 SEED = 20_000
@@ -29,7 +29,7 @@ def index(recording, tmp_path_factory):
     for name in rig.object_ids(3):
         (folder / "catalog" / name).mkdir(parents=True)
         rig.prepare(name, 0)
-        pixels = np.ascontiguousarray(rig.world.now().image("photo")[..., ::-1])
+        pixels = np.ascontiguousarray(rig.sim_state.current_scene().image("photo")[..., ::-1])
         assert cv2.imwrite(str(folder / "catalog" / name / "1.jpg"), pixels)
     config = dataclasses.replace(TINY, preprocessing=Preprocessing(touch_px=32, photo_px=48, background="difference"))
     train(recording, folder / "tiny.safetensors", config, quiet=True)
@@ -47,7 +47,10 @@ def live(opened):
 
 
 def test_the_simulated_jaws_close_and_their_untouched_gels_go_with_the_touch(browser, index, tmp_path):
-    with keeping(index, tmp_path, rig=of_index(index), serve=address) as url, page(browser, url) as opened:
+    with (
+        with_history(index, tmp_path, rig=simulated_live_rig(index), serve=address) as url,
+        page(browser, url) as opened,
+    ):
         assert live(opened).evaluate("one => one.naturalWidth") > 100
         opened.get_by_role("button", name="Grasp something").click()
         opened.locator(".answer").wait_for()
@@ -62,7 +65,7 @@ def test_the_simulated_jaws_close_and_their_untouched_gels_go_with_the_touch(bro
 
 
 def test_gels_of_a_rigs_file_are_live_and_taken_untouched_and_touched(browser, index):
-    with replay_file() as file, address(index, of_rig(str(file), index)) as url, page(browser, url) as opened:
+    with replay_file() as file, address(index, load_live_rig(str(file), index)) as url, page(browser, url) as opened:
         live(opened)
         assert opened.get_by_role("button", name="Grasp something").count() == 0  # nobody moves a rig from here
         opened.get_by_role("button", name="Take as no-contact frames").click()

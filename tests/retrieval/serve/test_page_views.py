@@ -9,7 +9,7 @@ import pytest
 
 from tests import synthetic
 from tests.browser import address, ask, page, serious
-from tests.serving import keeping
+from tests.serving import with_history
 
 pytestmark = pytest.mark.slow
 MANY = 100_000
@@ -20,7 +20,7 @@ def url(index, tmp_path_factory):
     """A service that keeps what it is told, with a recording of twelve objects that the model never saw."""
     folder = tmp_path_factory.mktemp("kept")
     unseen = synthetic.write_recording(folder / "unseen", synthetic.make_objects(12, seed=500), 2)
-    with keeping(index, folder, unseen, serve=address) as found:
+    with with_history(index, folder, unseen, serve=address) as found:
         yield found
 
 
@@ -67,7 +67,7 @@ def test_the_information_of_an_answer_is_shown_as_the_service_sends_it(opened, f
     alone = [
         informed(one, gained_bits=bits) for one, bits in zip(searcher.query_many(grasps), (0.5, 3.125), strict=True)
     ]
-    growing = {"answers": [one.to_dict() for one in searcher.query_growing(grasps)], "alone": alone}
+    growing = {"answers": [one.to_dict() for one in searcher.query_cumulative(grasps)], "per_grasp": alone}
     opened.route("**/v1/query", lambda route: route.fulfill(json=whole))
     opened.route("**/v1/query/growing*", lambda route: route.fulfill(json=growing))
     ask(opened, files)
@@ -90,7 +90,7 @@ def test_another_grasp_of_under_a_hundredth_bit_would_tell_hardly_anything(opene
     assert "would tell hardly anything" in opened.get_by_role("region", name="Another grasp").inner_text()
 
 
-def test_what_a_person_says_is_kept_and_stands_in_the_history(opened, files):
+def test_feedback_is_stored_and_shown_in_the_history(opened, files):
     ask(opened, files)
     opened.get_by_role("button", name="It was another object").click()
     name = opened.locator(".photo.object .name").nth(2).inner_text()

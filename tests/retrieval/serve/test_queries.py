@@ -57,15 +57,15 @@ def test_a_batch_gives_an_answer_for_each_object_in_their_order(client, searcher
         assert same(answer, expected)
 
 
-def test_a_growing_query_answers_after_each_grasp_and_for_each_alone_where_asked(client, searcher, grasps):
+def test_cumulative_query_returns_cumulative_and_per_grasp_answers(client, searcher, grasps):
     asked = {"touches": encoded(grasps)}
-    assert client.post("/v1/query/growing", json=asked).json()["alone"] == []
+    assert client.post("/v1/query/cumulative", json=asked).json()["per_grasp"] == []
     found = client.post("/v1/query/growing?alone=true", json=asked).json()
-    for answer, expected in zip(found["alone"], searcher.query_many([[grasp] for grasp in grasps]), strict=True):
+    for answer, expected in zip(found["per_grasp"], searcher.query_many([[grasp] for grasp in grasps]), strict=True):
         assert same(answer, expected)
     answers = found["answers"]
     assert [len(answer["query"]["touches"]) for answer in answers] == [1, 2]
-    for answer, expected in zip(answers, searcher.query_growing(grasps), strict=True):
+    for answer, expected in zip(answers, searcher.query_cumulative(grasps), strict=True):
         assert same(answer, expected)
 
 

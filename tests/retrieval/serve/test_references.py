@@ -8,13 +8,15 @@ from PIL import Image
 from retrieval.data.dataset import load_grasps
 from retrieval.search.build.build_index import build_index
 from tests.browser import address, ask, page, serious
-from tests.referenced import NAMES, a_model
-from tests.serving import keeping, problem, service
+from tests.reference_model import NAMES, write_reference_model
+from tests.serving import problem, service, with_history
 
 
 @pytest.fixture
-def index(touched, tmp_path):
-    build_index(touched, a_model(tmp_path / "felt.safetensors"), tmp_path / "index", quiet=True)
+def index(catalogue_with_touches, tmp_path):
+    build_index(
+        catalogue_with_touches, write_reference_model(tmp_path / "felt.safetensors"), tmp_path / "index", quiet=True
+    )
     return tmp_path / "index"
 
 
@@ -22,18 +24,18 @@ def files(grasp):
     return {"files": [("gelsight", (path.name, path.read_bytes())) for path in grasp]}
 
 
-def test_the_gel_images_that_an_answer_names_are_shown(index, touched, touches):
+def test_the_gel_images_that_an_answer_names_are_shown(index, catalogue_with_touches, touches):
     with service(index) as client:
         found = client.post("/v1/query", **files(touches[NAMES[1]][1])).json()
         best = {match["object_id"]: match for match in found["results"]}[NAMES[1]]
         assert best["reference"]["touch"] == [f"{NAMES[1]}/touch_1_{finger}.png" for finger in "ab"]
         for path in best["reference"]["touch"]:
             whole, small = client.get(f"/v1/photos/{path}"), client.get(f"/v1/thumbnails/{path}?px=64")
-            assert whole.content == (touched / path).read_bytes()
+            assert whole.content == (catalogue_with_touches / path).read_bytes()
             assert max(Image.open(io.BytesIO(small.content)).size) == 64
             assert client.get(f"/v1/photos/{path}", headers={"if-none-match": whole.headers["etag"]}).status_code == 304
         # What lies in the catalogue but was not taken up as a reference is no more shown than any other file.
-        (touched / NAMES[5]).joinpath("touch_0_a.png").write_bytes(whole.content)
+        (catalogue_with_touches / NAMES[5]).joinpath("touch_0_a.png").write_bytes(whole.content)
         assert problem(client.get(f"/v1/photos/{NAMES[5]}/touch_0_a.png"), 404, "unknown")
 
 
@@ -46,14 +48,14 @@ def test_a_gel_image_is_no_photo_to_compare_with(index, touches):
         assert client.get(f"/v1/photos/{NAMES[2]}/touch_0_a.png").status_code == 200
 
 
-def test_what_was_said_of_an_object_without_photos_is_kept_but_no_gel_becomes_a_photo(index, touches, tmp_path):
-    with keeping(index, tmp_path) as client:
+def test_feedback_on_an_object_without_photos_adds_no_photo(index, touches, tmp_path):
+    with with_history(index, tmp_path) as client:
         for name in (NAMES[0], NAMES[2]):
             asked = client.post("/v1/query", **files(touches[name][0]))
-            said = {"query": asked.headers["x-query-id"], "said": "object", "object_id": name}
+            said = {"query": asked.headers["x-query-id"], "feedback": "object", "object_id": name}
             assert client.post("/v1/feedback", json=said).status_code == 201
             entry = client.get(f"/v1/history/{said['query']}").json()
-            assert (entry["said"], entry["object_id"]) == ("object", name)
+            assert (entry["feedback"], entry["object_id"]) == ("object", name)
             assert entry["answer"] == asked.json()
     assert [grasp.object_id for grasp in load_grasps(tmp_path / "recording")] == [NAMES[0]]
 

@@ -9,7 +9,7 @@ import httpx
 import pytest
 from PIL import Image
 
-from retrieval.serve.uploads import HELD_BYTES, MAX_LARGE_BODIES, PICTURE_PATHS
+from retrieval.serve.uploads import MAX_LARGE_BODIES, MAX_SMALL_BODIES_BYTES, PICTURE_PATHS
 from tests.hostile_pictures import png_file
 from tests.serving import listening, problem, service
 
@@ -118,8 +118,8 @@ def test_only_bodies_with_pictures_may_be_large(client):
     posted = {path for path, operations in paths.items() if "post" in operations} - PICTURE_PATHS
     assert posted == {"/v1/session", "/v1/feedback", "/v1/trials", "/v1/trials/{name}/{number}", "/v1/grasp"}
     for path in posted - {"/v1/grasp"}:
-        large = client.post(path.format(name="x", number=1), content=b"[" * 16_385, headers=JSON)
-        assert "at most 16,384 bytes" in problem(large, 413, "too-large")
+        large_bodies = client.post(path.format(name="x", number=1), content=b"[" * 16_385, headers=JSON)
+        assert "at most 16,384 bytes" in problem(large_bodies, 413, "too-large")
         nested = client.post(path.format(name="x", number=1), content=b"[" * 16_384, headers=JSON)
         assert nested.status_code in (400, 422)
 
@@ -211,16 +211,16 @@ def test_a_slow_body_is_given_up_and_half_a_body_is_no_matter(url):
 def test_bodies_on_their_way_have_a_bound_together_and_large_ones_leave_room_for_others(index):
     with service(index) as client:
         limit = next(each for each in middlewares(client.app) if type(each).__name__ == "BodyLimit")
-        small, large = {"touches": [["aGk="]]}, {"touches": [["aGkk" * 300_000]]}
-        limit.held = HELD_BYTES
+        small, large_bodies = {"touches": [["aGk="]]}, {"touches": [["aGkk" * 300_000]]}
+        limit.held_bytes = MAX_SMALL_BODIES_BYTES
         assert "too many requests" in problem(client.post("/v1/query", json=small), 429, "busy")
-        assert limit.held == HELD_BYTES
-        limit.held, limit.large = 0, MAX_LARGE_BODIES
-        assert "too many large requests" in problem(client.post("/v1/query", json=large), 429, "busy")
+        assert limit.held_bytes == MAX_SMALL_BODIES_BYTES
+        limit.held_bytes, limit.large_bodies = 0, MAX_LARGE_BODIES
+        assert "too many large requests" in problem(client.post("/v1/query", json=large_bodies), 429, "busy")
         problem(client.post("/v1/query", json=small), 422, "bad-image")
-        limit.large = MAX_LARGE_BODIES - 1
-        problem(client.post("/v1/query", json=large), 422, "bad-image")
-        assert (limit.held, limit.large) == (0, MAX_LARGE_BODIES - 1)
+        limit.large_bodies = MAX_LARGE_BODIES - 1
+        problem(client.post("/v1/query", json=large_bodies), 422, "bad-image")
+        assert (limit.held_bytes, limit.large_bodies) == (0, MAX_LARGE_BODIES - 1)
 
 
 def middlewares(app):

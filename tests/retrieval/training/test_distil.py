@@ -1,4 +1,4 @@
-"""Teaching the pruner: its loss, its data, that it finds the classifier's winner, and that nothing else changes."""
+"""Teaching the candidate_encoder: its loss, its data, that it finds the classifier's winner, and that nothing else changes."""
 
 import dataclasses
 import itertools
@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from retrieval.data.dataset import load_grasps, make_split
-from retrieval.errors import Interrupted, NumericalError
-from retrieval.methods.base import Setting
+from retrieval.errors import JobInterrupted, NumericalError
 from retrieval.methods.late_fusion import LateFusion
-from retrieval.methods.prune_rerank import PruneRerank
+from retrieval.methods.method import MethodSettings
+from retrieval.methods.retrieve_rerank import RetrieveRerank
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, read_tensors, store_checkpoint, write_tensors
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import Matcher
@@ -21,14 +21,14 @@ from retrieval.training.train import build_matcher
 from tests.conftest import TINY
 
 HIDDEN = 16
-UNPRUNED = MatcherConfig(tower="small", fingers=1, hidden=HIDDEN, standardise=True, embedding_dim=8)
+WITHOUT_CANDIDATE_ENCODER = MatcherConfig(tower="small", fingers=1, hidden=HIDDEN, standardise=True, embedding_dim=8)
 
 
 @pytest.fixture
 def matcher():
     """Its head says how far apart touch and photo are: minus the sum of |t - v|, each as relu(t - v) + relu(v - t)."""
     torch.manual_seed(3)
-    matcher = Matcher(UNPRUNED).eval()
+    matcher = Matcher(WITHOUT_CANDIDATE_ENCODER).eval()
     with torch.no_grad():
         matcher.head.second.weight.copy_(torch.eye(HIDDEN))
         matcher.head.second.bias.zero_()
@@ -38,27 +38,27 @@ def matcher():
 
 @pytest.fixture(autouse=True)
 def _small_batches(monkeypatch):
-    monkeypatch.setattr(distil, "TOUCHES", 16)
-    monkeypatch.setattr(distil, "PHOTOS", 256)
-    monkeypatch.setattr(distil, "POOL", 2000)
+    monkeypatch.setattr(distil, "BATCH_TOUCHES", 16)
+    monkeypatch.setattr(distil, "BATCH_PHOTOS", 256)
+    monkeypatch.setattr(distil, "POOL_SIZE", 2000)
     monkeypatch.setattr(distil, "LEARNING_RATE", 0.02)
 
 
 def drawn(count, seed, sign):
-    """Halves that vary in two directions, as a tower's vary in few: of touches with sign 1, of photos with -1."""
+    """Partials that vary in two directions, as a tower's vary in few: of touches with sign 1, of photos with -1."""
     directions = torch.randn(2, HIDDEN // 2, generator=torch.Generator().manual_seed(4))
     seen = torch.randn(count, 2, generator=torch.Generator().manual_seed(seed)) @ directions
     return sign * torch.cat([seen, -seen], dim=1)
 
 
 @pytest.fixture
-def halves():
+def partials():
     return drawn(60, 5, sign=1), drawn(400, 6, sign=-1)
 
 
-def taught(matcher, halves, steps=5, seed=0, **given):
-    distil.distil(matcher, *halves, width=32, steps=steps, seed=seed, quiet=True, **given)
-    return {name: tensor.clone() for name, tensor in matcher.pruner.state_dict().items()}
+def taught(matcher, partials, steps=5, seed=0, **given):
+    distil.distil(matcher, *partials, width=32, steps=steps, seed=seed, quiet=True, **given)
+    return {name: tensor.clone() for name, tensor in matcher.candidate_encoder.state_dict().items()}
 
 
 def same(left, right):
@@ -70,7 +70,7 @@ def same(left, right):
 
 def test_the_loss_is_nothing_for_scores_that_are_the_logits_up_to_a_constant_of_each_touch():
     logits = torch.tensor([[3.0, -1.0, 0.5], [200.0, -200.0, 0.0]])
-    loss = distil.order_loss(logits + torch.tensor([[7.0], [-20.0]]), logits)
+    loss = distil.distillation_loss(logits + torch.tensor([[7.0], [-20.0]]), logits)
     torch.testing.assert_close(loss, torch.tensor(0.0), rtol=0, atol=1e-5)
 
 
@@ -81,7 +81,7 @@ def test_the_loss_is_the_divergence_and_a_share_of_the_error_by_hand():
     divergence = np.mean([(p * np.log(p / q)).sum() for p, q in zip(chances, other, strict=True)])
     centred = [row - row.mean() for row in scores], [row - row.mean() for row in logits]
     error = np.mean((np.array(centred[0]) - np.array(centred[1])) ** 2) / logits.var(ddof=1)
-    loss = distil.order_loss(torch.tensor(scores), torch.tensor(logits))
+    loss = distil.distillation_loss(torch.tensor(scores), torch.tensor(logits))
     assert loss.item() == pytest.approx(divergence + distil.SPREAD_WEIGHT * error)
 
 
@@ -89,30 +89,32 @@ def test_logits_that_lie_far_apart_have_a_finite_loss_where_probabilities_have_n
     scores, logits = torch.tensor([[-300.0, 300.0]]), torch.tensor([[300.0, -300.0]])
     chances = logits.softmax(1)
     assert (chances * (chances / scores.softmax(1)).log()).sum().isnan()
-    assert distil.order_loss(scores, logits).item() > 600
+    assert distil.distillation_loss(scores, logits).item() > 600
 
 
-def test_a_loss_that_is_not_finite_is_told_and_the_matcher_stays_as_it_was(matcher, halves):
+def test_a_loss_that_is_not_finite_is_told_and_the_matcher_stays_as_it_was(matcher, partials):
     with torch.no_grad():
         matcher.head.out.bias.fill_(torch.inf)
     with pytest.raises(NumericalError, match="loss must stay finite"):
-        taught(matcher, halves)
-    assert matcher.pruner is None
-    assert matcher.config == UNPRUNED
+        taught(matcher, partials)
+    assert matcher.candidate_encoder is None
+    assert matcher.config == WITHOUT_CANDIDATE_ENCODER
 
 
 # Its data --------------------------------------------------------------------------------------------------
 
 
-def test_a_blend_of_halves_is_the_half_of_the_blend_of_features(matcher):
+def test_a_blend_of_partials_is_the_partial_of_blended_features(matcher):
     features = torch.randn(5, matcher.photo_tower.feature_count)
-    blends = [distil.blend(rows, 50, torch.Generator().manual_seed(1)) for rows in (features, _half(matcher, features))]
-    torch.testing.assert_close(_half(matcher, blends[0]), blends[1], rtol=1e-4, atol=1e-5)
+    blends = [
+        distil.blend(rows, 50, torch.Generator().manual_seed(1)) for rows in (features, _partial(matcher, features))
+    ]
+    torch.testing.assert_close(_partial(matcher, blends[0]), blends[1], rtol=1e-4, atol=1e-5)
 
 
 @torch.no_grad()
-def _half(matcher, features):
-    return matcher.photo_code(features).half
+def _partial(matcher, features):
+    return matcher.photo_encoding(features).partial
 
 
 def test_a_blend_lies_between_two_rows_and_nearer_to_one():
@@ -124,101 +126,110 @@ def test_a_blend_lies_between_two_rows_and_nearer_to_one():
     assert len(blends.unique(dim=0)) > 100
 
 
-def test_every_touch_is_judged_with_every_photo(matcher, halves):
-    touches, photos = halves[0][:4], halves[1][:6]
+def test_every_touch_is_scored_with_every_photo(matcher, partials):
+    touches, photos = partials[0][:4], partials[1][:6]
     table = distil.all_logits(matcher.head, touches, photos)
     for row, column in itertools.product(range(4), range(6)):
         one = matcher.head(touches[row][None], photos[column][None])
         torch.testing.assert_close(table[row, column], one[0], rtol=1e-5, atol=1e-6)
 
 
-def test_what_is_taught_after_the_start_lies_nearer_to_the_touches_than_what_is_drawn(matcher, halves):
-    taught(matcher, halves)
-    crowd = distil._Crowd(matcher.pruner, halves[1], lambda rows: rows, torch.Generator().manual_seed(2))
-    drawn_alone = crowd.photos(-1, halves[0][:16])
-    chosen = crowd.photos(0, halves[0][:16])
-    assert drawn_alone.shape == chosen.shape == (256, HIDDEN)
-    touches = matcher.pruner.touch(halves[0][:16])
+def test_what_is_distilled_after_the_start_lies_nearer_to_the_touches_than_what_is_drawn(matcher, partials):
+    taught(matcher, partials)
+    crowd = distil._PhotoSampler(
+        matcher.candidate_encoder, partials[1], lambda rows: rows, torch.Generator().manual_seed(2)
+    )
+    drawn_alone = crowd.photos(-1, partials[0][:16])
+    best_params = crowd.photos(0, partials[0][:16])
+    assert drawn_alone.shape == best_params.shape == (256, HIDDEN)
+    touches = matcher.candidate_encoder.touch(partials[0][:16])
     best = [
-        (touches @ matcher.pruner.photo(photos).T).topk(12).values.mean().item() for photos in (drawn_alone, chosen)
+        (touches @ matcher.candidate_encoder.photo(photos).T).topk(12).values.mean().item()
+        for photos in (drawn_alone, best_params)
     ]
     assert best[1] > best[0]
-    pool = crowd._pool.of(halves[1], torch.arange(distil.POOL))
-    nearest = (touches @ matcher.pruner.photo(pool).T).topk(12).values
+    pool = crowd._pool.of(partials[1], torch.arange(distil.POOL_SIZE))
+    nearest = (touches @ matcher.candidate_encoder.photo(pool).T).topk(12).values
     assert best[1] >= nearest.mean().item() - 1e-6  # those of the pool are all there
-    crowd.photos(1, halves[0][:16])
-    assert torch.equal(crowd._pool.of(halves[1], torch.arange(distil.POOL)), pool)
-    crowd.photos(distil.RENEWED, halves[0][:16])
-    assert not torch.equal(crowd._pool.of(halves[1], torch.arange(distil.POOL)), pool)
+    crowd.photos(1, partials[0][:16])
+    assert torch.equal(crowd._pool.of(partials[1], torch.arange(distil.POOL_SIZE)), pool)
+    crowd.photos(distil.POOL_RENEWAL_STEPS, partials[0][:16])
+    assert not torch.equal(crowd._pool.of(partials[1], torch.arange(distil.POOL_SIZE)), pool)
 
 
 # What is taught --------------------------------------------------------------------------------------------
 
 
-def test_the_winner_is_found_among_few_where_an_untaught_pruner_misses_it(matcher, halves):
+def test_the_exhaustive_top1_is_found_among_few_where_an_untrained_candidate_encoder_misses_it(matcher, partials):
     """On touches that were not taught, among 400 photos."""
     unseen = drawn(100, 8, sign=1)
-    taught(matcher, halves, steps=1)
-    before = distil.winner_ranks(matcher, unseen, halves[1])
-    taught(matcher, halves, steps=60)
-    after = distil.winner_ranks(matcher, unseen, halves[1])
+    taught(matcher, partials, steps=1)
+    before = distil.exhaustive_top1_ranks(matcher, unseen, partials[1])
+    taught(matcher, partials, steps=60)
+    after = distil.exhaustive_top1_ranks(matcher, unseen, partials[1])
     assert (before < 40).mean() < 0.3
     assert (after < 40).mean() > 0.8
 
 
-def test_the_rank_of_a_winner_counts_the_photos_nearer_than_it(matcher, halves):
-    taught(matcher, halves)
-    touches, photos = halves[0][:10], halves[1]
-    ranks = distil.winner_ranks(matcher, touches, photos)
+def test_the_rank_of_the_exhaustive_top1_counts_the_photos_nearer_than_it(matcher, partials):
+    taught(matcher, partials)
+    touches, photos = partials[0][:10], partials[1]
+    ranks = distil.exhaustive_top1_ranks(matcher, touches, photos)
     for touch, rank in zip(touches, ranks, strict=True):
         logits = [matcher.head(touch[None], photo[None]).item() for photo in photos]
-        nearness = (matcher.pruner.touch(touch[None]) @ matcher.pruner.photo(photos).T)[0].tolist()
+        nearness = (matcher.candidate_encoder.touch(touch[None]) @ matcher.candidate_encoder.photo(photos).T)[
+            0
+        ].tolist()
         assert rank == sum(near > nearness[int(np.argmax(logits))] for near in nearness)
 
 
-def test_the_seed_decides_and_neither_the_pruner_before_nor_other_random_numbers_do(matcher, halves):
-    first = taught(matcher, halves)
+def test_the_seed_decides_and_neither_the_candidate_encoder_before_nor_other_random_numbers_do(matcher, partials):
+    first = taught(matcher, partials)
     torch.manual_seed(99)
     state = torch.get_rng_state()
-    assert same(taught(matcher, halves), first)
+    assert same(taught(matcher, partials), first)
     assert torch.equal(torch.get_rng_state(), state)
-    assert not same(taught(matcher, halves, seed=1), first)
+    assert not same(taught(matcher, partials, seed=1), first)
 
 
-def test_nothing_but_the_pruner_changes(matcher, halves):
+def test_nothing_but_the_candidate_encoder_changes(matcher, partials):
     before = {name: tensor.clone() for name, tensor in matcher.state_dict().items()}
-    taught(matcher, halves)
+    taught(matcher, partials)
     after = matcher.state_dict()
     assert same(before, after)
-    assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"pruner"}
-    assert matcher.config == dataclasses.replace(UNPRUNED, pruner_width=32)
-    assert all(parameter.grad is None for name, parameter in matcher.named_parameters() if "pruner" not in name)
+    assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"candidate_encoder"}
+    assert matcher.config == dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, candidate_width=32)
+    assert all(
+        parameter.grad is None for name, parameter in matcher.named_parameters() if "candidate_encoder" not in name
+    )
 
 
-def test_with_a_cosine_in_the_logit_linear_numbers_find_winners_deeper_in_the_order_than_a_network_alone(halves):
+def test_with_a_cosine_in_the_logit_linear_numbers_find_exhaustive_top1s_deeper_in_the_order_than_a_network_alone(
+    partials,
+):
     """A logit that is the cosine alone, of embeddings that vary in two directions."""
     torch.manual_seed(3)
-    config = dataclasses.replace(UNPRUNED, cosine=True)
+    config = dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, cosine=True)
     matcher = Matcher(config).eval()
     with torch.no_grad():
         matcher.head.out.weight.zero_()
     touches, photos = (
         torch.cat([part, sign * 2 * torch.nn.functional.normalize(part[:, :8])], dim=1)
-        for part, sign in zip(halves, (1, -1), strict=True)
+        for part, sign in zip(partials, (1, -1), strict=True)
     )
     found = []
     for linear in (0, 2):
         distil.distil(matcher, touches, photos, width=32, linear=linear, steps=3, seed=0, quiet=True)
-        assert matcher.config == dataclasses.replace(config, pruner_width=32, pruner_linear=linear)
-        found.append(distil.winner_ranks(matcher, touches, photos).mean())
+        assert matcher.config == dataclasses.replace(config, candidate_width=32, candidate_linear=linear)
+        found.append(distil.exhaustive_top1_ranks(matcher, touches, photos).mean())
     assert found[1] < found[0] / 2
 
 
-def test_a_stop_leaves_the_matcher_as_it_was(matcher, halves):
+def test_a_stop_leaves_the_matcher_as_it_was(matcher, partials):
     asked = iter([False, False, True])
-    with pytest.raises(Interrupted):
-        taught(matcher, halves, stopped=lambda: next(asked))
-    assert matcher.pruner is None
+    with pytest.raises(JobInterrupted):
+        taught(matcher, partials, should_stop=lambda: next(asked))
+    assert matcher.candidate_encoder is None
 
 
 # Into a checkpoint -----------------------------------------------------------------------------------------
@@ -231,7 +242,7 @@ def checkpoint(matcher, tmp_path):
         path=tmp_path / "m.safetensors",
         digest="",
         matcher=matcher,
-        config=Config(UNPRUNED),
+        config=Config(WITHOUT_CANDIDATE_ENCODER),
         split=None,
         gel_check=None,
         provenance=about,
@@ -239,77 +250,84 @@ def checkpoint(matcher, tmp_path):
 
 
 def wanted(steps=20):
-    return Config(dataclasses.replace(UNPRUNED, pruner_width=32), TrainingConfig(distil_steps=steps))
+    return Config(
+        dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, candidate_width=32), TrainingConfig(distil_steps=steps)
+    )
 
 
-def test_a_checkpoint_gets_a_pruner_queries_and_the_pruners_own_measure(checkpoint, halves):
+def test_a_checkpoint_gets_a_candidate_encoder_queries_and_the_candidate_encoders_own_measure(checkpoint, partials):
     held_out = drawn(30, 8, sign=1), drawn(50, 9, sign=-1)
     assert not checkpoint.config.has_embeddings
     path = checkpoint.path
-    store_checkpoint(distil.with_pruner(checkpoint, wanted(), halves, held_out, quiet=True), path)
+    store_checkpoint(distil.with_candidate_encoder(checkpoint, wanted(), partials, held_out, quiet=True), path)
     made = load_checkpoint(path)
     assert made.config == wanted()
     assert made.config.has_embeddings
     np.testing.assert_array_equal(made.queries, held_out[0].half().numpy())
-    ranks = distil.winner_ranks(
-        made.matcher, torch.from_numpy(made.queries).float(), torch.cat([halves[1], held_out[1]])
+    ranks = distil.exhaustive_top1_ranks(
+        made.matcher, torch.from_numpy(made.queries).float(), torch.cat([partials[1], held_out[1]])
     )
     metrics = made.provenance["metrics"]
-    assert metrics == {"validation_auc": 0.75, "pruner_finds_winner_in_nearest_percent": (ranks < 4).mean()}
-    assert "pruner finds winner in nearest percent" in path.with_suffix(".md").read_text()
+    assert metrics == {"validation_auc": 0.75, "candidate_agreement_at_1_percent": (ranks < 4).mean()}
+    assert "candidate_encoder finds winner in nearest percent" in path.with_suffix(".md").read_text()
 
 
-def test_without_validation_objects_there_are_neither_queries_nor_a_measure(checkpoint, halves):
-    made = distil.with_pruner(checkpoint, wanted(2), halves, quiet=True)
+def test_without_validation_objects_there_are_neither_queries_nor_a_measure(checkpoint, partials):
+    made = distil.with_candidate_encoder(checkpoint, wanted(2), partials, quiet=True)
     assert made.queries is None
     assert made.provenance["metrics"] == {"validation_auc": 0.75}
 
 
 def test_queries_are_as_many_as_are_kept_and_only_what_float16_holds():
-    halves = torch.arange(1200.0)[:, None] * torch.ones(1, 2)
-    halves[7, 1] = 70_000.0
-    queries = distil.kept_queries(halves, seed=0)
+    partials = torch.arange(1200.0)[:, None] * torch.ones(1, 2)
+    partials[7, 1] = 70_000.0
+    queries = distil.select_queries(partials, seed=0)
     assert queries.dtype == np.float16
-    assert queries.shape == (distil.QUERIES, 2)
-    assert len(np.unique(queries[:, 0])) == distil.QUERIES
+    assert queries.shape == (distil.MAX_QUERIES, 2)
+    assert len(np.unique(queries[:, 0])) == distil.MAX_QUERIES
     assert np.isfinite(queries).all()
-    np.testing.assert_array_equal(queries, distil.kept_queries(halves, seed=0))
-    assert halves.half()[7, 1].isinf()
-    assert distil.kept_queries(halves[7:8], seed=0) is None
+    np.testing.assert_array_equal(queries, distil.select_queries(partials, seed=0))
+    assert partials.half()[7, 1].isinf()
+    assert distil.select_queries(partials[7:8], seed=0) is None
 
 
-def test_a_checkpoint_from_before_pruners_had_linear_numbers_opens_and_searches_as_it_did(checkpoint, halves):
-    store_checkpoint(distil.with_pruner(checkpoint, wanted(2), halves, quiet=True), checkpoint.path)
+def test_a_checkpoint_from_before_candidate_encoders_had_linear_numbers_opens_and_searches_as_it_did(
+    checkpoint, partials
+):
+    store_checkpoint(distil.with_candidate_encoder(checkpoint, wanted(2), partials, quiet=True), checkpoint.path)
     state, header = read_tensors(checkpoint.path)
-    del header["config"]["matcher"]["pruner_linear"]
-    before = checkpoint.matcher.pruner.photo(halves[1])
+    del header["config"]["matcher"]["candidate_linear"]
+    before = checkpoint.matcher.candidate_encoder.photo(partials[1])
     write_tensors(checkpoint.path, state, {name: header[name] for name in header if name not in ("format", "software")})
     opened = load_checkpoint(checkpoint.path)
-    assert opened.config.matcher.pruner_linear == 0
-    assert torch.equal(opened.matcher.pruner.photo(halves[1]), before)
+    assert opened.config.matcher.candidate_linear == 0
+    assert torch.equal(opened.matcher.candidate_encoder.photo(partials[1]), before)
 
 
-def test_an_older_checkpoint_without_a_word_of_pruners_searches_by_its_contrastive_embeddings():
+def test_an_older_checkpoint_without_a_word_of_candidate_encoders_searches_by_its_contrastive_embeddings():
     tables = TINY.to_dict()
-    del tables["matcher"]["pruner_width"], tables["training"]["distil_steps"]
+    del tables["matcher"]["candidate_width"], tables["training"]["distil_steps"]
     config = Config.from_dict(tables)
-    assert (config.matcher.pruner_width, config.has_embeddings) == (0, True)
-    assert Matcher(config.matcher).pruner is None
+    assert (config.matcher.candidate_width, config.has_embeddings) == (0, True)
+    assert Matcher(config.matcher).candidate_encoder is None
 
 
 # In the harness --------------------------------------------------------------------------------------------
 
 
-def test_with_a_pruner_the_best_of_a_few_candidates_is_late_fusions_best_photo(recording, tmp_path):
+def test_with_a_candidate_encoder_the_best_of_a_few_candidates_is_late_fusions_best_photo(recording, tmp_path):
     training = dataclasses.replace(TINY.training, freeze_towers=True, distil_steps=60, iterations=30)
-    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, pruner_width=32), training=training)
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, candidate_width=32), training=training)
     grasps = load_grasps(recording)
     features = encode_recording(grasps, build_matcher(config).eval(), config, None, quiet=True)
     split = make_split(grasps, validation=0.25, test=0.2, seed=0)
     parts = [features.of_objects(part) for part in (split.train, split.validation)]
     best = []
-    for method in (LateFusion(Setting(config, folder=tmp_path)), PruneRerank(Setting(config, folder=tmp_path))):
+    for method in (
+        LateFusion(MethodSettings(config, folder=tmp_path)),
+        RetrieveRerank(MethodSettings(config, folder=tmp_path)),
+    ):
         method.fit(*parts)
         best.append(method.score(method.encode_touch(features.touch), method.encode_photo(features.photo)).argmax(1))
-    assert method.chosen["judged_share"] == 0.25
+    assert method.best_params["reranked_fraction"] == 0.25
     np.testing.assert_array_equal(*best)

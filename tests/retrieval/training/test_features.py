@@ -10,7 +10,14 @@ import torch
 from retrieval.data.dataset import load_grasps
 from retrieval.data.resize import resize
 from retrieval.errors import BadInput, DatasetError, NumericalError
-from retrieval.training.features import SHOWN, Features, blurred, by_image, encode_recording, margin
+from retrieval.training.features import (
+    PHOTO_VARIANTS,
+    Features,
+    encode_recording,
+    features_by_image,
+    low_pass,
+    photo_margin,
+)
 from retrieval.training.train import build_matcher
 from tests.conftest import TINY
 
@@ -115,67 +122,72 @@ def test_a_photo_file_that_grasps_share_is_encoded_once(grasps, matcher, counted
 
 def test_what_stands_for_a_touch_changes_the_touch_alone(grasps, matcher, tmp_path, counted):
     made = {
-        variant: encode_recording(grasps, matcher, TINY, tmp_path, variant=variant, quiet=True)
-        for variant in ("touch", "blurred", "before")
+        touch_variant: encode_recording(grasps, matcher, TINY, tmp_path, touch_variant=touch_variant, quiet=True)
+        for touch_variant in ("touch", "low_pass", "no_contact")
     }
     assert counted == {"touch_features": 27, "photo_features": 9}
-    again = encode_recording(grasps[:5], matcher, TINY, None, variant="before", photos_of=made["touch"], quiet=True)
+    again = encode_recording(
+        grasps[:5], matcher, TINY, None, touch_variant="no_contact", photo_features_from=made["touch"], quiet=True
+    )
     np.testing.assert_array_equal(again.photo, made["touch"].photo[:5])
-    for variant in ("blurred", "before"):
-        np.testing.assert_array_equal(made[variant].photo, made["touch"].photo)
-        assert np.abs(made[variant].touch - made["touch"].touch).max() > 0.01
-    shown = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in grasps]
-    before = encode_recording(shown, matcher, TINY, None, quiet=True)
-    np.testing.assert_array_equal(made["before"].touch, before.touch)
+    for touch_variant in ("low_pass", "no_contact"):
+        np.testing.assert_array_equal(made[touch_variant].photo, made["touch"].photo)
+        assert np.abs(made[touch_variant].touch - made["touch"].touch).max() > 0.01
+    photo_variant = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in grasps]
+    before = encode_recording(photo_variant, matcher, TINY, None, quiet=True)
+    np.testing.assert_array_equal(made["no_contact"].touch, before.touch)
 
 
 def test_frames_from_before_the_contact_must_be_there_to_be_shown(grasps, matcher):
     lacking = [dataclasses.replace(grasp, backgrounds=()) for grasp in grasps]
     with pytest.raises(DatasetError, match="before the contact"):
-        encode_recording(lacking, matcher, TINY, None, variant="before", quiet=True)
+        encode_recording(lacking, matcher, TINY, None, touch_variant="no_contact", quiet=True)
     with pytest.raises(BadInput, match="touch, blurred, before; got 'after'"):
-        encode_recording(grasps, matcher, TINY, None, variant="after", quiet=True)
+        encode_recording(grasps, matcher, TINY, None, touch_variant="after", quiet=True)
 
 
 def test_a_blur_keeps_colour_and_size_and_nothing_fine():
     image = np.full((60, 80, 3), 0.25, dtype=np.float32)
     image[::2] += 0.5  # stripes a pixel wide, mean 0.5
-    plain = blurred(image)
+    plain = low_pass(image)
     assert plain.shape == image.shape
     np.testing.assert_allclose(plain, 0.5, atol=0.02)
     halves = np.zeros((60, 80, 3), dtype=np.float32)
     halves[:, 40:] = 1  # what is coarse stays
-    assert blurred(halves)[:, :10].max() < 0.1
-    assert blurred(halves)[:, -10:].min() > 0.9
+    assert low_pass(halves)[:, :10].max() < 0.1
+    assert low_pass(halves)[:, -10:].min() > 0.9
 
 
 @pytest.mark.parametrize("size", [(240, 320), (32, 48), (7, 9), (1, 3)])
 def test_a_blur_is_that_of_the_whole_picture_made_small_and_large_again(size):
     image = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
     smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), size[1] / 10), dtype=np.float32)
-    np.testing.assert_allclose(blurred(image), resize(resize(smooth, (6, 8)), size), atol=2e-6)  # float32 sums
+    np.testing.assert_allclose(low_pass(image), resize(resize(smooth, (6, 8)), size), atol=2e-6)  # float32 sums
 
 
 def test_of_a_photo_its_margin_stays_and_nothing_inside():
     image = np.zeros((80, 160, 3), dtype=np.float32)
     image[:10], image[-10:], image[:, :20], image[:, -20:] = 1, 1, 1, 1
     image[40, 80] = 0.5
-    assert (margin(image) == 1).all()
+    assert (photo_margin(image) == 1).all()
     noise = np.random.default_rng(1).random((80, 160, 3), dtype=np.float32)
-    found = margin(noise)
+    found = photo_margin(noise)
     np.testing.assert_array_equal(found[:10], noise[:10])
     assert len(np.unique(found[10:-10, 20:-20].reshape(-1, 3), axis=0)) == 1
-    assert margin(noise[:1, :1]).shape == (1, 1, 3)
+    assert photo_margin(noise[:1, :1]).shape == (1, 1, 3)
 
 
 def test_the_margin_of_photos_is_encoded_beside_whole_photos(grasps, matcher, tmp_path):
-    whole, framed = (encode_recording(grasps, matcher, TINY, tmp_path, shown=shown, quiet=True) for shown in SHOWN)
+    whole, framed = (
+        encode_recording(grasps, matcher, TINY, tmp_path, photo_variant=photo_variant, quiet=True)
+        for photo_variant in PHOTO_VARIANTS
+    )
     np.testing.assert_array_equal(whole.touch, framed.touch)
     assert np.abs(whole.photo - framed.photo).max() > 0.01
     with pytest.raises(BadInput, match="photo, margin; got 'inside'"):
-        encode_recording(grasps, matcher, TINY, None, shown="inside", quiet=True)
+        encode_recording(grasps, matcher, TINY, None, photo_variant="inside", quiet=True)
     with pytest.raises(BadInput, match="two controls"):
-        encode_recording(grasps, matcher, TINY, None, variant="blurred", shown="margin", quiet=True)
+        encode_recording(grasps, matcher, TINY, None, touch_variant="low_pass", photo_variant="margin", quiet=True)
 
 
 def some_features():
@@ -228,7 +240,7 @@ def test_a_feature_that_is_not_finite_is_refused_and_its_grasp_named(part, value
 
 def test_features_are_found_by_grasp_and_by_photo_file(grasps, matcher):
     features = encode_recording(grasps, matcher, TINY, None, quiet=True)
-    known = by_image(grasps[2:4], features, torch.device("cpu"))
+    known = features_by_image(grasps[2:4], features, torch.device("cpu"))
     assert set(known) == {grasp.grasp_id for grasp in grasps[2:4]} | {grasp.photo for grasp in grasps[2:4]}
     np.testing.assert_array_equal(known[grasps[3].grasp_id], features.touch[3].ravel())
     np.testing.assert_array_equal(known[grasps[2].photo], features.photo[2])

@@ -55,7 +55,7 @@ def test_validation_comes_after_every_so_many_steps_and_after_the_last():
 
 def test_a_stop_ends_after_the_step_at_hand_which_is_validated():
     validated, asked = [], iter([False, True])
-    seen, done = descend(Plan(9, 0.1, validate_every=5), validate=validated.append, stopped=lambda: next(asked))
+    seen, done = descend(Plan(9, 0.1, validate_every=5), validate=validated.append, should_stop=lambda: next(asked))
     assert (len(seen), done, validated) == (2, 2, [2])
 
 
@@ -93,12 +93,12 @@ def test_the_gradients_are_there_before_the_step_and_gone_before_the_next():
 # The best step ---------------------------------------------------------------------------------------------
 
 
-def best_of(module, plan, loss, worth, **given):
+def best_of(module, plan, loss, score, **given):
     with Bar("fit", plan.steps, "steps", quiet=True) as bar:
-        return fit_best(module, plan, loss, worth, bar=bar, **given)
+        return fit_best(module, plan, loss, score, bar=bar, **given)
 
 
-def test_the_best_judged_step_is_kept_not_the_last():
+def test_the_best_scored_step_is_kept_not_the_last():
     """The worth falls again after step 4: its weights must come back, in evaluation mode."""
     weight = torch.nn.Linear(1, 1, bias=False)
     worths, seen, modes = iter([0.6, 0.9, 0.9, 0.3]), [], []
@@ -107,12 +107,12 @@ def test_the_best_judged_step_is_kept_not_the_last():
         modes.append(weight.training)
         return weight.weight.sum()
 
-    def worth():
+    def score():
         modes.append(weight.training)
         seen.append(weight.weight.item())
         return next(worths)
 
-    best = best_of(weight, Plan(8, 0.1, validate_every=2), loss, worth)
+    best = best_of(weight, Plan(8, 0.1, validate_every=2), loss, score)
     assert (best.step, best.value) == (4, 0.9)
     assert weight.weight.item() == seen[1] != seen[3]
     assert modes == [True, True, False] * 4

@@ -14,7 +14,7 @@ from retrieval.data.dataset import load_attempts, load_grasps
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, CheckpointError, ConfigError, DatasetError, NumericalError
 from retrieval.model.checkpoint import load_checkpoint, read_tensors, write_tensors
-from retrieval.training.gate import Gate, GateSettings, GraspNet
+from retrieval.training.gate import GateSettings, GraspNet, GraspSuccessGate
 from retrieval.training.grasp_success import BATCH, augment, draw_batch, gate_loss, load_gate, train_gate
 from robot.recording.folder import RecordingWriter
 
@@ -138,7 +138,7 @@ def test_misses_are_told_from_held_grasps_of_objects_never_seen(trained):
     assert report.accepted == {"held": (4, 4), "missed": (0, 4)}
     assert (report.accuracy, report.chance) == (1.0, 0.5)
     assert report.interval == pytest.approx((0.025 ** (1 / 8), 1.0))
-    assert report.least[1] == 1.0
+    assert report.lowest_acceptance[1] == 1.0
 
 
 def test_the_frame_after_the_lift_shows_a_slip_that_the_frame_during_it_cannot(attempts, tmp_path):
@@ -150,7 +150,7 @@ def test_the_frame_after_the_lift_shows_a_slip_that_the_frame_during_it_cannot(a
     assert after.accuracy > during.accuracy
 
 
-def test_the_frame_after_the_lift_is_judged_where_there_is_one(attempts, tmp_path):
+def test_the_frame_after_the_lift_is_scored_where_there_is_one(attempts, tmp_path):
     def frame(folder):
         return train_gate(folder, tmp_path / "g.safetensors", iterations=1, quiet=True).frame
 
@@ -192,7 +192,7 @@ def test_the_same_seed_gives_the_same_file_and_touches_no_one_elses_random_numbe
     assert files[0].read_bytes() != files[2].read_bytes()
 
 
-def test_only_the_frames_that_are_judged_are_read_and_each_once(attempts, tmp_path, monkeypatch):
+def test_only_the_frames_that_are_scored_are_read_and_each_once(attempts, tmp_path, monkeypatch):
     read = []
     load = Preprocessing.load_touch
     monkeypatch.setattr(Preprocessing, "load_touch", lambda self, *paths: read.append(paths) or load(self, *paths))
@@ -298,7 +298,7 @@ def test_settings_out_of_range_are_refused(misses, tmp_path):
 
 
 def test_a_place_that_cannot_be_written_is_told_before_the_first_step(misses, tmp_path, monkeypatch):
-    monkeypatch.setattr("retrieval.training.grasp_success._trained", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr("retrieval.training.grasp_success._train_net", lambda *_: pytest.fail("trained"))
     with pytest.raises(CheckpointError, match="is a folder"):
         train_gate(misses, tmp_path, quiet=True)
 
@@ -342,8 +342,8 @@ def test_a_grasp_is_accepted_when_any_finger_is_touched(trained):
 
 @pytest.mark.parametrize(("logits", "accepted"), [((0.0, -9.0), True), ((-1e-30, -9.0), False), ((-9.0, 1e-30), True)])
 def test_the_bound_is_a_probability_of_exactly_one_half(monkeypatch, logits, accepted):
-    gate = Gate(GraspNet(), DURING)
-    monkeypatch.setattr(Gate, "judge", lambda *_: [list(logits)])
+    gate = GraspSuccessGate(GraspNet(), DURING)
+    monkeypatch.setattr(GraspSuccessGate, "score", lambda *_: [list(logits)])
     assert gate(fingers(0)) is accepted
 
 
@@ -353,7 +353,7 @@ def test_a_logit_that_is_not_finite_is_no_failed_grasp():
     torch.nn.init.constant_(net.last.weight, 3e38)
     torch.nn.init.constant_(net.layers[0].bias, 3e38)
     with pytest.raises(NumericalError, match=r"finger 0 of grasp 0 has (nan|inf|-inf); train the gate again"):
-        Gate(net, DURING)(fingers(0))
+        GraspSuccessGate(net, DURING)(fingers(0))
 
 
 def test_a_change_of_one_grey_level_stays_one_and_never_wraps(trained):
@@ -372,7 +372,7 @@ def test_black_white_and_unchanged_pictures_give_finite_answers(trained, level):
     assert all(np.isfinite(value) for value in answers.values())
 
 
-def test_a_finger_is_judged_alike_alone_beside_others_and_at_another_size(trained):
+def test_a_finger_is_scored_alike_alone_beside_others_and_at_another_size(trained):
     gate, frames = load_gate(trained[0]), fingers(78, during="a")
     both = gate.logits(frames)
     large = Frames(*(picture.repeat(4, 0).repeat(4, 1) for picture in (frames["a"].before, frames["a"].during)))

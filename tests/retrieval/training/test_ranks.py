@@ -17,9 +17,9 @@ import pytest
 
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.training.state import state_path
-from tests import on_ray
+from tests import ray_processes
 from tests.retrieval.training.test_train import TINY_TOML
-from tests.waiting import running, until
+from tests.waiting import run_process, wait_until
 
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
 TORCHRUN = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
@@ -77,17 +77,17 @@ def test_two_ranks_reach_the_figures_of_one_process(program, instead, recording,
 @pytest.mark.parametrize("victim", [0, -1])
 def test_a_rank_that_is_killed_ends_the_job_and_resume_goes_on(victim, recording, settings, tmp_path):
     out, config = tmp_path / "m.safetensors", settings(iterations=100_000, validate_every=5)
-    with running(command(recording, out, config), env=ENVIRONMENT) as process:
-        until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
-        ranks = sorted(on_ray.called(r".*-m retrieval train|.*-u -m retrieval", process.pid))
+    with run_process(command(recording, out, config), env=ENVIRONMENT) as process:
+        wait_until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
+        ranks = sorted(ray_processes.processes_named(r".*-m retrieval train|.*-u -m retrieval", process.pid))
         assert len(ranks) == 2
         os.kill(ranks[victim], signal.SIGKILL)
         process.communicate(timeout=240)  # a rank that waited for the other one would wait for half an hour
     assert process.returncode != 0
-    assert not set(ranks) & set(on_ray.parents())
+    assert not set(ranks) & set(ray_processes.parents())
     state = state_path(out).stat().st_mtime_ns
-    with running([*command(recording, out, config), "--resume"], env=ENVIRONMENT) as process:
-        until(lambda: state_path(out).stat().st_mtime_ns != state or process.poll() is not None, limit_s=240)
+    with run_process([*command(recording, out, config), "--resume"], env=ENVIRONMENT) as process:
+        wait_until(lambda: state_path(out).stat().st_mtime_ns != state or process.poll() is not None, limit_s=240)
         assert process.poll() is None, process.stderr.read()
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=240)

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 from retrieval.commands.main import main
-from retrieval.data.labelled import load_labelled
+from retrieval.data.labelled_pictures import load_labelled
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import CheckpointError, ConfigError, DatasetError
 from retrieval.model.checkpoint import read_tensors
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.training import relief
-from retrieval.training.relief import augmented, centred, train_relief
+from retrieval.training.relief import augment, centre_crop, train_relief
 from retrieval.training.train import build_matcher
 
 CONFIG = Config(
@@ -65,7 +65,7 @@ def test_families_are_told_apart_on_objects_that_were_held_out(quick, tmp_path, 
     assert report.sizes["sharpness"] == 0.0  # nothing varies
 
 
-def test_a_touch_is_seen_with_its_background_and_without_and_judged_as_the_matcher_sees_it(tmp_path):
+def test_a_touch_is_seen_with_its_background_and_without_and_scored_as_the_matcher_sees_it(tmp_path):
     kind, pictures = load_labelled(write_pictures(tmp_path / "pictures", "touch"))
     for policy in ("difference+0.5", "none"):
         settings = dataclasses.replace(CONFIG.preprocessing, background=policy)
@@ -130,17 +130,17 @@ def test_a_gel_keeps_its_left_and_right_and_its_lamps():
     gel = torch.zeros(64, 3, 20, 20)
     gel[:, 0, :, :10] = 0.8
     gel[:, 2, :, 10:] = 0.8
-    seen = augmented(gel, "touch", np.random.default_rng(0))
+    seen = augment(gel, "touch", np.random.default_rng(0))
     assert (seen[:, 0, :, :5].mean((1, 2)) > seen[:, 0, :, 15:].mean((1, 2))).all()
     assert (seen[:, 2, :, 15:].mean((1, 2)) > seen[:, 2, :, :5].mean((1, 2))).all()
 
 
-def test_a_photo_that_is_judged_is_its_grey_middle():
+def test_a_photo_that_is_scored_is_its_grey_middle():
     photo = torch.rand(2, 3, 20, 20)
-    seen = centred(photo, "photo")
+    seen = centre_crop(photo, "photo")
     assert seen.shape == (2, 3, 16, 16)
     torch.testing.assert_close(seen[:, 1], photo[:, :, 2:18, 2:18].mean(1), atol=1e-5, rtol=0)
-    assert centred(photo, "touch") is photo
+    assert centre_crop(photo, "touch") is photo
 
 
 @pytest.mark.parametrize(

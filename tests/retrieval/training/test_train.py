@@ -14,7 +14,7 @@ from torch import nn
 from torch.nn import functional
 
 from retrieval.data.dataset import PairSampler, Split, load_grasps, make_split
-from retrieval.errors import CheckpointError, ConfigError, DatasetError, Interrupted
+from retrieval.errors import CheckpointError, ConfigError, DatasetError, JobInterrupted
 from retrieval.model.checkpoint import load_checkpoint, read_tensors
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses.contrastive import contrastive_loss
@@ -26,8 +26,8 @@ from retrieval.training.state import state_path
 from retrieval.training.step import WeightedLosses, batch_loss, shuffle_fingers
 from retrieval.training.train import Trainer, build_matcher, set_training_mode, train
 from tests.conftest import TINY
-from tests.labelled import label_recording
-from tests.waiting import running, until
+from tests.labelled_pictures import label_recording
+from tests.waiting import run_process, wait_until
 
 CPU = torch.device("cpu")
 
@@ -110,11 +110,11 @@ def test_each_loss_of_the_table_is_added_with_its_weight(recording):
         features = [part.detach() for part in source.train_features(matcher, loaded)]
     matcher.eval()
     loss, logits = batch_loss(matcher, WeightedLosses(config.training.weights, matcher, 9), loaded.batch, *features)
-    touch, photo = matcher.touch_code(features[0]), matcher.photo_code(features[1])
+    touch, photo = matcher.touch_encoding(features[0]), matcher.photo_encoding(features[1])
     objects = torch.from_numpy(loaded.batch.touch_objects), torch.from_numpy(loaded.batch.photo_objects)
     expected = match_loss(logits, torch.from_numpy(loaded.batch.labels))
     expected = expected + 0.3 * contrastive_loss(touch.embedding, photo.embedding, *objects, matcher.log_scale)
-    expected = expected + 0.7 * listwise_loss(matcher.head(touch.half[:, None], photo.half[None]), *objects)
+    expected = expected + 0.7 * listwise_loss(matcher.head(touch.partial[:, None], photo.partial[None]), *objects)
     assert loss.item() == expected.item()
 
 
@@ -192,12 +192,12 @@ def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_ends(recordin
 
 
 PRUNED = dataclasses.replace(
-    with_training(TINY, distil_steps=4), matcher=dataclasses.replace(TINY.matcher, pruner_width=8)
+    with_training(TINY, distil_steps=4), matcher=dataclasses.replace(TINY.matcher, candidate_width=8)
 )
 TINY_UNPRUNED = dataclasses.replace(PRUNED, matcher=TINY.matcher)
 
 
-def test_a_pruner_is_taught_after_the_last_step_and_queries_are_kept(recording, tmp_path):
+def test_a_candidate_encoder_is_distilled_after_the_last_step_and_queries_are_kept(recording, tmp_path):
     trainer = trainer_for(recording, tmp_path / "m.safetensors", PRUNED)
     with pytest.raises(RuntimeError, match="power cut"):
         stop_after(trainer, 4)
@@ -208,17 +208,17 @@ def test_a_pruner_is_taught_after_the_last_step_and_queries_are_kept(recording, 
     trainer.run(quiet=True)
     made = load_checkpoint(trainer.out)
     assert made.config == PRUNED
-    assert made.matcher.pruner is not None
-    assert made.queries.shape == (len(trainer.validation.grasps), PRUNED.matcher.half)
+    assert made.matcher.candidate_encoder is not None
+    assert made.queries.shape == (len(trainer.validation.grasps), PRUNED.matcher.partial_width)
     assert not state_path(trainer.out).exists()
 
 
-def test_a_pruner_changes_nothing_else_that_training_makes(recording, tmp_path):
+def test_a_candidate_encoder_changes_nothing_else_that_training_makes(recording, tmp_path):
     for name, config in (("a", PRUNED), ("b", TINY)):
         trainer_for(recording, tmp_path / f"{name}.safetensors", config).run(quiet=True)
     with_one, without = (load_checkpoint(tmp_path / f"{name}.safetensors").matcher.state_dict() for name in "ab")
     assert same_weights(without, with_one)
-    assert {name.split(".")[0] for name in with_one.keys() - without.keys()} == {"pruner"}
+    assert {name.split(".")[0] for name in with_one.keys() - without.keys()} == {"candidate_encoder"}
 
 
 def power_cut(*_, **__):
@@ -234,7 +234,9 @@ def power_cut_before_deleting(path):
     return guarded
 
 
-@pytest.mark.parametrize("where", ["while the pruner is taught", "before the state is deleted", "at the posterior"])
+@pytest.mark.parametrize(
+    "where", ["while the candidate_encoder is taught", "before the state is deleted", "at the posterior"]
+)
 def test_a_power_cut_after_the_last_step_changes_no_bit(where, recording, tmp_path, monkeypatch):
     """Before the complete checkpoint is written, and after that, while the state of the training still lies there."""
     trainer_for(recording, tmp_path / "a.safetensors", PRUNED).run(quiet=True)
@@ -243,11 +245,17 @@ def test_a_power_cut_after_the_last_step_changes_no_bit(where, recording, tmp_pa
         if where == "before the state is deleted":
             cut.setattr(Path, "unlink", power_cut_before_deleting(state_path(broken.out)))
         else:
-            step = "distil.order_loss" if where == "while the pruner is taught" else "train.with_verdicts"
+            step = (
+                "distil.distillation_loss"
+                if where == "while the candidate_encoder is taught"
+                else "train.with_verdicts"
+            )
             cut.setattr(f"retrieval.training.{step}", power_cut)
         with pytest.raises(RuntimeError, match="power cut"):
             broken.run(quiet=True)
-    assert (load_checkpoint(broken.out).matcher.pruner is not None) == (where == "before the state is deleted")
+    assert (load_checkpoint(broken.out).matcher.candidate_encoder is not None) == (
+        where == "before the state is deleted"
+    )
     resumed = trainer_for(recording, broken.out, PRUNED)
     resumed.resume()
     assert resumed.step == PRUNED.training.iterations
@@ -256,7 +264,7 @@ def test_a_power_cut_after_the_last_step_changes_no_bit(where, recording, tmp_pa
     assert not state_path(broken.out).exists()
 
 
-@pytest.mark.parametrize("step", ["distil.order_loss", "train.with_verdicts"])
+@pytest.mark.parametrize("step", ["distil.distillation_loss", "train.with_verdicts"])
 def test_ctrl_c_after_the_last_step_leaves_a_usable_checkpoint_that_resuming_completes(
     step, recording, tmp_path, monkeypatch
 ):
@@ -267,7 +275,7 @@ def test_ctrl_c_after_the_last_step_leaves_a_usable_checkpoint_that_resuming_com
     said = r"before the checkpoint was complete; .* ranks photos, --resume adds the rest"
     with monkeypatch.context() as interrupting:
         interrupting.setattr(f"retrieval.training.{step}", interrupted_before(function))
-        with pytest.raises(Interrupted, match=said):
+        with pytest.raises(JobInterrupted, match=said):
             train(recording, broken, PRUNED, quiet=True)
     left = load_checkpoint(broken)
     assert (left.config, left.posterior) == (TINY_UNPRUNED, None)
@@ -332,7 +340,7 @@ def test_ctrl_c_leaves_a_usable_checkpoint_and_a_state_to_go_on_from(recording, 
         return loss(loaded)
 
     trainer.loss = interrupted
-    with pytest.raises(Interrupted, match="stopped at step 2 of 1000"):
+    with pytest.raises(JobInterrupted, match="stopped at step 2 of 1000"):
         trainer.run(quiet=True)
     assert load_checkpoint(tmp_path / "m.safetensors").provenance["step"] == 2
     assert state_path(tmp_path / "m.safetensors").exists()
@@ -370,7 +378,7 @@ def test_training_takes_the_number_of_fingers_from_the_recording(model):
     assert load_checkpoint(model).config.matcher.fingers == 2
 
 
-def test_a_background_policy_needs_frames_of_the_untouched_gel(recording, tmp_path):
+def test_a_background_policy_needs_no_contact_frames(recording, tmp_path):
     grasps = [dataclasses.replace(grasp, backgrounds=()) for grasp in load_grasps(recording)]
     config = dataclasses.replace(TINY, preprocessing=dataclasses.replace(TINY.preprocessing, background="difference"))
     split = make_split(grasps, validation=0.25, test=0.2, seed=0)
@@ -406,7 +414,7 @@ from retrieval.model.losses.contrastive import contrastive_loss
 from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.train import build_matcher, set_training_mode
 from tests.conftest import TINY
-from tests.labelled import label_recording
+from tests.labelled_pictures import label_recording
 from tests.retrieval.training.test_train import with_training
 
 torch.set_num_threads(1)
@@ -421,8 +429,8 @@ with TrainedFeatures(config, torch.device("cpu")) as source:
     torch.manual_seed(1)
     if sys.argv[3] == "local":  # the naive way: every rank's loss over its own share of the images
         rows = torch.tensor(distributed.share(len(loaded.batch.photos)))
-        touch = matcher.touch_code(matcher.touch_features(loaded.touches)).embedding
-        photo = matcher.photo_code(matcher.photo_features(loaded.photos)).embedding
+        touch = matcher.touch_encoding(matcher.touch_features(loaded.touches)).embedding
+        photo = matcher.photo_encoding(matcher.photo_features(loaded.photos)).embedding
         touches = torch.tensor(distributed.share(len(loaded.batch.grasps)))
         touch_objects, photo_objects = (
             torch.from_numpy(labels) for labels in (loaded.batch.touch_objects, loaded.batch.photo_objects)
@@ -433,7 +441,7 @@ with TrainedFeatures(config, torch.device("cpu")) as source:
         touch, photo = source.train_features(matcher, loaded)
         labels = torch.from_numpy(loaded.batch.touch_objects), torch.from_numpy(loaded.batch.photo_objects)
         loss = contrastive_loss(
-            matcher.touch_code(touch).embedding, matcher.photo_code(photo).embedding, *labels, matcher.log_scale
+            matcher.touch_encoding(touch).embedding, matcher.photo_encoding(photo).embedding, *labels, matcher.log_scale
         )
     else:
         losses = WeightedLosses(config.training.weights, matcher, 9)
@@ -507,7 +515,7 @@ else:
     tower = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.ReLU(), nn.Conv2d(4, 2, 3), nn.BatchNorm2d(2))
     encode, images = tower.double(), 30 + torch.randn(4, 3, 8, 8).double()
 if sys.argv[2] == "all":
-    distributed.share_batch_statistics(tower)
+    distributed.synchronize_batch_norm(tower)
 with distributed.encoding(len(images)):
     local = encode(images[distributed.share(len(images))])
 rows = distributed.gather_rows(local.flatten(1), len(images))
@@ -562,7 +570,7 @@ TINY_TOML = """
 tower = "small"
 tower_output = "pooled"
 hidden = 16
-pruner_width = 8
+candidate_width = 8
 embedding_dim = 8
 standardise = true
 [training]
@@ -587,8 +595,8 @@ def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     command = [*torchrun, "-m", "retrieval", "train", str(recording), "--out", str(out), "--config", str(config)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
-    with running(command, env=environment) as process:
-        until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
+    with run_process(command, env=environment) as process:
+        wait_until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=240)
     assert "--resume goes on from here" in said
@@ -603,7 +611,7 @@ def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_
     assert "Warning" not in done.stderr
     made = load_checkpoint(out)
     assert made.provenance["step"] == 2
-    assert made.matcher.pruner is not None
+    assert made.matcher.candidate_encoder is not None
 
 
 def test_a_split_that_leaks_or_lacks_objects_is_refused(recording, tmp_path):
@@ -635,8 +643,8 @@ def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_p
     config = tmp_path / "tiny.toml"
     config.write_text(TINY_TOML.replace("validate_every = 30", "validate_every = 5"))
     command = [sys.executable, "-m", "retrieval", "train", str(recording), "--out", str(out), "--config", str(config)]
-    with running(command) as process:
-        until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
+    with run_process(command) as process:
+        wait_until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
     assert state_path(out).exists()
     done = subprocess.run([*command, "--resume"], capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr

@@ -13,7 +13,7 @@ from robot.drivers.cameras.kinect2 import Kinect2
 from robot.drivers.cameras.realsense import RealSense
 from robot.drivers.cameras.uvc import UvcCamera
 from robot.errors import DeviceError, RobotConfigError
-from tests.fake_video import EXTRINSICS, FakeCamera, FakeFreenect2, FakeRealSense, own_threads
+from tests.fake_video import EXTRINSICS, FakeFreenect2, FakeRealSense, FakeVideoDevice, own_threads
 
 
 @pytest.fixture
@@ -234,7 +234,7 @@ def test_the_first_pipeline_that_works_computes_the_depth(install, wanted, has, 
         assert freenect.events[0] == ("open", b"k1", expected)
 
 
-def test_a_pipeline_that_the_build_lacks_cannot_be_had(install):
+def test_a_pipeline_that_the_build_lacks_raises(install):
     install(FakeFreenect2(pipelines=("CpuPacketPipeline",)))
     with pytest.raises(DeviceError, match="compute its depth with cuda, but cuda"):
         kinect(pipeline="cuda").connect()
@@ -312,7 +312,7 @@ def test_the_loader_of_macos_names_a_missing_library_in_other_words():
 @pytest.fixture
 def usb(tmp_path, monkeypatch):
     """A connected camera's stand-in and its name."""
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     monkeypatch.setattr(cv2, "VideoCapture", camera.open)
     monkeypatch.setattr(discover, "DEV", tmp_path)
     name = tmp_path / "usb-Webcam-video-index0"

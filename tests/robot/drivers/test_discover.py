@@ -6,7 +6,7 @@ import tomllib
 import pytest
 
 from robot.drivers import discover
-from robot.drivers.discover import Found
+from robot.drivers.discover import DiscoveredDevice
 from tests.fake_video import FakeFreenect2, FakeRealSense
 
 GONE = ("pyrealsense2", "pylibfreenect2", "serial", "serial.tools")
@@ -46,7 +46,7 @@ def test_cameras_are_found_by_their_stable_names_with_what_they_call_themselves(
     plug_camera(roots, "usb-Maker_Webcam_12-video-index1", 1, "Webcam 12: Webcam", index="1")
     name = str(roots[0] / "v4l" / "by-id" / "usb-Maker_Webcam_12-video-index0")
     toml = f'driver = "uvc"\ndevice = "{name}"'
-    assert discover.discover(*roots) == [Found("camera", name, "Webcam 12: Webcam", toml)]
+    assert discover.discover(*roots) == [DiscoveredDevice("camera", name, "Webcam 12: Webcam", toml)]
 
 
 @pytest.mark.parametrize(

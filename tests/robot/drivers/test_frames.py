@@ -13,7 +13,7 @@ from robot.drivers.video.frames import FrameReader, ReaderSettings
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Frame
 from tests.fake_video import own_threads
-from tests.waiting import until
+from tests.waiting import wait_until
 
 SETTINGS = ReaderSettings(warmup_s=0.0, timeout_s=5.0, frozen_s=2.0)
 ENOUGH_S = 10.0
@@ -72,7 +72,7 @@ def make(script):
 
 
 def seen(reader, count):
-    until(lambda: reader.frames_seen >= count)
+    wait_until(lambda: reader.frame_count >= count)
 
 
 def test_the_newest_picture_is_given_and_the_newest_few_are_kept(script, make):
@@ -99,7 +99,7 @@ def test_pictures_of_the_warm_up_are_dropped(script, make):
     reader = make(ReaderSettings(warmup_s=1.0, timeout_s=5.0))
     reader.start()
     assert reader.near(0.0).time_s == 1.0
-    assert reader.frames_seen == 3
+    assert reader.frame_count == 3
 
 
 def test_a_camera_that_gives_nothing_is_waited_for_and_then_named(script, make):
@@ -121,11 +121,11 @@ def test_a_lost_stream_is_closed_opened_again_and_counted_and_its_old_pictures_a
     reader = make()
     reader.start()
     script.items.put(error)
-    until(lambda: script.opened == 2)
+    wait_until(lambda: script.opened == 2)
     script.show(7.0)
     assert reader.newest().time_s == 7.0
     assert reader.near(1.0).time_s == 7.0
-    assert (reader.lost, script.closed) == (1, 1)
+    assert (reader.lost_count, script.closed) == (1, 1)
 
 
 def test_what_is_wrong_with_a_lost_stream_is_said_to_whoever_asks(script, make):
@@ -133,7 +133,7 @@ def test_what_is_wrong_with_a_lost_stream_is_said_to_whoever_asks(script, make):
     reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.02), backoff_s=(ENOUGH_S, ENOUGH_S))
     reader.start()
     script.items.put(DeviceError("it gives no more pictures"))
-    until(lambda: reader.lost)
+    wait_until(lambda: reader.lost_count)
     with pytest.raises(DeviceError, match=r"it gives no more pictures; it was lost 1 time\(s\). Is it plugged in"):
         reader.newest()
     with pytest.raises(DeviceError, match="it gives no more pictures"):
@@ -144,15 +144,15 @@ def test_each_wait_before_opening_again_is_longer_up_to_a_bound_and_a_picture_ma
     script.show(1.0)
     reader = make()
     waits = []
-    monkeypatch.setattr(reader._hurry, "wait", waits.append)
+    monkeypatch.setattr(reader._reopen, "wait", waits.append)
     reader.start()
     script.unopenable = 4
     script.items.put(DeviceError("gone"))
-    until(lambda: script.opened == 2)
+    wait_until(lambda: script.opened == 2)
     script.show(2.0)
     seen(reader, 2)
     script.items.put(DeviceError("gone again"))
-    until(lambda: script.opened == 3)
+    wait_until(lambda: script.opened == 3)
     assert waits == [0.001, 0.002, 0.004, 0.004, 0.004, 0.001]
 
 
@@ -161,9 +161,9 @@ def test_a_lost_stream_is_opened_at_once_when_somebody_is_in_a_hurry(script, mak
     reader = make(ReaderSettings(warmup_s=0.0, timeout_s=5.0), backoff_s=(100.0, 100.0))
     reader.start()
     script.items.put(DeviceError("gone"))
-    until(lambda: reader.lost)
+    wait_until(lambda: reader.lost_count)
     script.show(2.0)
-    reader.hurry()
+    reader.reopen_now()
     assert reader.newest().time_s == 2.0
 
 
@@ -192,7 +192,7 @@ def test_a_stream_that_was_lost_has_time_to_warm_up_again(script, make):
     script.show(31.0)
     reader.start()
     script.items.put(OSError(19, "No such device"))
-    until(lambda: reader.lost == 1)
+    wait_until(lambda: reader.lost_count == 1)
     later = threading.Timer(0.2, script.show, (32.0,))
     later.start()
     assert reader.after(31.0).time_s == 32.0
@@ -207,7 +207,7 @@ def test_a_stream_that_stands_still_gives_nothing_fresh_long_before_it_counts_as
     seen(gel.reader, 3)
     with pytest.raises(DeviceError, match=r"at most 0\.5 s old, it is 0\.7 s; is the stream frozen"):
         gel.read()
-    assert gel.reader.lost == 0
+    assert gel.reader.lost_count == 0
 
 
 def test_a_stream_frozen_for_long_is_lost_and_said_to_be_frozen(script, make):
@@ -215,9 +215,9 @@ def test_a_stream_frozen_for_long_is_lost_and_said_to_be_frozen(script, make):
     script.show(0.0, 1.0, 2.0, picture=7)
     reader.start()
     seen(reader, 3)
-    assert reader.lost == 0
+    assert reader.lost_count == 0
     script.show(2.1, picture=7)
-    until(lambda: reader.lost)
+    wait_until(lambda: reader.lost_count)
     with pytest.raises(DeviceError, match=r"frozen: the same picture for 2\.1 s"):
         reader.newest()
 
@@ -227,12 +227,12 @@ def test_a_frozen_stream_stays_frozen_when_it_is_opened_again_until_its_picture_
     reader = make()
     reader.start()
     script.show(3.0, picture=7)
-    until(lambda: script.opened == 2)
+    wait_until(lambda: script.opened == 2)
     script.show(3.1, picture=7)
-    until(lambda: script.opened == 3)
+    wait_until(lambda: script.opened == 3)
     script.show(3.2, picture=8)
     assert reader.newest().time_s == 3.2
-    assert reader.lost == 2
+    assert reader.lost_count == 2
 
 
 def test_pictures_that_differ_in_one_pixel_are_not_frozen(script, make):
@@ -243,7 +243,7 @@ def test_pictures_that_differ_in_one_pixel_are_not_frozen(script, make):
         script.items.put(Frame(pixels, 1.0 * number))
     reader.start()
     seen(reader, 5)
-    assert reader.lost == 0
+    assert reader.lost_count == 0
 
 
 def test_closing_ends_the_thread_and_lets_go_of_the_camera_also_twice_and_before_starting(script, make):
@@ -264,7 +264,7 @@ def test_closing_ends_a_thread_that_waits_to_open_its_camera_again(script, make)
     reader = make(ReaderSettings(warmup_s=0.0), backoff_s=(100.0, 100.0))
     reader.start()
     script.items.put(DeviceError("gone"))
-    until(lambda: reader.lost)
+    wait_until(lambda: reader.lost_count)
     reader.close()
     assert not own_threads()
 
@@ -277,7 +277,7 @@ def test_closing_says_so_when_a_driver_does_not_come_back_and_the_camera_is_let_
     with pytest.raises(DeviceError, match="its driver still waits"):
         reader.close()
     script.show(2.0)
-    until(lambda: script.closed == 1)
+    wait_until(lambda: script.closed == 1)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ def connected(ask):
     return arm
 
 
-def test_a_pose_is_asked_for_in_words_and_believed():
+def test_a_pose_is_requested_in_words_and_assumed_reached():
     asked = []
     arm = connected(asked.append)
     target = Pose(-12.4, 30.0, 120.0, math.radians(35))

@@ -15,8 +15,8 @@ from robot.drivers.gels.opencv import Digit, GelSight, GelSightMini, OpencvTacti
 from robot.drivers.video import opencv_stream
 from robot.drivers.video.opencv_stream import CaptureSettings, CaptureStream, stable_path
 from robot.errors import DeviceError, RobotConfigError
-from tests.fake_video import FakeCamera, own_threads
-from tests.waiting import until
+from tests.fake_video import FakeVideoDevice, own_threads
+from tests.waiting import wait_until
 
 QUICK = {"warmup_s": 0.0, "timeout_s": 10.0}
 
@@ -61,7 +61,7 @@ def written(camera):
 
 @pytest.mark.parametrize("device", ["0", "/dev/video2", "/dev//video2", "/dev/v4l/by-id/../../video2"])
 def test_a_camera_named_by_a_number_is_refused_with_the_names_of_those_connected(plug, device):
-    name = plug(FakeCamera())
+    name = plug(FakeVideoDevice())
     with pytest.raises(RobotConfigError, match=f"another camera may have tomorrow. Connected: {name}$"):
         OpencvTactile(finger="a", device=device)
 
@@ -73,7 +73,7 @@ def test_a_camera_that_is_not_named_by_a_whole_path_is_refused(dev, device):
 
 
 def test_a_name_that_equal_cameras_share_is_listed_with_a_note(plug, dev):
-    name = plug(FakeCamera(), number=2)
+    name = plug(FakeVideoDevice(), number=2)
     (dev / "v4l" / "by-path").mkdir()
     (dev / "v4l" / "by-path" / "pci-1-video-index0").symlink_to(dev / "video0")
     with pytest.raises(RobotConfigError, match=rf"Connected: {name}, .*pci-1-video-index0 \(.*other camera tomorrow"):
@@ -88,13 +88,13 @@ def test_where_the_system_makes_no_stable_names_the_way_out_is_said(dev):
 
 
 def test_a_camera_that_is_not_plugged_in_is_named(plug, dev):
-    name = plug(FakeCamera())
+    name = plug(FakeVideoDevice())
     with pytest.raises(DeviceError, match=f"usb-Other must be there, but is not.*Connected: {name}"):
         OpencvTactile(finger="a", device=str(dev / "v4l" / "by-id" / "usb-Other")).connect()
 
 
 def test_the_stable_name_is_looked_up_and_opened_through_video4linux(plug, dev):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     with OpencvTactile(finger="a", device=plug(camera, number=4), **QUICK):
         assert camera.captures[0].path == str(dev / "video4")
         assert camera.captures[0].backend == cv2.CAP_V4L2
@@ -102,7 +102,7 @@ def test_the_stable_name_is_looked_up_and_opened_through_video4linux(plug, dev):
 
 
 def test_a_camera_in_use_cannot_be_connected_and_can_be_later(plug):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     gel = OpencvTactile(finger="a", device=plug(camera), **QUICK)
     camera.busy = True
     with pytest.raises(DeviceError, match="cannot be opened; is it used by another program"):
@@ -128,14 +128,14 @@ def test_what_is_no_camera_cannot_be_opened_by_the_real_opencv_either(dev):
 def test_nothing_is_touched_before_connecting(monkeypatch):
     monkeypatch.setattr(opencv_stream, "open_capture", lambda device: pytest.fail("opened"))
     gel = OpencvTactile(finger="b", device="7", allow_index=True)
-    assert (gel.name, gel.finger, gel.frames_seen, gel.lost) == ("gel b", "b", 0, 0)
+    assert (gel.name, gel.finger, gel.frame_count, gel.lost_count) == ("gel b", "b", 0, 0)
     with pytest.raises(DeviceError, match="must be connected before it is used"):
         gel.read()
 
 
 def test_opencv_waits_a_second_for_a_picture_unless_it_is_told_otherwise(plug, monkeypatch):
     monkeypatch.delenv("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", raising=False)
-    name = plug(FakeCamera())
+    name = plug(FakeVideoDevice())
     opencv_stream.open_capture(name)
     assert os.environ["OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT"] == "1"
     monkeypatch.setenv("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "5")
@@ -147,9 +147,9 @@ def test_opencv_waits_a_second_for_a_picture_unless_it_is_told_otherwise(plug, m
 
 
 def test_format_is_written_first_then_size_and_rate_and_then_the_rest(plug):
-    camera = FakeCamera()
-    asked = {"exposure_ms": 5.0, "white_balance_k": 4600.0, "gain": 0.0, "buffer": 2}
-    with GelSight(finger="a", device=plug(camera), **asked, **QUICK) as gel:
+    camera = FakeVideoDevice()
+    requested = {"exposure_ms": 5.0, "white_balance_k": 4600.0, "gain": 0.0, "buffer": 2}
+    with GelSight(finger="a", device=plug(camera), **requested, **QUICK) as gel:
         assert camera.written == [
             (cv2.CAP_PROP_FOURCC, 0x47504A4D),  # "MJPG", first letter lowest
             (cv2.CAP_PROP_FRAME_WIDTH, 1280),
@@ -166,7 +166,7 @@ def test_format_is_written_first_then_size_and_rate_and_then_the_rest(plug):
 
 
 def test_what_the_camera_says_of_its_settings_is_what_is_recorded(plug):
-    with GelSight(finger="a", device=plug(FakeCamera()), exposure_ms=5.0, **QUICK) as gel:
+    with GelSight(finger="a", device=plug(FakeVideoDevice()), exposure_ms=5.0, **QUICK) as gel:
         found = gel.settings()
     assert found["fourcc"] == "MJPG"
     assert (found["width"], found["height"], found["fps"]) == (1280, 960, 30.0)
@@ -177,7 +177,7 @@ def test_what_the_camera_says_of_its_settings_is_what_is_recorded(plug):
 
 
 def test_settings_that_the_camera_does_not_take_are_told_with_what_it_has_instead(plug):
-    camera = FakeCamera(stubborn=[cv2.CAP_PROP_FPS, cv2.CAP_PROP_FOURCC], lacks=[cv2.CAP_PROP_EXPOSURE])
+    camera = FakeVideoDevice(stubborn=[cv2.CAP_PROP_FPS, cv2.CAP_PROP_FOURCC], lacks=[cv2.CAP_PROP_EXPOSURE])
     with GelSight(finger="a", device=plug(camera), exposure_ms=5.0, **QUICK) as gel:
         assert gel.refused == {
             "fourcc": "asked MJPG, has YUYV",
@@ -188,20 +188,20 @@ def test_settings_that_the_camera_does_not_take_are_told_with_what_it_has_instea
 
 
 def test_a_rate_that_the_camera_states_a_little_differently_is_taken(plug):
-    camera = FakeCamera(stubborn=[cv2.CAP_PROP_FPS])
+    camera = FakeVideoDevice(stubborn=[cv2.CAP_PROP_FPS])
     camera.values[cv2.CAP_PROP_FPS] = 29.97
     with GelSight(finger="a", device=plug(camera), **QUICK) as gel:
         assert gel.refused == {}
 
 
 def test_only_the_automatics_are_written_to_a_camera_of_which_nothing_is_asked(plug):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     with OpencvTactile(finger="a", device=plug(camera), **QUICK):
         assert camera.written == [(cv2.CAP_PROP_AUTO_EXPOSURE, 1), (cv2.CAP_PROP_AUTO_WB, 0)]
 
 
 def test_the_brightness_of_a_digit_goes_through_its_zoom(plug):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     with Digit(finger="a", device=plug(camera), led=[15, 2, 1], **QUICK) as gel:
         assert (cv2.CAP_PROP_ZOOM, 0xF21) in camera.written
         assert gel.settings()["led"] == [15, 2, 1]
@@ -209,7 +209,7 @@ def test_the_brightness_of_a_digit_goes_through_its_zoom(plug):
 
 
 def test_a_files_settings_count_before_the_presets(plug):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     with Digit(finger="a", device=plug(camera), width=640, height=480, fps=30.0, **QUICK) as gel:
         found = gel.settings()
     assert (found["width"], found["height"], found["fps"], found["led"]) == (640, 480, 30.0, [15, 15, 15])
@@ -255,7 +255,7 @@ def test_settings_out_of_range_are_refused_before_anything_is_connected(setting,
 
 
 def test_pictures_come_in_rgb_with_row_0_on_top(plug):
-    with OpencvTactile(finger="a", device=plug(FakeCamera()), **QUICK) as gel:
+    with OpencvTactile(finger="a", device=plug(FakeVideoDevice()), **QUICK) as gel:
         pixels = gel.read(10).pixels
     assert pixels.shape == (6, 8, 3)
     assert (pixels[0, :, 0] == 200).all()
@@ -265,7 +265,7 @@ def test_pictures_come_in_rgb_with_row_0_on_top(plug):
 
 def test_a_digit_is_turned_to_the_left(plug):
     """The camera's first row becomes the left column, as after transposing and turning over."""
-    with Digit(finger="a", device=plug(FakeCamera()), **QUICK) as gel:
+    with Digit(finger="a", device=plug(FakeVideoDevice()), **QUICK) as gel:
         pixels = gel.read(10).pixels
     assert pixels.shape == (8, 6, 3)
     assert (pixels[:, 0, 0] == 200).all()
@@ -275,7 +275,7 @@ def test_a_digit_is_turned_to_the_left(plug):
 
 
 def test_the_border_of_a_gelsight_mini_is_cut_off_and_the_size_is_as_asked(plug):
-    camera = FakeCamera(size=(100, 80))
+    camera = FakeVideoDevice(size=(100, 80))
     with GelSightMini(finger="a", device=plug(camera), **QUICK) as gel:
         assert gel.read(10).pixels.shape == (56, 70, 3)  # 80 - 2 * 12 by 100 - 2 * 15
     with GelSightMini(finger="a", device=plug(camera), crop=[0.1, 0.0, 0.1, 0.5], output_px=[40, 30], **QUICK) as gel:
@@ -285,7 +285,7 @@ def test_the_border_of_a_gelsight_mini_is_cut_off_and_the_size_is_as_asked(plug)
 def test_a_calibration_file_for_another_size_is_found_when_connecting(plug, tmp_path):
     path = tmp_path / "gel.json"
     path.write_text('{"image_px": [64, 48], "crop": [0.1, 0.1, 0.1, 0.1]}')
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     name = plug(camera)
     gel = OpencvTactile(finger="a", device=name, calibration=str(path), **QUICK)
     with pytest.raises(DeviceError, match="must be 64 x 48 pixels, as in the calibration file, got 8 x 6"):
@@ -305,14 +305,14 @@ def test_a_calibration_file_that_is_none_is_named_before_anything_is_connected(t
 @pytest.mark.parametrize("shape", [(6, 8, 2), (6, 8), (6, 8, 4)])
 @pytest.mark.parametrize("make", [OpencvTactile, Digit, GelSightMini])
 def test_pictures_without_three_colours_are_a_device_error_that_says_what_to_set(plug, make, shape):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     camera.picture = lambda number: np.full(shape, number % 256, np.uint8)
     with pytest.raises(DeviceError, match=r'must give pictures H x W x 3 uint8, .*as "MJPG"'):
         make(finger="a", device=plug(camera), **QUICK).connect()
 
 
 def test_numbers_that_a_camera_makes_up_never_reach_the_settings(plug):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     for number, value in ((cv2.CAP_PROP_GAIN, math.nan), (cv2.CAP_PROP_FPS, math.inf), (cv2.CAP_PROP_FOURCC, 1e300)):
         camera.values[number] = value
     with OpencvTactile(finger="a", device=plug(camera), gain=None, **QUICK) as gel:
@@ -322,7 +322,7 @@ def test_numbers_that_a_camera_makes_up_never_reach_the_settings(plug):
 
 
 def test_a_picture_carries_the_time_at_which_its_buffer_was_filled(plug):
-    camera = FakeCamera(stamps=True)
+    camera = FakeVideoDevice(stamps=True)
     stream = CaptureStream(plug(camera), CaptureSettings(), lambda: 1e6)
     capture = camera.captures[0]
     for taken_s, expected_s in ((1e6 - 0.03, 1e6 - 0.03), (1e6 - 2.0, 1e6), (1e6 + 1.0, 1e6), (0.0, 1e6)):
@@ -332,7 +332,7 @@ def test_a_picture_carries_the_time_at_which_its_buffer_was_filled(plug):
 
 
 def test_a_few_damaged_pictures_are_passed_over_and_many_are_a_lost_stream(plug):
-    camera = FakeCamera(fps=1000.0)
+    camera = FakeVideoDevice(fps=1000.0)
     stream = CaptureStream(plug(camera), CaptureSettings(), lambda: 0.0)
     for _ in range(2):  # each good one ends the row
         camera.damaged = 10
@@ -345,7 +345,7 @@ def test_a_few_damaged_pictures_are_passed_over_and_many_are_a_lost_stream(plug)
 
 @pytest.mark.parametrize("method", ["grab", "retrieve", "set"])
 def test_an_exception_of_opencv_is_a_device_error(plug, method, monkeypatch):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     name = plug(camera)
 
     def fail(*_):
@@ -362,7 +362,7 @@ def test_an_exception_of_opencv_is_a_device_error(plug, method, monkeypatch):
 
 
 def test_a_camera_plugged_in_again_under_another_number_goes_on_with_its_settings_written_again(plug):
-    first, second = FakeCamera(stubborn=[cv2.CAP_PROP_FRAME_WIDTH]), FakeCamera(stubborn=[cv2.CAP_PROP_FPS])
+    first, second = FakeVideoDevice(stubborn=[cv2.CAP_PROP_FRAME_WIDTH]), FakeVideoDevice(stubborn=[cv2.CAP_PROP_FPS])
     with GelSight(finger="a", device=plug(first, number=0), **QUICK) as gel:
         gel.read(10)
         assert gel.refused == {"width": "asked 1280, has 0"}
@@ -370,7 +370,7 @@ def test_a_camera_plugged_in_again_under_another_number_goes_on_with_its_setting
         first.dead = True
         gel.recover()
         assert gel.read(10).pixels.shape == (6, 8, 3)
-        assert gel.lost >= 1
+        assert gel.lost_count >= 1
         assert written(second)[:3] == written(first)[:3]
         assert gel.refused == {"fps": "asked 30, has 15"}
     assert not first.open_captures
@@ -378,7 +378,7 @@ def test_a_camera_plugged_in_again_under_another_number_goes_on_with_its_setting
 
 
 def test_a_camera_that_is_gone_is_an_error_that_says_so_also_to_recover(plug, dev):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     with OpencvTactile(finger="a", device=plug(camera), warmup_s=0.0, timeout_s=0.3) as gel:
         camera.dead = True
         (dev / "video0").unlink()
@@ -389,10 +389,10 @@ def test_a_camera_that_is_gone_is_an_error_that_says_so_also_to_recover(plug, de
 
 
 def test_a_frozen_camera_is_an_error(plug):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     with OpencvTactile(finger="a", device=plug(camera), warmup_s=0.0, timeout_s=0.3, frozen_s=0.05) as gel:
         camera.frozen = True
-        until(lambda: gel.lost)
+        wait_until(lambda: gel.lost_count)
         with pytest.raises(DeviceError, match="frozen: the same picture"):
             gel.recover()
         camera.frozen = False
@@ -401,10 +401,10 @@ def test_a_frozen_camera_is_an_error(plug):
 
 
 def test_a_driver_that_waits_for_ever_gives_stale_pictures_which_are_refused(plug):
-    camera = FakeCamera()
+    camera = FakeVideoDevice()
     with OpencvTactile(finger="a", device=plug(camera), **QUICK) as gel:
         camera.hangs = threading.Event()
-        until(lambda: time.monotonic() - gel.read(10).time_s > 0.05)
+        wait_until(lambda: time.monotonic() - gel.read(10).time_s > 0.05)
         with pytest.raises(DeviceError, match=r"the frame must be at most 0\.05 s old"):
             gel.read(0.05)
         camera.hangs.set()

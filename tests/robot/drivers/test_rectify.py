@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot.drivers.video.rectify import CutSettings, Rectifier, in_rgb, load_rectifier, make_rectifier
+from robot.drivers.video.rectify import CropSettings, Rectifier, load_rectifier, make_rectifier, to_rgb
 from robot.errors import DeviceError, RobotConfigError
 
 CORNERS = ((10.0, 5.0), (49.0, 5.0), (49.0, 24.0), (10.0, 24.0))
@@ -81,17 +81,17 @@ def test_a_calibration_file_is_read(tmp_path):
         {"image_px": [60, 40], "corners_px": [[10, 5], [49, 5], [49, 24], [10, 24]], "output_px": [20, 10], "note": ""},
     )
     assert load_rectifier(path) == Rectifier((), CORNERS, (60, 40), (20, 10))
-    assert make_rectifier(CutSettings(calibration=str(path))).apply(ramp()).shape == (10, 20, 3)
-    assert make_rectifier(CutSettings(calibration=str(path), output_px=[8, 4])).apply(ramp()).shape == (4, 8, 3)
+    assert make_rectifier(CropSettings(calibration=str(path))).apply(ramp()).shape == (10, 20, 3)
+    assert make_rectifier(CropSettings(calibration=str(path), output_px=[8, 4])).apply(ramp()).shape == (4, 8, 3)
 
 
 def test_a_files_crop_excludes_the_settings_and_settings_count_before_a_preset(tmp_path):
     path = written(tmp_path, {"image_px": [60, 40], "crop": [0.1, 0.1, 0.1, 0.1]})
     with pytest.raises(RobotConfigError, match="by crop or by a calibration file"):
-        make_rectifier(CutSettings(calibration=str(path), crop=[0.2, 0.2, 0.2, 0.2]))
-    assert make_rectifier(CutSettings(calibration=str(path)), default_crop=[0.2] * 4).crop == (0.1,) * 4
-    assert make_rectifier(CutSettings(crop=[0.3] * 4), default_crop=[0.2] * 4).crop == (0.3,) * 4
-    assert make_rectifier(CutSettings(), default_crop=[0.2] * 4).crop == (0.2,) * 4
+        make_rectifier(CropSettings(calibration=str(path), crop=[0.2, 0.2, 0.2, 0.2]))
+    assert make_rectifier(CropSettings(calibration=str(path)), default_crop=[0.2] * 4).crop == (0.1,) * 4
+    assert make_rectifier(CropSettings(crop=[0.3] * 4), default_crop=[0.2] * 4).crop == (0.3,) * 4
+    assert make_rectifier(CropSettings(), default_crop=[0.2] * 4).crop == (0.2,) * 4
 
 
 SQUARE = [[1, 1], [9, 1], [9, 9], [1, 9]]
@@ -158,6 +158,6 @@ def test_whatever_a_calibration_file_holds_it_works_or_is_refused(tmp_path_facto
     "picture", [np.zeros((4, 6, 2), np.uint8), np.zeros((4, 6), np.uint8), np.zeros((4, 6, 3), np.uint16)]
 )
 def test_what_has_not_three_colours_is_refused(picture):
-    for use in (in_rgb, Rectifier(output_px=(3, 2)).apply):
+    for use in (to_rgb, Rectifier(output_px=(3, 2)).apply):
         with pytest.raises(DeviceError, match="H x W x 3 uint8"):
             use(picture)

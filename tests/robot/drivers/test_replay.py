@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.drivers.replay import ImagesSensor, ReplayCamera, VideoSensor
+from robot.drivers.replay import ImageFolderSensor, ReplayCamera, VideoSensor
 from robot.errors import DeviceError, RobotConfigError
 from robot.grasping.attempt import depth_in_mm
 from robot.recording.folder import RecordingWriter
@@ -61,7 +61,7 @@ def level(frame):
 @pytest.fixture(params=["film", "folder"])
 def make(request, film, folder, clock):
     """The same six pictures, from a film or from a folder."""
-    kind, path = {"film": (VideoSensor, film), "folder": (ImagesSensor, folder)}[request.param]
+    kind, path = {"film": (VideoSensor, film), "folder": (ImageFolderSensor, folder)}[request.param]
     return lambda **more: kind(finger="a", path=str(path), fps=10.0, clock=clock, **more)
 
 
@@ -107,7 +107,7 @@ def test_the_picture_nearest_to_a_time_is_found_and_none_of_the_future(make, clo
 @pytest.mark.parametrize("fps", [1.0, 0.5])
 def test_pictures_that_stand_for_long_are_never_too_old(folder, clock, fps):
     """At half a picture a second each is shown twenty times, every tenth of a second."""
-    with ImagesSensor(finger="a", path=str(folder), fps=fps, clock=clock) as gel:
+    with ImageFolderSensor(finger="a", path=str(folder), fps=fps, clock=clock) as gel:
         for later, expected in ((0.0, 20), (0.99, 20), (1.05, 60), (1.95, 60), (5.51, 220), (6.05, 20)):
             clock.now_s = 50.0 + later / fps
             frame = gel.read(0.11)
@@ -116,7 +116,7 @@ def test_pictures_that_stand_for_long_are_never_too_old(folder, clock, fps):
 
 
 def test_a_slow_film_that_is_not_to_begin_again_ends_after_its_last_picture(folder, clock):
-    with ImagesSensor(finger="a", path=str(folder), fps=2.0, loop=False, clock=clock) as gel:
+    with ImageFolderSensor(finger="a", path=str(folder), fps=2.0, loop=False, clock=clock) as gel:
         clock.now_s += 2.95
         assert level(gel.read()) == 220
         clock.now_s += 0.1
@@ -159,7 +159,7 @@ def test_what_is_replayed_is_said(make):
 
 
 def test_pictures_are_in_rgb(folder, clock):
-    with ImagesSensor(finger="a", path=str(folder), clock=clock) as gel:
+    with ImageFolderSensor(finger="a", path=str(folder), clock=clock) as gel:
         assert gel.read().pixels[0, 0].tolist() == [20, 20, 255]
 
 
@@ -173,7 +173,7 @@ def test_a_film_is_decoded_forward_and_opened_again_to_go_back(film, clock, monk
     real = cv2.VideoCapture
     monkeypatch.setattr(cv2, "VideoCapture", lambda path: opened.append(path) or real(path))
     with VideoSensor(finger="a", path=str(film), clock=clock) as gel:
-        monkeypatch.setattr("robot.drivers.replay._KEPT", 1)
+        monkeypatch.setattr("robot.drivers.replay._CACHE_SIZE", 1)
         for later in (0.0, 0.15, 0.15, 0.45):
             clock.now_s = 50.0 + later
             gel.read()
@@ -191,10 +191,10 @@ def test_a_film_shorter_than_it_says_is_an_error(film, clock):
             gel.read()
 
 
-@pytest.mark.parametrize("kind", [VideoSensor, ImagesSensor])
+@pytest.mark.parametrize("kind", [VideoSensor, ImageFolderSensor])
 def test_what_holds_no_pictures_cannot_be_connected(kind, tmp_path, clock):
     empty = tmp_path / "empty"
-    empty.mkdir() if kind is ImagesSensor else empty.write_text("no film")
+    empty.mkdir() if kind is ImageFolderSensor else empty.write_text("no film")
     for path in (empty, tmp_path / "none"):
         with pytest.raises(DeviceError):
             kind(finger="a", path=str(path), clock=clock).connect()
@@ -203,14 +203,14 @@ def test_what_holds_no_pictures_cannot_be_connected(kind, tmp_path, clock):
 def test_a_picture_that_cannot_be_decoded_is_named(folder, clock):
     (folder / "0.png").write_bytes(b"not a picture")
     with pytest.raises(DeviceError, match=r"0\.png must be a picture"):
-        ImagesSensor(finger="a", path=str(folder), clock=clock).connect()
+        ImageFolderSensor(finger="a", path=str(folder), clock=clock).connect()
 
 
 def test_what_other_systems_hide_beside_pictures_is_none(folder, pairs, clock):
     """A Mac leaves such a file beside each picture that it copies."""
     for hidden in (folder / "._0.png", pairs / "._view1.png"):
         hidden.write_bytes(b"Mac OS X")
-    with ImagesSensor(finger="a", path=str(folder), clock=clock) as gel:
+    with ImageFolderSensor(finger="a", path=str(folder), clock=clock) as gel:
         assert gel.settings()["pictures"] == len(LEVELS)
     with camera(pairs) as eye:
         assert int(eye.read().colour[0, 0, 1]) == 1
@@ -221,7 +221,7 @@ def test_a_pipe_that_bears_a_pictures_name_is_refused_unread(folder, clock):
     (folder / "0.png").unlink()
     os.mkfifo(folder / "0.png")
     with pytest.raises(DeviceError, match=r"0\.png must be a picture, but is no file"):
-        ImagesSensor(finger="a", path=str(folder), clock=clock).connect()
+        ImageFolderSensor(finger="a", path=str(folder), clock=clock).connect()
 
 
 @pytest.mark.parametrize("fps", [-1.0, float("nan"), 2000.0, 1e-3, 5e-324, float("inf")])
@@ -271,7 +271,7 @@ def camera(path, **more):
 def test_each_read_shows_the_next_picture_and_after_the_last_the_first(pairs):
     with camera(pairs) as eye:
         assert [int(eye.read().colour[0, 0, 1]) for _ in range(3)] == [1, 2, 1]
-        eye.show(3)
+        eye.seek(3)
         assert int(eye.read().colour[0, 0, 1]) == 2
 
 
@@ -287,7 +287,7 @@ def test_without_depth_no_depth_is_read(pairs):
     (pairs / "view1_depth.png").write_bytes(b"damaged")
     with camera(pairs) as eye:
         assert eye.read(depth=False).depth_m is None
-        eye.show(0)
+        eye.seek(0)
         with pytest.raises(DeviceError, match=r"view1_depth\.png must be a picture"):
             eye.read()
 

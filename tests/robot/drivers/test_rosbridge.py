@@ -17,7 +17,7 @@ from robot.drivers.sawyer import rosbridge
 from robot.drivers.sawyer.rosbridge import RosbridgeLink, decode, encode
 from robot.errors import DeviceError
 from tests.emulators.sawyer.server import EmulatedSawyer, MessageFaults, serve
-from tests.waiting import STARTED, STARTED_IDS, first_line, running, until
+from tests.waiting import STARTED, STARTED_IDS, first_line, run_process, wait_until
 
 
 def readers():
@@ -175,10 +175,10 @@ def kept_after(texts):
     """What a link that subscribed to /t has of it after these texts came."""
     link = RosbridgeLink("ws://127.0.0.1:1")
     link._socket = type("Deaf", (), {"send": lambda self, text: None})()
-    link._gone = ""
+    link._closed_reason = ""
     link.subscribe("/t", "std_msgs/String")
     for text in texts:
-        link._take(text)
+        link._handle(text)
     return link.history("/t")
 
 
@@ -217,10 +217,10 @@ def test_what_is_not_yet_read_does_not_pile_up(monkeypatch):
 
     with scripted(answer) as (url, _):
         link = RosbridgeLink(url, timeout_s=20.0)
-        monkeypatch.setattr(link, "_take", lambda text: read.wait(60.0))
+        monkeypatch.setattr(link, "_handle", lambda text: read.wait(60.0))
         link.open()
         link.subscribe("/t", "std_msgs/String")
-        until(lambda: link._socket.recv_messages.paused or len(sent) == 1000)
+        wait_until(lambda: link._socket.recv_messages.paused or len(sent) == 1000)
         assert link._socket.recv_messages.paused
         assert link._socket.recv_messages.frames.qsize() <= 20
         assert len(sent) < 500
@@ -339,7 +339,7 @@ def test_faults_are_drawn_from_a_seed_and_counted():
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
 def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c(by):
     command = [sys.executable, "-m", "tests.emulators.sawyer.server", "--port", "0", "--faults", "1"]
-    with running([*by, *command]) as process:
+    with run_process([*by, *command]) as process:
         url = next(word for word in first_line(process).split() if word.startswith("ws://")).rstrip(";")
         link = RosbridgeLink(url, timeout_s=60.0)
         link.open()

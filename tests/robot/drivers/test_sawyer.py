@@ -19,13 +19,13 @@ from hypothesis import strategies as st
 from robot.drivers.sawyer import messages, straight_line
 from robot.drivers.sawyer.driver import Sawyer
 from robot.drivers.sawyer.messages import JOINTS, Mount
-from robot.drivers.sawyer.rosbridge import Arrival
-from robot.drivers.sawyer.straight_line import Schedule, way_points
+from robot.drivers.sawyer.rosbridge import ReceivedMessage
+from robot.drivers.sawyer.straight_line import JointTrajectory, waypoints
 from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Pose, Region
 from tests.emulators.sawyer.arm import READY, SawyerModel, forward, inverse
 from tests.emulators.sawyer.server import LIMB, EmulatedSawyer, MessageFaults, serve
-from tests.waiting import running, until
+from tests.waiting import run_process, wait_until
 
 WORKSPACE = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
 MOUNT = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
@@ -53,7 +53,7 @@ def while_it_moves(emulator, act):
     before = len(emulator.commands)
 
     def run():
-        until(lambda: len(emulator.commands) > before + 15)
+        wait_until(lambda: len(emulator.commands) > before + 15)
         act()
 
     thread = threading.Thread(target=run)
@@ -131,23 +131,23 @@ def test_the_made_up_arm_says_no():
 
 
 def test_way_points_stand_on_the_line_and_turn_the_shorter_way():
-    points = way_points(Pose(0, 0, 0, 3.0), Pose(30, 40, 0, -3.0))
+    points = waypoints(Pose(0, 0, 0, 3.0), Pose(30, 40, 0, -3.0))
     assert points[0] == Pose(0, 0, 0, 3.0)
     assert points[-1] == Pose(30, 40, 0, -3.0)
     assert len(points) == 6  # 50 mm in steps of 10
     assert [point.x_mm for point in points] == pytest.approx([0, 6, 12, 18, 24, 30])
     assert points[2].yaw_rad == pytest.approx(3.0 + 0.4 * (math.tau - 6.0))
-    assert len(way_points(HOME, HOME)) == 2
+    assert len(waypoints(HOME, HOME)) == 2
 
 
 def planned(speed=100.0, joint_speed=10.0, ramp_s=0.3, goal=FAR):
-    poses = way_points(HOME, goal)
+    poses = waypoints(HOME, goal)
     mount, joints = Mount((500.0, 0.0, -100.0), math.pi, 150.0, 0.0), [READY]
     for pose in poses:
         tip = mount.tip_of(pose)
         place, turn = [tip["position"][axis] for axis in "xyz"], [tip["orientation"][axis] for axis in "xyzw"]
         joints.append(inverse(place, turn, joints[-1]))
-    return Schedule.of(poses, np.array(joints[1:]), speed, joint_speed, ramp_s), mount
+    return JointTrajectory.from_waypoints(poses, np.array(joints[1:]), speed, joint_speed, ramp_s), mount
 
 
 @pytest.mark.parametrize("goal", [FAR, Pose(140, -140, 20, 1.0), Pose(-140, 140, 290, -1.0), Pose(0, 0, 62, 0)])
@@ -174,7 +174,7 @@ def test_no_joint_is_faster_than_its_limit():
 
 @given(st.just(0.0) | st.floats(1e-6, 20), st.just(0.0) | st.floats(1e-6, 5))
 def test_a_schedule_begins_and_ends_where_it_must(full, ramp_s):
-    schedule = Schedule(np.array([[0.0] * 7, [1.0] * 7]), np.array([0.0, full]), ramp_s)
+    schedule = JointTrajectory(np.array([[0.0] * 7, [1.0] * 7]), np.array([0.0, full]), ramp_s)
     if full > 0:
         assert schedule.at(0.0)[0] == pytest.approx(0, abs=1e-12)
     assert schedule.at(schedule.duration_s)[0] == pytest.approx(1.0)
@@ -210,7 +210,7 @@ ANY = st.recursive(
 )
 READERS = {
     "state": messages.robot_state,
-    "collision": messages.collided,
+    "collision": messages.has_collided,
     "joints": messages.joints_of,
     "tip": lambda message: messages.tip_of(message, "right_hand"),
     "pose": Mount((0, 0, 0), 0.0, 0.0, 0.0).pose_of,
@@ -249,8 +249,8 @@ def test_joints_are_read_by_name_and_those_of_others_left_alone():
 )
 def test_what_keeps_the_arm_from_moving_says_what_a_person_must_do(fields, words):
     message = {"enabled": True, "stopped": False, "error": False, "estop_button": 0, "estop_source": 0}
-    assert messages.robot_state(message).obstacle is None
-    assert words in messages.robot_state(message | fields).obstacle
+    assert messages.robot_state(message).blocking_reason is None
+    assert words in messages.robot_state(message | fields).blocking_reason
 
 
 @pytest.mark.parametrize(
@@ -279,7 +279,7 @@ def test_a_joint_state_repeated_with_its_old_stamp_grows_old():
     names = {"name": list(JOINTS), "position": [0.0] * 7}
 
     def heard(*stamps_and_times):
-        arrivals = [Arrival({"header": {"stamp": stamp}, **names}, at) for stamp, at in stamps_and_times]
+        arrivals = [ReceivedMessage({"header": {"stamp": stamp}, **names}, at) for stamp, at in stamps_and_times]
         arm._link = SimpleNamespace(history=lambda _: arrivals, check=lambda: None)
 
     now[0] = 2.0
@@ -305,7 +305,7 @@ def test_it_goes_where_it_is_told_as_the_robot_itself_measures_it():
         x, y, z = forward(emulator.model.joints)[0]
         assert (x, y, z) == pytest.approx((0.480, 0.030, 0.140), abs=1e-3)  # base turned by 180 deg: 500 - 20, 30
         assert offset(arm.pose(), target) < (1.0, 0.02)
-        until(lambda: stands(emulator))
+        wait_until(lambda: stands(emulator))
 
 
 def test_commands_never_step_further_than_speed_allows_in_two_ticks_even_after_a_nap():
@@ -350,7 +350,7 @@ def test_an_emergency_stop_ends_the_motion_and_nobody_resets_it_from_here():
         assert emulator.model.stopped
         assert offset(arm.pose(), FAR)[0] > 50
         emulator.release_estop()
-        until(lambda: arm._robot_state().obstacle is None)
+        wait_until(lambda: arm._robot_state().blocking_reason is None)
         arm.recover()
         target = Pose(0, 0, arm.pose().z_mm + 5, 0)
         assert offset(arm.move_to(target, 100.0), target)[0] < 1
@@ -358,11 +358,13 @@ def test_an_emergency_stop_ends_the_motion_and_nobody_resets_it_from_here():
 
 def test_a_collision_reported_for_one_moment_stops_the_arm_where_it_is():
     def bump():
-        emulator.model.collided = True
+        emulator.model.has_collided = True
         published = len(arm._link.history(LIMB + "collision_detection_state"))
         history = lambda: arm._link.history(LIMB + "collision_detection_state")  # noqa: E731
-        until(lambda: any(each.message["collision_state"] for each in history()) or len(history()) > published + 99)
-        emulator.model.collided = False
+        wait_until(
+            lambda: any(each.message["collision_state"] for each in history()) or len(history()) > published + 99
+        )
+        emulator.model.has_collided = False
 
     with connected() as (emulator, arm):
         with while_it_moves(emulator, bump), pytest.raises(DeviceError, match="reports a collision, the arm holds"):
@@ -377,8 +379,8 @@ def test_a_collision_reported_for_one_moment_stops_the_arm_where_it_is():
 
 def test_a_collision_that_lasts_needs_a_person():
     with connected() as (emulator, arm):
-        emulator.model.collided = True
-        until(lambda: arm._collided_since(0.0))
+        emulator.model.has_collided = True
+        wait_until(lambda: arm._has_collided_since(0.0))
         with pytest.raises(DeviceError, match="recovery is refused: the robot reports a collision"):
             arm.recover()
         with pytest.raises(DeviceError, match="reports a collision"):
@@ -400,7 +402,7 @@ def test_a_robot_that_falls_silent_is_not_moved_on(topic, message, age_s, monkey
         with while_it_moves(emulator, lambda: emulator.silent.add(topic)), pytest.raises(DeviceError, match=message):
             arm.move_to(FAR, 20.0)
         count = len(emulator.commands)
-        until(lambda: stands(emulator))  # the robot's own time-out
+        wait_until(lambda: stands(emulator))  # the robot's own time-out
         assert len(emulator.commands) == count
         assert offset(FAR, Pose(0, 0, 1000 * forward(emulator.model.joints)[0][2] - 50, 0))[0] > 50
         emulator.silent.clear()
@@ -427,7 +429,7 @@ def test_a_robot_that_reported_collisions_is_not_brought_back_without(monkeypatc
     monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.001)
     with connected(timeout_s=0.5, max_state_age_s=0.5, reconnect_tries=2) as (emulator, arm):
         emulator.silent.add(messages.COLLISION[0])
-        until(lambda: time.monotonic() - arm._link.history(messages.COLLISION[0])[-1].time_s > 0.5)
+        wait_until(lambda: time.monotonic() - arm._link.history(messages.COLLISION[0])[-1].time_s > 0.5)
         for _ in range(2):
             with pytest.raises(DeviceError, match=r"no message on .*collision_detection_state"):
                 arm.recover()
@@ -443,10 +445,10 @@ def test_however_often_the_robot_is_tried_no_wait_is_longer_than_seconds(monkeyp
     """Doubled each time, the last of twenty waits would take more than a day."""
     waits = []
     arm = arm_at("ws://127.0.0.1:9090", reconnect_tries=20)
-    monkeypatch.setattr(arm, "_join", Mock(side_effect=DeviceError("nobody is there")))
+    monkeypatch.setattr(arm, "_open_link", Mock(side_effect=DeviceError("nobody is there")))
     monkeypatch.setattr("robot.drivers.sawyer.driver.time", SimpleNamespace(sleep=waits.append))
     with pytest.raises(DeviceError, match="nobody is there"):
-        arm._rejoin()
+        arm._reconnect()
     assert (len(waits), waits[0], max(waits)) == (19, 0.25, 5.0)
 
 
@@ -455,7 +457,7 @@ def test_states_may_be_as_old_as_is_allowed_and_two_seconds_at_least():
     state = {"enabled": True, "stopped": False, "error": False, "estop_button": 0, "estop_source": 0}
     for allowed_s, limit_s in ((0.5, 2.0), (3.0, 3.0)):
         arm = arm_at("ws://127.0.0.1:9090", clock=lambda: now[0], max_state_age_s=allowed_s)
-        arm._link = SimpleNamespace(history=lambda _: [Arrival(state, 0.0)], check=lambda: None)
+        arm._link = SimpleNamespace(history=lambda _: [ReceivedMessage(state, 0.0)], check=lambda: None)
         now[0] = limit_s - 0.01
         assert arm._robot_state().enabled
         now[0] = limit_s + 0.01
@@ -471,7 +473,7 @@ def test_a_broken_connection_stops_the_arm_and_is_made_anew(caplog):
         assert "and while sawyer was stopped" in caught.value.__notes__[0]
         with pytest.raises(DeviceError, match="is gone"):
             arm.stop()
-        until(lambda: stands(emulator))
+        wait_until(lambda: stands(emulator))
         with caplog.at_level(logging.WARNING):
             arm.recover()
         assert "connecting again" in caplog.text
@@ -485,7 +487,7 @@ def test_connecting_again_is_tried_so_often_and_no_more(monkeypatch, caplog):
         arm = arm_at(robot.enter_context(serve(EmulatedSawyer())), reconnect_tries=3, timeout_s=5.0)
         arm.connect()
         robot.close()
-        until(lambda: not arm._link.is_open)
+        wait_until(lambda: not arm._link.is_open)
         with caplog.at_level(logging.WARNING), pytest.raises(DeviceError, match="rosbridge must answer at"):
             arm.recover()
         assert caplog.text.count("try ") == 3
@@ -508,7 +510,7 @@ def test_ctrl_c_leaves_the_arm_standing():
         with pytest.raises(KeyboardInterrupt):
             arm.move_to(FAR, 50.0)
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02
-        until(lambda: stands(emulator))
+        wait_until(lambda: stands(emulator))
         assert offset(arm.pose(), FAR)[0] > 50
 
 
@@ -527,21 +529,21 @@ def test_ctrl_c_in_a_terminal_leaves_the_arm_standing_and_the_program_ends():
     emulator = EmulatedSawyer()
     with serve(emulator) as url:
         code = PROGRAM.replace("PORT", url.rpartition(":")[2])
-        with running([sys.executable, "-c", code]) as process:
-            until(lambda: len(emulator.commands) > 15 or process.poll() is not None, 60.0)
+        with run_process([sys.executable, "-c", code]) as process:
+            wait_until(lambda: len(emulator.commands) > 15 or process.poll() is not None, 60.0)
             process.send_signal(signal.SIGINT)
             errors = process.communicate(timeout=60)[1]
         assert "KeyboardInterrupt" in errors
         assert "and while" not in errors
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02
-        until(lambda: stands(emulator))
+        wait_until(lambda: stands(emulator))
 
 
 def test_closing_from_another_thread_ends_a_motion():
     with connected() as (emulator, arm):
         with while_it_moves(emulator, arm.close), pytest.raises(DeviceError, match="is gone"):
             arm.move_to(FAR, 20.0)
-        until(lambda: stands(emulator))
+        wait_until(lambda: stands(emulator))
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.05
         assert not arm.is_connected
 
@@ -690,7 +692,7 @@ def test_with_faults_every_motion_ends_at_its_goal_or_with_a_reason(rate, kinds,
                 outcomes["done"] += 1
             except DeviceError:
                 outcomes["failed"] += 1
-                until(lambda: stands(emulator))
+                wait_until(lambda: stands(emulator))
                 arm.recover()
     with capsys.disabled():
         print(f"\n10 motions: {dict(outcomes)}; faults: {dict(sorted(faults.counts.items()))}")

@@ -21,10 +21,10 @@ BUILT = {
     "disconnect": commands.packet(CommandId.DISCONNECT),
     "fast stop": commands.packet(CommandId.FAST_STOP),
     "stop": commands.packet(CommandId.STOP),
-    "get force limit": commands.ask(CommandId.GET_FORCE_LIMIT),
+    "get force limit": commands.query(CommandId.GET_FORCE_LIMIT),
     "grasping state every 4E0Eh ms": commands.update(CommandId.GRASPING_STATE, 0x4E0E),
     "opening every 1234h ms": commands.update(CommandId.OPENING, 0x1234),
-    "info": commands.ask(CommandId.INFO),
+    "info": commands.query(CommandId.INFO),
     "grasp 12 mm 34 mm/s": commands.packet(CommandId.GRASP, 12.0, 34.0),
     "loop abc": Packet(CommandId.LOOP, b"abc"),
     "move to 34 mm at 56 mm/s, stop on block": commands.move(34.0, 56.0),
@@ -98,7 +98,7 @@ def test_builders_without_a_printed_packet_pack_what_the_table_says():
     assert commands.packet(CommandId.SET_ACCELERATION, 150.0) == Packet(0x30, bytes.fromhex("00001643"))
     assert commands.packet(CommandId.SET_FORCE_LIMIT, 40.0) == Packet(0x32, struct.pack("<f", 40))
     assert commands.packet(CommandId.SET_SOFT_LIMITS, 5.0, 100.0) == Packet(0x34, struct.pack("<ff", 5, 100))
-    assert commands.ask(CommandId.OPENING) == Packet(0x43, b"\x00\x00\x00")
+    assert commands.query(CommandId.OPENING) == Packet(0x43, b"\x00\x00\x00")
     assert commands.update(CommandId.FORCE, 20) == Packet(0x45, b"\x01\x14\x00")
 
 
@@ -121,7 +121,7 @@ def test_parsers_read_what_was_packed_by_hand():
     )
     assert commands.grasping_state(b"\x04") is GraspingState.HOLDING
     assert commands.soft_limits(struct.pack("<ff", 5, 100)) == (5.0, 100.0)
-    assert commands.info(struct.pack("<BBHI", 1, 6, 0x4000, 123456)) == commands.Info(1, 6, 0x4000, 123456)
+    assert commands.info(struct.pack("<BBHI", 1, 6, 0x4000, 123456)) == commands.GripperInfo(1, 6, 0x4000, 123456)
     limits = commands.limits(struct.pack("<8f", 110, 5, 420, 100, 5000, 5, 80, 120))
     assert (limits.stroke_mm, limits.min_speed_mm_s, limits.max_force_n) == (110.0, 5.0, 80.0)
 
@@ -323,8 +323,8 @@ def test_packets_that_break_off_cost_each_byte_once_however_many_claim_it(half, 
 @given(st.binary(max_size=600), st.data())
 def test_the_sum_of_a_stretch_is_that_of_its_bytes_alone(data, draw):
     first = draw.draw(st.integers(0, len(data)))
-    sums = codec._Sums(data, first)
+    sums = codec._PrefixChecksums(data, first)
     for _ in range(3):
         start = draw.draw(st.integers(first, len(data)))
         stop = draw.draw(st.integers(start, min(len(data), start + 264)))
-        assert sums.of(start, stop) == codec.checksum(data[start:stop])
+        assert sums.checksum_of(start, stop) == codec.checksum(data[start:stop])

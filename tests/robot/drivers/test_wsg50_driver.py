@@ -9,12 +9,12 @@ import pytest
 from robot.drivers.wsg50.driver import WSG50
 from robot.errors import DeviceError, RobotConfigError
 from tests.emulators.wsg50.gripper import EmulatedWSG50
-from tests.wsg50_bench import GRASP, HOME, PORTS, RELEASE, bench
+from tests.wsg50_bench import GRASP, HOME, PORTS, RELEASE, gripper_with_emulator
 
 
 @PORTS
-def test_it_grasps_holds_and_lets_go(port):
-    with bench(port) as (gripper, emulator):
+def test_it_grasps_holds_and_releases(port):
+    with gripper_with_emulator(port) as (gripper, emulator):
         emulator.object_mm = 40.0
         held = gripper.grasp(10.0, 200.0)
         assert (held.opening_mm, held.force_n, held.status) == (pytest.approx(40.0), 10.0, "holding")
@@ -26,25 +26,25 @@ def test_it_grasps_holds_and_lets_go(port):
 
 
 def test_a_serial_line_takes_its_rate_and_stop_bits():
-    with bench("pty", baud=9600, stop_bits=2, update_ms=100) as (gripper, _):
+    with gripper_with_emulator("pty", baud=9600, stop_bits=2, update_ms=100) as (gripper, _):
         assert (gripper._link._port._serial.baudrate, gripper._link._port._serial.stopbits) == (9600, 2)
         assert gripper.state().status == "idle"
 
 
 @PORTS
 def test_closing_on_nothing_is_no_part_and_is_left_by_opening_or_grasping(port):
-    with bench(port) as (gripper, emulator):
+    with gripper_with_emulator(port) as (gripper, emulator):
         assert gripper.grasp(10.0).status == "no_part"
         assert gripper.open(60.0).status == "idle"
         assert gripper.grasp(10.0).status == "no_part"
         emulator.object_mm = 3.0
         assert gripper.grasp(10.0).status == "holding"  # released by 5 mm before: GRASP is refused in NO PART
-        assert emulator.heard.count(RELEASE) == 2
+        assert emulator.received.count(RELEASE) == 2
 
 
 @PORTS
 def test_a_part_that_is_lost_is_said_and_left(port):
-    with bench(port) as (gripper, emulator):
+    with gripper_with_emulator(port) as (gripper, emulator):
         emulator.object_mm = 40.0
         gripper.grasp(10.0)
         emulator.object_mm = None
@@ -53,14 +53,14 @@ def test_a_part_that_is_lost_is_said_and_left(port):
 
 
 def test_grasping_what_is_held_takes_it_anew_with_the_new_force():
-    with bench() as (gripper, emulator):
+    with gripper_with_emulator() as (gripper, emulator):
         emulator.object_mm = 40.0
         gripper.grasp(10.0)
         assert gripper.grasp(20.0).force_n == 20.0
 
 
 def test_opening_less_far_than_what_is_held_lets_go_first():
-    with bench() as (gripper, emulator):
+    with gripper_with_emulator() as (gripper, emulator):
         emulator.object_mm = 40.0
         gripper.grasp(10.0)
         with pytest.raises(DeviceError, match=r"AXIS_BLOCKED to MOVE .* stands at 40.0 mm"):
@@ -71,23 +71,26 @@ def test_opening_less_far_than_what_is_held_lets_go_first():
 
 
 def test_force_is_that_on_each_finger_and_twice_as_much_for_the_gripper():
-    with bench(max_force_n=30.0) as (gripper, emulator):
+    with gripper_with_emulator(max_force_n=30.0) as (gripper, emulator):
         assert (gripper.min_force_n, gripper.max_force_n) == (2.5, 30.0)
         emulator.object_mm = 40.0
         assert gripper.grasp(12.5).force_n == 12.5
         assert emulator.force_limit_n == 25.0
         assert gripper.settings()["force_limit_n"] == 12.5
-    with bench(finger_share=1.0, max_force_n=300.0) as (gripper, emulator):
+    with gripper_with_emulator(finger_share=1.0, max_force_n=300.0) as (gripper, emulator):
         assert (gripper.min_force_n, gripper.max_force_n) == (5.0, 80.0)
         gripper.grasp(12.5)
         assert emulator.force_limit_n == 12.5
 
 
 def test_what_is_out_of_range_never_reaches_the_gripper():
-    with bench(max_force_n=30.0, max_speed_mm_s=300.0, soft_limits_mm=[5.0, 100.0]) as (gripper, emulator):
+    with gripper_with_emulator(max_force_n=30.0, max_speed_mm_s=300.0, soft_limits_mm=[5.0, 100.0]) as (
+        gripper,
+        emulator,
+    ):
         emulator.object_mm = 40.0
         gripper.grasp(10.0)
-        emulator.heard.clear()
+        emulator.received.clear()
         for misuse in (
             lambda: gripper.grasp(2.4),
             lambda: gripper.grasp(30.1),
@@ -99,21 +102,21 @@ def test_what_is_out_of_range_never_reaches_the_gripper():
         ):
             with pytest.raises(DeviceError, match="must be from"):
                 misuse()
-        assert emulator.heard == []
+        assert emulator.received == []
         assert gripper.state().status == "holding"
     for settings in ({"acceleration_mm_s2": 5001.0}, {"soft_limits_mm": [50.0, 111.0]}):
-        with bench(connect=False, **settings) as (gripper, emulator):
+        with gripper_with_emulator(connect=False, **settings) as (gripper, emulator):
             with pytest.raises(DeviceError, match="must be from"):
                 gripper.connect()
-            assert not {0x30, 0x34} & set(emulator.heard)
+            assert not {0x30, 0x34} & set(emulator.received)
 
 
 def test_a_gripper_that_would_clamp_harder_than_asked_is_not_told_to():
-    with bench() as (gripper, emulator):
+    with gripper_with_emulator() as (gripper, emulator):
         emulator.keeps_force_n = 60.0
         with pytest.raises(DeviceError, match="force limit must be 20 N, the gripper has 60 N"):
             gripper.grasp(10.0)
-        assert GRASP not in emulator.heard
+        assert GRASP not in emulator.received
         assert gripper.refused["force_n"] == "asked 10, has 30"
         emulator.keeps_force_n = 16.0
         gripper.grasp(10.0)
@@ -124,14 +127,17 @@ def test_a_gripper_that_would_clamp_harder_than_asked_is_not_told_to():
 
 
 def test_a_force_limit_may_be_off_by_the_rounding_of_its_number_and_never_above_the_ceiling():
-    with bench(max_force_n=10.0) as (gripper, emulator):
+    with gripper_with_emulator(max_force_n=10.0) as (gripper, emulator):
         for kept, asked in ((20.002, 10.0), (20.00001, 10.0), (10.01, 5.0)):
             emulator.keeps_force_n = kept
             with pytest.raises(DeviceError, match="force limit must be"):
                 gripper.grasp(asked)
         emulator.keeps_force_n = 10.000005
         assert gripper.grasp(5.0).status == "no_part"
-    with bench(max_force_n=7.1, finger_share=0.3) as (gripper, emulator):  # 23.666..., which 32 bits round up
+    with gripper_with_emulator(max_force_n=7.1, finger_share=0.3) as (
+        gripper,
+        emulator,
+    ):  # 23.666..., which 32 bits round up
         gripper.grasp(7.1)
         assert 0.3 * emulator.force_limit_n == pytest.approx(7.1)
         assert 0.3 * emulator.force_limit_n <= 7.1
@@ -139,18 +145,18 @@ def test_a_force_limit_may_be_off_by_the_rounding_of_its_number_and_never_above_
 
 def test_a_nominal_width_that_no_motion_may_reach_is_refused():
     for settings in ({"grasp_width_mm": 111.0}, {"grasp_width_mm": 95.0, "soft_limits_mm": [0.0, 90.0]}):
-        with bench(connect=False, **settings) as (gripper, emulator):
+        with gripper_with_emulator(connect=False, **settings) as (gripper, emulator):
             with pytest.raises(DeviceError, match="grasp_width_mm must be at most"):
                 gripper.connect()
             assert not emulator.in_fast_stop
-            assert 0x34 not in emulator.heard
+            assert 0x34 not in emulator.received
 
 
 def test_only_the_states_are_asked_for_again_and_again():
-    with bench() as (gripper, emulator):
+    with gripper_with_emulator() as (gripper, emulator):
         gripper.open(80.0)
-        assert 0x44 not in emulator.heard
-        assert emulator.heard.count(0x43) == emulator.heard.count(0x45)  # readings only
+        assert 0x44 not in emulator.received
+        assert emulator.received.count(0x43) == emulator.received.count(0x45)  # readings only
 
 
 @pytest.mark.parametrize(("baud", "stop_bits", "ms", "fits"), [(9600, 1, 20, 0), (27499, 2, 20, 0), (27500, 2, 20, 1)])
@@ -164,27 +170,27 @@ def test_a_serial_line_must_have_room_beside_the_updates(baud, stop_bits, ms, fi
 
 def test_it_does_not_home_where_connecting_must_move_nothing():
     emulator = EmulatedWSG50(referenced=False, speed_up=20.0)
-    with bench(emulator=emulator, connect=False) as (gripper, _):
+    with gripper_with_emulator(emulator=emulator, connect=False) as (gripper, _):
         gripper.may_move = False
         with pytest.raises(DeviceError, match="does not know its reference, and may not be moved now"):
             gripper.connect()
-    assert HOME not in emulator.heard
+    assert HOME not in emulator.received
     assert emulator.opening_mm == 50.0
 
 
 @PORTS
 def test_it_homes_on_connecting_where_the_reference_is_lost(port, caplog):
-    with bench(port, emulator=EmulatedWSG50(speed_up=20.0)) as (gripper, emulator):
-        assert emulator.heard.count(HOME) == 1
+    with gripper_with_emulator(port, emulator=EmulatedWSG50(speed_up=20.0)) as (gripper, emulator):
+        assert emulator.received.count(HOME) == 1
         assert "homing, the jaws move" in caplog.text
         assert gripper.state().opening_mm == pytest.approx(110.0)
         assert gripper.home().status == "idle"
-    with bench(home_direction="in", emulator=EmulatedWSG50(speed_up=20.0)) as (gripper, _):
+    with gripper_with_emulator(home_direction="in", emulator=EmulatedWSG50(speed_up=20.0)) as (gripper, _):
         assert gripper.state().opening_mm == pytest.approx(0.0)
 
 
 def test_settings_are_written_read_back_and_plain():
-    with bench(acceleration_mm_s2=1500.0, soft_limits_mm=[5.0, 90.0], tare=True) as (gripper, emulator):
+    with gripper_with_emulator(acceleration_mm_s2=1500.0, soft_limits_mm=[5.0, 90.0], tare=True) as (gripper, emulator):
         settings = json.loads(json.dumps(gripper.settings()))
         assert settings["acceleration_mm_s2"] == 1500.0
         assert settings["soft_limits_mm"] == [5.0, 90.0]
@@ -201,7 +207,7 @@ def test_settings_are_written_read_back_and_plain():
 
 
 def test_what_is_held_thinner_than_a_part_is_the_other_finger():
-    with bench(least_part_mm=5.0) as (gripper, emulator):
+    with gripper_with_emulator(min_part_mm=5.0) as (gripper, emulator):
         emulator.object_mm = 4.0
         assert gripper.grasp(10.0).status == "no_part"
 
@@ -230,7 +236,7 @@ def test_a_setting_out_of_range_is_refused(settings):
 
 @pytest.mark.parametrize("settings", [{"max_force_n": 2.0}, {"max_speed_mm_s": 4.0}])
 def test_ceilings_below_what_it_can_do_are_refused_on_connecting(settings):
-    with bench(connect=False, **settings) as (gripper, emulator):
+    with gripper_with_emulator(connect=False, **settings) as (gripper, emulator):
         with pytest.raises(RobotConfigError, match="ceilings must allow"):
             gripper.connect()
         assert not gripper.is_connected

@@ -10,19 +10,19 @@ from robot.drivers.wsg50.link import LinkLost
 from robot.errors import DeviceError
 from tests.emulators.wsg50.faults import LineFaults
 from tests.emulators.wsg50.gripper import EmulatedWSG50
-from tests.waiting import until
-from tests.wsg50_bench import FAST_STOP, GRASP, HOME, MOVE, PORTS, STOP, Script, bench
+from tests.waiting import wait_until
+from tests.wsg50_bench import FAST_STOP, GRASP, HOME, MOVE, PORTS, STOP, ScriptedFaults, gripper_with_emulator
 
 
 @PORTS
 def test_a_line_that_is_cut_while_it_closes_ends_with_the_jaws_standing(port):
     slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
-    script = Script()
-    with bench(port, faults=script, emulator=slow, acknowledge_faults=True) as (gripper, _):
+    script = ScriptedFaults()
+    with gripper_with_emulator(port, faults=script, emulator=slow, acknowledge_faults=True) as (gripper, _):
         script.tell({(GRASP, 2): "disconnect"})
         with pytest.raises(DeviceError, match="recover"):
             gripper.grasp(10.0, 10.0)
-        until(lambda: not slow.moves)
+        wait_until(lambda: not slow.moves)
         assert not slow.is_closing
         assert slow.opening_mm > 50.0
         gripper.recover()
@@ -32,24 +32,24 @@ def test_a_line_that_is_cut_while_it_closes_ends_with_the_jaws_standing(port):
 
 def test_a_serial_line_that_is_cut_while_it_homes_on_connecting_is_opened_again_to_stop_it():
     slow = EmulatedWSG50(speed_up=0.1)
-    script = Script()
-    with bench("pty", faults=script, emulator=slow, connect=False) as (gripper, _):
+    script = ScriptedFaults()
+    with gripper_with_emulator("pty", faults=script, emulator=slow, connect=False) as (gripper, _):
         script.tell({(HOME, 2): "disconnect"})
         with pytest.raises(DeviceError, match=r"is gone.*recover"):
             gripper.connect()
-        assert HOME in slow.heard
+        assert HOME in slow.received
         assert not slow.moves
         assert not gripper._link.is_open
 
 
 def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_it_is_said(monkeypatch):
     slow = EmulatedWSG50(referenced=True, opening_mm=100.0, speed_up=0.1)
-    script = Script()
+    script = ScriptedFaults()
 
     def no_cable():
         raise LinkLost("no cable")
 
-    with bench("pty", faults=script, emulator=slow, reconnect_tries=2) as (gripper, _):
+    with gripper_with_emulator("pty", faults=script, emulator=slow, reconnect_tries=2) as (gripper, _):
         for back in (True, False):
             script.tell({(GRASP, 2): "disconnect"})
             with monkeypatch.context() as cable:
@@ -66,77 +66,80 @@ def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_it_is_said(mon
                 assert not slow.moves
             gripper.connect()
             assert not slow.moves
-        slow.heard.clear()
+        slow.received.clear()
         gripper.close()
-        assert STOP not in slow.heard
+        assert STOP not in slow.received
 
 
 @PORTS
 def test_a_stop_whose_length_is_damaged_swallows_no_later_one(port):
     slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
-    script = Script()
-    with bench(port, faults=script, emulator=slow, timeout_s=0.1) as (gripper, _):
+    script = ScriptedFaults()
+    with gripper_with_emulator(port, faults=script, emulator=slow, timeout_s=0.1) as (gripper, _):
         gripper._link.begin(wsg50.commands.move(10.0, 5.0))
-        until(lambda: slow.moves)
+        wait_until(lambda: slow.moves)
         script.tell({(STOP, 1): "long"})
         gripper.stop()
         assert not slow.moves
-        assert STOP in slow.heard
-        assert FAST_STOP not in slow.heard
+        assert STOP in slow.received
+        assert FAST_STOP not in slow.received
 
 
 def test_an_echo_whose_length_is_damaged_swallows_no_later_one():
-    script = Script()
-    with bench(faults=script, timeout_s=0.1) as (gripper, _):
-        gripper._link.doubt()
+    script = ScriptedFaults()
+    with gripper_with_emulator(faults=script, timeout_s=0.1) as (gripper, _):
+        gripper._link.require_sync()
         script.tell({(0x06, 1): "long"})
         gripper.state()
         assert gripper.line_counts["no echo"] == 1
 
 
 def test_homing_whose_result_is_lost_is_not_done_twice():
-    script = Script()
-    with bench(faults=script, emulator=EmulatedWSG50(speed_up=2.0), connect=False) as (gripper, emulator):
+    script = ScriptedFaults()
+    with gripper_with_emulator(faults=script, emulator=EmulatedWSG50(speed_up=2.0), connect=False) as (
+        gripper,
+        emulator,
+    ):
         script.tell({(HOME, 3): "dropped"})
         gripper.connect()
-        assert emulator.heard.count(HOME) == 1
-        emulator.heard.clear()
+        assert emulator.received.count(HOME) == 1
+        emulator.received.clear()
         script.tell({(HOME, 3): "dropped"})
         gripper.open(60.0)
         assert gripper.home().opening_mm == pytest.approx(110.0)
-        assert emulator.heard.count(HOME) == 1
+        assert emulator.received.count(HOME) == 1
 
 
 def test_a_gripper_that_says_what_it_heard_damaged_is_told_again_at_once():
-    script = Script()
-    with bench(faults=script, timeout_s=30.0) as (gripper, emulator):
+    script = ScriptedFaults()
+    with gripper_with_emulator(faults=script, timeout_s=30.0) as (gripper, emulator):
         emulator.answers_bad_checksum, emulator.object_mm = True, 40.0
         script.tell({(GRASP, 1): "bad sum", (0x32, 1): "bad sum", (0x40, 1): "bad sum"})
         started = time.monotonic()
         assert gripper.grasp(10.0).status == "holding"
         assert time.monotonic() - started < 25  # of the time-out nothing was waited for
-        assert emulator.heard.count(GRASP) == 1
-        assert gripper.line_counts == {"asked again": 2, "sent again": 1}
+        assert emulator.received.count(GRASP) == 1
+        assert gripper.line_counts == {"retried": 2, "resent": 1}
 
 
 @PORTS
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_a_grasp_is_done_once_whatever_of_it_is_lost(port, number):
     """1 the command, 2 that it is pending, 3 its result."""
-    script = Script()
-    with bench(port, faults=script) as (gripper, emulator):
+    script = ScriptedFaults()
+    with gripper_with_emulator(port, faults=script) as (gripper, emulator):
         emulator.object_mm = 40.0
         script.tell({(GRASP, number): "dropped"})
         assert gripper.grasp(10.0, 200.0).status == "holding"
-        assert emulator.heard.count(GRASP) == 1
-        assert gripper.line_counts.get("sent again", 0) == (number == 1)
+        assert emulator.received.count(GRASP) == 1
+        assert gripper.line_counts.get("resent", 0) == (number == 1)
 
 
 @pytest.mark.parametrize("kind", ["dropped", "duplicated", "corrupted", "delayed", "split", "wrong id"])
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_opening_ends_where_it_was_told_whatever_happens_to_a_packet(kind, number):
-    script = Script()
-    with bench(faults=script) as (gripper, emulator):
+    script = ScriptedFaults()
+    with gripper_with_emulator(faults=script) as (gripper, emulator):
         for opening in (20.0, 80.0):
             script.tell({(MOVE, number): kind})
             assert gripper.open(opening).opening_mm == pytest.approx(opening, abs=0.1)
@@ -144,9 +147,9 @@ def test_opening_ends_where_it_was_told_whatever_happens_to_a_packet(kind, numbe
 
 
 def test_a_result_that_comes_twice_does_not_end_the_next_motion():
-    script = Script()
+    script = ScriptedFaults()
     slow = EmulatedWSG50(referenced=True, opening_mm=50.0)
-    with bench(faults=script, emulator=slow, opening_speed_mm_s=100.0) as (gripper, _):
+    with gripper_with_emulator(faults=script, emulator=slow, opening_speed_mm_s=100.0) as (gripper, _):
         script.tell({(MOVE, 3): "duplicated"})
         gripper.open(60.0)
         state = gripper.open(40.0)
@@ -155,21 +158,21 @@ def test_a_result_that_comes_twice_does_not_end_the_next_motion():
 
 
 def test_a_result_that_is_none_is_not_believed_while_the_jaws_move():
-    script = Script()
+    script = ScriptedFaults()
     slow = EmulatedWSG50(referenced=True, opening_mm=50.0)
-    with bench(faults=script, emulator=slow, opening_speed_mm_s=50.0) as (gripper, _):
+    with gripper_with_emulator(faults=script, emulator=slow, opening_speed_mm_s=50.0) as (gripper, _):
         script.tell({(MOVE, 2): "after a result"})
         assert gripper.open(40.0).opening_mm == pytest.approx(40.0, abs=0.1)
         assert not slow.moves
-        assert slow.heard.count(MOVE) == 1
+        assert slow.received.count(MOVE) == 1
 
 
 def test_every_reading_that_is_lost_is_asked_again():
-    script = Script()
-    with bench(faults=script) as (gripper, _):
+    script = ScriptedFaults()
+    with gripper_with_emulator(faults=script) as (gripper, _):
         script.tell({(command, 2): "dropped" for command in (0x33, 0x35, 0x31, 0x50, 0x53)})
         assert gripper.settings()["limits"]["stroke_mm"] == 110.0
-        assert gripper.line_counts["asked again"] == 5
+        assert gripper.line_counts["retried"] == 5
 
 
 @PORTS
@@ -178,7 +181,7 @@ def test_grasps_over_a_bad_line_end_right_or_with_a_reason_and_never_closing(por
     faults = LineFaults(0.0, [kind], seed=7, delay_s=0.02)
     emulator = EmulatedWSG50(referenced=True, speed_up=40.0)
     settings = {"timeout_s": 0.1, "acknowledge_faults": True, "update_ms": 10}
-    with bench(port, faults=faults, emulator=emulator, **settings) as (gripper, _):
+    with gripper_with_emulator(port, faults=faults, emulator=emulator, **settings) as (gripper, _):
         faults.rate = 0.005 if kind == "disconnect" else 0.02
         for number in range(6):
             emulator.object_mm, want = (40.0, "holding") if number % 2 else (None, "no_part")
@@ -188,7 +191,7 @@ def test_grasps_over_a_bad_line_end_right_or_with_a_reason_and_never_closing(por
                     assert gripper.grasp(10.0, 300.0).status == want
                     break
                 except DeviceError:
-                    until(lambda: not emulator.is_closing)
+                    wait_until(lambda: not emulator.is_closing)
                     with contextlib.suppress(DeviceError):
                         gripper.recover()
             else:

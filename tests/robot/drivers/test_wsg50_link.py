@@ -23,7 +23,7 @@ from robot.drivers.wsg50.commands import CommandId, Status
 from robot.drivers.wsg50.driver import WSG50
 from robot.drivers.wsg50.link import CommandFailed, Link, LinkLost, NoEcho, NoReply, Port
 from robot.errors import DeviceError
-from tests.waiting import until
+from tests.waiting import wait_until
 from tests.wsg50_packets import bytes_of
 
 OK = bytes(2)
@@ -33,7 +33,7 @@ class Peer:
     """The other end of a TCP line: answers each packet by a function packet -> bytes, or None to hang up."""
 
     def __init__(self, answer):
-        self.answer, self.heard = answer, []
+        self.answer, self.received = answer, []
         self.server = socket.create_server(("127.0.0.1", 0))
         self.url = f"socket://127.0.0.1:{self.server.getsockname()[1]}"
         self.thread = threading.Thread(target=self.run)
@@ -53,7 +53,7 @@ class Peer:
                     del buffer[:used]
                     if packet is None:
                         break
-                    self.heard.append(packet.id)
+                    self.received.append(packet.id)
                     answer = self.answer(packet)
                     if answer is None:
                         return
@@ -191,7 +191,7 @@ def test_a_reply_is_found_among_updates_and_noise():
         return update + b"\xaa\xaa noise" + update + reply(packet, b"\x00\x00\x20\x42")
 
     with Peer(answer) as peer, linked(peer) as link:
-        assert link.ask(commands.ask(CommandId.GET_FORCE_LIMIT), commands.number) == 40.0
+        assert link.query(commands.query(CommandId.GET_FORCE_LIMIT), commands.number) == 40.0
         assert commands.number(link.updates[CommandId.OPENING][0]) == 150.0
 
 
@@ -209,19 +209,19 @@ def test_pending_is_not_the_end_of_a_command():
 def test_another_status_than_success_says_which_command_and_why():
     with Peer(lambda packet: echoing(packet) or reply(packet, status=16)) as peer, linked(peer) as link:
         with pytest.raises(CommandFailed, match=r"STOP \(22h\) with ACCESS_DENIED \(status 16\)") as caught:
-            link.tell(Packet(CommandId.STOP))
+            link.send(Packet(CommandId.STOP))
         assert caught.value.status is Status.ACCESS_DENIED
-        assert peer.heard.count(CommandId.STOP) == 1  # an answer is an answer
+        assert peer.received.count(CommandId.STOP) == 1  # an answer is an answer
 
 
 def test_silence_ends_with_the_deadline_and_is_asked_three_times():
     with Peer(echoing) as peer, linked(peer, timeout_s=0.05) as link:
         started = time.monotonic()
         with pytest.raises(NoReply, match=r"INFO \(50h\) within 0.05 s"):
-            link.ask(commands.ask(CommandId.INFO), commands.info)
+            link.query(commands.query(CommandId.INFO), commands.info)
         assert time.monotonic() - started < 5
-        assert peer.heard.count(CommandId.INFO) == 3
-        assert link.counts["asked again"] == 2
+        assert peer.received.count(CommandId.INFO) == 3
+        assert link.counts["retried"] == 2
 
 
 @FLOODS
@@ -232,8 +232,8 @@ def test_silence_ends_with_the_deadline_and_is_asked_three_times():
         (lambda link: link.pump(0.0), None),
         (lambda link: link.poll(CommandId.HOME, 0.05), None),
         (lambda link: link.sync(), NoEcho),
-        (lambda link: link.urgent(Packet(CommandId.STOP)), NoReply),
-        (lambda link: link.tell(Packet(CommandId.STOP)), NoEcho),
+        (lambda link: link.send_urgent(Packet(CommandId.STOP)), NoReply),
+        (lambda link: link.send(Packet(CommandId.STOP)), NoEcho),
     ],
 )
 def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, end, monkeypatch):
@@ -251,13 +251,13 @@ def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, en
     ("wait", "time_outs"),
     [
         (lambda link: link.poll(CommandId.HOME, 0.1), 1),
-        (lambda link: link.urgent(Packet(CommandId.STOP)), 1),
+        (lambda link: link.send_urgent(Packet(CommandId.STOP)), 1),
         (lambda link: link.sync(), 3),
         (lambda link: link.call(Packet(CommandId.STOP)), 4),
-        (lambda link: link.tell(Packet(CommandId.STOP)), 7),
+        (lambda link: link.send(Packet(CommandId.STOP)), 7),
         (lambda link: link.pump(0.0), 0),
     ],
-    ids=["poll", "urgent", "sync", "call", "tell", "pump"],
+    ids=["poll", "send_urgent", "sync", "call", "send", "pump"],
 )
 def test_a_deadline_holds_whatever_the_other_side_sends(wait, time_outs, data, at_once, echoes, monkeypatch):
     """Half packets byte by byte once had a call of 0.5 s last 23 s: what still came at its end was waited for."""
@@ -301,7 +301,7 @@ def test_what_has_come_while_the_program_was_held_up_is_taken_in_at_once():
         return echoing(packet) or reply(packet) + updates
 
     with Peer(answer) as peer, linked(peer) as link:
-        link.tell(Packet(CommandId.STOP))
+        link.send(Packet(CommandId.STOP))
         time.sleep(0.2)
         link.pump(0.0)
         assert commands.number(link.updates[CommandId.OPENING][0]) == 799.0
@@ -314,25 +314,25 @@ def test_a_command_that_was_heard_damaged_is_asked_again():
         return echoing(packet) or reply(packet, status=statuses.pop(0))
 
     with Peer(answer) as peer, linked(peer, timeout_s=5.0) as link:
-        link.tell(Packet(CommandId.STOP))
-        assert peer.heard.count(CommandId.STOP) == 2
-        assert link.counts == {"asked again": 1}
+        link.send(Packet(CommandId.STOP))
+        assert peer.received.count(CommandId.STOP) == 2
+        assert link.counts == {"retried": 1}
 
 
 def test_where_nobody_echoes_nothing_is_asked_again():
     with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
         with pytest.raises(NoEcho):
-            link.tell(Packet(CommandId.STOP))
-        until(lambda: len(peer.heard) == 3)
+            link.send(Packet(CommandId.STOP))
+        wait_until(lambda: len(peer.received) == 3)
         time.sleep(0.1)
-        assert peer.heard == [CommandId.LOOP] * 3
+        assert peer.received == [CommandId.LOOP] * 3
 
 
 def test_a_gripper_that_echoes_nothing_is_not_there():
     with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
         with pytest.raises(NoReply, match="is it on, and connected"):
             link.call(Packet(CommandId.STOP))
-        assert set(peer.heard) == {CommandId.LOOP}  # nothing was told to a line in doubt
+        assert set(peer.received) == {CommandId.LOOP}  # nothing was told to a line in doubt
 
 
 def test_a_late_reply_is_never_taken_for_the_present_one():
@@ -349,8 +349,8 @@ def test_a_late_reply_is_never_taken_for_the_present_one():
 
     with Peer(answer) as peer, linked(peer, timeout_s=0.1) as link:
         with pytest.raises(NoReply):
-            link.call(commands.ask(CommandId.GET_FORCE_LIMIT))
-        assert commands.number(link.call(commands.ask(CommandId.GET_FORCE_LIMIT))) == 2.0
+            link.call(commands.query(CommandId.GET_FORCE_LIMIT))
+        assert commands.number(link.call(commands.query(CommandId.GET_FORCE_LIMIT))) == 2.0
         assert link.counts["unexpected"] == 1
 
 
@@ -359,11 +359,11 @@ def test_a_doubled_reply_raises_doubt_before_the_next_command():
         return echoing(packet) or 2 * reply(packet, b"\x00\x00\x80\x3f")
 
     with Peer(answer) as peer, linked(peer) as link:
-        link.call(commands.ask(CommandId.GET_FORCE_LIMIT))
+        link.call(commands.query(CommandId.GET_FORCE_LIMIT))
         link.pump(0.05)
-        loops = peer.heard.count(CommandId.LOOP)
-        link.call(commands.ask(CommandId.GET_ACCELERATION))
-        assert peer.heard.count(CommandId.LOOP) == loops + 1
+        loops = peer.received.count(CommandId.LOOP)
+        link.call(commands.query(CommandId.GET_ACCELERATION))
+        assert peer.received.count(CommandId.LOOP) == loops + 1
 
 
 def test_a_packet_that_stops_half_way_hides_nothing_behind_it():
@@ -373,8 +373,8 @@ def test_a_packet_that_stops_half_way_hides_nothing_behind_it():
         return echoing(packet) or half + reply(packet, b"\x00\x00\x80\x3f")
 
     with Peer(answer) as peer, linked(peer) as link:
-        assert commands.number(link.call(commands.ask(CommandId.GET_FORCE_LIMIT))) == 1.0
-        assert link.counts["given up"] >= 1
+        assert commands.number(link.call(commands.query(CommandId.GET_FORCE_LIMIT))) == 1.0
+        assert link.counts["abandoned"] >= 1
 
 
 def test_replies_of_the_wrong_length_are_asked_again():
@@ -384,15 +384,15 @@ def test_replies_of_the_wrong_length_are_asked_again():
         return echoing(packet) or reply(packet, answers.pop(0))
 
     with Peer(answer) as peer, linked(peer) as link:
-        assert link.ask(commands.ask(CommandId.GET_FORCE_LIMIT), commands.number) == 1.0
+        assert link.query(commands.query(CommandId.GET_FORCE_LIMIT), commands.number) == 1.0
         assert answers == []
 
 
 def test_a_stop_does_not_wait_for_the_line_to_be_cleared():
     with Peer(lambda packet: echoing(packet) or reply(packet)) as peer, linked(peer) as link:
-        link.doubt()
-        link.urgent(Packet(CommandId.STOP))
-        assert peer.heard == [CommandId.STOP]
+        link.require_sync()
+        link.send_urgent(Packet(CommandId.STOP))
+        assert peer.received == [CommandId.STOP]
 
 
 def test_a_line_that_the_other_side_closes_is_noticed_and_can_be_opened_again():
@@ -403,7 +403,7 @@ def test_a_line_that_the_other_side_closes_is_noticed_and_can_be_opened_again():
             link.sync()
         assert not link.is_open
         with pytest.raises(LinkLost, match="must be open"):
-            link.tell(Packet(CommandId.STOP))
+            link.send(Packet(CommandId.STOP))
         link.close()
     with Peer(echoing) as other:
         link.name = other.url

@@ -13,7 +13,7 @@ import pytest
 from robot.drivers.wsg50.codec import Packet, encode
 from tests.emulators.wsg50.gripper import EmulatedWSG50
 from tests.emulators.wsg50.server import serve_pty, serve_tcp
-from tests.waiting import STARTED, STARTED_IDS, first_line, running
+from tests.waiting import STARTED, STARTED_IDS, first_line, run_process
 from tests.wsg50_packets import bytes_of
 
 STOP = 0x22
@@ -69,14 +69,14 @@ def test_a_damaged_command_is_answered_only_if_it_is_to_be():
         assert talk(client, bytes_of("loop abc"), encode(Packet(0x06, b"\0\0abc")))
         emulator.answers_bad_checksum = True
         assert talk(client, b"\xaa" + damaged(bytes_of("stop")), said)
-        assert STOP not in emulator.heard
+        assert STOP not in emulator.received
 
 
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
 @pytest.mark.parametrize(("port", "end"), [(["--tcp", "0"], signal.SIGINT), (["--pty"], signal.SIGTERM)])
 def test_it_runs_as_a_program_and_says_where(port, end, by):
     program = [sys.executable, "-m", "tests.emulators.wsg50.server", *port, "--object-mm", "40"]
-    with running([*by, *program]) as process:
+    with run_process([*by, *program]) as process:
         line = first_line(process)
         assert line.startswith("socket://127.0.0.1:") or os.path.exists(line.strip())
         process.send_signal(end)

@@ -11,7 +11,7 @@ import pytest
 from retrieval.commands.main import main
 from robot.errors import ImporterError, RecordingError, StorageError, UnknownName
 from robot.exporters import EXPORTERS
-from robot.exporters.base import fitted, read_picture, whole_folder
+from robot.exporters.exporting import atomic_folder, letterbox, read_picture
 from robot.recording.folder import RecordingWriter, read_recording
 
 RNG = np.random.default_rng(0)
@@ -144,8 +144,8 @@ def test_grasps_that_differ_in_their_fingers_are_refused_where_steps_are_written
 
 
 def test_two_exports_to_one_folder_do_not_mix(tmp_path):
-    second = whole_folder(tmp_path / "out")
-    with whole_folder(tmp_path / "out"), pytest.raises(StorageError, match="being written by another process"):
+    second = atomic_folder(tmp_path / "out")
+    with atomic_folder(tmp_path / "out"), pytest.raises(StorageError, match="being written by another process"):
         second.__enter__()
     assert (tmp_path / "out").is_dir()
 
@@ -153,13 +153,13 @@ def test_two_exports_to_one_folder_do_not_mix(tmp_path):
 def test_what_stands_where_the_half_made_folder_goes_is_not_touched(tmp_path):
     (tmp_path / "out.part").mkdir()
     (tmp_path / "out.part" / "mine.txt").write_text("mine")
-    with pytest.raises(RecordingError, match="in the way and no export made it"), whole_folder(tmp_path / "out"):
+    with pytest.raises(RecordingError, match="in the way and no export made it"), atomic_folder(tmp_path / "out"):
         pass
     assert (tmp_path / "out.part" / "mine.txt").read_text() == "mine"
 
 
 def test_a_picture_is_fitted_whole_into_the_middle():
-    found = fitted(np.full((10, 20, 3), 200, np.uint8), (40, 40))
+    found = letterbox(np.full((10, 20, 3), 200, np.uint8), (40, 40))
     assert found.shape == (40, 40, 3)
     assert (found[10:30] == 200).all()
     assert not found[:10].any()

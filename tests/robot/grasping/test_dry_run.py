@@ -3,8 +3,8 @@
 import pytest
 
 from robot.errors import DeviceError
-from robot.grasping.attempt import Attempter
-from robot.grasping.dry_run import without_motion
+from robot.grasping.attempt import AttemptRunner
+from robot.grasping.dry_run import make_dry_run
 from robot.grasping.settings import AttemptSettings
 from robot.readings import Pose
 from robot.sim.rig import SimRig
@@ -15,8 +15,8 @@ def test_the_motions_of_an_attempt_are_said_in_order_and_nothing_is_moved():
     said = []
     rig = FakeRig(5)
     world = rig.world
-    with without_motion(rig, said.append) as dry:
-        attempt = Attempter(dry, 5, AttemptSettings()).run("round-0", 0)
+    with make_dry_run(rig, said.append) as dry:
+        attempt = AttemptRunner(dry, 5, AttemptSettings()).run("round-0", 0)
     assert attempt.outcome == "held"
     assert {"arm", "grasp", "open", "arm.connect", "gripper.connect"}.isdisjoint(world.calls)
     assert "depth" in world.calls  # it looks, and feels
@@ -40,15 +40,15 @@ def test_the_motions_of_an_attempt_are_said_in_order_and_nothing_is_moved():
 
 def test_a_tilt_is_said_and_is_refused_where_the_arm_keeps_the_hand_upright():
     said, pose = [], Pose(0.0, 0.0, 100.0, 0.0, 1.5708)
-    with without_motion(SimRig(0), said.append) as dry:
+    with make_dry_run(SimRig(0), said.append) as dry:
         dry.arm.move_to(pose, 100.0)
     assert said == ["arm: to x 0.0, y 0.0, z 100.0 mm, yaw 0.000 rad, tilt 1.571 rad, at 100 mm/s"]
-    with without_motion(FakeRig(5), print) as dry, pytest.raises(DeviceError, match="straight down: tilt must be 0"):
+    with make_dry_run(FakeRig(5), print) as dry, pytest.raises(DeviceError, match="straight down: tilt must be 0"):
         dry.arm.move_to(pose, 100.0)
 
 
 def test_what_the_rig_may_not_do_is_refused_in_a_dry_run_too():
     rig = FakeRig(5)
     limits = rig.arm.workspace, rig.gripper.max_force_n
-    dry = without_motion(rig, print)
+    dry = make_dry_run(rig, print)
     assert (dry.arm.workspace, dry.gripper.max_force_n) == limits

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robot.errors import RobotConfigError, RobotError
-from robot.grasping.gates import ContactAreaGate, GraspFrames, difference, judge
+from robot.grasping.gates import ContactAreaGate, GraspFrames, apply_gate, difference
 
 SHAPE = (60, 80, 3)
 
@@ -27,19 +27,19 @@ def pressed(seed=1, side=20, change=(40, -30, 10), level=100.0):
 GATE = ContactAreaGate()
 
 
-def test_an_untouched_gel_is_no_grasp_and_a_pressed_one_is():
+def test_a_no_contact_gel_is_rejected_and_a_pressed_one_accepted():
     assert GATE({"a": GraspFrames(gel(0), gel(1))}) is False
     assert GATE({"a": GraspFrames(gel(0), pressed())}) is True
 
 
 def test_the_share_is_that_of_the_changed_area():
-    share = GATE.shares({"a": GraspFrames(gel(0, noise=0), pressed(1, 20))})["a"]
+    share = GATE.changed_fractions({"a": GraspFrames(gel(0, noise=0), pressed(1, 20))})["a"]
     assert 20**2 <= share * 60 * 80 <= 24**2  # a blur of 5 px moves the edge by 2 px at most
 
 
 def test_a_darker_gel_is_contact_as_much_as_a_lighter_one():
-    up = GATE.shares({"a": GraspFrames(gel(0), pressed(1, change=(30, 30, 30)))})
-    down = GATE.shares({"a": GraspFrames(gel(0), pressed(1, change=(-30, -30, -30)))})
+    up = GATE.changed_fractions({"a": GraspFrames(gel(0), pressed(1, change=(30, 30, 30)))})
+    down = GATE.changed_fractions({"a": GraspFrames(gel(0), pressed(1, change=(-30, -30, -30)))})
     assert up["a"] == pytest.approx(down["a"], abs=0.01)
 
 
@@ -82,7 +82,7 @@ def test_a_saturated_gel_is_no_contact(level):
     assert not GATE({"a": GraspFrames(gel(0, level), gel(1, level))})
 
 
-def test_a_gate_without_the_untouched_gel_says_what_it_needs():
+def test_a_gate_without_a_no_contact_frame_raises():
     with pytest.raises(RobotConfigError, match=r"compares with the untouched gel.*finger a has none"):
         GATE({"a": GraspFrames(None, gel())})
 
@@ -100,10 +100,10 @@ def test_a_setting_out_of_range_is_refused(setting):
     [(True, True), (False, False), (0.5, True), (0.49, False), (np.float32(0.9), True), (1, True)],
 )
 def test_a_gate_answers_yes_no_or_a_probability(answer, decision):
-    assert judge(lambda touches: answer, {}) == (decision, pytest.approx(float(answer)))
+    assert apply_gate(lambda touches: answer, {}) == (decision, pytest.approx(float(answer)))
 
 
 @pytest.mark.parametrize("answer", [math.nan, -0.1, 1.1, 17.0])
 def test_a_logit_is_no_answer(answer):
     with pytest.raises(RobotError, match="true, false or a probability"):
-        judge(lambda touches: answer, {})
+        apply_gate(lambda touches: answer, {})

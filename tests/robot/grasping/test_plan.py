@@ -13,7 +13,7 @@ from robot.grasping.settings import GraspSettings
 from robot.readings import Region
 from robot.settings import build
 from robot.sight.cylinder import CylinderFit
-from tests.fake_rig import WORKSPACE, FakeArm, FakeGripper, World
+from tests.fake_rig import WORKSPACE, FakeArm, FakeGripper, FakeRigState
 
 FIT = CylinderFit(12.0, -7.0, 100.0, 30.0, 0.5, "circle", (30.0, 30.0))
 STROKE = 110.0
@@ -155,7 +155,7 @@ def test_settings_come_from_plain_values():
 
 
 def test_forces_that_the_gripper_cannot_give_are_refused_before_anything_moves():
-    arm, gripper = FakeArm(World(0)), FakeGripper(World(0))
+    arm, gripper = FakeArm(FakeRigState(0)), FakeGripper(FakeRigState(0))
     GraspSettings().check(arm, gripper)
     for force in ((4.0, 25.0), (5.0, 81.0)):
         with pytest.raises(RobotConfigError, match="force_n must be within 5 to 80 N, the range of fake gripper"):

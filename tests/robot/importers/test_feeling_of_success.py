@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from retrieval.data.dataset import load_attempts, load_grasps
 from robot.errors import ImporterError
-from robot.importers import base
+from robot.importers import importing
 from robot.importers.feeling_of_success import import_feeling_of_success
 from tests.miniatures import feeling_of_success, pixels
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 FIRST = "calandra_corl2017_000"
 
@@ -150,7 +150,7 @@ def test_without_h5py_the_extra_is_named(source, tmp_path, monkeypatch):
     def missing(name):
         raise ImportError(name)
 
-    monkeypatch.setattr(base, "import_module", missing)
+    monkeypatch.setattr(importing, "import_module", missing)
     with pytest.raises(
         ImporterError, match=r"needs h5py, which is missing; run pip install 'touch-retrieval\[importers\]'"
     ):

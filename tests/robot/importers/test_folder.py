@@ -11,7 +11,7 @@ from robot.errors import ImporterError
 from robot.importers.folder import _Pattern, import_folder
 from tests.miniatures import folder, picture
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def source(tmp_path):
     return tmp_path / "src"
 
 
-def told(recording):
+def notes_of(recording):
     """(grasp, object, name of the photo's drawing) in order."""
     return [(grasp.grasp_id, grasp.object_id) for grasp in recording.grasps]
 
@@ -37,11 +37,11 @@ def photo_of(recording, source, number):
 
 def test_the_folder_names_the_object_and_the_ninth_comes_before_the_tenth(source, tmp_path):
     recording = import_folder(source, tmp_path / "out")
-    assert told(recording)[:3] == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-10", "mug")]
+    assert notes_of(recording)[:3] == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-10", "mug")]
     assert {grasp.object_id for grasp in recording.grasps} == {"mug", "tin can"}
 
 
-def test_touches_are_dealt_to_the_photos_of_their_object_in_turn(source, tmp_path):
+def test_touches_are_assigned_to_the_photos_of_their_object_in_turn(source, tmp_path):
     recording = import_folder(source, tmp_path / "out")
     photos = [photo_of(recording, source, number) for number in range(3)]
     assert photos == ["mug/photo_1.jpg", "mug/photo_2.jpg", "mug/photo_1.jpg"]
@@ -55,7 +55,7 @@ def test_words_that_both_patterns_have_must_agree(tmp_path):
     (tmp_path / "src/day1/mug/2_photo.jpg").unlink()
     options = {"touch": "{sequence}/{object}/{n}_touch", "photo": "{sequence}/{object}/{n}_photo"}
     recording = import_folder(tmp_path / "src", tmp_path / "out", **options)
-    assert told(recording) == [("mug-day1-1", "mug"), ("mug-day1-3", "mug")]
+    assert notes_of(recording) == [("mug-day1-1", "mug"), ("mug-day1-3", "mug")]
     assert photo_of(recording, tmp_path / "src", 1) == "day1/mug/3_photo.jpg"
     assert {grasp.sequence_id for grasp in recording.grasps} == {"day1"}
     assert recording.info["skipped"] == {"no photo agrees with it": 1}
@@ -84,7 +84,7 @@ def test_fingers_are_put_together_and_a_grasp_that_lacks_one_is_told(tmp_path):
 def test_of_two_touches_with_the_same_words_the_first_is_taken_and_the_other_told(source, tmp_path):
     picture(source / "mug/touch_1.jpg", 77)
     recording = import_folder(source, tmp_path / "out")
-    assert told(recording)[0] == ("mug-1", "mug")
+    assert notes_of(recording)[0] == ("mug-1", "mug")
     assert recording.info["skipped"] == {"another touch has the same words in its path": 1}
 
 
@@ -172,7 +172,7 @@ def row(number, **changes):
 def test_a_file_of_pairs_is_a_grasp_a_line(source, tmp_path, kind):
     name = write_pairs(source, kind, [row(1), row(10, background="mug/touch_2.png"), row(2)])
     recording = import_folder(source, tmp_path / "out", pairs=name)
-    assert told(recording) == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-3", "mug")]
+    assert notes_of(recording) == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-3", "mug")]
     touch = (tmp_path / "out" / recording.grasps[1].touches["a"]).read_bytes()
     assert touch == (source / "mug/touch_10.png").read_bytes()
     assert {(grasp.sequence_id, grasp.force_n) for grasp in recording.grasps} == {("monday", 2.5)}
@@ -184,7 +184,7 @@ def test_lines_that_are_wrong_are_skipped_by_reason(source, tmp_path, kind):
     wrong = [row(2, photo=""), row(2, touch="../../etc/touch.png"), row(2, force_n="much"), row(3)]
     name = write_pairs(source, kind, [row(1), *wrong])
     recording = import_folder(source, tmp_path / "out", pairs=name)
-    assert told(recording) == [("mug-1", "mug")]
+    assert notes_of(recording) == [("mug-1", "mug")]
     assert recording.info["skipped"] == {
         "its line lacks its object, its photo or a touch": 1,
         "a path must lead to a file below the folder, from there on": 1,
@@ -197,7 +197,7 @@ def test_a_line_that_is_no_json_costs_its_own_grasp(source, tmp_path):
     name = write_pairs(source, "jsonl", [row(1), row(2)])
     (source / name).write_text((source / name).read_text().replace("\n", "\n{half\n[1]\n"))
     recording = import_folder(source, tmp_path / "out", pairs=name)
-    assert told(recording) == [("mug-1", "mug"), ("mug-4", "mug")]
+    assert notes_of(recording) == [("mug-1", "mug"), ("mug-4", "mug")]
     assert recording.info["skipped"] == {"its line is not a JSON object": 2}
 
 
@@ -206,7 +206,7 @@ def test_what_json_alone_can_say_costs_its_own_grasp(source, tmp_path):
     wrong = [row(2, force_n=10**400), row(2, object="\ud800"), row(2, photo="a" * 5000)]
     name = write_pairs(source, "jsonl", [row(1), *wrong, row(10)])
     recording = import_folder(source, tmp_path / "out", pairs=name)
-    assert told(recording) == [("mug-1", "mug"), ("mug-5", "mug")]
+    assert notes_of(recording) == [("mug-1", "mug"), ("mug-5", "mug")]
     assert recording.info["skipped"]["force_n, opening_mm, time_s must be numbers"] == 1
     assert recording.info["skipped"]["its photo is missing"] == 1
 

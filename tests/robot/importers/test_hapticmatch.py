@@ -10,7 +10,7 @@ from robot.errors import ImporterError
 from robot.importers.hapticmatch import import_hapticmatch, normals
 from tests.miniatures import hapticmatch
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture

@@ -14,17 +14,26 @@ from retrieval.data.check.recording import check_split
 from retrieval.data.dataset import Split, load_grasps
 from robot.errors import ImporterError, RecordingError, RobotError, UnknownName
 from robot.importers import IMPORTERS, data_set_of, load_importer, options_of, read_options, title_of
-from robot.importers.base import SPLITS_FOLDER, DataSet, Item, Published, Skip, import_items, name_of, numbered
-from robot.recording.folder import RecordingWriter, Shared, read_recording
-from robot.storage import object_of
+from robot.importers.importing import (
+    SPLITS_FOLDER,
+    DataSet,
+    DataSetMetadata,
+    Item,
+    Skip,
+    import_items,
+    numbered_files,
+    safe_name,
+)
+from robot.recording.folder import RecordingWriter, SharedImage, read_recording
+from robot.storage import parse_object
 from tests.documents import text_of
 from tests.miniatures import encoded, picture, pixels
 
 PICTURES = {".png", ".jpg"}
-SAID_BY_THE_SOURCE = ("folder", "lerobot", "open-x-tactile")
+SOURCE_FACTS = ("folder", "lerobot", "open-x-tactile")
 """Which sensor it was, and the like, differs from source to source."""
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture(scope="module", params=IMPORTERS)
@@ -58,7 +67,7 @@ def test_a_data_set_becomes_a_recording_that_says_what_it_is(name, source, tmp_p
     facts = data_set_of(name)
     for key in ("source", "licence", "citation", "sensor", "fingers", "background"):
         assert recording.info[key]
-        assert recording.info[key] == getattr(facts, key) or name in SAID_BY_THE_SOURCE
+        assert recording.info[key] == getattr(facts, key) or name in SOURCE_FACTS
     assert {len(grasp.touches) for grasp in recording.grasps} == {recording.info["fingers"]}
     for grasp in recording.grasps:
         assert all(cv2.imread(str(recording.folder / path)) is not None for path in grasp.images().values())
@@ -66,7 +75,7 @@ def test_a_data_set_becomes_a_recording_that_says_what_it_is(name, source, tmp_p
     assert load_grasps(tmp_path / "out")
 
 
-def test_a_recording_says_its_traps_and_what_of_the_layout_is_unverified(name, source, tmp_path):
+def test_a_recording_states_its_caveats_and_unverified_layout(name, source, tmp_path):
     recording = load_importer(name)(source, tmp_path / "out")
     for note in data_set_of(name).notes():
         assert note in recording.notes
@@ -159,7 +168,7 @@ def test_published_splits_leak_no_object_and_no_sequence(name, source, tmp_path)
     recording = load_importer(name)(source, tmp_path / "out")
     grasps = load_grasps(tmp_path / "out")
     for path in (tmp_path / "out" / SPLITS_FOLDER).glob("*.json"):
-        split = Split.from_dict(object_of(path.read_bytes(), RecordingError))
+        split = Split.from_dict(parse_object(path.read_bytes(), RecordingError))
         assert not [each for each in check_split(grasps, split) if each.severity == "error"]
         assert {each for part in (split.train, split.validation, split.test) for each in part} <= {
             grasp.object_id for grasp in recording.grasps
@@ -222,7 +231,7 @@ def test_other_options_are_refused_in_a_sentence(word):
 
 # The loop they share -----------------------------------------------------------------------------------------------
 
-FACTS = DataSet("here", "none", "nobody", "gel", "by hand", "nothing", traps=("beware",), unverified=("its size",))
+FACTS = DataSet("here", "none", "nobody", "gel", "by hand", "nothing", caveats=("beware",), unverified=("its size",))
 
 
 def item(number, **changes):
@@ -286,7 +295,7 @@ def test_one_frame_of_many_grasps_is_read_and_kept_once(tmp_path):
         calls.append(1)
         return pixels(7)
 
-    recording = run([item(n, touch_a_before=Shared("rest", frame)) for n in range(3)], tmp_path / "out")
+    recording = run([item(n, touch_a_before=SharedImage("rest", frame)) for n in range(3)], tmp_path / "out")
     assert calls == [1]
     assert {grasp.touches_before["a"] for grasp in recording.grasps} == {"images/rest_shared.png"}
 
@@ -316,19 +325,25 @@ def test_a_published_split_is_kept_and_one_that_tears_objects_apart_is_told(tmp_
         "good": {"train": ["object0"], "test": ["object1"]},
         "bad": {"train": ["object0", "object1"], "test": ["object1"]},
     }
-    published = Published({"object0": {"material": "wood"}}, splits)
-    recording = run([item(0), item(1)], tmp_path / "out", published=published)
+    metadata = DataSetMetadata({"object0": {"material": "wood"}}, splits)
+    recording = run([item(0), item(1)], tmp_path / "out", metadata=metadata)
     kept = tmp_path / "out" / SPLITS_FOLDER / "good.json"
-    assert Split.from_dict(object_of(kept.read_bytes(), RecordingError)) == Split(0, ("object0",), (), ("object1",))
+    assert Split.from_dict(parse_object(kept.read_bytes(), RecordingError)) == Split(0, ("object0",), (), ("object1",))
     assert not kept.with_name("bad.json").exists()
     assert any("'bad' has grasps of 1 object(s) on two sides" in note for note in recording.notes)
     assert recording.info["objects"] == {"object0": {"material": "wood"}}
 
 
 def test_a_name_is_a_grasp_id_whatever_it_is_made_of():
-    assert name_of("mug", "01") == "mug-01"
-    strange = [name_of("my mug", "1"), name_of("my/mug", "1"), name_of("..", "1"), name_of("é" * 300), name_of("", "")]
-    strange += [name_of("caf\udce9"), name_of("caf\ud800")]  # a file's name that is no UTF-8; what JSON may escape
+    assert safe_name("mug", "01") == "mug-01"
+    strange = [
+        safe_name("my mug", "1"),
+        safe_name("my/mug", "1"),
+        safe_name("..", "1"),
+        safe_name("é" * 300),
+        safe_name("", ""),
+    ]
+    strange += [safe_name("caf\udce9"), safe_name("caf\ud800")]  # a file's name that is no UTF-8; what JSON may escape
     assert len(set(strange)) == len(strange)
     assert all(each[0].isalnum() and len(each) <= 128 for each in strange)
 
@@ -336,6 +351,6 @@ def test_a_name_is_a_grasp_id_whatever_it_is_made_of():
 def test_files_are_in_the_order_of_their_numbers(tmp_path):
     for each in ("img_10.png", "img_9.png", "img_2_b.png", "img_2_a.png", "Thumbs.db"):
         (tmp_path / each).touch()
-    found = [path.name for _, path in numbered(tmp_path, re.compile(r"img_(\d+).*\.png"))]
+    found = [path.name for _, path in numbered_files(tmp_path, re.compile(r"img_(\d+).*\.png"))]
     assert found == ["img_2_a.png", "img_2_b.png", "img_9.png", "img_10.png"]
-    assert not list(numbered(tmp_path / "gone", re.compile(".*")))
+    assert not list(numbered_files(tmp_path / "gone", re.compile(".*")))

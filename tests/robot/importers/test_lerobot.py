@@ -26,7 +26,7 @@ import pyarrow.parquet as pq
 from tests.miniatures import lerobot
 from tests.miniatures.lerobot import RIGHT
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture

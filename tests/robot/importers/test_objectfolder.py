@@ -5,12 +5,12 @@ import json
 import pytest
 
 from robot.errors import ImporterError, RecordingError
-from robot.importers.base import SPLITS_FOLDER
+from robot.importers.importing import SPLITS_FOLDER
 from robot.importers.objectfolder import import_objectfolder
-from robot.storage import object_of
+from robot.storage import parse_object
 from tests.miniatures import objectfolder, picture
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def test_a_touch_of_a_pack_has_the_photo_of_its_own_number(pack, tmp_path):
 
 def test_the_published_split_is_kept_by_objects(pack, tmp_path):
     import_objectfolder(pack, tmp_path / "out")
-    split = object_of((tmp_path / "out" / SPLITS_FOLDER / "published.json").read_bytes(), RecordingError)
+    split = parse_object((tmp_path / "out" / SPLITS_FOLDER / "published.json").read_bytes(), RecordingError)
     assert split == {"seed": 0, "train": ["2", "31"], "validation": ["10"], "test": ["100"]}
 
 
@@ -62,7 +62,7 @@ def test_the_samples_of_real_are_an_object_each_with_their_names(tmp_path):
     assert recording.info["objects"]["20"] == {"name": "Ladle", "material": "Steel"}
 
 
-def test_touches_without_a_photo_of_their_number_are_dealt_to_the_others(pack, tmp_path):
+def test_touches_without_a_photo_of_their_number_are_assigned_to_the_others(pack, tmp_path):
     (pack / "vision/31/2.png").unlink()
     recording = import_objectfolder(pack, tmp_path / "out")
     photos = {grasp.grasp_id: grasp.photo for grasp in recording.grasps}

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from robot.errors import ImporterError, RobotError
 from robot.exporters import EXPORTERS
 from robot.importers.open_x_tactile import import_open_x_tactile
-from robot.importers.zarr_store import Store
+from robot.importers.zarr_store import ZarrStore
 from robot.recording.folder import read_recording
 from tests import synthetic
 
@@ -25,7 +25,7 @@ pytest.importorskip("zarr")
 
 from tests.miniatures import open_x_tactile
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture
@@ -54,7 +54,7 @@ def test_a_task_is_an_object_an_episode_a_sequence_and_an_area_a_finger(source, 
     assert (recording.info["sensor"], recording.info["fingers"]) == ("GelSightMini", 2)
 
 
-def test_the_touch_is_the_step_that_is_most_pressed_and_the_first_step_is_the_untouched_gel(source, tmp_path):
+def test_the_touch_is_the_step_of_strongest_contact_and_the_first_step_is_the_no_contact_frame(source, tmp_path):
     recording = import_open_x_tactile(source, tmp_path / "out")
     steps = open_x_tactile.episode_steps(100, 5)  # the second episode of the first task
     grasp = recording.grasps[1]
@@ -157,7 +157,7 @@ def test_whatever_an_array_says_it_is_read_or_refused_in_a_sentence(store, chang
     try:
         forge(store, "data/camera_main_rgb", **changes)
         with suppress(RobotError):
-            array = Store(store).array("data/camera_main_rgb", kind="u1")
+            array = ZarrStore(store).array("data/camera_main_rgb", kind="u1")
             if array.shape:
                 array.step(0)
     finally:

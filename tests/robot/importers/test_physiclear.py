@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from robot.errors import ImporterError
-from robot.importers.physiclear import Press, import_physiclear
+from robot.importers.physiclear import StrongestFrames, import_physiclear
 from tests.data import touch_data
 from tests.miniatures import physiclear
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def test_a_part_is_an_object_and_a_video_a_sequence_of_five_frames(source, tmp_p
 def test_the_frames_of_strongest_contact_are_kept_in_order_of_time_with_the_first_frame_as_no_contact_frame(tmp_path):
     """Contact rises to frame 6 of 12 and falls: frames 4 to 8 differ most from frame 0."""
     physiclear.write_video(tmp_path / "pen_0.mov", physiclear.presses(0, 0))
-    press = Press(tmp_path / "pen_0.mov", 5)
+    press = StrongestFrames(tmp_path / "pen_0.mov", 5)
     made = physiclear.presses(0, 0)
     for place, frame in enumerate((4, 5, 6, 7, 8)):
         assert np.abs(press.frame(place).astype(float) - made[frame]).mean() < 3  # the codec's loss
@@ -42,7 +42,7 @@ def test_the_frames_of_strongest_contact_are_kept_in_order_of_time_with_the_firs
             np.abs(press.frame(place).astype(float) - made[other]).mean() for other in (3, 6, 9) if other != frame
         ]
         assert min(others) > np.abs(press.frame(place).astype(float) - made[frame]).mean() or frame in (4, 8)
-    assert np.abs(press.untouched().astype(float) - made[0]).mean() < 3
+    assert np.abs(press.no_contact().astype(float) - made[0]).mean() < 3
 
 
 def test_the_no_contact_frame_of_a_video_is_kept_once_and_is_not_that_of_another(source, tmp_path):

@@ -6,7 +6,7 @@ from robot.errors import ImporterError
 from robot.importers.rct import import_rct
 from tests.miniatures import rct
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from robot.errors import ImporterError
 from robot.importers.touch_and_go import _runs, import_touch_and_go
 from tests.miniatures import touch_and_go
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 FIRST, SECOND, THIRD = touch_and_go.VIDEOS
 
 
@@ -45,7 +45,7 @@ def test_a_negative_number_of_frames_is_refused(source, tmp_path):
         import_touch_and_go(source, tmp_path / "out", frames=-1)
 
 
-def test_photo_and_touch_are_of_one_moment_and_the_untouched_gel_is_a_frame_that_no_line_names(source, tmp_path):
+def test_photo_and_touch_are_of_one_moment_and_the_no_contact_frame_is_one_that_no_line_names(source, tmp_path):
     recording = import_touch_and_go(source, tmp_path / "out")
     grasp = next(grasp for grasp in recording.grasps if grasp.grasp_id == f"{SECOND}-0000000011")
     video = source / "dataset" / SECOND
@@ -57,7 +57,7 @@ def test_photo_and_touch_are_of_one_moment_and_the_untouched_gel_is_a_frame_that
         assert (recording.folder / path).read_bytes() == (video / file).read_bytes()
 
 
-def test_a_video_that_begins_in_contact_has_a_later_frame_for_its_untouched_gel(source, tmp_path):
+def test_a_video_that_begins_in_contact_has_a_later_no_contact_frame(source, tmp_path):
     lines = [f"{FIRST}/{frame:010d}.jpg,3" for frame in range(3)] + [f"{FIRST}/0000000003.jpg,1"]
     (source / "label.txt").write_text("\n".join(lines))
     recording = import_touch_and_go(source, tmp_path / "out")

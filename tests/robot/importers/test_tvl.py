@@ -11,7 +11,7 @@ from robot.importers.ssvtp import import_ssvtp
 from robot.importers.tvl import csv_rows, import_tvl
 from tests.miniatures import ssvtp, tvl
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_a_timestamp_folder_is_object_and_sequence_also_where_two_parts_number_a
     assert recording.info["objects"]["data1-1-1702507300.1"]["caption"] == "smooth, hard, cool"
 
 
-def test_photo_and_touch_have_one_name_and_each_contact_its_untouched_gel(hct, tmp_path):
+def test_photo_and_touch_have_one_name_and_each_contact_its_no_contact_frame(hct, tmp_path):
     recording = import_tvl(hct, tmp_path / "out")
     grasp = recording.grasps[0]
     contact = hct / "hct/data1/0-1702507215.615537"
@@ -118,7 +118,7 @@ def test_rows_of_test_csv_have_no_touch_and_count_all_the_same(pairs, tmp_path):
     assert left["test"] == ["pair-120"]
 
 
-def test_pairs_without_the_untouched_gel_of_the_code_are_imported_without(pairs, tmp_path):
+def test_pairs_without_the_no_contact_frame_are_imported_without(pairs, tmp_path):
     (pairs / "ssvtp/tac_background.png").unlink()
     recording = import_ssvtp(pairs / "ssvtp", tmp_path / "out")
     assert recording.info["background"] == "none"

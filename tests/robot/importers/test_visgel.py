@@ -2,11 +2,11 @@
 
 import pytest
 
-from robot.importers.base import SPLITS_FOLDER
+from robot.importers.importing import SPLITS_FOLDER
 from robot.importers.visgel import import_visgel
 from tests.miniatures import visgel
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture
@@ -29,8 +29,8 @@ def test_of_each_recording_the_frame_that_is_pressed_most_is_taken(source, tmp_p
         where, frame = f"{sitting}/{name}", f"frame{visgel.PRESSED:04}.jpg"
         assert (tmp_path / "out" / grasp.touches["a"]).read_bytes() == (root / "touch" / where / frame).read_bytes()
         assert (tmp_path / "out" / grasp.photo).read_bytes() == (root / "vision" / where / frame).read_bytes()
-        untouched = root / "touch" / where / "frame0000.jpg"
-        assert (tmp_path / "out" / grasp.touches_before["a"]).read_bytes() == untouched.read_bytes()
+        no_contact = root / "touch" / where / "frame0000.jpg"
+        assert (tmp_path / "out" / grasp.touches_before["a"]).read_bytes() == no_contact.read_bytes()
         assert grasp.sequence_id == f"{part}-{sitting}"
 
 
@@ -40,7 +40,7 @@ def test_the_folders_between_are_found(tmp_path, between):
     assert len(import_visgel(tmp_path / "src", tmp_path / "out").grasps) == visgel.GRASPS
 
 
-def test_what_the_authors_kept_for_judging_is_the_test_part(source, tmp_path):
+def test_what_the_authors_held_out_is_the_test_part(source, tmp_path):
     import_visgel(source, tmp_path / "out")
     assert (tmp_path / "out" / SPLITS_FOLDER / "unseen.json").is_file()
     assert '"test": [\n  "unseen-3-rec_00000"\n ]' in (tmp_path / "out" / SPLITS_FOLDER / "unseen.json").read_text()

@@ -10,7 +10,7 @@ from robot.importers.vt60 import import_vt60
 from tests.data import touch_data
 from tests.miniatures import vt60
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def test_the_ninth_touch_comes_before_the_tenth(recording):
     assert ball == [f"03_ball-01-{k}" for k in range(1, 13)]
 
 
-def test_touches_are_dealt_to_the_photos_of_their_own_object_in_turn(recording):
+def test_touches_are_assigned_to_the_photos_of_their_own_object_in_turn(recording):
     """12 touches and 5 photos: no photo is used more than once oftener than another."""
     ball = [grasp for grasp in recording.grasps if grasp.object_id == "03_ball-01"]
     assert [grasp.photo.split("_img_")[1].split("_")[0] for grasp in ball] == list("123451234512")
@@ -46,7 +46,7 @@ def test_touches_are_dealt_to_the_photos_of_their_own_object_in_turn(recording):
     assert sorted(Counter(grasp.photo for grasp in ball).values()) == [2, 2, 2, 3, 3]
 
 
-def test_every_photo_and_the_untouched_frame_are_kept_once(recording):
+def test_every_photo_and_the_no_contact_frame_are_stored_once(recording):
     assert {grasp.touches_before["a"] for grasp in recording.grasps} == {"images/untouched_shared.jpg"}
     files = list((recording.folder / "images").iterdir())
     assert len(files) == vt60.GRASPS + vt60.PHOTOS * len(vt60.OBJECTS) + 1
@@ -62,7 +62,7 @@ def test_a_bottle_empty_and_full_is_one_sequence_which_no_drawn_split_tears(reco
         assert ("02_bottleempty-01" in split.train) == ("08_bottlefull-01" in split.train)
 
 
-def test_the_touch_that_is_the_untouched_frame_itself_is_skipped(source, tmp_path):
+def test_the_touch_that_is_the_no_contact_frame_itself_is_skipped(source, tmp_path):
     """As in the published data: `retrieve check` calls such a grasp an error."""
     (touch,) = (source / "touch/03_ball/01").glob("touch_1_img_4_*")
     touch.write_bytes((source / "touch/baselineForCalibration.jpg").read_bytes())
@@ -82,7 +82,7 @@ def test_photos_without_touches_are_told(recording):
     assert "skipped 1: photos of an object that was not touched, such as 03_ball/07" in recording.notes
 
 
-def test_a_data_set_without_its_untouched_frame_is_imported_without(source, tmp_path):
+def test_a_data_set_without_its_no_contact_frame_is_imported_without(source, tmp_path):
     (source / "touch/baselineForCalibration.jpg").unlink()
     recording = import_vt60(source, tmp_path / "out")
     assert not any(grasp.touches_before for grasp in recording.grasps)

@@ -7,7 +7,7 @@ import pytest
 from robot.importers.x_capture import import_x_capture
 from tests.miniatures import picture, x_capture
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture

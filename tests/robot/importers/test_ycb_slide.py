@@ -8,7 +8,7 @@ from robot.errors import ImporterError
 from robot.importers.ycb_slide import import_ycb_slide
 from tests.miniatures import picture, ycb_slide
 
-pytestmark = pytest.mark.usefixtures("no_waiting_for_the_disk")
+pytestmark = pytest.mark.usefixtures("no_fsync")
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from PIL import Image
 
 from robot.errors import RecordingError, StorageError
 from robot.recording import folder as module
-from robot.recording.folder import RecordedGrasp, RecordingWriter, Shared, read_recording
+from robot.recording.folder import RecordedGrasp, RecordingWriter, SharedImage, read_recording
 
 INFO = {"source": "test", "sensor": "GelSight", "seed": 3}
 ROW = {"grasp_id": "1", "object_id": "mug", "photo_file_name": "p.png", "touch_a_file_name": "a.png"}
@@ -383,10 +383,12 @@ def test_bad_images_are_refused_before_anything_is_written(tmp_path, name):
     assert ids(tmp_path) == []
 
 
-def test_a_shared_image_is_kept_once_and_the_first_of_its_name(tmp_path):
+def test_a_shared_image_is_stored_once_and_the_first_of_its_name_wins(tmp_path):
     for number in (1, 2):  # another writer goes on with it
         with RecordingWriter(tmp_path / "recording", INFO) as writer:
-            writer.append(str(number), "mug", {**pictures(), "touch_a_before": Shared("rest", pixels(10 * number))})
+            writer.append(
+                str(number), "mug", {**pictures(), "touch_a_before": SharedImage("rest", pixels(10 * number))}
+            )
     grasps = read_recording(tmp_path / "recording").grasps
     assert {grasp.touches_before["a"] for grasp in grasps} == {"images/rest_shared.png"}
     kept = cv2.imread(str(tmp_path / "recording/images/rest_shared.png"))[..., ::-1]
@@ -396,16 +398,16 @@ def test_a_shared_image_is_kept_once_and_the_first_of_its_name(tmp_path):
 @pytest.mark.parametrize("name", ["", "../rest", "a/b", ".rest", "a" * 200])
 def test_the_name_of_a_shared_image_must_be_safe_in_a_file_name(tmp_path, name):
     with RecordingWriter(tmp_path / "recording", INFO) as writer, pytest.raises(RecordingError, match="shared image"):
-        writer.append("1", "mug", {**pictures(), "touch_a_before": Shared(name, pixels())})
+        writer.append("1", "mug", {**pictures(), "touch_a_before": SharedImage(name, pixels())})
 
 
 def test_a_writer_says_more_in_recording_json_but_not_what_grasps_are_held_to(tmp_path):
     with RecordingWriter(tmp_path / "recording", INFO) as writer:
-        writer.tell(skipped={"it is dark": 2})
+        writer.update_info(skipped={"it is dark": 2})
         with pytest.raises(RecordingError, match="sensor of a recording stays as it is"):
-            writer.tell(sensor="DIGIT")
+            writer.update_info(sensor="DIGIT")
         with pytest.raises(RecordingError, match="must hold plain JSON"):
-            writer.tell(skipped={1j})
+            writer.update_info(skipped={1j})
     info = read_recording(tmp_path / "recording").info
     assert (info["skipped"], info["sensor"], info["seed"]) == ({"it is dark": 2}, "GelSight", 3)
 
@@ -467,7 +469,7 @@ def test_a_picture_that_is_no_file_is_refused_without_being_read(tmp_path):
         writer.append("1", "mug", {**pictures(), "photo": tmp_path / "pipe.png"})
 
 
-def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path):
+def test_a_full_disk_error_names_the_file(tmp_path):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     with RecordingWriter(tmp_path, INFO) as writer:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))

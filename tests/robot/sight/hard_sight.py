@@ -12,7 +12,7 @@ from robot.readings import RGBD, Intrinsics
 from robot.sight.cloud import Rays, find_table
 from robot.sight.cylinder import fit_cylinder
 from robot.sight.solids import fit_circle
-from tests.hard_case import HardCase, refused
+from tests.hard_case import HardCase, error_of
 
 Array = npt.NDArray[np.float64]
 _CYLINDER, _DEPTH = "cylinder fit", "depth"
@@ -142,7 +142,7 @@ def _unknown_depth() -> HardCase:
 def _nothing_but_nan() -> HardCase:
     image = _picture(np.full((_ROWS, _COLUMNS), np.nan))
     naive = float(np.median(image.depth_m if image.depth_m is not None else math.nan))
-    ours, holds = refused(lambda: fit_cylinder(image, _pose()))
+    ours, holds = error_of(lambda: fit_cylinder(image, _pose()))
     return HardCase(_CYLINDER, "no depth at all", "refused", f"median depth {naive}", ours, holds, math.isfinite(naive))
 
 
@@ -153,7 +153,7 @@ def _crowded_table() -> HardCase:
     depth = np.full((_ROWS, _COLUMNS), 900.0) + np.random.default_rng([34]).normal(0, 1, (_ROWS, _COLUMNS))
     depth[:, : 2 * _COLUMNS // 5] -= 30.0
     image = _picture(depth)
-    rays = Rays.of(image, pose)
+    rays = Rays.from_image(image, pose)
     rows, columns = (one.ravel() for one in np.indices(depth.shape))
     points = rays.points(depth.astype(np.float32), rows, columns)
     naive = np.linalg.lstsq(np.c_[points[:, :2], np.ones(len(points))], points[:, 2], rcond=None)[0]
@@ -182,6 +182,6 @@ def _gel_of_another_shade() -> HardCase:
     before, after = np.full((24, 32, 3), 101, np.uint8), np.full((24, 32, 3), 100, np.uint8)
     gate = ContactAreaGate()
     naive = float(((after - before) > gate.noise_levels).any(axis=2).mean())
-    ours = gate.shares({"a": GraspFrames(before, after)})["a"]
+    ours = gate.changed_fractions({"a": GraspFrames(before, after)})["a"]
     words, said = (f"{100 * share:.0f} % of the gel" for share in (naive, ours))
     return HardCase("contact gate", "one grey level darker", "0 % of the gel", words, said, ours == 0, naive == 0)

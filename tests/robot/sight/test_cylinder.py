@@ -16,7 +16,7 @@ from robot.sight.cloud import Rays
 from robot.sight.cylinder import CylinderFit, fit_cylinder
 from robot.sight.solids import fit_circle
 from tests import views
-from tests.views import Ball, Block, Lying, Upright, view
+from tests.views import DepthBall, DepthBlock, LyingCylinder, UprightCylinder, view
 
 X, Y = 12.0, -7.0
 SEEDS = range(3)
@@ -52,13 +52,13 @@ def naive_fit(image, pose):
 # Cylinders that stand, after the table in the notes ----------------------------------------------------------
 
 STANDING = {
-    "R33 h120": (Upright(33, 120, X, Y), {}, 1.0),
-    "R33 h120, 3 mm, 10 % outliers": (Upright(33, 120, X, Y), NOISY, 3.0),
-    "R50 h200": (Upright(50, 200, X, Y), {}, 1.0),
-    "R50 h200, 3 mm, 10 % outliers": (Upright(50, 200, X, Y), NOISY, 3.0),
-    "R15 h100, 10 % outliers": (Upright(15, 100, X, Y), NOISY, 3.0),
-    "R33 h20 (tuna can)": (Upright(33, 20, X, Y), {}, 1.5),
-    "R33 h20, 3 mm, 10 % outliers": (Upright(33, 20, X, Y), NOISY, 3.0),
+    "R33 h120": (UprightCylinder(33, 120, X, Y), {}, 1.0),
+    "R33 h120, 3 mm, 10 % outliers": (UprightCylinder(33, 120, X, Y), NOISY, 3.0),
+    "R50 h200": (UprightCylinder(50, 200, X, Y), {}, 1.0),
+    "R50 h200, 3 mm, 10 % outliers": (UprightCylinder(50, 200, X, Y), NOISY, 3.0),
+    "R15 h100, 10 % outliers": (UprightCylinder(15, 100, X, Y), NOISY, 3.0),
+    "R33 h20 (tuna can)": (UprightCylinder(33, 20, X, Y), {}, 1.5),
+    "R33 h20, 3 mm, 10 % outliers": (UprightCylinder(33, 20, X, Y), NOISY, 3.0),
 }
 
 
@@ -77,19 +77,19 @@ def test_a_standing_cylinder_is_found(name):
 
 def test_the_naive_fit_fails_on_the_same_pictures():
     pose = views.camera_pose()
-    clean = naive_fit(view(Upright(33, 120, X, Y)), pose)
+    clean = naive_fit(view(UprightCylinder(33, 120, X, Y)), pose)
     assert math.hypot(clean[0] - X, clean[1] - Y) > 5  # the far side is not seen
-    wild = naive_fit(view(Upright(33, 120, X, Y), **NOISY), pose)
+    wild = naive_fit(view(UprightCylinder(33, 120, X, Y), **NOISY), pose)
     assert wild[2] > 33 + 50  # and outliers blow the radius up
 
 
 def test_the_fit_does_not_depend_on_when_it_is_made():
-    image = view(Upright(33, 120, X, Y), **NOISY)
+    image = view(UprightCylinder(33, 120, X, Y), **NOISY)
     assert fit_cylinder(image, views.camera_pose()) == fit_cylinder(image, views.camera_pose())
 
 
-def test_where_the_camera_believes_to_stand_moves_the_fit_as_much():
-    image, moved = view(Upright(33, 120, X, Y)), views.camera_pose()
+def test_an_error_of_the_extrinsics_moves_the_fit_as_much():
+    image, moved = view(UprightCylinder(33, 120, X, Y)), views.camera_pose()
     moved[:2, 3] += (8.0, -5.0)
     fit = fit_cylinder(image, moved)
     assert math.hypot(fit.x_mm - X - 8, fit.y_mm - Y + 5) < 1.0
@@ -99,11 +99,11 @@ def test_where_the_camera_believes_to_stand_moves_the_fit_as_much():
 # Other shapes ------------------------------------------------------------------------------------------------
 
 BOXES = {
-    "a flat packet": Block(180, 50, 220, X, Y, 0.2),
-    "a packet seen from its side": Block(180, 50, 220, X, Y, 1.5),
-    "a cube on edge": Block(60, 60, 60, X, Y, math.pi / 4),
-    "a box": Block(90, 50, 60, X, Y, 0.5),
-    "a box seen from its front": Block(90, 50, 60, X, Y, 0.0),
+    "a flat packet": DepthBlock(180, 50, 220, X, Y, 0.2),
+    "a packet seen from its side": DepthBlock(180, 50, 220, X, Y, 1.5),
+    "a cube on edge": DepthBlock(60, 60, 60, X, Y, math.pi / 4),
+    "a box": DepthBlock(90, 50, 60, X, Y, 0.5),
+    "a box seen from its front": DepthBlock(90, 50, 60, X, Y, 0.0),
 }
 
 
@@ -133,7 +133,7 @@ def test_without_a_bound_a_circle_through_a_plane_is_huge():
 @pytest.mark.parametrize("yaw", [0.0, 0.7, 1.5])
 @pytest.mark.parametrize("how", [{}, NOISY])
 def test_a_lying_cylinder_is_told_from_a_standing_one_and_from_a_box(yaw, how):
-    for fit in fits(Lying(25, 120, X, Y, yaw), **how):
+    for fit in fits(LyingCylinder(25, 120, X, Y, yaw), **how):
         assert fit.method == "lying"
         assert off_centre(fit) < 3.5
         assert off_centre(fit) < 3 * fit.error_mm
@@ -144,13 +144,13 @@ def test_a_lying_cylinder_is_told_from_a_standing_one_and_from_a_box(yaw, how):
 
 
 def test_a_ball_is_round():
-    for fit in fits(Ball(35, X, Y)):
+    for fit in fits(DepthBall(35, X, Y)):
         assert off_centre(fit) < 3.0
         assert fit.is_round
 
 
 def test_too_few_points_on_the_side_end_in_the_enclosing_circle_and_a_note():
-    for fit in fits(Upright(25, 8, X, Y)):
+    for fit in fits(UprightCylinder(25, 8, X, Y)):
         assert fit.method == "enclosing circle"
         assert off_centre(fit) < 4.0
         assert fit.radius_mm == pytest.approx(25, abs=3)
@@ -159,8 +159,8 @@ def test_too_few_points_on_the_side_end_in_the_enclosing_circle_and_a_note():
 
 def test_a_short_arc_is_no_circle_and_the_error_says_so():
     """Only a strip of the side has depth, 26 degrees of it, and nothing of the top."""
-    image, pose = view(Upright(60, 150, X, Y)), views.camera_pose()
-    height = image.depth_m * 1000 * Rays.of(image, pose).along(np.array([0.0, 0.0, 1.0])) + pose[2, 3]
+    image, pose = view(UprightCylinder(60, 150, X, Y)), views.camera_pose()
+    height = image.depth_m * 1000 * Rays.from_image(image, pose).along(np.array([0.0, 0.0, 1.0])) + pose[2, 3]
     strip = np.zeros(image.depth_m.shape, bool)
     strip[:, 255:266] = True
     depth = np.where((height > 5) & ~(strip & (height < 140)), np.nan, image.depth_m).astype(np.float32)
@@ -174,7 +174,9 @@ def test_a_short_arc_is_no_circle_and_the_error_says_so():
 # Pictures that are hard --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solid", [Upright(33, 120, X, Y), Upright(20, 60, X, Y), Upright(45, 180, X, Y)])
+@pytest.mark.parametrize(
+    "solid", [UprightCylinder(33, 120, X, Y), UprightCylinder(20, 60, X, Y), UprightCylinder(45, 180, X, Y)]
+)
 def test_glass_is_placed_by_its_outline_in_the_colour_picture(solid):
     fit = fit_cylinder(view(missing=[solid]), views.camera_pose())
     assert fit.method == "silhouette"
@@ -191,7 +193,7 @@ def test_an_empty_table_is_a_clear_error():
 
 
 def test_a_picture_without_depth_is_a_clear_error():
-    image = view(Upright(33, 120))
+    image = view(UprightCylinder(33, 120))
     with pytest.raises(PlanError, match="needs a picture with depth"):
         fit_cylinder(RGBD(image.colour, None, image.intrinsics, 0.0), views.camera_pose())
     blind = RGBD(image.colour, np.full_like(image.depth_m, np.nan), image.intrinsics, 0.0)
@@ -202,7 +204,7 @@ def test_a_picture_without_depth_is_a_clear_error():
 @pytest.mark.parametrize("value", [0.0, -1.0, np.inf, -np.inf])
 def test_depths_that_are_none_are_unknown(value):
     """The authors' Kinect says 0 where it knows nothing."""
-    image = view(Upright(33, 120, X, Y))
+    image = view(UprightCylinder(33, 120, X, Y))
     holes = image.depth_m.copy()
     holes[np.random.default_rng(0).uniform(size=holes.shape) < 0.05] = value
     with np.errstate(all="raise"):
@@ -215,7 +217,7 @@ def test_a_calibration_that_is_not_finite_is_not_taken_for_an_empty_table(value)
     pose = views.camera_pose()
     pose[0, 3] = value
     with pytest.raises(RobotConfigError, match="extrinsics must be finite"):
-        fit_cylinder(view(Upright(33, 120, X, Y)), pose)
+        fit_cylinder(view(UprightCylinder(33, 120, X, Y)), pose)
 
 
 def test_an_object_at_the_border_is_noted_or_refused():
@@ -223,7 +225,7 @@ def test_an_object_at_the_border_is_noted_or_refused():
     noted = refused = 0
     for x in range(580, 700, 20):
         try:
-            fit = fit_cylinder(view(Upright(33, 120, x, 0)), pose)
+            fit = fit_cylinder(view(UprightCylinder(33, 120, x, 0)), pose)
         except PlanError as error:
             refused += "border" in str(error)
             continue
@@ -237,7 +239,7 @@ def test_an_object_at_the_border_is_noted_or_refused():
 
 def test_what_stands_outside_the_region_is_not_looked_at():
     region = Region((-100.0, -100.0, 0.0), (100.0, 100.0, 500.0))
-    image = view(Upright(20, 80, X, Y), Upright(45, 200, 250, 0))
+    image = view(UprightCylinder(20, 80, X, Y), UprightCylinder(45, 200, 250, 0))
     assert off_centre(fit_cylinder(image, views.camera_pose(), region)) < 1.0
     assert fit_cylinder(image, views.camera_pose()).x_mm == pytest.approx(250, abs=2)
 
@@ -245,14 +247,14 @@ def test_what_stands_outside_the_region_is_not_looked_at():
 def test_a_table_that_is_not_where_the_calibration_says_is_found_and_noted():
     pose = views.camera_pose()
     pose[2, 3] += 20.0
-    fit = fit_cylinder(view(Upright(33, 120, X, Y)), pose)
+    fit = fit_cylinder(view(UprightCylinder(33, 120, X, Y)), pose)
     assert "the table is 20 mm high" in fit.notes[0]
     assert fit.height_mm == pytest.approx(120, abs=2)
 
 
 def test_a_table_that_is_hardly_seen_is_taken_from_the_calibration():
-    image, pose = view(Upright(60, 150, X, Y)), views.camera_pose()
-    rays = Rays.of(image, pose)
+    image, pose = view(UprightCylinder(60, 150, X, Y)), views.camera_pose()
+    rays = Rays.from_image(image, pose)
     height = image.depth_m * 1000 * rays.along(np.array([0.0, 0.0, 1.0])) + pose[2, 3]
     depth = np.where(height < 45, np.nan, image.depth_m).astype(np.float32)
     fit = fit_cylinder(RGBD(image.colour, depth, image.intrinsics, 0.0), pose)
@@ -262,7 +264,7 @@ def test_a_table_that_is_hardly_seen_is_taken_from_the_calibration():
 
 def test_a_fit_takes_milliseconds():
     """No bound decides: the benchmark `cylinder` prints the time. This only keeps a mistake of 50 times out."""
-    image, pose = view(Upright(33, 120, X, Y), **NOISY), views.camera_pose()
+    image, pose = view(UprightCylinder(33, 120, X, Y), **NOISY), views.camera_pose()
     start = time.process_time()
     fit_cylinder(image, pose)
     assert time.process_time() - start < 1.0

@@ -77,12 +77,12 @@ class TabulatedLaw(ForceLaw):
         return float(self._curve(inside)) + slope * (depth_mm - inside), slope
 
 
-def pressed_law(
-    gap_mm: npt.ArrayLike, pixel_mm: float, layer: Layer, deepest_mm: float, *, points: int = 8
+def press_law(
+    gap_mm: npt.ArrayLike, pixel_mm: float, layer: Layer, max_depth_mm: float, *, points: int = 8
 ) -> TabulatedLaw:
-    """The law of a gel against a height map, from `points` presses down to `deepest_mm` beyond first touch."""
+    """The law of a gel against a height map, from `points` presses down to `max_depth_mm` beyond first touch."""
     lowest = float(np.min(gap_mm))
-    depths = deepest_mm * np.linspace(0.0, 1.0, points + 1)[1:]
+    depths = max_depth_mm * np.linspace(0.0, 1.0, points + 1)[1:]
     return TabulatedLaw(depths, [press(gap_mm, pixel_mm, layer, depth_mm=lowest + d).force_n for d in depths])
 
 

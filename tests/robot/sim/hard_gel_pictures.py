@@ -12,7 +12,7 @@ from benchmarks.optics.real_presses import BallTable, Presses
 from robot.sim.contact.kernels import Floats
 from robot.sim.contact.layer import Layer
 from robot.sim.gel.sensor import GelSensor, Noise
-from tests.hard_case import HardCase, refused
+from tests.hard_case import HardCase, error_of
 
 _FIT, _GEL = "photometric fit", "gel picture"
 _RIDGE = 1e-4
@@ -139,6 +139,6 @@ def _nan_displacement() -> HardCase:
     displacement[12, 16] = np.nan
     sensor = GelSensor(Layer(0.3, 0.48, 2.0), rows=24, cols=32)
     naive = int((~np.isfinite(np.gradient(displacement, axis=1))).sum())
-    ours, holds = refused(partial(sensor.render, displacement, 0), "finite")
+    ours, holds = error_of(partial(sensor.render, displacement, 0), "finite")
     words = f"{naive} slopes along x are NaN"
     return HardCase(_GEL, "one displacement is NaN", "refused", words, ours, holds, naive == 0)

@@ -12,7 +12,7 @@ from robot.sim.objects.relief import RELIEFS, Relief
 from robot.sim.objects.shapes import SHAPES
 from robot.sim.objects.shapes.extrusion import Extrusion, RoundedRectangle
 from robot.sim.objects.shapes.revolution import Ball, Drum, Revolution
-from robot.sim.objects.wall import FINEST_MM
+from robot.sim.objects.wall import MIN_PIXEL_MM
 
 SMOOTH = Relief("smooth", 0.0, 5.0)
 ATOL = 2e-3  # mm; float32 coordinates and two secants
@@ -256,7 +256,7 @@ def test_every_family_stands_on_the_table(family):
 
 
 @pytest.mark.parametrize("relief", RELIEFS)
-def test_every_relief_can_be_felt_on_a_can(relief):
+def test_every_relief_changes_the_gap_of_a_can(relief):
     body = draw_object(4, 11, family="cylinder", relief=relief).body
     origins, directions = wall_rays(body, rows=60, columns=40, z=body.upper[2] / 2, pitch=0.3)
     origins = origins[np.abs(origins[:, 0]) < 4]
@@ -284,7 +284,7 @@ def test_a_camera_that_asks_for_less_detail_gets_nearly_the_same():
     hit = np.isfinite(fine) & np.isfinite(coarse) & (np.abs(origins[:, 0]) < 15)
     assert np.abs(fine - coarse)[hit].max() < 0.3
     assert body.wall.level(0.6).pixel_mm > 2 * body.wall.level(0.1).pixel_mm
-    assert body.wall.level(0.1).pixel_mm >= FINEST_MM * 0.99
+    assert body.wall.level(0.1).pixel_mm >= MIN_PIXEL_MM * 0.99
 
 
 def test_normals_over_a_pixel_are_calmer_than_those_of_the_gel():

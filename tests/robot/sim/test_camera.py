@@ -8,7 +8,7 @@ import pytest
 
 from robot.errors import SceneError
 from robot.sim import camera as cameras
-from robot.sim.camera import Lighting, PinholeCamera, Placement, look
+from robot.sim.camera import Lighting, PinholeCamera, Placement, cast_camera_rays
 from robot.sim.objects.draw import draw_object
 
 POST = draw_object(0, 0, family="cylinder", relief="smooth")
@@ -38,7 +38,7 @@ def test_each_ray_goes_through_the_centre_of_its_pixel():
 
 
 def test_the_object_is_seen_where_it_stands():
-    view = look(POST, Placement(30.0, -10.0, 0.4), CAMERA)
+    view = cast_camera_rays(POST, Placement(30.0, -10.0, 0.4), CAMERA)
     middle = project(CAMERA, (30.0, -10.0, HEIGHT_MM / 2)).round().astype(int)
     mask = view.is_object.reshape(CAMERA.px, CAMERA.px)
     assert mask[middle[1], middle[0]]
@@ -51,7 +51,7 @@ def test_the_object_is_seen_where_it_stands():
 @pytest.mark.parametrize("index", range(4))
 def test_casting_only_the_rays_near_the_object_leaves_nothing_of_it_out(index):
     obj, place = draw_object(0, index), Placement(12.0, -9.0, 0.3 + index)
-    view, rays = look(obj, place, CAMERA), CAMERA.rays
+    view, rays = cast_camera_rays(obj, place, CAMERA), CAMERA.rays
     origins = np.broadcast_to(place.to_object(np.array([CAMERA.position_mm])), rays.shape)
     every = obj.body.cast(origins, rays @ place.rotation(), view.detail_mm)
     table = -CAMERA.position_mm[2] / rays[:, 2]
@@ -64,25 +64,25 @@ def test_casting_only_the_rays_near_the_object_leaves_nothing_of_it_out(index):
 def test_casting_only_the_shadow_rays_near_the_object_leaves_no_shadow_out(index):
     obj, place = draw_object(0, index), Placement(12.0, -9.0, 0.3 + index)
     light = np.asarray(Lighting.draw(np.random.default_rng(index)).direction)
-    view = look(obj, place, CAMERA)
-    near = cameras.near_shadow(view, light)
+    view = cast_camera_rays(obj, place, CAMERA)
+    near = cameras.shadow_pixels(view, light)
     table = np.flatnonzero(~view.is_object)
     starts = place.to_object(view.points[table] + [0, 0, 0.4])
     dark = table[obj.body.hit(starts, np.broadcast_to(light @ place.rotation(), starts.shape))]
     assert len(dark) > 50
     assert set(dark) <= set(near)
     assert len(near) < 0.7 * len(table)
-    assert not len(cameras.near_shadow(view, np.array([0.6, 0.8, 0.0])))  # nor does a lamp on the horizon light it
+    assert not len(cameras.shadow_pixels(view, np.array([0.6, 0.8, 0.0])))  # nor does a lamp on the horizon light it
 
 
 def test_a_thing_that_reaches_behind_the_camera_may_be_anywhere_in_the_picture():
-    pixels = CAMERA.pixels_round(np.array([[0.0, 0, 0], [0, -900, 800]]))
+    pixels = CAMERA.pixels_around(np.array([[0.0, 0, 0], [0, -900, 800]]))
     np.testing.assert_array_equal(pixels, np.arange(CAMERA.px**2))
-    assert len(CAMERA.pixels_round(np.array([[5e3, 0, 80.0], [6e3, 0, 80]]))) == 0  # beside the picture
+    assert len(CAMERA.pixels_around(np.array([[5e3, 0, 80.0], [6e3, 0, 80]]))) == 0  # beside the picture
 
 
 def test_depth_of_the_bare_table_is_the_distance_of_its_plane_along_the_axis():
-    view = look(POST, Placement(), CAMERA)
+    view = cast_camera_rays(POST, Placement(), CAMERA)
     depth = cameras.depth(view, 1)
     row, column = 250, 10
     assert not view.is_object[row * CAMERA.px + column]
@@ -94,7 +94,7 @@ def test_depth_of_the_bare_table_is_the_distance_of_its_plane_along_the_axis():
 
 
 def test_depth_has_holes_flying_pixels_and_whole_millimetres():
-    view = look(POST, Placement(), CAMERA)
+    view = cast_camera_rays(POST, Placement(), CAMERA)
     depth = cameras.depth(view, 1)
     assert depth.dtype == np.float32
     known = depth[np.isfinite(depth)] * 1000.0
@@ -108,7 +108,7 @@ def test_depth_has_holes_flying_pixels_and_whole_millimetres():
 
 def test_the_shadow_darkens_the_table_on_the_side_away_from_the_lamp():
     light = dataclasses.replace(LIGHT, direction=(0.8, 0.0, 0.6))
-    view = look(POST, Placement(), CAMERA)
+    view = cast_camera_rays(POST, Placement(), CAMERA)
     with_shadow, without = (cameras.photo(view, light, 1, shadow).astype(float) for shadow in (True, False))
     darker = (without - with_shadow).mean(axis=2).reshape(-1)
     rim_mm = float(POST.body.upper[0])
@@ -121,7 +121,7 @@ def test_the_shadow_darkens_the_table_on_the_side_away_from_the_lamp():
 
 def test_the_side_towards_the_lamp_is_brighter():
     light = dataclasses.replace(LIGHT, direction=(0.8, -0.3, math.sqrt(1 - 0.73)))
-    view = look(POST, Placement(), CAMERA)
+    view = cast_camera_rays(POST, Placement(), CAMERA)
     photo = cameras.photo(view, light, 1).astype(float).mean(axis=2).reshape(-1)
     side = view.is_object & (view.points[:, 2] < HEIGHT_MM - 5)
     assert photo[side & (view.points[:, 0] > 0)].mean() > photo[side & (view.points[:, 0] < 0)].mean() + 10
@@ -130,10 +130,10 @@ def test_the_side_towards_the_lamp_is_brighter():
 def test_relief_that_is_large_enough_for_the_pixels_shows():
     """Ribs shade the wall in rows or columns; a smooth wall of the same shape, colour and light has none."""
     ribbed, smooth = (draw_object(0, 0, family="cylinder", relief=relief) for relief in ("ribs", "smooth"))
-    smooth = dataclasses.replace(smooth, looks=ribbed.looks, material=ribbed.material)
+    smooth = dataclasses.replace(smooth, appearance=ribbed.appearance, material=ribbed.material)
     roughness = []
     for obj in (ribbed, smooth):
-        view = look(obj, Placement(), CAMERA)
+        view = cast_camera_rays(obj, Placement(), CAMERA)
         photo = cameras.photo(view, LIGHT, 1).astype(float).mean(axis=2)
         mask = view.is_object.reshape(photo.shape)
         rows = slice(*np.quantile(np.nonzero(mask)[0], [0.4, 0.8]).astype(int))
@@ -160,4 +160,4 @@ def test_a_camera_that_cannot_be_is_refused(settings):
 
 def test_a_camera_that_sees_past_the_table_is_refused():
     with pytest.raises(SceneError, match="nothing but the table"):
-        look(POST, Placement(), PinholeCamera(position_mm=(0.0, -560.0, 80.0)))
+        cast_camera_rays(POST, Placement(), PinholeCamera(position_mm=(0.0, -560.0, 80.0)))

@@ -13,7 +13,7 @@ from tests.robot.sim.closing_jaws import (
     LinearLaw,
     Motion,
     close,
-    pressed_law,
+    press_law,
     settle,
 )
 
@@ -96,10 +96,10 @@ def test_the_rig_shows_the_gels_where_closing_jaws_come_to_rest():
     """The rig presses with the commanded force at once; the way there changes nothing of what it records."""
     with SimRig(4, families=["cylinder"]) as rig:
         rig.prepare(rig.object_ids(1)[0], 0)
-        at = rig.world.scene.placement
+        at = rig.sim_state.scene.placement
         rig.arm.move_to(Pose(at.x_mm, at.y_mm, 20.0, 0.3), 100.0)
         rig.gripper.grasp(12.0)
-        pinch = rig.world.scene.pinch
+        pinch = rig.sim_state.scene.pinch
         gaps = [np.maximum(pinch.gap(finger), 0.0) for finger in "ab"]
         layers = [pinch.sensors[finger].layer for finger in "ab"]
         pixel_mm = pinch._pixel_mm
@@ -107,7 +107,7 @@ def test_the_rig_shows_the_gels_where_closing_jaws_come_to_rest():
         press(gap, pixel_mm, layer, force_n=12.0, tolerance=1e-4) for gap, layer in zip(gaps, layers, strict=True)
     ]
     laws = [
-        pressed_law(gap, pixel_mm, layer, 1.5 * one.approach_mm, points=6)
+        press_law(gap, pixel_mm, layer, 1.5 * one.approach_mm, points=6)
         for gap, layer, one in zip(gaps, layers, pressed, strict=True)
     ]
     motion = Motion(Jaws(12.0), (laws[0], laws[1]))
@@ -120,7 +120,7 @@ def test_the_rig_shows_the_gels_where_closing_jaws_come_to_rest():
 def test_a_pressed_law_is_the_solver_s_force_at_each_depth_of_its_table_and_near_between():
     gap = (np.arange(-20.0, 21.0)[:, None] ** 2 + np.arange(-20.0, 21.0) ** 2) * 0.15**2 / 8.0 + 3.0
     layer = Layer(0.2, 0.48, 2.0)
-    law = pressed_law(gap, 0.15, layer, 0.8)
+    law = press_law(gap, 0.15, layer, 0.8)
     for depth, tolerance in ((0.4, 1e-9), (0.8, 1e-9), (0.45, 1e-2)):
         force = press(gap, 0.15, layer, depth_mm=3.0 + depth).force_n
         assert law(depth)[0] == pytest.approx(force, rel=tolerance)

@@ -93,13 +93,13 @@ def test_displacement_is_the_influence_of_the_pressure():
     assert contact.displacement_mm.ravel() == pytest.approx(exact, rel=1e-10)
 
 
-# Coarse grid and window ------------------------------------------------------------------------------------
+# CoarseScorer grid and window ------------------------------------------------------------------------------------
 
 
 def test_starting_from_a_coarse_grid_changes_nothing_but_the_time(monkeypatch):
     gap = bowl(61, 83) + 0.02 * np.random.default_rng([6]).random((61, 83))
     nested = press(gap, PIXEL, GEL, force_n=0.5, tolerance=1e-8)
-    monkeypatch.setattr(pressing, "_NEST_FROM", 1000)
+    monkeypatch.setattr(pressing, "_MIN_NESTED_PIXELS", 1000)
     plain = press(gap, PIXEL, GEL, force_n=0.5, tolerance=1e-8)
     assert nested.pressure_mpa == pytest.approx(plain.pressure_mpa, abs=1e-6 * plain.pressure_mpa.max())
     assert nested.approach_mm == pytest.approx(plain.approach_mm, rel=1e-8)
@@ -218,7 +218,7 @@ def test_the_half_space_has_no_strain_to_exceed():
     assert "large_strain" not in press(bowl(), PIXEL, HALF_SPACE, force_n=5.0).flags
 
 
-def test_stopped_short_is_said_and_still_carries_the_force():
+def test_early_stop_is_flagged_and_carries_the_force():
     contact = press(bowl(), PIXEL, GEL, force_n=0.3, tolerance=1e-8, max_iterations=3)
     assert not contact.converged
     assert "iteration_cap" in contact.flags

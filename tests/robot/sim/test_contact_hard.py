@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from robot.sim.contact.constrained_cg import GAP_WEIGHT, ContactProblem, nearest_of_sum
+from robot.sim.contact.constrained_cg import GAP_WEIGHT, ContactProblem, project_to_simplex
 from robot.sim.contact.kernels import Operator, influence, periodic_influence
-from robot.sim.contact.layer import SINGLE_FROM, Layer, press
+from robot.sim.contact.layer import SINGLE_PRECISION_TOLERANCE, Layer, press
 from tests.robot.sim.hard_contact import hard_gaps, hard_layers, is_finite, naive_solve
 
 # Contact conditions, checked apart from the solver ---------------------------------------------------------
@@ -35,7 +35,7 @@ def conditions(gap, layer, contact, padded):
 
 @pytest.mark.parametrize("name", hard_gaps())
 def test_hard_shapes_meet_them_with_products_in_float32_as_far_as_the_tolerance_asks(name):
-    gap, rough = hard_gaps()[name], 2 * SINGLE_FROM
+    gap, rough = hard_gaps()[name], 2 * SINGLE_PRECISION_TOLERANCE
     for layer, force in itertools.product(hard_layers(), (1e-6, 0.1, 1e4)):
         contact = press(gap, 1.0, layer, force_n=force, tolerance=rough)
         assert is_finite(contact)
@@ -129,7 +129,7 @@ def test_without_the_safeguard_the_pin_cycles_to_the_cap_and_with_it_the_energy_
     _, naive = naive_solve(operator, gap, 0.1, max_iterations=500)
     assert naive == 500
     problem = ContactProblem(operator, gap, load=0.1)
-    start, energies = problem.guess(), []
+    start, energies = problem.initial_pressure(), []
     for steps in range(0, 60, 3):
         pressure = problem.solve(start, 1e-12, steps).pressure
         energies.append(0.5 * float(np.vdot(pressure, operator(pressure))) + float(np.vdot(pressure, gap)))
@@ -138,7 +138,7 @@ def test_without_the_safeguard_the_pin_cycles_to_the_cap_and_with_it_the_energy_
 
 def test_the_nearest_pressure_of_a_given_sum_beats_every_other():
     values = np.array([3.0, -1.0, 0.5, 2.0])
-    nearest = nearest_of_sum(values, 2.0)
+    nearest = project_to_simplex(values, 2.0)
     # 3 and 2 stay, each less 1.5; the others go: by hand.
     assert nearest == pytest.approx([1.5, 0.0, 0.0, 0.5])
     rng = np.random.default_rng([7])

@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robot.errors import SceneError
-from robot.sim.compiled import compiled
+from robot.sim.jit import jit
 from robot.sim.objects.draw import draw_object
-from robot.sim.objects.formula import record
-from robot.sim.objects.packets import LANES, OPERATIONS, heights, run
+from robot.sim.objects.formula import trace_formula
+from robot.sim.objects.packets import LANES, OPERATIONS, evaluate_formula, interpolate_heights
 from robot.sim.objects.shapes import SHAPES
-from robot.sim.objects.shapes.base import arctan2, rounded
+from robot.sim.objects.shapes.shape import arctan2, rounded_corner
 
 SIZES = (1, LANES - 1, LANES, LANES + 1, 5 * LANES + 7)
 
@@ -37,20 +37,20 @@ def everything(a, b):
 @pytest.mark.parametrize("size", SIZES)
 def test_a_formula_gives_what_its_function_gives(size):
     operands = numbers(2, size)
-    formula = record(everything, 2)
-    for ours, exact in zip(run(formula, *operands), everything(*operands), strict=True):
+    formula = trace_formula(everything, 2)
+    for ours, exact in zip(evaluate_formula(formula, *operands), everything(*operands), strict=True):
         np.testing.assert_allclose(ours, exact, rtol=3e-6, atol=1e-6)
     assert {OPERATIONS[name] for name in formula.code[:, 0]} == set(OPERATIONS)
 
 
 def test_operations_without_rounding_of_their_own_are_equal_bit_by_bit():
     operands = numbers(2, 1000)
-    for function in (lambda a, b: rounded(a, b, 1.5), arctan2):
-        np.testing.assert_array_equal(run(record(function, 2), *operands)[0], function(*operands))
+    for function in (lambda a, b: rounded_corner(a, b, 1.5), arctan2):
+        np.testing.assert_array_equal(evaluate_formula(trace_formula(function, 2), *operands)[0], function(*operands))
 
 
 def test_what_is_written_twice_is_worked_out_once_and_rows_are_used_again():
-    formula = record(lambda a: (a + 1) * (a + 1) + (a + 1), 1)
+    formula = trace_formula(lambda a: (a + 1) * (a + 1) + (a + 1), 1)
     assert [OPERATIONS[name] for name in formula.code[:, 0]] == ["add", "multiply", "add"]
 
     def long(a):
@@ -58,7 +58,7 @@ def test_what_is_written_twice_is_worked_out_once_and_rows_are_used_again():
             a = a * 0.5 + 1
         return a
 
-    assert len(record(long, 1).start) == 5  # the operand, two constants, two that take turns
+    assert len(trace_formula(long, 1).start) == 5  # the operand, two constants, two that take turns
 
 
 def test_no_operation_writes_over_what_it_reads():
@@ -66,12 +66,12 @@ def test_no_operation_writes_over_what_it_reads():
     for name in SHAPES:
         shape = draw_object(0, 1, family=name).body.shape
         for function in (shape.distance_xyz, shape.chart.locate):
-            for _, result, *read in record(function, 3).code:
+            for _, result, *read in trace_formula(function, 3).code:
                 assert result not in read
 
 
 def test_a_result_may_be_an_operand_or_a_constant():
-    constant, same = run(record(lambda a: (np.full_like(a, 3.0), a), 1), *numbers(1, 70))
+    constant, same = evaluate_formula(trace_formula(lambda a: (np.full_like(a, 3.0), a), 1), *numbers(1, 70))
     np.testing.assert_array_equal(constant, 3)
     np.testing.assert_array_equal(same, *numbers(1, 70))
 
@@ -82,7 +82,7 @@ def test_any_number_comes_through_comparisons_as_in_numpy(values, limit):
         return np.maximum(np.minimum(a, limit), -2), np.where(a > limit, a, limit), np.abs(a)
 
     operand = np.array(values, np.float32)
-    for ours, exact in zip(run(record(function, 1), operand), function(operand), strict=True):
+    for ours, exact in zip(evaluate_formula(trace_formula(function, 1), operand), function(operand), strict=True):
         np.testing.assert_array_equal(ours, exact.astype(np.float32))
 
 
@@ -97,7 +97,7 @@ def test_any_number_comes_through_comparisons_as_in_numpy(values, limit):
 )
 def test_a_function_of_other_operations_is_refused_by_name(function, says):
     with pytest.raises(SceneError, match=f"(?s)a formula must be made of.*{says}"):
-        record(function, 1)
+        trace_formula(function, 1)
 
 
 # Against plain numpy -----------------------------------------------------------------------------------------
@@ -108,9 +108,11 @@ def test_every_family_is_in_packets_what_it_is_in_numpy(family):
     body = draw_object(3, 5, family=family, relief="knurl").body
     rng = np.random.default_rng(1)
     points = rng.uniform(body.lower - 3, body.upper + 3, (2000, 3)).astype(np.float32).T
-    for function in (body.shape.distance_xyz, body.located):
+    for function in (body.shape.distance_xyz, body.chart_coordinates):
         exact = function(*points)
-        for ours, numpys in zip(run(record(function, 3), *points), np.atleast_2d(exact), strict=True):
+        for ours, numpys in zip(
+            evaluate_formula(trace_formula(function, 3), *points), np.atleast_2d(exact), strict=True
+        ):
             np.testing.assert_allclose(ours, numpys, atol=5e-5)  # float32's sines and powers of some 100 mm
 
 
@@ -127,8 +129,8 @@ def test_normals_in_packets_are_differences_of_the_field():
 def test_heights_lie_between_pixels_and_end_at_the_border():
     grid = np.array([[0, 1, 2], [10, 11, 12]], np.float32)
     u, v = np.array([0.25, 1.5, 9, -3, 2], np.float32), np.array([0, 0.5, 9, -3, 1], np.float32)
-    np.testing.assert_allclose(heights(grid, u, v), [0.25, 6.5, 12, 0, 12])
-    assert heights(grid, u[:0], v[:0]).shape == (0,)
+    np.testing.assert_allclose(interpolate_heights(grid, u, v), [0.25, 6.5, 12, 0, 12])
+    assert interpolate_heights(grid, u[:0], v[:0]).shape == (0,)
 
 
 def test_rays_meet_the_same_whatever_their_order():
@@ -142,8 +144,8 @@ def test_rays_meet_the_same_whatever_their_order():
     assert np.isfinite(found).sum() > 100
 
 
-def test_code_that_cannot_be_kept_is_compiled_for_the_process():
+def test_code_without_a_cache_folder_is_compiled_in_the_process():
     function = eval("lambda a: a + 1")  # which stands in no file, so that there is no place beside it
     with pytest.raises(RuntimeError, match="no locator"):
         numba.njit(cache=True)(function)
-    assert compiled(function)(2) == 3
+    assert jit(function)(2) == 3

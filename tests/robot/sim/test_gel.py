@@ -61,7 +61,7 @@ def test_slopes_are_taken_before_they_are_interpolated_because_heights_interpola
     assert np.abs(naive - truth)[inside].max() > 5 * np.abs(ours - truth)[inside].max()
 
 
-def test_a_finer_grid_is_averaged_and_an_equal_one_kept():
+def test_resized_averages_a_finer_grid_and_returns_an_equal_one():
     fine = np.arange(16, dtype=np.float32).reshape(4, 4)
     np.testing.assert_allclose(resized(fine, (2, 2)), [[2.5, 4.5], [10.5, 12.5]])
     assert resized(fine, (4, 4)) is fine
@@ -100,7 +100,7 @@ HARD = {
 @pytest.mark.parametrize("kind", ["led", "grey", *fitted_names()])
 def test_hard_surfaces_give_pictures(name, kind):
     sensor = replace(draw_sensor(0, "a", optics=kind), rows=24, cols=32, pixel_mm=0.5, markers=Markers())
-    clean = sensor._clean(Surface(HARD[name], sensor.field))
+    clean = sensor._render_surface(Surface(HARD[name], sensor.field))
     assert np.isfinite(clean).all()
     assert clean.min() > -2000
     assert clean.max() < 2000
@@ -112,7 +112,7 @@ def test_hard_surfaces_give_pictures(name, kind):
 def test_a_grey_sensor_gives_grey_pictures_of_other_light():
     heights = 0.3 * np.exp(-((np.indices((24, 32)) - 12) ** 2).sum(0) / 20.0)
     grey = replace(draw_sensor(0, "a", optics="grey"), rows=24, cols=32, pixel_mm=0.5, markers=Markers())
-    clean = grey._clean(Surface(heights, grey.field))
+    clean = grey._render_surface(Surface(heights, grey.field))
     for channel in (1, 2):  # but for a white balance that is a little off
         assert np.allclose(
             clean[..., channel] / clean[..., 0], np.median(clean[..., channel] / clean[..., 0]), atol=0.02
@@ -163,7 +163,7 @@ def test_light_of_a_bar_is_the_near_field_formula(points):
     assert (light == 0).any() or points > 1
 
 
-def test_leds_stand_where_they_are_said_to():
+def test_led_positions_match_their_settings():
     above = LedBar(math.radians(90), distance_mm=10, height_mm=4, length_mm=6, points=3)
     np.testing.assert_allclose(above.positions(), [[-3, -10, 4], [0, -10, 4], [3, -10, 4]], atol=1e-12)
     right = LedBar(0.0, distance_mm=10, height_mm=4, points=1)
@@ -213,13 +213,13 @@ def test_a_flat_gel_shows_the_backdrop_and_render_of_nothing_is_the_background(k
     backdrop = np.clip(np.rint(quiet.optics.backdrop(quiet.field)), 0, 255)
     assert np.abs(quiet.background(0) - backdrop).max() <= 1  # a tie may round either way
     np.testing.assert_allclose(
-        quiet._clean(Surface(np.zeros((3, 4)), quiet.field)), quiet.optics.backdrop(quiet.field), atol=1e-3
+        quiet._render_surface(Surface(np.zeros((3, 4)), quiet.field)), quiet.optics.backdrop(quiet.field), atol=1e-3
     )
     for flat in (np.zeros((240, 320)), np.zeros((1, 1)), np.zeros((7, 9), np.float32)):
         np.testing.assert_array_equal(sensor.render(flat, 5), sensor.background(5))
 
 
-def test_a_gel_pushed_in_evenly_looks_untouched():
+def test_a_uniform_displacement_gives_the_no_contact_image():
     sensor = small_sensor()
     np.testing.assert_array_equal(sensor.render(np.full((24, 32), 0.7), 0), sensor.background(0))
 
@@ -242,7 +242,7 @@ def press_like(picture):
 def test_noise_has_the_variance_that_is_written_down():
     sensor = GelSensor(LAYER, noise=Noise(1.5, 0.02))
     many = np.stack([sensor.background(seed) for seed in range(60)]).astype(float)
-    clean = gel._untouched(sensor)
+    clean = gel._no_contact_image(sensor)
     wanted = 1.5**2 + 0.02 * clean + 1 / 12  # rounding adds a twelfth
     assert np.mean(many.var(axis=0)) == pytest.approx(wanted.mean(), rel=0.05)
 
@@ -254,7 +254,7 @@ def test_sensors_are_drawn_alike_from_the_same_seed_and_differ_by_seed_and_finge
     np.testing.assert_array_equal(again.background(1), draw_sensor(4, "b").background(1))
 
 
-def test_what_is_said_of_a_gel_is_not_drawn_and_all_else_is_as_without_it():
+def test_given_gel_settings_replace_drawn_ones_only():
     drawn = draw_sensor(4, "a")
     said = draw_sensor(4, "a", gel=GelSettings(thickness_mm=2.5, modulus_mpa=0.3))
     assert said == replace(drawn, layer=replace(drawn.layer, thickness_mm=2.5, modulus_mpa=0.3))

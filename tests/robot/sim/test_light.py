@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from benchmarks.frontier.light import shaded
-from robot.sim.camera import PinholeCamera, Placement, hidden_sky, look
-from robot.sim.light import GAMMA, Lamps, Surfaces, developed, radiance
+from robot.sim.camera import PinholeCamera, Placement, cast_camera_rays, sky_occlusion
+from robot.sim.light import GAMMA, GBuffer, Lamps, develop, radiance
 from robot.sim.objects.draw import draw_object
 
 
@@ -17,7 +17,7 @@ def surfaces_and_lamps(count=5000, seed=0):
     shares = rng.uniform(size=(2, count)).astype(np.float32)
     is_object, colour = rng.uniform(size=count) < 0.5, rng.uniform(size=(count, 3)).astype(np.float32)
     colour[:7] = 0
-    surfaces = Surfaces(unit[0], unit[1].astype(np.float32), is_object, *shares, colour)
+    surfaces = GBuffer(unit[0], unit[1].astype(np.float32), is_object, *shares, colour)
     return surfaces, Lamps(unit[2, 0], np.array([0.9, 0.8, 0.7]), np.array([0.2, 0.25, 0.3]), (1.1, 0.04), 60.0)
 
 
@@ -30,14 +30,14 @@ def test_radiance_is_that_of_lambert_blinn_and_the_sky():
 def test_what_no_light_reaches_is_black():
     surfaces, lamps = surfaces_and_lamps()
     dark = lamps._replace(sky=np.zeros(3))
-    assert not radiance(surfaces._replace(lamp_seen=np.zeros(5000, np.float32)), dark).any()
+    assert not radiance(surfaces._replace(lamp_visibility=np.zeros(5000, np.float32)), dark).any()
 
 
 def test_grey_levels_follow_the_gamma_and_are_clipped():
     linear = np.float32([[[0, 0.5, 1], [1.5, 1e-7, 0.25]]])
-    flat = developed(linear, np.zeros((1, 2, 3)))
+    flat = develop(linear, np.zeros((1, 2, 3)))
     np.testing.assert_array_equal(flat, [[[0, 186, 255], [255, 0, 136]]])  # 255 * 0.5^(1/2.2) = 186.08, 135.79
-    noisy = developed(linear, np.array([[[-3.0, 2.0, 5.0], [-7.0, 300.0, -200.0]]]))
+    noisy = develop(linear, np.array([[[-3.0, 2.0, 5.0], [-7.0, 300.0, -200.0]]]))
     np.testing.assert_array_equal(noisy, [[[0, 188, 255], [248, 255, 0]]])
 
 
@@ -45,16 +45,16 @@ def test_developed_pictures_are_those_of_powers_in_float64():
     rng = np.random.default_rng(0)
     linear, noise = rng.uniform(0, 1.1, (64, 64, 3)).astype(np.float32), rng.normal(0, 1.5, (64, 64, 3))
     exact = 255.0 * np.clip(linear.astype(np.float64), 0, 1) ** (1 / GAMMA) + noise
-    ours = developed(linear, noise)
+    ours = develop(linear, noise)
     assert np.abs(ours - np.clip(exact, 0, 255)).max() < 0.5 + 1e-3
 
 
 @pytest.mark.parametrize("px", [64, 256, 512])
 def test_the_sky_that_an_object_hides_is_blurred_as_on_the_full_grid(px):
-    view = look(draw_object(0, 3), Placement(), PinholeCamera(px=px, focal_px=860 * px / 256))
+    view = cast_camera_rays(draw_object(0, 3), Placement(), PinholeCamera(px=px, focal_px=860 * px / 256))
     shares = view.is_object.reshape(px, px).astype(np.float64)
     exact = cv2.GaussianBlur(shares, (0, 0), 0.03 * px).ravel()
-    error = np.abs(hidden_sky(view.is_object.reshape(px, px)).ravel() - exact)[~view.is_object]
+    error = np.abs(sky_occlusion(view.is_object.reshape(px, px)).ravel() - exact)[~view.is_object]
     # Of 0.45 of the sky's light, which is 0.3 of all: a hundredth is a third of a grey level.
     assert error.max() < 0.02
     assert error.mean() < 1e-3

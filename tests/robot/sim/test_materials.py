@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from robot.errors import RobotConfigError, UnknownName
-from robot.sim.objects.looks import Label, Looks, Paint, draw_looks
+from robot.sim.objects.appearance import Appearance, Label, Paint, draw_appearance
 from robot.sim.objects.materials import MATERIALS, ObjectMaterial, draw_material
 
 
@@ -56,16 +56,16 @@ def test_impossible_numbers_are_refused(field, value):
 def test_albedo_is_between_0_and_1_and_the_same_again():
     points = np.random.default_rng(1).uniform(-60, 120, (500, 3))
     for seed in range(30):
-        looks = draw_looks(np.random.default_rng(seed))
-        found = looks.albedo(points)
+        appearance = draw_appearance(np.random.default_rng(seed))
+        found = appearance.albedo(points)
         assert found.shape == (500, 3)
         assert found.min() >= 0
         assert found.max() <= 1
-        np.testing.assert_array_equal(found, draw_looks(np.random.default_rng(seed)).albedo(points))
+        np.testing.assert_array_equal(found, draw_appearance(np.random.default_rng(seed)).albedo(points))
 
 
 def test_colours_are_spread_evenly_over_hue_and_lightness():
-    colours = np.array([draw_looks(np.random.default_rng(seed)).colour for seed in range(1500)])
+    colours = np.array([draw_appearance(np.random.default_rng(seed)).colour for seed in range(1500)])
     lightness = (colours.max(axis=1) + colours.min(axis=1)) / 2
     counts = np.histogram(lightness, 7, (0.15, 0.85))[0]
     assert counts.min() > 0.7 * 1500 / 7
@@ -75,12 +75,12 @@ def test_colours_are_spread_evenly_over_hue_and_lightness():
 
 def test_paint_covers_where_its_field_is_high():
     paint = Paint((1, 1, 1), ((np.pi / 20, 0, 0),), (0.0,), 0.0, 0.01)
-    found = Looks((0, 0, 0), paint=paint).albedo(np.array([[10.0, 0, 0], [30, 0, 0], [50, 5, 5]]))
+    found = Appearance((0, 0, 0), paint=paint).albedo(np.array([[10.0, 0, 0], [30, 0, 0], [50, 5, 5]]))
     np.testing.assert_array_equal(found[:, 0], [1, 0, 1])
 
 
 def test_a_label_is_a_rectangle_on_one_side_with_lines_of_print():
     label = Label((1, 1, 1), (0, 0, 0), angle_rad=0.0, half_angle_rad=0.5, bottom_mm=20, top_mm=40, line_mm=5)
-    looks = Looks((0.5, 0.5, 0.5), label=label)
-    found = looks.albedo(np.array([[0.0, -30, 19], [0, -30, 21], [0, -30, 24], [0, 30, 24], [30, 0, 24]]))
+    appearance = Appearance((0.5, 0.5, 0.5), label=label)
+    found = appearance.albedo(np.array([[0.0, -30, 19], [0, -30, 21], [0, -30, 24], [0, 30, 24], [30, 0, 24]]))
     np.testing.assert_array_equal(found[:, 0], [0.5, 0, 1, 0.5, 0.5])

@@ -58,9 +58,14 @@ def test_only_geometry_is_read(tmp_path, monkeypatch):
 def test_the_same_file_and_seed_give_the_same_object(tmp_path):
     path = obj(tmp_path / "my cube.obj", 20 * CORNERS, CUBE)
     one, two = load_mesh_object(path, 4), load_mesh_object(path, 4)
-    assert (one.object_id, one.relief, one.material, one.looks) == (two.object_id, two.relief, two.material, two.looks)
+    assert (one.object_id, one.relief, one.material, one.appearance) == (
+        two.object_id,
+        two.relief,
+        two.material,
+        two.appearance,
+    )
     assert one.object_id.startswith("mesh.my_cube-")
-    assert load_mesh_object(path, 5).looks != one.looks
+    assert load_mesh_object(path, 5).appearance != one.appearance
 
 
 # Refusals --------------------------------------------------------------------------------------------------

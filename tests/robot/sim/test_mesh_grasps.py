@@ -10,14 +10,14 @@ import pytest
 
 from robot.collection import CollectSettings, collect
 from robot.errors import RobotConfigError, UngraspableError
-from robot.grasping.attempt import Attempter
+from robot.grasping.attempt import AttemptRunner
 from robot.grasping.settings import GraspSettings
 from robot.readings import Pose
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sim.antipodal import find_grasps
 from robot.sim.objects.mesh import Mesh, mesh_object, read_mesh
-from robot.sim.objects.resting import UP, resting_ups, tipping_angle, turn_up
+from robot.sim.objects.resting import UP, rotation_to_up, stable_up_directions, tipping_angle
 from tests.meshes import BOTTLE, box, load_mesh_object, revolved, sphere, stl
 
 pytest.importorskip("trimesh", reason="needs touch-retrieval[mesh]")
@@ -46,7 +46,7 @@ def surface(mesh, per_mm2=0.3):
 
 def test_a_box_rests_on_its_six_sides_as_it_stands_first_and_then_the_steadiest():
     vertices, _ = box(60, 90, 180)
-    ups = resting_ups(vertices, np.zeros(3))
+    ups = stable_up_directions(vertices, np.zeros(3))
     assert ups[0] is UP
     np.testing.assert_allclose(np.sort(np.abs(ups[1:5]), axis=1), np.tile([0, 0, 1], (4, 1)), atol=1e-9)
     np.testing.assert_allclose([abs(up[0]) for up in ups[1:5]], [1, 1, 0, 0], atol=1e-9)  # the largest sides
@@ -62,16 +62,16 @@ def test_a_box_falls_over_when_its_centre_passes_the_edge():
 
 def test_what_leans_in_its_file_is_set_on_the_side_that_it_nearly_stands_on(tmp_path):
     vertices, faces = box(60, 90, 180)
-    lean = turn_up(np.array([math.sin(0.1), 0.0, math.cos(0.1)]))
+    lean = rotation_to_up(np.array([math.sin(0.1), 0.0, math.cos(0.1)]))
     mesh = Mesh(vertices @ lean, faces)
-    up = resting_ups(mesh.vertices, np.zeros(3))[0]
-    np.testing.assert_allclose(np.ptp(mesh.resting(up).vertices, axis=0), [60, 90, 180], atol=1e-6)
+    up = stable_up_directions(mesh.vertices, np.zeros(3))[0]
+    np.testing.assert_allclose(np.ptp(mesh.rest_on_table(up).vertices, axis=0), [60, 90, 180], atol=1e-6)
 
 
 def test_a_pencil_on_end_lies_down():
     vertices, faces = box(6, 6, 150)
     mesh = Mesh(vertices, faces)
-    assert np.ptp(mesh.resting(resting_ups(vertices, np.zeros(3))[0]).vertices[:, 2]) == pytest.approx(6)
+    assert np.ptp(mesh.rest_on_table(stable_up_directions(vertices, np.zeros(3))[0]).vertices[:, 2]) == pytest.approx(6)
 
 
 def test_the_centre_of_mass_is_that_of_the_solid_wherever_it_is():
@@ -83,7 +83,7 @@ def test_the_centre_of_mass_is_that_of_the_solid_wherever_it_is():
 
 @pytest.mark.parametrize("up", [[0, 0, 1.0], [0, 0, -1.0], [1.0, 0, 0], [0.6, -0.64, 0.48]])
 def test_the_direction_that_is_to_point_up_does(up):
-    turn = turn_up(np.array(up))
+    turn = rotation_to_up(np.array(up))
     np.testing.assert_allclose(turn @ up, [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(turn) == pytest.approx(1)
@@ -127,7 +127,7 @@ def test_neither_fingers_nor_hand_sweep_over_the_object_or_the_table(tmp_path, s
         back = np.array([[0, side * HAND_MM / 2, SETTINGS.reach_mm] for side in (-1, 1)])
         corners = np.concatenate([tips, back]) @ pose.rotation().T + pose.as_tuple()[:3]
         assert corners[:, 2].min() >= 0
-        withdrawn = z - grasps.back_mm[number]  # from there, everything lies ahead of the fingertips
+        withdrawn = z - grasps.retreat_mm[number]  # from there, everything lies ahead of the fingertips
         assert withdrawn.max() < -SETTINGS.floor_mm + coarse
 
 
@@ -148,9 +148,9 @@ def test_a_box_that_is_too_wide_on_two_axes_is_grasped_when_it_rests_on_edge(tmp
     with rig:
         name = rig.object_ids(1)[0]
         rig.prepare(name, 0)
-        height = rig.world.scene.obj.body.mesh.vertices[:, 2].max()
+        height = rig.sim_state.scene.obj.body.mesh.vertices[:, 2].max()
         assert height > 149
-        attempts = [Attempter(rig, 0, rig.attempt).run(name, number) for number in range(6)]
+        attempts = [AttemptRunner(rig, 0, rig.attempt).run(name, number) for number in range(6)]
     held = [attempt for attempt in attempts if attempt.outcome == "held"]
     assert len(held) >= 3
     assert all(attempt.fit["width_mm"] < 80 for attempt in attempts)
@@ -168,16 +168,16 @@ def test_a_ball_that_is_too_large_has_no_grasp_and_the_reason_says_by_how_much(t
 def test_slopes_that_the_fingers_would_slip_off_are_no_opposite_sides(tmp_path):
     """A cone whose wall goes 15 mm inwards for 10 mm up: the friction cone ends at 3 for 10."""
     _, grasps = grasps_of(tmp_path, *revolved([(46, 0), (1, 30)]))
-    assert (len(grasps), grasps.narrowest_mm) == (0, math.inf)
+    assert (len(grasps), grasps.min_width_mm) == (0, math.inf)
 
 
 def test_what_no_force_of_the_settings_can_lift_is_named_too_heavy(tmp_path):
     stl(tmp_path / "brick.stl", *box(60, 90, 180))
     with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
         rig.prepare(rig.object_ids(1)[0], 0)
-        scene = rig.world.scene
+        scene = rig.sim_state.scene
         lead = dataclasses.replace(scene.obj.material, name="lead", density_kg_m3=11340.0, friction=0.3)
-        rig.world.scene = dataclasses.replace(scene, obj=dataclasses.replace(scene.obj, material=lead))
+        rig.sim_state.scene = dataclasses.replace(scene, obj=dataclasses.replace(scene.obj, material=lead))
         mass = (60 * 90 + 60 * 180 + 90 * 180) * 2 * 3 * 11340e-9  # a shell of 3 mm
         said = rf"too heavy to lift: {mass:.2f} kg of lead need {1.5 * mass * 9.81 / 0.6:.0f} N .* ends at 25 N"
         with pytest.raises(UngraspableError, match=said):
@@ -192,7 +192,7 @@ def attempts(tmp_path_factory):
     folder = tmp_path_factory.mktemp("meshes")
     stl(folder / "box.stl", *box(60, 90, 180))
     with load_rig("sim", seed=2, meshes=str(folder)) as rig:
-        attempter, name, moves = Attempter(rig, 2, rig.attempt), rig.object_ids(1)[0], []
+        attempter, name, moves = AttemptRunner(rig, 2, rig.attempt), rig.object_ids(1)[0], []
         move = rig.arm._move_to
         rig.arm._move_to = lambda pose, speed: moves.append(pose) or move(pose, speed)
         made = []
@@ -232,7 +232,7 @@ def test_touch_sees_what_the_photo_shows(tmp_path):
     with load_rig("sim", seed=0, meshes=str(tmp_path), localisation_mm=[0.0, 0.0]) as rig:
         name = rig.object_ids(1)[0]
         for number in range(8):
-            attempt = Attempter(rig, 0, rig.attempt).run(name, number)
+            attempt = AttemptRunner(rig, 0, rig.attempt).run(name, number)
             if attempt.outcome == "held":
                 width = 60 if attempt.fit["width_mm"] < 75 else 90
                 assert (
@@ -252,7 +252,7 @@ def test_a_mallet_is_taken_from_the_end_of_its_handle_and_not_through_its_head(t
             plan = rig.planner.plan(rig, None, SETTINGS, np.random.default_rng(number))
             across_handle = plan.fit["width_mm"] < 30
             if plan.pose.tilt_rad and across_handle:
-                ways.append(-plan.pose.rotation()[:, 2] @ rig.world.scene.placement.rotation())
+                ways.append(-plan.pose.rotation()[:, 2] @ rig.sim_state.scene.placement.rotation())
     assert len(ways) > 5
     np.testing.assert_allclose(np.array(ways)[:, 1] > 0.95, True)
 
@@ -308,7 +308,7 @@ def test_a_mesh_that_stands_in_its_file_is_not_turned(tmp_path):
     path = stl(tmp_path / "box.stl", vertices, faces)
     with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
         rig.prepare(rig.object_ids(1)[0], 0)
-        body = rig.world.scene.obj.body
+        body = rig.sim_state.scene.obj.body
     np.testing.assert_array_equal(body.mesh.vertices, load_mesh_object(path, 0).body.mesh.vertices)
 
 

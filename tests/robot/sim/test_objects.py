@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from robot.errors import RobotConfigError, UnknownName
+from robot.sim.objects.appearance import Appearance
 from robot.sim.objects.body import SdfBody
 from robot.sim.objects.draw import STROKE_MM, SimObject, draw_object
-from robot.sim.objects.looks import Looks
 from robot.sim.objects.materials import MATERIALS
 from robot.sim.objects.relief import RELIEFS, Relief
 from robot.sim.objects.shapes import SHAPES
@@ -19,7 +19,7 @@ from robot.sim.objects.shapes.revolution import Drum, Revolution
 def solid(radius, height, material):
     relief = Relief("smooth", 0.0, 5.0)
     body = SdfBody(Revolution((Drum(radius, 0, height),), height), relief)
-    return SimObject("x", "cylinder", relief, MATERIALS[material], Looks((1, 1, 1)), body)
+    return SimObject("x", "cylinder", relief, MATERIALS[material], Appearance((1, 1, 1)), body)
 
 
 # Drawing ---------------------------------------------------------------------------------------------------
@@ -28,11 +28,11 @@ def solid(radius, height, material):
 def test_the_same_seed_and_index_give_the_same_object():
     for index in (0, 7, 1234):
         one, two = draw_object(5, index), draw_object(5, index)
-        assert (one.object_id, one.relief, one.material, one.looks) == (
+        assert (one.object_id, one.relief, one.material, one.appearance) == (
             two.object_id,
             two.relief,
             two.material,
-            two.looks,
+            two.appearance,
         )
         points = np.random.default_rng(0).uniform(one.body.lower, one.body.upper, (500, 3))
         np.testing.assert_array_equal(one.body.shape.distance(points), two.body.shape.distance(points))
@@ -103,19 +103,21 @@ def test_nothing_is_baked_until_a_ray_asks_and_pickles_stay_small():
 # No shortcut between paint and touch -----------------------------------------------------------------------
 
 
-def test_looks_and_material_do_not_depend_on_shape_and_relief():
+def test_appearance_and_material_do_not_depend_on_shape_and_relief():
     for index in range(30):
         drawn = [
             draw_object(4, index, family=family, relief=relief)
             for family, relief in (("box", "knurl"), ("ring", "smooth"), (None, None))
         ]
-        assert len({repr(item.looks) for item in drawn}) == 1
+        assert len({repr(item.appearance) for item in drawn}) == 1
         assert len({item.material for item in drawn}) == 1
 
 
-def test_colour_is_not_correlated_with_anything_that_is_felt():
+def test_colour_is_not_correlated_with_tactile_properties():
     objects = [draw_object(6, index) for index in range(1500)]
-    looks = np.array([[*item.looks.colour, item.looks.paint is None, item.looks.label is None] for item in objects])
+    appearance = np.array(
+        [[*item.appearance.colour, item.appearance.paint is None, item.appearance.label is None] for item in objects]
+    )
     felt = np.array(
         [
             [
@@ -129,7 +131,7 @@ def test_colour_is_not_correlated_with_anything_that_is_felt():
             for item in objects
         ]
     )
-    correlation = np.corrcoef(looks.T.astype(float), felt.T)[: looks.shape[1], looks.shape[1] :]
+    correlation = np.corrcoef(appearance.T.astype(float), felt.T)[: appearance.shape[1], appearance.shape[1] :]
     # Of 40 independent pairs of 1500 samples the largest is below 0.11 but once in a thousand worlds.
     assert np.abs(correlation).max() < 0.11
 

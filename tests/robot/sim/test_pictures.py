@@ -38,7 +38,7 @@ def test_a_photo_is_the_one_that_the_rig_takes(tmp_path):
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "p" / row["file_name"]))[..., ::-1], seen)
 
 
-def test_every_press_has_both_fingers_with_the_untouched_gel(tmp_path):
+def test_every_press_has_both_fingers_with_a_no_contact_frame(tmp_path):
     count = collect_pictures("touch", tmp_path / "t", objects=3, seed=5)
     found = rows(tmp_path / "t")
     assert count == len(found) == 6
@@ -54,7 +54,7 @@ def test_every_press_has_both_fingers_with_the_untouched_gel(tmp_path):
 def test_no_camera_looks_where_only_touches_are_wanted():
     rig = load_rig("sim", seed=5)
     rig.press(rig.object_ids(1)[0], 0)
-    assert rig.world.now().passes["view"] == rig.world.now().passes["photo"] == 0
+    assert rig.sim_state.current_scene().passes["view"] == rig.sim_state.current_scene().passes["photo"] == 0
 
 
 def test_what_was_stopped_goes_on_and_ends_the_same(tmp_path):

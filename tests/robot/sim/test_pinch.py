@@ -69,17 +69,17 @@ def pinch(obj, *, yaw=0.0, force_n=12.0, sensors=None, placement=None, opening_m
 def test_flat_sides_end_square_to_the_fingers_but_for_a_trifle():
     block = thing(Slanted())
     for degrees in (-25, -7, 0, 7, 25):
-        turned = pinch(block, yaw=math.radians(degrees)).turned
-        assert math.degrees(turned.yaw_rad) == pytest.approx(degrees, abs=0.6)
+        final_placement = pinch(block, yaw=math.radians(degrees)).final_placement
+        assert math.degrees(final_placement.yaw_rad) == pytest.approx(degrees, abs=0.6)
 
 
 def test_the_jaws_end_at_the_width_less_both_approaches():
     made = pinch(thing(Slanted()))
     approach = made.contact("a").approach_mm + made.contact("b").approach_mm
-    angle = made.turned.yaw_rad
+    angle = made.final_placement.yaw_rad
     pad = SENSORS["a"].field.size_mm[1] * (1 - 1 / 160)
     width = 20 / math.cos(angle) + pad * abs(math.tan(angle))
-    assert made.closed_mm == pytest.approx(width - approach, abs=0.02)
+    assert made.final_opening_mm == pytest.approx(width - approach, abs=0.02)
 
 
 def test_a_finger_meets_what_lies_far_behind_the_first_touch():
@@ -91,13 +91,13 @@ def test_a_finger_meets_what_lies_far_behind_the_first_touch():
 
 def test_a_bare_finger_does_not_give_way():
     made = pinch(thing(Slanted()), sensors={"a": SENSORS["a"]})
-    assert made.closed_mm == pytest.approx(20 - made.contact("a").approach_mm, abs=0.3)
+    assert made.final_opening_mm == pytest.approx(20 - made.contact("a").approach_mm, abs=0.3)
     assert made.passes["contact"] == 1
-    assert made.slip is None
+    assert made.slip_reason is None
 
 
 def test_a_foam_is_not_squeezed_to_nothing():
-    assert pinch(thing(Slanted(), modulus_mpa=0.01), force_n=25.0).closed_mm >= 0.2 * 20
+    assert pinch(thing(Slanted(), modulus_mpa=0.01), force_n=25.0).final_opening_mm >= 0.2 * 20
 
 
 def test_a_stiffer_object_touches_less_of_the_gel():
@@ -114,7 +114,7 @@ def test_friction_must_carry_the_weight_and_a_half(factor, held):
     friction, mass_kg = 0.5, 0.1
     force = factor * Hand().safety * mass_kg * GRAVITY_M_S2 / (2 * friction)
     made = pinch(thing(Slanted(half_y_mm=5.0), friction=friction), force_n=force)
-    assert made.slip == (None if held else "the object is too heavy for the friction")
+    assert made.slip_reason == (None if held else "the object is too heavy for the friction")
 
 
 @pytest.mark.parametrize(("degrees", "held"), [(10, True), (25, False)])
@@ -122,24 +122,24 @@ def test_a_wedge_steeper_than_the_friction_cone_is_squeezed_out(degrees, held):
     """Friction 0.3 holds up to atan(0.3) = 16.7 degrees."""
     wedge = thing(Slanted(math.radians(degrees), math.radians(degrees)), friction=0.3)
     made = pinch(wedge, force_n=4.0)
-    assert (made.slip is None) == held
+    assert (made.slip_reason is None) == held
 
 
 def test_contacts_that_are_far_apart_along_the_fingers_slip():
     """A plate leaning by 50 degrees: a touches it low, b high."""
     made = pinch(thing(Slanted(math.radians(50), math.radians(-50)), friction=0.3))
-    assert made.slip in ("the fingers press past each other", "the side is too steep")
+    assert made.slip_reason in ("the fingers press past each other", "the side is too steep")
 
 
 def test_an_object_beside_the_fingers_is_missed():
     made = pinch(thing(Slanted(half_y_mm=5.0)), y_mm=30.0)
-    assert made.missed == "the object is not between the fingers"
+    assert made.miss_reason == "the object is not between the fingers"
     assert made.passes["contact"] == 0
 
 
 def test_a_finger_lands_on_an_object_that_stands_beside_the_middle():
     made = pinch(thing(Slanted()), placement=Placement(x_mm=50.0))
-    assert made.missed == "a finger comes down on the object"
+    assert made.miss_reason == "a finger comes down on the object"
 
 
 @pytest.mark.parametrize("opening_mm", [0.0, -1.0, 111.0, math.nan])
@@ -155,8 +155,8 @@ def test_a_thing_that_is_grasped_far_from_its_middle_is_turned_where_it_is_grasp
     moved = {}
     for about_grip in (True, False):
         made = dataclasses.replace(pinch(block, y_mm=30.0, yaw=angle), hand=Hand(turns_about_grip=about_grip))
-        assert made.turned.yaw_rad == pytest.approx(angle, abs=math.radians(0.6))
-        moved[about_grip] = made.turned.to_object(np.array([[0.0, 30.0, 0.0]]))[0]
+        assert made.final_placement.yaw_rad == pytest.approx(angle, abs=math.radians(0.6))
+        moved[about_grip] = made.final_placement.to_object(np.array([[0.0, 30.0, 0.0]]))[0]
     np.testing.assert_allclose(moved[True], [0, 30, 0], atol=1e-9)
     assert moved[False][0] == pytest.approx(30 * math.sin(angle), abs=0.4)
 
@@ -180,5 +180,5 @@ def test_a_tilted_pose_points_its_fingers_across_the_closing_direction():
     down = [-Pose(0, 0, 0, 0, tilt).rotation()[:, 2] for tilt in (0.0, math.pi / 2, -math.pi / 2, math.pi / 4)]
     half = math.sqrt(0.5)
     np.testing.assert_allclose(down, [[0, 0, -1], [0, 1, 0], [0, -1, 0], [0, half, -half]], atol=1e-12)
-    turned = Pose(0, 0, 0, math.pi / 2, math.pi / 2).rotation()
-    np.testing.assert_allclose(turned, [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)
+    final_placement = Pose(0, 0, 0, math.pi / 2, math.pi / 2).rotation()
+    np.testing.assert_allclose(final_placement, [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)

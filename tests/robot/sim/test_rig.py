@@ -8,7 +8,7 @@ import pytest
 
 from robot.collection import CollectSettings, collect
 from robot.errors import DeviceError, RobotConfigError, UnknownName
-from robot.grasping.attempt import Attempter
+from robot.grasping.attempt import AttemptRunner
 from robot.grasping.settings import AttemptSettings
 from robot.readings import Pose
 from robot.recording.folder import read_recording
@@ -24,7 +24,7 @@ def rig():
 
 def pinch(rig, z_mm=None, force_n=12.0, yaw=0.3, beside_mm=0.0):
     """Close over the object on the table; returns what the gripper says."""
-    placement, obj = rig.world.scene.placement, rig.world.scene.obj
+    placement, obj = rig.sim_state.scene.placement, rig.sim_state.scene.obj
     z_mm = max(10.0, 0.5 * obj.body.upper[2]) if z_mm is None else z_mm
     rig.gripper.open(STROKE_MM)
     rig.arm.move_to(Pose(placement.x_mm + beside_mm, placement.y_mm, z_mm, yaw), 100.0)
@@ -40,12 +40,12 @@ def lift(rig):
 def test_the_jaws_stop_at_the_objects_width_less_what_the_gels_give(rig):
     rig.prepare(rig.object_ids(1)[0], 0)
     state = pinch(rig)
-    width = 2 * float(rig.world.scene.obj.body.upper[0])
+    width = 2 * float(rig.sim_state.scene.obj.body.upper[0])
     assert state.status == "holding"
     assert width - 8 < state.opening_mm < width + 0.1
 
 
-def test_closing_on_nothing_ends_with_no_part_and_untouched_gels(rig):
+def test_closing_on_nothing_gives_no_part_and_no_contact_frames(rig):
     rig.prepare(rig.object_ids(1)[0], 0)
     before = rig.sensors["a"].read().pixels.astype(float)
     assert pinch(rig, beside_mm=100.0).status == "no_part"
@@ -66,14 +66,14 @@ def test_a_held_object_shows_in_both_gels_before_and_after_the_lift(rig):
     assert np.abs(rig.sensors["a"].read().pixels - before["a"]).mean() < 3
 
 
-def test_a_heavy_slippery_object_is_lost_in_the_lift_and_leaves_an_untouched_gel(rig):
+def test_a_heavy_slippery_object_is_lost_in_the_lift_and_gives_a_no_contact_frame(rig):
     import dataclasses
 
     rig.prepare(rig.object_ids(1)[0], 0)
     before = rig.sensors["a"].read().pixels.astype(float)
-    scene = rig.world.scene
+    scene = rig.sim_state.scene
     slippery = dataclasses.replace(scene.obj.material, friction=0.01)
-    rig.world.scene = dataclasses.replace(scene, obj=dataclasses.replace(scene.obj, material=slippery))
+    rig.sim_state.scene = dataclasses.replace(scene, obj=dataclasses.replace(scene.obj, material=slippery))
     assert pinch(rig).status == "holding"
     assert lift(rig).status == "part_lost"
     assert np.abs(rig.sensors["a"].read().pixels - before).mean() < 3
@@ -96,10 +96,10 @@ def test_an_attempt_depends_on_seed_object_and_number_alone(rig):
 def test_without_depth_no_depth_is_computed(rig):
     rig.prepare(rig.object_ids(1)[0], 0)
     assert rig.camera.read(depth=False).depth_m is None
-    assert rig.world.scene.passes["depth"] == 0
+    assert rig.sim_state.scene.passes["depth"] == 0
 
 
-def test_the_camera_believes_itself_five_to_ten_millimetres_from_where_it_is():
+def test_the_camera_pose_is_off_by_five_to_ten_millimetres():
     for seed in range(20):
         rig = SimRig(seed)
         error = rig.camera.extrinsics[:3, 3] - rig.camera._camera.to_rig[:3, 3]
@@ -117,16 +117,16 @@ def test_one_finger_is_enough():
         rig.prepare(rig.object_ids(1)[0], 0)
         pinch(rig)
         assert rig.sensors["b"].read().pixels.shape == (240, 320, 3)
-        assert rig.world.scene.passes["contact"] == 1
+        assert rig.sim_state.scene.passes["contact"] == 1
 
 
-def test_several_pairs_of_gels_share_the_objects():
+def test_several_pairs_of_gels_alternate_over_the_objects():
     with SimRig(0, gels=3) as rig:
         looks = set()
         for name in rig.object_ids(12):
             rig.prepare(name, 0)
             looks.add(rig.sensors["a"].read().pixels.astype(float).mean().round())
-            scene = rig.world.scene
+            scene = rig.sim_state.scene
             assert scene.sensors["a"] != scene.sensors["b"]
         assert len(looks) == 3
 
@@ -147,7 +147,7 @@ def test_force_and_manner_of_a_grasp_are_set_in_the_file(tmp_path):
     path.write_text('rig = "sim"\n[grasp]\nforce_n = [10.0, 11.0]\n[attempt]\nsettle_s = 0.25\noutputs = ["before"]\n')
     with load_rig(str(path), seed=0) as rig:
         assert (rig.attempt.settle_s, rig.attempt.retries) == (0.25, AttemptSettings.retries)
-        attempter = Attempter(rig, 0, rig.attempt)
+        attempter = AttemptRunner(rig, 0, rig.attempt)
         attempts = [attempter.run(rig.object_ids(1)[0], number) for number in range(6)]
     tried = [attempt for attempt in attempts if attempt.images]
     assert tried
@@ -186,7 +186,7 @@ def test_devices_say_when_nothing_stands_on_the_table(rig):
         rig.camera.read()
 
 
-def test_an_object_of_another_world_is_refused(rig):
+def test_an_object_of_another_seed_raises(rig):
     with pytest.raises(RobotConfigError, match="has no 'bottle"):
         rig.prepare("bottle-ribs-0009-00001", 0)
     with pytest.raises(RobotConfigError, match="has no 'mug'"):

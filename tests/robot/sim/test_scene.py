@@ -65,7 +65,7 @@ def test_the_depth_alone_needs_no_shading():
     assert work(["depth"]) == {"view": 1, "depth": 1}
 
 
-def test_photo_and_depth_share_the_look_at_the_object():
+def test_photo_and_depth_share_one_geometry_pass():
     assert work(["photo", "depth"])["view"] == 1
 
 
@@ -73,13 +73,13 @@ def test_touch_alone_needs_no_camera():
     assert not set(work(["touch_a", "touch_b"])) & {"view", "photo", "depth", "shadow"}
 
 
-def test_an_untouched_gel_needs_no_contact_and_no_grip():
+def test_a_no_contact_frame_needs_no_contact_solve_and_no_grip():
     assert work(["touch_a_before"], grip=None) == {"background": 1}
 
 
 def test_a_sensor_on_one_finger_solves_one_contact():
     done = work(["touch_a", "touch_a_after"], sensors={"a": SENSORS["a"]})
-    assert done["contact"] == done["wall"] == done["feel"] == 1
+    assert done["contact"] == done["wall"] == done["bare_finger"] == 1
 
 
 def test_one_finger_wanted_of_two_solves_one_contact_until_the_lift_asks_for_the_other():
@@ -97,11 +97,11 @@ def test_a_missed_grasp_solves_no_contact():
 def test_a_finger_that_comes_down_on_the_object_is_a_miss_that_says_so():
     narrow = dataclasses.replace(GRIP, opening_mm=0.5 * float(BOTTLE.body.upper[0]))
     pinch = scene([], grip=narrow).pinch
-    assert pinch.missed == pinch.slip == "a finger comes down on the object"
-    assert pinch.closed_mm == 0
+    assert pinch.miss_reason == pinch.slip_reason == "a finger comes down on the object"
+    assert pinch.final_opening_mm == 0
 
 
-def test_a_missed_gel_shows_what_an_untouched_one_shows():
+def test_a_missed_grasp_shows_the_no_contact_frame():
     beside = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
     images = scene(["touch_a", "touch_a_before"], grip=beside).run()
     difference = images["touch_a"].astype(float) - images["touch_a_before"].astype(float)
@@ -137,7 +137,7 @@ def test_both_gels_carry_the_clamping_force():
         assert contact.pressure_mpa.sum() * pixel_area == pytest.approx(12.0, rel=0.02)
 
 
-def test_turning_hand_and_object_together_changes_nothing_that_the_gels_feel():
+def test_turning_hand_and_object_together_changes_no_gel_image():
     turned = math.radians(70)
     c, s = math.cos(turned), math.sin(turned)
     here = scene([], placement=Placement(4.0, -3.0, 0.2), grip=Grip(Pose(2.0, 1.0, MIDDLE_MM, 0.3), 12.0))

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from robot.sim.objects.shapes import SHAPES
-from robot.sim.objects.shapes.base import Cylindrical, arctan2, rounded, smooth_min
 from robot.sim.objects.shapes.extrusion import Extrusion, Polygon, RoundedRectangle
-from robot.sim.objects.shapes.revolution import Ball, Cone, Drum, Revolution, Rod
-from robot.sim.objects.shapes.solids import Brick, Bricks, Brush, Comb, Ring, Superquadric, TwoSided
+from robot.sim.objects.shapes.revolution import Ball, Cone, Drum, Revolution, ThreadedRod
+from robot.sim.objects.shapes.shape import CylindricalChart, arctan2, rounded_corner, smooth_min
+from robot.sim.objects.shapes.solids import Brick, Bricks, Brush, Comb, Ring, Superquadric, TwoSidedChart
 
 
 def draw(family, seed):
@@ -152,7 +152,7 @@ def test_arc_length_comes_back_from_its_point(outline):
 def test_charts_look_at_the_places_that_they_name():
     s, t = np.meshgrid(np.linspace(1, 100, 30), np.linspace(5, 45, 9))
     twisted = Extrusion(Polygon(4, 18, 4), 50, twist_rad=1.0, taper=0.3)
-    for chart in (Cylindrical(20, 50), twisted.chart, TwoSided(30, 50, 8)):
+    for chart in (CylindricalChart(20, 50), twisted.chart, TwoSidedChart(30, 50, 8)):
         origins, directions = chart.rays(s.ravel(), t.ravel())
         np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
         found = chart.locate(*np.ascontiguousarray((origins + 0.5 * directions).T, np.float32))
@@ -161,18 +161,22 @@ def test_charts_look_at_the_places_that_they_name():
 
 def test_maps_run_to_the_right_when_seen_from_the_front():
     x, y, z = np.array([[-3, 3], [-20, -20], [10, 10]], np.float32)
-    for chart in (Cylindrical(20, 50), Extrusion(RoundedRectangle(30, 20, 5), 50).chart, TwoSided(30, 50, 20)):
+    for chart in (
+        CylindricalChart(20, 50),
+        Extrusion(RoundedRectangle(30, 20, 5), 50).chart,
+        TwoSidedChart(30, 50, 20),
+    ):
         left, right = chart.locate(x, y, z)[0]
         assert 5 < right - left < 7
 
 
 def test_a_thread_climbs_one_pitch_in_a_turn():
-    rod = Rod(10, 80, pitch_mm=6, depth_mm=2, starts=1, foot=Drum(15, 0, 8))
+    rod = ThreadedRod(10, 80, pitch_mm=6, depth_mm=2, starts=1, foot=Drum(15, 0, 8))
     around = rod.chart.width_mm
     t = np.linspace(20, 60, 400)
-    height = rod.macro(np.array([0, 0.25 * around]), t)
-    np.testing.assert_allclose(rod.macro(np.array([0.0]), t + 6)[:, 0], height[:, 0], atol=1e-5)
-    np.testing.assert_allclose(rod.macro(np.array([0.0]), t - 1.5)[:, 0], height[:, 1], atol=1e-5)
+    height = rod.wall_pattern(np.array([0, 0.25 * around]), t)
+    np.testing.assert_allclose(rod.wall_pattern(np.array([0.0]), t + 6)[:, 0], height[:, 0], atol=1e-5)
+    np.testing.assert_allclose(rod.wall_pattern(np.array([0.0]), t - 1.5)[:, 0], height[:, 1], atol=1e-5)
     assert height.min() == pytest.approx(-2)
     assert height.max() == pytest.approx(0)
 
@@ -198,4 +202,4 @@ def test_a_smooth_minimum_is_at_most_a_quarter_of_its_blend_below_the_sharp_one(
 
 def test_a_rounded_corner_keeps_its_faces():
     a, b = np.array([3, -8, -1], np.float32), np.array([-9, -2, -1], np.float32)
-    np.testing.assert_allclose(rounded(a, b, 2), [3, -2, np.hypot(1, 1) - 2], atol=1e-6)
+    np.testing.assert_allclose(rounded_corner(a, b, 2), [3, -2, np.hypot(1, 1) - 2], atol=1e-6)

@@ -147,7 +147,7 @@ function found(answer) {
   const rows = [
     ["Index", `${answer.index.generation}, kind ${answer.index.kind}`],
     ["Model", `${answer.index.model.split("/").at(-1)}, trained on: ${answer.index.trained_on}`],
-    ["Judged", `${answer.index.scored} of ${count(answer.index.photos, "photo")} by the full classifier`],
+    ["ShardResult", `${answer.index.scored} of ${count(answer.index.photos, "photo")} by the full classifier`],
     [
       "Time",
       Object.entries(answer.timing_ms)
@@ -169,9 +169,9 @@ function found(answer) {
           `fitted on ${count(references.worth.touches, "touch")} of ${count(references.worth.objects, "object")} ` +
           `(${references.by})`,
       ]);
-    const left = posterior.objects - posterior.judged_objects;
+    const left = posterior.objects - posterior.scored_objects;
     if (left)
-      rows.push(["Not judged", `${count(left, "object")}, which share ${percent(posterior.unjudged_probability)}`]);
+      rows.push(["Not judged", `${count(left, "object")}, which share ${percent(posterior.unscored_probability)}`]);
   }
   return h(
     "details",

@@ -7,7 +7,7 @@ import { count, moment, percent, saidWords } from "./words.js";
 const PAGE = 30;
 const SAID = [
   ["", "Everything"],
-  ["nothing", "Nothing said yet"],
+  ["missing", "Nothing said yet"],
   ["right", "Said to be right"],
   ["object", "Said to be another object"],
   ["none", "Said to be none"],

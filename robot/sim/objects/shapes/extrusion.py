@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.sim.objects.shapes.base import (
+from robot.sim.objects.shapes.shape import (
     Chart,
     Floats,
     Points,
@@ -14,7 +14,7 @@ from robot.sim.objects.shapes.base import (
     bounds,
     length,
     relief_limit,
-    rounded,
+    rounded_corner,
     smooth_min,
 )
 
@@ -36,7 +36,7 @@ class Outline(ABC):
         """Arc length in mm of the curve's point next to (x, y), in [0, length_mm)."""
 
     @abstractmethod
-    def place(self, s: Floats) -> tuple[Points, Points]:
+    def points_at(self, s: Floats) -> tuple[Points, Points]:
         """Points of the curve at arc length s and outward normals there, (N, 2) each."""
 
 
@@ -69,7 +69,9 @@ class RoundedRectangle(Outline):
         return 4 * sum(self._inner) + 2 * np.pi * self.corner_mm
 
     def distance(self, x: Floats, y: Floats) -> Floats:
-        return rounded(np.abs(x) - np.float32(self.half_x_mm), np.abs(y) - np.float32(self.half_y_mm), self.corner_mm)
+        return rounded_corner(
+            np.abs(x) - np.float32(self.half_x_mm), np.abs(y) - np.float32(self.half_y_mm), self.corner_mm
+        )
 
     def locate(self, x: Floats, y: Floats) -> Floats:
         """From the middle of the back (+y) over the left to the front, so that s grows to the right in front."""
@@ -84,7 +86,7 @@ class RoundedRectangle(Outline):
         unrolled: Floats = np.where(x > 0, 4 * quarter - s, s)
         return unrolled
 
-    def place(self, s: Floats) -> tuple[Points, Points]:
+    def points_at(self, s: Floats) -> tuple[Points, Points]:
         a, b = self._inner
         half = self.length_mm / 2
         folded = np.where(s > half, 2 * half - s, s)
@@ -150,7 +152,7 @@ class Polygon(Outline):
         s = face * np.float32(self.length_mm / self.sides) + np.copysign(along, u) + np.float32(self.length_mm / 2)
         return np.where(s < 0, s + np.float32(self.length_mm), s)
 
-    def place(self, s: Floats) -> tuple[Points, Points]:
+    def points_at(self, s: Floats) -> tuple[Points, Points]:
         shifted = s - self.length_mm / 2
         face = np.rint(shifted / (self.length_mm / self.sides))
         u = shifted - face * (self.length_mm / self.sides)
@@ -164,7 +166,7 @@ class Polygon(Outline):
         return core + self.corner_mm * normal, normal
 
 
-class Unrolled(Chart):
+class OutlineChart(Chart):
     """s = arc length of an outline, t = z, in the frame of a shape that may shrink and twist with height."""
 
     def __init__(self, shape: "Extrusion") -> None:
@@ -176,7 +178,7 @@ class Unrolled(Chart):
         return self._shape.outline.locate(u, v), z
 
     def rays(self, s: Floats, t: Floats) -> tuple[Points, Points]:
-        point, normal = self._shape.outline.place(s)
+        point, normal = self._shape.outline.points_at(s)
         start = point * self._shape.scale(t)[:, None] + normal
         turn = self._shape.twist_per_mm * t
         sine, cosine = np.sin(turn), np.cos(turn)
@@ -199,7 +201,7 @@ class Extrusion(Shape):
         reach = outline.radius_mm
         wide = (outline.reach_x_mm, outline.reach_y_mm) if twist_rad == 0 else (reach, reach)
         self.lower, self.upper = bounds(*wide, height_mm)
-        self.chart = Unrolled(self)
+        self.chart = OutlineChart(self)
         self._upright = taper == 0 and twist_rad == 0
         # How much faster than the point itself the straightened one can move.
         self._stretch = np.float32(np.hypot(1, reach * taper / height_mm) + reach * abs(self.twist_per_mm))
@@ -229,6 +231,6 @@ class Extrusion(Shape):
         half = np.float32(self.height_mm / 2)
         ends = np.abs(z - half) - half
         if self._upright:
-            return rounded(side, ends, self.rim_mm)
+            return rounded_corner(side, ends, self.rim_mm)
         # Leaning sides do not meet the ends at right angles: see Cone.
         return -smooth_min(-side / self._stretch, -ends, 2 * self.rim_mm)

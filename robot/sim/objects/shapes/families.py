@@ -5,9 +5,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from robot.sim.objects.shapes.base import Shape
 from robot.sim.objects.shapes.extrusion import Extrusion, Polygon, RoundedRectangle
-from robot.sim.objects.shapes.revolution import Ball, Cone, Drum, Fluted, Revolution, Rod
+from robot.sim.objects.shapes.revolution import Ball, Cone, Drum, FlutedCylinder, Revolution, ThreadedRod
+from robot.sim.objects.shapes.shape import Shape
 from robot.sim.objects.shapes.solids import Blobs, Brick, Bricks, Brush, Comb, Mug, Ring, Superquadric
 
 Rng = np.random.Generator
@@ -158,7 +158,7 @@ def knob(rng: Rng) -> Shape:
     depth = min(6.0, 0.22 * 2 * np.pi * radius / count, 0.25 * radius) * _between(rng, 0.5, 1)
     turns = float(rng.choice([0.0, _between(rng, -1.5, 1.5)]))
     drum = Drum(radius, 0, height, rim_mm=_between(rng, 1, 4))
-    return Fluted(drum, count=count, depth_mm=depth, turns=turns, sharpness=_between(rng, 0.6, 2))
+    return FlutedCylinder(drum, count=count, depth_mm=depth, turns=turns, sharpness=_between(rng, 0.6, 2))
 
 
 def screw(rng: Rng) -> Shape:
@@ -166,7 +166,7 @@ def screw(rng: Rng) -> Shape:
     radius, height, pitch = _between(rng, 6, 20), _between(rng, 50, 150), _skewed(rng, 2.5, 10)
     depth = min(0.45 * pitch, 0.3 * radius, 4.5)
     foot = Drum(radius * _between(rng, 1.3, 2), 0, _between(rng, 6, 14), rim_mm=1.2)
-    return Rod(radius, height, pitch_mm=pitch, depth_mm=depth, starts=int(rng.integers(1, 4)), foot=foot)
+    return ThreadedRod(radius, height, pitch_mm=pitch, depth_mm=depth, starts=int(rng.integers(1, 4)), foot=foot)
 
 
 def egg(rng: Rng) -> Shape:

@@ -5,7 +5,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.sim.objects.shapes.base import Cylindrical, Floats, Shape, bounds, length, relief_limit, rounded, smooth_min
+from robot.sim.objects.shapes.shape import (
+    CylindricalChart,
+    Floats,
+    Shape,
+    bounds,
+    length,
+    relief_limit,
+    rounded_corner,
+    smooth_min,
+)
 
 
 class Profile(ABC):
@@ -30,7 +39,9 @@ class Drum(Profile):
 
     def distance(self, r: Floats, z: Floats) -> Floats:
         middle, half = (self.top_mm + self.bottom_mm) / 2, (self.top_mm - self.bottom_mm) / 2
-        return rounded(r - np.float32(self.radius_mm), np.abs(z - np.float32(middle)) - np.float32(half), self.rim_mm)
+        return rounded_corner(
+            r - np.float32(self.radius_mm), np.abs(z - np.float32(middle)) - np.float32(half), self.rim_mm
+        )
 
 
 @dataclass(frozen=True)
@@ -87,7 +98,7 @@ class Revolution(Shape):
         # A blend may bulge by a quarter of its width.
         self.radius_mm = max(part.radius_mm for part in parts) + blend_mm / 4 * (len(parts) > 1)
         self.lower, self.upper = bounds(self.radius_mm, self.radius_mm, height_mm)
-        self.chart = Cylindrical(max(part.radius_mm for part in parts), height_mm, self.radius_mm + 1)
+        self.chart = CylindricalChart(max(part.radius_mm for part in parts), height_mm, self.radius_mm + 1)
         self.relief_limit_mm = relief_limit(2 * self.radius_mm)
         if hollow is not None:
             self.relief_limit_mm = min(self.relief_limit_mm, (self.radius_mm - hollow.radius_mm) / 2)
@@ -117,18 +128,18 @@ class Revolution(Shape):
         return weight
 
 
-class Rod(Revolution):
+class ThreadedRod(Revolution):
     """A cylinder with a screw thread cut by `depth_mm` (profile: a trapezoid), and a plain foot of `foot_mm`."""
 
     def __init__(
         self, radius_mm: float, height_mm: float, *, pitch_mm: float, depth_mm: float, starts: int, foot: Profile
     ) -> None:
         super().__init__((Drum(radius_mm, 0, height_mm, rim_mm=min(1.5, radius_mm / 4)), foot), height_mm, blend_mm=1)
-        self.chart = Cylindrical(radius_mm, height_mm, self.radius_mm + 1)
+        self.chart = CylindricalChart(radius_mm, height_mm, self.radius_mm + 1)
         self.pitch_mm, self.depth_mm, self.starts, self.foot = pitch_mm, depth_mm, starts, foot
         self.relief_limit_mm = min(0.25, relief_limit(2 * radius_mm))
 
-    def macro(self, s: Floats, t: Floats) -> Floats | None:
+    def wall_pattern(self, s: Floats, t: Floats) -> Floats | None:
         phase = t[:, None] / self.pitch_mm - self.starts * s[None, :] / self.chart.width_mm
         wave = np.abs(2 * (phase - np.floor(phase)) - 1).astype(np.float32)
         # Flanks of 30 degrees to the radius need half a pitch for the depth of an ISO thread; crests are flat.
@@ -136,7 +147,7 @@ class Rod(Revolution):
         return np.asarray(-np.float32(self.depth_mm) * free[:, None] * (1 - np.clip(wave * 1.4 - 0.2, 0, 1)))
 
 
-class Fluted(Revolution):
+class FlutedCylinder(Revolution):
     """A cylinder with `count` lobes of `depth_mm` round it, straight or twisted: a knob, a column, a grip."""
 
     def __init__(self, drum: Drum, *, count: int, depth_mm: float, turns: float = 0.0, sharpness: float = 1.0) -> None:
@@ -144,7 +155,7 @@ class Fluted(Revolution):
         self.count, self.depth_mm, self.turns, self.sharpness = count, depth_mm, turns, sharpness
         self.relief_limit_mm = min(self.relief_limit_mm, 1.0)
 
-    def macro(self, s: Floats, t: Floats) -> Floats | None:
+    def wall_pattern(self, s: Floats, t: Floats) -> Floats | None:
         phase = self.count * s[None, :] / self.chart.width_mm + self.turns * t[:, None] / self.height_mm
         wave = np.abs(np.sin(np.pi * phase)) ** self.sharpness
         return np.asarray(-self.depth_mm * (1 - wave), np.float32)

@@ -4,22 +4,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robot.sim.objects.shapes.base import (
+from robot.sim.objects.shapes.revolution import Drum, Revolution
+from robot.sim.objects.shapes.shape import (
     Chart,
-    Cylindrical,
+    CylindricalChart,
     Floats,
     Points,
     Shape,
     bounds,
     length,
     relief_limit,
-    rounded,
+    rounded_corner,
     smooth_min,
 )
-from robot.sim.objects.shapes.revolution import Drum, Revolution
 
 
-class TwoSided(Chart):
+class TwoSidedChart(Chart):
     """The front and the back of something flat: s = x across the front, then back across the back; t = z."""
 
     def __init__(self, half_x_mm: float, height_mm: float, reach_mm: float) -> None:
@@ -51,7 +51,7 @@ class Superquadric(Shape):
         self.half_mm, self.round_power, self.upright_power = half_mm, round_power, upright_power
         self.middle_mm = 0.93 * half_mm[2]
         self.lower, self.upper = bounds(half_mm[0], half_mm[1], half_mm[2] + self.middle_mm)
-        self.chart = Cylindrical(float(np.sqrt(half_mm[0] * half_mm[1])), self.upper[2], max(half_mm) + 1)
+        self.chart = CylindricalChart(float(np.sqrt(half_mm[0] * half_mm[1])), self.upper[2], max(half_mm) + 1)
         self.relief_limit_mm = relief_limit(2 * min(half_mm[:2]))
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
@@ -84,7 +84,7 @@ class Blobs(Shape):
         low = (array[:, :3] - array[:, 3:]).min(axis=0) - bulge
         self.lower, self.upper = np.array([*low[:2], 0.0]), high
         reach = float(np.hypot(*np.maximum(np.abs(low), np.abs(high))[:2]))
-        self.chart = Cylindrical(float(np.mean(high[:2] - low[:2])) / 2, float(high[2]), reach + 1)
+        self.chart = CylindricalChart(float(np.mean(high[:2] - low[:2])) / 2, float(high[2]), reach + 1)
         self.relief_limit_mm = relief_limit(float((high - low)[:2].min()), 2.0)
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
@@ -106,7 +106,7 @@ class Ring(Shape):
         self.middle_mm = ring_mm + 0.85 * tube_mm + stretch_mm / 2
         top = self.middle_mm + ring_mm + tube_mm + stretch_mm / 2
         self.lower, self.upper = bounds(ring_mm + tube_mm, tube_mm, top)
-        self.chart = TwoSided(ring_mm + tube_mm, top, tube_mm)
+        self.chart = TwoSidedChart(ring_mm + tube_mm, top, tube_mm)
         self.relief_limit_mm = relief_limit(2 * tube_mm)
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
@@ -125,7 +125,7 @@ class Mug(Revolution):
         super().__init__((outside,), outside.top_mm, hollow=inside)
         self.ear_mm = ear_mm
         self.upper = self.upper + np.array([sum(ear_mm), 0, 0])
-        self.chart = Cylindrical(outside.radius_mm, outside.top_mm, self.upper[0] + 1)
+        self.chart = CylindricalChart(outside.radius_mm, outside.top_mm, self.upper[0] + 1)
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
         assert self.hollow is not None
@@ -151,7 +151,9 @@ class Brick:
         p = np.abs(x - np.float32(self.middle_mm[0])) - np.float32(self.half_mm[0])
         q = np.abs(y - np.float32(self.middle_mm[1])) - np.float32(self.half_mm[1])
         rise = np.abs(z - np.float32((self.top_mm + self.bottom_mm) / 2))
-        return rounded(rounded(p, q, self.rim_mm), rise - np.float32((self.top_mm - self.bottom_mm) / 2), self.rim_mm)
+        return rounded_corner(
+            rounded_corner(p, q, self.rim_mm), rise - np.float32((self.top_mm - self.bottom_mm) / 2), self.rim_mm
+        )
 
 
 class Bricks(Shape):
@@ -164,7 +166,7 @@ class Bricks(Shape):
         top = max(bar.top_mm for bar in bars)
         self.lower, self.upper = np.array([*low, 0.0]), np.array([*high, top])
         half_x, half_y = np.maximum(np.abs(low), np.abs(high))
-        self.chart = TwoSided(float(half_x), top, float(half_y))
+        self.chart = TwoSidedChart(float(half_x), top, float(half_y))
         self.relief_limit_mm = relief_limit(float((high - low).min()), 3 * float(half.min()) / 4)
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
@@ -183,7 +185,7 @@ class Comb(Shape):
     def __init__(self, slab: Brick, *, pitch_mm: float, gap_mm: float, slot_mm: float, lying: bool) -> None:
         self.slab, self.pitch_mm, self.gap_mm, self.slot_mm, self.lying = slab, pitch_mm, gap_mm, slot_mm, lying
         self.lower, self.upper = bounds(*slab.half_mm, slab.top_mm)
-        self.chart = TwoSided(slab.half_mm[0], slab.top_mm, slab.half_mm[1])
+        self.chart = TwoSidedChart(slab.half_mm[0], slab.top_mm, slab.half_mm[1])
         self.relief_limit_mm = min(relief_limit(2 * slab.half_mm[1]), (pitch_mm - gap_mm) / 8)
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
@@ -203,7 +205,7 @@ class Brush(Shape):
     def __init__(self, block: Brick, *, bristle_mm: float, pitch_mm: float, top_mm: float) -> None:
         self.block, self.bristle_mm, self.pitch_mm, self.top_mm = block, bristle_mm, pitch_mm, top_mm
         self.lower, self.upper = bounds(*block.half_mm, top_mm)
-        self.chart = TwoSided(block.half_mm[0], top_mm, block.half_mm[1])
+        self.chart = TwoSidedChart(block.half_mm[0], top_mm, block.half_mm[1])
         self.relief_limit_mm = min(relief_limit(2 * block.half_mm[1]), bristle_mm / 4)
 
     def _fold(self, x: Floats, half: float) -> Floats:
@@ -222,5 +224,5 @@ class Brush(Shape):
         middle = np.float32((self.top_mm + self.block.top_mm) / 2)
         rise = np.abs(z - middle) - np.float32((self.top_mm - self.block.top_mm) / 2 + self.block.rim_mm)
         rise = np.maximum(rise, z - np.float32(self.top_mm))
-        bristles = rounded(across - np.float32(self.bristle_mm), rise, 0.5 * self.bristle_mm)
+        bristles = rounded_corner(across - np.float32(self.bristle_mm), rise, 0.5 * self.bristle_mm)
         return np.minimum(self.block.distance(x, y, z), bristles)

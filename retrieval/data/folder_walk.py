@@ -1,0 +1,84 @@
+"""The files of a folder and of those below it, by name; links are followed without going round in a circle."""
+
+import os
+from dataclasses import dataclass, field
+from operator import attrgetter
+from pathlib import Path
+
+from indexes.store.stat_cache import FolderCache
+from retrieval.data.text import is_utf8
+from retrieval.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class SkippedPhoto:
+    """A file or folder that could not be used, and why."""
+
+    path: str
+    reason: str
+
+
+@dataclass
+class FolderWalk:
+    """Files below the folder `root` as relative posix paths, and what was passed over. seen: what earlier builds saw in
+    its folders; followed: where links led.
+    """
+
+    root: Path
+    folder_cache: FolderCache | None = None
+    names: list[str] = field(default_factory=list)
+    skipped: list[SkippedPhoto] = field(default_factory=list)
+    link_targets: set[Path] = field(default_factory=set)
+
+    def walk(self, folder: str, prefix: str) -> None:
+        """Look through a folder, whose names get this prefix.
+
+        A link to a folder is followed when it leads out of the catalogue, and each target once: no loop can hang.
+        """
+        status = None if self.folder_cache is None else self.folder_cache.status(folder)  # before what is in it
+        if self.folder_cache is not None and (known := self.folder_cache.names(prefix, status)) is not None:
+            self.names += [prefix + name for name in known]
+            return
+        try:
+            entries = sorted(os.scandir(folder), key=attrgetter("name"))
+        except OSError as error:
+            raise DatasetError(f"cannot list the catalogue folder {folder}: {error.strerror}") from error
+        first, plain = len(self.names), True
+        for entry in entries:
+            name = entry.name
+            if name.startswith("."):
+                continue
+            path = prefix + name
+            if not path.isascii() and not is_utf8(path):
+                self.skipped.append(skipped_non_utf8(path))
+                plain = False
+                continue
+            try:
+                is_folder = entry.is_dir()
+            except OSError:  # a link that leads to itself
+                is_folder = False
+            plain &= not is_folder and not entry.is_symlink()
+            if not is_folder:
+                self.names.append(path)
+            elif entry.is_symlink():
+                self._follow(entry.path, path)
+            else:
+                self.walk(entry.path, path + "/")
+        if self.folder_cache is not None and plain:
+            self.folder_cache.note(prefix, status, [path[len(prefix) :] for path in self.names[first:]])
+
+    def _follow(self, link: str, path: str) -> None:
+        target = Path(os.path.realpath(link))
+        if target.is_relative_to(self.root) or self.root.is_relative_to(target):
+            self.skipped.append(SkippedPhoto(path, "a link into or around the catalogue itself is not followed"))
+        elif target in self.link_targets:
+            self.skipped.append(SkippedPhoto(path, f"a link to {target}, which another link has listed already"))
+        else:
+            self.link_targets.add(target)
+            self.walk(link, path + "/")
+
+
+def skipped_non_utf8(path: str) -> SkippedPhoto:
+    """A file whose name cannot be shown."""
+    named = path.encode(errors="surrogateescape").decode(errors="backslashreplace")
+    return SkippedPhoto(named, "the name is not valid UTF-8; rename it")

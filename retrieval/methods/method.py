@@ -1,0 +1,194 @@
+"""What every method owes the harness; a method only writes `_fit`, `_encode_touch`, `_encode_photo` and `_score`."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from retrieval.errors import BadInput, NumericalError
+from retrieval.model.config import Config
+
+if TYPE_CHECKING:
+    from retrieval.training.features import Features
+
+Array = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class MethodSettings:
+    """What a method is made with.
+
+    folder: where it may keep files, such as a checkpoint; None: it keeps nothing. quiet: no progress on stderr.
+    fit_on_validation: a method that can (`cca_towers`, `cca`, `cca_pca`) learns from validation objects, too, once its settings
+    are chosen; what is calibrated on their scores is then too sure. kind_of: the kind of each object, where the
+    recording names it: half of each kind is then held out together to choose settings.
+
+    >>> retrieval.MethodSettings(retrieval.load_config("tiny")).seed
+    0
+    """
+
+    config: Config
+    seed: int = 0
+    folder: Path | None = None
+    quiet: bool = True
+    fit_on_validation: bool = False
+    kind_of: Mapping[str, str] | None = None
+
+
+class Method(ABC):
+    """A way to say how well a touch and a photo go together: a higher score is a better match.
+
+    Scores are ranked, equal ones by expected rank; only calibration gives them a unit. `best_params` says after `fit` what
+    was chosen on validation objects, in JSON types. A method that comes fitted (from a checkpoint) sets `fitted`.
+
+    >>> import numpy as np
+    >>> class Brightness(retrieval.Method):
+    ...     is_seeded = False
+    ...     def _fit(self, train, validation): ...
+    ...     def _encode_touch(self, touch):
+    ...         return touch.mean((1, 2))[:, None]
+    ...     def _encode_photo(self, photo):
+    ...         return photo.mean(1)[:, None]
+    ...     def _score(self, touch_encodings, photo_encodings):
+    ...         return -abs(touch_encodings - photo_encodings.T)
+    >>> method = Brightness(retrieval.MethodSettings(retrieval.load_config("tiny")))
+    >>> method.fitted
+    False
+    """
+
+    is_seeded: ClassVar[bool] = True
+    """Whether fits differ by seed; where they do not, one is enough."""
+
+    def __init__(self, settings: MethodSettings) -> None:
+        self.settings = settings
+        self.best_params: dict[str, Any] = {}
+        self.fitted = False
+        self._shapes: tuple[tuple[int, ...], tuple[int, ...]] | None = None
+
+    def fit(self, train: "Features", validation: "Features") -> None:
+        """Learn from the grasps of training objects; choose whatever is to be chosen on those of validation objects.
+
+        Raises BadInput unless both hold at least two objects and share none, NumericalError for features that are
+        not finite.
+        """
+        _require_fit(train, validation)
+        self._fit(train, validation)
+        self._shapes = train.touch.shape[1:], train.photo.shape[1:]
+        self.fitted = True
+
+    def encode_touch(self, touch: NDArray[Any]) -> Array:
+        """Codes (T, ...) of touch features (T, fingers, F). Raises BadInput for another shape than fitted on."""
+        self._require_fitted()
+        touch = _checked("touch features", touch, 3, self._shapes and self._shapes[0])
+        return _checked_encodings(self._encode_touch(touch), len(touch))
+
+    def encode_photo(self, photo: NDArray[Any]) -> Array:
+        """Codes (N, ...) of photo features (N, F). Raises BadInput for another shape than fitted on."""
+        self._require_fitted()
+        photo = _checked("photo features", photo, 2, self._shapes and self._shapes[1])
+        return _checked_encodings(self._encode_photo(photo), len(photo))
+
+    def score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
+        """Scores (T, N) of every touch with every photo. Raises NumericalError for one that is not finite."""
+        self._require_fitted()
+        return _checked_scores(
+            self._score(touch_encodings, photo_encodings), len(touch_encodings), len(photo_encodings)
+        )
+
+    def score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
+        """Scores (S, N) of sets of grasps of one object with every photo.
+
+        sets (S, G): rows of `touch_encodings`. Unless a method fuses otherwise, the sum over the set of `score`: log-odds
+        of grasps that are independent given the object add.
+        """
+        self._require_fitted()
+        if sets.ndim != 2 or sets.shape[1] < 1 or not np.issubdtype(sets.dtype, np.integer):
+            raise BadInput(
+                f"sets of grasps must be whole numbers of shape (S, G), G >= 1; got {sets.dtype} {sets.shape}"
+            )
+        if sets.size and (sets.min() < 0 or sets.max() >= len(touch_encodings)):
+            raise BadInput(
+                f"sets must name rows of the {len(touch_encodings)} touch codes; got {sets.min()}..{sets.max()}"
+            )
+        return _checked_scores(
+            self._score_sets(touch_encodings, photo_encodings, sets), len(sets), len(photo_encodings)
+        )
+
+    @abstractmethod
+    def _fit(self, train: "Features", validation: "Features") -> None: ...
+
+    @abstractmethod
+    def _encode_touch(self, touch: Array) -> Array: ...
+
+    @abstractmethod
+    def _encode_photo(self, photo: Array) -> Array: ...
+
+    @abstractmethod
+    def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array: ...
+
+    def _score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
+        used, place = np.unique(sets, return_inverse=True)
+        return sum_over_sets(self._score(touch_encodings[used], photo_encodings), place.reshape(sets.shape))
+
+    def _require_fitted(self) -> None:
+        if not self.fitted:
+            raise BadInput(f"a method must be fitted before it is used; call fit on this {type(self).__name__} first")
+
+
+def sum_over_sets(scores: Array, sets: NDArray[np.int64]) -> Array:
+    """(S, N) sums over sets (S, G) of rows of scores (T, N); in float64, for the order of a set must not decide
+    near-ties.
+    """
+    total = np.zeros((len(sets), scores.shape[1]))
+    for rows in sets.T:
+        total += scores[rows]
+    return total.astype(np.float32)
+
+
+def _require_fit(train: "Features", validation: "Features") -> None:
+    for name, part in (("training", train), ("validation", validation)):
+        count = len(set(part.object_ids))
+        if count < 2:
+            raise BadInput(f"a method is fitted on at least 2 {name} objects; got {count}; record more objects")
+        _checked(f"touch features of {name} objects", part.touch, 3, train.touch.shape[1:])
+        _checked(f"photo features of {name} objects", part.photo, 2, train.photo.shape[1:])
+    if shared := set(train.object_ids) & set(validation.object_ids):
+        raise BadInput(
+            f"training and validation objects must be apart; {min(shared)!r} is in both; split the grasps by object"
+        )
+
+
+def _checked(what: str, array: NDArray[Any], ndim: int, shape: tuple[int, ...] | None) -> Array:
+    array = np.asarray(array, dtype=np.float32)
+    if array.ndim != ndim or (shape is not None and array.shape[1:] != shape):
+        wanted = f"of shape (B, {', '.join(map(str, shape))})" if shape is not None else f"with {ndim} axes"
+        raise BadInput(f"{what} must be an array {wanted}, as fitted on; got {array.shape}")
+    _require_finite(what, array)
+    return array
+
+
+def _checked_encodings(encodings: Array, count: int) -> Array:
+    encodings = np.asarray(encodings, dtype=np.float32)
+    if len(encodings) != count:
+        raise BadInput(f"a method must give one code for each item; got {len(encodings)} for {count}")
+    _require_finite("codes", encodings)
+    return encodings
+
+
+def _checked_scores(scores: Array, touches: int, photos: int) -> Array:
+    scores = np.asarray(scores, dtype=np.float32)
+    if scores.shape != (touches, photos):
+        raise BadInput(f"scores must be of shape {(touches, photos)}, touches by photos; got {scores.shape}")
+    _require_finite("scores", scores)
+    return scores
+
+
+def _require_finite(what: str, array: Array) -> None:
+    """Sorting would rank a NaN first."""
+    if not np.isfinite(array).all():
+        place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise NumericalError(f"{what} must be finite; got {array[place]} at {place}")

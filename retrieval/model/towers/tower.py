@@ -1,0 +1,136 @@
+"""What every tower owes its callers; a backbone only writes `_encode`."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from retrieval.errors import BadInput, CheckpointError, NumericalError
+from retrieval.model.towers.weights import State, download
+
+IMAGENET_MEAN = (0.485, 0.456, 0.406)
+IMAGENET_STD = (0.229, 0.224, 0.225)
+
+
+class Tower(nn.Module):
+    """Encoder of one modality: RGB images to feature vectors.
+
+    A subclass takes an output (`retrieval.model.towers.OUTPUTS`), sets `feature_count`, the length of a vector, and
+    writes `_encode`.
+
+    >>> import torch
+    >>> class Average(retrieval.Tower):
+    ...     def __init__(self, output):
+    ...         super().__init__(output)
+    ...         self.feature_count = 8
+    ...         self.linear = torch.nn.Linear(3, 8)
+    ...     def _encode(self, images):
+    ...         return self.linear(images.mean((2, 3)))
+    >>> Average("pooled")(torch.rand(2, 3, 64, 64)).shape
+    torch.Size([2, 8])
+    """
+
+    feature_count: int
+    optional_prefixes: ClassVar[tuple[str, ...]] = ()
+    """What the names of weights begin with that published checkpoints hold and some outputs of the tower do not need,
+    the 1000-way layer first."""
+    can_fold_batch_norm: ClassVar[bool] = True
+    """Whether a batch normalisation that is registered right after a convolution takes that one's output, so that the
+    two can be made one for inference."""
+    url: ClassVar[str | None] = None
+    """Where the published ImageNet weights are."""
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self, output: str = "pooled") -> None:
+        """Make what every tower has; a subclass makes its layers, for this output of
+        `retrieval.model.towers.OUTPUTS`.
+        """
+        super().__init__()
+        self.output = output
+        # Not persistent: the state dict holds exactly the keys that ImageNet checkpoints hold.
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Encode images (B, 3, H, W), float32 RGB within -1..1 (0..1 unless differences), to (B, feature_count).
+
+        Raises BadInput for another shape, type or range, NumericalError for a NaN or infinite pixel.
+        """
+        if images.ndim != 4 or images.shape[1] != 3:
+            raise BadInput(f"a tower takes RGB images shaped (B, 3, H, W); got {tuple(images.shape)}")
+        if images.dtype != torch.float32:
+            raise BadInput(f"a tower takes float32 images in 0..1; got {images.dtype}; divide 8-bit images by 255")
+        if images.shape[0] == 0:
+            raise BadInput("a tower takes at least one image; got an empty batch")
+        low, high = (float(bound) for bound in torch.aminmax(images))
+        if not (abs(low) < float("inf") and abs(high) < float("inf")):
+            raise NumericalError("a tower takes finite pixels; got a NaN or infinite one")
+        if max(-low, high) > 1.0 + 1e-4:  # averages of pixels may round past 1
+            raise BadInput(f"a tower takes pixels within -1..1; got {low:.3g}..{high:.3g}; divide 8-bit images by 255")
+        return self._encode((images - self.mean) / self.std)
+
+    def _encode(self, images: Tensor) -> Tensor:
+        """Encode normalised images (B, 3, H, W) to (B, feature_count)."""
+        raise NotImplementedError
+
+    def published_weights(self) -> State:
+        """Return the weights that are published for this architecture. Raises CheckpointError where there are none."""
+        if self.url is None:
+            raise CheckpointError(f"no weights are published for {type(self).__name__}; give a file, or `random`")
+        return download(self.url)
+
+    @staticmethod
+    def rename_state(state: State) -> State:
+        """Map the keys of a known older layout to today's; the identity unless a backbone has one."""
+        return state
+
+
+class TowerFamily(Tower, ABC):
+    """A tower around any of the models that another library builds."""
+
+    can_fold_batch_norm = False
+
+    def __init__(self, output: str, model: str, architecture: Mapping[str, Any]) -> None:
+        """Build a model.
+
+        Args:
+            output: As of any tower.
+            model: What stands behind "family:".
+            architecture: What `architecture(model)` returned when the training was configured.
+        """
+        super().__init__(output)
+        self.model_name = model
+
+    @classmethod
+    @abstractmethod
+    def architecture(cls, model: str) -> dict[str, Any]:
+        """Return plain JSON from which a model can be built again, without its files. Raises ConfigError for an unknown
+        one.
+        """
+
+
+def without_autocast(images: Tensor) -> AbstractContextManager[Any]:
+    """What the first layers are computed in: float32 also where the others multiply in bfloat16.
+
+    Gels differ by a few grey levels, which is what bfloat16 rounds away from an image: the gradient of MobileNetV2 in
+    bfloat16 then has a cosine of 0.75 with that in float32, and of 0.96 with the layers up to stride 4 in float32.
+    """
+    if torch.is_autocast_enabled(images.device.type):
+        return torch.autocast(images.device.type, enabled=False)
+    return nullcontext()
+
+
+def stage_statistics(maps: Iterable[Tensor]) -> Tensor:
+    """Mean, standard deviation and maximum over each of several maps (B, C, H, W), side by side: (B, 3 * all C).
+
+    The mean alone thins out what covers a small part of an image; deviation and maximum keep it.
+    """
+    parts = []
+    for x in maps:
+        # Not the root of the variance, whose slope is infinite where a map is constant; that of `std` is 0 there.
+        parts += [x.mean((2, 3)), x.std((2, 3), correction=0), x.amax((2, 3))]
+    return torch.cat(parts, dim=1)

@@ -1,0 +1,329 @@
+"""Build a sharded index: several index folders over one catalogue, which are switched together.
+
+The photos of an object go to one shard, and each shard is built as an ordinary index. Codes are reused from the shard,
+from the shards of another division, and from an interrupted build. The cluster's manifest is written when every shard
+is on the disk: a build that is killed leaves the cluster as it was.
+
+A sharded index in an object store is built in a local folder, and each shard is uploaded as soon as it is complete
+(`retrieval.search.sharding.object_store`).
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from _touch_retrieval.files import remove_folder
+from indexes.errors import CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
+from indexes.kinds.vector_index import VectorIndex
+from indexes.store.folder import IndexStore
+from indexes.store.generation import Generation
+from indexes.store.locking import WriterLock
+from indexes.store.sharded import (
+    MAX_SHARDS,
+    SHARD_FOLDER,
+    ShardedManifest,
+    ShardEntry,
+    generation_number,
+    read_sharded_manifest,
+    shard_entry,
+    shard_folder,
+    shard_number,
+    sharded_generation_name,
+    write_sharded_manifest,
+)
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable
+from retrieval.data.catalogue_touches import CatalogueTouch
+from retrieval.data.folder_walk import SkippedPhoto
+from retrieval.data.naming import Naming, count_summary, naming_warnings
+from retrieval.data.sources import list_photos
+from retrieval.data.storage import is_url
+from retrieval.errors import BadInput, NoReadablePhoto, TooManyUnreadable
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.checkpoint_info import fingerprint
+from retrieval.model.reference_calibration import REFERENCE_CALIBRATION, REFERENCE_ROWS
+from retrieval.search.build.build_index import BuildOptions, build_listed, naming_by
+from retrieval.search.build.build_report import BuildReport
+from retrieval.search.build.embed import no_photo
+from retrieval.search.build.operating import SearchRequirements
+from retrieval.search.sharding.object_store import RemoteShardedIndex, generation_names, local_folder
+from retrieval.version import __version__
+
+MAX_UNREADABLE = 0.05
+"""Fraction of a catalogue's photos that may be unreadable, by default."""
+_KEEP_ALL = 10**6
+ADDITIVE_FIELDS = ("photos", "embedded", "reused", "renamed", "resumed", "re_embedded", "removed", "unread", "seconds")
+"""Fields of a report that add up over the shards."""
+
+
+@dataclass(frozen=True)
+class ShardJob:
+    """One shard to build, as it is sent to the process that builds it.
+
+    Args:
+        cluster: Folder or URL of the sharded index.
+        folder: Folder of the shard in it.
+        catalogue: The shard's photos and touches.
+        model: Path of the checkpoint.
+        options: As for an index folder.
+        donors: Shards of another division, whose codes may be reused.
+    """
+
+    cluster: str | Path
+    folder: str
+    catalogue: Catalogue
+    model: Path
+    options: BuildOptions
+    donors: Sequence[ShardEntry]
+
+
+@dataclass(frozen=True)
+class ShardBuild:
+    """Result of a `ShardJob`.
+
+    Args:
+        folder: Folder of the shard.
+        entry: Its entry in the manifest; None if none of its photos can be read.
+        report: Its report; None likewise.
+        counts: Number of photos of each object.
+        skipped: Photos that could not be read.
+    """
+
+    folder: str
+    entry: ShardEntry | None
+    report: BuildReport | None
+    counts: list[int]
+    skipped: list[SkippedPhoto]
+
+
+ShardRunner = Callable[[Sequence[ShardJob], Checkpoint], Iterable[ShardBuild]]
+"""Builds shards, in any order."""
+
+
+def build_sharded(
+    folder: str | Path,
+    checkpoint: Checkpoint,
+    out: str | Path,
+    shards: int,
+    *,
+    objects_from: str | None = None,
+    kind: str | type[VectorIndex] | None = None,
+    min_recall: float | None = None,
+    max_ms: float | None = None,
+    max_unreadable: float = MAX_UNREADABLE,
+    verify: bool = False,
+    quiet: bool = False,
+    run: ShardRunner | None = None,
+) -> BuildReport:
+    """Write the next generation of a sharded index of a catalogue.
+
+    Args:
+        folder: The catalogue, as `build_index` takes it, and so the other arguments that are not listed here.
+        checkpoint: The model.
+        out: Folder or URL of the sharded index.
+        shards: Number of shards.
+        max_unreadable: Largest fraction of photos that may be unreadable.
+        run: Builds the shards; None: this process, one after another.
+
+    Returns:
+        What was built, in all shards together.
+
+    Raises:
+        BadInput: The number of shards is out of range, or `out` is an index folder.
+        TooManyUnreadable: More photos than `max_unreadable` cannot be read.
+        StorageError: The storage behind the URL refuses again and again, or another build finished first.
+    """
+    if not 1 <= shards <= MAX_SHARDS:
+        raise BadInput(f"shards must be from 1 to {MAX_SHARDS}; got {shards}")
+    if not 0 <= max_unreadable <= 1:
+        raise BadInput(f"the share of bad photos must be from 0 to 1; got {max_unreadable}")
+    stored = RemoteShardedIndex(str(out)) if is_url(out) else None
+    own = Path(out) if stored is None else stored.work
+    if (own / "CURRENT").is_file():
+        raise BadInput(f"{out} is an index folder; give another one for a cluster of {shards} shards")
+    requirements = SearchRequirements.of(kind, min_recall, max_ms)
+    with WriterLock(own / "LOCK"):
+        seen = None if stored is None else stored.manifest()
+        before: ShardedManifest | None = None
+        note = ""
+        try:
+            before = read_sharded_manifest(own) if stored is None else stored.parse_manifest(seen)
+        except NoIndex:
+            pass
+        except (CorruptIndex, UnsupportedFormat) as error:
+            note = f"The cluster there was not usable ({error})."
+        naming, renamed = naming_by(objects_from, {} if before is None else before.about)
+        catalogue = list_photos(folder, naming)
+        if catalogue.touches and checkpoint.references is None:
+            raise BadInput(
+                "of a catalogue in shards the model must say what reference touches are worth, for shards would find "
+                "it out each for itself, and this one does not; take one that `retrieve adapt` has made"
+            )
+        _sweep(own, before, shards)
+        left = {} if stored is None else stored.generations()
+        donors = [] if before is None or before.of == shards else before.shards
+        options = BuildOptions(naming, requirements, quiet, verify, keep=_KEEP_ALL)
+        jobs = [
+            ShardJob(out, folder, part, checkpoint.path, replace(options, about={"shard": folder}), donors)
+            for folder, part in _split_catalogue(catalogue, shards)
+        ]
+        built = sorted((run or build_in_process)(jobs, checkpoint), key=lambda one: one.folder)
+        report = _report(out, catalogue, naming, checkpoint, built)
+        every = len(catalogue.photos) + len(catalogue.touches)
+        what = "photos and touches" if catalogue.touches else "photos"
+        if (bad := len(report.skipped)) > max_unreadable * every:
+            first = report.skipped[0]
+            raise TooManyUnreadable(
+                f"{bad} of {every} {what} cannot be read, more than the share of {max_unreadable:g} that is "
+                f"allowed (--max-unreadable); the cluster stays as it was. The first: {first.path}: {first.reason}"
+            )
+        manifest = _manifest(before, built, shards, checkpoint, catalogue, report, requirements)
+        written = before is None or manifest.generation != before.generation
+        if written and stored is None:
+            write_sharded_manifest(own, manifest)
+        elif written and stored is not None:
+            stored.switch(seen, manifest)
+            stored.discard(
+                left.keys() - generation_names([*manifest.shards, *([] if before is None else before.shards)])
+            )
+        for entry in manifest.shards:
+            IndexStore(own / entry.folder).discard_before(entry.generation)
+    reason = " ".join(filter(None, (renamed, note, report.reason)))
+    return replace(report, generation=manifest.generation, written=written, reason=reason)
+
+
+def build_in_process(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterable[ShardBuild]:
+    """Build shards in this process."""
+    return [build_shard(job, checkpoint) for job in jobs]
+
+
+def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBuild:
+    """Build one shard. Raises the errors of `build_index`, except where none of its photos can be read."""
+    model = checkpoint or load_checkpoint(job.model)
+    stored = RemoteShardedIndex(str(job.cluster)) if is_url(job.cluster) else None
+    cluster = Path(job.cluster) if stored is None else stored.work
+    if stored is not None:
+        stored.restore(job.folder)
+    store, donors = IndexStore(cluster / job.folder), list[Generation]()
+    for donor in job.donors:
+        with suppress(IndexesError):  # it cannot serve then
+            place = local_folder(job.cluster, donor) / donor.folder
+            donors.append(IndexStore(place).open(name=donor.generation, expect=fingerprint(model)))
+    try:
+        report = build_listed(job.catalogue, model, store.path, replace(job.options, donors=donors))
+    except NoReadablePhoto as error:
+        return ShardBuild(job.folder, None, None, [], error.skipped)
+    generation = store.open(name=report.generation, verify=False)
+    counts = np.bincount(generation.codes("object_id")).tolist()
+    entry = shard_entry(cluster, job.folder, generation, len(counts))
+    if stored is not None:
+        stored.put(entry, job.options.verify)
+    return ShardBuild(job.folder, entry, report, counts, report.skipped)
+
+
+def _sweep(out: Path, before: ShardedManifest | None, shards: int) -> None:
+    """Delete shards of divisions that neither the current cluster nor the new one has."""
+    known = set() if before is None else {entry.folder for entry in before.shards}
+    for path in out.iterdir():
+        division = SHARD_FOLDER.fullmatch(path.name)
+        if division and path.is_dir() and path.name not in known and int(division[2]) != shards:
+            remove_folder(path)
+
+
+def _split_catalogue(catalogue: Catalogue, shards: int) -> list[tuple[str, Catalogue]]:
+    """Folder and catalogue of each shard that has photos or touches. Files that are neither belong to no shard."""
+    photos, touches = defaultdict[int, list[CataloguePhoto]](list), defaultdict[int, list[CatalogueTouch]](list)
+    for photo in catalogue.photos:
+        photos[shard_number(photo.object_id, shards)].append(photo)
+    for touch in catalogue.touches:
+        touches[shard_number(touch.object_id, shards)].append(touch)
+    none = replace(catalogue, ignored=(), skipped=(), notes=(), unsupported_objects=())
+    return [
+        (
+            shard_folder(number, shards),
+            replace(none, photos=PhotoTable.of(photos[number]), touches=tuple(touches[number])),
+        )
+        for number in sorted(photos.keys() | touches.keys())
+    ]
+
+
+def _report(
+    out: str | Path, catalogue: Catalogue, naming: Naming, checkpoint: Checkpoint, built: Sequence[ShardBuild]
+) -> BuildReport:
+    """The reports of all shards as one. Raises NoReadablePhoto where no shard has a photo."""
+    reports = [one.report for one in built if one.report is not None]
+    skipped = [*catalogue.skipped, *(item for one in built for item in one.skipped)]
+    if not reports:
+        raise no_photo(catalogue, skipped)
+    counts = [count for one in built for count in one.counts]
+    lost = {name for report in reports for name in report.without_photo}
+    bad = {item.path for one in built if one.report is None for item in one.skipped}
+    lost |= {photo.object_id for photo in catalogue.photos if photo.path in bad} | set(catalogue.unsupported_objects)
+    reason, same = Counter(report.reason for report in reports).most_common(1)[0]
+    told = [report.references for report in reports if report.references]
+    of_touches = {key: sum(one[key] for one in told) for key in ("touches", "objects", "touch_only", "encoded")}
+    return replace(
+        reports[0],
+        **{name: sum(getattr(report, name) for report in reports) for name in ADDITIVE_FIELDS},
+        index=str(out),
+        generation="",
+        written=True,
+        model=str(checkpoint.path),
+        objects=len(counts),
+        objects_from=naming.text,
+        per_object=count_summary(counts),
+        warnings=naming_warnings(Counter(catalogue.photos.objects), naming),
+        skipped=skipped,
+        ignored=list(catalogue.ignored),
+        without_photo=sorted(lost),
+        notes=list(catalogue.notes),
+        kind=", ".join(sorted({report.kind for report in reports})),
+        reason=f"{len(reports)} shards; of {same} of them: {reason}",
+        recall=min((report.recall for report in reports), key=lambda recall: recall["value"]),
+        candidates=None,
+        partial_error=max(report.partial_error for report in reports),
+        shards=[asdict(one.entry) for one in built if one.entry is not None],
+        references={**of_touches, "by": told[0]["by"]} if told else None,
+    )
+
+
+def _manifest(
+    before: ShardedManifest | None,
+    built: Sequence[ShardBuild],
+    shards: int,
+    checkpoint: Checkpoint,
+    catalogue: Catalogue,
+    report: BuildReport,
+    requirements: SearchRequirements,
+) -> ShardedManifest:
+    """The manifest to write, or the current one where they would be equal."""
+    about: dict[str, Any] = {
+        "checkpoint": str(checkpoint.path.resolve()),
+        "catalogue": catalogue.where,
+        "objects_from": report.objects_from,
+        "requirements": asdict(requirements),
+        "partial_error": report.partial_error,
+    }
+    if report.references is not None and checkpoint.references is not None:
+        about[REFERENCE_ROWS] = {key: report.references[key] for key in ("touches", "objects")}
+        about[REFERENCE_CALIBRATION] = {"by": report.references["by"], "calibration": checkpoint.references.to_dict()}
+    made = ShardedManifest(
+        generation=sharded_generation_name(1 if before is None else generation_number(before.generation) + 1),
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        software=__version__,
+        kind=report.kind,
+        fingerprint=fingerprint(checkpoint),
+        about=about,
+        calibration=checkpoint.posterior.to_dict() if checkpoint.posterior else None,
+        of=shards,
+        shards=[one.entry for one in built if one.entry is not None],
+    )
+    same = before is not None and before == replace(
+        made, generation=before.generation, created=before.created, software=before.software
+    )
+    return before if before is not None and same else made

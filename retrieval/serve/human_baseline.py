@@ -1,0 +1,206 @@
+"""The paths of the human test (`retrieval.serve.trials`)."""
+
+import secrets
+import time
+from string import ascii_lowercase
+from typing import Annotated
+
+from fastapi import APIRouter, Request, Response
+from fastapi import Path as InPath
+from pydantic import BaseModel, Field
+from starlette.concurrency import run_in_threadpool
+
+from retrieval.data.images import read_bytes
+from retrieval.serve.catalogue import IMAGE_RESPONSES, image_response
+from retrieval.serve.errors import HttpProblem, problem_responses
+from retrieval.serve.service import HistoryWriter, Parts, Service
+from retrieval.serve.store import HistoryStore, TrialChoice, TrialRun, new_id
+from retrieval.serve.trials import CHOICES, Trial, TrialAccuracy, Trials, trial_accuracies
+from retrieval.serve.uploads import RequestBody, json_body, read_json
+
+router = APIRouter(tags=["human baseline"])
+Number = Annotated[int, InPath(ge=1, le=10_000)]
+
+
+class RunBody(RequestBody):
+    """A series to be done: how many trials, by whom; the same seed gives the same trials."""
+
+    count: int = Field(20, ge=1, le=10_000)
+    participant: str = Field("", max_length=200)
+    seed: int | None = Field(None, ge=0, lt=2**31)
+
+
+class RunDocument(BaseModel):
+    """A series and how it stands. next: the first trial that was not done, null at the end."""
+
+    id: str
+    participant: str
+    seed: int
+    count: int
+    choices: int
+    completed: int
+    next: int | None
+    human_baseline: TrialAccuracy
+    model: TrialAccuracy
+    chance: float
+
+
+class TrialsDocument(BaseModel):
+    """What can be done, and the series so far."""
+
+    recording: str
+    objects: int
+    choices: int
+    runs: list[RunDocument]
+
+
+class TrialDocument(BaseModel):
+    """A trial. choice, truth, model: counted from 1, and null until it was done."""
+
+    number: int
+    touches: list[str]
+    photos: list[str]
+    choice: int | None = None
+    truth: int | None = None
+    model: int | None = None
+
+
+class ChoiceBody(RequestBody):
+    """The photo that shows the object, counted from 1."""
+
+    choice: int = Field(ge=1, le=CHOICES)
+
+
+def _require_trials(parts: Service) -> tuple[Trials, HistoryStore]:
+    if parts.trials is None:
+        raise HttpProblem(
+            "unknown", "this service has no recording to test people on; start it with --trials RECORDING"
+        )
+    history_writer: HistoryWriter | None = parts.history_writer
+    if history_writer is None:
+        raise HttpProblem("unknown", "this service keeps nothing, and so no trials; start it without --no-history")
+    return parts.trials, history_writer.store
+
+
+def _document(run: TrialRun, store: HistoryStore) -> RunDocument:
+    chosen = store.choices(run.id)
+    human_baseline, model = trial_accuracies(chosen)
+    left = set(range(1, run.count + 1)) - {one.number for one in chosen}
+    return RunDocument(
+        **vars(run),
+        choices=CHOICES,
+        completed=len(chosen),
+        next=min(left, default=None),
+        human_baseline=human_baseline,
+        model=model,
+        chance=1 / CHOICES,
+    )
+
+
+def _run(parts: Service, name: str) -> TrialRun:
+    trials, store = _require_trials(parts)
+    found = next((run for run in store.runs(trials.folder.name) if run.id == name), None)
+    if found is None:
+        raise HttpProblem("unknown", f"there is no series of trials {name[:64]!r} for {trials.folder.name}")
+    return found
+
+
+def _trial(parts: Service, run: TrialRun, number: int) -> Trial:
+    if number > run.count:
+        raise HttpProblem("unknown", f"this series has {run.count} trials; got {number}")
+    return _require_trials(parts)[0].trial(parts.generations.current, run.seed, number)
+
+
+@router.get("/v1/trials", responses=problem_responses("unknown"))
+def trials(parts: Parts) -> TrialsDocument:
+    """The objects that the model never saw, and the series of trials so far."""
+    known, store = _require_trials(parts)
+    return TrialsDocument(
+        recording=known.folder.name,
+        objects=len(known.unseen(parts.generations.current)),
+        choices=CHOICES,
+        runs=[_document(run, store) for run in store.runs(known.folder.name)],
+    )
+
+
+@router.post(
+    "/v1/trials",
+    status_code=201,
+    responses=problem_responses("unknown", "bad-input"),
+    openapi_extra=json_body("RunBody"),
+)
+async def begin_run(request: Request, parts: Parts) -> RunDocument:
+    """Begin a series."""
+    body = await read_json(request, RunBody)
+
+    def create() -> RunDocument:
+        known, store = _require_trials(parts)
+        seed = secrets.randbelow(2**31) if body.seed is None else body.seed
+        known.trial(parts.generations.current, seed, 1)  # says what is missing
+        run = TrialRun(new_id(), time.time(), body.participant, seed, body.count, known.folder.name)
+        store.add_run(run)
+        return _document(run, store)
+
+    return await run_in_threadpool(create)
+
+
+@router.get("/v1/trials/{name}", responses=problem_responses("unknown"))
+def get_run(name: str, parts: Parts) -> RunDocument:
+    """How a series stands: the person's share beside the model's in the same trials."""
+    return _document(_run(parts, name), _require_trials(parts)[1])
+
+
+@router.get("/v1/trials/{name}/{number}", responses=problem_responses("unknown", "bad-input"))
+def trial(name: str, number: Number, parts: Parts) -> TrialDocument:
+    """A trial; what is right is told when it was done."""
+    run = _run(parts, name)
+    sampled_trial = _trial(parts, run, number)
+    done = next((one for one in _require_trials(parts)[1].choices(name) if one.number == number), None)
+    where = f"/v1/trials/{name}/{number}"
+    return TrialDocument(
+        number=number,
+        touches=[f"{where}/touches/{finger}" for finger in ascii_lowercase[: len(sampled_trial.grasp.touches)]],
+        photos=[f"{where}/photos/{place}" for place in range(1, CHOICES + 1)],
+        **({"choice": done.choice, "truth": done.truth, "model": done.model} if done else {}),
+    )
+
+
+@router.post(
+    "/v1/trials/{name}/{number}",
+    responses=problem_responses("unknown", "bad-input", "conflict", "busy"),
+    openapi_extra=json_body("ChoiceBody"),
+)
+async def choose(request: Request, name: str, number: Number, parts: Parts) -> TrialDocument:
+    """Choose, once; what was right and what the model chose is in the answer."""
+    body = await read_json(request, ChoiceBody)
+    known, store = _require_trials(parts)
+    sampled_trial = await run_in_threadpool(lambda: _trial(parts, _run(parts, name), number))
+    model = await parts.queue.submit(lambda generation: known.model_choice(generation, sampled_trial), request)
+    choice = TrialChoice(number, body.choice, sampled_trial.truth, model)
+    if not await run_in_threadpool(store.choose, name, choice):
+        raise HttpProblem("conflict", f"trial {number} was done already")
+    return await run_in_threadpool(trial, name, number, parts)
+
+
+@router.get(
+    "/v1/trials/{name}/{number}/touches/{finger}",
+    response_class=Response,
+    responses={**IMAGE_RESPONSES, **problem_responses("unknown")},
+)
+def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
+    """A gel image of the grasp."""
+    files = _trial(parts, _run(parts, name), number).grasp.touches
+    place = ascii_lowercase.find(finger) if len(finger) == 1 else -1
+    if not 0 <= place < len(files):
+        raise HttpProblem("unknown", f"the grasp has no finger {finger[:10]!r}")
+    return image_response(read_bytes(files[place]))
+
+
+@router.get(
+    "/v1/trials/{name}/{number}/photos/{place}",
+    response_class=Response,
+    responses={**IMAGE_RESPONSES, **problem_responses("unknown")},
+)
+def photo(name: str, number: Number, place: Annotated[int, InPath(ge=1, le=CHOICES)], parts: Parts) -> Response:
+    """One of the photos, counted from 1."""
+    return image_response(read_bytes(_trial(parts, _run(parts, name), number).photos[place - 1]))

@@ -1,0 +1,36 @@
+"""A model that knows what reference touches are worth, for catalogues such as the fixture `touched`."""
+
+import dataclasses
+
+import torch
+
+from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from retrieval.model.config import Config
+from retrieval.model.fusion import Matcher
+from retrieval.model.posterior import Posterior
+from retrieval.model.reference_calibration import ReferenceCalibration
+from tests import synthetic
+from tests.conftest import TINY
+
+REFERENCE_CALIBRATION = ReferenceCalibration(Posterior(8.0, -3.0, 0.5, 40), 5.0, Posterior(1.5, -2.0, 0.8, 40), 20, 40)
+POSTERIOR = Posterior(0.9, -0.5, 0.7, 40)
+NAMES = sorted(one.object_id for one in synthetic.make_objects(8, seed=9))
+"""Objects of the catalogue that the fixture `catalogue` is."""
+
+
+def write_reference_model(path, references=REFERENCE_CALIBRATION, posterior=POSTERIOR, cosine=True):
+    """A matcher of random weights whose touches differ."""
+    matcher = dataclasses.replace(TINY.matcher, cosine=cosine)
+    config = Config(matcher, TINY.training, TINY.preprocessing)
+    torch.manual_seed(0)
+    about = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
+    save_checkpoint(
+        path,
+        Matcher(matcher).eval(),
+        config,
+        split=None,
+        provenance=about,
+        posterior=posterior,
+        references=references,
+    )
+    return load_checkpoint(path)

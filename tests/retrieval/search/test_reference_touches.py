@@ -1,0 +1,307 @@
+"""Reference touches in an index: that they are encoded, kept, asked and told beside photos."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+
+from indexes.errors import CorruptIndex
+from indexes.store.folder import IndexStore
+from retrieval.errors import BadInput
+from retrieval.model.reference_calibration import SHARPNESS, ReferenceCalibration, touch_embeddings
+from retrieval.report.query import query_html
+from retrieval.report.terminal import print_table
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.answer import QueryResult
+from retrieval.search.query.searcher import Searcher
+from retrieval.search.query.shard import FolderShard
+from retrieval.search.sharding.build_sharded import build_sharded
+from tests import synthetic
+from tests.documents import ROOT, text_of
+from tests.reference_model import NAMES, POSTERIOR, REFERENCE_CALIBRATION, write_reference_model
+
+
+@pytest.fixture
+def calibrated_model(tmp_path):
+    return write_reference_model(tmp_path / "felt.safetensors")
+
+
+def answered(catalogue, model, index, files, **asked):
+    build_index(catalogue, model, index, quiet=True)
+    with Searcher.open(index) as searcher:
+        return searcher.query(files, **{"top": 8, **asked})
+
+
+def test_a_touch_that_is_a_reference_itself_is_the_nearest_and_is_named(
+    catalogue_with_touches, calibrated_model, tmp_path, touches
+):
+    result = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[1]][1])
+    best = {match.object_id: match for match in result.results}[NAMES[1]]
+    assert best.reference.touch == (f"{NAMES[1]}/touch_1_a.png", f"{NAMES[1]}/touch_1_b.png")
+    assert best.reference.cosine == pytest.approx(1.0, abs=1e-3)  # halves are float16
+    assert [match.reference is None for match in result.results].count(False) == 4
+
+
+def test_an_object_without_photos_is_found_by_its_touches(catalogue_with_touches, calibrated_model, tmp_path, touches):
+    result = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[2]][0])
+    touch_only = {match.object_id: match for match in result.results}[NAMES[2]]
+    assert touch_only.reference.adds is None
+    assert touch_only.photo == f"{NAMES[2]}/touch_0_a.png"  # which shows it to people
+    cosines = [1.0, other_cosine(calibrated_model, touches[NAMES[2]][:2])]
+    near = math.log(sum(math.exp(SHARPNESS * one) for one in cosines) / 2) / SHARPNESS
+    ratio = REFERENCE_CALIBRATION.touch_only.slope * near + REFERENCE_CALIBRATION.touch_only.offset
+    assert touch_only.logit == pytest.approx((ratio - POSTERIOR.offset) / POSTERIOR.slope, abs=0.05)
+
+
+def other_cosine(model, grasps):
+    from retrieval.model.encode import encode_touches
+
+    load = model.config.preprocessing.load_touch
+    codes = touch_embeddings(
+        encode_touches(model.matcher, [[load(path) for path in one] for one in grasps]).partial.numpy(), 32
+    )
+    return float(codes[0] @ codes[1])
+
+
+def test_photos_and_references_of_an_object_add_up_as_reckoned_by_hand(
+    catalogue_with_touches, calibrated_model, tmp_path, touches
+):
+    files = touches[NAMES[0]][2]
+    index = tmp_path / "index"
+    result = answered(catalogue_with_touches, calibrated_model, index, files)
+    match = {one.object_id: one for one in result.results}[NAMES[0]]
+    with Searcher.open(index) as searcher:
+        partials = searcher.encode(files).partials
+        rows = [at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == NAMES[0]]
+        photos = searcher.scorer.logits(partials, searcher.generation.arrays["partials"][rows])
+        mine = [at for at, row in enumerate(searcher.generation.documents["references"]["touches"]) if at < 2]
+        kept = touch_embeddings(searcher.generation.documents["touches"][mine], 32)
+    cosines = touch_embeddings(partials, 32) @ kept.T
+    near = math.log(np.exp(SHARPNESS * cosines.astype(float)).mean()) / SHARPNESS
+    slope = REFERENCE_CALIBRATION.with_photos.slope
+    photo_logits = math.log(np.exp(slope * (photos.astype(float) + REFERENCE_CALIBRATION.weight * near)).mean()) / slope
+    ratio = slope * photo_logits + REFERENCE_CALIBRATION.with_photos.offset
+    assert match.logit == pytest.approx((ratio - POSTERIOR.offset) / POSTERIOR.slope, abs=1e-4)
+    bare = math.log(np.exp(POSTERIOR.slope * photos.astype(float)).mean()) / POSTERIOR.slope
+    assert match.reference.adds == pytest.approx(match.logit - bare, abs=1e-4)
+
+
+def test_objects_without_references_are_scored_as_before(
+    catalogue_copy, catalogue_with_touches, calibrated_model, tmp_path, touches
+):
+    with_them = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
+    for path in catalogue_with_touches.rglob("touch_*"):
+        path.unlink()
+    without = answered(catalogue_with_touches, calibrated_model, tmp_path / "bare", touches[NAMES[0]][2])
+    before, after = ({match.object_id: match.logit for match in one.results} for one in (without, with_them))
+    assert [after[name] for name in NAMES[4:]] == pytest.approx([before[name] for name in NAMES[4:]], abs=1e-5)
+
+
+def test_all_that_may_be_adds_up_to_one(catalogue_with_touches, calibrated_model, tmp_path, touches):
+    result = answered(
+        catalogue_with_touches, calibrated_model, tmp_path / "index", [touches[NAMES[0]][2], touches[NAMES[0]][1]]
+    )
+    whole = result.none_probability + sum(match.probability for match in result.results)
+    assert whole + result.posterior["unscored_probability"] == pytest.approx(1.0)
+
+
+def test_photos_of_the_nearest_reference_are_always_scored(
+    catalogue_with_touches, calibrated_model, tmp_path, touches, monkeypatch
+):
+    judged = []
+    whole = FolderShard._score_objects
+    monkeypatch.setattr(FolderShard, "_score_objects", lambda *asked: judged.append(asked[2]) or whole(*asked))
+    build_index(catalogue_with_touches, calibrated_model, tmp_path / "index", quiet=True)
+    with Searcher.open(tmp_path / "index") as searcher:
+        for name in NAMES[:4]:
+            searcher.query(touches[name][0], top=1, candidates=1)
+            rows = judged.pop().tolist()
+            catalogue_copy = {at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == name}
+            assert catalogue_copy <= set(rows)
+            assert len(rows) <= len(catalogue_copy) + 1
+
+
+def test_the_answer_says_what_it_rests_on_and_is_read_again(
+    catalogue_with_touches, calibrated_model, tmp_path, touches
+):
+    result = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
+    told = result.posterior["references"]
+    assert (told["touches"], told["objects"], told["by"]) == (8, 4, "objects that the model was not fitted to")
+    assert ReferenceCalibration.from_dict(told["calibration"]) == REFERENCE_CALIBRATION
+    document = json.loads(json.dumps(result.to_dict()))
+    assert QueryResult.from_dict(document).to_dict() == result.to_dict()
+
+
+def test_the_page_of_formats_names_what_is_written_of_references(
+    catalogue_with_touches, calibrated_model, tmp_path, touches
+):
+    said = text_of(ROOT / "docs" / "formats.md").split("| with reference touches |")[1].split("\n\n")[0]
+    result = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2]).to_dict()
+    generation = IndexStore(tmp_path / "index").open()
+    about = {name: generation.manifest.about[name] for name in ("references", "reference_calibration")}
+    keys = {f"about.{name}.{key}" for name, part in about.items() for key in part}
+    keys |= {f"reference.{key}" for key in result["results"][0]["reference"]}
+    assert keys | {"posterior.references"} == set(re.findall(r"`([a-z_0-9]+\.[\w.]+)`", said))
+    assert set(result["posterior"]["references"]) == {key.rsplit(".")[-1] for key in keys if key.startswith("about")}
+    assert {"references.json", "touches.npy"} <= {path.name for path in generation.folder.iterdir()}
+
+
+def test_pages_and_tables_show_the_nearest_touch(catalogue_with_touches, calibrated_model, tmp_path, touches, capsys):
+    result = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
+    page = query_html(result, catalogue_with_touches)
+    assert page.count('alt="reference touch"') == 8  # two fingers of each of four objects
+    assert "no photo: by touches alone" in page
+    assert "fitted on 40 touches of 20 objects" in page
+    print_table(result)
+    table = capsys.readouterr().out
+    assert "nearest touch" in table
+    assert "no photo" in table
+
+
+def test_without_touches_nothing_mentions_references(catalogue_copy, calibrated_model, tmp_path, touches, capsys):
+    result = answered(catalogue_copy, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
+    generation = IndexStore(tmp_path / "index").open()
+    assert list(generation.documents) == ["calibration"]
+    assert not {"references", "reference_calibration"} & set(generation.manifest.about)
+    assert "references" not in result.posterior
+    assert all("reference" not in one for one in result.to_dict()["results"])
+    print_table(result)
+    assert "touch" not in capsys.readouterr().out
+
+
+# Building again -----------------------------------------------------------------------------------------------------
+
+
+def test_only_new_touches_are_encoded_again(catalogue_with_touches, calibrated_model, tmp_path, touches):
+    index = tmp_path / "index"
+    first = build_index(catalogue_with_touches, calibrated_model, index, quiet=True)
+    assert first.references == {
+        "touches": 8,
+        "objects": 4,
+        "touch_only": 1,
+        "encoded": 8,
+        "by": "objects that the model was not fitted to",
+    }
+    again = build_index(catalogue_with_touches, calibrated_model, index, quiet=True)
+    assert (again.written, again.references["encoded"]) == (False, 0)
+    synthetic.put_touch(catalogue_with_touches, NAMES[5], 0, touches[NAMES[5]][0])
+    more = build_index(catalogue_with_touches, calibrated_model, index, quiet=True)
+    assert (more.written, more.embedded, more.references["touches"], more.references["encoded"]) == (True, 0, 9, 1)
+
+
+def test_without_the_touches_the_index_is_what_it_was_before_them(catalogue_copy, calibrated_model, tmp_path, touches):
+    index = tmp_path / "index"
+    before = answered(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2])
+    synthetic.put_touch(catalogue_copy, NAMES[0], 0, touches[NAMES[0]][0])
+    assert answered(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2]).results != before.results
+    (catalogue_copy / NAMES[0] / "touch_0_a.png").unlink()
+    (catalogue_copy / NAMES[0] / "touch_0_b.png").unlink()
+    assert answered(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2]).results == before.results
+
+
+def test_what_cannot_be_compared_is_left_out_with_its_reason(catalogue_with_touches, calibrated_model, tmp_path):
+    (catalogue_with_touches / NAMES[0] / "touch_0_b.png").unlink()
+    (catalogue_with_touches / NAMES[1] / "touch_0_a.png").write_bytes(b"no picture")
+    for path in (catalogue_with_touches / NAMES[2]).glob("touch_*"):
+        path.write_bytes(b"")
+    report = build_index(catalogue_with_touches, calibrated_model, tmp_path / "index", quiet=True)
+    reasons = {item.path: item.reason for item in report.skipped}
+    assert "1 gel image(s), the model takes 2: names end in _a and _b" in reasons[f"{NAMES[0]}/touch_0_a.png"]
+    assert len(reasons) == 4
+    assert report.references["touches"] == 4
+    assert report.without_photo == [NAMES[2]]  # neither photo nor touch of it can be used
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"cosine": False}, "this model cannot compare touches"),
+        ({"posterior": None}, "this model cannot compare touches"),
+        ({}, "8 reference touches are worth"),
+    ],
+)
+def test_a_model_without_reference_calibration_builds_nothing(catalogue_with_touches, tmp_path, changed, said):
+    model = write_reference_model(tmp_path / "other.safetensors", references=None, **changed)
+    with pytest.raises(BadInput, match=said):
+        build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
+    with pytest.raises(BadInput, match="in shards the model must say"):
+        build_sharded(catalogue_with_touches, model, tmp_path / "cluster", 2, quiet=True)
+    assert not (tmp_path / "index" / "CURRENT").exists()
+
+
+def test_references_are_calibrated_on_the_catalogue_if_the_model_is_not(tmp_path):
+    model = write_reference_model(tmp_path / "untold.safetensors", references=None)
+    objects = synthetic.make_objects(11, seed=4)
+    catalogue = synthetic.write_catalogue(tmp_path / "catalog", objects, 1)
+    for name, catalogue_copy in synthetic.write_queries(tmp_path / "felt", objects, 2).items():
+        for number, files in enumerate(catalogue_copy):
+            synthetic.put_touch(catalogue, name, number, files)
+    report = build_index(catalogue, model, tmp_path / "index", quiet=True)
+    assert report.references["by"] == "the catalogue's own touches"
+    told = IndexStore(tmp_path / "index").open().manifest.about["reference_calibration"]["calibration"]
+    worth = ReferenceCalibration.from_dict(told)
+    assert (worth.objects, worth.touches) == (11, 11)
+    assert worth.with_photos is not None
+
+
+# Several shards, and what others wrote ------------------------------------------------------------------------------
+
+
+def test_a_cluster_answers_as_one_folder_does(catalogue_with_touches, calibrated_model, tmp_path, touches):
+    files = touches[NAMES[1]][2]
+    whole = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", files)
+    report = build_sharded(catalogue_with_touches, calibrated_model, tmp_path / "cluster", 3, quiet=True)
+    assert (report.references["touches"], report.references["touch_only"]) == (8, 1)
+    with Searcher.open(tmp_path / "cluster") as searcher:
+        divided = searcher.query(files, top=8)
+    assert [one.object_id for one in divided.results] == [one.object_id for one in whole.results]
+    for mine, other in zip(divided.results, whole.results, strict=True):
+        assert (mine.logit, mine.probability) == pytest.approx((other.logit, other.probability), abs=1e-5)
+        assert (mine.reference is None) == (other.reference is None)
+    assert divided.posterior["references"]["touches"] == 8
+
+
+def forged(index, **changed):
+    """The index written again with another list of touches, other halves or another worth."""
+    store = IndexStore(index)
+    there = store.open()
+    rows = list(there.rows)
+    documents = {name: changed.get(name, content) for name, content in there.documents.items()}
+    about = {**there.manifest.about, **{name: changed[name] for name in changed if name == "reference_calibration"}}
+    store.write(
+        rows,
+        there.embeddings[there.slots],
+        {name: np.array(part) for name, part in there.arrays.items()},
+        documents,
+        fingerprint=there.fingerprint,
+        about=about,
+    )
+
+
+TOUCH = {"object_id": NAMES[0], "touch": ["a.png"], "digests": ["0"]}
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"references": []},
+        {"references": {"touches": [TOUCH | {"touch": ["../../etc/passwd"]}] * 8, "touch_only": []}},
+        {"references": {"touches": [TOUCH | {"object_id": 3}] * 8, "touch_only": []}},
+        {"references": {"touches": [TOUCH | {"digests": []}] * 8, "touch_only": []}},
+        {"references": {"touches": [TOUCH], "touch_only": []}},
+        {"touches": np.zeros((8, 3), np.float16)},
+        {"touches": np.zeros((8, 48), np.int16)},
+        {"touches": {"not": "an array"}},
+        {"reference_calibration": None},
+        {"reference_calibration": {"by": "hand", "calibration": {"weight": 1}}},
+        {"reference_calibration": [1]},
+    ],
+)
+def test_forged_references_are_refused_in_a_sentence(catalogue_with_touches, calibrated_model, tmp_path, changed):
+    index = tmp_path / "index"
+    build_index(catalogue_with_touches, calibrated_model, index, quiet=True)
+    forged(index, **changed)
+    with pytest.raises(CorruptIndex, match="retrieve build-index"):
+        Searcher.open(index)
