@@ -321,7 +321,7 @@ def test_settings_are_checked(kind):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "least"),
+    ("name", "value", "minimum"),
     [("neighbours", 1, 2), ("neighbours", 2**31, 2), ("ef_construction", 2**31, 1), ("ef_search", 2**31, 1)],
 )
 def test_what_faiss_cannot_count_is_refused(name, value, minimum):

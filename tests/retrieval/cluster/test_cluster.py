@@ -289,7 +289,7 @@ def test_a_new_generation_is_taken_up_while_queries_go_on(ray, catalogue, cluste
     finally:
         stop.set()
         thread.join(300)
-    assert set(told) == {("cluster-000001", 24, 1.0), ("cluster-000002", 25, 1.0)}
+    assert set(told) == {("sharded-000001", 24, 1.0), ("sharded-000002", 25, 1.0)}
     assert told == sorted(told)
 
 

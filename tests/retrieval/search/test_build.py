@@ -388,8 +388,8 @@ def test_the_recall_of_neighbours_is_measured_with_touches_where_the_checkpoint_
     build_index(catalogue_copy, queried, index, kind="hnsw", quiet=True)
     build_index(catalogue_copy, checkpoint, tmp_path / "other", kind="hnsw", quiet=True)
     with_touches, without = (IndexStore(path).open().manifest.recall for path in (index, tmp_path / "other"))
-    assert (with_touches["queries"], with_touches["how"]) == (30, "measured on the queries that were given")
-    assert without["how"] == "measured on moved own vectors"
+    assert (with_touches["queries"], with_touches["how"]) == (30, "measured on the given queries")
+    assert without["how"] == "measured on displaced vectors of the index"
 
 
 # The threads that read and decode ------------------------------------------------------------------------------

@@ -183,7 +183,7 @@ QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.
 
 
 @pytest.mark.parametrize(
-    ("requirements", "points", "kind", "k", "said"),
+    ("requirements", "points", "kind", "k", "message"),
     [
         (SearchRequirements(), QUICK, "flat", 500, ""),
         (SearchRequirements(min_recall=0.95), EXACT | {("ivf_sq8", 500): (99, 0.1, 2.0)}, "ivf_sq8", 500, ""),
@@ -199,21 +199,21 @@ QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.
         (SearchRequirements("flat", max_ms=1), QUICK, "flat", 500, "reaches 1 ms; this is the nearest"),
     ],
 )
-def test_what_was_asked_for_decides(asked, points, kind, k, said):
-    settled = choose_by_agreement(Scripted(points), asked)
-    assert (settled.kind, settled.candidates["k"]) == (kind, k)
-    assert said in settled.reason
-    assert bool(said) == ("nearest" in settled.reason)
+def test_the_requirements_decide(requirements, points, kind, k, message):
+    point = choose_by_agreement(Scripted(points), requirements)
+    assert (point.kind, point.candidates["k"]) == (kind, k)
+    assert message in point.reason
+    assert bool(message) == ("nearest" in point.reason)
 
 
 def test_an_approximate_kind_is_built_only_where_exact_search_does_not_do():
-    for asked, built in (
+    for requirements, built in (
         (SearchRequirements(), {"flat"}),
         (SearchRequirements(max_ms=5), {"flat"}),
         (SearchRequirements(max_ms=4), {"flat", "ivf_sq8"}),
     ):
         bench = Scripted(QUICK)
-        choose_by_agreement(bench, asked)
+        choose_by_agreement(bench, requirements)
         assert set(bench.built_kinds) == built
 
 
@@ -265,10 +265,10 @@ def unit(count, dim=16):
 
 
 def test_without_a_bound_on_the_time_exact_search_is_taken_and_no_vector_is_read():
-    for asked in (SearchRequirements(), SearchRequirements(min_recall=0.9)):
-        settled = choose_by_neighbours(None, None, asked)
-        assert (settled.kind, settled.candidates) == ("flat", None)
-        assert "no time budget was asked for" in settled.reason
+    for requirements in (SearchRequirements(), SearchRequirements(min_recall=0.9)):
+        point = choose_by_neighbours(None, None, requirements)
+        assert (point.kind, point.candidates) == ("flat", None)
+        assert "no time budget was asked for" in point.reason
     assert choose_by_neighbours(None, None, SearchRequirements("hnsw", max_ms=1.0)).kind == "hnsw"
 
 
