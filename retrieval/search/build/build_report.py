@@ -125,8 +125,9 @@ class BuildReport:
         yield from (f"warning: {warning}" for warning in self.warnings)
         if references := self.references:
             yield (
-                f"{references['touches']} reference touches of {references['objects']} objects, {references['touch_only']} "
-                f"of them without a photo; {references['encoded']} embedded; calibrated on {references['by']}"
+                f"{references['touches']} reference touches of {references['objects']} objects, "
+                f"{references['touch_only']} of them without a photo; {references['encoded']} embedded; "
+                f"calibrated on {references['by']}"
             )
         measured = ""
         if self.recall["queries"]:  # else exact by construction

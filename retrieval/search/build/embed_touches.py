@@ -130,9 +130,9 @@ class ReferenceBuild:
     def too_few_error(self) -> BadInput:
         """Return the error for too few touches to calibrate."""
         return BadInput(
-            f"the catalogue's {len(self.rows)} reference touches cannot be calibrated: the model has no calibration for "
-            f"them, and fitting one needs {MIN_OBJECTS} objects with two touches each, and with photos if objects have "
-            "photos. Touch some objects twice, or fit a model to a recording with `retrieve adapt`"
+            f"the catalogue's {len(self.rows)} reference touches cannot be calibrated: the model has no calibration "
+            f"for them, and fitting one needs {MIN_OBJECTS} objects with two touches each, and with photos if objects "
+            "have photos. Touch some objects twice, or fit a model to a recording with `retrieve adapt`"
         )
 
 
@@ -191,14 +191,14 @@ def embed_references(
 def _require_fit(checkpoint: Checkpoint) -> None:
     if not checkpoint.config.matcher.cosine or checkpoint.posterior is None:
         raise BadInput(
-            "the catalogue has touches (touch_* files next to photos), but this model cannot compare touches: its match "
-            "logit has no cosine term, or it is not calibrated. Use a shipped model or one of `retrieve adapt`, or "
-            "rename the files"
+            "the catalogue has touches (touch_* files next to photos), but this model cannot compare touches: its "
+            "match logit has no cosine term, or it is not calibrated. Use a shipped model or one of `retrieve adapt`, "
+            "or rename the files"
         )
     if checkpoint.config.preprocessing.background != "none":
         raise BadInput(
-            "the catalogue has touches (touch_* files next to photos), but this model subtracts no-contact frames, which "
-            "a catalogue cannot contain. Use a model with background none, or rename the files"
+            "the catalogue has touches (touch_* files next to photos), but this model subtracts no-contact frames, "
+            "which a catalogue cannot contain. Use a model with background none, or rename the files"
         )
 
 
@@ -246,7 +246,7 @@ def _encode_touches(checkpoint: Checkpoint, touches: list[list[Image]]) -> Itera
 
 
 def _sample_objects(names: NDArray[np.str_]) -> NDArray[np.int64]:
-    """Return rows of random objects with at least two touches, about `MAX_REFERENCE_QUERIES` at most, in their order."""
+    """Return rows of random objects with two or more touches, about `MAX_REFERENCE_QUERIES` at most, in their order."""
     _, owner, counts = np.unique(names, return_inverse=True, return_counts=True)
     drawn = np.random.default_rng(0).permutation(np.flatnonzero(counts > 1))
     chosen = drawn[: max(MIN_OBJECTS, int(np.searchsorted(np.cumsum(counts[drawn]), MAX_REFERENCE_QUERIES)))]

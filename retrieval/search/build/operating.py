@@ -326,8 +326,8 @@ def operating_point_sentence(candidates: Mapping[str, Any]) -> str:
     found = round(candidates["top1_agreement"] * candidates["queries"])
     scored = "scores every photo" if k >= photos else f"reranks the best {k} of {photos} photos"
     text = (
-        f"The classifier {scored}: these contain the exhaustive top-1 for {found} of {candidates['queries']} validation "
-        f"touches (95 % interval {low:.3f} to {high:.3f}), in {candidates['ms']:.3g} ms, compared with "
+        f"The classifier {scored}: these contain the exhaustive top-1 for {found} of {candidates['queries']} "
+        f"validation touches (95 % interval {low:.3f} to {high:.3f}), in {candidates['ms']:.3g} ms, compared with "
         f"{candidates['exhaustive_ms']:.3g} ms for all."
     )
     return text + _unmet_requirements(candidates["top1_agreement"], candidates["ms"], candidates["requirements"])
