@@ -191,9 +191,7 @@ class Searcher:
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
     ) -> list[QueryResult]:
-        """Return the results of cumulative queries: after the first grasp, the first two, and so on; see `query`.
-
-        Each grasp is encoded once.
+        """Return the results of `query` after the first grasp, the first two, and so on; each grasp is encoded once.
 
         >>> with retrieval.open("index") as searcher:
         ...     after_one, after_two = searcher.query_cumulative([["a.png", "b.png"], ["a2.png", "b2.png"]])
@@ -220,10 +218,8 @@ class Searcher:
         object are invalid, the error names the object and no query runs.
         """
         opened = self._snapshot()
-        parsed = [
-            parse_grasps(touches, opened.reader.fingers, of=f"object {number}, ")
-            for number, touches in enumerate(objects, 1)
-        ]
+        fingers = opened.reader.fingers
+        parsed = [parse_grasps(one, fingers, of=f"object {number}, ") for number, one in enumerate(objects, 1)]
         ends = np.cumsum([len(grasps) for grasps in parsed]).tolist()
         spans = [slice(end - len(grasps), end) for end, grasps in zip(ends, parsed, strict=True)]
         every = [grasp for grasps in parsed for grasp in grasps]
