@@ -21,7 +21,7 @@ _SETTINGS = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_ENABLE_AUTO_CONNECT": "0",
 }
-"""Settings for little output, and against an automatic start: a thread of Ray that outlives it would start Ray again."""
+"""Settings for little output and no automatic start, with which a thread that outlives Ray would start it again."""
 _LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
 """Ray's setting for a cluster of this machine only, which then listens on 127.0.0.1."""
 
