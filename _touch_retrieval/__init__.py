@@ -1,1 +1,1 @@
-"""What `indexes`, `robot` and `retrieval` share and none of them owns. Standard library only; not a public name."""
+"""Private helpers shared by `indexes`, `robot` and `retrieval`. Standard library only."""

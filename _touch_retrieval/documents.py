@@ -1,4 +1,4 @@
-"""Plain documents, as JSON and TOML give them, as typed values: msgspec checks, this words its refusals."""
+"""Conversion of plain JSON and TOML documents to typed values, checked by msgspec, with readable error messages."""
 
 import math
 import re
@@ -29,21 +29,24 @@ _STEP = re.compile(r"\.(\w+)|\[(\d+)\]|\[(\.\.\.)\]")
 def typed(
     document: Any, kind: type[T], name: str = "", *, complete: bool = False, error: type[Exception] = ValueError
 ) -> T:
-    """Return a plain document as a value of a type.
+    """Convert a plain document to a value of a type.
 
-    Lists become tuples and whole numbers become floats where the type says so, a scalar of numpy becomes a number;
-    nothing else is converted. A table with a key that its dataclass does not have is refused, and so are numbers that
-    are not finite and whole numbers beyond 64 bits.
+    Lists become tuples and whole numbers become floats if the type requires it; a numpy scalar becomes a number.
+    Nothing else is converted. Keys that the dataclass does not have, numbers that are not finite and whole numbers
+    beyond 64 bits are errors.
 
     Args:
-        document: What `json.loads` or `tomllib.loads` returns, or a part of it.
+        document: The result of `json.loads` or `tomllib.loads`, or a part of it.
         kind: Any type that msgspec checks, often a dataclass. `Annotated[int, msgspec.Meta(ge=1)]` states a range.
-        name: What messages call the document, such as the table of a file.
-        complete: Refuse a table without a key for each field of its dataclass; else the fields' defaults stand in.
-        error: What to raise instead of ValueError.
+        name: Name of the document in messages, such as the table of a file.
+        complete: Require a key for each field of the dataclass; otherwise missing fields get their defaults.
+        error: Exception type to raise instead of ValueError.
+
+    Returns:
+        The converted value.
 
     Raises:
-        ValueError: A value does not fit. The message names it, what it must be and what it is.
+        ValueError: A value does not fit. The message contains its name, its required type and its value.
 
     >>> typed({"low": 1, "high": 2}, dict[str, float])
     {'low': 1.0, 'high': 2.0}
@@ -53,24 +56,22 @@ def typed(
         _require_known(document, kind, name, complete)
         _require_finite(document, name)
         return msgspec.convert(document, kind)
-    except msgspec.ValidationError as refused:
-        raise error(_error_message(str(refused), document, name)) from refused
-    except ValueError as refused:
-        raise error(str(refused)) from refused
+    except msgspec.ValidationError as invalid:
+        raise error(_error_message(str(invalid), document, name)) from invalid
+    except ValueError as invalid:
+        raise error(str(invalid)) from invalid
 
 
 def check_fields(instance: Any, name: str, error: type[Exception] = ValueError) -> None:
-    """Check the fields of a dataclass in its `__post_init__`, as `typed` checks those of a document.
-
-    Each field then holds the converted value.
+    """Check and convert the fields of a dataclass in its `__post_init__`, by the rules of `typed`.
 
     Args:
-        instance: A frozen dataclass.
-        name: What messages call it; empty: they name the field alone.
-        error: What to raise instead of ValueError.
+        instance: A frozen dataclass. Its fields are replaced with the converted values.
+        name: Name of the instance in messages; empty: messages contain only the field's name.
+        error: Exception type to raise instead of ValueError.
 
     Raises:
-        ValueError: As `typed` does.
+        ValueError: A value does not fit.
     """
     for field, hint in _hints(instance.__class__).items():
         value = typed(getattr(instance, field), hint, f"{name}.{field}" if name else field, error=error)
@@ -87,7 +88,7 @@ def _require_known(document: Any, kind: Any, name: str, complete: bool) -> None:
     kind = getattr(kind, "__origin__", kind) if hasattr(kind, "__metadata__") else kind  # of Annotated
     parts: Any = [document]
     kinds = get_args(kind)
-    if kinds and get_origin(kind) not in (Union, UnionType):  # a list or a table of such
+    if kinds and get_origin(kind) not in (Union, UnionType):  # a list or a table of these types
         parts = list(document.values()) if isinstance(document, Mapping) else document
         parts = parts if isinstance(parts, list | tuple) else []
     for part in parts:
@@ -97,10 +98,10 @@ def _require_known(document: Any, kind: Any, name: str, complete: bool) -> None:
         return
     known = _hints(kind)
     if complete and (lacking := [key for key in known if key not in document]):
-        raise ValueError(f"{name or 'it'} must hold {', '.join(known)}; {lacking[0]} is missing")
+        raise ValueError(f"{name or 'it'} must have {', '.join(known)}; {lacking[0]} is missing")
     for key, value in document.items():
         if key not in known:
-            raise ValueError(f"{name or 'it'} has no setting {key!r}; it knows {', '.join(sorted(known))}")
+            raise ValueError(f"{name or 'it'} has no setting {key!r}; its settings are {', '.join(sorted(known))}")
         _require_known(value, known[key], f"{name}.{key}" if name else key, complete)
 
 
@@ -119,9 +120,9 @@ def _require_finite(document: Any, name: str) -> None:
             _require_finite(value, name)
 
 
-def _error_message(said: str, document: Any, name: str) -> str:
-    place = _PLACE.search(said)
-    reason = said[: place.start()] if place else said
+def _error_message(message: str, document: Any, name: str) -> str:
+    place = _PLACE.search(message)
+    reason = message[: place.start()] if place else message
     where = (name + place["place"].replace("[...]", "") if place else name).lstrip(".") or "it"
     expected = _EXPECTED.fullmatch(reason)
     if expected is None:  # such as a missing field

@@ -1,10 +1,10 @@
-"""Files that survive a crash: written whole, flushed to the disk, and named only then.
+"""Crash-safe files: write the whole content, flush it to the disk, then rename.
 
-A file that replaces another is written beside its place under a hidden name and renamed. While it is written its writer
-holds a lock on it, which the system drops when the writer dies: what a killed one left is swept by the next write to
-the same name, on whichever host that runs and whatever process numbers have been given out since.
+A replacement is written in the same folder under a hidden name and then renamed. The writer locks this temporary file
+while it writes, and the system releases the lock when the writer dies. The next write to the same name deletes
+unlocked temporary files, on any host and independent of process numbers.
 
-Only regular files are opened to be read, so that no pipe blocks and no device is read for ever.
+Only regular files are opened for reading: a pipe cannot block the reader, and no device is read without end.
 """
 
 import errno
@@ -24,26 +24,26 @@ from typing import Any, BinaryIO
 
 _ENDING = ".tmp"
 _UNFLUSHED = (errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP)
-"""Of a folder that may be written to but not read, and of disks that flush no folders."""
+"""Errors of folders that are writable but not readable, and of disks that cannot flush folders."""
 
 
 @contextmanager
 def durable_file(path: Path) -> Iterator[BinaryIO]:
-    """A new file to write; flushed to the disk when the block ends."""
+    """Open a new file for writing, and flush it to the disk when the block ends."""
     with path.open("wb") as handle:
         yield handle
         finish(handle)
 
 
 def finish(handle: BinaryIO) -> None:
-    """Flush what was written to the disk, and close the file."""
+    """Flush a file to the disk and close it."""
     handle.flush()
     os.fsync(handle.fileno())
     handle.close()
 
 
 def sync(path: Path) -> None:
-    """Flush a file or a folder (its names) to the disk."""
+    """Flush a file, or the names in a folder, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -52,8 +52,14 @@ def sync(path: Path) -> None:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write beside, flush to disk, rename: `path` holds all of `data`, or what it held before, whenever the power
-    fails. Where it is a link, the file that it leads to is written. Raises OSError that names `path`.
+    """Replace a file: after a power failure it has either all of `data` or its old content.
+
+    Args:
+        path: The file. If it is a link, its target is replaced.
+        data: The new content.
+
+    Raises:
+        OSError: The file cannot be written. The error contains `path`.
     """
     with named_write_errors(path), atomic_file(path) as file:
         file.write(data)
@@ -61,9 +67,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """A file to write what `path` shall hold, as `write_atomically` does it, piece by piece; where the block raises,
-    `path` stays as it was.
-    """
+    """Open a file that replaces `path` when the block ends (`write_atomically`); after an error nothing changes."""
     place = path.resolve() if path.is_symlink() else path
     _sweep(place)
     with _temporary_file(place) as (temporary, descriptor):
@@ -80,25 +84,25 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def named_write_errors(path: Path) -> Iterator[None]:
-    """What the disk refuses, with the name of the file that was to be written: a write alone does not tell it."""
+    """Add the name of the written file to errors of the block: a failed write does not contain it."""
     try:
         yield
     except OSError as error:
         raise OSError(error.errno, f"cannot be written: {error.strerror or error}", str(path)) from error
-    except RuntimeError as error:  # of a link that leads to itself
-        raise OSError(errno.ELOOP, "cannot be written: its links go round in a circle", str(path)) from error
+    except RuntimeError as error:  # a link that leads to itself
+        raise OSError(errno.ELOOP, "cannot be written: its links form a circle", str(path)) from error
 
 
 @contextmanager
 def _temporary_file(path: Path) -> Iterator[tuple[Path, int]]:
-    """A new file beside `path`, locked as long as it is written; gone afterwards unless it was renamed."""
+    """Create a locked temporary file in the folder of `path`, and delete it after the block unless it was renamed."""
     while True:
         name = path.with_name(f"{_temporary_prefix(path)}{secrets.token_hex(8)}{_ENDING}")
         descriptor = os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
-            with suppress(OSError):  # on a disk without locks nobody sweeps either
+            with suppress(OSError):  # on a disk without locks no other writer deletes it either
                 fcntl.flock(descriptor, fcntl.LOCK_EX)
-            if not os.fstat(descriptor).st_nlink:  # swept before it was locked
+            if not os.fstat(descriptor).st_nlink:  # deleted before it was locked
                 continue
             yield name, descriptor
             return
@@ -108,12 +112,12 @@ def _temporary_file(path: Path) -> Iterator[tuple[Path, int]]:
 
 
 def _sweep(path: Path) -> None:
-    """Delete what killed writers of `path` left beside it."""
+    """Delete the temporary files that killed writers of `path` left."""
     with suppress(OSError), os.scandir(path.parent) as entries:
-        left = [
+        names = [
             one.path for one in entries if one.name.startswith(_temporary_prefix(path)) and one.name.endswith(_ENDING)
         ]
-        for name in left:
+        for name in names:
             _delete_unless_locked(name)
 
 
@@ -125,12 +129,12 @@ def _delete_unless_locked(name: str) -> None:
 
 
 def _temporary_prefix(path: Path) -> str:
-    """Of the hidden names beside `path`, short enough for every disk."""
+    """Return the prefix of the hidden temporary names for `path`, short enough for every disk."""
     return f".{os.fsdecode(os.fsencode(path.name)[:200])}."
 
 
 def remove_folder(folder: Path) -> None:
-    """Delete a folder; renamed first, so that a half-deleted one is never taken for a whole one."""
+    """Delete a folder. It is renamed first, so that a partly deleted folder is never mistaken for a complete one."""
     doomed = folder
     if ".tmp-" not in folder.name:
         doomed = folder.with_name(f"{folder.name}.tmp-{os.getpid()}")
@@ -139,13 +143,13 @@ def remove_folder(folder: Path) -> None:
 
 
 def file_digest(path: Path) -> str:
-    """SHA-256 of a regular file, in hexadecimal. Raises OSError."""
+    """Return the SHA-256 of a regular file in hexadecimal. Raises OSError."""
     with open_regular(path) as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def encoded(document: Any, *, indent: int | None = None) -> bytes:
-    """JSON in UTF-8. Text that UTF-8 cannot hold (file names of unknown coding) is escaped."""
+    """Return JSON in UTF-8. Text that UTF-8 cannot represent (file names of unknown encoding) is escaped."""
     try:
         return json.dumps(document, ensure_ascii=False, allow_nan=False, indent=indent).encode()
     except UnicodeEncodeError:
@@ -153,11 +157,11 @@ def encoded(document: Any, *, indent: int | None = None) -> bytes:
 
 
 MAX_DEPTH = 64
-"""Levels of lists and objects inside one another; what reads or shows JSON by recursion ends somewhere beyond."""
+"""Largest number of nested lists and objects. Recursive readers and writers of JSON fail at some larger depth."""
 MAX_FILE_BYTES = 512 * 2**20
-"""Of what is read whole."""
+"""Largest file that is read as a whole."""
 MAX_JSON_BYTES = 64 * 2**20
-"""Of a JSON file whose reader states no tighter limit; parsed, it takes up to 25 times as much memory."""
+"""Default limit of a JSON file. A parsed document takes up to 25 times as much memory."""
 
 _WORDS = {
     stat.S_IFIFO: "is a pipe",
@@ -168,9 +172,9 @@ _WORDS = {
 
 
 def open_regular(path: str | Path) -> BufferedReader:
-    """A regular file, opened to be read. Raises OSError, whose `strerror` says what stands there instead."""
+    """Open a regular file for reading. Raises OSError; its `strerror` names the kind of any other file."""
     _require_regular(os.stat(path).st_mode, path)
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # what was swapped since does not block
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe swapped in since does not block
     try:
         _require_regular(os.fstat(descriptor).st_mode, path)
         return os.fdopen(descriptor, "rb")
@@ -180,29 +184,40 @@ def open_regular(path: str | Path) -> BufferedReader:
 
 
 def read_regular(path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
-    """The bytes of a regular file of at most `max_bytes` bytes. Raises OSError."""
+    """Return the content of a regular file of at most `max_bytes` bytes. Raises OSError."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size <= max_bytes:
             data = file.read(max_bytes + 1)
             size = max(size, len(data))
     if size > max_bytes:
-        raise OSError(errno.EINVAL, f"has {size} bytes; at most {max_bytes} are read", str(path))
+        raise OSError(errno.EINVAL, f"has {size} bytes; at most {max_bytes} are allowed", str(path))
     return data
 
 
 def read_json(path: str | Path, max_bytes: int = MAX_JSON_BYTES) -> Any:
-    """Return the JSON document in a regular file of at most `max_bytes` bytes; a larger one is not read.
+    """Return the JSON document in a regular file.
 
-    Raises OSError, and ValueError as `parse_json` does.
+    Args:
+        path: The file.
+        max_bytes: Largest size; a larger file is an error.
+
+    Raises:
+        OSError: The file is not regular, cannot be read or is too large.
+        ValueError: It is not a valid document (`parse_json`).
     """
     return parse_json(read_regular(path, max_bytes))
 
 
 def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
-    """Return a JSON document. Raises ValueError for what is none, repeats a key, or is nested deeper than `MAX_DEPTH`.
+    """Return the document in a JSON text.
 
-    finite: refuse numbers that are not finite too, which Python reads: NaN, Infinity and 1e999.
+    Args:
+        text: The JSON.
+        finite: Reject numbers that are not finite, which Python accepts: NaN, Infinity and 1e999.
+
+    Raises:
+        ValueError: The text is not JSON, has a key twice, or is nested deeper than `MAX_DEPTH`.
     """
     number = _finite if finite else None
     try:
@@ -215,7 +230,7 @@ def parse_json(text: str | bytes, *, finite: bool = False) -> Any:
 
 
 def is_deep(document: Any) -> bool:
-    """Whether JSON has more than `MAX_DEPTH` lists or objects inside one another."""
+    """Whether a document is nested deeper than `MAX_DEPTH` levels."""
     level = [document]
     for _ in range(MAX_DEPTH):
         level = [inner for each in level if isinstance(each, dict | list | tuple) for inner in _inside(each)]
@@ -223,11 +238,11 @@ def is_deep(document: Any) -> bool:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    document = dict(pairs)
+    if len(document) < len(pairs):
         names = [name for name, _ in pairs]
         raise ValueError(f"it has the key {next(name for name in names if names.count(name) > 1)!r} twice")
-    return found
+    return document
 
 
 def _finite(text: str) -> float:
@@ -245,4 +260,4 @@ def _require_regular(mode: int, path: str | Path) -> None:
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, "is a folder, not a file", str(path))
     if not stat.S_ISREG(mode):
-        raise OSError(errno.EINVAL, f"{_WORDS.get(stat.S_IFMT(mode), 'is no file')}, not a regular file", str(path))
+        raise OSError(errno.EINVAL, f"{_WORDS.get(stat.S_IFMT(mode), 'is not a file')}, not a regular file", str(path))

@@ -1,4 +1,4 @@
-"""Things by name: those of this project, of installed packages, and of any module that a user names."""
+"""Registries of classes and functions by name: built-in ones, entry points, and `module:Class` of any module."""
 
 import sys
 from collections.abc import Collection, Iterator, Mapping
@@ -10,18 +10,18 @@ T = TypeVar("T")
 
 
 class Registry(Collection[str], Generic[T]):
-    """Names of one kind of thing, each imported when it is used.
+    """Named classes or functions of one kind, imported on first use.
 
-    A package adds a name by an entry point of the group `touch_retrieval.<kind>`:
+    A package adds a name with an entry point of the group `touch_retrieval.<kind>`:
 
         [project.entry-points."touch_retrieval.methods"]
         my_method = "my_package.my_module:MyMethod"
 
-    `module:Class` is a name, too, and needs no entry point. As a collection it holds the built-in names; `names()`
-    gives all.
+    `module:Class` is also a name and needs no entry point. The collection contains the built-in names; `names()`
+    returns all names.
 
-    A name that stands in a file (a checkpoint, an index) may come from anybody, so `load` imports no module because a
-    file names it: `module:Class` must be imported already. `name_of` takes the word of a user, and imports it.
+    Names in files (checkpoints, indexes) are untrusted, so `load` imports no module for `module:Class`: the module
+    must already be imported. `name_of` trusts the user's name and imports its module.
     """
 
     def __init__(
@@ -30,11 +30,11 @@ class Registry(Collection[str], Generic[T]):
         """Make a registry.
 
         Args:
-            noun: What one of these things is called in an error, such as "tower".
-            kind: What ends the name of its group of entry points, such as "towers".
+            noun: Name of one entry in error messages, such as "tower".
+            kind: Last part of the group of entry points, such as "towers".
             table: Built-in name to "module:Class".
-            error: What is raised for an unknown or unusable name.
-            base: "module:Class" that each thing is a subclass or an instance of; None: each is a function.
+            error: Exception type for an unknown or unusable name.
+            base: "module:Class" of which each entry is a subclass or an instance; None: each entry is a function.
         """
         self.noun, self.group, self.table = noun, f"touch_retrieval.{kind}", table
         self._error, self._base = error, base
@@ -49,11 +49,11 @@ class Registry(Collection[str], Generic[T]):
         return name in self.table
 
     def names(self) -> list[str]:
-        """Return the built-in names, then those of installed packages."""
+        """Return the built-in names, then the names that installed packages add."""
         return list(dict.fromkeys([*self.table, *sorted(self._installed())]))
 
     def load(self, name: str) -> T:
-        """Return the thing called `name`. Raises the registry's error where there is none, or where it is unusable."""
+        """Return the entry with this name. Raises the registry's error if it is unknown or unusable."""
         if name in self.table:
             return cast(T, _attribute(import_module(self.table[name].partition(":")[0]), self.table[name]))
         installed = self._installed()
@@ -67,8 +67,8 @@ class Registry(Collection[str], Generic[T]):
             )
         if name not in installed and module not in sys.modules:
             raise self._error(
-                f"{self.noun} {name!r} is of a module that is not imported, and a file may not choose what is: import "
-                f"{module} first, or install a package that names it by an entry point of the group {self.group}"
+                f"{self.noun} {name!r}: its module is not imported, and a name in a file cannot import it. Import "
+                f"{module} first, or install a package that adds it by an entry point of the group {self.group}"
             )
         try:
             return self._checked(name, _attribute(import_module(module), place))
@@ -76,9 +76,9 @@ class Registry(Collection[str], Generic[T]):
             raise self._error(f"{self.noun} {name!r} cannot be imported: {error}") from error
 
     def name_of(self, choice: "str | T") -> str:
-        """Return the name of what a user gives: a name, a `module:Class`, which is imported, or the thing itself.
+        """Return the name of a user's choice: a name, a `module:Class`, which is imported, or the object itself.
 
-        Raises the registry's error for an unknown name, and for a thing that no name leads to.
+        Raises the registry's error for an unknown name, and for an object that no name resolves to.
         """
         if isinstance(choice, str):
             if choice in self.table:
@@ -89,8 +89,8 @@ class Registry(Collection[str], Generic[T]):
                     import_module(module)
                 except ImportError as error:
                     raise self._error(
-                        f"{self.noun} {choice!r} cannot be imported ({error}); install its package, or put its folder "
-                        "on PYTHONPATH"
+                        f"{self.noun} {choice!r} cannot be imported ({error}); install its package, or add its folder "
+                        "to PYTHONPATH"
                     ) from error
             self.load(choice)
             return choice
@@ -98,28 +98,28 @@ class Registry(Collection[str], Generic[T]):
         names = [name for name, its in {**self._installed(), **self.table}.items() if its == place]
         self._checked(place, choice)
         if not names and _attribute_or_none(place) is not choice:
-            raise self._error(f"{self.noun} {place!r} must stand at the top level of its module, to be found again")
+            raise self._error(f"{self.noun} {place!r} must be defined at the top level of its module")
         return names[0] if names else place
 
     def resolve(self, choice: "str | T") -> T:
-        """Return the thing that a user names or gives; raises what `name_of` raises."""
+        """Return the entry for a user's choice; raises as `name_of`."""
         return self.load(self.name_of(choice))
 
     def _installed(self) -> dict[str, str]:
-        """Names of installed packages, with their "module:Class"."""
-        from importlib.metadata import entry_points  # slow to import, and most runs need none
+        """Names that installed packages add, with their "module:Class"."""
+        from importlib.metadata import entry_points  # slow to import, and most runs do not need it
 
         return {point.name: point.value for point in entry_points(group=self.group)}
 
     def _checked(self, name: str, thing: Any) -> T:
         if self._base is None:
-            fits, wanted = callable(thing), "a function"
+            fits, required = callable(thing), "a function"
         else:
             base = _attribute(import_module(self._base.partition(":")[0]), self._base)
             fits = isinstance(thing, base) or (isinstance(thing, type) and issubclass(thing, base))
-            wanted = f"a {base.__name__}"
+            required = f"a {base.__name__}"
         if not fits:
-            raise self._error(f"{self.noun} {name!r} must be {wanted}; got {thing!r}")
+            raise self._error(f"{self.noun} {name!r} must be {required}; got {thing!r}")
         return cast(T, thing)
 
 

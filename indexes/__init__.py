@@ -1,11 +1,11 @@
-"""Vector indexes over unit vectors, and the folder that keeps one on disk.
+"""Vector indexes over unit vectors, and the index folder that stores one on disk.
 
-Importing this package needs only numpy; FAISS is imported when one of its kinds is used.
+This package imports only numpy; FAISS is imported when one of its kinds is used.
 
-    indexes.store.folder     `IndexStore`, the folder of generations
-    indexes.kinds.vector_index       `VectorIndex`, what every kind of index is and says of itself
-    indexes.kinds.measure    recall against the exact search
-    indexes.errors           every error
+    indexes.store.folder          `IndexStore`, the folder of generations
+    indexes.kinds.vector_index    `VectorIndex`, the base class of every kind of index
+    indexes.kinds.measure         recall compared with exact search
+    indexes.errors                every error
 
 >>> import indexes, numpy
 >>> axes = numpy.eye(3, dtype=numpy.float32)
@@ -42,12 +42,11 @@ KINDS: "Registry[type[VectorIndex]]" = Registry(
     error=ParameterError,
     base="indexes.kinds.vector_index:VectorIndex",
 )
-"""Names of the kinds of index, the quickest to build first. What others need to know of a kind, its class says
-(`indexes.VectorIndex`)."""
+"""Names of the kinds of index, the fastest to build first. The class of a kind describes it (`indexes.VectorIndex`)."""
 
 
 def load_kind(name: str) -> "type[VectorIndex]":
-    """Return the class of the kind `name`. Raises `ParameterError` for an unknown name, with the known ones.
+    """Return the class of the kind `name`. Raises `ParameterError` for an unknown name, and lists the known names.
 
     >>> indexes.load_kind("flat").exact, indexes.load_kind("hnsw").exact
     (True, False)
@@ -58,20 +57,20 @@ def load_kind(name: str) -> "type[VectorIndex]":
     kind = KINDS.load(name)
     if kind.kind != name:
         raise ParameterError(
-            f"the index {kind.__module__}:{kind.__qualname__} must say kind = {name!r}, got {kind.kind!r}"
+            f"the index {kind.__module__}:{kind.__qualname__} must have kind = {name!r}, got {kind.kind!r}"
         )
     return kind
 
 
 def open(folder: str | Path, *, verify: bool = True) -> "Generation":
-    """Return the current generation of an index folder, ready to be searched.
+    """Open the current generation of an index folder for searching.
 
     Args:
         folder: The index folder, as `retrieve build-index` writes it.
-        verify: Compare the SHA-256 of every file with the manifest's.
+        verify: Compare the SHA-256 of every file with the manifest.
 
     Raises:
-        IndexesError: There is no index, it is damaged, or its format is another one.
+        IndexesError: The index is missing or damaged, or has another format.
 
     >>> generation = indexes.open("index")
     >>> generation.count, generation.manifest.kind
@@ -89,11 +88,11 @@ _MODULES = {
     "VectorIndex": "kinds.vector_index",
     "recall_against_exact": "kinds.measure",
 }
-"""Public name -> its module in this package, imported when it is used."""
+"""Public name -> its module in this package, imported on first use."""
 
 __all__ = ["KINDS", "load_kind", "open", *_MODULES]
 
-if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
+if not TYPE_CHECKING:  # with it, a type checker would accept every attribute
 
     def __getattr__(name: str) -> Any:
         if name not in _MODULES:

@@ -1,19 +1,18 @@
-"""Every error that `indexes` raises on purpose.
+"""Every error that `indexes` raises on purpose; any other exception is a bug.
 
-A message says what must hold, what was got and what to do. Each class carries the exit code that a command
-line leaves with; anything that is not one of these errors is a bug.
+A message contains the requirement, the value and the remedy. Each class has the exit code of the command line.
 
     IndexesError                  wrong use or bad input (exit code 2)
-    +-- VectorError               a vector is NaN, infinite, zero, not of unit norm, or of another size
-    +-- RowError                  the rows, arrays or documents of an index are not usable
+    +-- VectorError               a vector is NaN, infinite, zero, not of unit norm, or of the wrong size
+    +-- RowError                  the rows, arrays or documents of an index are invalid
     +-- ParameterError            an unknown kind, or a setting that is unknown or out of range
     +-- NoIndex                   there is no index at the path
-    +-- CorruptIndex              a file of the index is missing, cut short or damaged
-    +-- MismatchedIndex           the index was made by another model or preprocessing than asked for
+    +-- CorruptIndex              a file of the index is missing, truncated or damaged
+    +-- MismatchedIndex           the index was made with another model or preprocessing than required
     +-- UnsupportedFormat         the index has a newer or older format than this software reads
-    +-- LockedIndex               another writer works on the index
+    +-- LockedIndex               another writer is writing the index
     +-- JobFailed                 the job ran and failed (exit code 1)
-        +-- SelfRetrievalFailed   rows of a new index do not find themselves
+        +-- SelfRetrievalFailed   a search for the vector of a row does not find the row
         +-- WriteFailed           the disk refused a write
         +-- EngineError           the vector library failed
 """
@@ -37,7 +36,7 @@ class IndexesError(Exception):
 
 
 class VectorError(IndexesError):
-    """A vector is not a finite unit vector of the right size. `row` names it where one row is to blame."""
+    """A vector is not a finite unit vector of the right size. `row` is the id if one row is the cause."""
 
     def __init__(self, message: str, row: str | None = None) -> None:
         super().__init__(message)
@@ -45,7 +44,7 @@ class VectorError(IndexesError):
 
 
 class RowError(IndexesError):
-    """The rows, arrays or documents of an index are not usable. `row` is the id where one row is to blame."""
+    """The rows, arrays or documents of an index are invalid. `row` is the id if one row is the cause."""
 
     def __init__(self, message: str, row: str | None = None) -> None:
         super().__init__(message)
@@ -61,11 +60,11 @@ class NoIndex(IndexesError):
 
 
 class CorruptIndex(IndexesError):
-    """A file of the index is missing, cut short or damaged."""
+    """A file of the index is missing, truncated or damaged."""
 
 
 class MismatchedIndex(IndexesError):
-    """The index was made by another model or preprocessing than the one asked for."""
+    """The index was made with another model or preprocessing than the required one."""
 
 
 class UnsupportedFormat(IndexesError):
@@ -73,7 +72,7 @@ class UnsupportedFormat(IndexesError):
 
 
 class LockedIndex(IndexesError):
-    """Another writer works on the index. `holder` is its process id where known."""
+    """Another writer is writing the index. `holder` is its process id, if known."""
 
     def __init__(self, message: str, holder: int | None = None) -> None:
         super().__init__(message)
@@ -87,7 +86,7 @@ class JobFailed(IndexesError):
 
 
 class SelfRetrievalFailed(JobFailed):
-    """Rows of an index do not find themselves. `ids` lists them."""
+    """Searches for the vectors of some rows do not find these rows. `ids` lists them."""
 
     def __init__(self, message: str, ids: Sequence[str]) -> None:
         super().__init__(message)
@@ -95,7 +94,7 @@ class SelfRetrievalFailed(JobFailed):
 
 
 class WriteFailed(JobFailed):
-    """The disk refused a write; the index is as it was, or as written, but whole."""
+    """The disk refused a write. The index is complete: either the old one or the new one."""
 
 
 class EngineError(JobFailed):

@@ -1,1 +1,1 @@
-"""Vector indexes: their contract, the exact one, and those of FAISS."""
+"""Vector indexes: the base class, exact search in numpy, and the FAISS kinds."""

@@ -1,4 +1,4 @@
-"""What every vector must satisfy before it is stored or searched for."""
+"""Checks of vectors before they are stored or used as queries."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from indexes.errors import AGAIN, CorruptIndex, ParameterError, VectorError
 from indexes.kinds.scores import Doubles, Floats, Slots
 
 NORM_TOLERANCE = 1e-3
-"""Largest distance of a norm from 1. The rounding of float32 is 1e-7, of float16 storage 5e-4."""
+"""Largest deviation of a norm from 1. Rounding to float32 changes a norm by 1e-7, to float16 by 5e-4."""
 
 BLOCK_ROWS = 8192
 
@@ -16,9 +16,16 @@ BLOCK_ROWS = 8192
 def check_unit(
     vectors: object, *, dim: int | None = None, names: Sequence[str] | None = None, what: str = "row"
 ) -> Floats:
-    """`vectors` as a C-contiguous (M, d) float32 array of finite unit vectors, or `VectorError`.
+    """Return vectors as a C-contiguous (M, d) float32 array after checking that they are finite unit vectors.
 
-    `names` gives the M names used in messages (default: the row numbers); `what` is the word before the name.
+    Args:
+        vectors: Array (M, d) float32.
+        dim: Required d; None: any.
+        names: Names (M,) of the rows in messages; None: the row numbers.
+        what: Word before the name in messages.
+
+    Raises:
+        VectorError: A vector has NaN, an infinite component, another norm than 1, or another size.
     """
     table = _check_shape(vectors, dim, what)
     if names is not None and len(names) != len(table):
@@ -36,15 +43,22 @@ def check_unit(
 
 
 def check_k(k: int) -> int:
-    """`k`, a count of results of at least 1, or `ParameterError`."""
+    """Return `k` as int. Raises `ParameterError` unless it is a whole number of at least 1."""
     if isinstance(k, bool) or not isinstance(k, int | np.integer) or k < 1:
         raise ParameterError(f"k, the number of results, must be a whole number of at least 1; got {k!r}")
     return int(k)
 
 
 def check_slots(found: Slots, count: int, minimum: int = 0) -> Slots:
-    """Return the slots (Q, n) that a search found, or raise `CorruptIndex`: each lies from `minimum` to count - 1, and no
-    query has one twice. `minimum` -1 admits the -1 of FAISS, its word for nothing.
+    """Return the slots of a search after checking them.
+
+    Args:
+        found: Slots (Q, n) int64.
+        count: Number of slots of the index; each result must be below it.
+        minimum: Smallest allowed slot; -1 allows the padding of FAISS.
+
+    Raises:
+        CorruptIndex: A slot is out of range, or a query has one slot twice.
     """
     if found.size:
         if found.min() < minimum or found.max() >= count:
@@ -57,7 +71,7 @@ def check_slots(found: Slots, count: int, minimum: int = 0) -> Slots:
 
 
 def row_norms(table: Floats) -> Doubles:
-    """Euclidean norms (M,) in float64; NaN and infinite where a row is."""
+    """Return the Euclidean norms (M,) of the rows in float64; rows with NaN or infinity give NaN or infinity."""
     norms = np.empty(len(table), dtype=np.float64)
     for start in range(0, len(table), BLOCK_ROWS):
         block = table[start : start + BLOCK_ROWS].astype(np.float64)
@@ -81,9 +95,9 @@ def _check_shape(vectors: object, dim: int | None, what: str) -> Floats:
 
 def _fault(row: Floats, norm: float) -> str:
     if np.isnan(row).any():
-        return "it holds NaN (not a number)"
+        return "it has NaN (not a number)"
     if np.isinf(row).any():
-        return "it holds an infinite component"
+        return "it has an infinite component"
     if norm == 0.0:
         return "the vector is zero"
     return f"got {norm:.6g}"

@@ -1,6 +1,6 @@
-"""The oracle: every vector scored against every query, in numpy alone.
+"""Exact search in numpy, the reference for the other kinds.
 
-It scores in float64 and reads all vectors for each search; `flat` gives the same answer many times faster.
+It scores in float64 and reads all vectors for each search; `flat` returns the same results many times faster.
 """
 
 from typing import ClassVar
@@ -10,7 +10,7 @@ from indexes.kinds.vector_index import VectorIndex
 
 
 class ExactIndex(VectorIndex):
-    """Exact search without a structure: the vectors are the index."""
+    """Exact search without a search structure."""
 
     kind: ClassVar[str] = "exact"
     exact: ClassVar[bool] = True

@@ -1,4 +1,4 @@
-"""What the FAISS kinds share: FAISS names the candidates, `indexes.kinds.scores` scores and orders them."""
+"""Base class of the FAISS kinds: FAISS finds the candidates, `indexes.kinds.scores` scores and orders them."""
 
 import math
 from collections.abc import Iterator
@@ -15,18 +15,18 @@ from indexes.kinds.scores import Doubles, Floats, Mask, Slots, error_bound, grid
 from indexes.kinds.vector_index import VectorIndex
 
 faiss: Any = _faiss
-"""The library, untyped: its stubs leave out half of it."""
+"""The library, untyped: its stubs are incomplete."""
 
 FETCH_FACTOR = 4
-"""How much further each round looks than the one before."""
+"""Growth of the number of candidates from one round to the next."""
 
 ADDED_ROWS = 1 << 16
-"""Vectors given to FAISS at once."""
+"""Vectors passed to FAISS at once."""
 
 
 @contextmanager
 def faiss_call(doing: str, threads: int | None) -> Iterator[None]:
-    """Run FAISS with `threads` threads (None: its own setting) and turn what it raises into `EngineError`."""
+    """Run FAISS with `threads` threads (None: its own setting), and convert its exceptions to `EngineError`."""
     before = faiss.omp_get_max_threads()
     if threads is not None:
         faiss.omp_set_num_threads(threads)
@@ -39,37 +39,41 @@ def faiss_call(doing: str, threads: int | None) -> Iterator[None]:
 
 
 class FaissIndex(VectorIndex):
-    """A kind whose candidates FAISS names.
+    """A kind whose candidates come from FAISS.
 
-    Rounds: FAISS names some candidates; they are scored and ordered exactly; a query is settled when
-    k live ones are there and, for an exact kind, no slot outside can reach the last of them. The unsettled
-    look `FETCH_FACTOR` times further, and once everything would be asked for the vectors are scanned instead.
+    The search runs in rounds. FAISS returns some candidates, which are then scored and ordered exactly. A query is
+    complete when k live candidates are found and, for an exact kind, no other slot can reach the score of the last
+    one. Incomplete queries fetch `FETCH_FACTOR` times more. When a round would fetch everything, all vectors are
+    scanned instead.
     """
 
     structure_type: ClassVar[str]
     """Name of the FAISS class."""
     build_threads: ClassVar[int | None] = None
-    """Threads of a build unless the caller names a number."""
+    """Number of threads of a build if the caller gives none."""
 
     _structure: Any = None
 
     def _make(self) -> Any:
-        """An empty, untrained structure for the resolved parameters."""
+        """Return an empty, untrained structure for the resolved parameters."""
         raise NotImplementedError
 
     def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
-        """The structure's own scores and slots (Q, fetch), best first, -1 where it found none.
+        """Return the structure's own scores and slots (Q, fetch), best first, padded with -1.
 
-        `effort` is 1 in the first round and grows; a kind that can look further multiplies by it.
+        Args:
+            queries: Unit vectors (Q, d).
+            fetch: Number of candidates for each query.
+            effort: Factor of the search breadth: 1 in the first round, larger in later ones.
         """
         raise NotImplementedError
 
     def _training(self) -> Floats:
-        """The vectors to train the structure on."""
+        """Return the vectors to train the structure on."""
         return np.ascontiguousarray(self._vectors)
 
     def _first_fetch(self, k: int) -> int:
-        """How many candidates the first round asks for when every slot is live."""
+        """Return the number of candidates of the first round if every slot is live."""
         return k
 
     def _search(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, Slots]:
@@ -80,40 +84,41 @@ class FaissIndex(VectorIndex):
         pending = np.arange(len(queries))
         while pending.size and fetch < self.count:
             rough, found = self._rough_candidates(queries[pending], fetch, effort)
-            gridded, open_still = to_grid(queries[pending]), []
+            gridded, incomplete = to_grid(queries[pending]), []
             for place, query in enumerate(pending):
-                kept = found[place][found[place] >= 0]
-                kept = kept if live is None else kept[live[kept]]
-                ranked, ordered = top_k(grid_scores(gridded[place], to_grid(self._vectors[kept])), kept, k)
+                named = found[place][found[place] >= 0]
+                named = named if live is None else named[live[named]]
+                ranked, ordered = top_k(grid_scores(gridded[place], to_grid(self._vectors[named])), named, k)
                 reach = float(rough[place].min()) + error_bound(self.dim)
                 if len(ranked) == k and (not self.exact or float(ranked[-1]) > reach):
                     scores[query], slots[query] = ranked, ordered
                 else:
-                    open_still.append(query)
-            pending = np.array(open_still, dtype=np.int64)
+                    incomplete.append(query)
+            pending = np.array(incomplete, dtype=np.int64)
             fetch, effort = fetch * FETCH_FACTOR, effort * FETCH_FACTOR
         if pending.size:
             scores[pending], slots[pending] = scan(self._vectors, queries[pending], k, live)
         return scores, slots
 
     def _candidate_slots(self, query: Floats, k: int, live: Mask | None) -> Slots:
-        """What the first round names, where that is enough. Of an exact kind those alone are scored again that rounding
-        may have put on the wrong side of the last place, and mostly none is as near to it.
+        """Return the slots of the first round if they suffice.
+
+        An exact kind scores only those again that rounding may have put on the wrong side of rank k, usually none.
         """
         dilution = 1.0 if live is None else self.count / np.count_nonzero(live)
         fetch = math.ceil(self._first_fetch(k) * dilution)
         if fetch < self.count:
             rough, found = (row[0] for row in self._rough_candidates(query, fetch, 1))
-            kept = found >= 0 if live is None else (found >= 0) & live[found]
-            scores: Floats = rough[kept]
-            slots: Slots = found[kept]
+            usable = found >= 0 if live is None else (found >= 0) & live[found]
+            scores: Floats = rough[usable]
+            slots: Slots = found[usable]
             if len(slots) >= k and not self.exact:
                 return slots
             if len(slots) > k:
                 last, off = float(scores[k - 1]), 2 * error_bound(self.dim)
                 if float(scores[k]) < last - off:
                     return slots[:k]
-                exact: Doubles = scores.astype(np.float64)  # what is added to them must not be rounded
+                exact: Doubles = scores.astype(np.float64)  # adding the bound must not round
                 above = exact > last + off
                 sure, near = slots[above], slots[~above & (exact >= last - off)]
                 if rough[-1] < last - off:
@@ -123,7 +128,7 @@ class FaissIndex(VectorIndex):
         return super()._candidate_slots(query, k, live)
 
     def _rough_candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
-        """FAISS's scores and slots (Q, n) of the best `fetch` candidates, -1 where there are fewer."""
+        """Return FAISS's scores and slots (Q, n) of the best `fetch` candidates, padded with -1."""
         with faiss_call("searching", 1 if len(queries) == 1 else self.threads):
             rough, found = self._candidates(queries, fetch, effort)
         return rough, check_slots(found, self.count, minimum=-1)
@@ -141,11 +146,11 @@ class FaissIndex(VectorIndex):
     def _extend_structure(self) -> None:
         if self._structure.ntotal < self.count:
             with faiss_call(f"copying {self.kind}", None):
-                self._structure = faiss.clone_index(self._structure)  # this one may be another index's too
+                self._structure = faiss.clone_index(self._structure)  # a copy of this index may use it too
             self._add_missing()
 
     def _add_missing(self) -> None:
-        """Give the structure the vectors that it does not hold."""
+        """Add the vectors that the structure lacks."""
         with faiss_call(f"adding to {self.kind}", self._build_threads()):
             for start in range(self._structure.ntotal, self.count, ADDED_ROWS):
                 self._structure.add(np.ascontiguousarray(self._vectors[start : start + ADDED_ROWS]))
@@ -163,6 +168,6 @@ class FaissIndex(VectorIndex):
         must = (self.structure_type, self.count, self.dim, faiss.METRIC_INNER_PRODUCT)
         if got != must:
             raise CorruptIndex(
-                f"{path}: must hold (type, count, size, metric) {must}, holds {got}; build the index again"
+                f"{path}: must have (type, count, size, metric) {must}, got {got}; build the index again"
             )
         self._structure = structure

@@ -6,13 +6,13 @@ from indexes.kinds.faiss_index import FaissIndex, faiss
 from indexes.kinds.scores import Floats, Slots
 
 SPARE = 16
-"""Candidates beyond k in the first round, so that rounding at the last rank rarely needs a second one."""
+"""Candidates beyond k in the first round, so that rounding at rank k rarely requires a second round."""
 
 
 class FlatIndex(FaissIndex):
-    """Every vector is compared in float32, and whatever could be among the best k is scored again exactly.
+    """Exact search: FAISS scores every vector in float32, and possible members of the best k are scored again exactly.
 
-    There is no structure: FAISS scans the vectors where they lie.
+    There is no structure: FAISS scans the vectors in place.
     """
 
     kind: ClassVar[str] = "flat"
@@ -20,10 +20,10 @@ class FlatIndex(FaissIndex):
     structure_file: ClassVar[bool] = False
 
     def _build(self) -> None:
-        """Nothing: no vector is in a structure, and so all are scanned."""
+        """Do nothing: there is no structure."""
 
     def _extend_structure(self) -> None:
-        """Nothing, as for `_build`."""
+        """Do nothing: there is no structure."""
 
     def _first_fetch(self, k: int) -> int:
         return k + SPARE

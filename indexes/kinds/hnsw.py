@@ -10,21 +10,21 @@ from indexes.kinds.scores import Floats, Slots
 
 @dataclass(frozen=True)
 class HNSWParameters(vector_index.Parameters):
-    """Links per node (`neighbours`, M in the paper); breadth of the search when building and asking."""
+    """Links of each node (`neighbours`, M in the paper), and the search breadth during building and searching."""
 
     neighbours: int = 32
     ef_construction: int = 80
     ef_search: int = 64
 
     def __post_init__(self) -> None:
-        self.check("neighbours", minimum=2, maximum=vector_index.MAX_COUNT)  # with one FAISS ends the process
+        self.check("neighbours", minimum=2, maximum=vector_index.MAX_COUNT)  # with 1, FAISS ends the process
         self.check("ef_construction", "ef_search", maximum=vector_index.MAX_COUNT)
 
 
 class HNSWIndex(FaissIndex):
-    """A graph of neighbours. Copies of one vector hide the rest of it, so give it distinct vectors.
+    """A neighbour graph. Duplicate vectors hide the rest of the graph, so the vectors must be distinct.
 
-    It is built on one thread unless told otherwise: with more, the graph depends on their timing.
+    By default one thread builds it: with more threads, the graph depends on their timing.
     """
 
     kind: ClassVar[str] = "hnsw"
@@ -42,12 +42,12 @@ class HNSWIndex(FaissIndex):
         return structure
 
     def _add_missing(self) -> None:
-        # A graph read from disk has lost its generator: seed it by what is there, read or not.
+        # The random generator is not stored with the graph: seed it by the number of vectors in the graph.
         self._structure.hnsw.rng = faiss.RandomGenerator(self.seed + self._structure.ntotal)
         super()._add_missing()
 
     def _candidates(self, queries: Floats, fetch: int, effort: int) -> tuple[Floats, Slots]:
-        # FAISS makes room for the whole breadth at once, and no more than all can be found.
+        # FAISS allocates memory for the whole breadth, and more than all vectors cannot be found.
         breadth = min(self.count, max(fetch, self.parameters.ef_search * effort))
         rough, found = self._structure.search(queries, fetch, params=faiss.SearchParametersHNSW(efSearch=breadth))
         return rough, found

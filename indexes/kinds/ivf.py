@@ -1,4 +1,4 @@
-"""FAISS inverted lists: vectors grouped around trained centres, of which a search visits a few."""
+"""FAISS inverted lists: vectors grouped around trained centres; a search visits a few lists."""
 
 import math
 from dataclasses import dataclass, replace
@@ -12,28 +12,31 @@ from indexes.kinds.faiss_index import FaissIndex, faiss
 from indexes.kinds.scores import Floats, Slots
 
 POINTS_PER_CENTRE = 39
-"""Fewest training points for each centre that FAISS accepts without a warning."""
+"""Smallest number of training points of each centre that FAISS accepts without a warning."""
 
 MAX_POINTS_PER_CENTRE = 64
-"""Training points for each centre beyond which the centres gain nothing worth the time."""
+"""Largest number of training points of each centre: more improve the centres too little for their time."""
 
 MIN_CODED_VECTORS = 16 * POINTS_PER_CENTRE
-"""Vectors that codes need for their training: enough for the smallest codebook, and for the range of each component."""
+"""Vectors that train compressed codes: enough for the smallest codebook and for the range of each component."""
 
 SPARE_CODES = 64
-"""Candidates beyond k that are scored exactly: with a byte for each component, near-copies change places."""
+"""Candidates beyond k that are scored exactly: one byte for each component swaps the order of near-copies."""
 
 MIN_REFINED = 64
-"""Compressed scores are too coarse to trust their very first: a smaller k refines as many as this one."""
+"""Smallest k for the number of refined candidates: compressed scores are too coarse to trust the first few."""
 
 
 @dataclass(frozen=True)
 class IVFParameters(vector_index.Parameters):
-    """Number of lists and of lists visited.
+    """Number of lists, and number of lists that a search visits.
 
-    `lists` None takes sqrt(N); any number is lowered to N / 39, what N points can train. Training and adding cost
-    N lists: with four times as many a build took ten times as long, and at equal recall a query a tenth to a half less.
-    `probes` None takes an eighth of the lists, and at least 8.
+    Training and adding cost N x lists: 4 times as many lists made a build 10 times slower and, at equal recall, a
+    query 10 to 50 % faster.
+
+    Attributes:
+        lists: Number of lists; None: sqrt(N). It is lowered to N / 39, the most that N points can train.
+        probes: Number of visited lists; None: an eighth of the lists, at least 8.
     """
 
     lists: int | None = None
@@ -45,9 +48,12 @@ class IVFParameters(vector_index.Parameters):
 
 @dataclass(frozen=True)
 class IVFPQParameters(IVFParameters):
-    """Lists, and codes of `code_bytes` bytes per vector; `refine` times k candidates are scored exactly.
+    """Lists and product-quantization codes.
 
-    `code_bytes` must divide the vector size; None takes its largest divisor up to an eighth of it (or 8).
+    Attributes:
+        code_bytes: Bytes of each code, a divisor of the vector size; None: the largest divisor up to an eighth of it
+            (or up to 8).
+        refine: `refine` times k candidates are scored exactly.
     """
 
     code_bytes: int | None = None
@@ -58,7 +64,7 @@ class IVFPQParameters(IVFParameters):
 
 
 class IVFFlatIndex(FaissIndex):
-    """Inverted lists of whole vectors."""
+    """Inverted lists of uncompressed vectors."""
 
     kind: ClassVar[str] = "ivf_flat"
     structure_type: ClassVar[str] = "IndexIVFFlat"
@@ -69,12 +75,13 @@ class IVFFlatIndex(FaissIndex):
     parameters: IVFParameters
 
     @classmethod
-    def resolve_parameters(cls, asked: Any, count: int, dim: int) -> Any:
-        asked = super().resolve_parameters(asked, count, dim)
+    def resolve_parameters(cls, parameters: Any, count: int, dim: int) -> Any:
+        """Fill in `lists` and `probes` for `count` vectors."""
+        parameters = super().resolve_parameters(parameters, count, dim)
         most = max(1, count // POINTS_PER_CENTRE)
-        lists = min(most, asked.lists or round(math.sqrt(count)))
-        probes = min(lists, asked.probes or max(8, math.ceil(lists / 8)))
-        return replace(asked, lists=lists, probes=probes)
+        lists = min(most, parameters.lists or round(math.sqrt(count)))
+        probes = min(lists, parameters.probes or max(8, math.ceil(lists / 8)))
+        return replace(parameters, lists=lists, probes=probes)
 
     def _make(self) -> Any:
         structure = faiss.IndexIVFFlat(self._centres(), self.dim, self._lists, faiss.METRIC_INNER_PRODUCT)
@@ -107,7 +114,7 @@ class IVFFlatIndex(FaissIndex):
 
 
 class IVFSQ8Index(IVFFlatIndex):
-    """Inverted lists of vectors with a byte for each component: a quarter of the memory, and scores within 1 %."""
+    """Inverted lists of vectors with one byte for each component: a quarter of the memory, scores within 1 %."""
 
     kind: ClassVar[str] = "ivf_sq8"
     structure_type: ClassVar[str] = "IndexIVFScalarQuantizer"
@@ -124,9 +131,9 @@ class IVFSQ8Index(IVFFlatIndex):
 
 
 class IVFPQIndex(IVFFlatIndex):
-    """Inverted lists of compressed vectors; the uncompressed ones on disk give the final scores.
+    """Inverted lists of compressed vectors; the final scores use the uncompressed vectors on disk.
 
-    The codebooks take 256 codes where there are vectors enough to train them, and fewer down to 16.
+    The codebooks have 256 codes if there are enough vectors to train them, else fewer, down to 16.
     """
 
     kind: ClassVar[str] = "ivf_pq"
@@ -138,12 +145,12 @@ class IVFPQIndex(IVFFlatIndex):
     parameters: IVFPQParameters
 
     @classmethod
-    def resolve_parameters(cls, asked: Any, count: int, dim: int) -> Any:
-        if asked.code_bytes is not None and dim % asked.code_bytes:
-            raise ParameterError(f"code_bytes must divide the vector size {dim}; got {asked.code_bytes}")
-        return replace(
-            super().resolve_parameters(asked, count, dim), code_bytes=asked.code_bytes or _default_bytes(dim)
-        )
+    def resolve_parameters(cls, parameters: Any, count: int, dim: int) -> Any:
+        """Fill in `lists`, `probes` and `code_bytes`. Raises `ParameterError` if `code_bytes` does not divide `dim`."""
+        if parameters.code_bytes is not None and dim % parameters.code_bytes:
+            raise ParameterError(f"code_bytes must divide the vector size {dim}; got {parameters.code_bytes}")
+        code_bytes = parameters.code_bytes or _default_bytes(dim)
+        return replace(super().resolve_parameters(parameters, count, dim), code_bytes=code_bytes)
 
     def _make(self) -> Any:
         bits = min(8, int(math.log2(self.count / POINTS_PER_CENTRE)))

@@ -1,4 +1,4 @@
-"""How well and how fast an index answers, against the exact search."""
+"""Recall of an index compared with exact search, and its time per query."""
 
 import time
 from collections.abc import Callable
@@ -12,14 +12,22 @@ from indexes.kinds.scores import Floats, scan
 from indexes.kinds.vector_index import VectorIndex
 
 Clock = Callable[[], float]
-"""Seconds from some start."""
+"""Returns seconds since an arbitrary start."""
 
 
 def sample_queries(vectors: Floats, count: int, *, seed: int = 0, noise: float = 0.5) -> Floats:
-    """`count` unit queries (count, d): vectors drawn at random, each moved by `noise` in a random direction.
+    """Draw unit queries near the vectors: randomly chosen vectors, each moved by `noise` in a random direction.
 
-    A noise of 0.5 leaves a cosine near 0.9 with the vector. Queries of another modality lie further away, so
-    where real queries are at hand, measure with those.
+    Queries of another modality are further from the vectors, so prefer real queries if there are any.
+
+    Args:
+        vectors: Unit vectors (M, d).
+        count: Number of queries Q.
+        seed: Seed of the random choices.
+        noise: Length of the displacement; 0.5 leaves a cosine near 0.9 with the vector.
+
+    Returns:
+        Unit queries (Q, d) float32.
     """
     rng = np.random.default_rng(seed)
     chosen = vectors[rng.integers(len(vectors), size=count)].astype(np.float64)
@@ -30,10 +38,17 @@ def sample_queries(vectors: Floats, count: int, *, seed: int = 0, noise: float =
 
 
 def recall_against_exact(index: VectorIndex, queries: Floats, k: int = 10) -> float:
-    """Mean share of the exact best k that `index` returns for unit queries (Q, d), Q >= 1.
+    """Return the recall@k of an index: the mean fraction of the exact best k that it returns.
 
-    A result counts when its score reaches the exact k-th score: a tie partner is as good. k is lowered to the
-    number of slots. An index that is exact has recall 1.
+    A result counts if its score reaches the exact k-th score, so ties at rank k count. An exact index has recall 1.
+
+    Args:
+        index: The index.
+        queries: Unit queries (Q, d), Q >= 1.
+        k: Number of results, lowered to the number of slots.
+
+    Raises:
+        ParameterError: There is no query.
 
     >>> import numpy as np
     >>> vectors = np.eye(8, dtype=np.float32)
@@ -49,7 +64,14 @@ def recall_against_exact(index: VectorIndex, queries: Floats, k: int = 10) -> fl
 
 
 def query_ms(index: VectorIndex, queries: Floats, k: int = 10, *, clock: Clock = time.perf_counter) -> float:
-    """Median milliseconds of one query (Q, d) asked alone, after one that is not counted."""
+    """Return the median milliseconds of single-query searches, after one untimed search.
+
+    Args:
+        index: The index.
+        queries: Unit queries (Q, d), searched one by one.
+        k: Number of results.
+        clock: Source of the time in seconds.
+    """
     index.search(queries[:1], k)
     taken = []
     for number in range(len(queries)):

@@ -1,14 +1,13 @@
-"""Inner products of unit vectors that come out the same bit for bit, whatever computes them.
+"""Bitwise reproducible inner products of unit vectors.
 
-A sum of floating-point products depends on its order, so the same pair scores differently in a batch of one
-and a batch of a thousand, on one thread and on eight, and identical vectors stop being ties. Here every
-component is first rounded to a multiple of 2^-26. A product of two components is then a multiple of 2^-52,
-and by Cauchy-Schwarz every partial sum of products of two vectors with norms up to 1.001 stays below
-1.003 in size, that is below 2^53 such multiples: float64 holds each of them exactly. Nothing is ever
-rounded, so every order gives the same sum.
+A sum of floating-point products depends on its order. The same pair then scores differently in a batch of 1 and a
+batch of 1000, on one thread and on eight, and identical vectors are no ties. Here every component is first rounded
+to a multiple of 2^-26. A product of two components is then a multiple of 2^-52. By Cauchy-Schwarz, every partial
+sum of products of two vectors with norms up to 1.001 stays below 1.003 in size, that is below 2^53 such multiples.
+Float64 represents each of them exactly, so nothing is rounded and every order gives the same sum.
 
-The price is the rounding of the components, at most 2^-27 each: the score moves by less than
-2^-26 * 1.001 * sqrt(d), which is 3.4e-7 at d = 512 (typically 1e-8), against the 6e-8 of float32 itself.
+Rounding the components (at most 2^-27 each) moves a score by less than 2^-26 * 1.001 * sqrt(d). This is 3.4e-7 at
+d = 512 (typically 1e-8), compared with 6e-8 for float32 itself.
 """
 
 import math
@@ -24,44 +23,51 @@ Mask: TypeAlias = NDArray[np.bool_]
 
 GRID = 2.0**26
 BLOCK_NUMBERS = 1 << 22
-"""Numbers held at once by the blocked loops (32 MiB of float64)."""
+"""Numbers in memory at once in the blocked loops (32 MiB of float64)."""
 
 
 def to_grid(vectors: Floats) -> Doubles:
-    """The components (..., d) as whole multiples of 2^-26, counted (float64 integers)."""
+    """Round components (..., d) to multiples of 2^-26; return the multiples as whole numbers in float64."""
     counted: Doubles = np.rint(vectors.astype(np.float64) * GRID)
     return counted
 
 
 def grid_scores(queries: Doubles, vectors: Doubles) -> Floats:
-    """Inner products (..., M) float32 of gridded queries (..., d) and gridded vectors (M, d)."""
+    """Return inner products (..., M) float32 of queries (..., d) and vectors (M, d), both from `to_grid`."""
     scores: Floats = (queries @ vectors.T * GRID**-2).astype(np.float32)
     return scores
 
 
 def error_bound(dim: int) -> float:
-    """How far a float32 inner product of any order may lie from `grid_scores`, for norms up to 1.001.
+    """Return the largest difference between a float32 inner product in any order and `grid_scores`.
 
-    The classical bound (d + 2) u |x| |y| with u = 2^-24, plus the grid's bound, plus a rounding to float32.
+    Valid for norms up to 1.001: the classical bound (d + 2) u |x| |y| with u = 2^-24, plus the bound of the grid,
+    plus one rounding to float32.
     """
     unit = 2.0**-24
     return 1.01 * ((dim + 2) * unit + math.sqrt(dim) * 2.0**-26 + unit)
 
 
 def top_k(scores: Floats, slots: Slots, k: int) -> tuple[Floats, Slots]:
-    """The k best of (n,) scores and their slots, ordered by (-score, slot)."""
+    """Return the best k of scores (n,) and their slots, ordered by (-score, slot)."""
     if len(scores) > k:
-        reach = scores >= np.partition(scores, len(scores) - k)[len(scores) - k]  # the last place's ties too
+        reach = scores >= np.partition(scores, len(scores) - k)[len(scores) - k]  # including ties at rank k
         scores, slots = scores[reach], slots[reach]
     order = np.lexsort((slots, -scores))[:k]
     return scores[order], slots[order]
 
 
 def scan(vectors: Floats, queries: Floats, k: int, live: Mask | None = None) -> tuple[Floats, Slots]:
-    """Score every slot: (Q, k) scores and slots ordered by (-score, slot), where `live` (M,) is true.
+    """Score every live slot: exact search, the reference for every kind.
 
-    The vectors (M, d) are read block by block. k must not exceed the number of live slots. This is the reference that
-    every kind is measured against.
+    Args:
+        vectors: Unit vectors (M, d), read block by block.
+        queries: Unit queries (Q, d).
+        k: Number of results, at most the number of live slots.
+        live: Mask (M,) of the slots to search; None: all.
+
+    Returns:
+        Scores (Q, k) float32 and slots (Q, k) int64, ordered by (-score, slot).
     """
     gridded = to_grid(queries)
     found = [(np.empty(0, np.float32), np.empty(0, np.int64))] * len(queries)

@@ -1,4 +1,4 @@
-"""The contract of a vector index, and the checks that every kind shares."""
+"""The base class of vector indexes, and the checks that every kind shares."""
 
 import copy
 import math
@@ -15,19 +15,28 @@ from indexes.kinds.checks import check_k, check_slots, check_unit
 from indexes.kinds.scores import Floats, Mask, Slots
 
 MAX_COUNT = 2**31 - 1
-"""FAISS counts in 32 bits."""
+"""Largest 32-bit integer: FAISS counts in 32 bits."""
 MAX_THREADS = 4096
 
 Ladder: TypeAlias = tuple[str, tuple[int, ...]]
-"""The name of a parameter, and values of it to try."""
+"""Name of a parameter, and its values to try."""
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """Settings of a kind; None means "chosen from the data when the index is built"."""
+    """Settings of a kind; None is filled in from the data when the index is built."""
 
     def check(self, *names: str, minimum: int = 1, maximum: float = math.inf) -> None:
-        """Each named setting is None or a whole number from `minimum` to `maximum`, or `ParameterError`."""
+        """Check that each named setting is None or a whole number in range.
+
+        Args:
+            *names: Names of the settings.
+            minimum: Smallest value.
+            maximum: Largest value.
+
+        Raises:
+            ParameterError: A setting is out of range.
+        """
         for name in names:
             value = getattr(self, name)
             if value is not None and not is_whole(value, minimum, maximum):
@@ -38,18 +47,17 @@ class Parameters:
 class VectorIndex(ABC):
     """Inner-product search over (M, d) float32 unit vectors in slots 0..M-1.
 
-    What holds for every kind:
+    Every kind guarantees:
 
-    * Scores are the inner products of `indexes.kinds.scores`: equal bit for bit in every batch, on any
-      number of threads, and in every kind.
-    * Results are ordered by (-score, slot). An exact kind returns the first k of that order, ties at the last
-      rank included; an approximate kind may miss slots, a tie partner among them, but scores exactly
-      those it finds.
-    * A search returns k' = min(k, live slots) results for every query, of every kind: where a structure finds
-      fewer, it looks further and in the end scans. There is no padding.
-    * Vectors are checked when added and when searched for: finite, of unit norm within 1e-3, of d components.
+    * Scores are the inner products of `indexes.kinds.scores`: bitwise equal in every batch, on any number of
+      threads, and in every kind.
+    * Results are ordered by (-score, slot). An exact kind returns the first k of this order. An approximate kind may
+      miss slots, tied ones too, but its scores are exact.
+    * A search returns k' = min(k, live slots) results for every query. If a structure finds fewer, it searches
+      further and finally scans all vectors. There is no padding.
+    * Added vectors and queries are checked: finite, of unit norm within 1e-3, with d components.
 
-    A subclass writes `_search`, and the structure's `_build`, `_extend_structure`, `_read`, `_write` where it has one.
+    A subclass implements `_search`; if it has a structure, also `_build`, `_extend_structure`, `_read` and `_write`.
 
     >>> import numpy as np
     >>> index = indexes.load_kind("flat").build(np.eye(4, dtype=np.float32))
@@ -60,24 +68,24 @@ class VectorIndex(ABC):
     """
 
     kind: ClassVar[str]
-    """Its name, which the manifest of an index keeps; module:Class where a subclass says none."""
+    """Name of the kind, stored in the manifest of an index; by default module:Class."""
     exact: ClassVar[bool] = False
     """Whether a search always finds the true best k."""
     auto_try: ClassVar[bool] = False
-    """Whether `retrieve build-index` tries this kind, unasked, where exact search takes too long."""
+    """Whether `retrieve build-index` tries this kind by itself if exact search takes too long."""
     retrain_growth: ClassVar[float | None] = None
-    """Growth, as a multiple of the trained size, beyond which to build anew; None: any."""
+    """Growth, as a multiple of the trained size, beyond which the structure is rebuilt; None: never."""
     structure_file: ClassVar[bool] = True
-    """Whether `save` writes a file; without one the vectors alone are the index."""
+    """Whether `save` writes a file; without one, the vectors are the whole index."""
     search_settings: ClassVar[frozenset[str]] = frozenset()
-    """Parameters that a search reads and the structure does not depend on."""
+    """Parameters of a search, on which the structure does not depend."""
     search_ladder: ClassVar[Ladder | None] = None
-    """The one of them that trades time for recall, and values from the fastest on."""
+    """The search setting that trades time for recall, with values from the fastest on."""
     build_ladder: ClassVar[Ladder | None] = None
-    """A parameter of the structure that trades memory for recall; `retrieve frontier` compares its values."""
+    """The structure parameter that trades memory for recall; `retrieve frontier` compares its values."""
     parameters_type: ClassVar[type[Parameters]] = Parameters
     min_vectors: ClassVar[int] = 1
-    """Vectors that a build needs."""
+    """Smallest number of vectors for a build."""
     parameters: Parameters
 
     def __init_subclass__(cls) -> None:
@@ -85,7 +93,7 @@ class VectorIndex(ABC):
             cls.kind = f"{cls.__module__}:{cls.__qualname__}"
 
     def __init__(self, vectors: Floats, parameters: Any, seed: int, threads: int | None) -> None:
-        """Used by `build` and `load`, which check what comes here."""
+        """Store checked arguments; `build` and `load` call this."""
         self._vectors = vectors
         self.parameters = parameters
         self.seed = seed
@@ -101,10 +109,18 @@ class VectorIndex(ABC):
         seed: int = 0,
         threads: int | None = None,
     ) -> Self:
-        """An index of `vectors` (M, d), M >= 1. `names` (M,) are the rows' names in messages.
+        """Build an index of vectors. The same input and seed give the same index.
 
-        `parameters` None takes the defaults; `.parameters` of the result has every None filled in.
-        `threads` None leaves the library's own setting. The same input and seed give the same index.
+        Args:
+            vectors: Unit vectors (M, d) float32, M >= 1.
+            parameters: Settings; None: the defaults. `.parameters` of the result has every None filled in.
+            names: Names (M,) of the rows in messages.
+            seed: Seed of all random choices.
+            threads: Number of threads; None: the library's own setting.
+
+        Raises:
+            VectorError: A vector is invalid, or there is none.
+            ParameterError: The parameters are of another kind, or this kind needs more vectors.
         """
         table = check_unit(vectors, names=names)
         if not len(table):
@@ -113,19 +129,17 @@ class VectorIndex(ABC):
 
     @classmethod
     def check_parameters(cls, parameters: Parameters | None) -> Parameters:
-        """The parameters, or the defaults for None; of another kind they raise `ParameterError`."""
-        check_parameters = cls.parameters_type() if parameters is None else parameters
-        if not isinstance(check_parameters, cls.parameters_type):
-            raise ParameterError(
-                f"{cls.kind} takes {cls.parameters_type.__name__}; got {type(check_parameters).__name__}"
-            )
-        return check_parameters
+        """Return the parameters, or the defaults for None. Raises `ParameterError` for those of another kind."""
+        checked = cls.parameters_type() if parameters is None else parameters
+        if not isinstance(checked, cls.parameters_type):
+            raise ParameterError(f"{cls.kind} takes {cls.parameters_type.__name__}; got {type(checked).__name__}")
+        return checked
 
     @classmethod
     def build_checked(
         cls, vectors: Floats, parameters: Parameters, *, seed: int = 0, threads: int | None = None
     ) -> Self:
-        """`build` over vectors (M, d), M >= 1, that were checked before."""
+        """Build an index of vectors (M, d), M >= 1, that are already checked."""
         index = cls(
             vectors, cls.resolve_parameters(parameters, *vectors.shape), check_seed(seed), check_threads(threads)
         )
@@ -142,14 +156,22 @@ class VectorIndex(ABC):
         seed: int = 0,
         threads: int | None = None,
     ) -> Self:
-        """The index that `save` wrote to `path`, over the same `vectors` (M, d), which may be memory-mapped.
+        """Load the index that `save` wrote.
 
-        A file that is unreadable or does not fit raises `CorruptIndex`. The vectors are trusted.
+        Args:
+            path: File of the structure; None for a kind without one.
+            vectors: The same vectors (M, d), perhaps memory-mapped; they are not checked.
+            parameters: The parameters of the saved index.
+            seed: The seed of the saved index.
+            threads: Number of threads; None: the library's own setting.
+
+        Raises:
+            CorruptIndex: The file is unreadable or does not fit the vectors.
         """
         index = cls(vectors, parameters, seed, check_threads(threads))
         if cls.structure_file:
             if path is None:
-                raise ParameterError(f"{cls.kind} is loaded from a file; got no path")
+                raise ParameterError(f"{cls.kind} needs a path to load from; got None")
             index._read(Path(path))
         else:
             index._build()
@@ -157,7 +179,7 @@ class VectorIndex(ABC):
 
     @classmethod
     def parameters_from(cls, settings: Mapping[str, Any]) -> Parameters:
-        """This kind's parameters from names and values; an unknown name raises `ParameterError`."""
+        """Return this kind's parameters from names and values. Raises `ParameterError` for an unknown name."""
         known = [field.name for field in fields(cls.parameters_type)]
         unknown = sorted(set(settings) - set(known))
         if unknown:
@@ -178,39 +200,52 @@ class VectorIndex(ABC):
 
     @property
     def vectors(self) -> Floats:
-        """The vectors (M, d); not to be written to."""
+        """The vectors (M, d); do not write to them."""
         return self._vectors
 
     def settings(self) -> dict[str, Any]:
-        """The parameters as a JSON object."""
+        """Return the parameters as a JSON object."""
         return asdict(self.parameters)
 
     def search(self, queries: Floats, k: int, live: Mask | None = None) -> tuple[Floats, Slots]:
-        """The best k slots of each unit query (Q, d): scores (Q, k') float32 and slots (Q, k') int64.
+        """Return the best k slots of each query.
 
-        `live` (M,) leaves out the slots where it is false; k' = min(k, number of live slots).
+        Args:
+            queries: Unit queries (Q, d) float32.
+            k: Number of results, at least 1.
+            live: Mask (M,) of the slots to search; None: all.
+
+        Returns:
+            Scores (Q, k') float32 and slots (Q, k') int64; k' = min(k, number of live slots).
         """
-        table, wanted = self._check_query(queries, k, live)
-        if wanted == 0 or not len(table):
-            shape = (len(table), wanted)
+        table, count = self._check_query(queries, k, live)
+        if count == 0 or not len(table):
+            shape = (len(table), count)
             return np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.int64)
-        scores, slots = self._search(table, wanted, live)
+        scores, slots = self._search(table, count, live)
         return scores, check_slots(slots, self.count)
 
     def candidates(self, queries: Floats, k: int, live: Mask | None = None) -> list[Slots]:
-        """The slots that `search` finds, of each query and in no order, for whoever scores them otherwise: an exact
-        kind names just these, an approximate one at least k' of its best. Takes less time, as few are scored.
+        """Return the slots that `search` finds for each query, unordered and without scores, for a caller that reranks.
+
+        An exact kind returns exactly these slots, an approximate kind at least k' of its best. This is faster than
+        `search`, because few slots are scored exactly.
+
+        Args:
+            queries: Unit queries (Q, d) float32.
+            k: Number of slots, at least 1.
+            live: Mask (M,) of the slots to search; None: all.
         """
-        table, wanted = self._check_query(queries, k, live)
-        if wanted == 0:
+        table, count = self._check_query(queries, k, live)
+        if count == 0:
             return [np.empty(0, dtype=np.int64) for _ in table]
-        named = [self._candidate_slots(query[None], wanted, live) for query in table]
-        for slots in named:
+        found = [self._candidate_slots(query[None], count, live) for query in table]
+        for slots in found:
             check_slots(slots[None], self.count)
-        return named
+        return found
 
     def _check_query(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, int]:
-        """The queries, and how many slots each can have."""
+        """Return the checked queries, and the number of results of each."""
         k = check_k(k)
         table = check_unit(queries, dim=self.dim, what="query")
         if live is not None and (live.shape != (self.count,) or live.dtype != np.bool_):
@@ -218,28 +253,40 @@ class VectorIndex(ABC):
         return table, min(k, self.count if live is None else int(np.count_nonzero(live)))
 
     def add(self, vectors: Floats, *, names: Sequence[str] | None = None) -> None:
-        """Append `vectors` (F, d) as slots M..M+F-1; F = 0 changes nothing."""
+        """Append vectors (F, d) as slots M..M+F-1.
+
+        Args:
+            vectors: Unit vectors (F, d) float32; F may be 0.
+            names: Names (F,) of the rows in messages.
+        """
         fresh = check_unit(vectors, dim=self.dim, names=names)
         if len(fresh):
             self.grow(np.concatenate([self._vectors, fresh]))
 
     def grow(self, vectors: Floats) -> None:
-        """Search `vectors` (M', d), M' >= M, of which the first M are those of this index and all were checked."""
+        """Replace the vectors with checked ones (M', d), M' >= M, whose first M rows are those of this index."""
         self._vectors = vectors
         self._extend_structure()
 
     def save(self, path: str | Path) -> bool:
-        """Write the structure to `path`; False, and nothing written, for a kind that has none."""
+        """Write the structure to `path` and return True; return False for a kind without a structure."""
         if self.structure_file:
             self._write(Path(path))
         return self.structure_file
 
     def copy(self) -> Self:
-        """An index whose `add` and `grow` leave this one as it is. The vectors are shared."""
+        """Return an index whose `add` and `grow` do not change this one. The vectors are shared."""
         return copy.copy(self)
 
     def with_settings(self, **settings: Any) -> Self:
-        """The same structure searched with other settings, for example `with_settings(ef_search=128)`."""
+        """Return an index with the same structure and other search settings, such as `with_settings(ef_search=128)`.
+
+        Args:
+            **settings: New values of search settings (`search_settings`).
+
+        Raises:
+            ParameterError: A setting requires a new build.
+        """
         fixed = sorted(set(settings) - self.search_settings)
         if fixed:
             can = ", ".join(sorted(self.search_settings)) or "nothing"
@@ -249,7 +296,7 @@ class VectorIndex(ABC):
         return other
 
     def search_variants(self) -> Iterator[Self]:
-        """The same structure with each value of its `search_ladder`; one without a ladder as it is."""
+        """Yield the same structure with each value of its `search_ladder`; without a ladder, yield this index."""
         if self.search_ladder is None:
             yield self
             return
@@ -258,31 +305,38 @@ class VectorIndex(ABC):
             yield self.with_settings(**{setting: value})
 
     @classmethod
-    def resolve_parameters(cls, check_parameters: Any, count: int, dim: int) -> Any:
-        """The parameters with every None filled in for `count` vectors of `dim` components, or `ParameterError` where
-        this kind cannot be built over so many.
+    def resolve_parameters(cls, parameters: Any, count: int, dim: int) -> Any:
+        """Return the parameters with every None filled in.
+
+        Args:
+            parameters: Parameters of this kind.
+            count: Number of vectors.
+            dim: Number of components of a vector.
+
+        Raises:
+            ParameterError: This kind needs more vectors.
         """
         if count < cls.min_vectors:
             raise ParameterError(f"{cls.kind} needs {cls.min_vectors} or more vectors to train its codes; got {count}")
-        return check_parameters
+        return parameters
 
     @abstractmethod
     def _search(self, queries: Floats, k: int, live: Mask | None) -> tuple[Floats, Slots]:
-        """The result of `search`: queries are checked, and 1 <= k <= live slots."""
+        """Return the result of `search` for checked queries, 1 <= k <= live slots."""
 
     def _candidate_slots(self, query: Floats, k: int, live: Mask | None) -> Slots:
-        """The result of `candidates` for one query (1, d), checked as those of `_search` are."""
+        """Return the result of `candidates` for one checked query (1, d), 1 <= k <= live slots."""
         slots: Slots = self._search(query, k, live)[1][0]
         return slots
 
     def _build(self) -> None:  # noqa: B027 - nothing to do without a structure
-        """Make the structure over `self._vectors`."""
+        """Build the structure over `self._vectors`."""
 
     def _extend_structure(self) -> None:  # noqa: B027 - nothing to do without a structure
-        """Take in that `self._vectors` has more vectors than before."""
+        """Extend the structure to the new vectors at the end of `self._vectors`."""
 
     def _read(self, path: Path) -> None:
-        """Read the structure and check that it holds `self._vectors`."""
+        """Read the structure and check that it fits `self._vectors`."""
         raise NotImplementedError
 
     def _write(self, path: Path) -> None:
@@ -291,19 +345,19 @@ class VectorIndex(ABC):
 
 
 def check_threads(threads: int | None) -> int | None:
-    """`threads`, None or a whole number from 1 to `MAX_THREADS`, or `ParameterError`."""
+    """Return `threads`. Raises `ParameterError` unless it is None or a whole number from 1 to `MAX_THREADS`."""
     if threads is not None and not is_whole(threads, 1, MAX_THREADS):
         raise ParameterError(f"threads must be a whole number from 1 to {MAX_THREADS}, or left out; got {threads!r}")
     return threads
 
 
 def check_seed(seed: int) -> int:
-    """`seed`, a whole number from 0 to `MAX_COUNT`, or `ParameterError`."""
+    """Return `seed`. Raises `ParameterError` unless it is a whole number from 0 to `MAX_COUNT`."""
     if not is_whole(seed, 0, MAX_COUNT):
         raise ParameterError(f"a seed must be a whole number from 0 to {MAX_COUNT}; got {seed!r}")
     return seed
 
 
 def is_whole(value: object, minimum: int, maximum: float) -> bool:
-    """Whether it is a whole number from `minimum` to `maximum`."""
+    """Whether a value is a whole number from `minimum` to `maximum`."""
     return isinstance(value, int) and not isinstance(value, bool) and minimum <= value <= maximum

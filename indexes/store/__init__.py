@@ -1,1 +1,1 @@
-"""The index on disk: a folder of generations, of which one is current."""
+"""The index on disk: a folder of generations, one of them current."""

@@ -1,4 +1,4 @@
-"""Arrays in `.npy` files: written block by block, and read where they lie."""
+"""Arrays in `.npy` files, written block by block and read by memory mapping."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,7 +11,7 @@ from _touch_retrieval.files import finish
 
 
 class ArrayFile:
-    """A `.npy` file that grows row by row; its header, written last, says how many rows there are."""
+    """A `.npy` file that grows row by row; its header with the number of rows is written last."""
 
     HEADER_BYTES = 256
 
@@ -21,7 +21,7 @@ class ArrayFile:
         self._handle.write(bytes(self.HEADER_BYTES))
 
     def append(self, block: NDArray[Any]) -> None:
-        """Add rows (n, *row_shape)."""
+        """Append rows (n, *row_shape)."""
         self._handle.write(np.ascontiguousarray(block, dtype=self.dtype).data.cast("B") if len(block) else b"")
         self.rows += len(block)
 
@@ -36,12 +36,12 @@ class ArrayFile:
         finish(self._handle)
 
     def abandon(self) -> None:
-        """Close without finishing."""
+        """Close the file without a header."""
         self._handle.close()
 
 
 def write_array(path: Path, dtype: Any, row_shape: tuple[int, ...], blocks: Iterable[NDArray[Any]]) -> None:
-    """A `.npy` file (n, *row_shape) from blocks of rows, without holding more than one of them."""
+    """Write a `.npy` file (n, *row_shape) from blocks of rows, with one block in memory at a time."""
     file = ArrayFile(path, dtype, row_shape)
     try:
         for block in blocks:
@@ -52,6 +52,6 @@ def write_array(path: Path, dtype: Any, row_shape: tuple[int, ...], blocks: Iter
 
 
 def open_array(path: Path) -> NDArray[Any]:
-    """The array in a file, memory-mapped."""
+    """Return the array in a file, memory-mapped."""
     array: NDArray[Any] = np.load(path, mmap_mode="r", allow_pickle=False)
     return array

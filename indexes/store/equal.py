@@ -1,4 +1,4 @@
-"""Which of many vectors are equal, byte for byte."""
+"""Search for vectors that are equal byte for byte."""
 
 import numpy as np
 
@@ -6,11 +6,15 @@ from indexes.kinds.checks import BLOCK_ROWS
 from indexes.kinds.scores import Floats, Slots
 
 COMPARED_COMPONENTS = 16
-"""Components that are compared at first: they tell embeddings apart."""
+"""Components that are hashed first: they distinguish embeddings."""
 
 
 def first_equal_rows(vectors: Floats) -> Slots:
-    """Return for each vector (M,) the first one of the same bytes. The vectors (M, d) are read block by block."""
+    """Return for each vector the row (M,) of the first vector with the same bytes.
+
+    Args:
+        vectors: Vectors (M, d), read block by block.
+    """
     drawn = np.random.default_rng(0).integers(2**63, size=min(vectors.shape[1], COMPARED_COMPONENTS), dtype=np.uint64)
     factors = drawn * np.uint64(2) + np.uint64(1)
     hashes = np.empty(len(vectors), np.uint64)

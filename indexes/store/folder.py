@@ -1,24 +1,24 @@
-"""The index on disk: a folder of generations, of which one is current.
+"""The index on disk: a folder of generations, one of them current.
 
-    CURRENT               the name of the current generation; the only file ever replaced
-    gen-000007/           a generation: written beside, checked, renamed into place, never changed afterwards
-      manifest.json       what it is, and size and SHA-256 of every other file; written last
+    CURRENT               name of the current generation; the only file that is ever replaced
+    gen-000007/           a generation: written under a temporary name, checked, renamed; immutable afterwards
+      manifest.json       its description, and size and SHA-256 of every other file; written last
       rows.jsonl          rows as lines of JSON
-      table.npy           slot, bytes and keys of each of those lines (see `indexes.store.rows`)
-      NAME.npy            per-row arrays
+      table.npy           slot, end and keys of each line (`indexes.store.rows`)
+      NAME.npy            per-row arrays, and documents that are arrays
       embeddings.npy      (slots, d) float32, from which any kind of index is built
-      vectors.faiss       the structure of the index, for kinds that have one
-      NAME.json           documents; NAME.npy those that are arrays, of no row
-    LOCK                  held by the writer
-    files.stat            the stat cache of the files behind the rows, of no generation (`indexes.store.stat_cache`)
-    folders.stat          and of their folders
-    unfinished.sqlite     what a build had embedded when it was cut off, of no generation (`indexes.store.unfinished`)
+      vectors.faiss       structure of the index, for kinds that have one
+      NAME.json           documents
+    LOCK                  locked by the writer
+    files.stat            stat cache of the files behind the rows; of no generation (`indexes.store.stat_cache`)
+    folders.stat          stat cache of their folders; of no generation
+    unfinished.sqlite     codes of an interrupted build; of no generation (`indexes.store.unfinished`)
 
-A generation is written whole and stands alone: its folder and a CURRENT are an index, wherever they are copied to. One
-made from a parent copies what it keeps of the parent's rows: a million photos (1 GB) in 2 to 7 seconds.
+A generation is self-contained: its folder together with a CURRENT is an index, also as a copy. A generation with a
+parent copies the rows that it reuses: a million photos (1 GB) in 2 to 7 seconds.
 
-One writer, many readers. A writer killed at any moment leaves the old or the new generation current, whole;
-the next writer sweeps up what the killed one left.
+There is one writer and any number of readers. If a writer is killed at any moment, the old or the new generation is
+current and complete; the next writer deletes the unfinished files.
 """
 
 import re
@@ -43,11 +43,11 @@ from indexes.store.writing import KindChooser, WriteJob, write_generation
 
 GENERATION = re.compile(r"gen-(\d{6,})")
 UNFINISHED_FOLDER = re.compile(r"gen-\d{6,}\.tmp-\d+")
-"""What killed writers leave: unfinished and half-deleted generations."""
+"""Folders of killed writers: unfinished or partly deleted generations."""
 
 
 class IndexStore:
-    """The index in the folder `path`, which need not exist before the first `write`.
+    """The index in the folder `path`, which the first `write` creates.
 
     >>> import numpy as np
     >>> store = indexes.IndexStore("photos")
@@ -70,25 +70,32 @@ class IndexStore:
         expect: Mapping[str, str] | None = None,
         threads: int | None = None,
     ) -> Generation:
-        """The current generation, or the one of that `name`, checked whole.
+        """Open and check a generation.
 
-        `verify` False leaves out the SHA-256 of the files (sizes are still checked). `expect` names values
-        that the fingerprint must have. `threads` is the number used by searches.
+        Args:
+            name: Its name; None: the current generation.
+            verify: Compare the SHA-256 of the files; sizes are always checked.
+            expect: Required values of the fingerprint.
+            threads: Number of threads of a search; None: the library's own setting.
 
-        Raises `NoIndex`, `CorruptIndex`, `UnsupportedFormat`, or `MismatchedIndex` (see `indexes.errors`).
+        Raises:
+            NoIndex: There is no index.
+            CorruptIndex: A file is missing or damaged.
+            UnsupportedFormat: The index has another format.
+            MismatchedIndex: The fingerprint has other values.
         """
-        wanted = name or self.current()
+        requested = name or self.current()
         try:
-            generation = self._read(wanted, verify, threads)
+            generation = self._read(requested, verify, threads)
         except CorruptIndex:
-            if name is not None or self.current() == wanted:
+            if name is not None or self.current() == requested:
                 raise
             generation = self._read(self.current(), verify, threads)  # a writer replaced it while it was being read
         generation.require(expect or {})
         return generation
 
     def current(self) -> str:
-        """The name of the current generation, as CURRENT says."""
+        """Return the name of the current generation, from CURRENT."""
         path = self.path / "CURRENT"
         try:
             text = read_regular(path).decode("ascii", "replace").strip()
@@ -97,11 +104,11 @@ class IndexStore:
         except OSError as error:
             raise NoIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
         if not GENERATION.fullmatch(text):
-            raise CorruptIndex(f"{path}: must name a generation such as gen-000001, holds {text!r}; {AGAIN}")
+            raise CorruptIndex(f"{path}: must name a generation such as gen-000001, got {text!r}; {AGAIN}")
         return text
 
     def lock(self) -> WriterLock:
-        """`with store.lock():` keeps other writers out over several steps, `write` among them."""
+        """Return the writer lock: `with store.lock():` excludes other writers during several steps, such as `write`."""
         return self._lock
 
     def write(
@@ -112,14 +119,17 @@ class IndexStore:
         documents: Mapping[str, Any] | None = None,
         **settings: Any,
     ) -> Generation:
-        """Write a new generation holding exactly `rows`, make it current, and return it opened.
+        """Write a new generation with exactly these rows, make it current, and return it opened.
 
-        rows         JSON objects with a distinct text "id", and a "digest" of the content for later reuse
-        embeddings   (F, d) float32 unit vectors; arrays: name -> (F, ...) finite numbers
-        documents    name -> JSON, or an array that is of no row; never taken over from the parent
-        settings     those of `write_blocks`. Rows that `parent.reusable` gives for their ids and digests keep its
-                     vectors and arrays, and F counts only the other rows, in their order (embeddings may be None
-                     when F = 0). Without a parent, F is the number of rows.
+        Rows that `parent.reusable` finds by their ids and digests reuse the parent's vectors and arrays. F counts the
+        other rows, in their order; without a parent it is the number of rows.
+
+        Args:
+            rows: JSON objects with a distinct text "id", and a "digest" of the content for later reuse.
+            embeddings: Unit vectors (F, d) float32; None if F = 0.
+            arrays: Name to per-row array (F, ...) of finite numbers.
+            documents: Name to JSON document or array; documents are never copied from the parent.
+            **settings: As for `write_blocks`.
         """
         return self.write_blocks([Block(rows, embeddings, arrays or {})], documents, **settings)
 
@@ -141,22 +151,35 @@ class IndexStore:
         self_check: int = 256,
         keep: int = 2,
     ) -> Generation:
-        """As `write`, from blocks of rows that are put on the disk as they come: memory holds one of them. A range is
-        of the parent's rows, which are taken over as they are, unparsed.
+        """Write a new generation from blocks of rows, with one block in memory at a time, and make it current.
 
-        fingerprint  what made the vectors; `open(expect=...)` compares it
-        about        anything else for the manifest
-        parent       a generation to take rows over from, as `Block` says
-        software     version that writes
-        settle       chooses kind, parameters and more of `about` instead, once all rows are on the disk
-        queries      (Q, d) unit vectors to measure recall with; None draws them near the index's own
-        self_check   rows that must find themselves before the switch: of new ones so many, of those that the parent
-                     had in the same structure a sixteenth of it (see `Generation.self_check`)
-        keep         generations before the new one that stay on disk for readers that are just opening them
+        If the write fails, the index does not change; after `WriteFailed` it is the old or the new one, complete.
 
-        Raises `RowError`, `VectorError`, `ParameterError`, `MismatchedIndex` for bad input, `LockedIndex`
-        while another writer works, `SelfRetrievalFailed`, and then the index is as it was; `WriteFailed` when
-        the disk refuses, and then it is the old one or the new one, whole.
+        Args:
+            blocks: Blocks of rows; a range selects rows of the parent, which are copied without parsing.
+            documents: As for `write`.
+            fingerprint: Origin of the vectors, compared by `open(expect=...)`.
+            about: Further entries of the manifest.
+            kind: Name of the kind of index.
+            parameters: Its parameters; None: the defaults.
+            parent: Generation whose rows may be reused (`Block`).
+            software: Version of the writing software.
+            seed: Seed of all random choices.
+            threads: Number of threads; None: the library's own setting.
+            choose_kind: Chooses kind, parameters and further entries of `about` when all rows are on the disk.
+            queries: Unit vectors (Q, d) to measure recall with; None: drawn near the vectors of the index.
+            self_check: Number of new rows that must be found by their own vectors before the switch. Of the rows that
+                the parent had in the same structure, a sixteenth of this number is checked (`Generation.self_check`).
+            keep: Number of earlier generations that stay on the disk for readers that are opening them.
+
+        Raises:
+            RowError: A row, array or document is invalid.
+            VectorError: A vector is invalid.
+            ParameterError: A setting is invalid.
+            MismatchedIndex: The parent has another fingerprint.
+            LockedIndex: Another writer is writing the index.
+            SelfRetrievalFailed: A row is not found by its own vector.
+            WriteFailed: The disk refuses.
         """
         job = WriteJob(
             documents=check_documents(documents or {}),
@@ -188,12 +211,12 @@ class IndexStore:
             raise WriteFailed(f"{where}: the disk refused ({error.strerror or error}); write again") from error
 
     def _require_index_folder(self) -> None:
-        """A file called CURRENT in a folder without a generation is not of an index, and would be replaced."""
+        """Refuse a folder without generations that has a file called CURRENT: it belongs to something else."""
         path = self.path / "CURRENT"
         try:
             if not self._numbers() and read_regular(path).strip():
-                raise NoIndex(f"{path} is not of an index, and is left as it is; give another folder for the index")
-        except (FileNotFoundError, NotADirectoryError):  # where a file lies in its place, the lock says so
+                raise NoIndex(f"{path} is not of an index and was not changed; give another folder for the index")
+        except (FileNotFoundError, NotADirectoryError):  # if the path is a file, locking it fails with a message
             return
         except OSError as error:
             raise NoIndex(f"{path} cannot be read ({error.strerror}); give another folder for the index") from error
@@ -204,9 +227,9 @@ class IndexStore:
         folder = self.path / f"{name}.tmp-{getpid()}"
         try:
             folder.mkdir()
-            kept = write_generation(folder, name, blocks, job)
-            generation = read_generation(folder, verify=False, threads=job.threads)  # the digests were just taken
-            generation.self_check(self_check, since=kept)
+            inherited = write_generation(folder, name, blocks, job)
+            generation = read_generation(folder, verify=False, threads=job.threads)  # the digests are new
+            generation.self_check(self_check, since=inherited)
             folder.rename(self.path / name)
         except BaseException:
             _discard(folder)
@@ -217,12 +240,17 @@ class IndexStore:
         return generation
 
     def make_current(self, name: str) -> None:
-        """Switch to a whole generation that lies there under that name. Raises OSError."""
+        """Switch to the complete generation of that name. Raises OSError."""
         files.sync(self.path)
         files.write_atomically(self.path / "CURRENT", f"{name}\n".encode())
 
     def discard_before(self, name: str, keep: int = 2) -> None:
-        """Delete the generations before the one of that name, but for `keep` of them that readers may just open."""
+        """Delete old generations.
+
+        Args:
+            name: Name of the current generation.
+            keep: Number of generations before it that stay for readers that are opening them.
+        """
         for number in self._numbers():
             if number < int(name.removeprefix("gen-")) - keep:
                 _discard(self.path / generation_name(number))
@@ -233,7 +261,7 @@ class IndexStore:
             raise CorruptIndex(f"{self.path}: the generation {name} is missing; {AGAIN}")
         generation = read_generation(folder, verify=verify, threads=threads)
         if generation.name != name:
-            raise CorruptIndex(f"{folder}: the manifest is that of {generation.name}; {AGAIN}")
+            raise CorruptIndex(f"{folder}: the manifest belongs to {generation.name}; {AGAIN}")
         return generation
 
     def _numbers(self) -> list[int]:
@@ -241,19 +269,19 @@ class IndexStore:
         return sorted(int(match[1]) for match in found if match)
 
     def _sweep(self) -> None:
-        """Delete what killed writers left, and nothing else."""
+        """Delete the unfinished folders of killed writers."""
         for path in [path for path in self.path.iterdir() if UNFINISHED_FOLDER.fullmatch(path.name)]:
             if path.is_dir() and not path.is_symlink():
                 files.remove_folder(path)
 
 
 def generation_name(number: int) -> str:
-    """The name of a generation, such as gen-000007."""
+    """Return the name of a generation, such as gen-000007."""
     return f"gen-{number:06d}"
 
 
 def _discard(folder: Path) -> None:
-    """Delete a folder that nobody needs; what cannot be deleted is left for the next writer."""
+    """Delete a folder; if that fails, leave it to the next writer."""
     try:
         files.remove_folder(folder)
     except OSError:

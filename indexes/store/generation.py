@@ -1,4 +1,4 @@
-"""One generation of an index, opened for reading: rows, vectors, per-row arrays and the search over them."""
+"""An opened generation of an index: rows, vectors, per-row arrays and the search over them."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
@@ -28,23 +28,24 @@ from indexes.store.rows import RECORD, Rows, are_distinct, keys_of
 
 ROWS, TABLE, EMBEDDINGS, STRUCTURE = "rows.jsonl", "table.npy", "embeddings.npy", "vectors.faiss"
 DOCUMENT_BYTES, DOCUMENT_BYTES_PER_ROW = 2**18, 2**12
-"""Of the JSON of a document: of any, and for each row or touch that it may speak of."""
+"""Largest JSON of a document: a constant, plus bytes for each row or touch."""
 SHOWN_IDS = 5
 MAX_CHECKED_RESULTS = 1000
 OLD_SAMPLE_DIVISOR = 16
-"""How many times fewer rows are checked where a parent's rows were."""
+"""Factor by which fewer rows are checked if the parent already had them."""
 
 
 class Generation:
-    """What a reader holds. It stays usable, arrays and all, when writers replace and delete it on the disk.
+    """An opened generation. It stays usable, with its arrays, when a writer replaces and deletes it on the disk.
 
-    rows        the N rows as they were written, in their order, each parsed when it is asked for
-    slots       (N,) int64, the slot of each row; rows with equal vectors share one
-    embeddings  (S, d) float32 unit vectors, one for each slot, memory-mapped
-    arrays      name -> (N, ...) per-row array, memory-mapped
-    documents   name -> JSON document, or array that is of no row, memory-mapped
-    manifest    what `manifest.json` says
-    index       the vector index over the slots
+    Attributes:
+        rows: The N rows in the order in which they were written, parsed on access.
+        slots: Slot of each row (N,) int64; rows with equal vectors share a slot.
+        embeddings: Unit vectors (S, d) float32, one for each slot, memory-mapped.
+        arrays: Name to per-row array (N, ...), memory-mapped.
+        documents: Name to JSON document or memory-mapped array.
+        manifest: Content of `manifest.json`.
+        index: Vector index over the slots.
 
     >>> import numpy as np
     >>> rows = [{"id": "mug/1.jpg", "object_id": "mug"}, {"id": "tin/1.jpg", "object_id": "tin"}]
@@ -88,25 +89,25 @@ class Generation:
 
     @property
     def fingerprint(self) -> dict[str, str]:
-        """What made the vectors."""
+        """Origin of the vectors: digests of the checkpoint and the preprocessing."""
         return self.manifest.fingerprint
 
     def require(self, expect: Mapping[str, str]) -> None:
-        """Check that the fingerprint has these values. Raises `MismatchedIndex` naming what differs."""
+        """Check that the fingerprint has these values. Raises `MismatchedIndex` with the first difference."""
         check_fingerprint(self.folder.parent, self.fingerprint, expect)
 
     def row_number(self, row_id: str) -> int:
-        """The number of the row with that id; KeyError where there is none."""
+        """Return the number of the row with that id. Raises KeyError if there is none."""
         number = int(self.rows.find([row_id])[0])
         if number < 0:
             raise KeyError(row_id)
         return number
 
     def codes(self, field: str) -> Slots:
-        """For each row (N,) a number that rows share when their `field` is the same text; no row is parsed.
+        """Return a number for each row (N,) that is equal for rows with the same text in a field; no row is parsed.
 
-        field is one of `indexes.store.rows.KEYS`; numbers count up from 0 in the order of the rows that have them
-        first.
+        Args:
+            field: One of `indexes.store.rows.KEYS`. Numbers count up from 0 in the order of their first rows.
         """
         _, first, code = np.unique(self.rows.keys(field), return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
@@ -114,41 +115,62 @@ class Generation:
         return rank[code]
 
     def search(self, queries: Floats, k: int) -> list[tuple[Slots, Floats]]:
-        """For each unit query (Q, d) the rows of the best k slots: row numbers (n,) and scores (n,) float32.
+        """Return the rows of the best k slots for each query, ordered by (-score, id).
 
-        A slot stands for all its rows, so n may exceed k. Order: (-score, id).
+        Args:
+            queries: Unit queries (Q, d) float32.
+            k: Number of slots.
+
+        Returns:
+            For each query, row numbers (n,) and scores (n,) float32. A slot stands for all its rows, so n may exceed k.
         """
         k = check_k(k)
         scores, slots = self.index.search(queries, k + 1, self._live)
         return [self._best_rows(*found, k) for found in zip(queries, scores, slots, strict=True)]
 
     def candidates(self, queries: Floats, k: int) -> list[Slots]:
-        """For each unit query (Q, d) the rows (n,) of the best k slots, in no order: those of `search`, but for slots
-        that tie for the last place, and of an approximate kind perhaps more.
+        """Return the unordered rows (n,) of the best k slots for each query.
+
+        They are the rows of `search`, except that ties at rank k may differ and an approximate kind may return more.
+
+        Args:
+            queries: Unit queries (Q, d) float32.
+            k: Number of slots.
         """
         return [self._rows_of(slots)[1] for slots in self.index.candidates(queries, k, self._live)]
 
     def match_rows(self, ids: NDArray[np.bytes_], digests: NDArray[np.bytes_]) -> Slots:
-        """For the keys of each id and digest (`indexes.store.rows.keys_of`) the row (n,) that has both; -1 where there
-        is none, or no digest.
+        """Return the row with each pair of id and digest.
+
+        Args:
+            ids: Keys (n,) of the ids (`indexes.store.rows.keys_of`).
+            digests: Keys (n,) of the digests; an empty key matches nothing.
+
+        Returns:
+            Row numbers (n,); -1 for no match.
         """
         numbers = self.rows.by_id.find(ids)
         same = (digests != b"") & (digests == self.rows.by_digest.keys[numbers])
         return np.where((numbers >= 0) & same, numbers, -1)
 
-    def reusable(self, wanted: Mapping[str, str | None]) -> dict[str, int]:
-        """Of the wanted {id: digest}, those that this generation holds with that digest: {id: row number}."""
-        numbers = self.match_rows(keys_of(wanted), keys_of(wanted.values())).tolist()
-        return {row_id: number for row_id, number in zip(wanted, numbers, strict=True) if number >= 0}
+    def reusable(self, digests: Mapping[str, str | None]) -> dict[str, int]:
+        """Return {id: row number} of those {id: digest} that this generation has with the same digest."""
+        numbers = self.match_rows(keys_of(digests), keys_of(digests.values())).tolist()
+        return {row_id: number for row_id, number in zip(digests, numbers, strict=True) if number >= 0}
 
     def self_check(self, sample: int = 256, seed: int = 0, *, since: int = 0) -> None:
-        """Search for the vectors of `sample` rows; `SelfRetrievalFailed` names those that do not come first.
+        """Search for the vectors of sampled rows, and check that each row is found.
 
-        since: the first of the slots that an earlier generation has not had in the same structure, and checked so; of
-        rows in others only a few are searched for.
-        A row passes when its slot, or one that scores as high (a near-copy), is at rank 1. Where a search for one
-        misses it, one for a hundredth of all rows may find it: candidates are asked for by the hundred, and codes
-        cannot tell near-copies apart.
+        A row passes if its slot, or a near-copy with the same score, is at rank 1 for k = 1, or else for k = 1 % of
+        all rows: queries use hundreds of candidates, and compressed codes cannot distinguish near-copies.
+
+        Args:
+            sample: Number of rows in new slots. Of rows in older slots, `sample` / `OLD_SAMPLE_DIVISOR` are checked.
+            seed: Seed of the sample.
+            since: First new slot: the parent has checked the slots before it in the same structure.
+
+        Raises:
+            SelfRetrievalFailed: Some rows are not found.
         """
         mixed = np.random.default_rng(seed).permutation(self.count)
         new = self.slots[mixed] >= since
@@ -160,13 +182,13 @@ class Generation:
         if lost:
             shown = ", ".join(lost[:SHOWN_IDS]) + (", ..." if len(lost) > SHOWN_IDS else "")
             raise SelfRetrievalFailed(
-                f"{len(lost)} of {searched} rows do not find themselves in the {self.manifest.kind} "
+                f"{len(lost)} of {searched} rows are not found by their own vectors in the {self.manifest.kind} "
                 f"index ({shown}); choose the kind flat, or a broader search",
                 lost,
             )
 
     def _rows_not_found(self, numbers: Slots, k: int) -> Slots:
-        """Those of the rows for whose vectors a search for k slots puts a worse one first."""
+        """Return the rows for whose vectors a search for k slots ranks a slot with a lower score first."""
         if not len(numbers):
             return numbers
         own = np.ascontiguousarray(self.embeddings[self.slots[numbers]])
@@ -175,13 +197,13 @@ class Generation:
         return numbers[top < must]
 
     def _best_rows(self, query: Floats, scores: Floats, slots: Slots, k: int) -> tuple[Slots, Floats]:
-        """The rows of the best k of k + 1 slots; where slots tie for the last place, their ids say which stays."""
-        wanted = k
-        while len(scores) > wanted and scores[wanted] == scores[k - 1]:
-            wanted *= 2
-            found_scores, found = self.index.search(query[None], wanted + 1, self._live)
+        """Return the rows of the best k of k + 1 slots; ties at rank k are broken by id."""
+        fetched = k
+        while len(scores) > fetched and scores[fetched] == scores[k - 1]:
+            fetched *= 2
+            found_scores, found = self.index.search(query[None], fetched + 1, self._live)
             scores, slots = found_scores[0], found[0]
-        if wanted == k:
+        if fetched == k:
             return self._rows_and_scores(scores[:k], slots[:k])
         rows, spread = self._rows_and_scores(scores, slots)
         _, first = np.unique(self.slots[rows], return_index=True)
@@ -189,13 +211,13 @@ class Generation:
         return rows[stay], spread[stay]
 
     def _rows_of(self, slots: Slots) -> tuple[Slots, Slots]:
-        """How many rows each slot has, and all of them, slot by slot."""
+        """Return the number of rows of each slot, and all these rows, slot by slot."""
         counts = self._per_slot[slots]
         inside = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         return counts, self._by_slot[np.repeat(self._starts[slots], counts) + inside]
 
     def _rows_and_scores(self, scores: Floats, slots: Slots) -> tuple[Slots, Floats]:
-        """All rows of slots in the order of their scores, and their scores; equal scores in the order of ids."""
+        """Return all rows of slots, ordered by (-score, id), and their scores."""
         counts, rows = self._rows_of(slots)
         spread = np.repeat(scores, counts)
         edges = np.flatnonzero(np.diff(spread)) + 1
@@ -208,19 +230,34 @@ class Generation:
 
 
 def check_fingerprint(where: str | Path, fingerprint: Mapping[str, str], expect: Mapping[str, str]) -> None:
-    """Check that a fingerprint has these values. Raises `MismatchedIndex` naming what differs."""
+    """Check that a fingerprint has these values.
+
+    Args:
+        where: The index, for the message.
+        fingerprint: Its fingerprint.
+        expect: Required values.
+
+    Raises:
+        MismatchedIndex: A value differs.
+    """
     for key, value in expect.items():
         got = fingerprint.get(key)
         if got != value:
             raise MismatchedIndex(
                 f"{where}: the index was made with {key} {got and got[:12]!r}, "
-                f"asked for is {value[:12]!r}; "
-                f"use what made it, or {AGAIN}"
+                f"but {value[:12]!r} is required; "
+                f"use the model that made it, or {AGAIN}"
             )
 
 
 def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -> Generation:
-    """Open a generation's folder, checked as `IndexStore.open` says."""
+    """Open and check a generation's folder, as `IndexStore.open`.
+
+    Args:
+        folder: The folder.
+        verify: Compare the SHA-256 of the files.
+        threads: Number of threads of a search; None: the library's own setting.
+    """
     manifest = read_manifest(folder)
     check_files(folder, manifest, verify=verify)
     try:
@@ -233,17 +270,17 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         documents |= {name: read_json(folder / f"{name}.json", max_bytes) for name in names if name not in documents}
         counts, slots = manifest.counts, rows.table["slot"]
         if slots.min() < 0 or slots.max() >= counts.slots:
-            raise CorruptIndex(f"{folder}: slots must be below {counts.slots}, are not; {AGAIN}")
+            raise CorruptIndex(f"{folder}: slots must be below {counts.slots}, but are not; {AGAIN}")
         tombstones = counts.slots - int(np.count_nonzero(np.bincount(slots)))
         got = {"rows": len(slots), "slots": len(embeddings), "tombstones": tombstones, "dim": embeddings.shape[1]}
         must = {**asdict(counts), "dim": manifest.dim}
         if any(must[name] != number for name, number in got.items()):
-            raise CorruptIndex(f"{folder}: the manifest says {must}, the files hold {got}; {AGAIN}")
+            raise CorruptIndex(f"{folder}: the manifest states {must}, the files have {got}; {AGAIN}")
         if verify:
             if not (np.abs(row_norms(embeddings) - 1.0) <= NORM_TOLERANCE).all():
-                raise CorruptIndex(f"{folder}: every vector must be finite and of norm 1, one is not; {AGAIN}")
+                raise CorruptIndex(f"{folder}: every vector must be finite and have norm 1, one does not; {AGAIN}")
             if not are_distinct(rows.keys("id")):
-                raise CorruptIndex(f"{folder}: the ids of the rows must be distinct, one comes twice; {AGAIN}")
+                raise CorruptIndex(f"{folder}: the ids of the rows must be distinct, one occurs twice; {AGAIN}")
         kind = load_kind(manifest.kind)
         index = kind.load(
             folder / STRUCTURE if kind.structure_file else None,
@@ -257,28 +294,33 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         raise UnsupportedFormat(f"{folder}: {error}. Update the software, or {AGAIN}") from error
     except IndexesError:
         raise
-    except Exception as error:  # damaged files raise anything: OSError, ValueError, KeyError, SyntaxError
+    except Exception as error:  # damaged files raise various errors: OSError, ValueError, KeyError, SyntaxError
         raise CorruptIndex(f"{folder}: cannot be read ({type(error).__name__}: {error}); {AGAIN}") from error
 
 
 def max_document_bytes(rows: int, arrays: Iterable[NDArray[Any]]) -> int:
-    """How many bytes of JSON a document may have, in an index of so many rows with these documents that are arrays."""
+    """Return the largest number of bytes of a JSON document.
+
+    Args:
+        rows: Number of rows of the index.
+        arrays: Its documents that are arrays.
+    """
     return min(MAX_JSON_BYTES, DOCUMENT_BYTES + DOCUMENT_BYTES_PER_ROW * (rows + sum(map(len, arrays))))
 
 
 def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[Any]], Floats]:
-    """The rows, per-row arrays and embeddings, memory-mapped."""
+    """Return the rows, per-row arrays and embeddings, memory-mapped."""
     files = {ROWS, TABLE, EMBEDDINGS, *(f"{name}.npy" for name in manifest.arrays)}
     if lacking := sorted(files - set(manifest.files)):
-        raise CorruptIndex(f"{folder}: the manifest must list {lacking[0]}, and does not; {AGAIN}")
-    # Plain arrays over the mapped files: taking one record out of a `np.memmap` costs several times more.
+        raise CorruptIndex(f"{folder}: the manifest must list {lacking[0]}, but does not; {AGAIN}")
+    # Plain arrays over the mapped files: reading one record of a `np.memmap` takes several times longer.
     text, table = np.asarray(np.memmap(folder / ROWS, np.uint8, "r")), np.asarray(open_array(folder / TABLE))
     arrays = {name: open_array(folder / f"{name}.npy") for name in manifest.arrays}
     must = {"fields": RECORD} | dict.fromkeys(arrays, len(table))
     got = {"fields": table.dtype} | {name: len(array) for name, array in arrays.items()}
     if got != must:
-        raise CorruptIndex(f"{folder}: the tables must hold {must}, hold {got}; {AGAIN}")
+        raise CorruptIndex(f"{folder}: the tables must have {must}, got {got}; {AGAIN}")
     stops = table["stop"]
     if not (np.diff(stops, prepend=0) > 0).all() or stops[-1] != len(text):
-        raise CorruptIndex(f"{folder}: the lines of {ROWS} must make up its text, and do not; {AGAIN}")
+        raise CorruptIndex(f"{folder}: the lines of {ROWS} must cover its text exactly, but do not; {AGAIN}")
     return Rows(text, table), arrays, open_array(folder / EMBEDDINGS)

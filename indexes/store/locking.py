@@ -1,4 +1,4 @@
-"""One writer at a time: a lock that the operating system drops when its holder dies."""
+"""The writer lock of an index, which the operating system releases when the writer dies."""
 
 import fcntl
 import os
@@ -13,10 +13,10 @@ from indexes.errors import LockedIndex, WriteFailed
 
 
 class WriterLock:
-    """`with WriterLock(path):` holds the lock file for this process, or raises `LockedIndex` at once.
+    """A lock file: `with WriterLock(path):` locks it for this process, or raises `LockedIndex` immediately.
 
-    Entering it again inside the block is allowed. The file stays when the lock is given up; it holds the last
-    holder's process id for messages, and means nothing by being there.
+    The block may enter the lock again. The file stays after the release and contains the process id of the last
+    writer, for messages; its existence means nothing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -45,38 +45,40 @@ class WriterLock:
         try:
             is_file = stat.S_ISREG(os.fstat(descriptor).st_mode)
             holder = os.pread(descriptor, 33, 0).decode("ascii", "replace").strip() if is_file else "no file"
-            if holder and not (holder.isdigit() and len(holder) <= 32):  # of the user
+            if holder and not (holder.isdigit() and len(holder) <= 32):  # a file of the user
                 raise WriteFailed(
-                    f"{self.path} is not the lock file of an index, and stays as it is; give another folder"
+                    f"{self.path} is not the lock file of an index and was not changed; give another folder"
                 )
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             os.close(descriptor)
             who = f"process {holder}" if holder else "an unknown process"
-            message = f"{self.path.parent}: one writer at a time; {who} is writing. Wait for it to end"
+            message = (
+                f"{self.path.parent}: only one writer at a time is allowed, and {who} is writing. Wait until it ends"
+            )
             raise LockedIndex(message, int(holder) if holder else None) from error
         except (OSError, WriteFailed) as error:
             os.close(descriptor)
             if isinstance(error, WriteFailed):
                 raise
             raise WriteFailed(
-                f"{self.path}: this disk keeps no locks ({error.strerror}); build the index on another one"
+                f"{self.path}: this disk does not support locks ({error.strerror}); build the index on another disk"
             ) from error
-        with suppress(OSError):  # a full disk may lack the room for who it is: the lock is held all the same
+        with suppress(OSError):  # a full disk may have no room for the process id; the lock works without it
             os.ftruncate(descriptor, 0)
             os.write(descriptor, f"{os.getpid()}\n".encode())
         return descriptor
 
 
 def _open_lock_file(path: Path) -> int:
-    """A lock file, made where there is none; a link is refused, and a pipe blocks nobody. Raises OSError."""
+    """Open a lock file, created if missing; links are refused and pipes do not block. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
 
 
 @contextmanager
 def exclusive_lock(path: Path) -> Iterator[None]:
-    """The block runs when no other one does that was given the same lock file, in whatever process. Raises OSError."""
+    """Wait for a lock file, and hold its lock during the block, among all processes. Raises OSError."""
     descriptor = _open_lock_file(path)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)

@@ -1,4 +1,4 @@
-"""`manifest.json`: what a generation is and what its files must be."""
+"""`manifest.json`: the description of a generation, with the size and SHA-256 of its files."""
 
 import hashlib
 import json
@@ -17,7 +17,7 @@ from indexes.errors import AGAIN, CorruptIndex, RowError, UnsupportedFormat
 FORMAT = 5
 NAME = "manifest.json"
 MAX_BYTES = 4 * 2**20
-"""Of a manifest: of 4096 shards with their names and digests it has 1 MiB."""
+"""Largest manifest. With the names and digests of 4096 shards it has 1 MiB."""
 
 T = TypeVar("T")
 Count = Annotated[int, Meta(ge=0, lt=10**9)]
@@ -27,7 +27,7 @@ FileName = Annotated[str, Meta(pattern=r"^[a-z0-9_]+\.(json|jsonl|npy|faiss)\Z")
 
 @dataclass(frozen=True)
 class Counts:
-    """Rows; slots (distinct vectors); tombstones (slots without a row); slots that the structure was trained with."""
+    """Numbers of rows, slots (distinct vectors), tombstones (slots without a row) and slots at the last training."""
 
     rows: Count
     slots: Count
@@ -45,7 +45,7 @@ class FileChecksum:
 
 @dataclass(frozen=True)
 class Manifest:
-    """The fields of the file, in its order. `requested` are the parameters before None was filled in."""
+    """Fields of the file, in its order. `requested` is the parameters before None was filled in."""
 
     generation: str
     parent: str | None
@@ -67,10 +67,10 @@ class Manifest:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write the file, with a digest of its own content at the end."""
+    """Write the file, with a digest of its content at the end. Raises `RowError` if it is too large."""
     text = encode_document(manifest, FORMAT)
     if len(text) > MAX_BYTES:
-        raise RowError(f"a manifest must have at most {MAX_BYTES} bytes, has {len(text)}; shorten `about`")
+        raise RowError(f"a manifest must have at most {MAX_BYTES} bytes, got {len(text)}; shorten `about`")
     with durable_file(folder / NAME) as handle:
         handle.write(text)
 
@@ -85,56 +85,66 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def encode_document(content: Any, version: int) -> bytes:
-    """Return the JSON of a dataclass, with its format's version first and the digest of all that last."""
+    """Return the JSON of a dataclass, with the format version first and the digest of the content last."""
     document = {"format": version} | asdict(content)
     return encoded(document | {"sha256": content_digest(document)}, indent=2) + b"\n"
 
 
 def read_document(path: Path, version: int, kind: type[T]) -> T:
-    """Return what `encode_document` wrote of a dataclass. Raises `CorruptIndex` or `UnsupportedFormat`."""
+    """Read a file that `encode_document` made of a dataclass.
+
+    Args:
+        path: The file.
+        version: Supported format version.
+        kind: The dataclass.
+
+    Raises:
+        CorruptIndex: The file is missing or damaged.
+        UnsupportedFormat: The file has another format version.
+    """
     try:
         content = read_json(path, MAX_BYTES)
     except OSError as error:
         raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
     except ValueError as error:
-        raise CorruptIndex(f"{path}: must be JSON, is cut short or damaged ({error}); {AGAIN}") from error
+        raise CorruptIndex(f"{path}: must be JSON, but is truncated or damaged ({error}); {AGAIN}") from error
     if not isinstance(content, dict):
         raise CorruptIndex(f"{path}: must be a JSON object; {AGAIN}")
     found = content.get("format")
     if not isinstance(found, int) or isinstance(found, bool):
-        raise CorruptIndex(f"{path}: must say its format version, says {found!r}; {AGAIN}")
+        raise CorruptIndex(f"{path}: must have a format version, got {found!r}; {AGAIN}")
     if found != version:
         age, remedy = ("newer", f"update the software, or {AGAIN}") if found > version else ("older", AGAIN)
         raise UnsupportedFormat(f"{path}: has the {age} format {found}, this software reads {version}; {remedy}")
     if content.pop("sha256", None) != content_digest(content):
-        raise CorruptIndex(f"{path}: the content does not fit its own SHA-256, it was altered; {AGAIN}")
+        raise CorruptIndex(f"{path}: the content does not match its SHA-256, the file was altered; {AGAIN}")
     del content["format"]
-    try:  # all of it: software that alters the file can write the digest that fits
+    try:  # check every field: software that alters the file can also write the right digest
         return typed(content, kind, path.stem)
     except ValueError as error:
         raise CorruptIndex(f"{path}: the file was altered ({error}); {AGAIN}") from error
 
 
 def file_checksums(folder: Path) -> dict[str, FileChecksum]:
-    """Return size and SHA-256 of every file in the folder."""
+    """Return the size and SHA-256 of every file in a folder."""
     return {path.name: FileChecksum(path.stat().st_size, file_digest(path)) for path in sorted(folder.iterdir())}
 
 
 def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
-    """Every file has its size and, with `verify`, its SHA-256; or `CorruptIndex` naming the file."""
-    for name, seal in manifest.files.items():
+    """Check the size and, with `verify`, the SHA-256 of every file. Raises `CorruptIndex` for the first bad file."""
+    for name, checksum in manifest.files.items():
         path = folder / name
         try:
             with open_regular(path) as file:
                 size = os.fstat(file.fileno()).st_size
-            if size != seal.bytes:
-                raise CorruptIndex(f"{path}: must have {seal.bytes} bytes, has {size}; {AGAIN}")
-            if verify and file_digest(path) != seal.sha256:
-                raise CorruptIndex(f"{path}: the SHA-256 differs from the manifest's, it was altered; {AGAIN}")
+            if size != checksum.bytes:
+                raise CorruptIndex(f"{path}: must have {checksum.bytes} bytes, has {size}; {AGAIN}")
+            if verify and file_digest(path) != checksum.sha256:
+                raise CorruptIndex(f"{path}: the SHA-256 differs from the manifest, the file was altered; {AGAIN}")
         except OSError as error:
             raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
 
 
 def content_digest(content: Mapping[str, Any]) -> str:
-    """What a document says of itself under "sha256": the digest of all else in it."""
+    """Return the digest of all other entries of a document, which it stores under "sha256"."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -1,12 +1,12 @@
-"""A cluster: several index folders that are one catalogue together, and the one file that says which.
+"""A sharded index: several index folders that together form one catalogue, and the file that lists them.
 
-    CLUSTER.json          the shards: folder, generation, SHA-256 of that generation's manifest; the only file replaced
-    shard-00-of-04/       an ordinary index folder, with its own CURRENT; empty shards have none
-    LOCK                  held by whoever builds
+    SHARDS.json           the shards: folder, generation, SHA-256 of its manifest; the only file that is replaced
+    shard-00-of-04/       an ordinary index folder with its own CURRENT; empty shards have no folder
+    LOCK                  locked by the build
 
-What the file names is the cluster, whatever CURRENT says in the folders: all shards are switched by one rename. The
-digest of a generation's manifest stands for every byte of the generation, so that no folder can be mistaken for
-another. Opening reads this file alone; it is as long as there are shards, however many photos they hold.
+The generations in this file are current, whatever CURRENT contains in the folders: one rename switches all shards. The
+digest of a generation's manifest covers every byte of the generation, so no folder can be mistaken for another.
+Opening a sharded index reads only this file. Its length depends on the number of shards, not on the number of photos.
 """
 
 import re
@@ -32,9 +32,7 @@ MAX_SHARDS = 4096
 
 @dataclass(frozen=True)
 class ShardEntry:
-    """One shard: its folder in the cluster's, its generation, the SHA-256 of that one's manifest.json, and what it
-    holds.
-    """
+    """One shard: its folder, generation, SHA-256 of its manifest.json, and numbers of photos and objects."""
 
     folder: Annotated[str, Meta(pattern=rf"^{SHARD_FOLDER.pattern}\Z")]
     generation: Annotated[str, Meta(pattern=r"^gen-\d{6,}\Z")]
@@ -45,11 +43,21 @@ class ShardEntry:
 
 @dataclass(frozen=True)
 class ShardedManifest:
-    """The file. kind, fingerprint: those of all shards; about: catalogue, checkpoint and what else was said of the
-    build; calibration: the document of that name, None without one.
+    """Content of the file.
+
+    Attributes:
+        generation: Name of this generation, such as sharded-000007.
+        created: Time of the build.
+        software: Version of the software.
+        kind: Kinds of index of the shards.
+        fingerprint: Fingerprint of all shards.
+        about: Catalogue, checkpoint and further facts of the build.
+        calibration: The document of that name; None without one.
+        of: Number of shards, including empty ones.
+        shards: The shards that have photos.
     """
 
-    generation: Annotated[str, Meta(pattern=r"^cluster-\d{6,}\Z")]
+    generation: Annotated[str, Meta(pattern=r"^sharded-\d{6,}\Z")]
     created: str
     software: str
     kind: str
@@ -61,85 +69,106 @@ class ShardedManifest:
 
     @property
     def photos(self) -> int:
-        """Of all shards."""
+        """Number of photos in all shards."""
         return sum(shard.photos for shard in self.shards)
 
     @property
     def objects(self) -> int:
-        """Of all shards; none lies in two."""
+        """Number of objects in all shards; the photos of an object are in one shard."""
         return sum(shard.objects for shard in self.shards)
 
 
 def is_sharded(folder: Path) -> bool:
-    """Whether a cluster lies there."""
+    """Whether the folder is a sharded index."""
     return (folder / NAME).is_file()
 
 
 def shard_number(object_id: str, shards: int) -> int:
-    """Which of so many shards holds the photos of an object: by a hash of its name, the same everywhere."""
+    """Return the shard of an object, from a hash of its name that is equal on every machine.
+
+    Args:
+        object_id: The object.
+        shards: Number of shards.
+    """
     return int.from_bytes(key_of(object_id)[8:], "little") % shards
 
 
 def shard_folder(number: int, of: int) -> str:
-    """The folder of a shard, counted from 0."""
+    """Return the folder name of shard `number`, counted from 0, of `of` shards."""
     return f"shard-{number:02d}-of-{of:02d}"
 
 
 def sharded_generation_name(number: int) -> str:
-    """The name of a cluster's generation, such as cluster-000007."""
-    return f"cluster-{number:06d}"
+    """Return the name of a generation of a sharded index, such as sharded-000007."""
+    return f"sharded-{number:06d}"
 
 
 def generation_number(name: str) -> int:
-    """The number in a generation's name."""
+    """Return the number in a generation's name."""
     return int(name.rpartition("-")[2])
 
 
-def shard_entry(cluster: Path, folder: str, generation: Generation, objects: int) -> ShardEntry:
-    """What the manifest is to say of a shard that was written."""
-    digest = file_digest(cluster / folder / generation.name / GENERATION_MANIFEST)
+def shard_entry(index: Path, folder: str, generation: Generation, objects: int) -> ShardEntry:
+    """Return the manifest entry of a written shard.
+
+    Args:
+        index: Folder of the sharded index.
+        folder: Folder of the shard in it.
+        generation: Generation of the shard.
+        objects: Number of its objects.
+    """
+    digest = file_digest(index / folder / generation.name / GENERATION_MANIFEST)
     return ShardEntry(folder, generation.name, digest, generation.count, objects)
 
 
 def write_sharded_manifest(folder: Path, manifest: ShardedManifest) -> None:
-    """Put the file in its place: this cluster answers from now on."""
+    """Write the manifest, which switches the sharded index to this generation."""
     with named_write_errors(folder / NAME):
         write_atomically(folder / NAME, sharded_manifest_bytes(manifest))
 
 
 def sharded_manifest_bytes(manifest: ShardedManifest) -> bytes:
-    """The content of the file."""
+    """Return the content of the file."""
     return encode_document(manifest, FORMAT)
 
 
 def read_sharded_manifest(folder: Path) -> ShardedManifest:
-    """The manifest of a cluster. Raises NoIndex, CorruptIndex or UnsupportedFormat."""
+    """Read the manifest of a sharded index. Raises NoIndex, CorruptIndex or UnsupportedFormat."""
     path = folder / NAME
     if not path.exists():
-        raise NoIndex(f"{folder}: there is no cluster here; run `retrieve build-index --shards` first")
+        raise NoIndex(f"{folder}: there is no sharded index here; run `retrieve build-index --shards` first")
     manifest = read_document(path, FORMAT, ShardedManifest)
     if len({shard.folder for shard in manifest.shards}) < len(manifest.shards):
-        raise CorruptIndex(f"{path}: every shard must have a folder of its own, two share one; {AGAIN}")
+        raise CorruptIndex(f"{path}: every shard must have its own folder, two shards have the same; {AGAIN}")
     return manifest
 
 
 def open_shard(
-    cluster: Path,
+    index: Path,
     entry: ShardEntry,
     fingerprint: Mapping[str, str],
     *,
     verify: bool = True,
     threads: int | None = None,
 ) -> Generation:
-    """The generation that the cluster names, checked as `IndexStore.open` does. Raises its errors, and CorruptIndex for
-    another generation than the cluster was made of.
+    """Open and check a shard, as `IndexStore.open`.
+
+    Args:
+        index: Folder of the sharded index.
+        entry: Manifest entry of the shard.
+        fingerprint: Fingerprint of the sharded index.
+        verify: Compare the SHA-256 of the files.
+        threads: Number of threads of a search; None: the library's own setting.
+
+    Raises:
+        IndexesError: The shard is missing, damaged, or not the generation in the manifest.
     """
-    store = IndexStore(cluster / entry.folder)
+    store = IndexStore(index / entry.folder)
     generation = store.open(name=entry.generation, verify=verify, threads=threads)
     try:
         generation.require(fingerprint)
     except MismatchedIndex as error:
-        raise CorruptIndex(f"{generation.folder} is not of this cluster ({error})") from error
+        raise CorruptIndex(f"{generation.folder} does not belong to this sharded index ({error})") from error
     if file_digest(generation.folder / GENERATION_MANIFEST) != entry.sha256 or generation.count != entry.photos:
-        raise CorruptIndex(f"{generation.folder} is not the generation that {cluster / NAME} was written for; {AGAIN}")
+        raise CorruptIndex(f"{generation.folder} is not the generation that {index / NAME} lists; {AGAIN}")
     return generation

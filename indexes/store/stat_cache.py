@@ -1,11 +1,11 @@
-"""The stat cache: what builds saw of photos' files and folders. What looks as it did need not be read or listed again.
+"""The stat cache of photos' files and folders. Files and folders with the same stat need not be read or listed again.
 
-    files.stat      of each file the keys of its row's id and of its content's digest, its size, times and inode
-    folders.stat    of each folder without folders and links in it its times, inode, device, and the names in it
+    files.stat      for each file: keys of its row's id and of its content digest, size, times and inode
+    folders.stat    for each folder without folders and links in it: times, inode, device, and the names in it
 
-Each entry is a fact of its own, "a file that looks so has this content", whatever generation is current. The files
-belong to no generation and may be deleted at any time: then all is read once more. So it is where one was altered or
-cut short, which the SHA-256 at its end tells.
+Each entry states that a file with this stat has this content, whatever generation is current. The files belong to no
+generation and may be deleted at any time; the next build then reads everything. It also does if the SHA-256 at the
+end of a file shows that it was altered or truncated.
 """
 
 import hashlib
@@ -25,10 +25,9 @@ from indexes.store.rows import KeyIndex
 
 FILES, FOLDERS = "files.stat", "folders.stat"
 MIN_AGE_NS = 2 * 10**9
-"""An entry must have been left alone for so long: the coarsest clock of a common disk, FAT's, ticks every two
-seconds."""
+"""Time without a change that an entry needs: the coarsest clock of a common disk (FAT) ticks every two seconds."""
 STATUS = ("bytes", "mtime_ns", "ctime_ns", "inode")
-"""What the disk says of a file, each modulo 2^64."""
+"""Compared values of a file's stat, each modulo 2^64."""
 RECORD = np.dtype([("id", "S16"), ("digest", "S16"), ("status", "<u8", (len(STATUS),))])
 _MAX_BYTES = 2**33
 
@@ -38,7 +37,11 @@ FolderStatus: TypeAlias = tuple[int, int, int, int]
 
 
 class StatRecords:
-    """The files' records in the folder of an index; use it under the index's lock. records (N,) of `RECORD`."""
+    """Stat records of the files, in the folder of an index; use it under the lock of the index.
+
+    Attributes:
+        records: Array (N,) of `RECORD`.
+    """
 
     def __init__(self, index: Path) -> None:
         self._path = index / FILES
@@ -46,8 +49,14 @@ class StatRecords:
         self.records = np.frombuffer(body, RECORD, count=len(body) // RECORD.itemsize)
 
     def digests(self, ids: Keys, statuses: Statuses) -> Keys:
-        """For each file, by its row's id and its status (N, 4), the key of its content's digest; b"" where the status
-        is another one than it was, or unknown.
+        """Return the key of the content digest of each file.
+
+        Args:
+            ids: Keys (N,) of the rows' ids.
+            statuses: Stat values (N, 4) of the files.
+
+        Returns:
+            Keys (N,); b"" if the stat changed or is unknown.
         """
         found = np.zeros(len(ids), "S16")
         if len(self.records):
@@ -57,7 +66,16 @@ class StatRecords:
         return found
 
     def write(self, ids: Keys, digests: Keys, statuses: Statuses) -> None:
-        """Put these records (N,) in the place of all others. Raises OSError where the disk refuses."""
+        """Replace all records.
+
+        Args:
+            ids: Keys (N,) of the rows' ids.
+            digests: Keys (N,) of the content digests.
+            statuses: Stat values (N, 4) of the files.
+
+        Raises:
+            OSError: The disk refuses.
+        """
         before, self.records = self.records, np.zeros(len(ids), RECORD)
         self.records["id"], self.records["digest"], self.records["status"] = ids, digests, statuses
         if (body := self.records.tobytes()) != before.tobytes():
@@ -65,14 +83,18 @@ class StatRecords:
 
 
 class FolderCache:
-    """The folders' entries in the folder of an index, and those that a listing makes for the next one.
+    """Stat entries of folders, in the folder of an index, and the new entries of a listing.
 
-    Made before the listing begins. known: whether the entries that are there are believed. A folder's times change with
-    its names on the disks of a machine; folders on no block device, as those of a network or a program, get no entry.
+    Create it before the listing begins. On local disks a folder's times change with the names in it. Folders on no
+    block device, such as network folders, get no entry.
+
+    Args:
+        index: Folder of the index.
+        known: Use the stored entries; otherwise every folder is listed.
     """
 
     def __init__(self, index: Path, known: bool = True) -> None:
-        self._path, self._settled = index / FOLDERS, time.time_ns() - MIN_AGE_NS
+        self._path, self._max_time_ns = index / FOLDERS, time.time_ns() - MIN_AGE_NS
         try:
             self._before = msgspec.msgpack.decode(_read(self._path), type=dict[str, tuple[FolderStatus, str]])
         except msgspec.DecodeError:
@@ -81,15 +103,20 @@ class FolderCache:
         self._now: dict[str, tuple[FolderStatus, str]] = {}
 
     def status(self, folder: str) -> FolderStatus | None:
-        """What the disk says of a folder, asked before it is listed; None where it says nothing."""
+        """Return the stat of a folder, to be read before it is listed; None if it cannot be read."""
         try:
             found = os.stat(folder)
-        except OSError:  # listing it will say why
+        except OSError:  # listing it reports the error
             return None
         return found.st_mtime_ns, found.st_ctime_ns, found.st_ino, found.st_dev
 
     def names(self, path: str, status: FolderStatus | None) -> list[str] | None:
-        """The names in the folder at this path, relative to the catalogue; None where it must be listed."""
+        """Return the stored names in a folder; None if it must be listed.
+
+        Args:
+            path: Path of the folder, relative to the catalogue.
+            status: Its stat.
+        """
         entry = self._known.get(path)
         if entry is None or entry[0] != status:
             return None
@@ -97,15 +124,19 @@ class FolderCache:
         return entry[1].split("/") if entry[1] else []
 
     def note(self, path: str, status: FolderStatus | None, names: Sequence[str]) -> None:
-        """Keep the names in a folder, which are neither folders nor links, and valid UTF-8. A folder that has changed
-        just now may do so again within a tick of its clock, and gets no entry.
+        """Store the names in a folder. A folder that has just changed gets no entry: it may change again in one tick.
+
+        Args:
+            path: Path of the folder, relative to the catalogue.
+            status: Its stat.
+            names: Its names, valid UTF-8, of neither folders nor links.
         """
         if sys.platform == "linux" and status is not None:
-            if os.major(status[3]) and max(status[:2]) < self._settled:
+            if os.major(status[3]) and max(status[:2]) < self._max_time_ns:
                 self._now[path] = status, "/".join(names)
 
     def write(self) -> None:
-        """Put the entries of this listing in the place of all others. Raises OSError where the disk refuses."""
+        """Replace all entries with those of this listing. Raises OSError if the disk refuses."""
         if self._now != self._before:
             _write(self._path, msgspec.msgpack.encode(self._now))
 
@@ -115,7 +146,7 @@ def _write(path: Path, body: bytes) -> None:
 
 
 def _read(path: Path) -> bytes:
-    """What `_write` wrote; nothing where that is not there as it was."""
+    """Return the content that `_write` wrote; empty if the file is missing or was altered."""
     try:
         content = files.read_regular(path, _MAX_BYTES)
     except OSError:

@@ -1,4 +1,4 @@
-"""The tables of a new generation: what a writer is given, checked and put on the disk block by block."""
+"""The tables of a new generation: rows, vectors and arrays, checked and written block by block."""
 
 import json
 import re
@@ -21,17 +21,17 @@ from indexes.store.generation import EMBEDDINGS, ROWS, TABLE, Generation
 from indexes.store.rows import KEYS, MAX_LINE_BYTES, RECORD, are_distinct, json_of, keys_of
 
 MAX_TOMBSTONE_FRACTION = 0.10
-"""Share of slots without a row beyond which slots are numbered anew, and a structure over them is built anew."""
+"""Fraction of slots without a row beyond which slots are renumbered and the structure is rebuilt."""
 
 RESERVED = {"rows", "table", "embeddings", "vectors", "manifest"}
 
 Layouts: TypeAlias = dict[str, tuple[np.dtype[Any], tuple[int, ...]]]
-"""Name of a per-row array -> its dtype, and the shape of one row of it."""
+"""Name of a per-row array to its dtype and the shape of one row."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Rows one after another, and embeddings (F, d) and arrays (F, ...) of those that the parent lacks, in order."""
+    """Consecutive rows, with embeddings (F, d) and arrays (F, ...) of those that the parent lacks, in their order."""
 
     rows: Sequence[Mapping[str, Any]]
     embeddings: Floats | None = None
@@ -40,11 +40,15 @@ class Block:
 
 @dataclass(frozen=True)
 class Tables:
-    """What a generation will hold, on the disk and memory-mapped.
+    """Written tables of a new generation, memory-mapped.
 
-    vectors (S, d), not all of which need have a row; slots (N,) of the rows, and objects (N,), the keys of their
-    "object_id" (`indexes.store.rows`); arrays: name -> (N, ...); parent: the generation that rows were taken from, None
-    where there were none; renumbered: whether slots are others than there.
+    Attributes:
+        vectors: Vectors (S, d), one for each slot; a slot may have no row.
+        slots: Slot of each row (N,).
+        objects: Keys (N,) of the rows' "object_id" (`indexes.store.rows`).
+        arrays: Name to per-row array (N, ...).
+        parent: Generation from which rows were reused; None: none were.
+        renumbered: Whether the slots have other numbers than in the parent.
     """
 
     vectors: Floats
@@ -56,11 +60,10 @@ class Tables:
 
 
 class TableWriter:
-    """Takes blocks with `add` and the parent's rows with `add_parent_rows`, writes them to files in `folder`, and maps what was
-    written with `close`.
+    """Writes blocks of rows (`add`) and the parent's rows (`add_parent_rows`) to `folder`; `close` maps the files.
 
-    What comes is written once and in order. Embeddings are the parent's, then the new ones; where some of these are
-    equal, or many of those have no row any more, they are written again at the end.
+    Rows are written once, in order. The embeddings are those of the parent, then the new ones. They are written again
+    at the end if some new ones are equal, or if many of the parent's have no row.
     """
 
     def __init__(self, folder: Path, parent: Generation | None, fingerprint: Mapping[str, str]) -> None:
@@ -85,13 +88,13 @@ class TableWriter:
             file.abandon()
 
     def add(self, block: Block) -> None:
-        """Take the next rows. Raises `RowError`, `VectorError` or `MismatchedIndex`, naming the row."""
+        """Append rows. Raises `RowError`, `VectorError` or `MismatchedIndex` with the id of the row."""
         if not block.rows:
-            raise RowError("a block must hold at least one row; got none")
+            raise RowError("a block must have at least one row; got none")
         ids: list[Any] = [row.get("id") for row in block.rows]
         if odd := [name for name in ids if not isinstance(name, str) or not name]:
             raise RowError(f"every row needs a text id; row {ids.index(odd[0])} has {odd[0]!r}")
-        numbers = np.full(len(ids), -1)  # of the parent's rows, to take vectors and arrays from
+        numbers = np.full(len(ids), -1)  # rows of the parent whose vectors and arrays are reused
         if self.parent is not None:
             numbers = self.parent.match_rows(keys_of(ids), keys_of(row.get("digest") for row in block.rows))
         known = numbers >= 0
@@ -114,12 +117,18 @@ class TableWriter:
         self._add_lines(block.rows, ids, numbers, records)
 
     def add_parent_rows(self, numbers: range) -> None:
-        """Take the parent's rows of these numbers (a step of 1) next, as they are. Raises `RowError` without a parent,
-        or `MismatchedIndex`.
+        """Append rows of the parent unchanged.
+
+        Args:
+            numbers: Their row numbers, with a step of 1.
+
+        Raises:
+            RowError: There is no parent, or the range is empty.
+            MismatchedIndex: The parent has another fingerprint.
         """
         parent = self.parent
         if parent is None or not numbers:
-            raise RowError("rows can be kept of a parent alone, and one at least")
+            raise RowError("copying rows needs a parent and at least one row number")
         self._require_fit(parent)
         span = slice(numbers.start, numbers.stop)
         self._open_arrays(parent.arrays)
@@ -132,7 +141,7 @@ class TableWriter:
         self._records.append(records)
 
     def close(self) -> Tables:
-        """Finish the files, check that everything fits together, and map what was written."""
+        """Finish the files, check their consistency, and return them memory-mapped. Raises `RowError`."""
         if self._vectors is None or not self._records:
             raise RowError("an index needs at least one row; got none")
         finish(self._text)
@@ -151,10 +160,10 @@ class TableWriter:
         return [*([self._vectors] if self._vectors else ()), *(self._arrays or {}).values()]
 
     def _require_fit(self, parent: Generation) -> None:
-        """Rows are to be taken over from the parent: they must have been made alike."""
+        """Check that the parent's rows are reusable: its fingerprint must be equal."""
         if not self._fits:
             raise MismatchedIndex(
-                f"vectors can be taken over only from an index with the same fingerprint {self._fingerprint}; "
+                f"vectors can be reused only from an index with the same fingerprint {self._fingerprint}; "
                 f"{parent.name} has {parent.fingerprint}. Build the index without a parent"
             )
         self._used = True
@@ -164,26 +173,26 @@ class TableWriter:
             self._vectors = ArrayFile(self.folder / EMBEDDINGS, np.float32, vectors.shape[1:])
         self._vectors.append(vectors)
 
-    def _add_arrays(self, given: Mapping[str, NDArray[Any]], numbers: Slots, fresh_ids: Sequence[str]) -> None:
-        """Write the arrays of a block: those given of its new rows, the parent's of the others."""
-        for name, array in given.items():
+    def _add_arrays(self, fresh: Mapping[str, NDArray[Any]], numbers: Slots, fresh_ids: Sequence[str]) -> None:
+        """Write the arrays of a block: `fresh` for its new rows, the parent's arrays for the others."""
+        for name, array in fresh.items():
             check_name(name)
             _check_array(name, array, fresh_ids)
         known = numbers >= 0
         if self.parent is not None and known.any():
             self._open_arrays(self.parent.arrays)
-        if fresh_ids or given:
-            self._open_arrays(given)
+        if fresh_ids or fresh:
+            self._open_arrays(fresh)
         for name, file in (self._arrays or {}).items():
             block = np.empty((len(numbers), *file.row_shape), file.dtype)
             if fresh_ids:
-                block[~known] = given[name]
+                block[~known] = fresh[name]
             if self.parent is not None and known.any():
                 block[known] = self.parent.arrays[name][numbers[known]]
             file.append(block)
 
     def _open_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Open the files of arrays like these, which must be like those of all rows before."""
+        """Open files for these arrays, whose names, dtypes and shapes must match those of earlier rows."""
         got: Layouts = {name: (array.dtype, array.shape[1:]) for name, array in arrays.items()}
         if self._arrays is None:
             self._arrays = {name: ArrayFile(self.folder / f"{name}.npy", *how) for name, how in got.items()}
@@ -193,18 +202,18 @@ class TableWriter:
                 ", ".join(f"{name} {dtype} {shape}" for name, (dtype, shape) in sorted(each.items())) or "none"
                 for each in (got, must)
             )
-            raise RowError(f"all rows, the parent's too, must have the same arrays: {must_text}; got {got_text}")
+            raise RowError(f"all rows, including the parent's, must have the same arrays: {must_text}; got {got_text}")
 
     def _add_lines(
         self, rows: Sequence[Mapping[str, Any]], ids: Sequence[str], numbers: Slots, records: NDArray[Any]
     ) -> None:
-        """Write the rows as text, and fill in their records but for the slots."""
+        """Write the rows as text, and fill in their records except for the slots."""
         lines, same = [], np.zeros(len(rows), bool)
         for place, (row, name, number) in enumerate(zip(rows, ids, numbers.tolist(), strict=True)):
             before = b"" if self.parent is None or number < 0 else self.parent.rows.line(number)
             line = json_of(dict(row), f"row {name!r}", name, checked=before)
             if len(line) >= MAX_LINE_BYTES:
-                raise RowError(f"row {name!r} must have less than {MAX_LINE_BYTES} bytes, has {len(line)}", name)
+                raise RowError(f"row {name!r} must have less than {MAX_LINE_BYTES} bytes, got {len(line)}", name)
             lines.append(line + b"\n")
             same[place] = line == before
         for name in KEYS:
@@ -224,13 +233,16 @@ class TableWriter:
         with (self.folder / ROWS).open("rb") as text:
             text.seek(int(table["stop"][number - 1]) if number else 0)
             name = json.loads(text.readline())["id"]
-        raise RowError(f"row ids must be distinct; {name!r} comes twice", name)
+        raise RowError(f"row ids must be distinct; {name!r} occurs twice", name)
 
     def _number_slots(self, table: NDArray[Any]) -> bool:
-        """Give equal vectors one slot, in the table and in the file; whether the parent's slots have other numbers.
+        """Merge equal vectors into one slot, in the table and in the file.
 
-        The parent's slots stay, without rows too, until these are `MAX_TOMBSTONE_FRACTION` of all: a structure cannot forget.
-        Slots that are numbered anew are in the order of the rows.
+        A structure cannot delete vectors, so the parent's slots stay, also without rows, until more than
+        `MAX_TOMBSTONE_FRACTION` of all slots have none. Renumbered slots follow the order of the rows.
+
+        Returns:
+            Whether the parent's slots have other numbers.
         """
         if self._vectors is None:
             return False
@@ -241,39 +253,43 @@ class TableWriter:
         used = np.count_nonzero(stay)
         if self.parent is not None and self._fits:
             stay[: len(self.parent.embeddings)] = True
-        slots_kept = np.flatnonzero(stay)
-        renumbered = not self._used or len(slots_kept) - int(used) > MAX_TOMBSTONE_FRACTION * len(slots_kept)
+        live_slots = np.flatnonzero(stay)
+        renumbered = not self._used or len(live_slots) - int(used) > MAX_TOMBSTONE_FRACTION * len(live_slots)
         if renumbered:
             distinct, first = np.unique(slots, return_index=True)
-            slots_kept = distinct[np.argsort(first)]
+            live_slots = distinct[np.argsort(first)]
         number_of = np.full(len(vectors), -1)
-        number_of[slots_kept] = np.arange(len(slots_kept))
+        number_of[live_slots] = np.arange(len(live_slots))
         table["slot"] = number_of[slots]
-        if not np.array_equal(slots_kept, np.arange(len(vectors))):
-            beside = self._vectors.path.with_suffix(".new")
+        if not np.array_equal(live_slots, np.arange(len(vectors))):
+            new_path = self._vectors.path.with_suffix(".new")
             blocks = (
-                vectors[slots_kept[start : start + BLOCK_ROWS]] for start in range(0, len(slots_kept), BLOCK_ROWS)
+                vectors[live_slots[start : start + BLOCK_ROWS]] for start in range(0, len(live_slots), BLOCK_ROWS)
             )
-            write_array(beside, np.float32, vectors.shape[1:], blocks)
-            beside.replace(self._vectors.path)
+            write_array(new_path, np.float32, vectors.shape[1:], blocks)
+            new_path.replace(self._vectors.path)
         return renumbered
 
 
 def check_documents(documents: Mapping[str, Any]) -> dict[str, Any]:
-    """The documents, named for files and of finite JSON or arrays of finite numbers, or `RowError`."""
+    """Return the documents after checking their names, and that they are JSON or arrays of finite numbers.
+
+    Raises:
+        RowError: A document is invalid.
+    """
     for name, document in documents.items():
         check_name(name)
         if not isinstance(document, np.ndarray):
             json_of(document, f"document {name!r}")
         elif document.dtype.kind not in "biuf" or not np.isfinite(document).all():
-            raise RowError(f"document {name!r}: an array must hold finite numbers; got {document.dtype}")
+            raise RowError(f"document {name!r}: an array must contain finite numbers; got {document.dtype}")
         elif document.ndim < 1 or 0 in document.shape[1:]:
-            raise RowError(f"document {name!r}: an array must have rows of numbers; got the shape {document.shape}")
+            raise RowError(f"document {name!r}: an array must have rows of numbers; got shape {document.shape}")
     return dict(documents)
 
 
 def check_name(name: str) -> None:
-    """`name` can be a file's name in a generation, or `RowError`."""
+    """Check that `name` can be a file name in a generation. Raises `RowError`."""
     if not re.fullmatch(r"[a-z][a-z0-9_]*", name) or name in RESERVED:
         raise RowError(
             f"names of arrays and documents must be lower-case words, not {', '.join(sorted(RESERVED))}; got {name!r}"
@@ -284,10 +300,10 @@ def _check_array(name: str, array: NDArray[Any], ids: Sequence[str]) -> None:
     if not isinstance(array, np.ndarray) or array.ndim < 1 or array.dtype.kind not in "biuf":
         raise RowError(f"array {name!r} must be a numpy array of numbers; got {type(array).__name__}")
     if 0 in array.shape[1:]:
-        raise RowError(f"array {name!r} must hold at least one number for each row; got {array.shape[1:]}")
+        raise RowError(f"array {name!r} must have at least one number for each row; got shape {array.shape[1:]}")
     if len(array) != len(ids):
         raise RowError(f"array {name!r}: must have one entry for each of {len(ids)} new rows; got {len(array)}")
     finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
     if not finite.all():
         row = ids[int(np.argmin(finite))]
-        raise RowError(f"array {name!r}: row {row!r} holds NaN or infinity (too large for its type?)", row)
+        raise RowError(f"array {name!r}: row {row!r} has NaN or infinity (too large for its type?)", row)

@@ -1,9 +1,9 @@
-"""What a build has embedded until it was cut off, kept for the next one to take up: `unfinished.sqlite`.
+"""Codes of an interrupted build, stored for the next build: `unfinished.sqlite`.
 
-A record stands under the digest of the content and under a key of what makes the arrays and of their layout, so that
-nothing is ever taken from another model's build. It is committed at once, with a checksum: whatever a kill or a full
-disk leaves, a record is whole or counts as absent. The file belongs to no generation and no query opens it. It may be
-deleted at any time, and is when a generation has been written.
+The key of a record is the digest of the content, with a digest of the fingerprint and the array layout, so codes of
+another model are never reused. Records are committed immediately, with a checksum: after a kill or a full disk, a
+record is complete or counts as missing. The file belongs to no generation, and queries do not read it. It may be
+deleted at any time; a build deletes it after writing a generation.
 """
 
 import hashlib
@@ -29,9 +29,12 @@ _TABLE = """CREATE TABLE IF NOT EXISTS records (
 
 
 class UnfinishedBuild:
-    """Records by digest, in the folder `index`; use it under the index's lock. Threads may share it.
+    """Records by content digest; use it under the lock of the index. Threads may share it.
 
-    layouts: name of an array -> dtype and shape of one record's, as in `indexes.store.tables`.
+    Args:
+        index: Folder of the index.
+        fingerprint: Fingerprint of the model.
+        layouts: Name of each array to its dtype and shape in one record (`indexes.store.tables`).
     """
 
     def __init__(self, index: Path, fingerprint: Mapping[str, str], layouts: Layouts) -> None:
@@ -43,10 +46,10 @@ class UnfinishedBuild:
         self._connection: sqlite3.Connection | None = None
         if self.path.exists():
             try:
-                whole = self._open().execute("PRAGMA quick_check").fetchall() == [("ok",)]
+                intact = self._open().execute("PRAGMA quick_check").fetchall() == [("ok",)]
             except sqlite3.Error:
-                whole = False
-            if not whole:
+                intact = False
+            if not intact:
                 self.clear()
 
     def __enter__(self) -> Self:
@@ -59,9 +62,7 @@ class UnfinishedBuild:
             self._connection.close()
 
     def find(self, digests: Iterable[str]) -> dict[str, Any]:
-        """Of these digests, those of which an earlier build left a whole record: {digest: record}, which gives its
-        arrays by their names.
-        """
+        """Return {digest: record} for those digests that have a complete record; a record has arrays by name."""
         if self._connection is None:
             return {}
         found = {}
@@ -75,9 +76,14 @@ class UnfinishedBuild:
         return found
 
     def add(self, digests: Sequence[str], arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Write records of these digests: arrays (n, ...) by name. Those that are not finite are left out.
+        """Write records; skip those with numbers that are not finite.
 
-        Raises `WriteFailed` where the disk refuses.
+        Args:
+            digests: Content digests, n of them.
+            arrays: Name to array (n, ...).
+
+        Raises:
+            WriteFailed: The disk refuses.
         """
         records, finite = np.zeros(len(digests), self._record), np.ones(len(digests), bool)
         for name in self._record.names or ():
@@ -95,7 +101,7 @@ class UnfinishedBuild:
             raise WriteFailed(f"{self.path}: the disk refused ({error}); build again") from error
 
     def clear(self) -> None:
-        """Delete what all unfinished builds left: a generation holds it now. What cannot be deleted stays."""
+        """Delete all records, after a generation contains them. Files that cannot be deleted stay."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -106,9 +112,9 @@ class UnfinishedBuild:
     def _open(self) -> sqlite3.Connection:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         self._connection = sqlite3.connect(self.path, check_same_thread=False)
-        self._connection.execute("PRAGMA synchronous = OFF")  # a commit outlives the process, though not the power
+        self._connection.execute("PRAGMA synchronous = OFF")  # commits survive a kill, but not a power failure
         self._connection.execute(_TABLE)
-        self._connection.execute("PRAGMA user_version = 1")  # fails where it cannot be written to
+        self._connection.execute("PRAGMA user_version = 1")  # fails if the file is not writable
         return self._connection
 
 

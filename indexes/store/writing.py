@@ -1,4 +1,4 @@
-"""How a generation's folder is filled, the manifest last."""
+"""Writing of a generation's folder, the manifest last."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -26,7 +26,7 @@ RECALL_QUERIES = 100
 
 @dataclass(frozen=True)
 class KindChoice:
-    """A kind, its parameters, and what the manifest shall say of the choice."""
+    """A chosen kind, its parameters, and manifest entries about the choice."""
 
     kind: str
     parameters: Parameters
@@ -34,12 +34,12 @@ class KindChoice:
 
 
 KindChooser = Callable[[Tables], KindChoice]
-"""Chooses the kind of an index by what it will hold."""
+"""Chooses the kind of an index from its tables."""
 
 
 @dataclass(frozen=True)
 class WriteJob:
-    """What a generation is to be, but for its rows; see `indexes.store.folder.IndexStore.write_blocks`."""
+    """Settings of a new generation, without its rows (`indexes.store.folder.IndexStore.write_blocks`)."""
 
     documents: dict[str, Any]
     fingerprint: dict[str, str]
@@ -55,8 +55,16 @@ class WriteJob:
 
 
 def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], job: WriteJob) -> int:
-    """Fill the empty `folder` with the generation of that name. Returns how many slots, the first ones, are the
-    parent's in the parent's structure.
+    """Write a generation into an empty folder.
+
+    Args:
+        folder: The folder.
+        name: Name of the generation.
+        blocks: Blocks of rows, and ranges of the parent's rows.
+        job: The settings.
+
+    Returns:
+        Number of leading slots that the parent already had in the same structure.
     """
     with TableWriter(folder, job.parent, job.fingerprint) as writer:
         for block in blocks:
@@ -67,7 +75,7 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
         tables = writer.close()
     clash = sorted(set(job.documents) & set(tables.arrays))
     if clash:
-        raise RowError(f"an array and a document cannot share a name; got {', '.join(clash)}")
+        raise RowError(f"an array and a document must have different names; got {', '.join(clash)}")
     arrays = {document: content for document, content in job.documents.items() if isinstance(content, np.ndarray)}
     max_bytes = max_document_bytes(len(tables.slots), arrays.values())
     for document, content in job.documents.items():
@@ -76,7 +84,7 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
             continue
         text = files.encoded(content, indent=2) + b"\n"
         if len(text) > max_bytes:
-            raise RowError(f"document {document!r} must have at most {max_bytes} bytes of JSON, has {len(text)}")
+            raise RowError(f"document {document!r} must have at most {max_bytes} bytes of JSON, got {len(text)}")
         with files.durable_file(folder / f"{document}.json") as handle:
             handle.write(text)
     if job.choose_kind is not None:
@@ -86,7 +94,7 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
         job = replace(
             job, kind=kind, requested=kind.check_parameters(chosen.parameters), about={**job.about, **chosen.about}
         )
-    index, built_slots, kept = _build_or_grow(tables, job)
+    index, built_slots, inherited = _build_or_grow(tables, job)
     if index.save(folder / STRUCTURE):
         files.sync(folder / STRUCTURE)
     slots = len(tables.vectors)
@@ -112,13 +120,11 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
     )
     write_manifest(folder, manifest)
     files.sync(folder)
-    return kept
+    return inherited
 
 
 def _build_or_grow(tables: Tables, job: WriteJob) -> tuple[VectorIndex, int, int]:
-    """The index over the vectors, how many there were when its structure was trained, and how many the parent had in
-    it.
-    """
+    """Return the index, its number of vectors at the last training, and the number that the parent already had."""
     vectors, parent = tables.vectors, tables.parent
     if parent is None or tables.renumbered or not _can_reuse_structure(parent, len(vectors), job):
         return job.kind.build_checked(vectors, job.requested, seed=job.seed, threads=job.threads), len(vectors), 0
@@ -129,7 +135,7 @@ def _build_or_grow(tables: Tables, job: WriteJob) -> tuple[VectorIndex, int, int
 
 
 def _can_reuse_structure(parent: Generation, slots: int, job: WriteJob) -> bool:
-    """Whether the parent's structure can be kept for that many slots."""
+    """Whether the parent's structure is reusable for that many slots."""
     manifest, kind = parent.manifest, job.kind
     if (
         manifest.kind != kind.kind
@@ -145,5 +151,5 @@ def _recall(index: VectorIndex, job: WriteJob) -> dict[str, Any]:
         return {"value": 1.0, "at": RECALL_AT, "queries": 0, "how": "exact by construction"}
     queries = sample_queries(index.vectors, RECALL_QUERIES, seed=job.seed) if job.queries is None else job.queries
     value = recall_against_exact(index, queries, RECALL_AT)
-    how = "measured on moved own vectors" if job.queries is None else "measured on the queries that were given"
+    how = "measured on displaced vectors of the index" if job.queries is None else "measured on the given queries"
     return {"value": value, "at": RECALL_AT, "queries": len(queries), "how": how}

@@ -1,1 +1,1 @@
-"""Catalogues on several machines: Ray embeds them and holds their shards. Extra `cluster`."""
+"""Catalogues on several machines with Ray: building, serving and training. Extra `cluster`."""

@@ -1,9 +1,9 @@
-"""Shards built by Ray Data: a pool of processes, each of which embeds and writes one shard after the other.
+"""Building of shards with Ray Data: each process of a pool embeds and writes one shard after another.
 
-What is sent are names; a photo is read, embedded and written by one process on one machine. A process that is lost is
-replaced, and its shard is taken up where it was left: by the codes that are in its folder, which all machines must see.
+Only names are sent; one process on one machine reads, embeds and writes a photo. A lost process is replaced, and its
+shard continues from the codes in its folder, which must be visible to all machines.
 
-Where Ray has graphics cards, each process has one of them to itself, and the towers run there.
+If Ray has GPUs, each process has a GPU of its own, and the towers run there.
 """
 
 import time
@@ -23,11 +23,11 @@ from retrieval.model.encode import default_device
 from retrieval.search.sharding.build_sharded import ShardBuild, ShardJob, ShardRunner, build_shard
 
 RELEASE_TIMEOUT_S, MAX_FAILURES = 60.0, 3
-"""Within which a process that was given up lets go of its shard; how often all may fail without a shard between."""
+"""Time until a lost process releases its shard; largest number of failures without a finished shard in between."""
 
 
 class BuildWorkerPool(NamedTuple):
-    """So many processes at once, and what each asks Ray for: processors, and a graphics card or none."""
+    """Number of concurrent processes, and the CPUs and GPUs that each requests from Ray."""
 
     processes: int
     cpus: int
@@ -35,19 +35,19 @@ class BuildWorkerPool(NamedTuple):
 
 
 class ShardBuildWorker:
-    """A process of the pool, with the model; on a graphics card where Ray has given it one."""
+    """A process of the pool with the model, on a GPU if Ray assigned one."""
 
     def __init__(self, model: Path, has_gpu: bool) -> None:
         self._checkpoint = load_checkpoint(model)
         if has_gpu:
-            torch.backends.cudnn.allow_tf32 = False  # an index may have codes of both: they are to be the same
+            torch.backends.cudnn.allow_tf32 = False  # an index may mix codes of CPU and GPU, which must be equal
             self._checkpoint.matcher.to(default_device())
 
     def __call__(self, batch: dict[str, Any]) -> dict[str, Any]:
-        """Build the shards of these jobs. What is wrong with one is its answer, for another try would say it again."""
-        return {"built": np.array([self._answer(job) for job in batch["job"]], dtype=object)}
+        """Build the shards of these jobs. Errors are returned as results, because a retry would fail the same way."""
+        return {"built": np.array([self._build(job) for job in batch["job"]], dtype=object)}
 
-    def _answer(self, job: ShardJob) -> ShardBuild | RetrievalError | IndexesError:
+    def _build(self, job: ShardJob) -> ShardBuild | RetrievalError | IndexesError:
         until = time.monotonic() + RELEASE_TIMEOUT_S
         while True:
             try:
@@ -61,36 +61,40 @@ class ShardBuildWorker:
 
 
 def ray_runner(cpus: int | None = None, workers: int | None = None) -> ShardRunner:
-    """Builds shards on a Ray cluster (`retrieval.cluster.session`). workers: processes at once, at most; None: one for
-    each graphics card of the cluster, or for each processor where it has none.
+    """Return a function that builds shards on a Ray cluster (`retrieval.cluster.session`).
+
+    Args:
+        cpus: CPUs of a Ray that is started here; None: all.
+        workers: Largest number of concurrent processes; None: one for each GPU of the cluster, or for each CPU if it
+            has no GPU.
     """
 
     def run(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterator[ShardBuild]:
-        left, failures = {job.folder: job for job in jobs}, 0
+        remaining, failures = {job.folder: job for job in jobs}, 0
         with ray_session(cpus) as ray:
             ray.data.DataContext.get_current().enable_progress_bars = False
-            while left:
+            while remaining:
                 try:
-                    for answer in _answers(ray, list(left.values()), checkpoint, workers):
-                        if isinstance(answer, Exception):
-                            raise answer
-                        del left[answer.folder]
+                    for result in _results(ray, list(remaining.values()), checkpoint, workers):
+                        if isinstance(result, Exception):
+                            raise result
+                        del remaining[result.folder]
                         failures = 0
-                        yield answer
+                        yield result
                 except (RetrievalError, IndexesError):
                     raise
-                except Exception as error:  # Ray Data's own: processes lost at the wrong moment make it fail as a whole
+                except Exception as error:  # Ray Data itself may fail when processes are lost
                     failures += 1
                     if failures > MAX_FAILURES:
                         raise RetrievalError(
-                            f"Ray failed {failures} times without a shard ({type(error).__name__}: {error}); the same "
-                            "command goes on where it stopped"
+                            f"Ray failed {failures} times without a finished shard ({type(error).__name__}: {error}); "
+                            "run the same command again to continue"
                         ) from error
 
     return run
 
 
-def _answers(
+def _results(
     ray: Any, jobs: Sequence[ShardJob], checkpoint: Checkpoint, workers: int | None
 ) -> Iterator[ShardBuild | RetrievalError | IndexesError]:
     items, pool = [{"job": job} for job in jobs], ray_worker_pool(ray)
@@ -107,16 +111,18 @@ def _answers(
 
 
 def ray_worker_pool(ray: Any) -> BuildWorkerPool:
-    """A process for each graphics card of a Ray cluster, with its share of its machine's processors, which read and
-    decode; for each processor where there is no card, or none that PyTorch can use there.
+    """Return the worker pool of a Ray cluster.
+
+    It has a process for each GPU, with an equal number of the machine's CPUs, which read and decode. Without a GPU that
+    PyTorch can use, it has a process for each CPU.
     """
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    having = [node for node in nodes if node.get("GPU", 0) >= 1]
-    if having and ray.get(ray.remote(num_cpus=0, num_gpus=1)(_has_gpu).remote()):
-        share = min(int(node.get("CPU", 1) / node["GPU"]) for node in having)
-        return BuildWorkerPool(sum(int(node["GPU"]) for node in having), max(1, share), 1)
-    if having:
-        say("Ray has graphics cards, but PyTorch cannot use them there: processors embed")
+    gpu_nodes = [node for node in nodes if node.get("GPU", 0) >= 1]
+    if gpu_nodes and ray.get(ray.remote(num_cpus=0, num_gpus=1)(_has_gpu).remote()):
+        cpus = min(int(node.get("CPU", 1) / node["GPU"]) for node in gpu_nodes)
+        return BuildWorkerPool(sum(int(node["GPU"]) for node in gpu_nodes), max(1, cpus), 1)
+    if gpu_nodes:
+        say("Ray has GPUs, but PyTorch cannot use them there; CPUs embed the photos")
     return BuildWorkerPool(max(1, int(sum(node.get("CPU", 0) for node in nodes))), 1, 0)
 
 

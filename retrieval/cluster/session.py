@@ -1,4 +1,4 @@
-"""Ray, joined where there is one, else started here for as long as it is wanted."""
+"""Ray sessions: join an existing Ray cluster, or start Ray on this machine for the length of a block."""
 
 import gc
 import logging
@@ -11,7 +11,7 @@ from typing import Any
 from retrieval.errors import BadInput, RetrievalError
 
 OBJECT_STORE_BYTES = 200 * 2**20
-"""Of a Ray that is started here: what travels is small."""
+"""Object store of a Ray that is started here; the transferred objects are small."""
 ADDRESS, LOOPBACK = "RAY_ADDRESS", "127.0.0.1"
 _SETTINGS = {
     "RAY_USAGE_STATS_ENABLED": "0",
@@ -21,14 +21,14 @@ _SETTINGS = {
     "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
     "RAY_ENABLE_AUTO_CONNECT": "0",
 }
-"""Quiet, and started by `ray_session` alone: a thread of Ray's own that outlives it would start another Ray."""
+"""Settings for little output and no automatic start, with which a thread that outlives Ray would start it again."""
 _LOOPBACK = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}
-"""Ray's own switch for a cluster of this machine alone, which then listens on 127.0.0.1."""
+"""Ray's setting for a cluster of this machine only, which then listens on 127.0.0.1."""
 
 
 @contextmanager
 def _without_ray_warnings() -> Iterator[None]:
-    """Without the warnings of Ray's own making, most of which are about Ray."""
+    """Suppress the warnings of Ray and its libraries."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", module=r"(ray|pydantic|google)(\.|$)")
         yield
@@ -36,11 +36,17 @@ def _without_ray_warnings() -> Iterator[None]:
 
 @contextmanager
 def ray_session(cpus: int | None = None) -> Iterator[Any]:
-    """Ray with its parts `data` and `serve`, connected to the cluster that the variable RAY_ADDRESS names ("auto": one
-    of this machine), else to one that is started here, on 127.0.0.1 alone, and ends with the block. Where this process
-    is connected already, it stays so.
+    """Connect to a Ray cluster, and yield the module `ray` with `ray.data` and `ray.serve`.
 
-    cpus: of a Ray that is started here, None: all. Raises BadInput without Ray, RetrievalError where it cannot be had.
+    The environment variable RAY_ADDRESS names the cluster ("auto": one on this machine). Without it, Ray is started
+    here, on 127.0.0.1 only, and ends with the block. An existing connection of this process is reused and stays open.
+
+    Args:
+        cpus: CPUs of a Ray that is started here; None: all.
+
+    Raises:
+        BadInput: Ray is not installed.
+        RetrievalError: The cluster cannot be joined, or Ray cannot be started.
     """
     os.environ.update({name: os.environ.get(name, value) for name, value in _SETTINGS.items()})
     joined = os.environ.get(ADDRESS)
@@ -53,9 +59,9 @@ def ray_session(cpus: int | None = None) -> Iterator[Any]:
             import ray.serve
     except ImportError as error:
         raise BadInput(f"{error.name} is missing; run: pip install 'touch-retrieval[cluster]'") from error
-    said: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False, "ignore_reinit_error": True}
+    options: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False, "ignore_reinit_error": True}
     if not joined:
-        said |= {
+        options |= {
             "num_cpus": cpus,
             "object_store_memory": OBJECT_STORE_BYTES,
             "include_dashboard": False,
@@ -64,7 +70,7 @@ def ray_session(cpus: int | None = None) -> Iterator[Any]:
     ours = not ray.is_initialized()
     try:
         with _without_ray_warnings():
-            ray.init(address=joined, **said)
+            ray.init(address=joined, **options)
     except (ConnectionError, OSError, RuntimeError, ValueError) as error:
         what = f"the Ray cluster at {joined} cannot be joined" if joined else "Ray cannot be started here"
         raise RetrievalError(f"{what}: {error}") from error
@@ -73,8 +79,8 @@ def ray_session(cpus: int | None = None) -> Iterator[Any]:
     try:
         if not joined and (address := ray.util.get_node_ip_address()) != LOOPBACK:
             raise RetrievalError(
-                f"Ray would listen on {address}, for this process had imported it already: "
-                f"set {', '.join(_LOOPBACK)}=0 before that, or start Ray yourself and name it in RAY_ADDRESS"
+                f"Ray would listen on {address}, because this process imported it before: "
+                f"set {', '.join(_LOOPBACK)}=0 before the import, or start Ray yourself and set RAY_ADDRESS"
             )
         with _without_ray_warnings():
             yield ray
@@ -83,13 +89,11 @@ def ray_session(cpus: int | None = None) -> Iterator[Any]:
             ray.shutdown()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", ResourceWarning)
-                gc.collect()  # Ray waits for none of the processes that it started
+                gc.collect()  # Ray does not wait for the processes that it started
 
 
 def on_loopback() -> None:
-    """In each process of a Ray that is started here: replicas of Ray Serve listen on 127.0.0.1 too, for which Ray has
-    no setting.
-    """
+    """Make replicas of Ray Serve listen on 127.0.0.1, for which Ray has no setting; runs in each Ray process."""
     try:
         from ray.serve._private import replica
     except ImportError:

@@ -1,7 +1,7 @@
-"""Training on the processes of a Ray cluster: Ray Train starts the ranks, and each trains as it does under `torchrun`.
+"""Training on a Ray cluster: Ray Train starts the ranks, and each rank trains as under `torchrun`.
 
-A rank that is lost ends the others, and Ray starts all of them again; they go on from the state beside the checkpoint,
-which every machine must see under the same path, as it must see the recording.
+If a rank is lost, Ray restarts all of them. They resume from the state file next to the checkpoint. The state file and
+the recording must have the same path on every machine.
 """
 
 import tempfile
@@ -18,7 +18,7 @@ from retrieval.training.state import require_no_unfinished_state, state_path
 from retrieval.training.train import train
 
 MAX_RESTARTS = 3
-"""How often a training without a step of progress is begun again."""
+"""Largest number of restarts without progress."""
 
 
 def train_on_ray(
@@ -32,17 +32,29 @@ def train_on_ray(
     workers: int = 2,
     cpus: int | None = None,
 ) -> Checkpoint:
-    """As `retrieval.training.train.train`, on so many ranks, each with a graphics card where the cluster has as many.
+    """Train on several ranks, each with a GPU if the cluster has enough; as `retrieval.training.train.train`.
 
-    cpus: of a Ray that is started here, None: all. Raises its errors, BadInput without Ray or for a number of workers
-    that is none, and RetrievalError where ranks are lost again and again.
+    Args:
+        recording: As for `train`.
+        out: As for `train`.
+        config: As for `train`.
+        split: As for `train`.
+        resume: As for `train`.
+        cache: As for `train`.
+        workers: Number of ranks.
+        cpus: CPUs of a Ray that is started here; None: all.
+
+    Raises:
+        BadInput: Ray is not installed, or `workers` is less than 1.
+        RetrievalError: Training fails, or ranks are lost repeatedly.
+        JobInterrupted: The user stopped the training.
     """
     if workers < 1:
         raise BadInput(f"workers must be 1 or more; got {workers}")
     require_writable(out)
     if not resume:
         require_no_unfinished_state(out)
-    asked = {
+    settings = {
         "recording": recording.resolve(),
         "out": out.resolve(),
         "config": config,
@@ -54,38 +66,39 @@ def train_on_ray(
         from ray.train import RunConfig, ScalingConfig, TrainingFailedError
         from ray.train.torch import TorchTrainer
 
-        has_cards = ray.cluster_resources().get("GPU", 0) >= workers
-        scaling = ScalingConfig(num_workers=workers, use_gpu=has_cards, resources_per_worker={"CPU": 1})
+        has_gpus = ray.cluster_resources().get("GPU", 0) >= workers
+        scaling = ScalingConfig(num_workers=workers, use_gpu=has_gpus, resources_per_worker={"CPU": 1})
         failures, known = 0, None
-        say(f"training on {workers} ranks of Ray; their logs show how far they are")
+        say(f"training on {workers} ranks of Ray; their logs show the progress")
         while True:
             trainer = TorchTrainer(
-                _rank, train_loop_config=asked, scaling_config=scaling, run_config=RunConfig(storage_path=notes)
+                _rank, train_loop_config=settings, scaling_config=scaling, run_config=RunConfig(storage_path=notes)
             )
             try:
                 trainer.fit()
                 return load_checkpoint(out)
             except KeyboardInterrupt as error:
-                raise JobInterrupted(f"stopped; --resume goes on from {state_path(out)}, where it is") from error
+                raise JobInterrupted(f"stopped; --resume continues from {state_path(out)}, if it exists") from error
             except TrainingFailedError as error:
-                if (ours := _error_of_rank(error)) is not None:
-                    raise ours from error
+                if (own_error := _error_of_rank(error)) is not None:
+                    raise own_error from error
                 state = _state_mtime(out)
                 failures = failures + 1 if state == known else 1
                 known = state
                 if failures > MAX_RESTARTS:
                     raise RetrievalError(f"ranks were lost {failures} times without progress: {error}") from error
-                say("a rank was lost; all begin again" + (" from the last state" if state else ""))
+                say("a rank was lost; all ranks restart" + (" from the last state" if state else ""))
 
 
-def _rank(asked: dict[str, Any]) -> None:
+def _rank(settings: dict[str, Any]) -> None:
     """Train in a process of Ray Train, which has joined the ranks."""
-    resume = asked["resume"] or state_path(asked["out"]).exists()
-    train(asked["recording"], asked["out"], asked["config"], split=asked["split"], resume=resume, cache=asked["cache"])
+    resume = settings["resume"] or state_path(settings["out"]).exists()
+    recording, out, config, split, cache = (settings[name] for name in ("recording", "out", "config", "split", "cache"))
+    train(recording, out, config, split=split, resume=resume, cache=cache)
 
 
 def _error_of_rank(error: BaseException) -> RetrievalError | None:
-    """What a rank says is wrong with what it was given; another try would say it again."""
+    """Return the error that a rank raised on purpose, which a restart would raise again; None for other failures."""
     for failure in getattr(error, "worker_failures", {}).values():
         cause = failure
         while cause is not None:
@@ -96,7 +109,7 @@ def _error_of_rank(error: BaseException) -> RetrievalError | None:
 
 
 def _state_mtime(out: Path) -> float | None:
-    """When the state was written last; None without one."""
+    """Return the modification time of the state file; None without one."""
     try:
         return state_path(out).stat().st_mtime
     except FileNotFoundError:

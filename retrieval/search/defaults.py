@@ -1,8 +1,8 @@
-"""What a command uses where the user names no model or index: what lies in the working folder, else what is shipped.
+"""The default model and index of a command: those of the working folder, else the shipped model.
 
-Which model was trained and which index built last is remembered for each working folder on its own, in
-`$XDG_STATE_HOME/touch-retrieval/last.json` (`~/.local/state` where it is not set): a training in one folder never
-changes what a command in another one does.
+The last trained model and the last built index are remembered separately for each working folder, in
+`$XDG_STATE_HOME/touch-retrieval/last.json` (`~/.local/state` if it is not set). A training in one folder never changes
+the commands in another one.
 """
 
 import json
@@ -21,52 +21,62 @@ if TYPE_CHECKING:
     from indexes.store.sharded import ShardedManifest
 
 SHIPPED = {2: "simulated-mobilenet.safetensors", 1: "simulated-mobilenet-one-finger.safetensors"}
-"""The checkpoints that come with the package, by the gel images of a touch."""
+"""Shipped checkpoints by the number of gel images of a touch."""
 SHIPPED_NAMES = {"shipped": 2, "shipped-one-finger": 1}
-"""What they are called where a command takes a checkpoint."""
+"""Their names in options that take a checkpoint."""
 INDEX = Path("index")
-"""Where `build-index` writes and `query` looks, if nothing else is said."""
+"""Default index folder of `build-index` and `query`."""
 
 MAX_FOLDERS = 100
-"""Of how many working folders it is remembered what was made there last."""
+"""Number of working folders that are remembered."""
 
 
 def shipped_model(fingers: int = 2) -> Path:
-    """The checkpoint that comes with the package; trained on the simulated rig, for trying the program out.
+    """Return the path of a shipped checkpoint, trained on the simulated rig, to try out the program.
 
-    fingers: gel images of a touch. Raises BadInput for more than two.
+    Args:
+        fingers: Number of gel images of a touch.
+
+    Raises:
+        BadInput: No shipped checkpoint takes this number.
 
     >>> retrieval.shipped_model().name
     'simulated-mobilenet.safetensors'
     """
     if fingers not in SHIPPED:
-        raise BadInput(f"models for touches of 1 and of 2 gel images come with the package; got {fingers}")
+        raise BadInput(f"the shipped models take touches of 1 or 2 gel images; got {fingers}")
     return Path(str(resources.files("retrieval") / "shipped" / SHIPPED[fingers]))
 
 
 def is_shipped(path: Path) -> bool:
-    """Whether this is a checkpoint in the folder of the package, wherever links lead."""
+    """Whether this is a shipped checkpoint, after following links."""
     return path.resolve() in [shipped_model(fingers).resolve() for fingers in SHIPPED]
 
 
-def find_model(given: str | None, index: str | Path = INDEX) -> tuple[Path, str]:
-    """The checkpoint to use and why: the one given, else that of `index`, else the last trained here, else the shipped.
+def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str]:
+    """Return the checkpoint to use, and the reason.
 
-    given: a path, or one of `SHIPPED_NAMES`. Raises CheckpointError where there is none, or where that of `index` is gone.
+    Args:
+        choice: A path or one of `SHIPPED_NAMES`; None: the checkpoint of `index`, else the last one trained in this
+            folder, else the shipped one.
+        index: Index folder, or URL of a sharded index.
+
+    Raises:
+        CheckpointError: There is no checkpoint, or the one of `index` is missing.
     """
-    if given in SHIPPED_NAMES:
-        return shipped_model(SHIPPED_NAMES[given]), "shipped; trained on the simulated rig"
-    if given is not None:
-        return Path(given), "given"
+    if choice in SHIPPED_NAMES:
+        return shipped_model(SHIPPED_NAMES[choice]), "shipped; trained on the simulated rig"
+    if choice is not None:
+        return Path(choice), "given"
     from indexes.errors import IndexesError
 
     here = _last_model()
     manifest: Manifest | ShardedManifest | None = None
-    with suppress(IndexesError):  # no usable index is none
+    with suppress(IndexesError):  # an unusable index counts as none
         manifest = manifest_of(index)
     if manifest is not None:
         own = model_of(manifest)
-        newer = f"; {here} was trained in this folder too: name it to take it" if here not in (None, own) else ""
+        newer = f"; {here} was trained in this folder too: use --model to select it" if here not in (None, own) else ""
         return own, f"the one that {index} was built with{newer}"
     if here is not None:
         return here, "the last one trained in this folder"
@@ -76,8 +86,14 @@ def find_model(given: str | None, index: str | Path = INDEX) -> tuple[Path, str]
 
 
 def manifest_of(index: str | Path) -> "Manifest | ShardedManifest":
-    """What an index folder, or a cluster of them, says of what it holds now. Raises the errors of `indexes.store`, and
-    StorageError of what lies behind a URL.
+    """Return the manifest of the current generation of an index.
+
+    Args:
+        index: An index folder, or the folder or URL of a sharded index.
+
+    Raises:
+        IndexesError: The index is missing or damaged.
+        StorageError: The storage behind the URL fails.
     """
     from indexes.store.folder import IndexStore
     from indexes.store.manifest import read_manifest
@@ -89,9 +105,13 @@ def manifest_of(index: str | Path) -> "Manifest | ShardedManifest":
 
 
 def model_of(manifest: "Manifest | ShardedManifest") -> Path:
-    """The checkpoint that built an index: where it lay then, else the last trained here or the shipped one, if equal.
+    """Return the checkpoint that built an index: at its old path, else an equal last trained or shipped one.
 
-    Raises CheckpointError where none is.
+    Args:
+        manifest: Manifest of the index.
+
+    Raises:
+        CheckpointError: None of these exists.
     """
     path = Path(str(manifest.about.get("checkpoint")))
     if path.is_file():
@@ -104,14 +124,19 @@ def model_of(manifest: "Manifest | ShardedManifest") -> Path:
     )
 
 
-def find_index(given: str | None) -> tuple[str | Path, str]:
-    """The index to use, a folder or a URL, and why: the one given, else ./index, else the last one built from this
-    folder. Raises BadInput where there is none.
+def find_index(choice: str | None) -> tuple[str | Path, str]:
+    """Return the index to use, a folder or a URL, and the reason.
+
+    Args:
+        choice: A folder or URL; None: ./index, else the last index built from this folder.
+
+    Raises:
+        BadInput: There is no index.
     """
-    if given is not None:
-        if not is_url(given) and Path(given).is_file():
-            raise BadInput(f"{given} is a file; an index is a folder, which `retrieve build-index` writes")
-        return url_or_path(given), "given"
+    if choice is not None:
+        if not is_url(choice) and Path(choice).is_file():
+            raise BadInput(f"{choice} is a file; an index is a folder, which `retrieve build-index` writes")
+        return url_or_path(choice), "given"
     if _is_index(INDEX):
         return INDEX, "in this folder"
     if (last := _last_of_folder().get("index")) and (is_url(last) or _is_index(Path(last))):
@@ -123,31 +148,31 @@ def find_index(given: str | None) -> tuple[str | Path, str]:
 
 
 def _is_index(folder: Path) -> bool:
-    """Whether an index folder or a cluster of them lies there."""
+    """Whether the folder is an index or a sharded index."""
     return any((folder / name).is_file() for name in ("CURRENT", "SHARDS.json"))
 
 
 def remember(kind: str, path: str | Path) -> None:
-    """Note `path` as the last "model" or "index" made from the working folder; does nothing where it cannot."""
+    """Remember `path` as the last "model" or "index" of the working folder, if the state file is writable."""
     try:
         here = str(Path.cwd())
-        notes = _read_state()
-        mine = {**notes.pop(here, {}), kind: str(path if is_url(path) else Path(path).resolve())}
-        notes = {**dict(list(notes.items())[-MAX_FOLDERS + 1 :]), here: mine}
+        state = _read_state()
+        mine = {**state.pop(here, {}), kind: str(path if is_url(path) else Path(path).resolve())}
+        state = {**dict(list(state.items())[-MAX_FOLDERS + 1 :]), here: mine}
         _state_file().parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(_state_file(), json.dumps(notes).encode())
+        write_atomically(_state_file(), json.dumps(state).encode())
     except (OSError, RuntimeError):  # RuntimeError: the user has no home folder
         return
 
 
 def _last_model() -> Path | None:
-    """The last model trained from the working folder, while it is there."""
+    """Return the last model trained from the working folder; None if it is missing."""
     path = Path(_last_of_folder().get("model", ""))
     return path if path.is_file() else None
 
 
 def _last_of_folder() -> dict[str, str]:
-    """The last "model" and "index" that were made from the working folder, by their whole paths."""
+    """Return the absolute paths of the last "model" and "index" of the working folder."""
     try:
         return _read_state().get(str(Path.cwd()), {})
     except OSError:  # the working folder was removed
@@ -155,16 +180,16 @@ def _last_of_folder() -> dict[str, str]:
 
 
 def _read_state() -> dict[str, dict[str, str]]:
-    """By working folder, the one noted last at the end."""
+    """Return {working folder: {kind: path}}, the most recent folder last."""
     try:
-        notes = read_json(_state_file())
+        state = read_json(_state_file())
     except (OSError, RuntimeError, ValueError):
         return {}
-    mine = notes.items() if isinstance(notes, dict) else ()
+    folders = state.items() if isinstance(state, dict) else ()
     return {
-        folder: {kind: path for kind, path in noted.items() if isinstance(path, str)}
-        for folder, noted in mine
-        if isinstance(noted, dict)
+        folder: {kind: path for kind, path in paths.items() if isinstance(path, str)}
+        for folder, paths in folders
+        if isinstance(paths, dict)
     }
 
 

@@ -1,4 +1,4 @@
-"""Photos to embeddings, for those who bring an index of their own."""
+"""Embeddings of photos, for use with another vector index."""
 
 import os
 from collections.abc import Sequence
@@ -14,12 +14,21 @@ from retrieval.search.defaults import find_model
 
 
 def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint | None = None) -> EncodedTouches:
-    """The unit embeddings (N, embedding_dim) and halves (N, half) of N photos, in their order, float32.
+    """Return the unit embeddings and partial activations of photos.
 
-    photos: paths, bytes of files, Pillow images or uint8 arrays (height, width, 3), red first. model: a checkpoint or
-    its file; None is the one that `retrieve build-index` takes. The inner product of a touch's embedding
-    (`Searcher.encode`) with a photo's is the score by which an index of ours finds candidates. Raises ImageError,
-    BadInput where there is no photo, and CheckpointError.
+    An index finds candidates by the inner product of a touch's embedding (`Searcher.encode`) with a photo's.
+
+    Args:
+        photos: N photos: paths, bytes of files, Pillow images or uint8 arrays (height, width, 3), red first.
+        model: A checkpoint or its file; None: the default of `retrieve build-index`.
+
+    Returns:
+        Embeddings (N, embedding_dim) and partial activations (N, partial_width), float32, in the order of the photos.
+
+    Raises:
+        ImageError: A photo cannot be read.
+        BadInput: There is no photo.
+        CheckpointError: The checkpoint is missing or damaged.
 
     >>> photos = ["catalog/mug/1.jpg", "catalog/tin/1.jpg"]
     >>> embeddings, partials = retrieval.embed_photos(photos, model="model.safetensors")
@@ -30,10 +39,10 @@ def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint |
     >>> scores.shape, logits.shape
     ((1, 2), (2,))
     """
-    if isinstance(photos, str | bytes | os.PathLike):  # of which each letter would be taken for a path
-        raise BadInput("photos must be a list, of one photo too; put it into [ ]")
+    if isinstance(photos, str | bytes | os.PathLike):  # each letter would be read as a path
+        raise BadInput("photos must be a list; put a single photo into [ ]")
     if not photos:
-        raise BadInput("give at least one photo to embed")
+        raise BadInput("photos must contain at least one photo; got none")
     if not isinstance(model, Checkpoint):
         model = load_checkpoint(find_model(None)[0] if model is None else Path(model))
     settings = model.config.preprocessing
@@ -43,7 +52,7 @@ def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint |
 
 
 def _preprocess(photo: AnyImage, name: str, settings: Preprocessing) -> RgbImage:
-    """What the tower sees of a photo, which a file or its bytes say how to decode."""
+    """Return the photo tower's input for a photo."""
     if isinstance(photo, str | os.PathLike):
         return settings.load_photo(os.fspath(photo))
     if isinstance(photo, bytes | bytearray | memoryview):

@@ -28,9 +28,9 @@ def hard_cases() -> Iterator[HardCase]:
     yield _more_than_there_are()
     yield _removed_rows()
     yield _another_order_of_the_sum()
-    yield _half_precision_scores()
+    yield _float16_scores()
     yield _recall_among_equals()
-    yield _overflowing_half()
+    yield _overflowing_partial()
 
 
 def _axes(count: int = 3) -> Floats:
@@ -57,7 +57,7 @@ def _nan_vector() -> HardCase:
     order = np.argsort(vectors @ _axes()[0])[::-1]
     ours, holds = error_of(lambda: ExactIndex.build(vectors, names=["mug", "cup", "jar"]), "'cup'", "NaN")
     naive = f"argsort ranks photos {_text(order)}: the NaN is best"
-    return HardCase(_UNIT, "one of three photos is NaN", "refused, and named", naive, ours, holds, order[0] != 1)
+    return HardCase(_UNIT, "one of three photos is NaN", "error that names it", naive, ours, holds, order[0] != 1)
 
 
 def _nan_query() -> HardCase:
@@ -68,8 +68,8 @@ def _nan_query() -> HardCase:
     structure.add(_axes())
     found = structure.search(query, 2)[1][0]
     ours, holds = error_of(lambda: ExactIndex.build(_axes()).search(query, 2), "query '0'", "NaN")
-    naive = f"FAISS answers rows {_text(found)}, and row -1 of a list is its last photo"
-    return HardCase(_UNIT, "a query is NaN", "refused, and named", naive, ours, holds, bool((found >= 0).all()))
+    naive = f"FAISS returns rows {_text(found)}, and row -1 of a list is its last photo"
+    return HardCase(_UNIT, "a query is NaN", "error that names it", naive, ours, holds, bool((found >= 0).all()))
 
 
 def _zero_vector() -> HardCase:
@@ -78,36 +78,42 @@ def _zero_vector() -> HardCase:
     cosine = float((vectors[2] / np.linalg.norm(vectors[2])) @ _axes()[0])
     ours, holds = error_of(lambda: ExactIndex.build(vectors), "'2'", "zero")
     return HardCase(
-        _UNIT, "one vector is zero", "refused, and named", f"cosine {cosine}", ours, holds, math.isfinite(cosine)
+        _UNIT, "one vector is zero", "error that names it", f"cosine {cosine}", ours, holds, math.isfinite(cosine)
     )
 
 
 def _huge_vector() -> HardCase:
-    """Its cosine with itself is 1, and float32 squares end at 3e38."""
+    """Its cosine with itself is 1, but float32 squares overflow at 3e38."""
     vector = np.full((1, 4), 1e30, np.float32)
     unit = vector / np.sqrt((vector * vector).sum())
     ours, holds = error_of(lambda: ExactIndex.build(vector), "'0'", "2e+30")
-    wanted = "refused, its norm of 2e30 named"
+    must_hold = "error with its norm of 2e30"
     cosine = float((unit @ unit.T)[0, 0])
     return HardCase(
-        _UNIT, "components of 1e30", wanted, f"normalised to a cosine of {cosine} with itself", ours, holds, cosine == 1
+        _UNIT,
+        "components of 1e30",
+        must_hold,
+        f"normalised to a cosine of {cosine} with itself",
+        ours,
+        holds,
+        cosine == 1,
     )
 
 
 def _tiny_vector() -> HardCase:
-    """float32 squares end at 1e-45."""
+    """float32 squares underflow at 1e-45."""
     vector = np.full((1, 4), 1e-30, np.float32)
     norm = float(np.sqrt((vector * vector).sum()))
     ours, holds = error_of(lambda: ExactIndex.build(vector), "'0'", "2e-30")
-    wanted = "refused, its norm of 2e-30 named"
-    return HardCase(_UNIT, "components of 1e-30", wanted, f"a norm of {norm}", ours, holds, norm > 0)
+    must_hold = "error with its norm of 2e-30"
+    return HardCase(_UNIT, "components of 1e-30", must_hold, f"a norm of {norm}", ours, holds, norm > 0)
 
 
 # Top k -----------------------------------------------------------------------------------------------------
 
 
 def _ties_at_the_last_rank() -> HardCase:
-    """Forty of 41 photos score the same; the first six of the order (-score, slot) are asked for."""
+    """Forty of 41 photos have the same score; a search returns the first six in the order (-score, slot)."""
     vectors = np.repeat(_axes(8)[:1], 41, axis=0)
     vectors[40] = _axes(8)[1]
     query = np.asarray(_axes(8)[1:2] * 0.6 + _axes(8)[:1] * 0.8, np.float32)
@@ -116,8 +122,8 @@ def _ties_at_the_last_rank() -> HardCase:
     kinds: list[type[VectorIndex]] = [load_kind(name) for name in ("exact", "flat")]
     ours = [kind.build(vectors).search(query, 6)[1][0].tolist() for kind in kinds]
     holds = all(found == must for found in ours)
-    wanted = f"slots {must}"
-    return HardCase(_SEARCH, "40 equal photos, 6 asked for", wanted, str(naive), str(ours), holds, naive == must)
+    must_hold = f"slots {must}"
+    return HardCase(_SEARCH, "40 equal photos, k = 6", must_hold, str(naive), str(ours), holds, naive == must)
 
 
 def _more_than_there_are() -> HardCase:
@@ -127,11 +133,11 @@ def _more_than_there_are() -> HardCase:
     structure.add(_axes())
     naive = structure.search(_axes()[:1], 5)[1][0].tolist()
     ours = load_kind("flat").build(_axes()).search(_axes()[:1], 5)[1][0].tolist()
-    wanted = "the three there are, none twice"
+    must_hold = "all three, none twice"
     return HardCase(
         _SEARCH,
-        "5 asked for of 3",
-        wanted,
+        "k = 5 of 3 photos",
+        must_hold,
         f"FAISS pads with -1: {naive}",
         str(ours),
         ours == [0, 1, 2],
@@ -140,21 +146,21 @@ def _more_than_there_are() -> HardCase:
 
 
 def _removed_rows() -> HardCase:
-    """Every score is below 0, and a removed photo must not come up for all that."""
+    """Every score is below 0, and a removed photo must not be found."""
     vectors, query, live = -_axes(), np.full((1, 3), 3**-0.5, np.float32), np.array([True, False, True])
     naive = int(np.argmax((query @ vectors.T)[0] * live))
     ours = [load_kind(name).build(vectors).search(query, 3, live)[1][0].tolist() for name in ("exact", "flat")]
     holds = all(found == [0, 2] for found in ours)
-    wanted = "photos 0 and 2, never 1"
+    must_hold = "photos 0 and 2, never 1"
     multiplied = f"scores x live: photo {naive} first"
-    return HardCase(_SEARCH, "a removed photo among bad matches", wanted, multiplied, str(ours), holds, naive != 1)
+    return HardCase(_SEARCH, "a removed photo among bad matches", must_hold, multiplied, str(ours), holds, naive != 1)
 
 
 # Inner products --------------------------------------------------------------------------------------------
 
 
 def _another_order_of_the_sum() -> HardCase:
-    """Equal vectors are ties only where their sums are equal, whatever adds them up."""
+    """Equal vectors are ties only if their sums are equal in every order."""
     query, vectors = _spread(300, 256)[:1], _spread(300, 256)[1:]
     turned = np.random.default_rng([6]).permutation(256)
     ways = (np.arange(256), turned)
@@ -162,27 +168,27 @@ def _another_order_of_the_sum() -> HardCase:
     ours = [grid_scores(to_grid(query[:, way]), to_grid(vectors[:, way])) for way in ways]
     differ = [int((one != other).sum()) for one, other in (naive, ours)]
     before, after = (f"{count} of 299 scores differ" for count in differ)
-    wanted = "the same bits"
+    must_hold = "the same bits"
     return HardCase(
-        _SCORES, "components summed in another order", wanted, before, after, differ[1] == 0, differ[0] == 0
+        _SCORES, "components summed in another order", must_hold, before, after, differ[1] == 0, differ[0] == 0
     )
 
 
-def _half_precision_scores() -> HardCase:
-    """Scores rounded to float16 make ties that are none."""
+def _float16_scores() -> HardCase:
+    """Scores rounded to float16 create false ties."""
     query, vectors = _spread(4001, 64)[:1], _spread(4001, 64)[1:]
     naive = np.sort((query @ vectors.T).astype(np.float16)[0])[::-1][:100]
     ours = ExactIndex.build(vectors).search(query, 100)[0][0]
     distinct = [len(np.unique(scores)) for scores in (naive, ours)]
     naive_words, words = (f"{count} distinct" for count in distinct)
-    wanted = "100 distinct scores among the best 100"
+    must_hold = "100 distinct scores among the best 100"
     return HardCase(
-        _SCORES, "4000 photos, scores in float16", wanted, naive_words, words, distinct[1] == 100, distinct[0] == 100
+        _SCORES, "4000 photos, scores in float16", must_hold, naive_words, words, distinct[1] == 100, distinct[0] == 100
     )
 
 
 def _recall_among_equals() -> HardCase:
-    """All photos are the same: every answer is as good as the exact one."""
+    """All photos are equal, so every result is as good as the exact one."""
     vectors = np.repeat(_axes(8)[:1], 50, axis=0)
     index = load_kind("flat").build(vectors)
     exact = set(np.argsort(index.vectors @ vectors[0])[::-1][:10].tolist())
@@ -193,8 +199,8 @@ def _recall_among_equals() -> HardCase:
     )
 
 
-def _overflowing_half() -> HardCase:
-    """float16 ends at 65504; what lies beyond is infinite in it, and infinity less infinity is NaN."""
+def _overflowing_partial() -> HardCase:
+    """The largest float16 is 65504; larger numbers become infinite, and infinity minus infinity is NaN."""
     partials = np.array([[1.0], [7e4]], np.float32).astype(np.float16)
     naive = float(partials[1, 0] - partials[1, 0])
     rows = [{"id": "mug"}, {"id": "cup"}]
@@ -203,5 +209,5 @@ def _overflowing_half() -> HardCase:
         ours, holds = error_of(
             lambda: store.write(rows, _axes(2), {"partials": partials}, fingerprint={}, kind="exact"), "'cup'"
         )
-    words = f"a half of {partials[1, 0]}, and {naive} in the next sum"
-    return HardCase("partials", "7e4 in float16", "refused, and named", words, ours, holds, math.isfinite(naive))
+    words = f"a partial activation of {partials[1, 0]}, and {naive} in the next sum"
+    return HardCase("partials", "7e4 in float16", "error that names it", words, ours, holds, math.isfinite(naive))

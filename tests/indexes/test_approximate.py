@@ -1,4 +1,4 @@
-"""What approximate kinds do in the cases where approximate search is known to go wrong."""
+"""Approximate kinds in cases where approximate search is known to fail."""
 
 import faiss
 import numpy as np
@@ -18,7 +18,7 @@ def unit(count: int, dim: int, seed: int = 0) -> np.ndarray:
 
 
 def clustered(count: int, dim: int, centres: int, seed: int = 0) -> np.ndarray:
-    """Vectors around a few directions, as embeddings of a few objects are."""
+    """Vectors around a few directions, like embeddings of a few objects."""
     rng = np.random.default_rng(seed)
     vectors = rng.normal(size=(centres, dim))[rng.integers(centres, size=count)]
     vectors = vectors + 0.5 * rng.normal(size=(count, dim))
@@ -26,7 +26,7 @@ def clustered(count: int, dim: int, centres: int, seed: int = 0) -> np.ndarray:
 
 
 def naive_wrong_hits(seed):
-    """Share of wrong hits of plain HNSW over 200 copies of twenty vectors."""
+    """Fraction of wrong hits of plain HNSW over 200 copies of twenty vectors."""
     distinct = unit(20, 32, seed)
     faiss.omp_set_num_threads(1)  # the same graph every time
     naive = faiss.IndexHNSWFlat(32, 32, faiss.METRIC_INNER_PRODUCT)
@@ -34,8 +34,8 @@ def naive_wrong_hits(seed):
     return (naive.search(distinct, 20)[1] % 20 != np.arange(20)[:, None]).mean()
 
 
-def test_a_thousand_copies_of_twenty_vectors_lose_naive_hnsw_and_not_ours(tmp_path):
-    # Which graphs go wrong depends on the version of FAISS; that some do, does not.
+def test_a_thousand_copies_of_twenty_vectors_break_naive_hnsw_but_not_ours(tmp_path):
+    # Which graphs fail depends on the version of FAISS, but some always do.
     assert max(naive_wrong_hits(seed) for seed in range(8)) > 0.02
 
     distinct = unit(20, 32)
@@ -59,7 +59,7 @@ def test_approximate_kinds_find_most_of_the_best_in_clustered_data(kind):
 @pytest.mark.parametrize(
     ("kind", "setting"), [("hnsw", "ef_search"), ("ivf_flat", "probes"), ("ivf_sq8", "probes"), ("ivf_pq", "refine")]
 )
-def test_looking_further_finds_more(kind, setting):
+def test_a_broader_search_finds_more(kind, setting):
     vectors = unit(2000, 32)
     index, queries = load_kind(kind).build(vectors, threads=1), sample_queries(vectors, 100)
     recalls = [recall_against_exact(index.with_settings(**{setting: value}), queries) for value in (1, 8, 64)]
@@ -73,7 +73,7 @@ def test_visiting_every_list_is_exact():
 
 
 @pytest.mark.parametrize("count", [1, 10, 38, 39, 78, 500])
-def test_few_points_train_few_lists_and_say_nothing(count, capfd):
+def test_few_points_train_few_lists_without_warnings(count, capfd):
     vectors = unit(count, 8)
     index = IVFFlatIndex.build(vectors, IVFParameters(lists=64))
     assert index.parameters.lists == max(1, count // 39)
@@ -100,7 +100,7 @@ def test_code_bytes_divide_the_vector(dim, parts):
     assert IVFPQIndex.resolve_parameters(IVFPQParameters(), 1000, dim).code_bytes == parts
 
 
-def test_code_bytes_that_do_not_divide_are_refused():
+def test_code_bytes_that_do_not_divide_the_size_raise():
     with pytest.raises(ParameterError, match="divide the vector size 16; got 5"):
         IVFPQIndex.build(unit(700, 16), IVFPQParameters(code_bytes=5))
 

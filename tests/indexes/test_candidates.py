@@ -1,4 +1,4 @@
-"""Candidates, where only which they are is wanted: those of a search, and few of them are scored."""
+"""Candidates without scores: the same slots as those of a search, with few scored exactly."""
 
 import numpy as np
 import pytest
@@ -15,26 +15,28 @@ EXACT = [kind for kind in KINDS if load_kind(kind).exact]
 
 @pytest.fixture(scope="module")
 def crowded():
-    """Vectors in tight crowds: float32 sums of other orders put neighbours on the wrong side of a last place."""
+    """Vectors in tight groups: float32 sums in another order put neighbours on the wrong side of rank k."""
     rng = np.random.default_rng(4)
-    made = unit(30, D, seed=4)[rng.integers(30, size=N)] + np.float32(1e-6) * rng.normal(size=(N, D)).astype(np.float32)
-    return made / np.linalg.norm(made, axis=1, keepdims=True)
+    vectors = unit(30, D, seed=4)[rng.integers(30, size=N)] + np.float32(1e-6) * rng.normal(size=(N, D)).astype(
+        np.float32
+    )
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("kind", EXACT)
 @pytest.mark.parametrize("k", [1, 7, 100, N - 1, N, 5 * N])
-@pytest.mark.parametrize("share", [1.0, 0.5, 0.01, 0.0])
-def test_an_exact_kind_names_what_it_finds(kind, k, share, crowded):
+@pytest.mark.parametrize("live_fraction", [1.0, 0.5, 0.01, 0.0])
+def test_candidates_of_an_exact_kind_equal_its_search_results(kind, k, live_fraction, crowded):
     index, queries = load_kind(kind).build(crowded, threads=1), unit(5, D, seed=6)
-    live = None if share == 1.0 else np.random.default_rng(1).random(N) < share
+    live = None if live_fraction == 1.0 else np.random.default_rng(1).random(N) < live_fraction
     found = index.search(queries, k, live)[1]
-    named = index.candidates(queries, k, live)
-    assert [sorted(slots.tolist()) for slots in named] == [sorted(slots.tolist()) for slots in found]
+    candidates = index.candidates(queries, k, live)
+    assert [sorted(slots.tolist()) for slots in candidates] == [sorted(slots.tolist()) for slots in found]
 
 
 @pytest.mark.parametrize("kind", sorted(set(KINDS) - set(EXACT)))
 @pytest.mark.parametrize("k", [1, 20, 300, N])
-def test_an_approximate_kind_names_as_many_live_slots_each_once(kind, k):
+def test_candidates_of_an_approximate_kind_are_enough_distinct_live_slots(kind, k):
     index, queries = load_kind(kind).build(unit(N, D, seed=3), threads=1), unit(5, D, seed=6)
     live = np.random.default_rng(1).random(N) < 0.6
     for mask in (None, live):
@@ -46,7 +48,7 @@ def test_an_approximate_kind_names_as_many_live_slots_each_once(kind, k):
             assert len(set(found.tolist()) & set(slots.tolist())) >= 0.6 * len(found)
 
 
-def test_only_the_last_places_are_scored_again(monkeypatch):
+def test_only_slots_near_rank_k_are_scored_again(monkeypatch):
     scored = []
     scores = faiss_index.grid_scores
     monkeypatch.setattr(
@@ -61,14 +63,14 @@ def test_only_the_last_places_are_scored_again(monkeypatch):
         assert sum(scored) >= 100
 
 
-def test_queries_are_checked_and_none_gives_none():
+def test_queries_are_checked_and_no_query_gives_no_candidates():
     index = load_kind("flat").build(unit(20, D, seed=3))
     assert index.candidates(np.empty((0, D), np.float32), 3) == []
     with pytest.raises(VectorError, match="query"):
         index.candidates(np.full((1, D), np.nan, np.float32), 3)
 
 
-def test_a_generation_names_all_rows_of_the_slots(tmp_path):
+def test_candidates_of_a_generation_include_all_rows_of_their_slots(tmp_path):
     vectors = np.repeat(unit(40, D, seed=3), 2, axis=0)
     rows = [{"id": f"{number:03d}", "object_id": "o"} for number in range(80)]
     generation = IndexStore(tmp_path / "index").write(rows, vectors, fingerprint={})

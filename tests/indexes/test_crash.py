@@ -1,4 +1,4 @@
-"""Writers that die or collide: readers always find a whole index, the old one or the new one."""
+"""Writers that die or collide: readers always find a complete index, the old one or the new one."""
 
 import errno
 import json
@@ -34,12 +34,12 @@ NAMES = [f"{number:02d}" for number in range(40)]
 OLD, NEW = json.loads(sys.argv[3])
 
 def write(path, ids, parent=None):
-    # The vectors of rows that the parent has come from there.
+    # Rows that the parent has reuse its vectors.
     known = parent.reusable(dict.fromkeys(ids, "1")) if parent else {}
     vectors = np.eye(40, dtype=np.float32)[[NAMES.index(name) for name in ids if name not in known]].reshape(-1, 40)
     rows = [{"id": name, "digest": "1"} for name in ids]
     more = {"fingerprint": {}, "kind": "exact", "parent": parent}
-    IndexStore(path).write(rows, vectors, {"halves": vectors}, {"calibration": {}}, **more)
+    IndexStore(path).write(rows, vectors, {"partials": vectors}, {"calibration": {}}, **more)
 
 def killed(path, number):
     steps = 0
@@ -59,7 +59,7 @@ def killed(path, number):
 for _ in range(3):
     write(base, OLD)
 (base / "gen-000009.tmp-1").mkdir()
-seen, number, alive = [], 0, False
+states, number, alive = [], 0, False
 while not alive:
     number += 1
     shutil.rmtree(work, ignore_errors=True)
@@ -72,14 +72,14 @@ while not alive:
     store = IndexStore(work)
     found = store.open()
     found.self_check()
-    assert np.array_equal(found.arrays["halves"], np.eye(40)[[NAMES.index(row["id"]) for row in found.rows]])
+    assert np.array_equal(found.arrays["partials"], np.eye(40)[[NAMES.index(row["id"]) for row in found.rows]])
     ids = [row["id"] for row in found.rows]
-    seen.append("old" if ids == OLD else "new" if ids == NEW else "broken")
+    states.append("old" if ids == OLD else "new" if ids == NEW else "broken")
     write(work, NEW)
     assert [row["id"] for row in store.open().rows] == NEW
     left = sorted(path.name for path in work.iterdir())
     assert len(left) == 5 and left[0] == "CURRENT" and left[1] == "LOCK", left
-print(json.dumps(seen))
+print(json.dumps(states))
 """
 
 
@@ -106,12 +106,12 @@ CHANGES = {
 @pytest.mark.parametrize(
     "how", [pytest.param(how, marks=() if how == "grown" else pytest.mark.slow) for how in CHANGES]
 )
-def test_a_kill_at_any_step_of_the_filesystem_leaves_the_old_or_the_new_index_whole(tmp_path, how):
+def test_a_kill_at_any_filesystem_step_leaves_the_old_or_the_new_index_complete(tmp_path, how):
     states, parent = json.dumps(CHANGES[how]), "fresh" if how == "fresh" else "grown"
-    seen = json.loads(run(KILLED_AT_EVERY_STEP, str(tmp_path), json.dumps(STEPS), states, parent))
-    assert set(seen) == {"old", "new"}
-    assert seen == sorted(seen, reverse=True)  # the switch happens once: old up to it, new after it
-    assert len(seen) > 15
+    found = json.loads(run(KILLED_AT_EVERY_STEP, str(tmp_path), json.dumps(STEPS), states, parent))
+    assert set(found) == {"old", "new"}
+    assert found == sorted(found, reverse=True)  # the switch happens once: old before it, new after it
+    assert len(found) > 15
 
 
 WRITING_FOREVER = """
@@ -125,13 +125,13 @@ while True:
     vectors = np.random.default_rng(turn).normal(size=(200, 16))
     vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
     more = {"fingerprint": {}, "kind": sys.argv[2], "threads": 1}
-    IndexStore(sys.argv[1]).write(rows, vectors, {"halves": vectors}, **more)
+    IndexStore(sys.argv[1]).write(rows, vectors, {"partials": vectors}, **more)
     print(turn, flush=True)
 """
 
 
 @pytest.mark.parametrize("kind", ["exact", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("flat", "hnsw"))])
-def test_kills_at_random_moments_leave_a_whole_index(tmp_path, kind):
+def test_kills_at_random_moments_leave_a_complete_index(tmp_path, kind):
     store, rng = IndexStore(tmp_path), np.random.default_rng(0)
     for _ in range(3):
         with run_process([sys.executable, "-c", WRITING_FOREVER, str(tmp_path), kind]) as writer:
@@ -147,7 +147,7 @@ def test_kills_at_random_moments_leave_a_whole_index(tmp_path, kind):
 
 
 class Steps:
-    """Counts the calls that change the disk, and lets one of them fail."""
+    """Record the calls that change the disk, and make one of them fail."""
 
     def __init__(self, monkeypatch, fails_at: int | None, error: BaseException | None = None) -> None:
         self.calls: list[tuple[str, str]] = []
@@ -166,12 +166,12 @@ class Steps:
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="names of open files are read from /proc")
-def test_everything_is_on_the_disk_before_it_is_named(tmp_path, monkeypatch):
+def test_everything_is_flushed_before_it_is_renamed(tmp_path, monkeypatch):
     filled(tmp_path)
     steps = Steps(monkeypatch, None)
     filled(tmp_path, kind="hnsw", arrays={"partials": np.ones((20, 2))}, documents={"calibration": {}})
     suffix = f".tmp-{os.getpid()}"
-    calls = [(step, re.sub(r"^\.CURRENT\..*", "beside", name)) for step, name in steps.calls if step != "mkdir"]
+    calls = [(step, re.sub(r"^\.CURRENT\..*", "temporary", name)) for step, name in steps.calls if step != "mkdir"]
     assert calls == [
         *(("fsync", name) for name in ("rows.jsonl", "embeddings.npy", "partials.npy", "table.npy")),
         *(("fsync", name) for name in ("calibration.json", "vectors.faiss")),
@@ -179,15 +179,15 @@ def test_everything_is_on_the_disk_before_it_is_named(tmp_path, monkeypatch):
         ("fsync", f"gen-000002{suffix}"),
         ("rename", f"gen-000002{suffix}"),
         ("fsync", tmp_path.name),
-        ("fsync", "beside"),
-        ("replace", "beside"),
-        ("unlink", "beside"),
+        ("fsync", "temporary"),
+        ("replace", "temporary"),
+        ("unlink", "temporary"),
         ("fsync", tmp_path.name),
     ]
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="names of open files are read from /proc")
-def test_a_disk_that_refuses_any_step_is_one_error_and_a_whole_index(tmp_path, monkeypatch):
+def test_a_failing_disk_step_gives_one_error_and_a_complete_index(tmp_path, monkeypatch):
     for number in range(1, 100):
         path = tmp_path / str(number)
         filled(path)
@@ -203,7 +203,7 @@ def test_a_disk_that_refuses_any_step_is_one_error_and_a_whole_index(tmp_path, m
     raise AssertionError("the steps never ended")
 
 
-def test_an_interrupted_writer_cleans_up_and_gives_the_lock_back(tmp_path, monkeypatch):
+def test_an_interrupted_writer_cleans_up_and_releases_the_lock(tmp_path, monkeypatch):
     filled(tmp_path)
 
     def interrupted(self, sample=256, seed=0, since=0):
@@ -217,7 +217,7 @@ def test_an_interrupted_writer_cleans_up_and_gives_the_lock_back(tmp_path, monke
     assert filled(tmp_path, 5).name == "gen-000002"
 
 
-def test_a_writer_killed_before_the_first_switch_leaves_no_index_and_no_obstacle(tmp_path, monkeypatch):
+def test_a_writer_killed_before_the_first_switch_does_not_block_the_next(tmp_path, monkeypatch):
     def killed(path, data):
         raise KeyboardInterrupt
 
@@ -230,7 +230,7 @@ def test_a_writer_killed_before_the_first_switch_leaves_no_index_and_no_obstacle
     assert filled(tmp_path).count == 20
 
 
-def test_two_writers_in_one_process_cannot_work_at_once(tmp_path):
+def test_two_writers_in_one_process_exclude_each_other(tmp_path):
     store = IndexStore(tmp_path)
     with store.lock():
         with pytest.raises(LockedIndex, match=rf"process {os.getpid()} is writing") as caught:
@@ -246,12 +246,12 @@ HOLDING = """
 import sys, time
 from indexes.store.folder import IndexStore
 with IndexStore(sys.argv[1]).lock():
-    print("held", flush=True)
+    print("locked", flush=True)
     time.sleep(60)
 """
 
 
-def test_a_writer_in_another_process_is_named_and_its_death_frees_the_lock(tmp_path):
+def test_a_writer_in_another_process_is_reported_and_its_death_releases_the_lock(tmp_path):
     filled(tmp_path)
     with run_process([sys.executable, "-c", HOLDING, str(tmp_path)]) as holder:
         first_line(holder)
@@ -262,13 +262,13 @@ def test_a_writer_in_another_process_is_named_and_its_death_frees_the_lock(tmp_p
     assert filled(tmp_path, 5).count == 5
 
 
-def test_a_lock_that_cannot_be_made_is_one_error(tmp_path):
+def test_a_lock_file_that_cannot_be_opened_raises_one_error(tmp_path):
     (tmp_path / "index").write_text("a file")
     with pytest.raises(WriteFailed, match="lock file cannot be opened"):
         filled(tmp_path / "index")
 
 
-def test_a_disk_without_room_for_the_writers_number_is_locked_and_let_go_all_the_same(tmp_path, monkeypatch):
+def test_a_disk_without_room_for_the_process_id_still_locks_and_releases(tmp_path, monkeypatch):
     def full(descriptor, data):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -279,12 +279,14 @@ def test_a_disk_without_room_for_the_writers_number_is_locked_and_let_go_all_the
     assert filled(tmp_path).count == 20
 
 
-def test_a_disk_that_keeps_no_locks_is_not_taken_for_one_that_somebody_writes_to(tmp_path, monkeypatch):
+def test_a_disk_without_locks_is_not_reported_as_locked(tmp_path, monkeypatch):
     def refused(descriptor, how):
         raise OSError(errno.EOPNOTSUPP, "Operation not supported")
 
     monkeypatch.setattr(locking.fcntl, "flock", refused)
-    with pytest.raises(WriteFailed, match=r"this disk keeps no locks \(Operation not supported\); build the index on"):
+    with pytest.raises(
+        WriteFailed, match=r"this disk does not support locks \(Operation not supported\); build the index on"
+    ):
         filled(tmp_path)
 
 
@@ -296,7 +298,7 @@ def test_a_generation_replaced_while_it_is_being_opened_is_read_again(tmp_path, 
         if not turns:
             turns.append(name)
             for _ in range(4):
-                filled(tmp_path, 6)  # by now the generation that was to be read is gone
+                filled(tmp_path, 6)  # deletes the generation that is being read
         return real(self, name, verify, threads)
 
     monkeypatch.setattr(IndexStore, "_read", slow)
@@ -304,7 +306,7 @@ def test_a_generation_replaced_while_it_is_being_opened_is_read_again(tmp_path, 
     assert turns == ["gen-000001"]
 
 
-def test_names_go_on_counting_past_a_generation_that_never_became_current(tmp_path):
+def test_generation_numbers_skip_one_that_never_became_current(tmp_path):
     filled(tmp_path)
     (tmp_path / "gen-000005").mkdir()
     assert filled(tmp_path).name == "gen-000006"

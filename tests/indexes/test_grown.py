@@ -1,4 +1,4 @@
-"""An index that grows: blocks, what is copied from the parent, tombstones, structures that are kept, equal vectors."""
+"""Growth of an index: blocks, rows copied from the parent, tombstones, reused structures, equal vectors."""
 
 import shutil
 
@@ -16,7 +16,7 @@ from tests.indexes.test_store import APPROXIMATE, DIM, EVERY_KIND, FINGERPRINT, 
 
 
 def block(start: int, stop: int, **more) -> Block:
-    """Rows start to stop - 1, whose halves hold their numbers."""
+    """Rows start to stop - 1, with their numbers as partial activations."""
     partials = np.arange(start, stop, dtype=np.float32)[:, None] * np.ones(3, np.float32)
     rows = [row | more for row in rows_of(names(stop - start, start))]
     return Block(
@@ -29,7 +29,7 @@ def grown(store, blocks, **more):
 
 
 def known(generation, start=0, stop=None) -> Block:
-    """The generation's own rows, of which nothing is given anew."""
+    """The generation's own rows, without new vectors or arrays."""
     return Block(generation.rows[start:stop])
 
 
@@ -37,7 +37,7 @@ def known(generation, start=0, stop=None) -> Block:
 
 
 @pytest.mark.parametrize("kind", EVERY_KIND)
-def test_a_grown_index_holds_the_parents_rows_and_the_new_ones_and_leaves_the_parent_alone(tmp_path, kind):
+def test_a_grown_index_has_the_parents_rows_and_new_ones_and_does_not_change_the_parent(tmp_path, kind):
     store = IndexStore(tmp_path)
     first = grown(store, [block(0, 1000)], kind=kind)
     before = {path.name: path.read_bytes() for path in first.folder.iterdir()}
@@ -52,7 +52,7 @@ def test_a_grown_index_holds_the_parents_rows_and_the_new_ones_and_leaves_the_pa
     opened.self_check(1010)
 
 
-def test_a_generation_is_a_folder_that_can_be_taken_elsewhere_alone(tmp_path):
+def test_the_folder_of_a_generation_can_be_moved_by_itself(tmp_path):
     store = IndexStore(tmp_path / "here")
     first = grown(store, [block(0, 100)], kind="hnsw")
     second = grown(store, [known(first), block(100, 105)], kind="hnsw", parent=first)
@@ -65,7 +65,7 @@ def test_a_generation_is_a_folder_that_can_be_taken_elsewhere_alone(tmp_path):
     moved.self_check(105)
 
 
-def test_blocks_and_one_writing_give_the_same_files(tmp_path):
+def test_blocks_and_a_single_write_give_the_same_files(tmp_path):
     whole, parts = (IndexStore(tmp_path / name) for name in "ab")
     rows = rows_of(names(300))
     partials = np.arange(900, dtype=np.float16).reshape(300, 3)
@@ -77,20 +77,20 @@ def test_blocks_and_one_writing_give_the_same_files(tmp_path):
             assert path.read_bytes() == (tmp_path / "b" / "gen-000001" / path.name).read_bytes()
 
 
-def test_blocks_are_asked_for_one_at_a_time_and_on_the_disk_before_the_next(tmp_path):
-    seen = []
+def test_each_block_is_written_before_the_next_is_requested(tmp_path):
+    sizes = []
 
     def blocks():
         for start in range(0, 5000, 1000):
             (folder,) = tmp_path.glob("gen-*")
-            seen.append((folder / "partials.npy").stat().st_size if start else 0)
+            sizes.append((folder / "partials.npy").stat().st_size if start else 0)
             yield block(start, start + 1000)
 
     assert grown(IndexStore(tmp_path), blocks()).count == 5000
-    assert all(bytes_there >= 12_000 * number - 2**13 for number, bytes_there in enumerate(seen))
+    assert all(bytes_there >= 12_000 * number - 2**13 for number, bytes_there in enumerate(sizes))
 
 
-def test_rows_that_go_are_gone_and_their_slots_stay_until_a_tenth_of_them_has_no_row(tmp_path):
+def test_slots_of_removed_rows_stay_until_more_than_a_tenth_has_no_row(tmp_path):
     store = IndexStore(tmp_path)
     first = grown(store, [block(0, 1000)])
     second = grown(store, [Block(first.rows[100:][::-1])], parent=first)
@@ -107,7 +107,7 @@ def test_rows_that_go_are_gone_and_their_slots_stay_until_a_tenth_of_them_has_no
         generation.self_check(900)
 
 
-def test_rows_with_other_metadata_keep_their_vectors_and_get_new_lines(tmp_path):
+def test_rows_with_new_metadata_reuse_their_vectors(tmp_path):
     store = IndexStore(tmp_path)
     first = grown(store, [block(0, 100)])
     rows = [row | ({"price": 3} if number < 5 else {}) for number, row in enumerate(first.rows)]
@@ -118,15 +118,15 @@ def test_rows_with_other_metadata_keep_their_vectors_and_get_new_lines(tmp_path)
     assert np.array_equal(second.slots, first.slots)
 
 
-def test_rows_are_taken_over_only_from_a_parent_made_by_the_same_model_and_come_once(tmp_path):
+def test_rows_are_reused_only_from_a_parent_of_the_same_model_and_occur_once(tmp_path):
     first = grown(IndexStore(tmp_path), [block(0, 10)])
     with pytest.raises(MismatchedIndex):
         grown(IndexStore(tmp_path), [known(first)], parent=first, fingerprint={"checkpoint": "other"})
     with pytest.raises(VectorError, match="each of the 10 new rows; got 0"):
         grown(IndexStore(tmp_path), [known(first)])
-    with pytest.raises(RowError, match="'p00001' comes twice"):
+    with pytest.raises(RowError, match="'p00001' occurs twice"):
         grown(IndexStore(tmp_path), [known(first), known(first, 1, 2)], parent=first)
-    with pytest.raises(RowError, match="'p00009' comes twice"):
+    with pytest.raises(RowError, match="'p00009' occurs twice"):
         grown(IndexStore(tmp_path), [known(first), block(9, 12, digest="2")], parent=first)
     assert IndexStore(tmp_path).current() == "gen-000001"
 
@@ -140,7 +140,7 @@ def test_rows_are_taken_over_only_from_a_parent_made_by_the_same_model_and_come_
         (Block([], None), RowError, "at least one row"),
     ],
 )
-def test_blocks_that_do_not_fit_the_ones_before_are_refused(tmp_path, later, error, words):
+def test_blocks_that_do_not_match_earlier_ones_raise(tmp_path, later, error, words):
     with pytest.raises(error, match=words):
         grown(IndexStore(tmp_path), [block(0, 10), later])
     assert sorted(path.name for path in tmp_path.iterdir()) == ["LOCK"]
@@ -150,7 +150,7 @@ def test_blocks_that_do_not_fit_the_ones_before_are_refused(tmp_path, later, err
 
 
 @pytest.mark.parametrize("kind", APPROXIMATE)
-def test_new_vectors_are_put_into_a_copy_of_the_parents_structure_which_is_not_trained_again(tmp_path, kind):
+def test_new_vectors_are_added_to_a_copy_of_the_parents_structure_without_training(tmp_path, kind):
     store = IndexStore(tmp_path)
     first = grown(store, [block(0, 900)], kind=kind)
     second = grown(store, [known(first), block(900, 950)], kind=kind, parent=first)
@@ -161,7 +161,7 @@ def test_new_vectors_are_put_into_a_copy_of_the_parents_structure_which_is_not_t
     first.self_check(900)
 
 
-def test_growing_leaves_the_index_that_was_copied_as_it_was():
+def test_growing_a_copy_does_not_change_the_original():
     from indexes.kinds.hnsw import HNSWIndex
 
     first = HNSWIndex.build(unit(100), threads=1)
@@ -170,7 +170,7 @@ def test_growing_leaves_the_index_that_was_copied_as_it_was():
     assert [(each.count, each._structure.ntotal) for each in (first, second)] == [(100, 100), (150, 150)]
 
 
-def test_a_structure_of_fewer_vectors_than_the_manifest_says_is_refused(tmp_path):
+def test_a_structure_with_too_few_vectors_is_corrupt(tmp_path):
     from indexes.kinds.hnsw import HNSWIndex, HNSWParameters
 
     HNSWIndex.build(unit(100), threads=1).save(tmp_path / "x")
@@ -187,7 +187,7 @@ def test_codes_need_enough_vectors_to_be_trained():
             load_kind(kind).build(unit(623))
 
 
-def test_training_looks_at_a_bounded_number_of_vectors(monkeypatch):
+def test_training_uses_a_bounded_number_of_vectors(monkeypatch):
     from indexes.kinds.ivf import IVFFlatIndex, IVFParameters
 
     monkeypatch.setattr("indexes.kinds.ivf.MAX_POINTS_PER_CENTRE", 39)
@@ -201,25 +201,25 @@ def test_training_looks_at_a_bounded_number_of_vectors(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["exact", "flat"])
-def test_ties_at_the_last_place_go_by_id_in_an_index_that_has_grown(tmp_path, kind):
+def test_ties_at_rank_k_are_ordered_by_id_in_a_grown_index(tmp_path, kind):
     axes = np.eye(8, dtype=np.float32)
     store, generation = IndexStore(tmp_path), None
     for axis in (5, 3, 1, 2, 4):
-        kept = [] if generation is None else [known(generation)]
+        old = [] if generation is None else [known(generation)]
         fresh = Block(rows_of([f"row{axis}"]), axes[axis : axis + 1])
-        generation = store.write_blocks([*kept, fresh], fingerprint={}, kind=kind, parent=generation)
+        generation = store.write_blocks([*old, fresh], fingerprint={}, kind=kind, parent=generation)
     for k in (1, 2, 3, 4, 5):
         ((hits, scores),) = generation.search(axes[:1], k)
         assert [generation.rows[hit]["id"] for hit in hits] == [f"row{axis}" for axis in range(1, k + 1)]
         assert scores.tolist() == [0.0] * k
-    naive = generation.index.search(axes[:1], 2)[1][0]  # slots go by age
+    naive = generation.index.search(axes[:1], 2)[1][0]  # slots are ordered by age
     assert [generation.rows[slot]["id"] for slot in naive] == ["row5", "row3"]
 
 
 # Files and keys ---------------------------------------------------------------------------------------------
 
 
-def test_an_array_file_reads_back_and_counts_its_rows_at_the_end(tmp_path):
+def test_an_array_file_reads_back_with_its_number_of_rows(tmp_path):
     file = ArrayFile(tmp_path / "x.npy", np.float16, (3,))
     for count in (2, 0, 5):
         file.append(np.full((count, 3), count))
@@ -242,19 +242,19 @@ def test_codes_of_rows_are_equal_for_equal_texts_and_count_up(tmp_path):
 # Equal vectors ----------------------------------------------------------------------------------------------
 
 
-def test_equal_vectors_are_found_as_two_plain_loops_find_them():
+def test_equal_vectors_match_two_plain_loops():
     vectors = unit(40)[np.random.default_rng(1).integers(40, size=200)]
     must = [min(other for other in range(200) if (vectors[other] == vector).all()) for vector in vectors]
     assert first_equal_rows(vectors).tolist() == must
 
 
-def test_vectors_that_begin_alike_are_told_apart_by_the_rest():
+def test_vectors_with_a_common_prefix_are_distinguished():
     vectors = np.zeros((5, equal.COMPARED_COMPONENTS + 4), np.float32)
     vectors[:, 0] = 1
     vectors[[1, 3], -1], vectors[4, -2] = 0.5, 0.5
     assert first_equal_rows(vectors).tolist() == [0, 1, 0, 1, 4]
 
 
-def test_zero_and_minus_zero_are_other_bytes():
+def test_zero_and_minus_zero_differ():
     vectors = np.array([[1, 0], [1, -0.0], [1, 0]], np.float32)
     assert first_equal_rows(vectors).tolist() == [0, 1, 0]

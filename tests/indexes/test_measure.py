@@ -1,4 +1,4 @@
-"""Recall, and the check of claimed results."""
+"""Recall, and the check of search results against the reference."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def unit(count: int, dim: int, seed: int = 0) -> np.ndarray:
 
 
 def claimed(slots: list[list[int]], queries: np.ndarray, vectors: np.ndarray) -> list[str]:
-    """The disagreements when each claimed slot comes with its own true score."""
+    """Disagreements if each claimed slot has its true score."""
     table = np.array(slots)
     scores = np.take_along_axis(queries @ vectors.T, np.maximum(table, 0), axis=1)
     return disagreements(vectors, queries, scores, table, 1e-6)
@@ -55,7 +55,7 @@ def test_every_tie_partner_is_accepted_at_the_last_rank(last):
     assert claimed([[0, 1, 2, last]], QUERY, AXES) == []
 
 
-def test_a_slot_that_comes_twice_is_rejected_even_where_its_score_would_do():
+def test_a_repeated_slot_is_rejected_even_with_a_sufficient_score():
     assert claimed([[0, 1, 2, 4, 4]], QUERY, AXES) == ["query 0: a slot comes twice in [0, 1, 2, 4, 4]"]
 
 
@@ -82,7 +82,7 @@ class Fixed(VectorIndex):
 @pytest.mark.parametrize(
     ("slots", "recall"), [([0, 1, 2], 1.0), ([0, 1, 3], 2 / 3), ([3, 4, 5], 0.0), ([2, 1, 0], 1.0)]
 )
-def test_recall_is_the_share_of_the_best_that_is_found(slots, recall):
+def test_recall_is_the_fraction_of_the_best_that_is_found(slots, recall):
     assert recall_against_exact(Fixed(AXES, None, slots, None), QUERY, 3) == pytest.approx(recall)
 
 
@@ -90,11 +90,11 @@ def test_recall_counts_a_tie_partner_as_found():
     assert recall_against_exact(Fixed(AXES, None, [0, 1, 2, 5], None), QUERY, 4) == 1.0
 
 
-def test_recall_of_more_than_there_is_is_over_what_there_is():
+def test_recall_with_k_above_the_count_is_over_all_slots():
     assert recall_against_exact(ExactIndex.build(AXES), QUERY, 50) == 1.0
 
 
-def test_recall_without_queries_is_refused():
+def test_recall_without_queries_raises():
     with pytest.raises(ParameterError, match="at least one query"):
         recall_against_exact(ExactIndex.build(AXES), np.empty((0, 6), np.float32))
 

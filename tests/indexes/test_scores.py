@@ -1,4 +1,4 @@
-"""Scores that do not depend on the order of a sum, and the naive ones that do."""
+"""Scores that do not depend on the order of a sum, compared with naive ones that do."""
 
 import math
 
@@ -47,14 +47,14 @@ def test_the_gridded_sum_is_exact_and_near_the_true_one(dim, seed, scale):
 
 
 @pytest.mark.parametrize("dim", [2, 64, 512])
-def test_the_slack_covers_what_a_float32_product_may_be_off(dim):
+def test_the_error_bound_covers_float32_products(dim):
     queries, vectors = unit(20, dim, seed=3), unit(200, dim, seed=4)
     off = np.abs((queries @ vectors.T) - grid_scores(to_grid(queries), to_grid(vectors)))
     assert off.max() <= error_bound(dim) < 1e-3
 
 
-def test_the_worst_case_of_the_grid_stays_within_the_slack():
-    # Every component lies half a step off the grid, so all the rounding goes one way.
+def test_the_worst_case_of_the_grid_is_within_the_error_bound():
+    # Every component is half a step off the grid, so all rounding has the same sign.
     dim = 4096
     vector = np.full((1, dim), 1 / 64 + 2.0**-28, np.float32)
     exact = dim * float(vector[0, 0]) ** 2

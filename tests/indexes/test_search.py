@@ -1,4 +1,4 @@
-"""The contract of a vector index: one suite over every kind."""
+"""Guarantees of a vector index, tested for every kind."""
 
 import numpy as np
 import pytest
@@ -34,7 +34,7 @@ def exact_kind(request):
     return load_kind(request.param)
 
 
-def test_an_unknown_kind_lists_the_known_ones():
+def test_the_error_for_an_unknown_kind_lists_the_known_kinds():
     with pytest.raises(ParameterError, match=r"exact, flat, ivf_flat, ivf_sq8, ivf_pq, hnsw; got 'annoy'"):
         load_kind("annoy")
 
@@ -112,7 +112,7 @@ def test_a_search_for_nearly_everything_has_no_padding(built):
     assert all(len(set(row)) == COUNT - 1 for row in slots.tolist())
 
 
-def test_naive_faiss_pads_with_minus_one_where_a_kind_of_ours_does_not():
+def test_naive_faiss_pads_with_minus_one_and_our_kinds_do_not():
     import faiss
 
     vectors, query = unit(COUNT), unit(1, seed=6)
@@ -134,7 +134,7 @@ def test_no_queries_give_no_results(built):
 
 
 @pytest.mark.parametrize("k", [0, -1, True, 2.0, "3"])
-def test_a_count_of_results_that_is_none_is_refused(built, k):
+def test_an_invalid_number_of_results_raises(built, k):
     with pytest.raises(ParameterError, match="at least 1"):
         built.search(unit(1), k)
 
@@ -147,8 +147,8 @@ BAD_ROWS = {
 }
 
 
-@pytest.mark.parametrize("fault", [*BAD_ROWS, "zero", "half"])
-def test_a_row_that_is_not_a_unit_vector_is_refused_by_its_name(kind, fault):
+@pytest.mark.parametrize("fault", [*BAD_ROWS, "zero", "too short"])
+def test_the_error_for_a_row_that_is_not_a_unit_vector_has_its_name(kind, fault):
     vectors, names = unit(COUNT), [f"mug/{number}.jpg" for number in range(COUNT)]
     if fault in BAD_ROWS:
         vectors[5, 3] = BAD_ROWS[fault][0]
@@ -161,7 +161,7 @@ def test_a_row_that_is_not_a_unit_vector_is_refused_by_its_name(kind, fault):
     assert caught.value.row == "mug/5.jpg"
 
 
-def test_bad_rows_are_refused_when_added_and_when_searched_for(built):
+def test_bad_rows_raise_when_added_and_as_queries(built):
     bad = unit(3)
     bad[1] = 0
     index = built.copy()
@@ -179,7 +179,7 @@ def test_norms_may_be_off_by_a_thousandth_and_no_more():
         ExactIndex.build(vectors * np.float32(1.0011))
 
 
-def test_a_query_of_another_size_is_refused_in_words_where_faiss_says_nothing(built):
+def test_a_query_of_the_wrong_size_raises_a_clear_error_unlike_faiss(built):
     import faiss
 
     with pytest.raises(VectorError, match=r"16 components.*got 8"):
@@ -195,7 +195,7 @@ def test_a_query_of_another_size_is_refused_in_words_where_faiss_says_nothing(bu
     [unit(3).astype(np.float64), unit(3)[0], unit(3).tolist(), np.empty((3, 0), np.float32)],
     ids=["float64", "one vector", "lists", "no components"],
 )
-def test_only_float32_tables_are_taken(kind, vectors):
+def test_only_float32_tables_are_accepted(kind, vectors):
     with pytest.raises(VectorError, match=r"float32|at least one component"):
         kind.build(vectors)
 
@@ -205,8 +205,8 @@ def test_an_index_needs_a_vector(kind):
         kind.build(np.empty((0, 4), np.float32))
 
 
-def test_ties_come_in_the_order_of_slots_also_at_the_last_rank(exact_kind):
-    # Slots 10..49 hold the same vector, so 40 partners tie for places 1 to 6.
+def test_ties_are_ordered_by_slot_also_at_the_last_rank(exact_kind):
+    # Slots 10..49 have the same vector, so 40 slots tie for ranks 1 to 6.
     vectors = unit(300, seed=7)
     vectors[10:50] = vectors[10]
     scores, slots = exact_kind.build(vectors).search(vectors[10:11], 6)
@@ -214,7 +214,7 @@ def test_ties_come_in_the_order_of_slots_also_at_the_last_rank(exact_kind):
     assert len(set(scores[0].tolist())) == 1
 
 
-def test_ties_of_different_vectors_come_in_the_order_of_slots(exact_kind):
+def test_ties_of_different_vectors_are_ordered_by_slot(exact_kind):
     # Every axis but the first is at right angles to the query: 15 scores of exactly 0.
     axes = np.eye(DIM, dtype=np.float32)[::-1].copy()
     scores, slots = exact_kind.build(axes).search(np.eye(DIM, dtype=np.float32)[:1], 4)
@@ -222,8 +222,8 @@ def test_ties_of_different_vectors_come_in_the_order_of_slots(exact_kind):
     assert scores[0].tolist() == [1.0, 0.0, 0.0, 0.0]
 
 
-def test_vectors_closer_than_rounding_are_still_ranked_truly(exact_kind):
-    # 500 vectors within 1e-6 of one another: float32 products cannot order them, so all must be looked at.
+def test_vectors_closer_than_rounding_are_ranked_correctly(exact_kind):
+    # 500 vectors within 1e-6 of one another: float32 products cannot order them, so all must be scored exactly.
     base, spread = unit(1, seed=8).astype(np.float64), unit(500, seed=9).astype(np.float64)
     vectors = base + 1e-6 * spread
     vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
@@ -239,9 +239,9 @@ def test_slots_that_are_not_live_are_left_out_and_replaced(built):
     assert slots.shape == (20, 12)
     assert live[slots].all()
     if built.exact:
-        alone = ExactIndex.build(built.vectors[live]).search(queries, 12)
-        assert np.array_equal(scores, alone[0])
-        assert np.array_equal(slots, np.flatnonzero(live)[alone[1]])
+        live_only = ExactIndex.build(built.vectors[live]).search(queries, 12)
+        assert np.array_equal(scores, live_only[0])
+        assert np.array_equal(slots, np.flatnonzero(live)[live_only[1]])
 
 
 def test_few_live_slots_are_all_found(built):
@@ -257,7 +257,7 @@ def test_a_live_mask_of_another_shape_or_type_is_refused(built, live):
         built.search(unit(1), 1, live)
 
 
-def test_added_vectors_are_found_and_a_copy_leaves_the_original_alone(built):
+def test_added_vectors_are_found_and_a_copy_does_not_change_the_original(built):
     fresh, grown = unit(30, seed=12), built.copy()
     grown.add(fresh)
     grown.add(np.empty((0, DIM), np.float32))
@@ -266,7 +266,7 @@ def test_added_vectors_are_found_and_a_copy_leaves_the_original_alone(built):
     assert built.search(fresh, 1)[1].max() < COUNT
 
 
-def test_a_saved_index_loads_and_answers_the_same(built, tmp_path):
+def test_a_saved_index_loads_and_gives_the_same_results(built, tmp_path):
     path, queries = tmp_path / "x.faiss", unit(15, seed=13)
     saved = built.save(path)
     assert saved == path.exists() == built.structure_file
@@ -275,7 +275,7 @@ def test_a_saved_index_loads_and_answers_the_same(built, tmp_path):
         assert np.array_equal(a, b)
 
 
-def test_a_structure_that_does_not_fit_is_refused(built, tmp_path):
+def test_a_structure_that_does_not_match_raises(built, tmp_path):
     if not built.structure_file:
         return
     path = tmp_path / "x.faiss"
@@ -288,7 +288,7 @@ def test_a_structure_that_does_not_fit_is_refused(built, tmp_path):
         type(built).load(path, built.vectors, built.parameters)
     with pytest.raises(CorruptIndex, match="FAISS cannot read it"):
         type(built).load(tmp_path / "absent", built.vectors, built.parameters)
-    with pytest.raises(ParameterError, match="from a file"):
+    with pytest.raises(ParameterError, match="needs a path"):
         type(built).load(None, built.vectors, built.parameters)
 
 
@@ -300,7 +300,7 @@ def test_an_index_of_one_kind_is_not_loaded_as_another(tmp_path):
         hnsw.load(tmp_path / "x", index.vectors, hnsw.parameters_from({}))
 
 
-def test_what_faiss_throws_becomes_our_error(tmp_path):
+def test_exceptions_of_faiss_become_our_error(tmp_path):
     with pytest.raises(EngineError, match="FAISS failed while writing"):
         load_kind("hnsw").build(unit(5)).save(tmp_path / "no" / "folder")
 
@@ -321,17 +321,17 @@ def test_settings_are_checked(kind):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "least"),
+    ("name", "value", "minimum"),
     [("neighbours", 1, 2), ("neighbours", 2**31, 2), ("ef_construction", 2**31, 1), ("ef_search", 2**31, 1)],
 )
-def test_what_faiss_cannot_count_is_refused(name, value, minimum):
-    """With one link a node FAISS ends the process."""
+def test_settings_that_faiss_cannot_represent_raise(name, value, minimum):
+    """With one link for each node, FAISS ends the process."""
     with pytest.raises(ParameterError, match=f"{name} must be a whole number of at least {minimum} and at most 2147"):
         load_kind("hnsw").parameters_from({name: value})
 
 
-def test_the_broadest_search_there_is_may_look_further():
-    """One slot in forty is live, so that the first round finds too few."""
+def test_the_broadest_search_can_still_fetch_more():
+    """One slot in forty is live, so the first round finds too few."""
     vectors = unit(400)
     index = load_kind("hnsw").build(vectors).with_settings(ef_search=2**31 - 1)
     live = np.arange(400) % 40 == 7
@@ -339,7 +339,7 @@ def test_the_broadest_search_there_is_may_look_further():
     assert np.array_equal(slots, load_kind("exact").build(vectors).search(vectors[:50], 2, live)[1])
 
 
-def test_parameters_of_another_kind_are_refused():
+def test_parameters_of_another_kind_raise():
     with pytest.raises(ParameterError, match="flat takes Parameters; got int"):
         load_kind("flat").build(unit(5), 3)
     with pytest.raises(ParameterError, match="hnsw takes HNSWParameters; got IVFParameters"):

@@ -1,4 +1,4 @@
-"""What builds note of files, rows that are taken over unparsed, and checks in time of what changed."""
+"""Stat records of files, rows that are copied without parsing, and self checks of changed rows."""
 
 import hashlib
 import os
@@ -26,12 +26,14 @@ def rows(numbers):
 @pytest.fixture
 def store(tmp_path):
     """An index of 40 rows with an array."""
-    made = IndexStore(tmp_path / "index")
-    made.write(rows(range(40)), unit(40), {"partials": np.arange(80, dtype=np.float16).reshape(40, 2)}, fingerprint=OF)
-    return made
+    opened = IndexStore(tmp_path / "index")
+    opened.write(
+        rows(range(40)), unit(40), {"partials": np.arange(80, dtype=np.float16).reshape(40, 2)}, fingerprint=OF
+    )
+    return opened
 
 
-def test_a_file_is_identified_by_its_whole_status(tmp_path):
+def test_a_file_is_identified_by_its_whole_stat(tmp_path):
     ids, digests = keys_of(["a", "b", "c"]), keys_of(["1", "2", "3"])
     statuses = np.arange(12, dtype=np.uint64).reshape(3, 4) + np.uint64(2**64 - 20)
     StatRecords(tmp_path).write(ids, digests, statuses)
@@ -64,15 +66,15 @@ def test_a_damaged_stat_cache_is_an_empty_one(tmp_path, name, harm, monkeypatch)
     assert (FolderCache(tmp_path).names("cup/", status) is None) == (name == FOLDERS)
 
 
-def test_keys_that_begin_alike_are_told_apart():
+def test_keys_with_a_common_prefix_are_distinguished():
     keys = np.array([b"8 bytes." + end for end in (b"a", b"b", b"c", b"b")] + [b"other", b""], "S16")
-    wanted = np.array([b"8 bytes.b", b"8 bytes.c", b"8 bytes.d", b"other", b"", b"none"], "S16")
-    assert KeyIndex(keys).find(wanted).tolist() == [1, 2, -1, 4, 5, -1]
-    assert KeyIndex(keys).find(np.tile(wanted, 5)).tolist() == [1, 2, -1, 4, 5, -1] * 5
+    requested = np.array([b"8 bytes.b", b"8 bytes.c", b"8 bytes.d", b"other", b"", b"none"], "S16")
+    assert KeyIndex(keys).find(requested).tolist() == [1, 2, -1, 4, 5, -1]
+    assert KeyIndex(keys).find(np.tile(requested, 5)).tolist() == [1, 2, -1, 4, 5, -1] * 5
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_keys_are_found_wherever_a_list_was_changed(seed):
+def test_keys_are_found_after_insertions_and_removals(seed):
     draw = random.Random(seed)
     names = [f"{number:04d}" for number in range(draw.choice([1, 2, 50, 300]))]
     other = list(names)
@@ -84,38 +86,38 @@ def test_keys_are_found_wherever_a_list_was_changed(seed):
     assert found.tolist() == [place_of.get(name, -1) for name in other]
 
 
-def test_keys_are_distinct_though_they_begin_alike():
+def test_keys_with_a_common_prefix_are_distinct():
     keys = np.array([b"8 bytes.a", b"8 bytes.b", b"other"], "S16")
     assert are_distinct(keys)
     assert not are_distinct(keys[[0, 1, 2, 1]])
 
 
-def test_rows_that_are_kept_are_those_that_would_have_been_written(store, tmp_path):
+def test_copied_rows_equal_written_rows(store, tmp_path):
     parent = store.open()
     new = Block(rows([50]), unit(1, seed=5), {"partials": np.ones((1, 2), np.float16)})
-    kept = store.write_blocks([range(5), new, range(9, 40)], fingerprint=OF, parent=parent)
+    copied = store.write_blocks([range(5), new, range(9, 40)], fingerprint=OF, parent=parent)
     other = IndexStore(tmp_path / "other")
     other.write(rows(range(40)), unit(40), {"partials": parent.arrays["partials"]}, fingerprint=OF)
     written = other.write_blocks(
         [Block(rows(range(5))), new, Block(rows(range(9, 40)))], fingerprint=OF, parent=other.open()
     )
-    assert kept.rows.text.tobytes() == written.rows.text.tobytes()
-    np.testing.assert_array_equal(kept.rows.table, written.rows.table)
-    np.testing.assert_array_equal(kept.arrays["partials"], written.arrays["partials"])
-    np.testing.assert_array_equal(kept.embeddings, written.embeddings)
-    assert kept.manifest.parent == parent.name
+    assert copied.rows.text.tobytes() == written.rows.text.tobytes()
+    np.testing.assert_array_equal(copied.rows.table, written.rows.table)
+    np.testing.assert_array_equal(copied.arrays["partials"], written.arrays["partials"])
+    np.testing.assert_array_equal(copied.embeddings, written.embeddings)
+    assert copied.manifest.parent == parent.name
 
 
-def test_rows_are_kept_of_a_parent_that_was_made_alike(store):
-    with pytest.raises(RowError, match="kept of a parent alone"):
+def test_rows_are_copied_only_from_a_parent_with_the_same_fingerprint(store):
+    with pytest.raises(RowError, match="copying rows needs a parent"):
         store.write_blocks([range(3)], fingerprint=OF)
     with pytest.raises(MismatchedIndex, match="same fingerprint"):
         store.write_blocks([range(3)], fingerprint={"checkpoint": "other"}, parent=store.open())
-    with pytest.raises(RowError, match="comes twice"):
+    with pytest.raises(RowError, match="occurs twice"):
         store.write_blocks([range(3), range(2, 5)], fingerprint=OF, parent=store.open())
 
 
-def test_what_a_parent_has_checked_is_checked_by_a_sample(store, monkeypatch):
+def test_rows_that_the_parent_checked_are_checked_by_a_sample(store, monkeypatch):
     searched = []
     search = VectorIndex.search
     monkeypatch.setattr(VectorIndex, "search", lambda self, q, *how: searched.append(len(q)) or search(self, q, *how))
@@ -126,7 +128,7 @@ def test_what_a_parent_has_checked_is_checked_by_a_sample(store, monkeypatch):
     assert searched[-1] == 32  # another structure
 
 
-def test_the_ends_of_lines_are_compared_unparsed(store):
+def test_line_ends_are_compared_without_parsing(store):
     found = store.open().rows
     assert found.lines_end_with(b'"metadata": {}}').all()
     assert found.lines_end_with(b'"d7", "metadata": {}}').nonzero()[0].tolist() == [7]

@@ -1,4 +1,4 @@
-"""The store: what is written is read back, catalogues change, duplicates and removals come out right."""
+"""The store: reading back, changes of the catalogue, duplicates and removals."""
 
 import json
 import subprocess
@@ -43,7 +43,7 @@ def filled(path, count: int = 20, kind: str = "flat", **more) -> Generation:
 
 
 @pytest.mark.parametrize("kind", EVERY_KIND)
-def test_what_is_written_is_read_back(tmp_path, kind):
+def test_a_written_index_is_read_back(tmp_path, kind):
     count = 650
     rows = [
         {"id": f"фото/{n}\u2028.jpg", "digest": str(n), "metadata": {"price": 0.1 + n, "tags": [None, True]}}
@@ -79,7 +79,7 @@ def test_what_is_written_is_read_back(tmp_path, kind):
         assert np.array_equal(a[1], b[1])
 
 
-def test_a_document_may_be_an_array_that_is_of_no_row(tmp_path):
+def test_a_document_may_be_an_array(tmp_path):
     touches = np.arange(6, dtype=np.float16).reshape(2, 3)
     filled(tmp_path, documents={"touches": touches, "calibration": {}})
     read = IndexStore(tmp_path).open()
@@ -96,7 +96,7 @@ def test_an_empty_array_is_a_document_too(tmp_path):
     assert IndexStore(tmp_path).open().documents["touches"].shape == (0, 3)
 
 
-def test_the_folder_is_laid_out_as_promised(tmp_path):
+def test_the_folder_has_the_documented_layout(tmp_path):
     filled(tmp_path, kind="hnsw", about={"catalogue": "mugs/"}, software="1.2", documents={"calibration": {}})
     assert (tmp_path / "CURRENT").read_text() == "gen-000001\n"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["CURRENT", "LOCK", "gen-000001"]
@@ -106,7 +106,7 @@ def test_the_folder_is_laid_out_as_promised(tmp_path):
     assert found == sorted(["calibration.json", "manifest.json", "vectors.faiss", *tables])
     manifest = json.loads((folder / "manifest.json").read_text())
     counts = {"rows": 20, "slots": 20, "tombstones": 0, "built_slots": 20}
-    must = {"format": 4, "generation": "gen-000001", "parent": None, "fingerprint": FINGERPRINT, "software": "1.2"}
+    must = {"format": 5, "generation": "gen-000001", "parent": None, "fingerprint": FINGERPRINT, "software": "1.2"}
     must |= {"about": {"catalogue": "mugs/"}, "kind": "hnsw", "metric": "inner_product", "dim": DIM, "counts": counts}
     assert {key: manifest[key] for key in must} == must
     assert manifest["recall"]["value"] == 1.0
@@ -128,7 +128,7 @@ def test_approximate_kinds_state_their_measured_recall_and_settings(tmp_path):
     assert generation.manifest.parameters == {"neighbours": 32, "ef_construction": 80, "ef_search": 20}
 
 
-def test_equal_vectors_are_stored_once_and_come_back_as_all_their_rows(tmp_path):
+def test_equal_vectors_are_stored_once_and_all_their_rows_are_found(tmp_path):
     vectors = np.array([[1, 0], [0, 1], [1, 0], [0.6, 0.8], [1, 0]], np.float32)
     generation = IndexStore(tmp_path).write(rows_of("ebdca"), vectors, fingerprint={})
     assert len(generation.embeddings) == 3
@@ -137,8 +137,8 @@ def test_equal_vectors_are_stored_once_and_come_back_as_all_their_rows(tmp_path)
     np.testing.assert_allclose(scores, [1, 1, 1, 0.6], atol=2**-24)  # one rounding to float32
 
 
-def test_ties_between_slots_go_by_row_id_whatever_the_order_of_writing(tmp_path):
-    # Four vectors at right angles to the query; two of them are asked for.
+def test_ties_between_slots_are_ordered_by_row_id_for_any_order_of_writing(tmp_path):
+    # Four vectors at right angles to the query; k = 2.
     axes = np.eye(6, dtype=np.float32)
     for turn, order in enumerate(([1, 2, 3, 4], [4, 3, 2, 1], [2, 4, 1, 3])):
         rows = rows_of([f"row{axis}" for axis in order])
@@ -151,7 +151,7 @@ def test_ties_between_slots_go_by_row_id_whatever_the_order_of_writing(tmp_path)
 
 
 @pytest.mark.parametrize("kind", EVERY_KIND)
-def test_unchanged_rows_keep_their_vectors_and_only_new_ones_are_given(tmp_path, kind):
+def test_unchanged_rows_reuse_their_vectors(tmp_path, kind):
     store, count = IndexStore(tmp_path), 700
     partials = np.arange(count, dtype=np.float32)[:, None]
     first = store.write(rows_of(names(count)), unit(count), {"partials": partials}, kind=kind, **MORE)
@@ -178,7 +178,7 @@ def test_unchanged_rows_keep_their_vectors_and_only_new_ones_are_given(tmp_path,
 
 
 @pytest.mark.parametrize("kind", EVERY_KIND)
-def test_removed_rows_leave_tombstones_until_a_tenth_is_gone(tmp_path, kind):
+def test_removed_rows_leave_tombstones_until_more_than_a_tenth_is_removed(tmp_path, kind):
     store, count = IndexStore(tmp_path), 1000
     generation = filled(tmp_path, count, kind)
     for removed, slots, tombstones in [(50, 1000, 50), (100, 1000, 100), (101, 899, 0), (150, 899, 49)]:
@@ -186,13 +186,13 @@ def test_removed_rows_leave_tombstones_until_a_tenth_is_gone(tmp_path, kind):
         generation = store.write(rows, None, kind=kind, parent=generation, **MORE)
         counts = generation.manifest.counts
         assert (counts.rows, counts.slots, counts.tombstones) == (count - removed, slots, tombstones)
-        # The removed vectors themselves are asked for: their neighbours fill all the places.
+        # The removed vectors are the queries: their neighbours fill all ranks.
         for hits, _ in store.open(threads=1).search(unit(count)[:40], 15):
             assert len(hits) == 15
             assert {generation.rows[row]["id"] for row in hits} <= set(names(count - removed, start=removed))
 
 
-def test_a_removed_row_that_comes_back_takes_up_its_old_slot(tmp_path):
+def test_a_removed_row_that_returns_reuses_its_slot(tmp_path):
     store, all_rows = IndexStore(tmp_path), rows_of(names(100))
     first = filled(tmp_path, 100, "hnsw")
     second = store.write(all_rows[1:], None, parent=first, kind="hnsw", **MORE)
@@ -210,7 +210,7 @@ def test_inverted_lists_are_trained_again_when_the_index_has_more_than_doubled(t
     assert generation.manifest.parameters["lists"] == 801 // 39
 
 
-def test_other_parameters_or_another_kind_build_the_structure_anew_from_the_kept_vectors(tmp_path):
+def test_other_parameters_or_another_kind_rebuild_the_structure_from_stored_vectors(tmp_path):
     store, generation = IndexStore(tmp_path), filled(tmp_path, 700, "hnsw")
     rows = rows_of(names(699, start=1))
     turns = [("hnsw", HNSWParameters(neighbours=8)), *((kind, None) for kind in APPROXIMATE + EXACT), ("hnsw", None)]
@@ -222,7 +222,7 @@ def test_other_parameters_or_another_kind_build_the_structure_anew_from_the_kept
         generation.self_check(699)
 
 
-def test_vectors_of_another_model_are_not_taken_over(tmp_path):
+def test_vectors_of_another_model_are_not_reused(tmp_path):
     first = filled(tmp_path)
     with pytest.raises(MismatchedIndex, match=r"'checkpoint': 'xyz'.*'checkpoint': 'abc'"):
         IndexStore(tmp_path).write(rows_of(names(20)), None, fingerprint={"checkpoint": "xyz"}, parent=first)
@@ -232,7 +232,7 @@ def test_vectors_of_another_model_are_not_taken_over(tmp_path):
     assert other.manifest.parent is None
 
 
-def test_rows_without_a_digest_are_never_taken_over(tmp_path):
+def test_rows_without_a_digest_are_never_reused(tmp_path):
     rows = [{"id": "a"}, {"id": "b", "digest": "1"}]
     generation = IndexStore(tmp_path).write(rows, unit(2), fingerprint={})
     assert generation.reusable({"a": None, "b": None}) == {}
@@ -252,13 +252,13 @@ NOT_JSON = {
 
 
 @pytest.mark.parametrize("row", NOT_JSON.values(), ids=NOT_JSON.keys())
-def test_rows_that_cannot_be_kept_as_they_are_are_refused(tmp_path, row):
+def test_rows_that_json_would_change_raise(tmp_path, row):
     with pytest.raises(RowError, match=r"row|slot"):
         IndexStore(tmp_path).write([row], unit(1), fingerprint={})
     assert not (tmp_path / "CURRENT").exists()
 
 
-def test_file_names_of_unknown_coding_survive(tmp_path):
+def test_file_names_of_unknown_encoding_are_preserved(tmp_path):
     name = b"mug\xff.jpg".decode(errors="surrogateescape")
     IndexStore(tmp_path).write([{"id": name}], unit(1), fingerprint={})
     assert IndexStore(tmp_path).open().rows == [{"id": name}]
@@ -268,24 +268,24 @@ def test_file_names_of_unknown_coding_survive(tmp_path):
     ("change", "error", "words"),
     [
         ({"rows": []}, RowError, "at least one row"),
-        ({"rows": rows_of("aab")}, RowError, "'a' comes twice"),
+        ({"rows": rows_of("aab")}, RowError, "'a' occurs twice"),
         ({"embeddings": unit(2)}, VectorError, "each of the 3 new rows; got 2"),
         ({"embeddings": None}, VectorError, "each of the 3 new rows; got 0"),
         ({"embeddings": unit(3) * np.float32(2)}, VectorError, "row 'a': the norm must be 1"),
         ({"arrays": {"partials": np.zeros((2, 4))}}, RowError, "each of 3 new rows; got 2"),
-        ({"arrays": {"partials": np.float16([[1], [np.inf], [2]])}}, RowError, "row 'b' holds NaN or inf"),
+        ({"arrays": {"partials": np.float16([[1], [np.inf], [2]])}}, RowError, "row 'b' has NaN or inf"),
         ({"arrays": {"partials": np.array([{}, 1, 2])}}, RowError, "array of numbers"),
         ({"arrays": {"partials": np.zeros((3, 0))}}, RowError, "at least one number"),
         ({"arrays": {"rows": np.zeros(3)}}, RowError, "lower-case words"),
         ({"arrays": {"../x": np.zeros(3)}}, RowError, "lower-case words"),
         ({"documents": {"manifest": {}}}, RowError, "lower-case words"),
         ({"documents": {"calibration": {"a": float("nan")}}}, RowError, "document 'calibration'"),
-        ({"documents": {"touches": np.float16([1, np.nan])}}, RowError, "'touches': an array must hold finite"),
-        ({"documents": {"touches": np.array([{}])}}, RowError, "'touches': an array must hold finite"),
-        ({"documents": {"x": 1}, "arrays": {"x": np.zeros(3)}}, RowError, "cannot share a name"),
+        ({"documents": {"touches": np.float16([1, np.nan])}}, RowError, "'touches': an array must contain finite"),
+        ({"documents": {"touches": np.array([{}])}}, RowError, "'touches': an array must contain finite"),
+        ({"documents": {"x": 1}, "arrays": {"x": np.zeros(3)}}, RowError, "must have different names"),
         ({"fingerprint": {"checkpoint": 3}}, RowError, "fingerprint must map text to text"),
         ({"about": {"a": float("inf")}}, RowError, "about must be JSON"),
-        ({"documents": {"touches": np.array(1.0)}}, RowError, r"must have rows of numbers; got the shape \(\)"),
+        ({"documents": {"touches": np.array(1.0)}}, RowError, r"must have rows of numbers; got shape \(\)"),
         ({"documents": {"touches": np.zeros((3, 0))}}, RowError, "must have rows of numbers"),
         ({"seed": 2**31}, ParameterError, "seed must be a whole number from 0"),
         ({"threads": 10**10}, ParameterError, "threads must be a whole number from 1"),
@@ -296,7 +296,7 @@ def test_file_names_of_unknown_coding_survive(tmp_path):
         ({"kind": "ivf_pq"}, ParameterError, "624 or more"),
     ],
 )
-def test_bad_input_is_refused_in_words_and_leaves_the_old_index(tmp_path, change, error, words):
+def test_bad_input_raises_a_clear_error_and_does_not_change_the_index(tmp_path, change, error, words):
     filled(tmp_path)
     good = {"rows": rows_of("abc"), "embeddings": unit(3), "fingerprint": FINGERPRINT}
     with pytest.raises(error, match=words):
@@ -306,38 +306,38 @@ def test_bad_input_is_refused_in_words_and_leaves_the_old_index(tmp_path, change
 
 
 @pytest.mark.parametrize("k", [0, -1, True, 2.0, "2", None])
-def test_a_search_for_no_number_of_results_is_refused_and_ends(tmp_path, k):
+def test_a_search_for_an_invalid_number_of_results_raises(tmp_path, k):
     generation = filled(tmp_path)
-    for ask in (generation.search, generation.candidates):
+    for search in (generation.search, generation.candidates):
         with pytest.raises(ParameterError, match="k, the number of results, must be a whole number of at least 1"):
-            ask(unit(1), k)
+            search(unit(1), k)
 
 
 @pytest.mark.parametrize(
     ("arrays", "words"),
     [
-        (None, r"the same arrays: halves float64 \(2,\); got none"),
-        ({"partials": np.zeros((1, 2)), "more": np.zeros(1)}, r"got halves float64 \(2,\), more float64 \(\)"),
-        ({"partials": np.zeros((1, 3))}, r"got halves float64 \(3,\)"),
-        ({"partials": np.zeros((1, 2), np.float32)}, r"got halves float32 \(2,\)"),
+        (None, r"the same arrays: partials float64 \(2,\); got none"),
+        ({"partials": np.zeros((1, 2)), "more": np.zeros(1)}, r"got more float64 \(\), partials float64 \(2,\)"),
+        ({"partials": np.zeros((1, 3))}, r"got partials float64 \(3,\)"),
+        ({"partials": np.zeros((1, 2), np.float32)}, r"got partials float32 \(2,\)"),
     ],
 )
-def test_arrays_that_differ_from_the_parents_are_refused(tmp_path, arrays, words):
+def test_arrays_that_differ_from_the_parents_raise(tmp_path, arrays, words):
     parent = filled(tmp_path, arrays={"partials": np.zeros((20, 2))})
     with pytest.raises(RowError, match=words):
         IndexStore(tmp_path).write(rows_of(names(21)), unit(1, seed=3), arrays, fingerprint=FINGERPRINT, parent=parent)
 
 
-def test_new_vectors_of_another_size_than_the_parents_are_refused(tmp_path):
+def test_new_vectors_of_another_size_than_the_parents_raise(tmp_path):
     with pytest.raises(VectorError, match="must have 8 components"):
         IndexStore(tmp_path).write(rows_of(names(21)), unit(1, 5), fingerprint=FINGERPRINT, parent=filled(tmp_path))
 
 
-def test_a_build_whose_rows_do_not_find_themselves_never_becomes_current(tmp_path, monkeypatch):
+def test_a_build_with_a_failed_self_check_never_becomes_current(tmp_path, monkeypatch):
     filled(tmp_path)
 
     def failing(self, sample=256, seed=0, since=0):
-        raise SelfRetrievalFailed("2 of 20 rows do not find themselves (p1, p2)", ["p1", "p2"])
+        raise SelfRetrievalFailed("2 of 20 rows are not found by their own vectors (p1, p2)", ["p1", "p2"])
 
     monkeypatch.setattr(Generation, "self_check", failing)
     with pytest.raises(SelfRetrievalFailed, match="p1, p2") as caught:
@@ -357,7 +357,7 @@ def test_the_self_check_passes_on_good_indexes_with_copies_and_near_copies(tmp_p
     assert generation.self_check(700, seed=3) is None
 
 
-def test_the_self_check_passes_where_codes_cannot_tell_near_copies_apart(tmp_path):
+def test_the_self_check_passes_if_codes_cannot_distinguish_near_copies(tmp_path):
     count, rng = 20_000, np.random.default_rng(0)
     vectors = unit(67, seed=1)[rng.integers(67, size=count)] + 1e-3 * rng.normal(size=(count, DIM))
     vectors = (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).astype(np.float32)
@@ -368,7 +368,7 @@ def test_the_self_check_passes_where_codes_cannot_tell_near_copies_apart(tmp_pat
     assert len(generation._rows_not_found(drawn, 1)) > 20 > len(generation._rows_not_found(drawn, 200)) == 0
 
 
-def test_the_self_check_names_the_rows_that_a_wrong_structure_loses(tmp_path):
+def test_the_self_check_reports_the_rows_that_a_wrong_structure_loses(tmp_path):
     import faiss
 
     path = filled(tmp_path, 60, "ivf_flat").folder / "vectors.faiss"
@@ -382,13 +382,13 @@ def test_the_self_check_names_the_rows_that_a_wrong_structure_loses(tmp_path):
     assert caught.value.ids == ["p00007", "p00009"]
 
 
-def test_old_generations_are_deleted_but_for_the_last_two(tmp_path):
+def test_old_generations_are_deleted_except_the_last_two(tmp_path):
     for _ in range(5):
         filled(tmp_path)
     assert sorted(path.name for path in tmp_path.glob("gen-*")) == ["gen-000003", "gen-000004", "gen-000005"]
 
 
-def test_a_reader_keeps_its_generation_while_a_writer_makes_four_more(tmp_path):
+def test_a_reader_can_use_its_generation_after_a_writer_makes_four_more(tmp_path):
     partials = np.arange(40, dtype=np.float32).reshape(20, 2)
     filled(tmp_path, arrays={"partials": partials}, kind="hnsw")
     reader = IndexStore(tmp_path).open()
@@ -401,19 +401,19 @@ def test_a_reader_keeps_its_generation_while_a_writer_makes_four_more(tmp_path):
     for a, b in zip(before, reader.search(unit(4, seed=2), 3), strict=True):
         assert np.array_equal(a[0], b[0])
     assert IndexStore(tmp_path).open().count == 2
-    # Even a deleted generation can be the parent of the next.
+    # Even a deleted generation can be the parent of the next one.
     again = IndexStore(tmp_path).write(reader.rows, None, parent=reader, kind="hnsw", **MORE)
     assert np.array_equal(again.arrays["partials"], partials)
 
 
 CHANGES = st.lists(st.dictionaries(st.integers(0, 11), st.integers(0, 4), min_size=1), min_size=2, max_size=4)
-"""States of a catalogue one after another: photo number -> content. Equal contents are equal vectors."""
+"""Successive states of a catalogue: photo number -> content. Equal contents have equal vectors."""
 
 
 @pytest.mark.parametrize("kind", ["exact", "flat", "hnsw", "ivf_flat"])
 @settings(max_examples=8)
 @given(states=CHANGES)
-def test_any_changes_of_a_catalogue_end_in_what_a_fresh_build_gives(tmp_path_factory, kind, states):
+def test_any_sequence_of_changes_gives_the_result_of_a_new_build(tmp_path_factory, kind, states):
     folder, contents = tmp_path_factory.mktemp("index"), unit(5, seed=4)
     store, generation = IndexStore(folder / "grown"), None
     more = {"fingerprint": FINGERPRINT, "kind": kind, "threads": 1}
@@ -429,7 +429,7 @@ def test_any_changes_of_a_catalogue_end_in_what_a_fresh_build_gives(tmp_path_fac
         assert generation.rows == anew.rows
         assert np.array_equal(generation.arrays["partials"], anew.arrays["partials"])
         for k in (1, 2, 12):
-            # Approximate kinds are exhaustive when all slots are asked for.
+            # Approximate kinds are exhaustive if k covers all slots.
             if k < 12 and kind not in ("exact", "flat"):
                 continue
             for a, b in zip(generation.search(contents, k), anew.search(contents, k), strict=True):

@@ -1,4 +1,4 @@
-"""Build a searchable index from a folder of photos; only photos whose content changed are embedded again."""
+"""Build an index from a folder of photos; only photos with changed content are embedded again."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,18 +33,18 @@ from retrieval.search.build.stat_cache import StatCache, unchanged_runs
 from retrieval.version import __version__
 
 NO_STAT_CACHE = (
-    "No earlier build noted sizes and times of the photos' files, as older versions do not, so each was read and "
+    "The index has no stat records of the photos' files (older versions write none), so every file was read and "
     "compared."
 )
 CANDIDATE_ENCODER_CHANGED = (
-    "The model finds candidates in another way and judges as before, so unchanged photos kept their halves and were "
-    "given new embeddings made of these; none of them was decoded or encoded."
+    "Only the candidate encoder changed: partial activations of unchanged photos were reused and their embeddings "
+    "recomputed, without decoding or encoding a photo."
 )
 CHANGE_REASONS = {
-    "checkpoint": "the model is another one",
-    "preprocessing": "the model wants photos prepared in another way",
+    "checkpoint": "the model changed",
+    "preprocessing": "the preprocessing of photos changed",
 }
-"""Why photos are embedded again, by the part of the fingerprint that changed."""
+"""Reasons to embed photos again, by the part of the fingerprint that changed."""
 
 
 def build_index(
@@ -62,32 +62,32 @@ def build_index(
     """Write the next generation of an index of a catalogue, or the first one.
 
     Nothing is written if neither the photos, nor their objects, nor the requirements changed. Photos that cannot be
-    read are skipped and reported. An interrupted build leaves what it embedded for the next one.
+    read are skipped and reported. An interrupted build stores its codes for the next build.
 
     Args:
-        folder: The catalogue: a folder of this machine, or a URL (`retrieval.data.sources`).
+        folder: The catalogue: a local folder or a URL (`retrieval.data.sources`).
         checkpoint: The model.
         out: The index folder.
-        objects_from: Rule that names the object of a photo (`retrieval.data.naming`); None: the rule of the index that
-            is there, else by folder.
-        kind: Kind of index, a name or a class; None: exact search, unless a bound requires another one.
-        min_recall: Least winner recall of candidate search (`retrieval.search.build.operating`).
-        max_ms: Longest candidate search and reranking of one touch, in milliseconds.
+        objects_from: Rule that names the object of a photo (`retrieval.data.naming`); None: the rule of the existing
+            index, else by folder.
+        kind: Kind of index, a name or a class; None: exact search, unless a bound requires another kind.
+        min_recall: Smallest agreement with exhaustive search at rank 1 (`retrieval.search.build.operating`).
+        max_ms: Longest time of candidate search and reranking for one touch, in milliseconds.
         verify: List every folder and read every file, even if size, times and inode did not change
             (`retrieval.search.build.stat_cache`).
         quiet: Show no progress.
 
     Returns:
-        What was built, skipped and chosen.
+        A report of the build.
 
     Raises:
         BadInput: The rule or a requirement is invalid.
         DatasetError: No photo can be read.
-        IndexesError: The index could not be written (`indexes.store.folder.IndexStore.write`); it is as it was.
+        IndexesError: The index could not be written (`indexes.store.folder.IndexStore.write`) and did not change.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> report = retrieval.build_index("catalog", checkpoint, "index", quiet=True)
-    >>> report.photos, report.embedded  # the index was there, and no photo changed
+    >>> report.photos, report.embedded  # the index exists, and no photo changed
     (4, 0)
     """
     requirements, out = SearchRequirements.of(kind, min_recall, max_ms), Path(out)
@@ -96,10 +96,10 @@ def build_index(
     except IndexesError:
         before = {}
     naming, note = naming_by(objects_from, before)
-    seen = FolderCache(out, known=not verify)
-    catalogue = list_photos(folder, naming, seen)
+    folders = FolderCache(out, known=not verify)
+    catalogue = list_photos(folder, naming, folders)
     report = build_listed(catalogue, checkpoint, out, BuildOptions(naming, requirements, quiet, verify, note))
-    seen.write()
+    folders.write()
     return report
 
 
@@ -107,9 +107,9 @@ def build_index(
 class BuildOptions:
     """Options of one build.
 
-    Args:
+    Attributes:
         naming: Rule that names the object of a photo.
-        asked: Requirements of candidate search.
+        requirements: Requirements of candidate search.
         quiet: Show no progress.
         verify: Read every file.
         note: First sentence of the report's reason.
@@ -129,7 +129,14 @@ class BuildOptions:
 
 
 def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, options: BuildOptions) -> BuildReport:
-    """As `build_index`, of photos that are listed already."""
+    """Write the next generation of an index of listed photos; as `build_index`.
+
+    Args:
+        catalogue: The listed photos and touches.
+        checkpoint: The model.
+        out: The index folder.
+        options: The options of the build.
+    """
     requirements, store = options.requirements, IndexStore(out)
     if requirements.kind is not None:
         chosen = load_kind(requirements.kind)
@@ -139,7 +146,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
     with store.lock():
         parent, partials, why = _reusable(store, checkpoint)
         references = embed_references(catalogue, checkpoint, parent, options.quiet)
-        catalogue = references.shown(catalogue)
+        catalogue = references.with_gel_images(catalogue)
         start = time.perf_counter()
         stat_cache = StatCache(catalogue, out, options.verify)
         known = stat_cache.known(parent)
@@ -191,11 +198,11 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
     )
 
 
-def naming_by(requirements: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]:
-    """Return the rule that names objects, and a note where it replaces another one.
+def naming_by(rule: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]:
+    """Return the rule that names objects, and a note if it replaces another one.
 
     Args:
-        asked: The user's rule; None: the rule of the index that is there, else by folder.
+        rule: The user's rule; None: the rule of the existing index, else by folder.
         about: Entries of that index's manifest.
 
     Raises:
@@ -204,36 +211,36 @@ def naming_by(requirements: str | None, about: Mapping[str, Any]) -> tuple[Namin
     before = about.get("objects_from")
     try:
         known = None if before is None else Naming(before)
-    except (BadInput, TypeError):  # of another version
+    except (BadInput, TypeError):  # a rule of another version
         known = None
-    naming = Naming(requirements) if requirements is not None else known or Naming(FOLDER)
+    naming = Naming(rule) if rule is not None else known or Naming(FOLDER)
     if known is None or known == naming:
         return naming, ""
-    return naming, f"Objects are named by {naming.text} now, no longer by {known.text}."
+    return naming, f"The rule for object names changed from {known.text} to {naming.text}."
 
 
 def _reusable(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, Generation | None, str]:
-    """The generation whose photos can be reused, the one whose partial activations alone can, and why not all are."""
+    """Return the generation with reusable photos, the one with reusable partial activations only, and a reason."""
     try:
-        there = store.open()
+        current = store.open()
     except NoIndex:
         return None, None, ""
     except (CorruptIndex, UnsupportedFormat) as error:
-        return None, None, f"The index there was not usable, so every photo was embedded again ({error})."
-    before, now = there.manifest.fingerprint, fingerprint(checkpoint)
+        return None, None, f"The existing index is not usable, so every photo was embedded again ({error})."
+    before, now = current.manifest.fingerprint, fingerprint(checkpoint)
     if {name: before.get(name) for name in now} == now:
-        return there, None, ""
-    partial = (checkpoint.config.matcher.partial_width,)
-    if can_reuse_partials(checkpoint, before) and there.arrays["partials"].shape[1:] == partial:
-        return None, there, CANDIDATE_ENCODER_CHANGED
-    changed = [said for name, said in CHANGE_REASONS.items() if before.get(name) != now[name]]
-    written = f"; the index was written by version {there.manifest.software}" if there.manifest.software else ""
+        return current, None, ""
+    width = (checkpoint.config.matcher.partial_width,)
+    if can_reuse_partials(checkpoint, before) and current.arrays["partials"].shape[1:] == width:
+        return None, current, CANDIDATE_ENCODER_CHANGED
+    changed = [reason for name, reason in CHANGE_REASONS.items() if before.get(name) != now[name]]
+    written = f"; the index was written by version {current.manifest.software}" if current.manifest.software else ""
     return None, None, f"Every photo was embedded again: {' and '.join(changed)}{written}."
 
 
 @dataclass
 class _BuildJob:
-    """Write a generation from parts, and choose its operating point when all of them are on the disk."""
+    """Write a generation from parts, and choose its operating point when all parts are on the disk."""
 
     store: IndexStore
     embedder: Embedder
@@ -243,7 +250,7 @@ class _BuildJob:
     choosing_s: float = 0.0
 
     def write(self, parts: Iterator[BuildPart]) -> tuple[Generation, bool]:
-        """Return the new generation and True; or the parent and False where the new one would equal it."""
+        """Return the new generation and True; or the parent and False if the new one would be equal."""
         checkpoint, parent, options = self.embedder.checkpoint, self.embedder.parent, self.options
         about = {
             "checkpoint": str(checkpoint.path.resolve()),
@@ -253,7 +260,7 @@ class _BuildJob:
             **self.references.about,
             **options.about,
         }
-        # A catalogue that had references may have none any more.
+        # Compare `REFERENCE_ROWS` even if it is not in `about`: all references may have been removed.
         if parent is not None and all(
             parent.manifest.about.get(key) == about.get(key) for key in (REFERENCE_ROWS, *about)
         ):
@@ -284,14 +291,12 @@ class _BuildJob:
         self.choosing_s = time.perf_counter() - start
         about = {"partial_error": embedder.partial_error, "reason": point.reason, "candidates": point.candidates}
         if self.references.rows:
-            about[REFERENCE_CALIBRATION] = self.references.worth(embedder.checkpoint, tables)
+            about[REFERENCE_CALIBRATION] = self.references.calibrate(embedder.checkpoint, tables)
         return KindChoice(point.kind, point.parameters, about)
 
 
 def _changed(parent: Generation, parts: Iterator[BuildPart]) -> Iterator[BuildPart] | None:
-    """All parts, or None where they hold the parent's rows, one by one. Parts without codes are held back until one
-    differs.
-    """
+    """Return all parts, or None if they equal the parent's rows. Parts without codes are buffered until one differs."""
     same: list[BuildPart] = []
     place = 0
     for part in parts:

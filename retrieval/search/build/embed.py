@@ -1,7 +1,7 @@
-"""Embed the photos of a catalogue: threads read and decode files while others encode.
+"""Embed the photos of a catalogue: some threads read and decode files while others encode.
 
-Each thread takes a whole batch from its files to its codes and computes alone. A team of threads for each product of
-the towers, PyTorch's default, waits for its members whose core is decoding a file.
+One thread processes a whole batch, from files to codes. PyTorch's default, several threads for each matrix product,
+waits for threads whose cores are decoding files.
 """
 
 from collections import Counter
@@ -37,18 +37,18 @@ R = TypeVar("R")
 
 BATCH = 16
 READ = 32
-"""Files that a thread reads at a time: the overhead of a task is a tenth of the time to read and hash a photo."""
+"""Files that a thread reads in one task: the overhead of a task is a tenth of the time to read and hash a photo."""
 MIN_PHOTOS_TO_TUNE = 256
-"""New photos from which on a faster encoder is tried, which takes as long as encoding a hundred."""
+"""Smallest number of new photos for which a faster encoder is tried; the trial takes as long as encoding 100 photos."""
 MAX_REUSED_PER_PART = 256
-"""Reused codes in one part, at most, so that little memory waits between the threads."""
+"""Largest number of reused codes in one part, which limits the memory between the threads."""
 EMBEDDED, RENAMED, RE_EMBEDDED, RESUMED = "embedded", "renamed", "re_embedded", "resumed"
-"""Origins of a code: encoded now; of a row with the same content; a new embedding of a stored partial activation; left
-by an interrupted build."""
+"""Origins of a code: encoded now; from a row with the same content; a new embedding of a stored partial activation;
+from an interrupted build."""
 
 
 class _PhotoEncoding(NamedTuple):
-    """Embedding (d,) and partial activation (half,) of a photo, its rounding error where it is new, and its origin."""
+    """Embedding (d,) and partial activation (partial_width,) of a photo, its rounding error if new, and its origin."""
 
     embedding: NDArray[np.float32]
     partial_activation: NDArray[np.float16]
@@ -58,7 +58,7 @@ class _PhotoEncoding(NamedTuple):
 
 @dataclass(slots=True)
 class _Photo:
-    """The row of a photo that was read; and where the parent lacks it, its file or the code of an equal file."""
+    """The row of a photo that was read; if the parent lacks it, also its file or the code of an equal file."""
 
     row: dict[str, Any]
     file: PhotoBytes | None = None
@@ -73,7 +73,7 @@ class BuildPart:
         rows: Rows of the photos that could be read.
         codes: Codes of those rows that the parent lacks, in their order.
         skipped: Photos that could not be read.
-        kept: Numbers of the parent's rows that stay as they are; a part has either these or rows.
+        unchanged: Numbers of unchanged rows of the parent; a part has either these or rows.
         objects: Object of each photo of the part.
     """
 
@@ -85,7 +85,7 @@ class BuildPart:
 
     @property
     def block(self) -> Block | range:
-        """What the index writes of this part."""
+        """The block of rows, or the range of the parent's rows, for the index writer."""
         if self.unchanged or not self.codes:
             return self.unchanged or Block(self.rows)
         partials = np.stack([code.partial_activation for code in self.codes])
@@ -97,16 +97,16 @@ _CataloguedPhoto: TypeAlias = tuple[CataloguePhoto, int]
 
 
 class Embedder:
-    """Embed the photos of a catalogue, and count them, under the lock of the index; `close` it.
+    """Embed and count the photos of a catalogue, under the lock of the index. Call `close` afterwards.
 
-    New codes are stored in the index folder at once, for the case that the build is interrupted.
+    New codes are stored in the index folder immediately, in case the build is interrupted.
 
     Args:
         checkpoint: The model.
         index: Folder of the index.
-        parent: The current generation, if this model made it.
-        donors: Other generations of this model, whose codes serve photos of the same content.
-        halves: A generation whose partial activations this model would make again, but not its embeddings.
+        parent: The current generation, if it is of this model.
+        donors: Other generations of this model, whose codes are reused for photos with the same content.
+        partials: A generation with the same partial activations as this model would give, but other embeddings.
 
     Attributes:
         objects: Number of photos of each object.
@@ -132,7 +132,7 @@ class Embedder:
             "partial_error": (np.dtype(np.float32), ()),
         }
         self._unfinished = UnfinishedBuild(index, fingerprint(checkpoint), layouts)
-        self._holders = [holder for holder in (parent, *donors, partials) if holder is not None]
+        self._sources = [source for source in (parent, *donors, partials) if source is not None]
         self.objects, self.made = Counter[str](), Counter[str]()
         self.skipped: list[SkippedPhoto] = []
         self.known, self.partial_error = 0, 0.0
@@ -142,32 +142,32 @@ class Embedder:
         )
 
     def close(self) -> None:
-        """Close the file of the codes for an interrupted build."""
+        """Close the file with the codes for an interrupted build."""
         self._unfinished.__exit__(None, None, None)
 
     def clear(self) -> None:
-        """Delete the codes for an interrupted build: a generation holds them now."""
+        """Delete the codes for an interrupted build, after a generation contains them."""
         self._unfinished.clear()
 
     @property
     def removed(self) -> int:
-        """Number of the parent's photos that the catalogue no longer has."""
+        """Number of the parent's photos that the catalogue lacks."""
         return 0 if self.parent is None else self.parent.count - self.known
 
     def parts(
         self, catalogue: Catalogue, known: Slots, unchanged: Iterable[slice], quiet: bool
     ) -> Generator[BuildPart, None, None]:
-        """Yield the photos of the catalogue in its order.
+        """Yield the photos of the catalogue, in its order.
 
         Args:
             catalogue: The photos, N of them.
             known: The parent's row of each photo whose file need not be read (N,), else -1.
-            kept: Runs of photos whose rows in the parent follow each other and stay as they are.
+            unchanged: Runs of photos whose rows are consecutive in the parent and do not change.
             quiet: Show no progress.
 
         Raises:
             NoReadablePhoto: No photo can be read.
-            NumericalError: Float16 cannot hold a partial activation.
+            NumericalError: A partial activation exceeds float16.
         """
         self.skipped += catalogue.skipped
         threads = torch.get_num_threads()
@@ -186,12 +186,12 @@ class Embedder:
         if not self.objects:
             raise no_photo(catalogue, self.skipped)
         if self.made[EMBEDDED] + self.made[RESUMED] < self.objects.total():
-            # Codes that are reused were rounded when they were made.
-            errors = [holder.manifest.about.get("partial_error", 0.0) for holder in self._holders]
+            # Reused codes were rounded by earlier builds.
+            errors = [source.manifest.about.get("partial_error", 0.0) for source in self._sources]
             self.partial_error = max(self.partial_error, *errors)
 
     def _find(self, catalogue: Catalogue, step: BuildPart | list[_CataloguedPhoto]) -> BuildPart | list[_ReadItem]:
-        """Read files, and keep the bytes of those that must be encoded. Called on threads."""
+        """Read files, and keep the bytes of those that must be encoded. Runs on threads."""
         if isinstance(step, BuildPart):
             return step
         items, new = list[_ReadItem](), dict[str, _Photo]()
@@ -213,19 +213,19 @@ class Embedder:
         return items
 
     def _find_encoded(self, digests: Sequence[str]) -> dict[str, _PhotoEncoding]:
-        """Codes of these contents: of generations under any id, or of an interrupted build."""
+        """Return the codes of these contents from generations, under any id, or from an interrupted build."""
         found: dict[str, _PhotoEncoding] = {}
-        for holder in self._holders:
-            if not (wanted := [digest for digest in digests if digest not in found]):
+        for source in self._sources:
+            if not (missing := [digest for digest in digests if digest not in found]):
                 break
-            numbers = holder.rows.by_digest.find(keys_of(wanted))
-            having = [digest for digest, number in zip(wanted, numbers, strict=True) if number >= 0]
+            numbers = source.rows.by_digest.find(keys_of(missing))
+            present = [digest for digest, number in zip(missing, numbers, strict=True) if number >= 0]
             rows = numbers[numbers >= 0]
-            partials, is_remade = holder.arrays["partials"][rows], holder is self._partials
-            embeddings = self._embeddings(partials) if is_remade else holder.embeddings[holder.slots[rows]]
-            for digest, embedding, partial_activation in zip(having, embeddings, partials, strict=True):
+            partials, is_partial_only = source.arrays["partials"][rows], source is self._partials
+            embeddings = self._embeddings(partials) if is_partial_only else source.embeddings[source.slots[rows]]
+            for digest, embedding, partial_activation in zip(present, embeddings, partials, strict=True):
                 found[digest] = _PhotoEncoding(
-                    embedding, partial_activation, 0.0, RE_EMBEDDED if is_remade else RENAMED
+                    embedding, partial_activation, 0.0, RE_EMBEDDED if is_partial_only else RENAMED
                 )
         for digest, record in self._unfinished.find(digest for digest in digests if digest not in found).items():
             found[digest] = _PhotoEncoding(
@@ -235,15 +235,15 @@ class Embedder:
 
     @torch.inference_mode()
     def _embeddings(self, partials: NDArray[np.float16]) -> NDArray[np.float32]:
-        """Embeddings (n, d) that the candidate encoder makes of stored partial activations (n, half)."""
+        """Return the candidate encoder's embeddings (n, d) of stored partial activations (n, partial_width)."""
         candidate_encoder = self.checkpoint.matcher.candidate_encoder
         assert candidate_encoder is not None
-        read = torch.from_numpy(partials.astype(np.float32)).to(next(candidate_encoder.parameters()).device)
-        made: NDArray[np.float32] = candidate_encoder.photo(read).cpu().numpy()
-        return made
+        stored = torch.from_numpy(partials.astype(np.float32)).to(next(candidate_encoder.parameters()).device)
+        embeddings: NDArray[np.float32] = candidate_encoder.photo(stored).cpu().numpy()
+        return embeddings
 
     def _encode(self, found: BuildPart | list[_ReadItem]) -> BuildPart:
-        """Decode and encode the photos that have no code. Called on threads."""
+        """Decode and encode the photos that have no code. Runs on threads."""
         if isinstance(found, BuildPart):
             return found
         part, photos, images = BuildPart(), list[_Photo](), list[Image]()
@@ -268,13 +268,13 @@ class Embedder:
         return part
 
     def _encode_images(self, rows: Sequence[dict[str, Any]], images: Sequence[Image]) -> list[_PhotoEncoding]:
-        """Encode the images of these rows, and store their codes for the case that the build is interrupted."""
+        """Encode the images of these rows, and store their codes in case the build is interrupted."""
         partials, embeddings = self._encode_photos(images)
         largest = np.abs(partials).max(axis=1)
         if len(bad := np.flatnonzero(~(largest <= np.finfo(np.float16).max))):
             raise NumericalError(
-                f"halves are stored as float16 and must stay within 65504; {rows[bad[0]]['id']} gives "
-                f"{largest[bad[0]]}; the model has diverged, train again with a lower learning rate"
+                f"partial activations are stored as float16 and must be within 65504; {rows[bad[0]]['id']} gives "
+                f"{largest[bad[0]]}: the model has diverged, train again with a lower learning rate"
             )
         stored = partials.astype(np.float16)
         errors = np.abs(stored - partials).max(axis=1)
@@ -295,7 +295,12 @@ class Embedder:
 
 
 def no_photo(catalogue: Catalogue, skipped: list[SkippedPhoto]) -> NoReadablePhoto:
-    """Return the error for a catalogue of which no photo can be read."""
+    """Return the error for a catalogue without a readable photo.
+
+    Args:
+        catalogue: The catalogue.
+        skipped: Its photos that could not be read, at least one.
+    """
     first = skipped[0]
     return NoReadablePhoto(
         f"no photo in {catalogue.where} can be read; the first: {first.path}: {first.reason}", skipped
@@ -303,9 +308,15 @@ def no_photo(catalogue: Catalogue, skipped: list[SkippedPhoto]) -> NoReadablePho
 
 
 def map_ahead(function: Callable[[T], R], items: Iterable[T], threads: int, window: int) -> Iterator[R]:
-    """Yield `map(function, items)`, computed on threads, never more than `window` items ahead of the reader.
+    """Yield `map(function, items)`, computed on threads ahead of the reader.
 
-    Waiting items are dropped when the reader stops or an item fails; running ones are waited for.
+    When the reader stops or an item fails, waiting items are dropped and running ones finish first.
+
+    Args:
+        function: Called on threads.
+        items: Its arguments.
+        threads: Number of threads.
+        window: Largest number of items ahead of the reader.
     """
     pool = ThreadPoolExecutor(threads)
     try:
@@ -317,7 +328,7 @@ def map_ahead(function: Callable[[T], R], items: Iterable[T], threads: int, wind
 def _steps(
     photos: PhotoTable, known: Slots, unchanged: Iterable[slice]
 ) -> Iterator[BuildPart | list[_CataloguedPhoto]]:
-    """Parts of the parent's rows, and between them lists of photos, each with its row where it is known."""
+    """Yield parts of the parent's rows and, between them, lists of photos with their known rows."""
     done = 0
     for run in [*unchanged, slice(len(known), len(known))]:
         yield from batches(zip(photos[done : run.start], known[done : run.start].tolist(), strict=True), READ)
@@ -328,21 +339,21 @@ def _steps(
 
 
 def _full_batches(found: Iterable[BuildPart | list[_ReadItem]]) -> Iterator[BuildPart | list[_ReadItem]]:
-    """Regroup photos: a whole batch to encode in each list, but in the last one and those before rows that are kept."""
+    """Regroup photos into lists with a full batch to encode, except the last list and lists before unchanged rows."""
     waiting = list[_ReadItem]()
-    new = held = 0
+    new = reused = 0
     for step in found:
         for item in [] if isinstance(step, BuildPart) else step:
             waiting.append(item)
             new += isinstance(item, _Photo) and item.file is not None
-            held += isinstance(item, _Photo) and item.code is not None
-            if new == BATCH or held == MAX_REUSED_PER_PART:
+            reused += isinstance(item, _Photo) and item.code is not None
+            if new == BATCH or reused == MAX_REUSED_PER_PART:
                 yield waiting
-                waiting, new, held = [], 0, 0
+                waiting, new, reused = [], 0, 0
         if isinstance(step, BuildPart):
             if waiting:
                 yield waiting
             yield step
-            waiting, new, held = [], 0, 0
+            waiting, new, reused = [], 0, 0
     if waiting:
         yield waiting

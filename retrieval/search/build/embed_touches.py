@@ -35,9 +35,9 @@ from retrieval.model.reference_calibration import (
 
 Partials = NDArray[np.float16]
 MIN_OBJECTS = 10
-"""Objects with at least two touches each that are needed to calibrate references, if the model is not calibrated."""
+"""Smallest number of objects with two touches that calibrates references, if the model has no such calibration."""
 MAX_REFERENCE_QUERIES = 600
-"""Touches of the catalogue used for that calibration."""
+"""Largest number of touches of the catalogue for that calibration."""
 BATCH = 32
 
 
@@ -45,10 +45,10 @@ BATCH = 32
 class ReferenceBuild:
     """The encoded reference touches of a catalogue (R of them).
 
-    Args:
+    Attributes:
         rows: Object, paths of the gel images and their digests, of each touch.
-        halves: Their partial activations (R, half).
-        alone: Objects without photos.
+        partials: Their partial activations (R, partial_width).
+        touch_only: Objects without photos.
         skipped: Touches that could not be used.
         encoded: Number of touches that were encoded now.
     """
@@ -71,19 +71,19 @@ class ReferenceBuild:
     @property
     def about(self) -> dict[str, Any]:
         """Entries of the manifest; empty without references."""
-        told = json.dumps([self.rows, self.touch_only]).encode()
-        return {REFERENCE_ROWS: {**self._counts, "sha256": hashlib.sha256(told).hexdigest()}} if self.rows else {}
+        content = json.dumps([self.rows, self.touch_only]).encode()
+        return {REFERENCE_ROWS: {**self._counts, "sha256": hashlib.sha256(content).hexdigest()}} if self.rows else {}
 
     @property
     def _counts(self) -> dict[str, int]:
         return {"touches": len(self.rows), "objects": len({row["object_id"] for row in self.rows})}
 
     def summary(self, by: str) -> dict[str, Any]:
-        """Return the report's entry. by: the source of their calibration."""
+        """Return the entry of the report; `by` is the source of the calibration."""
         return {**self._counts, "touch_only": len(self.touch_only), "encoded": self.encoded, "by": by}
 
-    def shown(self, catalogue: Catalogue) -> Catalogue:
-        """Return the catalogue with the first gel image of each object without photos in place of a photo."""
+    def with_gel_images(self, catalogue: Catalogue) -> Catalogue:
+        """Return the catalogue with a gel image of each object without photos in place of its photo."""
         first: dict[str, CatalogueTouch] = {}
         for touch in catalogue.touches:
             if touch.object_id in self.touch_only:
@@ -94,41 +94,45 @@ class ReferenceBuild:
         photos = sorted([*catalogue.photos, *pictures], key=lambda photo: photo.path)
         return replace(catalogue, photos=PhotoTable.of(photos))
 
-    def worth(self, checkpoint: Checkpoint, tables: Tables) -> dict[str, Any]:
+    def calibrate(self, checkpoint: Checkpoint, tables: Tables) -> dict[str, Any]:
         """Return the calibration of the references and its source, for the manifest.
 
-        It is that of the checkpoint, else it is fitted to the catalogue's own touches: the last ones of each object are
-        queries, its first ones references.
+        The calibration is that of the checkpoint. If it has none, it is fitted to the catalogue's own touches: the
+        last touches of each object are queries, its first ones references.
+
+        Args:
+            checkpoint: The model.
+            tables: Tables of the new generation.
 
         Raises:
-            BadInput: The touches are too few.
+            BadInput: There are too few touches.
         """
         if checkpoint.references is not None:
             return {"by": "objects that the model was not fitted to", "calibration": checkpoint.references.to_dict()}
         names = np.array([row["object_id"] for row in self.rows])
-        kept = _sample_objects(names)
-        codes = touch_embeddings(self.partials[kept], checkpoint.config.matcher.hidden)
+        sample = _sample_objects(names)
+        codes = touch_embeddings(self.partials[sample], checkpoint.config.matcher.hidden)
         photographed = ~np.isin(tables.objects, keys_of(self.touch_only))
-        asked, owner = np.unique(names[kept], return_inverse=True)
-        keys = keys_of(asked.tolist())
+        touched, owner = np.unique(names[sample], return_inverse=True)
+        keys = keys_of(touched.tolist())
         photos = np.flatnonzero(photographed & np.isin(tables.objects, keys))
         order = np.argsort(keys)
         photo_owner = order[np.searchsorted(keys[order], tables.objects[photos])]
-        classify = scorer_of(checkpoint.matcher.head)
-        felt, shown = self.partials[kept].astype(np.float32), tables.arrays["partials"][photos]
-        logits = np.stack([classify.logits(partial[None], shown) for partial in felt])
+        scorer = scorer_of(checkpoint.matcher.head)
+        touch_partials, photo_partials = self.partials[sample].astype(np.float32), tables.arrays["partials"][photos]
+        logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
         none = np.zeros(logits.shape, np.bool_)
-        found = fit_reference_calibration(ReferenceTouches(ScoredTouches(logits, owner, photo_owner, none), codes))
-        if found is None or (found.with_photos is None and len(set(names) - set(self.touch_only))):
+        fitted = fit_reference_calibration(ReferenceTouches(ScoredTouches(logits, owner, photo_owner, none), codes))
+        if fitted is None or (fitted.with_photos is None and len(set(names) - set(self.touch_only))):
             raise self.too_few_error()
-        return {"by": "the catalogue's own touches", "calibration": found.to_dict()}
+        return {"by": "the catalogue's own touches", "calibration": fitted.to_dict()}
 
     def too_few_error(self) -> BadInput:
-        """Return the error for touches that are too few to be calibrated."""
+        """Return the error for too few touches to calibrate."""
         return BadInput(
-            f"nothing says what the catalogue's {len(self.rows)} reference touches are worth: the model does not, "
-            f"and {MIN_OBJECTS} objects with two touches each, and photos where objects have photos, would tell; touch some "
-            "objects twice, or let `retrieve adapt` fit a model to a recording"
+            f"the catalogue's {len(self.rows)} reference touches cannot be calibrated: the model has no calibration "
+            f"for them, and fitting one needs {MIN_OBJECTS} objects with two touches each, and with photos if objects "
+            "have photos. Touch some objects twice, or fit a model to a recording with `retrieve adapt`"
         )
 
 
@@ -137,10 +141,16 @@ def embed_references(
 ) -> ReferenceBuild:
     """Encode the touches of a catalogue that the parent lacks.
 
-    Touches that cannot be read, with another number of fingers or without contact are left out.
+    Touches that cannot be read, have another number of fingers or show no contact are left out.
+
+    Args:
+        catalogue: The catalogue.
+        checkpoint: The model.
+        parent: Generation whose encoded touches are reused; None: none.
+        quiet: Show no progress.
 
     Raises:
-        BadInput: The model cannot compare touches, or their calibration is unknown.
+        BadInput: The model cannot compare touches, or there are too few touches to calibrate.
     """
     if not catalogue.touches:
         return ReferenceBuild()
@@ -163,7 +173,7 @@ def embed_references(
                     partial, shows = next(made)
                     encoded += 1
                     if shows != CONTACT:
-                        skipped.append(SkippedPhoto(row["touch"][0], f"{shows}: no touch to compare with"))
+                        skipped.append(SkippedPhoto(row["touch"][0], f"{shows}: not usable as a reference touch"))
                         continue
                 rows.append(row)
                 partials.append(partial)
@@ -171,7 +181,7 @@ def embed_references(
     photographed, counts = set(catalogue.photos.objects), Counter(row["object_id"] for row in rows)
     stacked = np.stack(partials) if partials else np.empty((0, 0), np.float16)
     references = ReferenceBuild(rows, stacked, sorted(counts.keys() - photographed), skipped, encoded)
-    if rows and checkpoint.references is None:  # of touched objects with photos, if there are any
+    if rows and checkpoint.references is None:  # count objects with photos, if any touched object has photos
         both = counts.keys() & photographed
         if sum(count > 1 and (name in both or not both) for name, count in counts.items()) < MIN_OBJECTS:
             raise references.too_few_error()
@@ -181,13 +191,14 @@ def embed_references(
 def _require_fit(checkpoint: Checkpoint) -> None:
     if not checkpoint.config.matcher.cosine or checkpoint.posterior is None:
         raise BadInput(
-            "the catalogue has touches (touch_* beside photos), and this model cannot compare touches: its match logit "
-            "counts no cosine, or was never calibrated; take a shipped model, one of `retrieve adapt`, or rename them"
+            "the catalogue has touches (touch_* files next to photos), but this model cannot compare touches: its "
+            "match logit has no cosine term, or it is not calibrated. Use a shipped model or one of `retrieve adapt`, "
+            "or rename the files"
         )
     if checkpoint.config.preprocessing.background != "none":
         raise BadInput(
-            "the catalogue has touches (touch_* beside photos), and this model subtracts the untouched gel, for which "
-            "a catalogue has no place; take a model with background none, or rename them"
+            "the catalogue has touches (touch_* files next to photos), but this model subtracts no-contact frames, "
+            "which a catalogue cannot contain. Use a model with background none, or rename the files"
         )
 
 
@@ -198,14 +209,15 @@ def _read(
     known: Mapping[tuple[str, ...], Partials],
     skipped: list[SkippedPhoto],
 ) -> Iterator[tuple[dict[str, Any], list[Image], Partials | None]]:
-    """Yield the row of each touch, the tower's inputs, and its partial activation if it is known. Add touches that
-    cannot be used to `skipped`.
+    """Yield the row of each touch, the tower's inputs, and its partial activation if it is known.
+
+    Touches that cannot be used are added to `skipped`.
     """
-    fingers, see = checkpoint.config.matcher.fingers, checkpoint.config.preprocessing.touch
+    fingers, preprocess = checkpoint.config.matcher.fingers, checkpoint.config.preprocessing.touch
     for touch in touches:
         if len(touch.paths) != fingers:
             ends = " and ".join(f"_{letter}" for letter in "abcdefghij"[:fingers])
-            reason = f"a touch has {len(touch.paths)} gel image(s), the model takes {fingers}: names end in {ends}"
+            reason = f"the touch has {len(touch.paths)} gel image(s), the model takes {fingers}: names end in {ends}"
             skipped.append(SkippedPhoto(touch.paths[0], reason))
             continue
         try:
@@ -214,7 +226,7 @@ def _read(
             row = {"object_id": touch.object_id, "touch": list(touch.paths), "digests": digests}
             partial = known.get(tuple(digests))
             named = zip(files, touch.paths, strict=True)
-            views = [] if partial is not None else [see(decode_rgb(data, path), None) for data, path in named]
+            views = [] if partial is not None else [preprocess(decode_rgb(data, path), None) for data, path in named]
         except ImageError as error:
             skipped.append(SkippedPhoto(touch.paths[0], error.reason))
             continue
@@ -223,7 +235,7 @@ def _read(
 
 @torch.inference_mode()
 def _encode_touches(checkpoint: Checkpoint, touches: list[list[Image]]) -> Iterator[tuple[Partials, str]]:
-    """Yield the partial activation of each touch, and what it shows."""
+    """Yield the partial activation of each touch, and its gel check: contact, no contact or not a gel image."""
     matcher = checkpoint.matcher
     features = touch_features(matcher, touches)
     partials = matcher.touch_encoding(features).partial.cpu().numpy().astype(np.float16)
@@ -234,7 +246,7 @@ def _encode_touches(checkpoint: Checkpoint, touches: list[list[Image]]) -> Itera
 
 
 def _sample_objects(names: NDArray[np.str_]) -> NDArray[np.int64]:
-    """Rows of randomly chosen objects with at least two touches, at most about `MAX_REFERENCE_QUERIES`, in their order."""
+    """Return rows of random objects with two or more touches, about `MAX_REFERENCE_QUERIES` at most, in their order."""
     _, owner, counts = np.unique(names, return_inverse=True, return_counts=True)
     drawn = np.random.default_rng(0).permutation(np.flatnonzero(counts > 1))
     chosen = drawn[: max(MIN_OBJECTS, int(np.searchsorted(np.cumsum(counts[drawn]), MAX_REFERENCE_QUERIES)))]

@@ -1,4 +1,4 @@
-"""What searches find of a catalogue, and how long they take: the measurements that an operating point is chosen by."""
+"""Measurements of candidate search on a catalogue, agreement and time, from which the operating point is chosen."""
 
 import copy
 import time
@@ -23,25 +23,32 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import score_partials
 
 EXHAUSTIVE_LIMIT = 500
-"""With no more photos than this all are judged, and nothing is measured."""
+"""Up to this number of photos, all are scored and nothing is measured."""
 
 SHORT_LADDER = (250, 100, 50, 25, 10)
-"""Candidates to try below `EXHAUSTIVE_LIMIT` where time is short."""
+"""Numbers of candidates below `EXHAUSTIVE_LIMIT`, tried if the time bound is short."""
 
 TIMED_QUERIES = 15
 MIN_QUERIES = 50
 MEASUREMENT_FLOPS = 3e12
-"""Floating-point operations to spend on finding winners: 150 touches over 100,000 halves of 256 numbers."""
+"""Floating-point operations for exhaustive search: 150 touches over 100,000 partial activations of 256 numbers."""
 
 NEIGHBOURS, DRAWN_QUERIES = 10, 64
-"""Neighbours to find of each query, and queries to draw, where the checkpoint keeps no touches."""
+"""Neighbours to find for each query, and queries to draw, if the checkpoint stores no touches."""
 
 
 @dataclass(frozen=True)
 class SearchPoint:
-    """One way to search: what it found, and median milliseconds of search and of judging.
+    """One setting of candidate search with its measurements.
 
-    k: candidates for one touch. found: of `queries` winners, or nearest neighbours.
+    Attributes:
+        kind: Kind of index.
+        parameters: Its parameters.
+        k: Number of candidates for one touch.
+        found: Number of exhaustive top-1 photos, or of nearest neighbours, among the candidates.
+        queries: Number of touches, or of neighbours to find.
+        search_ms: Median milliseconds of candidate search for one touch.
+        rerank_ms: Median milliseconds of reranking.
     """
 
     kind: str
@@ -54,20 +61,23 @@ class SearchPoint:
 
     @property
     def recall(self) -> float:
-        """Share of what there was to find."""
+        """Agreement with exhaustive search at rank 1, or recall of the nearest neighbours."""
         return self.found / self.queries
 
     @property
     def ms(self) -> float:
-        """Milliseconds of search and judging together, for one touch."""
+        """Milliseconds of candidate search and reranking for one touch."""
         return self.search_ms + self.rerank_ms
 
 
 class SearchBench(ABC):
-    """A catalogue to measure searches on: `count` photos with the distinct vectors (S, d) float32 of norm 1.
+    """A catalogue on which searches are measured.
 
-    steps: numbers of candidates to try, ascending. queries: how much there is to find. exhaustive_ms: for one touch
-    where every photo is judged and nothing is searched.
+    Attributes:
+        count: Number of photos.
+        steps: Numbers of candidates to try, ascending.
+        queries: Number of touches, or of neighbours to find.
+        exhaustive_ms: Median milliseconds of scoring every photo for one touch.
     """
 
     steps: Sequence[int]
@@ -75,17 +85,18 @@ class SearchBench(ABC):
     exhaustive_ms: float
 
     def __init__(self, count: int, vectors: Floats) -> None:
+        """Take the number of photos and their distinct unit vectors (S, d) float32."""
         self.count, self._vectors = count, np.ascontiguousarray(vectors)
-        self._built: dict[str, VectorIndex] = {}
+        self._indexes: dict[str, VectorIndex] = {}
 
-    def built(self, kind: str) -> VectorIndex:
-        """An index of that kind over the distinct embeddings; each is built once."""
-        if kind not in self._built:
-            self._built[kind] = load_kind(kind).build(self._vectors, threads=torch.get_num_threads())
-        return self._built[kind]
+    def index_of_kind(self, kind: str) -> VectorIndex:
+        """Return an index of that kind over the distinct embeddings, built on first use."""
+        if kind not in self._indexes:
+            self._indexes[kind] = load_kind(kind).build(self._vectors, threads=torch.get_num_threads())
+        return self._indexes[kind]
 
     def kinds_to_try(self) -> list[str]:
-        """Kinds to try, unasked, where exact search takes too long: those that can be built, the quickest first."""
+        """Return the kinds to try if exact search takes too long, the fastest to build first."""
         return [
             name
             for name in KINDS.names()
@@ -94,18 +105,23 @@ class SearchBench(ABC):
 
     @abstractmethod
     def point(self, index: VectorIndex, k: int) -> SearchPoint:
-        """What `index` finds with `k` candidates, and in what time."""
+        """Measure `index` with `k` candidates."""
 
     @abstractmethod
     def times(self, index: VectorIndex, k: int) -> tuple[float, float]:
-        """Median milliseconds of search and of judging, one touch at a time."""
+        """Return the median milliseconds of candidate search and of reranking, one touch at a time."""
 
 
 class ExhaustiveBench(SearchBench):
-    """Touches whose winners are known, to be found among the candidates.
+    """Touches with known exhaustive top-1 photos, from scoring every photo for every touch.
 
-    vectors (S, d), slots (N,) that say which of them is each photo's, and halves (N, half), which are read where they
-    lie. Finding the winners judges every photo for every touch; `quiet` shows no progress.
+    Args:
+        checkpoint: The model, with the touches that it stores to measure with.
+        vectors: Distinct unit embeddings (S, d) float32.
+        slots: Row of `vectors` of each photo (N,).
+        partials: Partial activations (N, partial_width) of the photos, perhaps memory-mapped.
+        quiet: Show no progress.
+        clock: Source of the time in seconds.
     """
 
     def __init__(
@@ -121,25 +137,23 @@ class ExhaustiveBench(SearchBench):
         used, self._first, places = np.unique(slots, return_index=True, return_inverse=True)
         super().__init__(len(partials), vectors[used])
         self.steps = candidate_steps(self.count)
-        # ShardResult, and timed, as searches do: on the processor, wherever the towers run.
+        # Scored and timed on the CPU as in searches, even if the towers run on a GPU.
         self._head, self._partials, self._clock = copy.deepcopy(checkpoint.matcher.head).cpu(), partials, clock
         self._touches, self._queries = _queries(checkpoint, self.count)
         self.queries = len(self._queries)
         self._top1, self.exhaustive_ms = self._find_exhaustive_top1(places, quiet)
 
     def point(self, index: VectorIndex, k: int) -> SearchPoint:
-        """Winner recall and time of `index` with `k` candidates. With no fewer than there are photos, all are judged
-        and nothing is searched.
-        """
+        """Measure agreement at rank 1 and time with `k` candidates; if k >= count, all are scored without a search."""
         about = (index.kind, index.parameters, k)
         if k >= self.count:
             return SearchPoint(*about, self.queries, self.queries, 0.0, self.exhaustive_ms)
         found = index.candidates(self._queries, k)
-        hits = sum(winner in slots for winner, slots in zip(self._top1, found, strict=True))
+        hits = sum(top1 in slots for top1, slots in zip(self._top1, found, strict=True))
         return SearchPoint(*about, hits, self.queries, *self.times(index, k))
 
     def times(self, index: VectorIndex, k: int) -> tuple[float, float]:
-        """Median milliseconds of search and of judging, one touch at a time."""
+        """Return the median milliseconds of candidate search and of reranking, one touch at a time."""
         taken = []
         for query in range(min(TIMED_QUERIES, self.queries)):
             start = self._clock()
@@ -147,22 +161,22 @@ class ExhaustiveBench(SearchBench):
             between = self._clock()
             score_partials(self._head, self._touches[query : query + 1], self._partials, np.sort(self._first[slots]))
             taken.append((between - start, self._clock() - between))
-        search, judge = zip(*taken, strict=True)
-        return 1e3 * median(search), 1e3 * median(judge)
+        search, rerank = zip(*taken, strict=True)
+        return 1e3 * median(search), 1e3 * median(rerank)
 
     def _find_exhaustive_top1(self, slots: Slots, quiet: bool) -> tuple[Slots, float]:
-        winners, taken = [], []
+        top1, taken = [], []
         with Bar("measure", self.queries, "touches", quiet=quiet) as bar:
             for touch in self._touches:
                 start = self._clock()
-                winners.append(slots[int(score_partials(self._head, touch[None], self._partials).argmax())])
+                top1.append(slots[int(score_partials(self._head, touch[None], self._partials).argmax())])
                 taken.append(self._clock() - start)
                 bar.advance()
-        return np.array(winners, dtype=np.int64), 1e3 * median(taken)
+        return np.array(top1, dtype=np.int64), 1e3 * median(taken)
 
 
 class NeighbourBench(SearchBench):
-    """Drawn queries (Q, d) near the vectors (S, d), and their nearest neighbours to be found. Judging is not timed."""
+    """Random queries near the vectors (S, d), and their nearest neighbours. Reranking is not timed."""
 
     steps = (NEIGHBOURS,)
     queries = NEIGHBOURS * DRAWN_QUERIES
@@ -173,25 +187,25 @@ class NeighbourBench(SearchBench):
         self._drawn, self._clock = sample_queries(self._vectors, DRAWN_QUERIES), clock
 
     def point(self, index: VectorIndex, k: int) -> SearchPoint:
-        """Recall of the nearest `k` neighbours, and the time of a search for them."""
+        """Measure the recall of the nearest `k` neighbours and the time of a search."""
         recall = 1.0 if index.exact else recall_against_exact(index, self._drawn, k)
         return SearchPoint(
             index.kind, index.parameters, k, round(recall * self.queries), self.queries, *self.times(index, k)
         )
 
     def times(self, index: VectorIndex, k: int) -> tuple[float, float]:
-        """Median milliseconds of search, and none of judging."""
+        """Return the median milliseconds of a search, and 0 for reranking."""
         return query_ms(index, self._drawn, k, clock=self._clock), 0.0
 
 
 def candidate_steps(photos: int) -> list[int]:
-    """Numbers of candidates to try for so many photos: `EXHAUSTIVE_LIMIT`, doubled again and again, and all."""
+    """Return the numbers of candidates to try: `EXHAUSTIVE_LIMIT`, its doubles below `photos`, and `photos`."""
     doubled = takewhile(lambda k: k < photos, (EXHAUSTIVE_LIMIT << power for power in range(40)))
     return [*doubled, photos]
 
 
 def can_measure(checkpoint: Checkpoint) -> bool:
-    """Whether the checkpoint keeps touches to measure with, and embeddings that are made from what it keeps."""
+    """Whether the checkpoint has touches to measure with, and a candidate encoder that embeds them."""
     return (
         bool(checkpoint.queries is not None and len(checkpoint.queries))
         and checkpoint.matcher.candidate_encoder is not None
@@ -200,11 +214,20 @@ def can_measure(checkpoint: Checkpoint) -> bool:
 
 @torch.inference_mode()
 def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch.Tensor, Floats]:
-    """Partials (Q, half) and unit embeddings (Q, d), float32, of the first `count` touches that the checkpoint keeps.
-    Raises BadInput where `can_measure` says that there are none.
+    """Return the codes of the touches that a checkpoint stores to measure with.
+
+    Args:
+        checkpoint: The model.
+        count: Number of touches; None: all.
+
+    Returns:
+        Partial activations (Q, partial_width) and unit embeddings (Q, d), float32.
+
+    Raises:
+        BadInput: The checkpoint stores no touches or has no candidate encoder (`can_measure`).
     """
     if checkpoint.queries is None or checkpoint.matcher.candidate_encoder is None:
-        raise BadInput(f"{checkpoint.path} must keep touches to measure with, and a candidate_encoder; train it again")
+        raise BadInput(f"{checkpoint.path} must have touches to measure with and a candidate encoder; train it again")
     partials, candidate_encoder = (
         torch.from_numpy(checkpoint.queries[:count].astype(np.float32)),
         checkpoint.matcher.candidate_encoder,
@@ -213,8 +236,9 @@ def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch
 
 
 def _queries(checkpoint: Checkpoint, photos: int) -> tuple[torch.Tensor, Floats]:
-    """The halves and embeddings of as many touches as may judge every photo within `MEASUREMENT_FLOPS` operations (a judgement
-    is a product with a square matrix), but of `MIN_QUERIES` at least.
+    """Return the codes of as many touches as can score every photo within `MEASUREMENT_FLOPS`, at least `MIN_QUERIES`.
+
+    One score is a product with a square matrix: 2 hidden^2 operations.
     """
     affordable = MEASUREMENT_FLOPS / (2.0 * photos * checkpoint.config.matcher.hidden**2)
     return query_codes(checkpoint, max(MIN_QUERIES, int(affordable)))

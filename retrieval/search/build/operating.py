@@ -1,18 +1,18 @@
-"""The operating point of an index: which kind finds the candidates, and how many of them the classifier judges.
+"""The operating point of an index: the kind that finds candidates, and the number of candidates to rerank.
 
-It is measured on the catalogue itself, with touches of validation objects that the checkpoint keeps for it. The winner
-of a touch is the photo that the classifier ranks first when it judges every one; the winner recall at k is the share of
-touches whose winner is among the k candidates.
+It is measured on the catalogue, with touches of validation objects that the checkpoint stores for this. The exhaustive
+top-1 of a touch is the photo that the classifier ranks first if it scores every photo. The agreement@k with exhaustive
+search ("recall" below) is the fraction of touches whose exhaustive top-1 is among the k candidates.
 
-    neither bound asked for    exact search, and the least k of a ladder with a winner recall of 0.99
-    min_recall                 the least k with that recall; approximate kinds are tried where exact search takes
-                               longer than judging its candidates, and the fastest point is taken
-    max_ms                     the same if search and judging take no longer; else what approximate kind does; else
-                               the highest recall within the time, or where nothing is, the fastest with the recall
-    both                       recall and time, or where nothing has both, the fastest with the recall
+    no bound       exact search, and the smallest k of a ladder with a recall of 0.99
+    min_recall     the smallest k with that recall. If exact search takes longer than reranking its candidates,
+                   approximate kinds are tried as well, and the fastest point is chosen
+    max_ms         as without a bound if search and reranking are within the time; else an approximate kind that is;
+                   else the highest recall within the time; else the fastest point with the recall
+    both           a point with both; else the fastest point with the recall
 
-What must be judged to know the winners grows with the catalogue: fewer touches are asked then, and what was measured
-stands until a tenth of the photos has changed.
+The cost of exhaustive search grows with the catalogue, so larger catalogues use fewer touches. A measurement is reused
+until a tenth of the photos has changed.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,22 +40,22 @@ from retrieval.search.build.measuring import (
 )
 
 TARGET = 0.99
-"""Winner recall where none is asked for."""
+"""Default agreement with exhaustive search at rank 1."""
 
 APPROXIMATE_FACTOR = 4
-"""How many times more candidates an approximate kind may take than exact search needs."""
+"""Largest factor of candidates of an approximate kind, compared with exact search."""
 
 MAX_CHANGED_FRACTION = 0.10
-"""Share of a catalogue that may change before its operating point is measured again."""
+"""Fraction of a catalogue that may change before its operating point is measured again."""
 
 
 @dataclass(frozen=True)
 class SearchRequirements:
-    """What a user requires of candidate search; None leaves it open.
+    """A user's requirements of candidate search; None means no requirement.
 
-    Args:
+    Attributes:
         kind: Name of a kind of index.
-        min_recall: Least winner recall.
+        min_recall: Smallest agreement with exhaustive search at rank 1.
         max_ms: Longest candidate search and reranking of one touch, in milliseconds, with the index open.
 
     Raises:
@@ -71,20 +71,30 @@ class SearchRequirements:
         if self.kind is not None:
             load_kind(self.kind)
         if self.min_recall is not None and not 0 < self.min_recall <= 1:
-            raise BadInput(f"the least winner recall must lie above 0 and be 1 at most; got {self.min_recall}")
+            raise BadInput(f"the minimum recall must be above 0 and at most 1; got {self.min_recall}")
         if self.max_ms is not None and not self.max_ms > 0:
-            raise BadInput(f"the longest search must be above 0 ms; got {self.max_ms}")
+            raise BadInput(f"the longest search must take more than 0 ms; got {self.max_ms}")
 
     @classmethod
     def of(
         cls, kind: str | type[VectorIndex] | None, min_recall: float | None, max_ms: float | None
     ) -> "SearchRequirements":
-        """Return the requirements; `kind` is a name, "module:Class" or a class. Raises as the class does."""
+        """Return the requirements.
+
+        Args:
+            kind: A name, "module:Class" or a class; None: no requirement.
+            min_recall: As the attribute.
+            max_ms: As the attribute.
+
+        Raises:
+            BadInput: A bound is out of range.
+            ParameterError: No kind has this name.
+        """
         return cls(None if kind is None else KINDS.name_of(kind), min_recall, max_ms)
 
     @property
     def target(self) -> float:
-        """The winner recall to reach."""
+        """Agreement with exhaustive search that the point must reach."""
         return TARGET if self.min_recall is None else self.min_recall
 
     @property
@@ -95,7 +105,7 @@ class SearchRequirements:
 
 @dataclass(frozen=True)
 class OperatingPoint:
-    """The index to build, the reason in a sentence, and the manifest's "candidates" (None: nothing)."""
+    """A chosen kind of index with its parameters, the reason as a sentence, and the manifest's "candidates" or None."""
 
     kind: str
     parameters: Parameters
@@ -112,21 +122,21 @@ def choose_operating_point(
     *,
     quiet: bool = True,
 ) -> OperatingPoint:
-    """Choose the kind of index and the number of candidates, measured where there is something to measure with.
+    """Choose the kind of index and the number of candidates, by measurement if the checkpoint stores touches.
 
     Args:
         checkpoint: The model, with the touches that it stores to measure with.
-        tables: Everything that the index will hold.
-        asked: The user's requirements.
-        previous: Manifest of the generation before, whose measurement may still hold.
+        tables: Tables of the new generation.
+        requirements: The user's requirements.
+        previous: Manifest of the previous generation, whose measurement may be reused.
         changed: Number of photos that changed since.
         quiet: Show no progress.
     """
     photos = len(tables.slots)
-    again = previous and carry_over(previous.about.get("candidates"), requirements, photos, changed)
-    if previous is not None and again:
+    record = previous and carry_over(previous.about.get("candidates"), requirements, photos, changed)
+    if previous is not None and record:
         parameters = load_kind(previous.kind).parameters_from(previous.requested)
-        return OperatingPoint(previous.kind, parameters, operating_point_sentence(again), again)
+        return OperatingPoint(previous.kind, parameters, operating_point_sentence(record), record)
     if not checkpoint.config.has_embeddings or not needs_measurement(photos, requirements):
         kind, candidates = requirements.kind or "flat", exhaustive_record(photos, requirements)
         return OperatingPoint(kind, load_kind(kind).parameters_type(), operating_point_sentence(candidates), candidates)
@@ -138,34 +148,40 @@ def choose_operating_point(
 
 
 def needs_measurement(photos: int, requirements: SearchRequirements) -> bool:
-    """Whether the choice needs a measurement: of few photos all are scored, unless that may be too slow."""
+    """Whether the choice needs a measurement. Few photos are all scored, unless a time bound may forbid it."""
     return len(candidate_steps(photos)) > 1 or requirements.max_ms is not None
 
 
 def choose_by_agreement(bench: SearchBench, requirements: SearchRequirements) -> OperatingPoint:
-    """The operating point for what was asked, measured on the bench by winners."""
-    taken = _choose_point(bench, requirements)
-    candidates = _record(taken, requirements, bench)
-    return OperatingPoint(taken.kind, taken.parameters, operating_point_sentence(candidates), candidates)
+    """Choose the operating point by measured agreement with exhaustive search."""
+    point = _choose_point(bench, requirements)
+    candidates = _record(point, requirements, bench)
+    return OperatingPoint(point.kind, point.parameters, operating_point_sentence(candidates), candidates)
 
 
 def choose_by_neighbours(vectors: Floats, slots: Slots, requirements: SearchRequirements) -> OperatingPoint:
-    """The kind alone, for vectors (S, d) and the slots (N,) of the photos, where the checkpoint keeps no touches to
-    find winners of. Without a bound on the time nothing is measured.
+    """Choose the kind only, by recall of nearest neighbours, for a checkpoint that stores no touches.
+
+    Without a time bound nothing is measured.
+
+    Args:
+        vectors: Unit embeddings (S, d) float32.
+        slots: Row of `vectors` of each photo (N,).
+        requirements: The user's requirements.
     """
-    why = "The checkpoint keeps no touches to measure candidates with, so recall is that of nearest neighbours."
+    why = "The checkpoint stores no touches to measure candidates with, so recall is that of nearest neighbours."
     if requirements.kind is not None or requirements.max_ms is None:
         kind = requirements.kind or "flat"
-        said = "Exact search: no time budget was asked for." if requirements.kind is None else "It was asked for."
-        return OperatingPoint(kind, load_kind(kind).parameters_type(), f"{said} {why}", None)
-    taken = _choose_point(NeighbourBench(vectors[np.unique(slots)]), requirements)
-    found = f"A search takes {taken.ms:.3g} ms and finds {taken.found} of {taken.queries} neighbours."
-    missed = _unmet_requirements(taken.recall, taken.ms, asdict(requirements))
-    return OperatingPoint(taken.kind, taken.parameters, f"{found}{missed} {why}", None)
+        reason = "Exact search: there is no time bound." if requirements.kind is None else "The user chose this kind."
+        return OperatingPoint(kind, load_kind(kind).parameters_type(), f"{reason} {why}", None)
+    point = _choose_point(NeighbourBench(vectors[np.unique(slots)]), requirements)
+    found = f"A search takes {point.ms:.3g} ms and finds {point.found} of {point.queries} neighbours."
+    unmet = _unmet_requirements(point.recall, point.ms, asdict(requirements))
+    return OperatingPoint(point.kind, point.parameters, f"{found}{unmet} {why}", None)
 
 
 def _choose_point(bench: SearchBench, requirements: SearchRequirements) -> SearchPoint:
-    """The first point that is good enough; where none is, the nearest."""
+    """Return the first sufficient point; if there is none, the best one."""
     tried: list[SearchPoint] = []
     for point in _points(bench, requirements):
         if _is_sufficient(point, requirements):
@@ -175,11 +191,12 @@ def _choose_point(bench: SearchBench, requirements: SearchRequirements) -> Searc
 
 
 def _points(bench: SearchBench, requirements: SearchRequirements) -> Iterator[SearchPoint]:
-    """Exact search with more and more candidates until the recall is there; then the approximate kinds, if any is to
-    be tried, with as many candidates and more.
+    """Yield points of exact search with more and more candidates until one has the recall, then of approximate kinds.
+
+    Approximate kinds start with the number of candidates of the last exact point.
     """
     approximate = None if requirements.kind is None or load_kind(requirements.kind).exact else requirements.kind
-    exact = bench.built("flat" if requirements.kind is None or approximate else requirements.kind)
+    exact = bench.index_of_kind("flat" if requirements.kind is None or approximate else requirements.kind)
     for point in (bench.point(exact, k) for k in bench.steps):
         if not approximate:
             yield point
@@ -193,26 +210,27 @@ def _points(bench: SearchBench, requirements: SearchRequirements) -> Iterator[Se
         else []
     )
     for kind in others if point.k < bench.count else ():
-        yield from _kind_points(bench, bench.built(kind), requirements, least=point.k)
+        yield from _kind_points(bench, bench.index_of_kind(kind), requirements, minimum=point.k)
     if approximate:
-        yield bench.point(bench.built(approximate), bench.count)
+        yield bench.point(bench.index_of_kind(approximate), bench.count)
 
 
 def _kind_points(
-    bench: SearchBench, built: VectorIndex, requirements: SearchRequirements, least: int
+    bench: SearchBench, index: VectorIndex, requirements: SearchRequirements, minimum: int
 ) -> Iterator[SearchPoint]:
-    """Settings are tried only where there is a bound to meet; else the kind's own are taken."""
-    steps = [k for k in bench.steps if k >= least]
+    """Yield points with at least `minimum` candidates; search settings vary only if there is a bound to meet."""
+    steps = [k for k in bench.steps if k >= minimum]
     if not requirements.is_bounded:
-        yield from (bench.point(built, k) for k in steps)
+        yield from (bench.point(index, k) for k in steps)
         return
-    for index in built.search_variants():
-        yield from (bench.point(index, k) for k in steps if k <= APPROXIMATE_FACTOR * least)
+    for variant in index.search_variants():
+        yield from (bench.point(variant, k) for k in steps if k <= APPROXIMATE_FACTOR * minimum)
 
 
 def _is_sufficient(point: SearchPoint, requirements: SearchRequirements) -> bool:
-    """Whether no further point need be tried: this one has the recall and is within the time; where no time was asked
-    for, its search takes no longer than its judging.
+    """Whether the search for a point can stop here.
+
+    The point has the recall and is within the time. Without a time bound, its search takes no longer than reranking.
     """
     if point.recall < requirements.target:
         return False
@@ -224,11 +242,11 @@ def _is_sufficient(point: SearchPoint, requirements: SearchRequirements) -> bool
 def _points_within_time(
     bench: SearchBench, requirements: SearchRequirements, tried: Sequence[SearchPoint]
 ) -> Iterator[SearchPoint]:
-    """Points with fewer candidates than the recall needs, for a user who asked for a short time and nothing else."""
+    """Yield points with fewer candidates than the recall needs, if the user set only a time bound."""
     if requirements.max_ms is None or requirements.min_recall is not None:
         return
     for kind in dict.fromkeys(point.kind for point in tried):
-        for index in bench.built(kind).search_variants():
+        for index in bench.index_of_kind(kind).search_variants():
             fewer = (k for k in SHORT_LADDER if k < bench.steps[0])
             k = next((k for k in fewer if sum(bench.times(index, k)) <= requirements.max_ms), None)
             if k is not None:
@@ -236,8 +254,10 @@ def _points_within_time(
 
 
 def _best_point(points: Sequence[SearchPoint], requirements: SearchRequirements) -> SearchPoint:
-    """The point to take where none was good enough. Where only a time was asked for: the highest recall within that
-    time. Else, and where nothing is within it: the fastest point with the recall.
+    """Return the best of points of which none is sufficient.
+
+    With a time bound only, this is the point with the highest recall within the time. Otherwise, or if no point is
+    within the time, it is the fastest point with the recall.
     """
     quick = [point for point in points if requirements.max_ms is not None and point.ms <= requirements.max_ms]
     if requirements.min_recall is None and quick:
@@ -264,7 +284,7 @@ def _record(point: SearchPoint, requirements: SearchRequirements, bench: SearchB
 
 
 def exhaustive_record(photos: int, requirements: SearchRequirements) -> dict[str, Any]:
-    """What the manifest says of a catalogue so small that every photo is judged, unmeasured."""
+    """Return the manifest's "candidates" of a small catalogue whose photos are all scored, without a measurement."""
     return {
         "k": photos,
         "top1_agreement": 1.0,
@@ -278,8 +298,15 @@ def exhaustive_record(photos: int, requirements: SearchRequirements) -> dict[str
 def carry_over(
     previous: Mapping[str, Any] | None, requirements: SearchRequirements, photos: int, changed: int
 ) -> dict[str, Any] | None:
-    """The record of what was measured before, brought up to date, where the same was asked for and too few of `photos`
-    have changed since to measure again; else None. changed: how many photos this build changed.
+    """Return the updated record of an earlier measurement; None if a new measurement is necessary.
+
+    A measurement is reused if the requirements are equal and at most `MAX_CHANGED_FRACTION` of the photos changed.
+
+    Args:
+        previous: The manifest's "candidates" of the previous generation.
+        requirements: The user's requirements.
+        photos: Number of photos now.
+        changed: Number of photos that this build changed.
     """
     if not previous or not previous.get("queries") or previous["requirements"] != asdict(requirements):
         return None
@@ -291,16 +318,16 @@ def carry_over(
 
 
 def operating_point_sentence(candidates: Mapping[str, Any]) -> str:
-    """A record in words: what is judged, what of the winners that finds, and whether it is what was asked for."""
+    """Return a record as text: the candidates, their agreement with exhaustive search, and unmet requirements."""
     k, photos = candidates["k"], candidates["photos"]
     if not candidates["queries"]:
-        return f"The classifier judges all {photos} photos."
+        return f"The classifier scores all {photos} photos."
     low, high = candidates["interval"]
     found = round(candidates["top1_agreement"] * candidates["queries"])
-    judged = "every photo" if k >= photos else f"the best {k} of {photos} photos"
+    scored = "scores every photo" if k >= photos else f"reranks the best {k} of {photos} photos"
     text = (
-        f"The classifier judges {judged}: these hold its winner for {found} of {candidates['queries']} validation "
-        f"touches (95 % interval {low:.3f} to {high:.3f}), in {candidates['ms']:.3g} ms against "
+        f"The classifier {scored}: these contain the exhaustive top-1 for {found} of {candidates['queries']} "
+        f"validation touches (95 % interval {low:.3f} to {high:.3f}), in {candidates['ms']:.3g} ms, compared with "
         f"{candidates['exhaustive_ms']:.3g} ms for all."
     )
     return text + _unmet_requirements(candidates["top1_agreement"], candidates["ms"], candidates["requirements"])
@@ -308,9 +335,9 @@ def operating_point_sentence(candidates: Mapping[str, Any]) -> str:
 
 def _unmet_requirements(recall: float, ms: float, requirements: Mapping[str, Any]) -> str:
     target = TARGET if requirements["min_recall"] is None else requirements["min_recall"]
-    missed = []
+    unmet = []
     if recall < target:
-        missed.append(f"a recall of {target:g}")
+        unmet.append(f"a recall of {target:g}")
     if requirements["max_ms"] is not None and ms > requirements["max_ms"]:
-        missed.append(f"{requirements['max_ms']:g} ms")
-    return f" Nothing measured here reaches {' and '.join(missed)}; this is the nearest." if missed else ""
+        unmet.append(f"{requirements['max_ms']:g} ms")
+    return f" No measured setting reaches {' and '.join(unmet)}; this is the closest." if unmet else ""

@@ -1,4 +1,4 @@
-"""Where a photo agrees with a touch: what of it the match logit hangs on."""
+"""Occlusion sensitivity: which parts of a photo the match logit depends on."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,15 +15,17 @@ from retrieval.search.embeddings import embed_photos
 from retrieval.search.query.searcher import Searcher
 
 LONGER_SIDE = 640
-"""Pixels of the photo that squares are hidden in: more than any view shows of it."""
+"""Longer side of the photo in pixels before squares are hidden: more than any view of it has."""
 
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """What of a photo speaks for a match, found by hiding one square of it after the other.
+    """Occlusion map of a photo: the effect of each square on the match logit.
 
-    logit: match logit of the whole photo with the touches. falls (rows, columns): by how much the logit falls when that
-    square is hidden; a square with a negative number speaks against the match.
+    Attributes:
+        logit: Match logit of the whole photo with the touches.
+        falls: Decrease of the logit when a square is hidden (rows, columns) float32. Positive squares support the
+            match; negative squares are evidence against it.
 
     >>> with retrieval.open("index") as searcher:
     ...     found = retrieval.agreement(searcher, ["a.png", "b.png"], "catalog/mug/1.jpg", squares=2)
@@ -44,11 +46,21 @@ def agreement(
     model: Checkpoint | None = None,
     squares: int = 8,
 ) -> Agreement:
-    """Hide one square of a photo after the other (Zeiler and Fergus, ECCV 2014) and judge the rest with the touches.
+    """Hide each square of a photo in turn and measure the match logit (Zeiler and Fergus, ECCV 2014).
 
-    `touches`, `background`: as `Searcher.query` takes them. `model`: the searcher's checkpoint, where it is loaded
-    already. `squares`: how many the photo has along each side; a hidden one gets the photo's mean colour. The photo
-    tower looks squares^2 + 1 times. Raises BadInput and ImageError.
+    A hidden square has the photo's mean colour. The photo tower encodes squares^2 + 1 images.
+
+    Args:
+        searcher: The opened index.
+        touches: As `Searcher.query` takes them.
+        photo: As `retrieval.embed_photos` takes one.
+        background: As `Searcher.query` takes it.
+        model: The searcher's checkpoint, if it is already loaded.
+        squares: Number of squares along each side, from 1 to 32.
+
+    Raises:
+        BadInput: An argument is invalid.
+        ImageError: An image cannot be read.
 
     >>> with retrieval.open("index") as searcher:
     ...     found = retrieval.agreement(searcher, ["a.png", "b.png"], "catalog/mug/1.jpg", squares=2)
@@ -66,13 +78,13 @@ def agreement(
     plain = np.rint(whole.mean(axis=(0, 1))).astype(np.uint8)
     rows, columns = (np.linspace(0, side, squares + 1).round().astype(int) for side in (height, width))
 
-    def judged(photos: list[NDArray[np.uint8]]) -> NDArray[np.float32]:
+    def logits(photos: list[NDArray[np.uint8]]) -> NDArray[np.float32]:
         return searcher.scorer.logits(partials, embed_photos(photos, model=model).partials)
 
-    logit, falls = judged([whole])[0], []
+    logit, falls = logits([whole])[0], []
     for top, bottom in pairwise(rows):  # one row of squares is in memory at once
         hidden = [whole.copy() for _ in range(squares)]
         for one, (left, right) in zip(hidden, pairwise(columns), strict=True):
             one[top:bottom, left:right] = plain
-        falls.append(logit - judged(hidden))
+        falls.append(logit - logits(hidden))
     return Agreement(float(logit), np.array(falls, dtype=np.float32))

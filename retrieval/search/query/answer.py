@@ -1,4 +1,4 @@
-"""What a query answers: a verdict, a ranking of objects with their probabilities, of what index, in how long."""
+"""The result of a query: a verdict and a ranking of objects with probabilities, with the index and the timing."""
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -14,19 +14,21 @@ from retrieval.model.posterior import Posterior
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
 CLEAR_PROBABILITY = 0.5
-"""A ranking is clear where its first object, given that the catalogue has the object, has a larger probability: it is
-likelier than all others together."""
+"""A ranking is clear if its first object has a larger probability, given that the catalogue has the object: it is then
+more likely than all others together."""
 EXIT_CODES = {MATCH: 0, UNCALIBRATED: 0, NONE_OF_THESE: 3, NO_CONTACT: 4, NOT_A_GEL: 5}
-"""Of `retrieve query`, by verdict."""
+"""Exit codes of `retrieve query` by verdict."""
 
 
 @dataclass(frozen=True)
 class NearestReference:
-    """The reference touch of an object that is nearest to one of the grasps.
+    """The reference touch of an object with the largest cosine with one of the grasps.
 
-    touch: its gel images, paths in the catalogue. cosine: how near it is. adds: what all references of the object add
-    to the logit that its photos alone give it, perhaps less than nothing; None for an object without photos, which its
-    references alone have found.
+    Attributes:
+        touch: Paths of its gel images in the catalogue.
+        cosine: Cosine with the nearest grasp.
+        adds: Difference that all references of the object make to the logit of its photos, perhaps negative; None for
+            an object without photos.
     """
 
     touch: tuple[str, ...]
@@ -43,15 +45,20 @@ _MATCH_FIELDS = ("rank", "object_id", "logit", "probability", "probability_if_pr
 
 @dataclass(frozen=True)
 class Match:
-    """One object of a ranking, shown by its best photo.
+    """One object of a ranking, with its best photo.
 
-    * `logit`: what ranks. `probability`: P(object | touches, catalogue); over all objects and "none of these" it adds
-      up to 1; None where the model was never calibrated.
-    * `probability_if_present`: P(object | touches, the catalogue has the object); over all objects it adds up to 1;
-      None where the model was never calibrated.
-    * `photo`: path of the photo in the catalogue. `photo_path`: its absolute path on the disk. `metadata`: the user's
-      own.
-    * `reference`: the nearest reference touch of the object; None, and in no document, where it has none.
+    Attributes:
+        rank: Rank from 1.
+        object_id: The object.
+        logit: Match logit, which determines the rank.
+        probability: P(object | touches, catalogue), which sums to 1 over all objects and "none of these"; None if the
+            model is not calibrated.
+        photo: Path of the best photo in the catalogue.
+        metadata: The user's metadata of the photo.
+        photo_path: Absolute path of the photo on the disk.
+        reference: Nearest reference touch of the object; None, and absent from JSON, if it has none.
+        probability_if_present: P(object | touches, the catalogue has the object), which sums to 1 over all objects;
+            None if the model is not calibrated.
 
     >>> with retrieval.open("index") as searcher:
     ...     best = searcher.query(["a.png", "b.png"]).top
@@ -71,29 +78,30 @@ class Match:
 
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON, without the absolute path: the document names the catalogue once."""
-        said = {name: getattr(self, name) for name in _MATCH_FIELDS}
-        return said if self.reference is None else {**said, "reference": self.reference.to_dict()}
+        document = {name: getattr(self, name) for name in _MATCH_FIELDS}
+        return document if self.reference is None else {**document, "reference": self.reference.to_dict()}
 
 
 @dataclass(frozen=True)
 class QueryResult:
     """A verdict and a ranking.
 
-    * `verdict`: "match": the best object is likelier than that the catalogue lacks it. "none of these": it is not; the
-      ranking names the nearest. "no contact": no grasp felt anything. "not a gel image": one of the images is none, as
-      far as the model knows gels. These two come without a ranking. "uncalibrated": a ranking of a model without
-      probabilities.
-    * `touches`: the gel images of each grasp by name, files by their paths. `grasps`: what each shows, "contact", "no
-      contact" or "not a gel image"; only grasps with contact were judged.
-    * `none_probability`: probability that the object is none of the catalogue's. `posterior`: the formula of the
-      probabilities and its numbers (`retrieval.model.posterior`).
-    * `more_grasps`: where the verdict is "none of these" and the ranking is clear (its first object is likelier than
-      all others together, given that the catalogue has the object): further grasps like those so far after which the
-      verdict is expected to be "match" (`Posterior.more_grasps`); None where too many are needed, and else.
-    * `index`: what was searched, and with which model. `timing_ms`: milliseconds of this query by stage; of several
-      objects at once (`Searcher.query_many`) each has an equal share.
-    * `embeddings`: those of the grasps, (G, embedding_dim), where they were encoded in this process; no document holds
-      them.
+    Attributes:
+        touches: Names of the gel images of each grasp; for files, their paths.
+        grasps: Gel check of each grasp: "contact", "no contact" or "not a gel image". Only grasps with contact count.
+        index: The searched index and the model.
+        timing_ms: Milliseconds of this query by stage; `Searcher.query_many` divides them equally among its objects.
+        verdict: "match": the best object is more likely than its absence from the catalogue. "none of these": it is
+            not; the ranking lists the nearest objects. "no contact": no grasp shows contact. "not a gel image": an
+            image is unlike the gels of the model. These two have no ranking. "uncalibrated": the model has no
+            probabilities.
+        none_probability: Probability that the object is out of catalogue.
+        posterior: Formula of the probabilities and its numbers (`retrieval.model.posterior`).
+        results: The ranking.
+        more_grasps: If the verdict is "none of these" and the ranking is clear (`is_clear`): number of further grasps
+            like these after which "match" is expected (`Posterior.more_grasps`). None if too many are needed, and
+            otherwise.
+        embeddings: Embeddings (G, embedding_dim) of the grasps, if they were encoded in this process; absent from JSON.
 
     >>> with retrieval.open("index") as searcher:
     ...     answer = searcher.query(["a.png", "b.png"])
@@ -116,12 +124,12 @@ class QueryResult:
 
     @property
     def top(self) -> Match | None:
-        """The best object; None where nothing was ranked."""
+        """The best object; None without a ranking."""
         return self.results[0] if self.results else None
 
     @property
     def advice(self) -> str | None:
-        """A sentence for people on how to get a clearer answer, where the verdict is "none of these"; else None."""
+        """A sentence on how to get a clearer answer, if the verdict is "none of these"; else None."""
         best = self.top
         if self.verdict != NONE_OF_THESE or best is None or best.probability_if_present is None:
             return None
@@ -138,7 +146,7 @@ class QueryResult:
 
     @property
     def unlisted_probability(self) -> float | None:
-        """Probability of all objects of the catalogue that `results` does not list; None without probabilities."""
+        """Probability of all objects that `results` does not list; None without probabilities."""
         none = self.none_probability
         return (
             None if none is None else unlisted_probability(none, [match.probability or 0.0 for match in self.results])
@@ -146,37 +154,35 @@ class QueryResult:
 
     @property
     def information(self) -> Information | None:
-        """What the grasps told, what is left, and what a further grasp is expected to tell; None without
-        probabilities.
-        """
-        said, none = self.posterior, self.none_probability
-        if said is None or none is None:
+        """Information gained by the grasps, remaining, and expected from another grasp; None without probabilities."""
+        formula, none = self.posterior, self.none_probability
+        if formula is None or none is None:
             return None
         return information(
-            Posterior(said["slope"], said["offset"], said["dependence"]),
-            said["grasps"],
+            Posterior(formula["slope"], formula["offset"], formula["dependence"]),
+            formula["grasps"],
             none,
             [match.probability or 0.0 for match in self.results],
-            objects=said["objects"],
-            none_prior=said["none_prior"],
+            objects=formula["objects"],
+            none_prior=formula["none_prior"],
         )
 
     @classmethod
     def from_dict(cls, document: dict[str, Any]) -> "QueryResult":
-        """Inverse of `to_dict`. Raises BadInput for another document."""
+        """Return the result of a document; the inverse of `to_dict`. Raises BadInput for another document."""
         try:
             matches = [_match(match, Path(document["index"]["catalogue"])) for match in document["results"]]
-            asked = {name: document["query"][name] for name in ("touches", "grasps")}
+            query = {name: document["query"][name] for name in ("touches", "grasps")}
             names = ("index", "timing_ms", "verdict", "none_probability", "posterior")
             others = {name: document[name] for name in names}
-            others["more_grasps"] = document.get("more_grasps")  # a service's history holds documents without it
-            return cls(**asked, results=matches, **others)
+            others["more_grasps"] = document.get("more_grasps")  # old documents in a service's history lack it
+            return cls(**query, results=matches, **others)
         except (KeyError, TypeError) as error:
-            raise BadInput(f"this is not the document of `retrieve query --json`: {error!r}") from error
+            raise BadInput(f"this is not a document of `retrieve query --json`: {error!r}") from error
 
     def to_dict(self) -> dict[str, Any]:
-        """The document of `retrieve query --json`."""
-        told = self.information
+        """Return the document of `retrieve query --json`."""
+        gained = self.information
         return {
             "query": {"touches": self.touches, "grasps": self.grasps},
             "index": self.index,
@@ -186,18 +192,18 @@ class QueryResult:
             "unlisted_probability": self.unlisted_probability,
             "more_grasps": self.more_grasps,
             "advice": self.advice,
-            "information": None if told is None else asdict(told),
+            "information": None if gained is None else asdict(gained),
             "posterior": self.posterior,
             "results": [match.to_dict() for match in self.results],
         }
 
 
-def _match(said: dict[str, Any], catalogue: Path) -> Match:
-    own = {name: value for name, value in said.items() if name != "reference"}
-    reference = said.get("reference")
+def _match(document: dict[str, Any], catalogue: Path) -> Match:
+    own = {name: value for name, value in document.items() if name != "reference"}
+    reference = document.get("reference")
     if reference is not None:
         reference = NearestReference(**{**reference, "touch": tuple(reference["touch"])})
-    return Match(**own, photo_path=catalogue / said["photo"], reference=reference)
+    return Match(**own, photo_path=catalogue / document["photo"], reference=reference)
 
 
 def is_clear(probability_if_present: float) -> bool:
@@ -206,17 +212,17 @@ def is_clear(probability_if_present: float) -> bool:
 
 
 def verdict_sentence(result: QueryResult) -> str:
-    """The verdict as a sentence for people, and which grasps were left out."""
+    """Return the verdict as a sentence, with the grasps that were left out."""
 
     def grasps(shown: str) -> str:
         return ", ".join(str(number) for number, what in enumerate(result.grasps, start=1) if what == shown)
 
     if result.verdict == NO_CONTACT:
-        return "no contact: the gels look untouched; close the jaws on the object, or press harder, and query again"
+        return "no contact: the gels show no contact; close the jaws on the object, or press harder, and query again"
     if result.verdict == NOT_A_GEL:
         return (
-            f"not a gel image: what was given for grasp {grasps(NOT_A_GEL)} does not look like a gel that the model "
-            f"knows (trained on: {result.index['trained_on']}); give gel images, or a model trained on this sensor"
+            f"not a gel image: an image of grasp {grasps(NOT_A_GEL)} does not look like the gels of the model (trained "
+            f"on: {result.index['trained_on']}); give gel images, or use a model trained on this sensor"
         )
     best, none = result.results[0], result.none_probability
     remark = f"; grasps without contact were left out: {grasps(NO_CONTACT)}" if NO_CONTACT in result.grasps else ""
@@ -227,4 +233,4 @@ def verdict_sentence(result: QueryResult) -> str:
             f"none of these: the catalogue lacks the object with probability {none:.2f}; if it has the object, this is "
             f"{best.object_id} with probability {best.probability_if_present:.2f}{remark}. {result.advice}"
         )
-    return f"uncalibrated: {best.object_id} comes first; this model has no probabilities{remark}"
+    return f"uncalibrated: {best.object_id} ranks first; this model has no probabilities{remark}"

@@ -1,4 +1,4 @@
-"""Photos near a photo, by the embeddings that an index keeps."""
+"""Photos similar to a photo, by the embeddings in an index."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,7 @@ from retrieval.search.query.searcher import Searcher
 
 
 class Neighbour(NamedTuple):
-    """A photo and its inner product with the one asked for, 1 for equal pictures.
+    """A photo and the inner product of its embedding with that of the query photo, 1 for equal images.
 
     >>> with retrieval.open("index") as searcher:
     ...     near = retrieval.nearest_photos(searcher, "mug/1.jpg")
@@ -23,9 +23,15 @@ class Neighbour(NamedTuple):
 
 
 def nearest_photos(searcher: Searcher, photo: str, count: int = 10) -> list[Neighbour]:
-    """The photos whose embeddings are nearest to that of `photo`, which is named by its path in the catalogue and left
-    out itself; the nearest first. Raises BadInput for a photo that the index lacks, and for a model whose embeddings
-    were not trained.
+    """Return the photos with the nearest embeddings to that of a photo, the nearest first, without the photo itself.
+
+    Args:
+        searcher: The opened index.
+        photo: Path of the photo in the catalogue.
+        count: Number of photos to return.
+
+    Raises:
+        BadInput: The index lacks the photo, or the model has no trained embeddings.
 
     >>> with retrieval.open("index") as searcher:
     ...     near = retrieval.nearest_photos(searcher, "mug/1.jpg", count=1)
@@ -36,7 +42,7 @@ def nearest_photos(searcher: Searcher, photo: str, count: int = 10) -> list[Neig
     if count < 1:
         raise BadInput(f"count must be 1 or more; got {count}")
     if not searcher.checkpoint.config.has_embeddings:
-        raise BadInput("the embeddings of this model were not trained: nearness by them means nothing")
+        raise BadInput("this model has no trained embeddings, so they cannot measure similarity")
     try:
         own = generation.row_number(photo)
     except KeyError:

@@ -14,7 +14,7 @@ from retrieval.search.query.shard import FolderShard, IndexInfo, Shard, Shards
 from retrieval.search.sharding.object_store import is_sharded, local_folder, read_sharded_manifest
 
 OpenShards = Callable[[str | Path, ShardedManifest, CheckpointInfo], Shard]
-"""Opens the shards of a sharded index in a folder or behind a URL, wherever they are held."""
+"""Opens the shards of a sharded index in a folder or behind a URL, in this process or elsewhere."""
 
 
 def open_index(
@@ -27,6 +27,9 @@ def open_index(
         model: Path of the checkpoint, if it was moved.
         verify: Compare the checksums of the files.
         shards: Opens the shards; None: in this process.
+
+    Returns:
+        The index, and the checkpoint's header.
 
     Raises:
         IndexesError: The index is missing, damaged, or of another model.
@@ -42,39 +45,57 @@ def open_index(
 
 
 def read_checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path | None) -> CheckpointInfo:
-    """Return what the checkpoint of an index says of itself. model: its path, if it was moved.
+    """Return the header of the checkpoint that built an index.
 
-    Raises CheckpointError for a missing or damaged one; `check_fingerprint` refuses another one.
+    The header is not compared with the index; `check_fingerprint` refuses another model.
+
+    Args:
+        manifest: Manifest of the index.
+        model: Path of the checkpoint, if it was moved.
+
+    Raises:
+        CheckpointError: The checkpoint is missing or damaged.
     """
     stored = read_checkpoint_info(Path(model) if model else defaults.model_of(manifest))
     if stored.digest != manifest.fingerprint.get("checkpoint"):
         from retrieval.model.checkpoint import load_checkpoint
 
-        load_checkpoint(stored.path)  # a damaged one says so
+        load_checkpoint(stored.path)  # raises an error for a damaged checkpoint
     return stored
 
 
 def folder_shard(generation: Generation, stored: CheckpointInfo) -> FolderShard:
-    """Return an opened generation with the scoring layers. Raises MismatchedIndex for another model, CorruptIndex."""
+    """Return a shard of an opened generation and the scoring layers. Raises MismatchedIndex or CorruptIndex."""
     generation.require(fingerprint(stored))
     check_usable(generation, stored.config.matcher.partial_width)
     return FolderShard(generation, read_scorer(stored.path), stored.config.has_embeddings)
 
 
 def open_sharded_index(
-    cluster: str | Path, manifest: ShardedManifest, stored: CheckpointInfo, verify: bool = True
+    index: str | Path, manifest: ShardedManifest, stored: CheckpointInfo, verify: bool = True
 ) -> Shard:
-    """Open all shards of a sharded index in this process; those behind a URL are fetched first. Raises IndexesError."""
-    check_fingerprint(cluster, manifest.fingerprint, fingerprint(stored))
+    """Open all shards of a sharded index in this process.
+
+    Args:
+        index: Its folder, or its URL, from which the shards are fetched first.
+        manifest: Its manifest.
+        stored: Header of the checkpoint.
+        verify: Compare the checksums of the files.
+
+    Raises:
+        IndexesError: A shard is missing or damaged, or the index is of another model.
+        StorageError: The storage behind the URL fails.
+    """
+    check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
     opened = (
-        open_shard(local_folder(cluster, entry), entry, manifest.fingerprint, verify=verify, threads=1)
+        open_shard(local_folder(index, entry), entry, manifest.fingerprint, verify=verify, threads=1)
         for entry in manifest.shards
     )
     return Shards([folder_shard(generation, stored) for generation in opened], sharded_index_info(manifest))
 
 
 def sharded_index_info(manifest: ShardedManifest) -> IndexInfo:
-    """Return what the manifest says of all shards together."""
+    """Return the information about a sharded index from its manifest."""
     return IndexInfo(
         manifest.generation,
         manifest.kind,

@@ -1,4 +1,4 @@
-"""Reference touches of an opened index: what they say of its objects, and which of them is nearest."""
+"""Reference touches of an opened index: their contribution to object logits, and the nearest one of an object."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -48,19 +48,30 @@ class _ReferenceDocument:
 
 
 class References:
-    """Touches of a generation's objects; `count` objects are numbered as in `Objects`."""
+    """Reference touches of a generation's objects, which are numbered as in `Objects`.
+
+    `similarities` (count,) is the value C of each object with the grasps of a query, NaN without a reference
+    (`retrieval.model.reference_calibration`).
+    """
 
     def __init__(self, generation: Generation, objects: Objects, hidden: int) -> None:
-        """hidden: numbers of a half before its embedding. Raises CorruptIndex."""
+        """Read and check the references.
+
+        Args:
+            generation: An opened generation with reference touches.
+            objects: Its objects.
+            hidden: Number of entries of a partial activation before the embedding.
+
+        Raises:
+            CorruptIndex: The documents are damaged.
+        """
         where, documents = generation.folder, generation.documents
         try:
             listed = typed(documents[REFERENCE_ROWS], _ReferenceDocument)
             if not all(len(one.touch) == len(one.digests) and all(map(is_inside, one.touch)) for one in listed.touches):
-                raise ValueError("a gel image lies outside the catalogue or has no digest")
+                raise ValueError("a gel image is outside the catalogue or has no digest")
         except ValueError as error:
-            raise CorruptIndex(
-                f"{where}: its list of reference touches is not what the format says ({error}); {AGAIN}"
-            ) from error
+            raise CorruptIndex(f"{where}: the list of reference touches is invalid ({error}); {AGAIN}") from error
         touches, touch_only = listed.touches, listed.touch_only
         partials = documents.get(REFERENCE_PARTIALS)
         width = generation.arrays["partials"].shape[1]
@@ -69,77 +80,99 @@ class References:
             or partials.shape != (len(touches), width)
             or partials.dtype.kind != "f"
         ):
-            raise CorruptIndex(f"{where}: it must hold a half of {width} numbers of each reference touch; {AGAIN}")
+            raise CorruptIndex(
+                f"{where}: each reference touch must have a partial activation of {width} numbers; {AGAIN}"
+            )
         try:
             self.calibration = ReferenceCalibration.from_dict(
                 reference_summary(generation.manifest.about).get("calibration")
             )
         except (BadInput, TypeError) as error:
-            raise CorruptIndex(f"{where}: what its references are worth is damaged ({error}); {AGAIN}") from error
+            raise CorruptIndex(f"{where}: the calibration of its references is damaged ({error}); {AGAIN}") from error
         known = objects.numbers_of([one.object_id for one in touches] + touch_only)
-        numbers, shown_alone = known[: len(touches)], known[len(touches) :]
-        order = np.flatnonzero(numbers >= 0)  # an object whose photos are all broken has no number
+        numbers, without_photos = known[: len(touches)], known[len(touches) :]
+        order = np.flatnonzero(numbers >= 0)  # an object without a readable photo has no number
         order = order[np.argsort(numbers[order], kind="stable")]
         self._touches, self._all = [touches[row].touch for row in order], touches
         self._codes: Floats = touch_embeddings(partials[order], hidden)
         self._objects, self._starts = np.unique(numbers[order], return_index=True)
-        self._hidden, self._alone = hidden, np.zeros(objects.count, np.bool_)
-        self._alone[shown_alone[shown_alone >= 0]] = True
+        self._hidden, self._touch_only = hidden, np.zeros(objects.count, np.bool_)
+        self._touch_only[without_photos[without_photos >= 0]] = True
 
     def image(self, path: str) -> dict[str, Any] | None:
-        """A row for the gel image at this path of the catalogue, as those of photos, but with `touch`; None where no
-        reference has it.
+        """Return a row for a gel image of a reference touch, like a photo's row but with `touch`.
+
+        Args:
+            path: Path of the gel image in the catalogue.
+
+        Returns:
+            The row; None if no reference has this image.
         """
         if path not in self._images:
             return None
         one, digest = self._images[path]
-        told = {"object_id": one.object_id, "digest": digest, "metadata": {}, "touch": True}
-        return {"id": path, "path": path, **told}
+        fields = {"object_id": one.object_id, "digest": digest, "metadata": {}, "touch": True}
+        return {"id": path, "path": path, **fields}
 
     @cached_property
     def _images(self) -> dict[str, tuple[_ReferenceTouch, str]]:
-        """Touch and digest of each gel image; a query needs none of it."""
+        """Touch and digest of each gel image; queries do not need them."""
         return {path: (one, digest) for one in self._all for path, digest in zip(one.touch, one.digests, strict=True)}
 
-    def near(self, partials: Floats) -> Nearness:
-        """C (count,) of the grasps with these halves (G, half) with every object; NaN where it has no reference."""
-        found = np.full(len(self._alone), np.nan)
+    def nearness_to_objects(self, partials: Floats) -> Nearness:
+        """Return the similarities (count,) of grasps, given by partial activations (G, partial_width), with objects."""
+        found = np.full(len(self._touch_only), np.nan)
         if len(self._objects):
             found[self._objects] = reference_similarity(
                 touch_embeddings(partials, self._hidden) @ self._codes.T, self._starts
             ).sum(0)
         return found
 
-    def nearest_objects(self, near: Nearness, most: int) -> Numbers:
-        """At most so many objects of largest C."""
-        order = np.argsort(-near[self._objects], kind="stable")
+    def nearest_objects(self, similarities: Nearness, most: int) -> Numbers:
+        """Return the objects with the largest similarities, at most `most`."""
+        order = np.argsort(-similarities[self._objects], kind="stable")
         return np.asarray(self._objects[order[:most]])
 
     def combine(
         self,
-        judged: ScoredObjects,
+        scored: ScoredObjects,
         both_logits: ScoredObjects | None,
-        near: Nearness,
+        similarities: Nearness,
         posterior: Posterior,
         grasps: int,
     ) -> ScoredObjects:
-        """The objects with the logits that photos and references give them together.
+        """Return the objects with the combined logits of photos and references.
 
-        by_both: the same objects by their photos, as the posterior beside references takes these; None where no object
-        has both.
+        Args:
+            scored: Objects scored by their photos.
+            both_logits: The same objects, scored by photos with the posterior for photos next to references; None if
+                no object has both.
+            similarities: Similarities (count,) with the references.
+            posterior: Posterior of photos.
+            grasps: Number of grasps.
         """
-        mine, touch_only = near[judged.numbers], self._alone[judged.numbers]
-        felt, logits = np.isfinite(mine), judged.logits.copy()
-        one = felt & touch_only
+        mine, touch_only = similarities[scored.numbers], self._touch_only[scored.numbers]
+        touched, logits = np.isfinite(mine), scored.logits.copy()
+        one = touched & touch_only
         logits[one] = posterior.logit_of(self.calibration.touch_only.log_ratio(mine[one], grasps), grasps)
-        both = felt & ~touch_only
+        both = touched & ~touch_only
         if both_logits is not None and self.calibration.with_photos is not None and self.calibration.weight is not None:
             sums = both_logits.logits[both] + self.calibration.weight * mine[both]
             logits[both] = posterior.logit_of(self.calibration.with_photos.log_ratio(sums, grasps), grasps)
-        return judged._replace(logits=logits, photo_logits=np.where(touch_only, np.nan, judged.logits))
+        return scored._replace(logits=logits, photo_logits=np.where(touch_only, np.nan, scored.logits))
 
     def nearest(self, number: int, partials: Floats, logit: float, photo_logits: float) -> NearestReference | None:
-        """That of an object, with its logit and the one that photos alone give it (NaN without photos)."""
+        """Return the nearest reference touch of an object.
+
+        Args:
+            number: Number of the object.
+            partials: Partial activations (G, partial_width) of the grasps.
+            logit: Logit of the object.
+            photo_logits: Its logit from photos only; NaN without photos.
+
+        Returns:
+            The reference; None if the object has none.
+        """
         place = int(np.searchsorted(self._objects, number))
         if place == len(self._objects) or self._objects[place] != number:
             return None
@@ -152,8 +185,6 @@ class References:
 
 
 def reference_summary(about: Mapping[str, Any]) -> dict[str, Any]:
-    """What a manifest says of reference touches: how many, of how many objects, and what they are worth; nothing where
-    there are none.
-    """
+    """Return a manifest's entries about reference touches: counts and calibration; empty without references."""
     counts, calibration = about.get(REFERENCE_ROWS), about.get(REFERENCE_CALIBRATION)
     return {**counts, **calibration} if isinstance(counts, dict) and isinstance(calibration, dict) else {}

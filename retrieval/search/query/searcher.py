@@ -37,10 +37,10 @@ Floats = NDArray[np.float32]
 
 
 class Searcher:
-    """An opened index with its model, for any number of queries.
+    """An opened index with its model.
 
-    Any number of threads may query it at once, and a process forked from this one too: no thread or lock outlives a
-    query. `close` it, or open it by `with`; a query that is under way then is answered.
+    Any number of threads may query it at once, and forked processes too: no thread or lock outlives a query. Close it
+    with `close` or a `with` block; running queries then finish.
 
     >>> searcher = retrieval.open("index")
     >>> one = searcher.query(["a.png", "b.png"], top=2)
@@ -60,13 +60,13 @@ class Searcher:
         self.gel_check = checkpoint.gel_check
         compares_contact = self.gel_check is not None and self.gel_check.level_above is not None
         self.reader = TouchReader(checkpoint.config, encoder, compares_contact)
-        self.posterior: Posterior | None = None  # where the model was never calibrated
+        self.posterior: Posterior | None = None  # None: the model is not calibrated
         if self.info.calibration is not None:
             try:
                 self.posterior = Posterior.from_dict(self.info.calibration)
             except BadInput as error:
                 raise UnsupportedFormat(
-                    f"the calibration in {index} is of another version ({error}); run `retrieve build-index` again"
+                    f"{index}: the calibration has another version ({error}); run `retrieve build-index` again"
                 ) from error
         self.catalogue = Path(self.info.about["catalogue"])
         self._closed = False
@@ -81,17 +81,17 @@ class Searcher:
         threads: int | None = None,
         shards: OpenShards | None = None,
     ) -> "Searcher":
-        """Open the current generation of an index, or of a sharded index, with the checkpoint that built it.
+        """Open the current generation of an index or a sharded index, with the checkpoint that built it.
 
-        Touches are encoded by the export of the checkpoint (`retrieval.model.export`) if one lies beside it or in the
-        user's cache, without PyTorch.
+        If an export of the checkpoint (`retrieval.model.export`) is in its folder or in the user's cache, the export
+        encodes touches, without PyTorch.
 
         Args:
             index: Its folder; or the URL of a sharded index, whose shards are fetched once into the user's cache.
             model: Path of the checkpoint, if it was moved.
             verify: Compare the checksums of the index's files.
-            threads: Number of threads that encode a touch; None: the library's choice. PyTorch has one number for all
-                computation of a process.
+            threads: Number of threads that encode a touch; None: the library's choice. With PyTorch it applies to the
+                whole process.
             shards: Opens the shards of a sharded index; None: in this process.
 
         Raises:
@@ -111,14 +111,14 @@ class Searcher:
         return cls(url_or_path(index), shard, stored, encoder, read_scorer(stored.path))
 
     def close(self) -> None:
-        """Release index and model; queries in other threads are answered first. Does nothing twice."""
+        """Release the index and the model; running queries finish first. A second call does nothing."""
         self._closed = True
         for name in ("shard", "encoder", "reader", "scorer"):
             vars(self).pop(name, None)
 
     def __reduce__(self) -> NoReturn:
         raise BadInput(
-            "a Searcher cannot be pickled, as it holds opened files and a model; open the index in each process: "
+            "a Searcher cannot be pickled: it has opened files and a model. Open the index in each process: "
             f"retrieval.open({str(self.index)!r})"
         )
 
@@ -136,7 +136,7 @@ class Searcher:
     def _folder(self) -> FolderShard:
         shard = self._snapshot().shard
         if not isinstance(shard, FolderShard):
-            raise BadInput(f"{self.index} is a cluster of index folders, and this wants one; open a shard of it")
+            raise BadInput(f"{self.index} is a sharded index, but one index folder is required; open one of its shards")
         return shard
 
     def __enter__(self) -> "Searcher":
@@ -158,19 +158,19 @@ class Searcher:
     ) -> QueryResult:
         """Rank the objects of the catalogue by one or more grasps of the object in the hand.
 
-        Only grasps with contact count. Match logits of several grasps add; `retrieval.model.posterior` states how the
-        sums become probabilities of the objects and of "none of these".
+        Only grasps with contact count. Match logits of several grasps add up; `retrieval.model.posterior` converts
+        the sums to probabilities of the objects and of "none of these".
 
         Args:
             touches: One grasp, a list with an image for each finger in their order; or a list of such grasps. For a
-                model with one finger an image alone is a grasp too. An image is a path, the bytes of a file, a Pillow
-                image, or an array (height, width, 3) of uint8, red first: OpenCV reads blue first, so turn its arrays
-                by `image[..., ::-1]`. A file and its decoded array give the same answer.
-            background: The fingers' no-contact frames, for a model that subtracts them or compares with them.
+                model with one finger a single image is a grasp too. An image is a path, the bytes of a file, a Pillow
+                image, or an array (height, width, 3) of uint8, red first. OpenCV arrays have blue first: convert them
+                with `image[..., ::-1]`. A file and its decoded array give the same answer.
+            background: The fingers' no-contact frames, for a model that uses them.
             top: Number of objects to return.
-            candidates: Number of photos to rerank, at least `top`: those nearest to all grasps together; None: as
-                measured for the index. All photos are reranked if they are no more than that, or if the model has no
-                trained embeddings.
+            candidates: Number of photos to rerank, at least `top`: the nearest to all grasps together; None: as
+                measured for the index. All photos are scored if there are no more, or if the model has no trained
+                embeddings.
             none_prior: Prior probability that the catalogue lacks the object.
 
         Raises:
@@ -178,9 +178,9 @@ class Searcher:
             ImageError: An image cannot be read.
             NumericalError: A logit is not finite.
         """
-        held = self._snapshot()
-        grasps = parse_grasps(touches, held.reader.fingers)
-        return held._answers(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
+        opened = self._snapshot()
+        grasps = parse_grasps(touches, opened.reader.fingers)
+        return opened._answers(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
 
     def query_cumulative(
         self,
@@ -191,17 +191,17 @@ class Searcher:
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
     ) -> list[QueryResult]:
-        """Return what `query` answers after the first grasp, after the first two, and so on; each is encoded once.
+        """Return the results of `query` after the first grasp, the first two, and so on; each grasp is encoded once.
 
         >>> with retrieval.open("index") as searcher:
         ...     after_one, after_two = searcher.query_cumulative([["a.png", "b.png"], ["a2.png", "b2.png"]])
         >>> len(after_one.touches), len(after_two.touches)
         (1, 2)
         """
-        held = self._snapshot()
-        grasps = parse_grasps(touches, held.reader.fingers)
+        opened = self._snapshot()
+        grasps = parse_grasps(touches, opened.reader.fingers)
         spans = [slice(count) for count in range(1, len(grasps) + 1)]
-        return held._answers(grasps, spans, background, top, candidates, none_prior)
+        return opened._answers(grasps, spans, background, top, candidates, none_prior)
 
     def query_many(
         self,
@@ -212,43 +212,41 @@ class Searcher:
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
     ) -> list[QueryResult]:
-        """Return the answer for each of several objects in the hand, given as `query` takes them.
+        """Return the result for each of several objects in the hand, each as `query` takes it.
 
-        Touches are encoded in batches, so logits are within 1e-4 of those of single queries. If the touches of one
-        object cannot be used, the error names it and nothing is answered.
+        Touches are encoded in batches, so logits differ by at most 1e-4 from single queries. If the touches of one
+        object are invalid, the error names the object and no query runs.
         """
-        held = self._snapshot()
-        asked = [
-            parse_grasps(touches, held.reader.fingers, of=f"object {number}, ")
-            for number, touches in enumerate(objects, 1)
-        ]
-        ends = np.cumsum([len(grasps) for grasps in asked]).tolist()
-        spans = [slice(end - len(grasps), end) for end, grasps in zip(ends, asked, strict=True)]
-        every = [grasp for grasps in asked for grasp in grasps]
-        return held._answers(every, spans, background, top, candidates, none_prior)
+        opened = self._snapshot()
+        fingers = opened.reader.fingers
+        parsed = [parse_grasps(one, fingers, of=f"object {number}, ") for number, one in enumerate(objects, 1)]
+        ends = np.cumsum([len(grasps) for grasps in parsed]).tolist()
+        spans = [slice(end - len(grasps), end) for end, grasps in zip(ends, parsed, strict=True)]
+        every = [grasp for grasps in parsed for grasp in grasps]
+        return opened._answers(every, spans, background, top, candidates, none_prior)
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> EncodedTouches:
-        """Return the unit embeddings (G, embedding_dim) and partial activations (G, half) of G grasps.
+        """Return the unit embeddings (G, embedding_dim) and partial activations (G, partial_width) of G grasps.
 
         The inner product of a grasp's embedding with a photo's (`retrieval.embed_photos`) orders candidates; it is not
-        a probability. Match logits, summed over the grasps, are `searcher.scorer.logits(partials, photo_partials)`.
+        a probability. `searcher.scorer.logits(partials, photo_partials)` gives match logits, summed over the grasps.
 
         Args:
             touches: As `query` takes them.
             background: As `query` takes it.
         """
-        held = self._snapshot()
-        grasps = parse_grasps(touches, held.reader.fingers)
-        codes = held.reader.encode(grasps, held.reader.no_contact_frames(background), Stopwatch())
+        opened = self._snapshot()
+        grasps = parse_grasps(touches, opened.reader.fingers)
+        codes = opened.reader.encode(grasps, opened.reader.no_contact_frames(background), Stopwatch())
         return EncodedTouches(codes.embeddings, codes.partials)
 
     def _snapshot(self) -> "Searcher":
-        """This searcher with all it needs, so that `close` in another thread takes nothing away from a query."""
-        held = object.__new__(type(self))
-        vars(held).update(vars(self))
-        if held._closed:
-            raise BadInput(f"this searcher of {self.index} was closed; open the index again")
-        return held
+        """Return a copy with references to all resources, so that `close` in another thread cannot break a query."""
+        opened = object.__new__(type(self))
+        vars(opened).update(vars(self))
+        if opened._closed:
+            raise BadInput(f"this searcher of {self.index} is closed; open the index again")
+        return opened
 
     def _answers(
         self,
@@ -259,7 +257,7 @@ class Searcher:
         candidates: int | None,
         none_prior: float,
     ) -> list[QueryResult]:
-        """An answer for each object in the hand; each span selects the grasps of one object."""
+        """Return a result for each object in the hand; each span selects the grasps of one object."""
         require_counts(top, candidates)
         require_prior(none_prior)
         if not grasps:
@@ -269,33 +267,32 @@ class Searcher:
         shown = np.full(len(codes.partials), CONTACT)
         if self.gel_check is not None and codes.readings is not None:
             shown = np.array(self.gel_check.classify(codes.readings, codes.levels))
-        judged = []
-        for its in spans:
-            felt = (shown[its] == CONTACT) & (shown[its] != NOT_A_GEL).all()
-            own = ShardQuery(codes.embeddings[its][felt], codes.partials[its][felt])
-            judged.append(self._score(own, top, candidates, none_prior, clock))
+        scored = []
+        for span in spans:
+            in_contact = (shown[span] == CONTACT) & (shown[span] != NOT_A_GEL).all()
+            query = ShardQuery(codes.embeddings[span][in_contact], codes.partials[span][in_contact])
+            scored.append(self._score(query, top, candidates, none_prior, clock))
         timing_ms = clock.finish(len(spans))
         return [
-            self._answer(grasps[its], shown[its].tolist(), codes.embeddings[its], timing_ms, found, none_prior)
-            for its, found in zip(spans, judged, strict=True)
+            self._answer(grasps[span], shown[span].tolist(), codes.embeddings[span], timing_ms, found, none_prior)
+            for span, found in zip(spans, scored, strict=True)
         ]
 
     def _score(
-        self, felt: ShardQuery, top: int, candidates: int | None, none_prior: float, clock: Stopwatch
+        self, query: ShardQuery, top: int, candidates: int | None, none_prior: float, clock: Stopwatch
     ) -> "_ScoredQuery | None":
-        """The best objects and their posterior; None without a grasp with contact."""
-        if not len(felt.partials):
+        """Return the best objects and their probabilities; None without a grasp with contact."""
+        grasps = len(query.partials)
+        if not grasps:
             clock.add({"candidates": 0.0, "rerank": 0.0})
             return None
-        found = self.shard.search(felt, top, candidates, self.posterior)
+        found = self.shard.search(query, top, candidates, self.posterior)
         clock.add({stage: found.timing_ms[stage] for stage in ("candidates", "rerank")})
-        posterior_probabilities = None
+        probabilities = None
         if self.posterior is not None and found.mass is not None:
             logits = [one.logit for one in found.best]
-            posterior_probabilities = self.posterior.probabilities_given(
-                logits, found.mass, len(felt.partials), none_prior
-            )
-        return _ScoredQuery(found, len(felt.partials), posterior_probabilities)
+            probabilities = self.posterior.probabilities_given(logits, found.mass, grasps, none_prior)
+        return _ScoredQuery(found, grasps, probabilities)
 
     def _answer(
         self,
@@ -303,13 +300,13 @@ class Searcher:
         shown: list[str],
         embeddings: Floats,
         timing_ms: dict[str, float],
-        judged: "_ScoredQuery | None",
+        scored: "_ScoredQuery | None",
         none_prior: float,
     ) -> QueryResult:
-        info, posterior_probabilities = self.info, judged.posterior_probabilities if judged else None
-        verdict = _verdict(shown, posterior_probabilities)
-        searched = judged.found.searched if judged else info.photos
-        shares = {"shards": info.shards, "searched": searched / info.photos} if info.shards > 1 else {}
+        info, probabilities = self.info, scored.probabilities if scored else None
+        verdict = _verdict(shown, probabilities)
+        searched = scored.found.searched if scored else info.photos
+        sharding = {"shards": info.shards, "searched": searched / info.photos} if info.shards > 1 else {}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
             grasps=shown,
@@ -319,8 +316,8 @@ class Searcher:
                 "kind": info.kind,
                 "photos": info.photos,
                 "objects": info.objects,
-                "scored": judged.found.photos if judged else 0,
-                **shares,
+                "scored": scored.found.photos if scored else 0,
+                **sharding,
                 "encoder": self.encoder.name,
                 "catalogue": str(info.about["catalogue"]),
                 "model": str(self.checkpoint.path),
@@ -328,78 +325,74 @@ class Searcher:
             },
             timing_ms=timing_ms,
             verdict=verdict,
-            none_probability=posterior_probabilities.none if posterior_probabilities else None,
-            posterior=self._formula(judged, none_prior) if judged else None,
-            results=self._ranking(judged) if judged else [],
-            more_grasps=self._more_grasps(judged, none_prior) if verdict == NONE_OF_THESE and judged else None,
+            none_probability=probabilities.none if probabilities else None,
+            posterior=self._formula(scored, none_prior) if scored else None,
+            results=self._ranking(scored) if scored else [],
+            more_grasps=self._more_grasps(scored, none_prior) if verdict == NONE_OF_THESE and scored else None,
             embeddings=embeddings,
         )
 
-    def _more_grasps(self, judged: "_ScoredQuery", none_prior: float) -> int | None:
-        """Further grasps after which the verdict is expected to be a match; None where the ranking is not clear."""
-        mass, posterior_probabilities = judged.found.mass, judged.posterior_probabilities
-        if (
-            self.posterior is None
-            or posterior_probabilities is None
-            or mass is None
-            or not is_clear(float(posterior_probabilities.objects_if_present[0]))
-        ):
+    def _more_grasps(self, scored: "_ScoredQuery", none_prior: float) -> int | None:
+        """Return the number of further grasps until a match is expected; None if the ranking is not clear."""
+        mass, probabilities = scored.found.mass, scored.probabilities
+        if self.posterior is None or probabilities is None or mass is None:
             return None
-        return self.posterior.more_grasps(judged.found.best[0].logit, mass.objects, judged.grasps, none_prior)
+        if not is_clear(float(probabilities.objects_if_present[0])):
+            return None
+        return self.posterior.more_grasps(scored.found.best[0].logit, mass.objects, scored.grasps, none_prior)
 
-    def _ranking(self, judged: "_ScoredQuery") -> list[Match]:
-        ranking, base, posterior_probabilities = [], self.catalogue.absolute(), judged.posterior_probabilities
-        for rank, (logit, photo, reference) in enumerate(judged.found.best, start=1):
-            probability = None if posterior_probabilities is None else float(posterior_probabilities.objects[rank - 1])
-            if_present = (
-                None if posterior_probabilities is None else float(posterior_probabilities.objects_if_present[rank - 1])
-            )
-            told = (rank, photo.object_id, logit, probability, photo.path, photo.metadata)
-            ranking.append(Match(*told, base / photo.path, reference, if_present))
+    def _ranking(self, scored: "_ScoredQuery") -> list[Match]:
+        ranking, base, probabilities = [], self.catalogue.absolute(), scored.probabilities
+        for rank, (logit, photo, reference) in enumerate(scored.found.best, start=1):
+            probability = None if probabilities is None else float(probabilities.objects[rank - 1])
+            if_present = None if probabilities is None else float(probabilities.objects_if_present[rank - 1])
+            fields = (rank, photo.object_id, logit, probability, photo.path, photo.metadata)
+            ranking.append(Match(*fields, base / photo.path, reference, if_present))
         return ranking
 
-    def _formula(self, judged: "_ScoredQuery", none_prior: float) -> dict[str, Any] | None:
-        """The formula of the probabilities, with the numbers of this answer."""
-        if self.posterior is None or judged.posterior_probabilities is None:
+    def _formula(self, scored: "_ScoredQuery", none_prior: float) -> dict[str, Any] | None:
+        """Return the formula of the probabilities, with the numbers of this query."""
+        if self.posterior is None or scored.probabilities is None:
             return None
+        references = reference_summary(self.info.about)
         return {
             **self.posterior.to_dict(),
             "none_prior": none_prior,
-            "grasps": judged.grasps,
+            "grasps": scored.grasps,
             "objects": self.info.objects,
-            "scored_objects": judged.found.objects,
-            "unscored_probability": judged.posterior_probabilities.unscored,
-            **({REFERENCE_ROWS: told} if (told := reference_summary(self.info.about)) else {}),
+            "scored_objects": scored.found.objects,
+            "unscored_probability": scored.probabilities.unscored,
+            **({REFERENCE_ROWS: references} if references else {}),
         }
 
 
 class _ScoredQuery(NamedTuple):
-    """The result for one object in the hand, the number of its grasps with contact, and the posterior."""
+    """The result for one object in the hand, its number of grasps with contact, and the probabilities."""
 
     found: ShardResult
     grasps: int
-    posterior_probabilities: PosteriorProbabilities | None
+    probabilities: PosteriorProbabilities | None
 
 
-def _verdict(shown: Sequence[str], posterior_probabilities: PosteriorProbabilities | None) -> str:
+def _verdict(shown: Sequence[str], probabilities: PosteriorProbabilities | None) -> str:
     if NOT_A_GEL in shown:
         return NOT_A_GEL
     if CONTACT not in shown:
         return NO_CONTACT
-    if posterior_probabilities is None:
+    if probabilities is None:
         return UNCALIBRATED
-    return MATCH if posterior_probabilities.is_match else NONE_OF_THESE
+    return MATCH if probabilities.is_match else NONE_OF_THESE
 
 
 def require_counts(top: int, candidates: int | None) -> None:
-    """Raises BadInput for numbers of objects or candidates that are none."""
-    given: list[object] = [top] if candidates is None else [top, candidates]
-    if not all(isinstance(count, int | np.integer) and count >= 1 for count in given):
+    """Check numbers of objects and candidates. Raises BadInput unless they are whole numbers of at least 1."""
+    counts: list[object] = [top] if candidates is None else [top, candidates]
+    if not all(isinstance(count, int | np.integer) and count >= 1 for count in counts):
         raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
 
 
 def torch_encoder(stored: CheckpointInfo, threads: int | None = None) -> TouchEncoder:
-    """The towers in PyTorch, whose import takes longer than all the rest."""
+    """Return an encoder of the towers in PyTorch, whose slow import happens here."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.encode import TorchEncoder
 

@@ -1,10 +1,11 @@
-"""What can be searched: the photos of an index folder, or of several that are one catalogue together.
+"""Shards: the photos of one index folder, or of several that together form one catalogue.
 
-Whoever asks has the codes of touches and gets the best objects, and what all others weigh: an answer is made of that
-alone, however many photos there are. No photo's half, no list of candidates and no other object's logit leaves a shard.
+A query sends the codes of touches and receives the best objects and the evidence mass of all objects. A result has
+this size for any number of photos: partial activations of photos, candidates and logits of other objects stay in the
+shard.
 
-An object's photos all lie in one shard, so that its logit is known there. Merged, the best of all shards are the best
-of the catalogue, and the sums of their likelihoods are its sum.
+All photos of an object are in one shard, which therefore computes the object's logit. The best objects of all shards
+include the best of the catalogue, and their evidence masses add up to the total.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,22 +30,22 @@ from retrieval.search.query.reference_touches import Nearness, References
 
 DEFAULT_CANDIDATES = 1000
 MIN_COMPLETED_OBJECTS = 20
-"""Objects, at least, of which every photo is judged."""
+"""Smallest number of best objects whose photos are all scored."""
 MIN_SUM_NORM = 1e-5
-"""Length of a sum of unit embeddings that is rounding alone."""
+"""Norm of a sum of unit embeddings below which it is only rounding error."""
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
 
 
 class ShardQuery(NamedTuple):
-    """Grasps of one object that felt something: embeddings (G, embedding_dim) and halves (G, half), G > 0."""
+    """Grasps with contact of one object: embeddings (G, embedding_dim) and partials (G, partial_width), G > 0."""
 
     embeddings: Floats
     partials: Floats
 
 
 class RankedObject(NamedTuple):
-    """An object with its logit, the photo that shows it best, and its nearest reference touch where it has any."""
+    """An object with its logit, its best photo, and its nearest reference touch if it has any."""
 
     logit: float
     photo: ListedPhoto
@@ -53,11 +54,15 @@ class RankedObject(NamedTuple):
 
 @dataclass(frozen=True)
 class ShardResult:
-    """What a shard says of one object in the hand.
+    """The result of a shard for one object in the hand.
 
-    photos, objects: how many were judged. best: at most as many objects as asked for, the best first, equals by name.
-    mass: what all objects weigh; None where the model was never calibrated. searched: photos that could have been
-    candidates, which are all where every shard answered. timing_ms: by stage.
+    Attributes:
+        photos: Number of scored photos.
+        objects: Number of scored objects.
+        best: The best objects, ordered by (-logit, name), at most the requested number.
+        mass: Evidence mass of all objects; None if the model is not calibrated.
+        searched: Number of photos that could be candidates: all photos, unless a shard did not answer.
+        timing_ms: Milliseconds by stage.
     """
 
     photos: int
@@ -70,11 +75,17 @@ class ShardResult:
 
 @dataclass(frozen=True)
 class IndexInfo:
-    """What is known of a shard without asking it.
+    """Information about an index or a shard, available without a search.
 
-    name: of the generation, or of the whole cluster's. kind: of the candidate search. photos, objects: how many.
-    fingerprint: what made its codes. about: what its manifest says besides, the catalogue and the checkpoint among it.
-    calibration: the posterior as the index has it, None without one. shards: index folders.
+    Attributes:
+        name: Name of the generation.
+        kind: Kind of index of candidate search.
+        photos: Number of photos.
+        objects: Number of objects.
+        fingerprint: Origin of the codes.
+        about: Further manifest entries, such as the catalogue and the checkpoint.
+        calibration: The posterior as stored in the index; None without one.
+        shards: Number of index folders.
     """
 
     name: str
@@ -88,43 +99,59 @@ class IndexInfo:
 
 
 class Page(NamedTuple):
-    """Some rows of so many that there are in all."""
+    """Some rows, and the total number of matching rows."""
 
     total: int
     rows: list[dict[str, Any]]
 
 
 class Shard(Protocol):
-    """What a searcher searches. Any number of threads may ask at once."""
+    """Photos that a searcher searches. Any number of threads may call the methods at once."""
 
     @property
     def info(self) -> IndexInfo:
-        """What is known without asking."""
+        """Information that needs no search."""
 
     def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
-        """The best `top` objects for these grasps, and what all weigh.
+        """Return the best objects for the grasps of a query, and the evidence mass of all objects.
 
-        candidates: photos that the full classifier judges, in each index folder, `top` at least; None: as many as
-        measured there. Raises NumericalError.
+        Args:
+            query: The grasps.
+            top: Number of objects to return.
+            candidates: Number of photos that each index folder reranks, at least `top`; None: as measured there.
+            posterior: Converts logits to probabilities; None: the model is not calibrated.
+
+        Raises:
+            NumericalError: A logit is not finite.
         """
 
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
-        """The rows of these photos, and of gel images of reference touches, which have `touch`; None for one that is
-        not there.
-        """
+        """Return the rows of photos, and of gel images of reference touches, which have `touch`; None if missing."""
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
-        """Photos in whose object, path and metadata all these words stand, in small letters, and of that object alone
-        where one is named; at most `limit` of them, from the one at `offset`.
+        """Return a page of the photos that contain all words in object, path or metadata.
+
+        Args:
+            words: Lower-case words.
+            object_id: Return only photos of this object; None: of all objects.
+            offset: Number of photos to skip.
+            limit: Largest number of photos to return.
         """
 
 
 class FolderShard:
-    """The photos of one generation of an index folder, opened in this process: candidates by its index, judged by the
-    model's head. Threads may ask it at once; they wait for each other only where words are looked for in all rows.
+    """The photos of one generation of an index folder, opened in this process.
 
-    judge: the layers of the head that take halves. has_embeddings: whether the model's embeddings were trained;
-    without, every photo is judged. Objects with reference touches are judged by these, too. Raises CorruptIndex.
+    Its index finds candidates, and the model's head reranks them. Reference touches contribute to the logits of their
+    objects. Threads may search at once; they wait for each other only for the text search over all rows.
+
+    Args:
+        generation: The opened generation.
+        scorer: Layers of the head that take partial activations.
+        has_embeddings: Whether the model has trained embeddings; without them every photo is scored.
+
+    Raises:
+        CorruptIndex: The reference touches are damaged.
     """
 
     def __init__(self, generation: Generation, scorer: FusionScorer, has_embeddings: bool) -> None:
@@ -136,7 +163,7 @@ class FolderShard:
 
     @property
     def info(self) -> IndexInfo:
-        """What is known without asking."""
+        """Information that needs no search."""
         manifest = self.generation.manifest
         return IndexInfo(
             manifest.generation,
@@ -149,15 +176,15 @@ class FolderShard:
         )
 
     def search(self, query: ShardQuery, top: int, candidates: int | None, posterior: Posterior | None) -> ShardResult:
-        """As `Shard.search`. Candidates are some photos of an object: of the best objects the others are judged too."""
+        """As `Shard.search`. Remaining photos of the best objects are scored too."""
         clock = Stopwatch()
         with clock("candidates"):
             limit = self.limit(top, candidates)
-            near = None if self.references is None else self.references.near(query.partials)
-            rows = self._candidates(query.embeddings, near, limit)
+            similarities = None if self.references is None else self.references.nearness_to_objects(query.partials)
+            rows = self._candidates(query.embeddings, similarities, limit)
         with clock("rerank"):
-            objects, photos = self._score_objects(query.partials, rows, top, posterior or Posterior(), near)
-            mass = None if posterior is None else self._mass(query.partials, objects, posterior, near)
+            objects, photos = self._score_objects(query.partials, rows, top, posterior or Posterior(), similarities)
+            mass = None if posterior is None else self._mass(query.partials, objects, posterior, similarities)
         best = [
             self._ranked_object(objects, place, query.partials) for place in self.objects.best(objects, top).tolist()
         ]
@@ -170,7 +197,7 @@ class FolderShard:
         if self.references is None:
             return found
         images = map(self.references.image, ids)
-        # An object without photos is shown by a gel image, which has a row of both kinds.
+        # A gel image in place of a photo has rows of both kinds.
         return [row if image is None else {**image, **(row or {})} for row, image in zip(found, images, strict=True)]
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
@@ -188,7 +215,7 @@ class FolderShard:
 
     @cached_property
     def _texts(self) -> list[str]:
-        """What each row is found by: object, path and metadata, without capitals."""
+        """Searched text of each row: object, path and metadata in lower case."""
         found = []
         for row in self.generation.rows:
             values = [row.get("object_id"), row.get("path"), *(row.get("metadata") or {}).values()]
@@ -196,20 +223,27 @@ class FolderShard:
         return found
 
     def limit(self, top: int, candidates: int | None) -> int:
-        """Photos that are judged: as many as asked for, else as measured on the index, else 1000."""
+        """Return the number of photos to rerank: `candidates`, else as measured for the index, else 1000.
+
+        Args:
+            top: Number of objects to return, the smallest limit.
+            candidates: The user's number; None: as measured.
+        """
         measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
         return max(top, int(measured["k"]) if candidates is None else candidates)
 
-    def _candidates(self, embeddings: Floats, near: Nearness | None, k: int) -> Rows:
-        """Rows to score: the k nearest to all grasps together, and the photos of the k objects whose reference touches
-        are nearest; all rows where that would leave nothing out.
+    def _candidates(self, embeddings: Floats, similarities: Nearness | None, k: int) -> Rows:
+        """Return the rows to score.
+
+        These are the k photos nearest to all grasps together, and the photos of the k objects with the nearest
+        reference touches; or all rows, if k covers them.
         """
         if not self.has_embeddings or k >= self.generation.count:
             return np.arange(self.generation.count)
         rows = np.sort(self.generation.candidates(combined_embedding(embeddings), k)[0])
-        if self.references is None or near is None or len(rows) == self.generation.count:
+        if self.references is None or similarities is None or len(rows) == self.generation.count:
             return rows
-        return np.union1d(rows, self.objects.remaining_rows(self.references.nearest_objects(near, k), rows))
+        return np.union1d(rows, self.objects.remaining_rows(self.references.nearest_objects(similarities, k), rows))
 
     def _ranked_object(self, objects: ScoredObjects, place: int, partials: Floats) -> RankedObject:
         photo, logit = listed_photo(self.generation.rows[int(objects.rows[place])]), float(objects.logits[place])
@@ -219,22 +253,22 @@ class FolderShard:
         return RankedObject(logit, photo, self.references.nearest(number, partials, logit, photo_logits))
 
     def _objects_of(
-        self, rows: Rows, logits: Floats, meaning: Posterior, grasps: int, near: Nearness | None
+        self, rows: Rows, logits: Floats, posterior: Posterior, grasps: int, similarities: Nearness | None
     ) -> ScoredObjects:
-        """Objects by their photos at these rows, and by their reference touches."""
-        objects = self.objects.judged(rows, logits, meaning, grasps)
-        if self.references is None or near is None:
+        """Return the objects of these photos, scored by photos and reference touches."""
+        objects = self.objects.aggregate(rows, logits, posterior, grasps)
+        if self.references is None or similarities is None:
             return objects
         with_photos = self.references.calibration.with_photos  # the posterior of photos next to references
-        both = None if with_photos is None else self.objects.judged(rows, logits, with_photos, grasps)
-        return self.references.combine(objects, both, near, meaning, grasps)
+        both = None if with_photos is None else self.objects.aggregate(rows, logits, with_photos, grasps)
+        return self.references.combine(objects, both, similarities, posterior, grasps)
 
     def _score_objects(
-        self, partials: Floats, rows: Rows, top: int, meaning: Posterior, near: Nearness | None
+        self, partials: Floats, rows: Rows, top: int, posterior: Posterior, similarities: Nearness | None
     ) -> tuple[ScoredObjects, int]:
-        """Objects by their judged photos, and how many photos these are."""
+        """Return the scored objects, and the number of scored photos."""
         logits = self._logits(partials, rows)
-        objects = self._objects_of(rows, logits, meaning, len(partials), near)
+        objects = self._objects_of(rows, logits, posterior, len(partials), similarities)
         if len(rows) == self.generation.count:
             return objects, len(rows)
         best = objects.numbers[self.objects.best(objects, max(top, MIN_COMPLETED_OBJECTS))]
@@ -243,32 +277,31 @@ class FolderShard:
             return objects, len(rows)
         rows = np.concatenate([rows, rest])
         logits = self.objects.align_duplicates(rows, np.concatenate([logits, self._logits(partials, rest)]))
-        return self._objects_of(rows, logits, meaning, len(partials), near), len(rows)
+        return self._objects_of(rows, logits, posterior, len(partials), similarities), len(rows)
 
     def _mass(
-        self, partials: Floats, objects: ScoredObjects, posterior: Posterior, near: Nearness | None
+        self, partials: Floats, objects: ScoredObjects, posterior: Posterior, similarities: Nearness | None
     ) -> EvidenceMass:
         unscored = self.objects.count - len(objects.numbers)
-        # Without a sample of them, these are taken to be like the least of the judged ones, which candidates are not
-        # expected to be.
+        # A sample of unscored objects estimates their mass. Without a sample, use the lowest logit of the scored ones,
+        # an upper estimate: unscored objects are expected to be worse than candidates.
         sample = objects.logits.min(keepdims=True)
-        if unscored and len(drawn := self.objects.sample_rows_without(objects.numbers)):
-            sample = self._objects_of(drawn, self._logits(partials, drawn), posterior, len(partials), near).logits
+        if unscored and len(rows := self.objects.sample_rows_without(objects.numbers)):
+            sample = self._objects_of(rows, self._logits(partials, rows), posterior, len(partials), similarities).logits
         return posterior.mass(objects.logits, len(partials), unscored=unscored, sample=sample)
 
     def _logits(self, partials: Floats, rows: Rows) -> Floats:
-        """Match logits of the rows, summed over grasps."""
+        """Return the match logits of the rows, summed over grasps."""
         every = len(rows) == self.generation.count
         logits = self.scorer.logits(partials, self.generation.arrays["partials"], None if every else rows)
         return self.objects.align_duplicates(rows, logits)
 
 
 def combined_embedding(embeddings: Floats) -> Floats:
-    """One embedding (1, d) of unit length that stands for several grasps (G, d): its cosines order photos as the sums
-    of the grasps' cosines do.
+    """Return one unit embedding (1, d) whose cosines order photos like the sums of cosines of several grasps (G, d).
 
-    Match logits of grasps add, and so do the cosines that foretell them. Where the embeddings cancel out, no photo is
-    nearer than another, and the first grasp's stands for all.
+    Match logits of grasps add up, and so do the cosines that approximate them. If the embeddings cancel out, no photo
+    is nearer than another, and the result is the first grasp's embedding.
     """
     total = embeddings.sum(0, keepdims=True, dtype=np.float64)
     length = float(np.linalg.norm(total))
@@ -276,8 +309,11 @@ def combined_embedding(embeddings: Floats) -> Floats:
 
 
 class Shards:
-    """Several shards of this process as one: asked one after another, their answers merged as those of shards on other
-    machines are. described: what is known of all of them together.
+    """Several shards of this process as one: searched one after another, with results merged as for remote shards.
+
+    Args:
+        shards: The shards.
+        info: Information about all of them together.
     """
 
     def __init__(self, shards: Sequence[Shard], info: IndexInfo) -> None:
@@ -292,29 +328,43 @@ class Shards:
         return merge_rows([shard.rows(ids) for shard in self.shards])
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
-        """As `Shard.page`; the photos of one shard after those of the other."""
+        """As `Shard.page`, in the order of the shards."""
         return merge_pages([partial(shard.page, words, object_id) for shard in self.shards], offset, limit)
 
 
-def merge_results(answers: Sequence[ShardResult], top: int) -> ShardResult:
-    """One answer of those of several shards, one at least."""
-    if not answers:
-        raise BadInput("there is no answer to merge; a cluster needs a shard at least")
-    best = sorted((one for answer in answers for one in answer.best), key=lambda one: (-one.logit, one.photo.object_id))
-    masses = [answer.mass for answer in answers if answer.mass is not None]
-    stages = dict.fromkeys(stage for answer in answers for stage in answer.timing_ms)
+def merge_results(results: Sequence[ShardResult], top: int) -> ShardResult:
+    """Merge the results of several shards.
+
+    Args:
+        results: Results of at least one shard.
+        top: Number of objects to return.
+
+    Raises:
+        BadInput: There is no result.
+    """
+    if not results:
+        raise BadInput("there are no results to merge; a sharded index needs at least one shard")
+    best = sorted((one for result in results for one in result.best), key=lambda one: (-one.logit, one.photo.object_id))
+    masses = [result.mass for result in results if result.mass is not None]
+    stages = dict.fromkeys(stage for result in results for stage in result.timing_ms)
     return ShardResult(
-        sum(answer.photos for answer in answers),
-        sum(answer.objects for answer in answers),
+        sum(result.photos for result in results),
+        sum(result.objects for result in results),
         best[:top],
         EvidenceMass.merged(masses) if masses else None,
-        sum(answer.searched for answer in answers),
-        {stage: max(answer.timing_ms.get(stage, 0.0) for answer in answers) for stage in stages},
+        sum(result.searched for result in results),
+        {stage: max(result.timing_ms.get(stage, 0.0) for result in results) for stage in stages},
     )
 
 
 def merge_pages(pages: Sequence[Callable[[int, int], Page]], offset: int, limit: int) -> Page:
-    """The page of all shards together; each of `pages` gives that of one shard for an offset and a limit."""
+    """Return one page over all shards.
+
+    Args:
+        pages: For each shard, a function of offset and limit that returns its page.
+        offset: Number of photos to skip.
+        limit: Largest number of photos to return.
+    """
     total, rows = 0, list[dict[str, Any]]()
     for page in pages:
         found = page(max(0, offset - total), limit - len(rows))
@@ -324,7 +374,5 @@ def merge_pages(pages: Sequence[Callable[[int, int], Page]], offset: int, limit:
 
 
 def merge_rows(found: Sequence[Sequence[dict[str, Any] | None]]) -> list[dict[str, Any] | None]:
-    """The row of each photo, from whichever shard has it: `found` holds what every shard says of the same photos, None
-    where it has none.
-    """
+    """Return the row of each photo from the shard that has it; `found` has one list of rows per shard."""
     return [next((row for row in rows if row is not None), None) for rows in zip(*found, strict=True)]

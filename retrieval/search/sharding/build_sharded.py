@@ -1,8 +1,8 @@
 """Build a sharded index: several index folders over one catalogue, which are switched together.
 
-The photos of an object go to one shard, and each shard is built as an ordinary index. Codes are reused from the shard,
-from the shards of another division, and from an interrupted build. The cluster's manifest is written when every shard
-is on the disk: a build that is killed leaves the cluster as it was.
+All photos of an object go to one shard, and each shard is built as an ordinary index. Codes are reused from the shard,
+from the shards of another division, and from an interrupted build. The manifest is written when every shard is on the
+disk: a killed build does not change the index.
 
 A sharded index in an object store is built in a local folder, and each shard is uploaded as soon as it is complete
 (`retrieval.search.sharding.object_store`).
@@ -63,10 +63,10 @@ ADDITIVE_FIELDS = ("photos", "embedded", "reused", "renamed", "resumed", "re_emb
 
 @dataclass(frozen=True)
 class ShardJob:
-    """One shard to build, as it is sent to the process that builds it.
+    """One shard to build, as sent to the process that builds it.
 
-    Args:
-        cluster: Folder or URL of the sharded index.
+    Attributes:
+        index: Folder or URL of the sharded index.
         folder: Folder of the shard in it.
         catalogue: The shard's photos and touches.
         model: Path of the checkpoint.
@@ -74,7 +74,7 @@ class ShardJob:
         donors: Shards of another division, whose codes may be reused.
     """
 
-    cluster: str | Path
+    index: str | Path
     folder: str
     catalogue: Catalogue
     model: Path
@@ -86,7 +86,7 @@ class ShardJob:
 class ShardBuild:
     """Result of a `ShardJob`.
 
-    Args:
+    Attributes:
         folder: Folder of the shard.
         entry: Its entry in the manifest; None if none of its photos can be read.
         report: Its report; None likewise.
@@ -123,49 +123,55 @@ def build_sharded(
     """Write the next generation of a sharded index of a catalogue.
 
     Args:
-        folder: The catalogue, as `build_index` takes it, and so the other arguments that are not listed here.
+        folder: The catalogue, as for `build_index`.
         checkpoint: The model.
         out: Folder or URL of the sharded index.
         shards: Number of shards.
+        objects_from: As for `build_index`.
+        kind: As for `build_index`.
+        min_recall: As for `build_index`.
+        max_ms: As for `build_index`.
         max_unreadable: Largest fraction of photos that may be unreadable.
+        verify: As for `build_index`.
+        quiet: Show no progress.
         run: Builds the shards; None: this process, one after another.
 
     Returns:
-        What was built, in all shards together.
+        One report of all shards together.
 
     Raises:
         BadInput: The number of shards is out of range, or `out` is an index folder.
         TooManyUnreadable: More photos than `max_unreadable` cannot be read.
-        StorageError: The storage behind the URL refuses again and again, or another build finished first.
+        StorageError: The storage behind the URL fails repeatedly, or another build finished first.
     """
     if not 1 <= shards <= MAX_SHARDS:
         raise BadInput(f"shards must be from 1 to {MAX_SHARDS}; got {shards}")
     if not 0 <= max_unreadable <= 1:
-        raise BadInput(f"the share of bad photos must be from 0 to 1; got {max_unreadable}")
+        raise BadInput(f"the fraction of unreadable photos must be from 0 to 1; got {max_unreadable}")
     stored = RemoteShardedIndex(str(out)) if is_url(out) else None
     own = Path(out) if stored is None else stored.work
     if (own / "CURRENT").is_file():
-        raise BadInput(f"{out} is an index folder; give another one for a cluster of {shards} shards")
+        raise BadInput(f"{out} is an index folder; give another folder for a sharded index of {shards} shards")
     requirements = SearchRequirements.of(kind, min_recall, max_ms)
     with WriterLock(own / "LOCK"):
-        seen = None if stored is None else stored.manifest()
+        current = None if stored is None else stored.manifest()
         before: ShardedManifest | None = None
         note = ""
         try:
-            before = read_sharded_manifest(own) if stored is None else stored.parse_manifest(seen)
+            before = read_sharded_manifest(own) if stored is None else stored.parse_manifest(current)
         except NoIndex:
             pass
         except (CorruptIndex, UnsupportedFormat) as error:
-            note = f"The cluster there was not usable ({error})."
+            note = f"The existing sharded index is not usable ({error})."
         naming, renamed = naming_by(objects_from, {} if before is None else before.about)
         catalogue = list_photos(folder, naming)
         if catalogue.touches and checkpoint.references is None:
             raise BadInput(
-                "of a catalogue in shards the model must say what reference touches are worth, for shards would find "
-                "it out each for itself, and this one does not; take one that `retrieve adapt` has made"
+                "a sharded index with reference touches needs a model with a calibration for them, because each shard "
+                "would otherwise fit its own, and this model has none; use a model of `retrieve adapt`"
             )
-        _sweep(own, before, shards)
-        left = {} if stored is None else stored.generations()
+        _delete_old_shards(own, before, shards)
+        old_generations = {} if stored is None else stored.generations()
         donors = [] if before is None or before.of == shards else before.shards
         options = BuildOptions(naming, requirements, quiet, verify, keep=_KEEP_ALL)
         jobs = [
@@ -179,18 +185,17 @@ def build_sharded(
         if (bad := len(report.skipped)) > max_unreadable * every:
             first = report.skipped[0]
             raise TooManyUnreadable(
-                f"{bad} of {every} {what} cannot be read, more than the share of {max_unreadable:g} that is "
-                f"allowed (--max-unreadable); the cluster stays as it was. The first: {first.path}: {first.reason}"
+                f"{bad} of {every} {what} cannot be read, more than the allowed fraction {max_unreadable:g} "
+                f"(--max-unreadable); the index was not changed. The first: {first.path}: {first.reason}"
             )
         manifest = _manifest(before, built, shards, checkpoint, catalogue, report, requirements)
         written = before is None or manifest.generation != before.generation
         if written and stored is None:
             write_sharded_manifest(own, manifest)
         elif written and stored is not None:
-            stored.switch(seen, manifest)
-            stored.discard(
-                left.keys() - generation_names([*manifest.shards, *([] if before is None else before.shards)])
-            )
+            stored.switch(current, manifest)
+            in_use = generation_names([*manifest.shards, *([] if before is None else before.shards)])
+            stored.discard(old_generations.keys() - in_use)
         for entry in manifest.shards:
             IndexStore(own / entry.folder).discard_before(entry.generation)
     reason = " ".join(filter(None, (renamed, note, report.reason)))
@@ -198,21 +203,30 @@ def build_sharded(
 
 
 def build_in_process(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterable[ShardBuild]:
-    """Build shards in this process."""
+    """Build shards in this process, one after another."""
     return [build_shard(job, checkpoint) for job in jobs]
 
 
 def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBuild:
-    """Build one shard. Raises the errors of `build_index`, except where none of its photos can be read."""
+    """Build one shard.
+
+    Args:
+        job: The shard.
+        checkpoint: The model; None: loaded from `job.model`.
+
+    Raises:
+        IndexesError: The shard could not be written.
+        RetrievalError: As for `build_index`, except if none of the shard's photos can be read.
+    """
     model = checkpoint or load_checkpoint(job.model)
-    stored = RemoteShardedIndex(str(job.cluster)) if is_url(job.cluster) else None
-    cluster = Path(job.cluster) if stored is None else stored.work
+    stored = RemoteShardedIndex(str(job.index)) if is_url(job.index) else None
+    index = Path(job.index) if stored is None else stored.work
     if stored is not None:
         stored.restore(job.folder)
-    store, donors = IndexStore(cluster / job.folder), list[Generation]()
+    store, donors = IndexStore(index / job.folder), list[Generation]()
     for donor in job.donors:
-        with suppress(IndexesError):  # it cannot serve then
-            place = local_folder(job.cluster, donor) / donor.folder
+        with suppress(IndexesError):  # an unusable donor is skipped
+            place = local_folder(job.index, donor) / donor.folder
             donors.append(IndexStore(place).open(name=donor.generation, expect=fingerprint(model)))
     try:
         report = build_listed(job.catalogue, model, store.path, replace(job.options, donors=donors))
@@ -220,14 +234,14 @@ def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBui
         return ShardBuild(job.folder, None, None, [], error.skipped)
     generation = store.open(name=report.generation, verify=False)
     counts = np.bincount(generation.codes("object_id")).tolist()
-    entry = shard_entry(cluster, job.folder, generation, len(counts))
+    entry = shard_entry(index, job.folder, generation, len(counts))
     if stored is not None:
         stored.put(entry, job.options.verify)
     return ShardBuild(job.folder, entry, report, counts, report.skipped)
 
 
-def _sweep(out: Path, before: ShardedManifest | None, shards: int) -> None:
-    """Delete shards of divisions that neither the current cluster nor the new one has."""
+def _delete_old_shards(out: Path, before: ShardedManifest | None, shards: int) -> None:
+    """Delete shards of divisions that neither the current index nor the new one uses."""
     known = set() if before is None else {entry.folder for entry in before.shards}
     for path in out.iterdir():
         division = SHARD_FOLDER.fullmatch(path.name)
@@ -236,7 +250,7 @@ def _sweep(out: Path, before: ShardedManifest | None, shards: int) -> None:
 
 
 def _split_catalogue(catalogue: Catalogue, shards: int) -> list[tuple[str, Catalogue]]:
-    """Folder and catalogue of each shard that has photos or touches. Files that are neither belong to no shard."""
+    """Return folder and catalogue of each shard with photos or touches; other files belong to no shard."""
     photos, touches = defaultdict[int, list[CataloguePhoto]](list), defaultdict[int, list[CatalogueTouch]](list)
     for photo in catalogue.photos:
         photos[shard_number(photo.object_id, shards)].append(photo)
@@ -255,7 +269,7 @@ def _split_catalogue(catalogue: Catalogue, shards: int) -> list[tuple[str, Catal
 def _report(
     out: str | Path, catalogue: Catalogue, naming: Naming, checkpoint: Checkpoint, built: Sequence[ShardBuild]
 ) -> BuildReport:
-    """The reports of all shards as one. Raises NoReadablePhoto where no shard has a photo."""
+    """Merge the reports of all shards. Raises NoReadablePhoto if no shard has a photo."""
     reports = [one.report for one in built if one.report is not None]
     skipped = [*catalogue.skipped, *(item for one in built for item in one.skipped)]
     if not reports:
@@ -265,8 +279,8 @@ def _report(
     bad = {item.path for one in built if one.report is None for item in one.skipped}
     lost |= {photo.object_id for photo in catalogue.photos if photo.path in bad} | set(catalogue.unsupported_objects)
     reason, same = Counter(report.reason for report in reports).most_common(1)[0]
-    told = [report.references for report in reports if report.references]
-    of_touches = {key: sum(one[key] for one in told) for key in ("touches", "objects", "touch_only", "encoded")}
+    references = [report.references for report in reports if report.references]
+    sums = {key: sum(one[key] for one in references) for key in ("touches", "objects", "touch_only", "encoded")}
     return replace(
         reports[0],
         **{name: sum(getattr(report, name) for report in reports) for name in ADDITIVE_FIELDS},
@@ -283,12 +297,12 @@ def _report(
         without_photo=sorted(lost),
         notes=list(catalogue.notes),
         kind=", ".join(sorted({report.kind for report in reports})),
-        reason=f"{len(reports)} shards; of {same} of them: {reason}",
+        reason=f"{len(reports)} shards; for {same} of them: {reason}",
         recall=min((report.recall for report in reports), key=lambda recall: recall["value"]),
         candidates=None,
         partial_error=max(report.partial_error for report in reports),
         shards=[asdict(one.entry) for one in built if one.entry is not None],
-        references={**of_touches, "by": told[0]["by"]} if told else None,
+        references={**sums, "by": references[0]["by"]} if references else None,
     )
 
 
@@ -301,7 +315,7 @@ def _manifest(
     report: BuildReport,
     requirements: SearchRequirements,
 ) -> ShardedManifest:
-    """The manifest to write, or the current one where they would be equal."""
+    """Return the new manifest, or the current one if they would be equal."""
     about: dict[str, Any] = {
         "checkpoint": str(checkpoint.path.resolve()),
         "catalogue": catalogue.where,

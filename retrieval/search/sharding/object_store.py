@@ -1,16 +1,16 @@
-"""A sharded index in an object store: whatever `fsspec` writes to, by its URL.
+"""A sharded index in an object store, at any URL that `fsspec` can write to.
 
-    CLUSTER.json                               as in a folder (`indexes.store.sharded`); put last, by one request
+    SHARDS.json                                as in a folder (`indexes.store.sharded`); uploaded last, by one request
     shard-00-of-04/gen-000007-<SHA-256>/       a generation, named by the digest of its manifest
         rows.jsonl, ...
-        manifest.json                          put last
+        manifest.json                          uploaded last
 
-The name of a generation stands for every byte of it: it never changes, and two builds cannot mix theirs. A generation
-is complete when its manifest is there; files of another size than the manifest states are put again. Each file is
-checked by its digest when it is fetched.
+The name of a generation determines every byte of it: it is immutable, and two builds cannot mix their files. A
+generation is complete if its manifest exists; files with another size than in the manifest are uploaded again. Each
+file is checked by its digest when it is fetched.
 
-Generations are made in one local folder and fetched into another one to be searched. Both lie in the user's cache and
-may be deleted at any time. The caches of fsspec (`filecache`, `simplecache`) do not serve here: they store files under
+Generations are built in one local folder and fetched into another for searching. Both are in the user's cache and may
+be deleted at any time. The caches of fsspec (`filecache`, `simplecache`) are not suitable: they store files under
 hashed names and do not compare digests.
 """
 
@@ -24,7 +24,7 @@ from typing import Any, TypeVar
 
 from _touch_retrieval.files import file_digest, remove_folder, write_atomically
 from indexes.errors import AGAIN, CorruptIndex, IndexesError, NoIndex, UnsupportedFormat
-from indexes.store import sharded as folders
+from indexes.store import sharded
 from indexes.store.folder import IndexStore
 from indexes.store.locking import exclusive_lock
 from indexes.store.manifest import NAME as MANIFEST
@@ -37,26 +37,31 @@ from retrieval.errors import BadInput, RemoteStorageError
 T = TypeVar("T")
 GENERATION = re.compile(r"(gen-\d{6,})-([0-9a-f]{64})")
 MAX_MANIFEST_BYTES = 16 * 2**20
-"""Of a manifest."""
+"""Largest manifest."""
 MAX_FETCHED_GENERATIONS = 2
-"""Generations of a shard that stay fetched: one that is searched while the next is."""
+"""Fetched generations of a shard that stay in the cache: one can be searched while the next is fetched."""
 
 
 def is_sharded(where: str | Path) -> bool:
-    """Whether this is a sharded index; what lies behind a URL always is."""
-    return is_url(where) or folders.is_sharded(Path(where))
+    """Whether this is a sharded index; an index behind a URL always is."""
+    return is_url(where) or sharded.is_sharded(Path(where))
 
 
 def read_sharded_manifest(where: str | Path) -> ShardedManifest:
     """Return the manifest in a folder or behind a URL. Raises IndexesError and StorageError."""
     if not is_url(where):
-        return folders.read_sharded_manifest(Path(where))
+        return sharded.read_sharded_manifest(Path(where))
     stored = RemoteShardedIndex(str(where))
     return stored.parse_manifest(stored.manifest())
 
 
 def local_folder(where: str | Path, entry: ShardEntry) -> Path:
-    """Return the local folder of the sharded index that holds this shard, which is fetched from a URL."""
+    """Return the local folder that contains a shard, which is fetched first from a URL.
+
+    Args:
+        where: Folder or URL of the sharded index.
+        entry: Manifest entry of the shard.
+    """
     return RemoteShardedIndex(str(where)).fetch(entry) if is_url(where) else Path(where)
 
 
@@ -67,21 +72,21 @@ class RemoteShardedIndex:
         url: Its URL.
 
     Attributes:
-        work: Local folder in which its shards are made.
+        work: Local folder in which its shards are built.
 
     Raises:
-        BadInput: Nothing opens the URL, or it names a local folder.
+        BadInput: The URL cannot be opened, or is a local folder.
     """
 
     def __init__(self, url: str) -> None:
         self.url = url.rstrip("/")
         if self.url.startswith(("file:", "local:")):
-            raise BadInput(f"{url} is a folder of this machine; name it by its path")
+            raise BadInput(f"{url} is a local folder; give its path")
         self._system, root = file_system(self.url)
         self._root = root.rstrip("/")
         cache = cache_folder()
         if cache is None:
-            raise BadInput(f"{url}: there is no folder to work in; set XDG_CACHE_HOME")
+            raise BadInput(f"{url}: there is no cache folder to work in; set XDG_CACHE_HOME")
         make_cache_folder(cache)
         key = hashlib.sha256(self.url.encode()).hexdigest()[:32]
         self.work, self._fetched = cache / "building" / key, cache / "shards" / key
@@ -89,25 +94,32 @@ class RemoteShardedIndex:
     # Reading ---------------------------------------------------------------------------------------------------
 
     def manifest(self) -> bytes | None:
-        """Return the content of its manifest; None without one. Raises StorageError."""
-        return self._try(folders.NAME, self._content)
+        """Return the content of the manifest; None without one. Raises StorageError."""
+        return self._try(sharded.NAME, self._content)
 
     def parse_manifest(self, manifest: bytes | None) -> ShardedManifest:
-        """Return the manifest of that content. Raises NoIndex for None, CorruptIndex and UnsupportedFormat."""
+        """Parse the content of a manifest. Raises NoIndex for None, CorruptIndex and UnsupportedFormat."""
         if manifest is None:
-            raise NoIndex(f"{self.url}: there is no cluster here; run `retrieve build-index --out {self.url}` first")
-        own = self._fetched / folders.NAME
+            raise NoIndex(
+                f"{self.url}: there is no sharded index here; run `retrieve build-index --out {self.url}` first"
+            )
+        own = self._fetched / sharded.NAME
         own.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(own, manifest)
         try:
-            return folders.read_sharded_manifest(own.parent)
+            return sharded.read_sharded_manifest(own.parent)
         except (CorruptIndex, UnsupportedFormat) as error:
             raise type(error)(f"{self.url}: {error}") from error
 
     def fetch(self, entry: ShardEntry) -> Path:
-        """Return the local folder that holds this shard, which is fetched unless it is there.
+        """Fetch a shard unless it is in the cache, and return the local folder that contains it.
 
-        Raises CorruptIndex for a shard with another content, and StorageError.
+        Args:
+            entry: Manifest entry of the shard.
+
+        Raises:
+            CorruptIndex: The shard has another content.
+            StorageError: The storage fails.
         """
         own = self._fetched / entry.sha256[:32]
         place = own / entry.folder / entry.generation
@@ -115,15 +127,19 @@ class RemoteShardedIndex:
             with exclusive_lock(own.with_name(f"{own.name}.lock")):
                 if not place.is_dir():
                     self._fetch(f"{entry.folder}/{_generation_name(entry)}", entry.sha256, place)
-            with suppress(OSError):  # another process does the same
+            with suppress(OSError):  # another process may delete the same folders
                 old = sorted(self._fetched.glob(f"*/{entry.folder}"), key=lambda path: path.stat().st_mtime)
                 for path in old[:-MAX_FETCHED_GENERATIONS]:
                     remove_folder(path.parent)
         return own
 
     def restore(self, folder: str) -> None:
-        """Make the newest complete generation of this shard the current one of the local folder: a build then reuses
-        what another machine embedded. A damaged one is ignored.
+        """Fetch the newest complete generation of a shard and make it current in the local folder.
+
+        A build then reuses the codes of other machines. A damaged generation is ignored.
+
+        Args:
+            folder: Folder of the shard.
         """
         name = max((name for name, is_whole in self.generations(folder).items() if is_whole), default=None)
         if name is None:
@@ -134,13 +150,13 @@ class RemoteShardedIndex:
         if place.is_dir():
             if file_digest(place / MANIFEST) == sha256:
                 return
-            remove_folder(place)  # of another history: what the store has counts
+            remove_folder(place)  # a local generation of that name with other content is obsolete
         with suppress(IndexesError):
             self._fetch(f"{folder}/{name}", sha256, place)
             store.make_current(generation)
 
     def generations(self, folder: str = "") -> dict[str, bool]:
-        """Return {generation: whether its manifest is there} of one shard; or of all, as `<shard>/<generation>`."""
+        """Return {generation: whether its manifest exists} of one shard; or of all, as `<shard>/<generation>`."""
         files = self._sizes(folder)
         generation_names = {file.rpartition("/")[0] for file in files}
         found = {
@@ -155,15 +171,21 @@ class RemoteShardedIndex:
     # Writing ---------------------------------------------------------------------------------------------------
 
     def put(self, entry: ShardEntry, verify: bool = False) -> None:
-        """Upload a shard from the local folder, except files that are there: with the same size, and with `verify` with
-        the same digest. Raises StorageError.
+        """Upload the files of a shard from the local folder, except those that the store already has.
+
+        Args:
+            entry: Manifest entry of the shard.
+            verify: Compare digests, not only sizes.
+
+        Raises:
+            StorageError: The storage fails.
         """
         place, own = f"{entry.folder}/{_generation_name(entry)}", self.work / entry.folder / entry.generation
-        there = self._sizes(place)
-        must = {name: seal.sha256 for name, seal in read_manifest(own).files.items()} | {MANIFEST: entry.sha256}
+        uploaded = self._sizes(place)
+        must = {name: file.sha256 for name, file in read_manifest(own).files.items()} | {MANIFEST: entry.sha256}
         for name, sha256 in must.items():
             size = (own / name).stat().st_size
-            if there.get(name) != size or (verify and self._try(f"{place}/{name}", self._digest) != sha256):
+            if uploaded.get(name) != size or (verify and self._try(f"{place}/{name}", self._digest) != sha256):
                 self._put(own / name, f"{place}/{name}")
 
     def switch(self, before: bytes | None, manifest: ShardedManifest) -> None:
@@ -174,18 +196,18 @@ class RemoteShardedIndex:
             manifest: The new manifest.
 
         Raises:
-            StorageError: The storage refuses, or another build switched meanwhile; a store with conditional writes
-                refuses even if that happened after the last look.
+            StorageError: The storage fails, or another build switched in the meantime. Stores with conditional writes
+                detect a switch up to the write itself.
         """
         content = sharded_manifest_bytes(manifest)
 
         def put(path: str) -> bool:
-            condition = self._unchanged(path)  # first, so that the content below is no older
-            there = self._content(path)
-            if there == content:  # put by a request whose answer was lost
+            condition = self._unchanged(path)  # read before the content, which must not be older
+            current = self._content(path)
+            if current == content:  # written by a request whose response was lost
                 return True
-            torn = there is not None and content.startswith(there)
-            if there != before and not torn:
+            torn = current is not None and content.startswith(current)
+            if current != before and not torn:
                 return False
             try:
                 self._system.pipe_file(path, content, **condition)
@@ -194,20 +216,20 @@ class RemoteShardedIndex:
                     raise
                 self._system.pipe_file(path, content)
             if self._content(path) != content:
-                raise OSError("it was torn on its way")
+                raise OSError("the upload was incomplete")
             return True
 
-        if not self._try(folders.NAME, put):
+        if not self._try(sharded.NAME, put):
             raise RemoteStorageError(
-                f"{self.url}: another build put its own cluster there meanwhile; run the same command again, which "
-                "embeds nothing twice"
+                f"{self.url}: another build switched this index in the meantime; run the same command again, which "
+                "reuses all embeddings"
             )
 
     def discard(self, generation_names: Iterable[str]) -> None:
         """Delete generations, named as `generations` names them, each manifest first."""
 
         def delete(path: str) -> None:
-            with suppress(FileNotFoundError):  # deleted by a request whose answer was lost
+            with suppress(FileNotFoundError):  # deleted by a request whose response was lost
                 self._system.rm_file(path)
 
         for name in generation_names:
@@ -217,7 +239,7 @@ class RemoteShardedIndex:
     # The store -------------------------------------------------------------------------------------------------
 
     def _try(self, name: str, function: Callable[[str], T]) -> T:
-        """Call `function` with the whole path of `name`, again where the store refuses. Raises StorageError."""
+        """Call `function` with the whole path of `name`, and retry if the store fails. Raises StorageError."""
         what = f"{self.url}/{name}".rstrip("/")
         try:
             return retry(what, lambda: function(f"{self._root}/{name}".rstrip("/")))
@@ -225,7 +247,7 @@ class RemoteShardedIndex:
             raise RemoteStorageError(f"{what}: the storage refuses ({type(error).__name__}: {error})") from error
 
     def _sizes(self, name: str) -> dict[str, int]:
-        """{file below `name`: its bytes}."""
+        """Return {file below `name`: its number of bytes}."""
 
         def sizes(path: str) -> dict[str, int]:
             self._system.invalidate_cache()
@@ -240,7 +262,7 @@ class RemoteShardedIndex:
         return self._try(name, sizes)
 
     def _info(self, path: str) -> dict[str, Any] | None:
-        """The store's information about a file now; None without one."""
+        """Return the store's current information about a file; None without one."""
         self._system.invalidate_cache()
         try:
             found: dict[str, Any] = self._system.info(path)
@@ -249,18 +271,19 @@ class RemoteShardedIndex:
         return found
 
     def _content(self, path: str) -> bytes | None:
-        """The content of a manifest; None without one."""
+        """Return the content of a manifest; None without one."""
         try:
             data: bytes = self._system.cat_file(path, start=0, end=MAX_MANIFEST_BYTES + 1)
         except FileNotFoundError:
             return None
         if len(data) > MAX_MANIFEST_BYTES:
-            raise ValueError(f"a manifest has at most {MAX_MANIFEST_BYTES} bytes")
+            raise ValueError(f"a manifest must have at most {MAX_MANIFEST_BYTES} bytes")
         return data
 
     def _unchanged(self, path: str) -> dict[str, Any]:
-        """Arguments with which `pipe_file` refuses to replace another file than the current one: fsspec's for no file,
-        S3's for a file; none for other stores.
+        """Return arguments with which `pipe_file` replaces only the current file.
+
+        These are fsspec's if there is no file, S3's for an existing file, and none for other stores.
         """
         found = self._info(path)
         if found is None:
@@ -275,12 +298,12 @@ class RemoteShardedIndex:
         def put(path: str) -> None:
             self._system.put_file(str(file), path)
             if (self._info(path) or {}).get("size") != file.stat().st_size:
-                raise OSError("it was torn on its way")
+                raise OSError("the upload was incomplete")
 
         self._try(name, put)
 
     def _fetch(self, name: str, sha256: str, place: Path) -> None:
-        """Fetch a generation into `place`, which appears when it is complete. Files of an earlier try are reused."""
+        """Fetch a generation into `place`, which is created when it is complete; files of earlier tries are reused."""
         part = place.with_name(f"{place.name}.part")
         part.mkdir(parents=True, exist_ok=True)
         self._fetch_file(f"{name}/{MANIFEST}", part / MANIFEST, None, sha256)
@@ -289,27 +312,27 @@ class RemoteShardedIndex:
         part.rename(place)
 
     def _fetch_file(self, name: str, file: Path, must: int | None, sha256: str) -> None:
-        """Fetch one file. must: its number of bytes; None for a manifest."""
+        """Fetch one file; `must` is its number of bytes, None for a manifest."""
         if file.is_file() and file_digest(file) == sha256:
             return
         size = (self._try(name, self._info) or {}).get("size")
         if size is None or (size > MAX_MANIFEST_BYTES if must is None else size != must):
-            what = "is missing" if size is None else f"has {size} bytes, and not {must or MAX_MANIFEST_BYTES}"
+            what = "is missing" if size is None else f"has {size} bytes instead of {must or MAX_MANIFEST_BYTES}"
             raise CorruptIndex(f"{self.url}/{name} {what}; {AGAIN}")
 
         def fetch(path: str) -> None:
             self._system.get_file(path, str(file))
             if file.stat().st_size != size:
-                raise OSError("it was torn on its way")
+                raise OSError("the download was incomplete")
 
         self._try(name, fetch)
         if file_digest(file) != sha256:
             file.unlink()
-            raise CorruptIndex(f"{self.url}/{name} was altered; `retrieve build-index --verify` mends it")
+            raise CorruptIndex(f"{self.url}/{name} was altered; `retrieve build-index --verify` repairs it")
 
 
 def generation_names(entries: Iterable[ShardEntry]) -> set[str]:
-    """Return the names of generations, as in `RemoteShardedIndex.generations`."""
+    """Return the names of generations in the form of `RemoteShardedIndex.generations`."""
     return {f"{entry.folder}/{_generation_name(entry)}" for entry in entries}
 
 

@@ -1,7 +1,7 @@
-"""A catalogue on Ray: shards are embedded, held and asked there; no fault makes a wrong or a silently partial answer.
+"""A catalogue on Ray: shards are built, served and searched there; no fault gives a wrong or silently partial result.
 
-One Ray serves all tests of this file: two processors, a small object store, 127.0.0.1. Processes are killed and stopped
-as machines are lost and hang.
+One Ray serves all tests of this file: two CPUs, a small object store, 127.0.0.1. Processes are killed and stopped to
+simulate lost and hanging machines.
 """
 
 import math
@@ -38,7 +38,7 @@ pytestmark = [
 ]
 
 LOOPBACK = {"0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000"}
-MADE = []
+OPENED = []
 SHARD, WORKER = r"ray::ServeReplica:shard-", r"ray::MapWorker"
 
 
@@ -48,20 +48,20 @@ def ray():
 
     with ray_session(2) as module:
         yield module
-        for made in MADE:
-            made.close()
+        for opened in OPENED:
+            opened.close()
 
 
-def deployments(ray, **held):
+def deployments(ray, **settings):
     from retrieval.cluster.serving import Deployments, ReplicaSettings
 
-    MADE.append(Deployments(ray, ReplicaSettings(cpus=0.1, **held)))
-    return MADE[-1]
+    OPENED.append(Deployments(ray, ReplicaSettings(cpus=0.1, **settings)))
+    return OPENED[-1]
 
 
 @pytest.fixture(scope="module")
-def held(ray, cluster):
-    """The cluster, held by Ray; an answer must have searched all of it, within two minutes."""
+def served(ray, cluster):
+    """The sharded index, served by Ray; a query must search all of it within two minutes."""
     with Searcher.open(cluster, shards=deployments(ray, wait_s=120.0).open) as searcher:
         yield searcher
 
@@ -78,33 +78,33 @@ def names(answer):
     return [(match.object_id, match.photo) for match in answer.results]
 
 
-# Answers --------------------------------------------------------------------------------------------------------------
+# Results --------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_answers_are_those_of_the_folder(count, held, searcher, grasps):
+def test_results_equal_those_of_the_folder(count, served, searcher, grasps):
     for own in grasps:
-        ours, theirs = held.query(own[:count]), searcher.query(own[:count])
+        ours, theirs = served.query(own[:count]), searcher.query(own[:count])
         assert names(ours) == names(theirs)
         assert numbers(ours) == pytest.approx(numbers(theirs), abs=1e-5)
         assert (ours.verdict, ours.posterior["scored_objects"]) == (theirs.verdict, 8)
         assert (ours.index["shards"], ours.index["searched"]) == (4, 1.0)
 
 
-def test_photos_are_found_and_listed_wherever_they_lie(held, searcher):
+def test_photos_are_found_and_listed_in_all_shards(served, searcher):
     rows = list(searcher.generation.rows)
     ids = [row["id"] for row in rows[::7]] + ["absent"]
-    assert held.shard.rows(ids) == [*rows[::7], None]
-    pages = [held.shard.page([], None, offset, 7) for offset in range(0, 24, 7)]
+    assert served.shard.rows(ids) == [*rows[::7], None]
+    pages = [served.shard.page([], None, offset, 7) for offset in range(0, 24, 7)]
     assert {page.total for page in pages} == {24}
     assert sorted(row["id"] for page in pages for row in page.rows) == sorted(row["id"] for row in rows)
     name = rows[0]["object_id"]
-    assert held.shard.page([], name, 0, 10).total == 3
-    assert held.shard.page([name], None, 0, 2).rows == [row for row in rows if row["object_id"] == name][:2]
+    assert served.shard.page([], name, 0, 10).total == 3
+    assert served.shard.page([name], None, 0, 2).rows == [row for row in rows if row["object_id"] == name][:2]
 
 
-def test_reference_touches_answer_over_ray_as_in_the_folder(ray, catalogue_with_touches, touches, tmp_path):
-    model = reference_model.write_reference_model(tmp_path / "felt.safetensors")
+def test_reference_touches_give_the_results_of_the_folder(ray, catalogue_with_touches, touches, tmp_path):
+    model = reference_model.write_reference_model(tmp_path / "model.safetensors")
     build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
     build_sharded(catalogue_with_touches, model, tmp_path / "cluster", 2, quiet=True)
     with (
@@ -121,8 +121,8 @@ def test_reference_touches_answer_over_ray_as_in_the_folder(ray, catalogue_with_
         assert ours.shard.rows([gel, "absent"]) == theirs.shard.rows([gel, "absent"])
 
 
-def test_everything_listens_on_this_machine_alone(held, touch):
-    held.query(touch)
+def test_everything_listens_only_on_this_machine(served, touch):
+    served.query(touch)
     found = ray_processes.listening_addresses()
     assert found
     assert found <= LOOPBACK
@@ -140,76 +140,76 @@ print(*(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] ==
 """
 
 
-def test_a_shard_leaves_the_processors_to_others_between_two_queries(cluster):
-    """Idle threads of OpenBLAS spin on for a while: a query over Ray took 40 ms where it takes 6."""
+def test_a_shard_uses_one_blas_thread(cluster):
+    """Idle threads of OpenBLAS spin for a while: with them, a query over Ray took 40 ms instead of 6."""
     model = read_sharded_manifest(cluster).about["checkpoint"]
     environment = os.environ | {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
     command = [sys.executable, "-c", REPLICA, str(cluster), str(model)]
-    said = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
-    assert said
-    assert set(said) == {"1"}
+    output = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.split()
+    assert output
+    assert set(output) == {"1"}
 
 
-def test_one_that_ends_leaves_the_shards_of_another(ray, cluster, held, grasps):
+def test_closing_deployments_does_not_affect_others(ray, cluster, served, grasps):
     other = deployments(ray, wait_s=120.0)
     searcher = Searcher.open(cluster, shards=other.open)
-    assert names(searcher.query(grasps[0])) == names(held.query(grasps[0]))
+    assert names(searcher.query(grasps[0])) == names(served.query(grasps[0]))
     before = set(ray.serve.status().applications)
     other.close()
-    wait_until = time.monotonic() + 60
-    while len(before & set(ray.serve.status().applications)) > 4 and time.monotonic() < wait_until:
+    deadline = time.monotonic() + 60
+    while len(before & set(ray.serve.status().applications)) > 4 and time.monotonic() < deadline:
         time.sleep(0.1)
     assert len(before) == 8
     assert len(ray.serve.status().applications) == 4
-    assert held.query(grasps[0]).index["searched"] == 1.0
+    assert served.query(grasps[0]).index["searched"] == 1.0
 
 
 HOLDING = """
 import sys, time
-from retrieval.cluster.serving import Deployments, Held
-from retrieval.cluster.session import connected
+from retrieval.cluster.serving import Deployments, ReplicaSettings
+from retrieval.cluster.session import ray_session
 from retrieval.search.query.searcher import Searcher
-with connected() as ray:
-    searcher = Searcher.open(sys.argv[1], shards=Deployments(ray, Held(cpus=0.1)).open)
-    print("held", flush=True)
+with ray_session() as ray:
+    searcher = Searcher.open(sys.argv[1], shards=Deployments(ray, ReplicaSettings(cpus=0.1)).open)
+    print("ready", flush=True)
     time.sleep(600)
 """
 
 
-def test_shards_of_a_process_that_was_killed_are_deleted_by_the_next(ray, cluster, held, grasps, monkeypatch):
+def test_shards_of_a_killed_process_are_deleted_by_the_next(ray, cluster, served, grasps, monkeypatch):
     before = set(ray.serve.status().applications)
     monkeypatch.setenv("RAY_ADDRESS", ray.get_runtime_context().gcs_address)
     with run_process([sys.executable, "-W", "ignore", "-c", HOLDING, str(cluster)]) as process:
-        assert first_line(process, 240) == "held\n"
-        left = set(ray.serve.status().applications) - before
+        assert first_line(process, 240) == "ready\n"
+        orphans = set(ray.serve.status().applications) - before
         process.kill()
         process.wait(60)
-    assert len(left) == 4
-    wait_until = time.monotonic() + 120  # until Ray has noticed
-    while left & set(ray.serve.status().applications) and time.monotonic() < wait_until:
+    assert len(orphans) == 4
+    deadline = time.monotonic() + 120  # until Ray has noticed
+    while orphans & set(ray.serve.status().applications) and time.monotonic() < deadline:
         deployments(ray).close()
         time.sleep(0.5)
-    assert not left & set(ray.serve.status().applications)
+    assert not orphans & set(ray.serve.status().applications)
     assert before <= set(ray.serve.status().applications)
-    assert held.query(grasps[0]).index["searched"] == 1.0
+    assert served.query(grasps[0]).index["searched"] == 1.0
 
 
 # Faults ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_shard_that_is_killed_is_started_again_and_every_answer_is_whole(held, grasps):
-    expected = names(held.query(grasps[0]))
+def test_a_killed_shard_is_restarted_and_every_result_is_complete(served, grasps):
+    expected = names(served.query(grasps[0]))
     for turn in range(20):
         process = ray_processes.processes_named(SHARD)[turn % len(ray_processes.processes_named(SHARD))]
         os.kill(process, signal.SIGKILL)
-        answer = held.query(grasps[0])
+        answer = served.query(grasps[0])
         assert names(answer) == expected
         assert answer.index["searched"] == 1.0
 
 
 @pytest.fixture
 def stopped():
-    """Stops every process of one shard, whoever holds it, as a machine hangs; all go on at the end."""
+    """Stop every process of one shard, like a hanging machine; all continue at the end."""
     done = []
 
     def stop():
@@ -221,7 +221,7 @@ def stopped():
     for process in done:
         try:
             os.kill(process, signal.SIGCONT)
-        except ProcessLookupError:  # Ray has given it up
+        except ProcessLookupError:  # Ray has replaced it
             continue
 
 
@@ -231,11 +231,13 @@ def test_a_shard_that_hangs_is_reported(ray, cluster, grasps, stopped):
     strict, lenient = Searcher.open(cluster, shards=whole.open), Searcher.open(cluster, shards=part.open)
     expected = strict.query(grasps[0], top=8)
     stopped()
-    with pytest.raises(IncompleteSearch, match=r"no answer within 2 s from shard-0\d-of-04: 0\.\d+ of the catalogue"):
+    with pytest.raises(
+        IncompleteSearch, match=r"no answer within 2 s from shard-0\d-of-04: only 0\.\d+ of the catalogue"
+    ):
         strict.query(grasps[0])
     found = []
 
-    def answered():  # of a busy machine the other shards may be late too
+    def answered():  # on a busy machine the other shards may be late too
         with suppress(IncompleteSearch):
             found.append(lenient.query(grasps[0], top=8))
         return found
@@ -245,8 +247,8 @@ def test_a_shard_that_hangs_is_reported(ray, cluster, grasps, stopped):
     if answer.index["searched"] == 1.0:  # Ray has replaced it already
         return
     assert 0.1 <= answer.index["searched"] < 1
-    kept = [match for match in expected.results if match.object_id in {one.object_id for one in answer.results}]
-    assert [match.object_id for match in kept] == [match.object_id for match in answer.results]
+    searched = [match for match in expected.results if match.object_id in {one.object_id for one in answer.results}]
+    assert [match.object_id for match in searched] == [match.object_id for match in answer.results]
     shown = math.fsum(match.probability for match in answer.results)
     assert answer.posterior["unscored_probability"] > 0
     assert answer.none_probability + shown + answer.posterior["unscored_probability"] == pytest.approx(1, abs=1e-9)
@@ -254,52 +256,52 @@ def test_a_shard_that_hangs_is_reported(ray, cluster, grasps, stopped):
 
 @pytest.mark.parametrize(
     "field",
-    [{"replicas": 0}, {"replicas": 3, "max_replicas": 2}, {"least_share": 0.0}, {"least_share": 1.5}, {"wait_s": 0.0}],
+    [{"replicas": 0}, {"replicas": 3, "max_replicas": 2}, {"min_share": 0.0}, {"min_share": 1.5}, {"wait_s": 0.0}],
 )
-def test_settings_that_are_none_are_refused(field):
+def test_invalid_settings_raise(field):
     from retrieval.cluster.serving import ReplicaSettings
 
     with pytest.raises(BadInput):
         ReplicaSettings(**field)
 
 
-def test_a_new_generation_is_taken_up_while_queries_go_on(ray, catalogue, cluster, model, grasps, tmp_path):
+def test_a_new_generation_is_used_during_running_queries(ray, catalogue, cluster, model, grasps, tmp_path):
     shutil.copytree(catalogue, tmp_path / "catalog")
     shutil.copytree(cluster, tmp_path / "cluster")
-    held = deployments(ray, wait_s=120.0)
-    current, told, stop = [Searcher.open(tmp_path / "cluster", shards=held.open)], [], threading.Event()
+    served = deployments(ray, wait_s=120.0)
+    current, reports, stop = [Searcher.open(tmp_path / "cluster", shards=served.open)], [], threading.Event()
 
-    def ask():
+    def run_queries():
         while not stop.is_set():
             answer = current[0].query(grasps[0], top=1)
-            told.append((answer.index["generation"], answer.index["photos"], answer.index["searched"]))
+            reports.append((answer.index["generation"], answer.index["photos"], answer.index["searched"]))
 
-    thread = threading.Thread(target=ask)
+    thread = threading.Thread(target=run_queries)
     thread.start()
     try:
         name = min(path.name for path in (tmp_path / "catalog").iterdir())
         shutil.copy(next(catalogue.glob("*/2.jpg")), tmp_path / "catalog" / name / "new.jpg")
         build_sharded(tmp_path / "catalog", load_checkpoint(model), tmp_path / "cluster", 4, quiet=True)
         before = current[0]
-        current[0] = Searcher.open(tmp_path / "cluster", shards=held.open)
+        current[0] = Searcher.open(tmp_path / "cluster", shards=served.open)
         del before
-        count, wait_until = len(told), time.monotonic() + 120
-        while len(told) < count + 3 and time.monotonic() < wait_until:
+        count, deadline = len(reports), time.monotonic() + 120
+        while len(reports) < count + 3 and time.monotonic() < deadline:
             time.sleep(0.05)
     finally:
         stop.set()
         thread.join(300)
-    assert set(told) == {("cluster-000001", 24, 1.0), ("cluster-000002", 25, 1.0)}
-    assert told == sorted(told)
+    assert set(reports) == {("sharded-000001", 24, 1.0), ("sharded-000002", 25, 1.0)}
+    assert reports == sorted(reports)
 
 
-def test_replicas_grow_while_requests_wait(ray, cluster, grasps, held):
+def test_replicas_grow_while_requests_wait(ray, cluster, grasps, served):
     grown = deployments(ray, wait_s=120.0, max_replicas=2, max_ongoing_requests=2)
-    expected, stop, found = names(held.query(grasps[0])), threading.Event(), set()
+    expected, stop, found = names(served.query(grasps[0])), threading.Event(), set()
     with Searcher.open(cluster, shards=grown.open) as searcher:
-        own = [name for name in ray.serve.status().applications if name.endswith(grown._own)]
+        own = [name for name in ray.serve.status().applications if name.endswith(grown._owner_id)]
 
-        def ask():
+        def run_queries():
             while not stop.is_set():
                 found.add(tuple(names(searcher.query(grasps[0]))))
 
@@ -307,13 +309,13 @@ def test_replicas_grow_while_requests_wait(ray, cluster, grasps, held):
             applications = ray.serve.status().applications
             return sum(sum(applications[name].deployments["shard"].replica_states.values()) for name in own)
 
-        threads = [threading.Thread(target=ask) for _ in range(12)]
+        threads = [threading.Thread(target=run_queries) for _ in range(12)]
         try:
             assert replicas() == 4
             for thread in threads:
                 thread.start()
-            wait_until = time.monotonic() + 240
-            while replicas() <= 4 and time.monotonic() < wait_until:
+            deadline = time.monotonic() + 240
+            while replicas() <= 4 and time.monotonic() < deadline:
                 time.sleep(0.2)
             assert 4 < replicas() <= 8
         finally:
@@ -327,23 +329,23 @@ def test_replicas_grow_while_requests_wait(ray, cluster, grasps, held):
 ENDING = """
 import sys, time
 from concurrent.futures import ThreadPoolExecutor
-from retrieval.cluster.serving import Deployments, Held
-from retrieval.cluster.session import connected
+from retrieval.cluster.serving import Deployments, ReplicaSettings
+from retrieval.cluster.session import ray_session
 from retrieval.search.query.searcher import Searcher
-with connected(2) as ray:
-    held = Deployments(ray, Held(cpus=0.1, wait_s=240.0, max_replicas=2))
-    with Searcher.open(sys.argv[1], shards=held.open) as searcher, ThreadPoolExecutor(12) as threads:
+with ray_session(2) as ray:
+    served = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=240.0, max_replicas=2))
+    with Searcher.open(sys.argv[1], shards=served.open) as searcher, ThreadPoolExecutor(12) as threads:
         print(set(threads.map(lambda _: str(searcher.shard.rows(["nothing"])), range(12))), flush=True)
-    held.close()
+    served.close()
 time.sleep(12)
 print(ray.is_initialized())
 """
 
 
-def test_after_the_end_nothing_speaks_to_ray_or_starts_another(cluster):
-    """Where shards may grow, a thread tells Ray every ten seconds how many requests wait."""
-    asked = [sys.executable, "-W", "ignore", "-c", ENDING, str(cluster)]
-    done = subprocess.run(asked, capture_output=True, text=True, timeout=600)
+def test_after_closing_nothing_calls_ray_or_starts_it_again(cluster):
+    """With autoscaling, a thread reports the number of waiting requests to Ray every ten seconds."""
+    command = [sys.executable, "-W", "ignore", "-c", ENDING, str(cluster)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
     assert done.stdout.splitlines() == ["{'[None]'}", "False"], done.stderr
     assert "metrics" not in done.stderr
 
@@ -351,8 +353,8 @@ def test_after_the_end_nothing_speaks_to_ray_or_starts_another(cluster):
 # Building -------------------------------------------------------------------------------------------------------------
 
 
-def halves_of(cluster):
-    """{photo: its half}, of all shards."""
+def partials_of(cluster):
+    """{photo: its partial activation} of all shards."""
     found = {}
     for entry in read_sharded_manifest(cluster).shards:
         generation = IndexStore(cluster / entry.folder).open(name=entry.generation)
@@ -363,13 +365,13 @@ def halves_of(cluster):
     return found
 
 
-def test_shards_built_by_ray_are_those_built_here(ray, catalogue, cluster, model, tmp_path):
+def test_shards_built_by_ray_equal_those_built_in_process(ray, catalogue, cluster, model, tmp_path):
     from retrieval.cluster.building import ray_runner
 
     report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=ray_runner())
     assert (report.photos, report.embedded, len(report.shards)) == (24, 24, 4)
-    assert ray.is_initialized()  # it was before, and others may use it
-    ours, theirs = halves_of(tmp_path / "c"), halves_of(cluster)
+    assert ray.is_initialized()  # an existing session stays open
+    ours, theirs = partials_of(tmp_path / "c"), partials_of(cluster)
     assert ours.keys() == theirs.keys()
     for name, partial in ours.items():
         np.testing.assert_allclose(
@@ -377,19 +379,19 @@ def test_shards_built_by_ray_are_those_built_here(ray, catalogue, cluster, model
         )
 
 
-def test_what_is_wrong_with_a_catalogue_is_a_sentence_from_afar_too(ray, catalogue, model, tmp_path):
+def test_an_error_of_a_remote_build_is_raised_as_a_clear_error(ray, catalogue, model, tmp_path):
     from retrieval.cluster.building import ray_runner
 
     shutil.copytree(catalogue, tmp_path / "catalog")
     for photo in list((tmp_path / "catalog").glob("*/2.jpg"))[:4]:
-        photo.write_bytes(b"no picture")
+        photo.write_bytes(b"not an image")
     with pytest.raises(TooManyUnreadable, match="4 of 24 photos cannot be read"):
         build_sharded(tmp_path / "catalog", load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=ray_runner())
 
 
 @pytest.fixture
 def many(tmp_path):
-    """A catalogue of 240 photos, no two alike."""
+    """A catalogue of 240 different photos."""
     folder = tmp_path / "many"
     base = next(
         path for path in sorted(synthetic.write_catalogue(tmp_path / "few", synthetic.make_objects(1)).rglob("*.jpg"))
@@ -398,12 +400,12 @@ def many(tmp_path):
     for number in range(240):
         place = folder / f"object-{number % 40:02d}" / f"{number}.jpg"
         place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes(data + b"\0" + str(number).encode())  # of another content; decoders stop at the end marker
+        place.write_bytes(data + b"\0" + str(number).encode())  # different content; decoders stop at the end marker
     return folder
 
 
-def test_a_worker_killed_while_it_embeds_loses_nothing_and_repeats_little(ray, many, model, tmp_path):
-    """Codes are kept as they are made: what is embedded twice is what the killed process had in work."""
+def test_a_killed_worker_loses_nothing_and_repeats_little(ray, many, model, tmp_path):
+    """Codes are stored immediately: only photos in work of the killed process are embedded twice."""
     from retrieval.cluster.building import ray_runner
 
     done = {}
@@ -415,8 +417,8 @@ def test_a_worker_killed_while_it_embeds_loses_nothing_and_repeats_little(ray, m
 
     thread = threading.Thread(target=build)
     thread.start()
-    wait_until, killed = time.monotonic() + 240, 0
-    while thread.is_alive() and killed < 2 and time.monotonic() < wait_until:
+    deadline, killed = time.monotonic() + 240, 0
+    while thread.is_alive() and killed < 2 and time.monotonic() < deadline:
         records = sum(path.stat().st_size for path in (tmp_path / "c").glob("shard-*/unfinished.sqlite"))
         if records and (workers := ray_processes.processes_named(WORKER)):
             os.kill(workers[0], signal.SIGKILL)
@@ -427,11 +429,11 @@ def test_a_worker_killed_while_it_embeds_loses_nothing_and_repeats_little(ray, m
     report = done["report"]
     assert killed
     assert (report.photos, report.objects, report.skipped) == (240, 40, [])
-    assert len(halves_of(tmp_path / "c")) == 240 == len(list_catalogue(many).photos)
+    assert len(partials_of(tmp_path / "c")) == 240 == len(list_catalogue(many).photos)
 
 
-def test_the_service_over_a_cluster_is_that_over_the_folder_and_lives_again_after_a_kill(cluster, searcher, touch):
-    """Without RAY_ADDRESS its Ray is its own, ends with it however it ends, and listens on this machine alone."""
+def test_the_service_on_a_cluster_gives_the_results_of_the_folder_and_restarts_after_a_kill(cluster, searcher, touch):
+    """Without RAY_ADDRESS the service starts its own Ray, which ends with it and listens only on this machine."""
     expected = searcher.query(touch)
     for how in (signal.SIGKILL, signal.SIGTERM):
         with serving.command("--index", cluster, "--cluster", "--no-history", "--port", 0) as (process, address, _):
@@ -448,10 +450,10 @@ def test_the_service_over_a_cluster_is_that_over_the_folder_and_lives_again_afte
             assert ray_processes.listening_addresses(process.pid) <= LOOPBACK
             process.send_signal(how)
             assert process.wait(120) == (0 if how == signal.SIGTERM else -signal.SIGKILL)
-        wait_until = time.monotonic() + 240  # an agent of Ray asks once in a while whether its raylet lives
-        while (left := set(below) & set(ray_processes.parents())) and time.monotonic() < wait_until:
+        deadline = time.monotonic() + 240  # an agent of Ray checks from time to time whether its raylet is alive
+        while (remaining := set(below) & set(ray_processes.parents())) and time.monotonic() < deadline:
             time.sleep(0.2)
-        assert not left
+        assert not remaining
 
 
 def test_without_a_cluster_the_service_says_what_to_do(index, capsys):

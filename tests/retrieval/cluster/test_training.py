@@ -1,4 +1,4 @@
-"""Training on Ray: the ranks are those of `torchrun`, and a lost one costs the steps since the last state."""
+"""Training on Ray: the ranks are those of `torchrun`, and a lost rank costs the steps since the last state."""
 
 import os
 import signal
@@ -25,13 +25,13 @@ RANK = r"ray::RayTrainWorker|ray::_RayTrainWorker|ray::RayTrainWorker__execute"
 
 
 def train_on_ray(*words, **how):
-    from retrieval.cluster.training import train_on_ray as ray_runner
+    from retrieval.cluster.training import train_on_ray as train_on_cluster
 
-    return ray_runner(*words, cpus=2, **how)
+    return train_on_cluster(*words, cpus=2, **how)
 
 
 @pytest.mark.slow
-def test_two_ranks_of_ray_train_what_one_process_does(recording, tmp_path):
+def test_two_ranks_on_ray_train_the_same_model_as_one_process(recording, tmp_path):
     config = with_training(TINY, freeze_towers=True)  # see tests/retrieval/training/test_ranks.py
     one = train(recording, tmp_path / "one.safetensors", config, quiet=True)
     two = train_on_ray(recording, tmp_path / "two.safetensors", config, workers=2)
@@ -47,7 +47,7 @@ def test_a_rank_that_is_killed_costs_the_steps_since_the_last_state(recording, t
     expected = train(recording, tmp_path / "calm.safetensors", config, quiet=True)
 
     def work():
-        done["made"] = train_on_ray(recording, out, config, workers=2)
+        done["checkpoint"] = train_on_ray(recording, out, config, workers=2)
 
     thread, killed = threading.Thread(target=work), 0
     thread.start()
@@ -59,13 +59,13 @@ def test_a_rank_that_is_killed_costs_the_steps_since_the_last_state(recording, t
         time.sleep(0.005)
     thread.join(600)
     assert killed
-    assert "a rank was lost; all begin again from the last state" in capsys.readouterr().err
-    assert done["made"].provenance["metrics"] == pytest.approx(expected.provenance["metrics"], abs=1e-3)
+    assert "a rank was lost; all ranks restart from the last state" in capsys.readouterr().err
+    assert done["checkpoint"].provenance["metrics"] == pytest.approx(expected.provenance["metrics"], abs=1e-3)
     assert load_checkpoint(out).posterior is not None
 
 
 @pytest.mark.slow
-def test_what_is_wrong_with_a_training_is_a_sentence_from_afar_too(recording, tmp_path):
+def test_an_error_of_a_rank_is_raised_as_a_clear_error(recording, tmp_path):
     config = with_training(TINY, init=str(tmp_path / "nothing.pth"))
     with pytest.raises(BadInput, match=r"nothing\.pth"):
         train_on_ray(recording, tmp_path / "m.safetensors", config, workers=1)
@@ -81,6 +81,6 @@ def test_an_unfinished_training_is_not_overwritten_and_workers_are_one_or_more(r
 
 
 @pytest.mark.parametrize("options", [["--cluster", "--task", "relief"], ["--workers", "2"]])
-def test_options_of_a_cluster_are_for_matchers_on_one(options, recording, tmp_path, capsys):
+def test_cluster_options_are_only_for_matchers_on_a_cluster(options, recording, tmp_path, capsys):
     assert main(["train", str(recording), "--out", str(tmp_path / "m.safetensors"), *options]) == 2
     assert "--cluster trains matchers" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Building an index over a folder of photos: what is embedded, what is taken over, what is left out and said."""
+"""Building an index of a folder of photos: embedding, reuse, skipped files and the report."""
 
 import dataclasses
 import json
@@ -54,7 +54,7 @@ def changed_model(checkpoint, path):
 PROVENANCE = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
 
 
-# What is embedded --------------------------------------------------------------------------------------------
+# Embedding and reuse -------------------------------------------------------------------------------------------------
 
 
 def test_a_first_build_embeds_every_photo_once_in_batches(catalogue_copy, checkpoint, index, embedded):
@@ -67,23 +67,23 @@ def test_a_first_build_embeds_every_photo_once_in_batches(catalogue_copy, checkp
     assert set(rows[0]) == {"id", "object_id", "path", "digest", "metadata"}
 
 
-def test_a_rebuild_with_nothing_changed_writes_nothing_and_says_so(catalogue_copy, checkpoint, index, embedded):
+def test_a_rebuild_without_changes_writes_nothing_and_reports_it(catalogue_copy, checkpoint, index, embedded):
     first = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert first.written
     embedded.clear()
-    (catalogue_copy / "note.txt").write_text("no photo")
-    (catalogue_copy / "broken.png").write_bytes(b"no photo either")
-    left = {"LOCK", "files.stat", "folders.stat"}  # how files and folders look is noted when they have settled
-    before = {path: path.stat().st_mtime_ns for path in index.rglob("*") if path.name not in left}
+    (catalogue_copy / "note.txt").write_text("not a photo")
+    (catalogue_copy / "broken.png").write_bytes(b"not a photo either")
+    changing = {"LOCK", "files.stat", "folders.stat"}  # stat records are written when files are old enough
+    before = {path: path.stat().st_mtime_ns for path in index.rglob("*") if path.name not in changing}
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (embedded, report.embedded, report.reused, report.generation) == ([], 0, 24, "gen-000001")
     assert (report.written, report.partial_error) == (False, first.partial_error)
-    assert {path: path.stat().st_mtime_ns for path in index.rglob("*") if path.name not in left} == before
+    assert {path: path.stat().st_mtime_ns for path in index.rglob("*") if path.name not in changing} == before
     assert "nothing changed: the index stays as it is" in list(report.lines())
     assert (report.ignored, [item.path for item in report.skipped]) == (["note.txt"], ["broken.png"])
 
 
-def test_another_wish_or_another_place_is_written_though_nothing_is_embedded(
+def test_new_requirements_or_a_moved_catalogue_are_written_without_embedding(
     catalogue_copy, checkpoint, index, embedded
 ):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
@@ -113,7 +113,7 @@ def test_a_rebuild_embeds_only_changed_and_new_photos(catalogue_copy, checkpoint
         assert np.array_equal(old, new) == (row_id != name)
 
 
-def test_a_rebuild_gives_what_a_build_from_nothing_gives(catalogue_copy, checkpoint, index, tmp_path):
+def test_a_rebuild_equals_a_new_build(catalogue_copy, checkpoint, index, tmp_path):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     other_picture(first_photo(catalogue_copy))
     shutil.rmtree(sorted(catalogue_copy.iterdir())[3])
@@ -121,12 +121,12 @@ def test_a_rebuild_gives_what_a_build_from_nothing_gives(catalogue_copy, checkpo
     build_index(catalogue_copy, checkpoint, tmp_path / "fresh", quiet=True)
     again, fresh = (IndexStore(path).open() for path in (index, tmp_path / "fresh"))
     assert again.rows == fresh.rows
-    # Another batch of the tower sums in another order: 1e-5 in float32, then one step of float16.
+    # In another batch the tower adds in another order: 1e-5 in float32, then one step of float16.
     np.testing.assert_allclose(again.arrays["partials"], fresh.arrays["partials"], rtol=2e-3, atol=2e-3)
     np.testing.assert_allclose(again.embeddings[again.slots], fresh.embeddings[fresh.slots], atol=1e-5)
 
 
-def test_photos_that_are_removed_or_broke_since_vanish_and_are_counted(catalogue_copy, checkpoint, index):
+def test_photos_that_were_removed_or_damaged_are_dropped_and_counted(catalogue_copy, checkpoint, index):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     first_photo(catalogue_copy).unlink()
     broken = first_photo(catalogue_copy)
@@ -150,7 +150,7 @@ def test_a_renamed_photo_is_a_new_photo_that_is_not_embedded_again(catalogue_cop
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert embedded == []
     assert (report.photos, report.embedded, report.reused, report.renamed, report.removed) == (24, 0, 24, 1, 1)
-    assert "24 unchanged (1 under another name), 1 removed" in next(report.lines())
+    assert "24 unchanged (1 renamed), 1 removed" in next(report.lines())
     after = IndexStore(index).open()
     old, new = (
         part.row_number(path.relative_to(catalogue_copy).as_posix()) for part, path in ((before, photo), (after, moved))
@@ -161,7 +161,7 @@ def test_a_renamed_photo_is_a_new_photo_that_is_not_embedded_again(catalogue_cop
     assert report.partial_error == before.manifest.about["partial_error"]
 
 
-def test_the_same_picture_under_two_objects_is_two_rows_with_one_vector(catalogue_copy, checkpoint, index):
+def test_the_same_image_of_two_objects_gives_two_rows_with_one_vector(catalogue_copy, checkpoint, index):
     (catalogue_copy / "twin").mkdir()
     shutil.copy(first_photo(catalogue_copy), catalogue_copy / "twin" / "1.jpg")
     assert build_index(catalogue_copy, checkpoint, index, quiet=True).photos == 25
@@ -174,7 +174,7 @@ def test_the_same_picture_under_two_objects_is_two_rows_with_one_vector(catalogu
     assert len(generation.embeddings) == 24
 
 
-def test_new_metadata_alone_embeds_nothing_and_stands_in_the_rows(catalogue_copy, checkpoint, index, embedded):
+def test_new_metadata_changes_the_rows_without_embedding(catalogue_copy, checkpoint, index, embedded):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     embedded.clear()
     name = first_photo(catalogue_copy).parent.name
@@ -184,18 +184,18 @@ def test_new_metadata_alone_embeds_nothing_and_stands_in_the_rows(catalogue_copy
     assert {row["object_id"] for row in rows_of(index).values() if row["metadata"] == {"price": 3}} == {name}
 
 
-def test_a_changed_model_embeds_everything_and_says_so(catalogue_copy, checkpoint, index, embedded, tmp_path):
+def test_a_changed_model_embeds_everything_and_reports_it(catalogue_copy, checkpoint, index, embedded, tmp_path):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     embedded.clear()
     other = changed_model(checkpoint, tmp_path / "other.safetensors")
     report = build_index(catalogue_copy, other, index, quiet=True)
     assert (sum(embedded), report.embedded, report.reused) == (24, 24, 0)
     assert report.reason.startswith(
-        f"Every photo was embedded again: the model is another one; the index was written by version {__version__}."
+        f"Every photo was embedded again: the model changed; the index was written by version {__version__}."
     )
 
 
-def test_a_damaged_index_is_built_anew_and_says_so(catalogue_copy, checkpoint, index):
+def test_a_damaged_index_is_rebuilt_and_reported(catalogue_copy, checkpoint, index):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     partials = index / "gen-000001" / "partials.npy"
     partials.write_bytes(partials.read_bytes()[:-1])
@@ -205,14 +205,14 @@ def test_a_damaged_index_is_built_anew_and_says_so(catalogue_copy, checkpoint, i
     assert Searcher.open(index).generation.count == 24
 
 
-# What cannot be used -----------------------------------------------------------------------------------------
+# Unusable input ------------------------------------------------------------------------------------------------------
 
 
-def test_broken_photos_among_many_are_skipped_and_listed_and_stop_nothing(catalogue_copy, checkpoint, index):
+def test_broken_photos_are_skipped_and_listed(catalogue_copy, checkpoint, index):
     photos = sorted(catalogue_copy.rglob("*.jpg"))
     photos[0].write_bytes(b"")
     photos[7].write_bytes(photos[7].read_bytes()[:900])
-    photos[23].write_bytes(b"this is no picture")
+    photos[23].write_bytes(b"this is not an image")
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (report.photos, report.embedded) == (21, 21)
     assert [item.path for item in report.skipped] == [
@@ -225,7 +225,7 @@ def test_broken_photos_among_many_are_skipped_and_listed_and_stop_nothing(catalo
     assert len(json.loads(json.dumps(report.to_dict()))["skipped"]) == 3
 
 
-def test_long_lists_are_cut_for_people_and_whole_in_json(catalogue_copy, checkpoint, index):
+def test_long_lists_are_truncated_in_text_and_complete_in_json(catalogue_copy, checkpoint, index):
     for number in range(30):
         (catalogue_copy / f"broken{number:02}.png").write_bytes(b"x")
         (catalogue_copy / f"note{number:02}.txt").write_text("x")
@@ -238,7 +238,7 @@ def test_long_lists_are_cut_for_people_and_whole_in_json(catalogue_copy, checkpo
     assert len(report.to_dict()["skipped"]) == len(report.to_dict()["ignored"]) == 30
 
 
-def test_a_catalogue_of_broken_photos_alone_is_an_error_and_the_old_index_stays(catalogue_copy, checkpoint, index):
+def test_a_catalogue_of_only_broken_photos_raises_and_the_old_index_stays(catalogue_copy, checkpoint, index):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     for path in catalogue_copy.rglob("*.jpg"):
         path.write_bytes(b"broken")
@@ -253,51 +253,51 @@ BAD_NUMBERS = [
     ("photo_projection", float("nan")),
     ("photo_projection", float("inf")),
     ("head.photo_partial", float("nan")),
-    ("head.photo_partial", 1e6),  # more than float16 holds
+    ("head.photo_partial", 1e6),  # beyond float16
 ]
 
 
 @pytest.mark.parametrize(("part", "value"), BAD_NUMBERS)
 def test_a_nan_or_overflow_never_reaches_an_index(part, value, catalogue_copy, checkpoint, index):
-    """A module gives a bad number for the fourth photo: that photo is named, and the old index stays."""
+    """A module outputs a bad number for the fourth photo: the error names the photo, and the old index stays."""
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     for path in catalogue_copy.rglob("*.jpg"):
-        path.write_bytes(path.read_bytes() + b"other content, the same picture")
+        path.write_bytes(path.read_bytes() + b"other content, the same image")
 
-    def spoil(module, inputs, output):
+    def corrupt(module, inputs, output):
         return output.index_fill(0, torch.tensor([3]), value) if len(output) == 16 else output
 
-    for_inference(checkpoint.matcher).get_submodule(part).register_forward_hook(spoil)
+    for_inference(checkpoint.matcher).get_submodule(part).register_forward_hook(corrupt)
     with pytest.raises((NumericalError, VectorError), match=list_catalogue(catalogue_copy).photos[3].path):
         build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert IndexStore(index).current() == "gen-000001"
     assert np.isfinite(IndexStore(index).open().arrays["partials"]).all()
 
 
-def test_what_cannot_be_built_is_refused_before_anything_is_embedded(catalogue_copy, checkpoint, index, embedded):
+def test_invalid_requirements_raise_before_embedding(catalogue_copy, checkpoint, index, embedded):
     with pytest.raises(ParameterError, match="flat"):
         build_index(catalogue_copy, checkpoint, index, kind="tree", quiet=True)
     with pytest.raises(ParameterError, match="ivf_pq needs 624 or more vectors to train its codes; got 24"):
         build_index(catalogue_copy, checkpoint, index, kind="ivf_pq", quiet=True)
     for recall in (0, -0.1, 1.01, float("nan")):
-        with pytest.raises(BadInput, match="least winner recall"):
+        with pytest.raises(BadInput, match="minimum recall must be above 0"):
             build_index(catalogue_copy, checkpoint, index, min_recall=recall, quiet=True)
     for budget in (0, -1, float("nan")):
-        with pytest.raises(BadInput, match="must be above 0 ms"):
+        with pytest.raises(BadInput, match="must take more than 0 ms"):
             build_index(catalogue_copy, checkpoint, index, max_ms=budget, quiet=True)
     assert embedded == []
 
 
-def test_a_second_writer_is_refused(catalogue_copy, checkpoint, index, embedded):
+def test_a_second_writer_raises(catalogue_copy, checkpoint, index, embedded):
     with IndexStore(index).lock(), pytest.raises(LockedIndex):
         build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert embedded == []
 
 
-# What is said of the result ------------------------------------------------------------------------------------
+# The report ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_error_of_float16_partials_is_stated_and_small(catalogue_copy, checkpoint, index):
+def test_the_error_of_float16_partials_is_reported_and_small(catalogue_copy, checkpoint, index):
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     generation = IndexStore(index).open()
     load = checkpoint.config.preprocessing.load_photo
@@ -307,13 +307,13 @@ def test_the_error_of_float16_partials_is_stated_and_small(catalogue_copy, check
     stored = np.asarray(generation.arrays["partials"])
     assert stored.dtype == np.float16
     error = float(np.abs(stored - exact).max())
-    assert report.partial_error == pytest.approx(error, abs=1e-5)  # the tower's batches were others
+    assert report.partial_error == pytest.approx(error, abs=1e-5)  # in other batches of the tower
     assert 0 < report.partial_error <= 2**-11 * np.abs(exact).max()  # half a step of 11 bits
     assert generation.manifest.about["partial_error"] == report.partial_error
-    assert f"within {report.partial_error:.2g} of" in "\n".join(report.lines())
+    assert f"error of at most {report.partial_error:.2g}" in "\n".join(report.lines())
 
 
-def test_exact_search_is_the_default_and_vectors_are_measured_only_for_a_budget(
+def test_exact_search_is_the_default_and_vectors_are_measured_only_for_a_time_bound(
     catalogue_copy, checkpoint, index, monkeypatch
 ):
     measured = []
@@ -324,8 +324,8 @@ def test_exact_search_is_the_default_and_vectors_are_measured_only_for_a_budget(
     assert measured == []
     report = build_index(catalogue_copy, checkpoint, index, max_ms=1e-9, quiet=True)
     assert (measured, report.candidates) == ([24], None)
-    assert "reaches 1e-09 ms; this is the nearest" in report.reason
-    assert "keeps no touches to measure candidates with, so recall is that of nearest neighbours" in report.reason
+    assert "reaches 1e-09 ms; this is the closest" in report.reason
+    assert "stores no touches to measure candidates with, so recall is that of nearest neighbours" in report.reason
     assert "hnsw" in "\n".join(build_index(catalogue_copy, checkpoint, index, kind="hnsw", quiet=True).lines())
     assert Searcher.open(index).generation.manifest.kind == "hnsw"
 
@@ -334,12 +334,12 @@ def test_few_photos_are_all_scored_without_a_measurement(catalogue_copy, queried
     monkeypatch.setattr(operating, "ExhaustiveBench", None)
     report = build_index(catalogue_copy, queried, index, quiet=True)
     assert (report.candidates["k"], report.candidates["queries"]) == (24, 0)
-    assert "candidate search: flat. The classifier judges all 24 photos." in list(report.lines())
+    assert "candidate search: flat. The classifier scores all 24 photos." in list(report.lines())
 
 
 @pytest.fixture
 def queried(checkpoint, tmp_path):
-    """A checkpoint with a candidate_encoder, and touches to measure with."""
+    """A checkpoint with a candidate encoder, and touches to measure with."""
     config = dataclasses.replace(
         checkpoint.config, matcher=dataclasses.replace(checkpoint.config.matcher, candidate_width=8)
     )
@@ -362,9 +362,7 @@ def test_the_measured_operating_point_is_in_manifest_and_report(catalogue_copy, 
     assert "validation touches (95 % interval" in "\n".join(report.lines())
 
 
-def test_newcomers_and_old_photos_are_measured_together_once_enough_changed(
-    catalogue_copy, queried, index, monkeypatch
-):
+def test_new_and_old_photos_are_measured_together_after_enough_changes(catalogue_copy, queried, index, monkeypatch):
     monkeypatch.setattr(measuring, "EXHAUSTIVE_LIMIT", 4)
     benches = []
     monkeypatch.setattr(
@@ -382,20 +380,20 @@ def test_newcomers_and_old_photos_are_measured_together_once_enough_changed(
     np.testing.assert_array_equal(vectors[slots], generation.embeddings[generation.slots])
 
 
-def test_the_recall_of_neighbours_is_measured_with_touches_where_the_checkpoint_keeps_some(
+def test_recall_is_measured_with_touches_if_the_checkpoint_stores_some(
     catalogue_copy, checkpoint, queried, index, tmp_path
 ):
     build_index(catalogue_copy, queried, index, kind="hnsw", quiet=True)
     build_index(catalogue_copy, checkpoint, tmp_path / "other", kind="hnsw", quiet=True)
     with_touches, without = (IndexStore(path).open().manifest.recall for path in (index, tmp_path / "other"))
-    assert (with_touches["queries"], with_touches["how"]) == (30, "measured on the queries that were given")
-    assert without["how"] == "measured on moved own vectors"
+    assert (with_touches["queries"], with_touches["how"]) == (30, "measured on the given queries")
+    assert without["how"] == "measured on displaced vectors of the index"
 
 
-# The threads that read and decode ------------------------------------------------------------------------------
+# Threads that read and decode ----------------------------------------------------------------------------------------
 
 
-def test_looking_ahead_keeps_the_order_and_never_runs_further_than_its_window():
+def test_map_ahead_preserves_the_order_and_stays_within_its_window():
     taken = []
 
     def items():
@@ -412,7 +410,7 @@ def test_looking_ahead_keeps_the_order_and_never_runs_further_than_its_window():
         assert len(taken) <= place + 5
 
 
-def test_an_error_on_a_thread_comes_out_where_the_item_would():
+def test_an_error_on_a_thread_is_raised_in_place_of_its_item():
     def fail(number):
         return 1 / (number - 3)
 

@@ -1,4 +1,4 @@
-"""What `build-index` understood of a folder of photos, and what it says of it."""
+"""The report of `build-index`: object names, warnings and skipped files."""
 
 import json
 import shutil
@@ -22,8 +22,8 @@ def photos(catalogue):
     return sorted(catalogue.glob("*/1.jpg"))
 
 
-def laid_out(folder, photos, *names):
-    """A catalogue of the photos under these names."""
+def catalogue_of(folder, photos, *names):
+    """A catalogue with the photos under these names."""
     for photo, name in zip(photos, names, strict=False):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(photo, folder / name)
@@ -34,9 +34,9 @@ def objects(index):
     return {row["path"]: row["object_id"] for row in IndexStore(index).open().rows}
 
 
-def test_it_says_how_many_photos_each_object_has_and_shows_three(tmp_path, photos, checkpoint, index):
+def test_the_report_has_photo_counts_and_three_examples(tmp_path, photos, checkpoint, index):
     names = ["mug/0.jpg", "mug/1.jpg", "mug/2.jpg", "cup/0.jpg", "cup/1.jpg", "ball.jpg"]
-    report = build_index(laid_out(tmp_path / "own", photos, *names), checkpoint, index, quiet=True)
+    report = build_index(catalogue_of(tmp_path / "own", photos, *names), checkpoint, index, quiet=True)
     assert (report.objects_from, report.per_object) == ("folder", {"min": 1, "median": 2, "max": 3})
     assert report.examples == [("ball", "ball.jpg"), ("cup", "cup/0.jpg"), ("mug", "mug/0.jpg")]
     lines = list(report.lines())
@@ -45,9 +45,11 @@ def test_it_says_how_many_photos_each_object_has_and_shows_three(tmp_path, photo
     assert report.warnings == []
 
 
-def test_a_data_sets_layout_is_warned_of_and_a_pattern_puts_it_right(tmp_path, photos, checkpoint, index):
-    """Every photo below train/ had become a photo of the object "train", silently."""
-    own = laid_out(tmp_path / "own", photos, "train/mug/0.jpg", "train/mug/1.jpg", "train/cup/0.jpg", "test/cup/1.jpg")
+def test_the_layout_of_a_data_set_gives_a_warning_and_a_pattern_corrects_it(tmp_path, photos, checkpoint, index):
+    """Without the warning, every photo below train/ silently becomes a photo of the object "train"."""
+    own = catalogue_of(
+        tmp_path / "own", photos, "train/mug/0.jpg", "train/mug/1.jpg", "train/cup/0.jpg", "test/cup/1.jpg"
+    )
     report = build_index(own, checkpoint, index, quiet=True)
     assert set(objects(index).values()) == {"train", "test"}
     assert any(line.startswith("warning: test, train are taken for the name of an object") for line in report.lines())
@@ -56,55 +58,57 @@ def test_a_data_sets_layout_is_warned_of_and_a_pattern_puts_it_right(tmp_path, p
     assert (report.written, report.embedded, report.warnings) == (True, 0, [])
 
 
-def test_numbered_files_are_warned_of_and_stem_puts_them_right(tmp_path, photos, checkpoint, index):
-    """Every photo had become an object of its own, silently."""
-    own = laid_out(tmp_path / "own", photos, "mug_0.jpg", "mug_1.jpg", "cup-1.jpg", "cup-2.jpg")
+def test_numbered_files_give_a_warning_and_stem_corrects_it(tmp_path, photos, checkpoint, index):
+    """Without the warning, every photo silently becomes a separate object."""
+    own = catalogue_of(tmp_path / "own", photos, "mug_0.jpg", "mug_1.jpg", "cup-1.jpg", "cup-2.jpg")
     report = build_index(own, checkpoint, index, quiet=True)
     assert "every object has one photo, and 4 of 4" in report.warnings[0]
     report = build_index(own, checkpoint, index, objects_from="stem", quiet=True)
     assert (report.objects, report.warnings) == (2, [])
 
 
-def test_the_index_keeps_the_rule_and_says_when_it_changes(tmp_path, photos, checkpoint, index):
-    own = laid_out(tmp_path / "own", photos, "mug_0.jpg", "mug_1.jpg", "cup_0.jpg")
+def test_the_index_stores_the_rule_and_reports_a_change(tmp_path, photos, checkpoint, index):
+    own = catalogue_of(tmp_path / "own", photos, "mug_0.jpg", "mug_1.jpg", "cup_0.jpg")
     build_index(own, checkpoint, index, objects_from="stem", quiet=True)
     again = build_index(own, checkpoint, index, quiet=True)
     assert (again.objects_from, again.objects, again.written) == ("stem", 2, False)
     changed = build_index(own, checkpoint, index, objects_from="folder", quiet=True)
     assert (changed.objects, changed.written, changed.embedded) == (3, True, 0)
-    assert changed.reason.startswith("Objects are named by folder now, no longer by stem.")
+    assert changed.reason.startswith("The rule for object names changed from stem to folder.")
     assert IndexStore(index).open().manifest.about["objects_from"] == "folder"
     alike = build_index(own, checkpoint, index, objects_from="{object}.jpg", quiet=True)
     assert (alike.objects, alike.written) == (3, True)
 
 
-def test_a_rule_that_is_none_is_refused_before_anything_is_made(tmp_path, photos, checkpoint, index):
+def test_an_invalid_rule_raises_before_anything_is_written(tmp_path, photos, checkpoint, index):
     with pytest.raises(BadInput, match="folder, stem, or a pattern"):
-        build_index(laid_out(tmp_path / "own", photos, "mug.jpg"), checkpoint, index, objects_from="name", quiet=True)
+        build_index(
+            catalogue_of(tmp_path / "own", photos, "mug.jpg"), checkpoint, index, objects_from="name", quiet=True
+        )
     assert not index.exists()
 
 
-def test_what_is_left_out_is_counted_by_reason_and_whole_in_json(tmp_path, photos, checkpoint, index):
-    own = laid_out(tmp_path / "own", photos, "mug/0.jpg", "cup/0.jpg")
+def test_left_out_files_are_counted_by_reason_and_complete_in_json(tmp_path, photos, checkpoint, index):
+    own = catalogue_of(tmp_path / "own", photos, "mug/0.jpg", "cup/0.jpg")
     for name in ("a.txt", "b.TXT", "README", "mug/1.gif", "mug/2.gif"):
         (own / name).write_text("x")
     (own / "mug" / "3.jpg").write_bytes(b"")
     report = build_index(own, checkpoint, index, quiet=True)
     assert report.left_out == {
-        "no picture by name (.txt)": 2,
+        "not an image file (.txt)": 2,
         ".gif pictures are not read": 2,
-        "no picture by name (without an ending)": 1,
+        "not an image file (without an ending)": 1,
         "the file is empty": 1,
     }
-    assert "6 file(s) left out: 2 no picture by name (.txt), 2 .gif" in "\n".join(report.lines())
+    assert "6 file(s) left out: 2 not an image file (.txt), 2 .gif" in "\n".join(report.lines())
     document = json.loads(json.dumps(report.to_dict()))
     assert (document["left_out"], document["ignored"]) == (report.left_out, ["README", "a.txt", "b.TXT"])
     assert [item["path"] for item in document["skipped"]] == ["mug/1.gif", "mug/2.gif", "mug/3.jpg"]
     assert document["without_photo"] == []
 
 
-def test_objects_without_a_readable_photo_are_named_and_the_exit_code_says_so(tmp_path, photos, model, index, capsys):
-    own = laid_out(tmp_path / "own", photos, "mug/0.jpg", "cup/0.jpg", "cup/1.jpg", "ball/0.jpg")
+def test_objects_without_a_readable_photo_are_listed_and_give_exit_code_1(tmp_path, photos, model, index, capsys):
+    own = catalogue_of(tmp_path / "own", photos, "mug/0.jpg", "cup/0.jpg", "cup/1.jpg", "ball/0.jpg")
     command = ["build-index", str(own), "--model", str(model), "--out", str(index)]
     (own / "cup" / "0.jpg").write_bytes(b"broken")
     assert main(command) == 0  # the cup has another photo
@@ -114,6 +118,6 @@ def test_objects_without_a_readable_photo_are_named_and_the_exit_code_says_so(tm
     assert main([*command, "--json"]) == 1
     printed = capsys.readouterr()
     assert json.loads(printed.out)["without_photo"] == ["ball", "cup"]
-    assert "2 of 3 objects are not in the index, for none of their pictures can be read: ball, cup" in printed.err
+    assert "2 of 3 objects are not in the index, because none of their images can be read: ball, cup" in printed.err
     assert "the index is written, but 2 object(s) have no photo that can be read" in printed.err
     assert objects(index) == {"mug/0.jpg": "mug"}

@@ -1,6 +1,6 @@
-"""`retrieve build-index` killed at any moment: the next query finds the old or the new catalogue, whole.
+"""`retrieve build-index` killed at any moment: the next query finds the old or the new catalogue, complete.
 
-KILLS=50 python -m pytest tests/retrieval/search/test_crash.py -s     the long run, which prints what was hit
+KILLS=50 python -m pytest tests/retrieval/search/test_crash.py -s     the long run, which prints counts
 """
 
 import json
@@ -30,7 +30,7 @@ DEADLINE_S = 120.0
 
 @dataclass(frozen=True)
 class Build:
-    """A build that was watched: seconds from its start until it wrote, until CURRENT changed, until it ended."""
+    """Seconds from the start of a build until it wrote, until CURRENT changed, and until it ended."""
 
     pid: int
     writing_s: float | None
@@ -44,14 +44,14 @@ def command(*arguments):
 
 
 def watched_build(catalogue, model, index, kill_at_s=math.inf, kill_writing_s=math.inf):
-    """Run `retrieve build-index`; SIGKILL it so long after its start, or after it began to write, if it still runs.
+    """Run `retrieve build-index`, and kill it some time after its start or after it began to write, if it still runs.
 
     Writing begins when the folder of the unfinished generation appears.
     """
     folders, current = set(index.glob("gen-*")), (index / "CURRENT").read_text()
     arguments = command("build-index", catalogue, "--model", model, "--out", index)
     start, written, changed = time.monotonic(), None, None
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # starts faster where other work takes the cores
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}  # starts faster on a busy machine
     with subprocess.Popen(arguments, stderr=subprocess.DEVNULL, env=environment) as process:
         while process.poll() is None:
             now = time.monotonic() - start
@@ -68,13 +68,13 @@ def watched_build(catalogue, model, index, kill_at_s=math.inf, kill_writing_s=ma
 
 
 def content(catalogue):
-    """What the rows of an index over this folder must be: {id: digest}."""
+    """Expected rows of an index of this folder: {id: digest}."""
     listed = list_catalogue(catalogue)
     return {photo.path: read_photo(listed, photo).digest for photo in listed.photos}
 
 
 def changed_copy(catalogue, path):
-    """The catalogue with one object gone, one new, and one photo replaced."""
+    """A copy of the catalogue with one object removed, one added, and one photo replaced."""
     shutil.copytree(catalogue, path)
     objects = sorted(path.iterdir())
     shutil.rmtree(objects[0])
@@ -84,7 +84,7 @@ def changed_copy(catalogue, path):
 
 
 def moments(count, build, rng):
-    """Half of the kills while it writes and a little beyond, the others at any time from its start to its end."""
+    """Every other kill during or just after writing, the others at any time of the build."""
     for number in range(count):
         if number % 2:
             yield {"kill_at_s": rng.uniform(0.0, build.ended_s)}
@@ -92,8 +92,8 @@ def moments(count, build, rng):
             yield {"kill_writing_s": rng.uniform(0.0, 1.5 * (build.current_s - build.writing_s))}
 
 
-def what_is_there(index, model, touch):
-    """The rows of a whole index, after a query that must work on it: {id: digest}."""
+def checked_rows(index, model, touch):
+    """Rows of a complete index, {id: digest}, after a query on it."""
     searcher = Searcher.open(index, model=model)
     searcher.generation.self_check()
     result = searcher.query([touch], top=100)
@@ -104,28 +104,34 @@ def what_is_there(index, model, touch):
 
 
 @pytest.mark.slow
-def test_a_killed_build_leaves_the_old_or_the_new_index_whole(catalogue, model, touch, tmp_path):
+def test_a_killed_build_leaves_the_old_or_the_new_index_complete(catalogue, model, touch, tmp_path):
     index, rng = tmp_path / "index", random.Random(SEED)
     folders = [shutil.copytree(catalogue, tmp_path / "old"), changed_copy(catalogue, tmp_path / "new")]
     contents = [content(folder) for folder in folders]
     build_index(folders[0], load_checkpoint(model), index, quiet=True)
-    unbroken = watched_build(folders[1], model, index)
-    assert what_is_there(index, model, touch) == contents[1]
-    old, seen = 1, Counter()
-    for moment in moments(KILLS, unbroken, rng):
+    uninterrupted = watched_build(folders[1], model, index)
+    assert checked_rows(index, model, touch) == contents[1]
+    old, outcomes = 1, Counter()
+    for moment in moments(KILLS, uninterrupted, rng):
         new = 1 - old
         build = watched_build(folders[new], model, index, **moment)
-        left = any(index.glob(f"gen-*.tmp-{build.pid}"))
-        rows = what_is_there(index, model, touch)
+        has_unfinished = any(index.glob(f"gen-*.tmp-{build.pid}"))
+        rows = checked_rows(index, model, touch)
         assert rows in (contents[old], contents[new])
         assert build.killed or rows == contents[new]
-        how = "not killed in time" if not build.killed else "killed, unfinished folder left" if left else "killed"
-        seen[f"{how}, {'new' if rows == contents[new] else 'old'} index"] += 1
+        how = (
+            "not killed in time"
+            if not build.killed
+            else "killed, unfinished folder left"
+            if has_unfinished
+            else "killed"
+        )
+        outcomes[f"{how}, {'new' if rows == contents[new] else 'old'} index"] += 1
         old = contents.index(rows)
-    print(f"\n{KILLS} kills; unbroken: {unbroken}; {dict(seen)}")
+    print(f"\n{KILLS} kills; uninterrupted: {uninterrupted}; {dict(outcomes)}")
     assert objects_by_command_line(index, touch) == sorted({name.split("/")[0] for name in contents[old]})
-    build_index(folders[1 - old], load_checkpoint(model), index, quiet=True)  # the next build clears up and goes on
-    assert what_is_there(index, model, touch) == contents[1 - old]
+    build_index(folders[1 - old], load_checkpoint(model), index, quiet=True)  # the next build cleans up and continues
+    assert checked_rows(index, model, touch) == contents[1 - old]
     assert list(index.glob("*.tmp-*")) == []
 
 

@@ -1,4 +1,4 @@
-"""Which model and index a command takes where the user names none."""
+"""The default model and index of a command."""
 
 import json
 import os
@@ -41,30 +41,30 @@ def of_a_fixture():
     return defaults._state_file()
 
 
-def test_nothing_that_these_tests_make_is_remembered_for_the_user(of_a_fixture, monkeypatch):
-    """A slow test's training was the default of the next run's fixtures."""
-    catalogue_copy = defaults._state_file()
+def test_tests_do_not_change_the_users_state(of_a_fixture, monkeypatch):
+    """Otherwise a model that a test trained would become the user's default."""
+    of_this_test = defaults._state_file()
     monkeypatch.delenv("XDG_STATE_HOME")
-    assert len({AT_IMPORT, of_a_fixture, catalogue_copy, defaults._state_file()}) == 4
+    assert len({AT_IMPORT, of_a_fixture, of_this_test, defaults._state_file()}) == 4
 
 
-def test_what_is_given_is_taken_even_if_it_is_not_there():
+def test_an_explicit_choice_is_used_even_if_it_is_missing():
     assert defaults.find_model("none.safetensors") == (Path("none.safetensors"), "given")
     assert defaults.find_index("none") == (Path("none"), "given")
 
 
-def test_a_file_given_for_an_index_is_refused(tmp_path):
+def test_a_file_in_place_of_an_index_raises(tmp_path):
     (tmp_path / "model.safetensors").touch()
     with pytest.raises(BadInput, match=r"model\.safetensors is a file; an index is a folder"):
         defaults.find_index(str(tmp_path / "model.safetensors"))
 
 
-def test_shipped_models_are_named_by_the_fingers_that_they_take():
+def test_shipped_models_are_selected_by_their_number_of_fingers():
     assert defaults.find_model("shipped")[0] == defaults.shipped_model()
     assert defaults.find_model("shipped-one-finger")[0] == defaults.shipped_model(1)
     for fingers in (1, 2):
         assert read_checkpoint_info(defaults.shipped_model(fingers)).config.matcher.fingers == fingers
-    with pytest.raises(BadInput, match="1 and of 2 gel images"):
+    with pytest.raises(BadInput, match="take touches of 1 or 2 gel images; got 3"):
         defaults.shipped_model(3)
 
 
@@ -84,7 +84,7 @@ def index_built_with(model, folder):
     return folder
 
 
-def test_the_last_model_trained_from_this_folder_is_taken_while_it_is_there(tmp_path, monkeypatch):
+def test_the_last_model_trained_from_this_folder_is_used_while_it_exists(tmp_path, monkeypatch):
     shipped, last = shipped_in(tmp_path, monkeypatch), tmp_path / "last.safetensors"
     last.touch()
     assert defaults.find_model(None)[0] == shipped
@@ -95,7 +95,7 @@ def test_the_last_model_trained_from_this_folder_is_taken_while_it_is_there(tmp_
     assert defaults.find_model(None)[0] == shipped
 
 
-def test_what_was_made_from_another_folder_is_never_taken(tmp_path, monkeypatch):
+def test_models_and_indexes_of_another_folder_are_never_used(tmp_path, monkeypatch):
     shipped, model = shipped_in(tmp_path, monkeypatch), tmp_path / "m.safetensors"
     model.touch()
     defaults.remember("model", model)
@@ -105,28 +105,28 @@ def test_what_was_made_from_another_folder_is_never_taken(tmp_path, monkeypatch)
     assert defaults.find_model(None)[0] == shipped
     with pytest.raises(BadInput, match="no index in this folder and none was built from it"):
         defaults.find_index(None)
-    defaults.remember("model", shipped)  # what was trained since elsewhere changes nothing at the first place
+    defaults.remember("model", shipped)  # a training in another folder does not change the first one
     monkeypatch.chdir(tmp_path)
     assert defaults.find_model(None) == (model, "the last one trained in this folder")
     assert defaults.find_index(None)[0] == tmp_path / "built"
 
 
-def test_an_index_in_the_folder_knows_its_own_model(tmp_path, monkeypatch):
+def test_an_index_in_the_folder_determines_the_model(tmp_path, monkeypatch):
     shipped_in(tmp_path, monkeypatch)
-    catalogue_copy, newer = tmp_path / "own.safetensors", tmp_path / "newer.safetensors"
-    catalogue_copy.write_bytes(b"own")
+    own, newer = tmp_path / "own.safetensors", tmp_path / "newer.safetensors"
+    own.write_bytes(b"own")
     newer.write_bytes(b"newer")
-    index_built_with(catalogue_copy, tmp_path / "index")
-    assert defaults.find_model(None) == (catalogue_copy, "the one that index was built with")
+    index_built_with(own, tmp_path / "index")
+    assert defaults.find_model(None) == (own, "the one that index was built with")
     defaults.remember("model", newer)
     assert defaults.find_model(None) == (
-        catalogue_copy,
-        f"the one that index was built with; {newer} was trained in this folder too: name it to take it",
+        own,
+        f"the one that index was built with; {newer} was trained in this folder too: use --model to select it",
     )
-    assert defaults.find_model(None, Path("elsewhere"))[0] == newer  # no index is there to know better
+    assert defaults.find_model(None, Path("elsewhere"))[0] == newer  # no index determines the model
 
 
-def test_a_model_of_an_index_that_went_away_is_found_by_its_content_or_missed_aloud(tmp_path, monkeypatch):
+def test_a_moved_model_of_an_index_is_found_by_its_content_or_raises(tmp_path, monkeypatch):
     shipped, gone = shipped_in(tmp_path, monkeypatch), tmp_path / "gone.safetensors"
     gone.write_bytes(b"shipped")
     index_built_with(gone, tmp_path / "index")
@@ -137,14 +137,14 @@ def test_a_model_of_an_index_that_went_away_is_found_by_its_content_or_missed_al
         defaults.find_model(None)
 
 
-def test_a_damaged_index_names_no_model(tmp_path, monkeypatch):
+def test_a_damaged_index_does_not_determine_the_model(tmp_path, monkeypatch):
     shipped = shipped_in(tmp_path, monkeypatch)
     index_built_with(shipped, tmp_path / "index")
     (tmp_path / "index" / "gen-000001" / "manifest.json").write_text("{")
     assert defaults.find_model(None)[1].startswith("shipped")
 
 
-def test_only_so_many_folders_are_remembered(tmp_path, monkeypatch):
+def test_a_limited_number_of_folders_is_remembered(tmp_path, monkeypatch):
     monkeypatch.setattr(defaults, "MAX_FOLDERS", 2)
     for name in "abac":
         (tmp_path / name).mkdir(exist_ok=True)
@@ -154,12 +154,12 @@ def test_only_so_many_folders_are_remembered(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("nothing_shipped")
-def test_without_any_model_the_error_says_what_to_run():
+def test_the_error_without_any_model_names_the_command():
     with pytest.raises(CheckpointError, match=r"make one with `retrieve train`, or name it with --model"):
         defaults.find_model(None)
 
 
-def test_the_index_of_this_folder_comes_before_the_last_one_and_other_folders_are_none(tmp_path):
+def test_an_index_in_this_folder_precedes_the_last_one(tmp_path):
     (tmp_path / "index").mkdir()
     (tmp_path / "other").mkdir()
     defaults.remember("index", tmp_path / "other")
@@ -172,7 +172,7 @@ def test_the_index_of_this_folder_comes_before_the_last_one_and_other_folders_ar
     assert defaults.find_index(None) == (Path("index"), "in this folder")
 
 
-def test_paths_are_remembered_in_full_each_kind_on_its_own(tmp_path, monkeypatch):
+def test_absolute_paths_are_remembered_separately_for_each_kind(tmp_path, monkeypatch):
     defaults.remember("model", Path("a.safetensors"))
     defaults.remember("index", Path("index"))
     defaults.remember("model", Path("b.safetensors"))
@@ -183,7 +183,7 @@ def test_paths_are_remembered_in_full_each_kind_on_its_own(tmp_path, monkeypatch
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"3", b"null", b"\xff", b'{"model": 3}', b'{"model": "/none"}'])
 @pytest.mark.usefixtures("nothing_shipped")
-def test_a_note_that_makes_no_sense_is_as_none_and_is_replaced(content, tmp_path):
+def test_an_invalid_state_file_is_ignored_and_replaced(content, tmp_path):
     state_file().parent.mkdir(parents=True)
     state_file().write_bytes(content)
     with pytest.raises(CheckpointError):
@@ -195,7 +195,7 @@ def test_a_note_that_makes_no_sense_is_as_none_and_is_replaced(content, tmp_path
     assert defaults.find_index(None)[0] == index
 
 
-def test_without_a_place_for_the_note_a_user_does_without_it(tmp_path, monkeypatch):
+def test_commands_work_without_a_writable_state_file(tmp_path, monkeypatch):
     def homeless():
         raise RuntimeError("Could not determine home directory.")
 
@@ -211,7 +211,7 @@ def test_without_a_place_for_the_note_a_user_does_without_it(tmp_path, monkeypat
     assert (tmp_path / "home" / ".local" / "state" / "touch-retrieval" / "last.json").is_file()
 
 
-def test_a_crash_while_noting_leaves_the_old_note(tmp_path, monkeypatch):
+def test_a_crash_while_writing_leaves_the_old_state_file(tmp_path, monkeypatch):
     defaults.remember("model", tmp_path / "old.safetensors")
     before = state_file().read_bytes()
 

@@ -1,6 +1,6 @@
-"""A cluster in an object store: built, torn, killed and fetched, it is the cluster in a folder.
+"""A sharded index in an object store: building, incomplete transfers, kills and fetching.
 
-The store is fsspec's in this process; `benchmarks.faults` and one slow test ask a server that speaks S3 (moto).
+The store is fsspec's memory file system; `benchmarks.faults` and slow tests use an S3 server (moto).
 """
 
 import dataclasses
@@ -37,7 +37,7 @@ def _no_waiting(monkeypatch):
 
 @pytest.fixture
 def store():
-    """An empty object store in this process: {path: its file}."""
+    """An empty object store in this process: {path: file}."""
     system = fsspec.filesystem("memory")
     system.store.clear()
     yield system.store
@@ -46,7 +46,7 @@ def store():
 
 @pytest.fixture
 def build(catalogue, model):
-    """Builds the catalogue, or another one, in four shards behind the URL."""
+    """Build the catalogue, or another one, in four shards behind the URL."""
 
     def built(folder=catalogue, shards=4, **how):
         return build_sharded(folder, load_checkpoint(model), URL, shards, quiet=True, **how)
@@ -55,12 +55,12 @@ def build(catalogue, model):
 
 
 def another_machine():
-    """This one, without what it keeps."""
+    """Simulate another machine by deleting the cache."""
     shutil.rmtree(cache_folder(), ignore_errors=True)
 
 
 def changed(catalogue, folder, times=1):
-    """A copy of the catalogue with so many more photos, each of its own content."""
+    """A copy of the catalogue with additional photos of distinct content."""
     shutil.copytree(catalogue, folder, dirs_exist_ok=True)
     name = min(path.name for path in folder.iterdir())
     for number in range(times):
@@ -81,7 +81,7 @@ def test_answers_equal_those_of_the_sharded_index_in_a_folder(build, store, sear
             same_answers(opened.query(own), searcher.query(own))
 
 
-def test_another_machine_embeds_nothing_again_and_puts_nothing(build, store, embedded, monkeypatch):
+def test_another_machine_embeds_and_uploads_nothing_again(build, store, embedded, monkeypatch):
     first = build()
     before = {path: file.created for path, file in store.items()}
     embedded.clear()
@@ -91,13 +91,13 @@ def test_another_machine_embeds_nothing_again_and_puts_nothing(build, store, emb
     assert {path: file.created for path, file in store.items()} == before
 
 
-def test_a_changed_catalogue_puts_the_shards_that_changed_and_keeps_the_generation_before(
+def test_a_changed_catalogue_uploads_changed_shards_and_keeps_the_previous_generation(
     build, store, catalogue, tmp_path, embedded
 ):
     build()
     first = set(store)
     embedded.clear()
-    report = build(changed(catalogue, tmp_path / "c"))  # elsewhere: all shards say so
+    report = build(changed(catalogue, tmp_path / "c"))  # the catalogue's path changed in all shards
     assert (report.written, report.photos, embedded) == (True, 25, [1])
     assert first <= set(store)
     second = set(store)
@@ -112,7 +112,7 @@ def _generations(paths):
     return {folder.removeprefix("/bucket/cluster/") for folder in folders}
 
 
-def test_another_number_of_shards_takes_the_codes_from_the_store(build, store, embedded):
+def test_another_number_of_shards_reuses_the_codes_in_the_store(build, store, embedded):
     build()
     embedded.clear()
     another_machine()
@@ -120,7 +120,7 @@ def test_another_number_of_shards_takes_the_codes_from_the_store(build, store, e
     assert (report.photos, report.embedded, embedded) == (24, 0, [])
 
 
-def test_what_was_fetched_stays_and_old_generations_go(build, store, catalogue, tmp_path, requests):
+def test_fetched_generations_stay_in_the_cache_and_old_ones_are_deleted(build, store, catalogue, tmp_path, requests):
     build()
     Searcher.open(URL).close()
     count = requests.count("get_file")
@@ -130,19 +130,19 @@ def test_what_was_fetched_stays_and_old_generations_go(build, store, catalogue, 
     for times in (1, 2, 3):
         build(changed(catalogue, tmp_path / "c", times))
         Searcher.open(URL).close()
-    kept = list((cache_folder() / "shards").glob("*/*/shard-*/gen-*"))
-    assert len(kept) == 4 * object_store.MAX_FETCHED_GENERATIONS
+    cached = list((cache_folder() / "shards").glob("*/*/shard-*/gen-*"))
+    assert len(cached) == 4 * object_store.MAX_FETCHED_GENERATIONS
 
 
 # Faults ---------------------------------------------------------------------------------------------------------------
 
 
 class Killed(BaseException):
-    """As a signal that nobody catches."""
+    """Like a signal that is not caught."""
 
 
 class Requests(list):
-    """What was asked of the store, in order; `rule` is asked first, and may raise, or answer by True."""
+    """Requests to the store, in order; `rule` runs first and may raise, or return True to replace the request."""
 
     rule = None
 
@@ -150,34 +150,34 @@ class Requests(list):
 @pytest.fixture
 def requests(monkeypatch):
     """The requests of this test."""
-    kind, made = type(fsspec.filesystem("memory")), Requests()
+    kind, made_requests = type(fsspec.filesystem("memory")), Requests()
 
     def counted(name, plain):
-        def asked(self, *words, **how):
-            made.append(name)
-            if made.rule and made.rule(name, *words):
+        def request(self, *words, **how):
+            made_requests.append(name)
+            if made_requests.rule and made_requests.rule(name, *words):
                 return None
             return plain(self, *words, **how)
 
-        return asked
+        return request
 
     for name in ("put_file", "pipe_file", "rm_file", "get_file", "cat_file", "info", "find"):
         monkeypatch.setattr(kind, name, counted(name, getattr(kind, name)))
-    return made
+    return made_requests
 
 
 @pytest.mark.slow
-def test_killed_at_any_request_one_cluster_or_the_other_answers_and_nothing_is_embedded_twice(
+def test_killed_at_any_request_the_old_or_the_new_index_answers_and_nothing_is_embedded_twice(
     build, store, requests, catalogue, tmp_path, embedded, touch
 ):
-    """At twelve requests, evenly, of a build that changes a cluster."""
+    """Kill a build that changes the index at twelve evenly spaced requests."""
     build()
     before, expected, work = dict(store), Searcher.open(URL).query(touch), tmp_path / "work"
     folder = changed(catalogue, tmp_path / "c", 2)
     shutil.copytree(cache_folder(), work)
     start = len(requests)
     build(folder)
-    count, seen = len(requests) - start, []
+    count, photos = len(requests) - start, []
     for number in np.linspace(0, count - 1, 12).astype(int):
         another_machine()
         shutil.copytree(work, cache_folder())
@@ -195,18 +195,16 @@ def test_killed_at_any_request_one_cluster_or_the_other_answers_and_nothing_is_e
             build(folder)
         requests.rule = None
         with Searcher.open(URL) as opened:
-            seen.append(opened.info.photos)
-            if seen[-1] == 24:
+            photos.append(opened.info.photos)
+            if photos[-1] == 24:
                 same_answers(opened.query(touch), expected)
         report = build(folder)
         assert (report.photos, sum(embedded)) == (26, 2)
-    assert set(seen) == {24, 26}
-    assert seen == sorted(seen)
+    assert set(photos) == {24, 26}
+    assert photos == sorted(photos)
 
 
-def test_killed_before_the_first_switch_there_is_no_cluster_and_another_machine_takes_up_what_was_put(
-    build, store, requests, embedded
-):
+def test_killed_before_the_first_switch_another_machine_reuses_the_uploaded_shards(build, store, requests, embedded):
     def third_shard(name, *_):
         if name == "put_file" and sum(name == "put_file" for name in requests) > 14:
             raise Killed
@@ -215,24 +213,26 @@ def test_killed_before_the_first_switch_there_is_no_cluster_and_another_machine_
     with pytest.raises(Killed):
         build()
     requests.rule = None
-    with pytest.raises(NoIndex, match="there is no cluster here"):
+    with pytest.raises(NoIndex, match="there is no sharded index here"):
         Searcher.open(URL)
     whole = [name for name, is_whole in RemoteShardedIndex(URL).generations().items() if is_whole]
     assert 1 <= len(whole) < 4
     embedded.clear()
     another_machine()
     report = build()
-    kept = sum(entry["photos"] for entry in report.shards if any(name.startswith(entry["folder"]) for name in whole))
-    assert (report.photos, sum(embedded)) == (24, 24 - kept)
+    uploaded = sum(
+        entry["photos"] for entry in report.shards if any(name.startswith(entry["folder"]) for name in whole)
+    )
+    assert (report.photos, sum(embedded)) == (24, 24 - uploaded)
 
 
-def test_what_is_torn_on_its_way_is_sent_and_fetched_again(build, store, requests, touch):
-    left = {"put_file": 5, "get_file": 5}
+def test_incomplete_transfers_are_repeated(build, store, requests, touch):
+    remaining = {"put_file": 5, "get_file": 5}
 
-    def torn(name, *words):
-        if not left.get(name) or requests.count(name) % 2:
+    def truncate(name, *words):
+        if not remaining.get(name) or requests.count(name) % 2:
             return False
-        left[name] -= 1
+        remaining[name] -= 1
         source, target = words
         if name == "put_file":
             store_file(target, Path(source).read_bytes()[:-7])
@@ -240,11 +240,11 @@ def test_what_is_torn_on_its_way_is_sent_and_fetched_again(build, store, request
             Path(target).write_bytes(store[source].getvalue()[:-7])
         return True
 
-    requests.rule = torn
+    requests.rule = truncate
     build()
     with Searcher.open(URL) as opened:
         assert opened.query(touch).index["searched"] == 1.0
-    assert left == {"put_file": 0, "get_file": 0}
+    assert remaining == {"put_file": 0, "get_file": 0}
 
 
 def store_file(path, content):
@@ -252,7 +252,7 @@ def store_file(path, content):
         file.write(content)
 
 
-def test_a_store_that_refuses_one_request_of_twenty_loses_nothing(build, store, requests, searcher, grasps):
+def test_a_store_that_refuses_every_twentieth_request_loses_nothing(build, store, requests, searcher, grasps):
     refused = []
 
     def refuse(name, *_):
@@ -267,7 +267,7 @@ def test_a_store_that_refuses_one_request_of_twenty_loses_nothing(build, store, 
     assert len(refused) >= 5
 
 
-def test_a_store_that_keeps_refusing_is_an_error_and_the_work_is_stored(build, store, requests, embedded):
+def test_a_store_that_always_refuses_raises_and_the_codes_are_stored(build, store, requests, embedded):
     def refuse(name, *_):
         if name == "put_file":
             raise OSError("503 Slow Down")
@@ -283,7 +283,7 @@ def test_a_store_that_keeps_refusing_is_an_error_and_the_work_is_stored(build, s
 
 @pytest.mark.parametrize("what", ["partials.npy", "manifest.json", "rows.jsonl"])
 @pytest.mark.parametrize("how", ["torn", "altered", "gone"])
-def test_damage_in_the_store_is_named_and_mended(what, how, build, store, touch):
+def test_damage_in_the_store_is_reported_and_repaired(what, how, build, store, touch):
     build()
     path = next(path for path in sorted(store) if path.endswith(f"/{what}"))
     data = store[path].getvalue()
@@ -300,9 +300,9 @@ def test_damage_in_the_store_is_named_and_mended(what, how, build, store, touch)
         assert opened.query(touch).index["searched"] == 1.0
 
 
-def test_damage_that_another_machine_finds_is_embedded_again(build, store, embedded):
+def test_another_machine_embeds_damaged_shards_again(build, store, embedded):
     build()
-    path = next(path for path in sorted(store) if path.endswith("/halves.npy"))
+    path = next(path for path in sorted(store) if path.endswith("/partials.npy"))
     store_file(path, b"torn")
     another_machine()
     embedded.clear()
@@ -329,7 +329,7 @@ def test_the_second_of_two_concurrent_builds_fails_and_embeds_nothing_twice(
         return found
 
     monkeypatch.setattr(building, "build_in_process", meanwhile)
-    with pytest.raises(RemoteStorageError, match="another build put its own cluster there meanwhile"):
+    with pytest.raises(RemoteStorageError, match="another build switched this index in the meantime"):
         build(changed(catalogue, tmp_path / "c"))
     with Searcher.open(URL) as opened:
         assert opened.info.photos == 26
@@ -341,12 +341,12 @@ def test_the_second_of_two_concurrent_builds_fails_and_embeds_nothing_twice(
 # Bad input ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_forged_digest_leads_nowhere(build, store, cluster):
+def test_a_forged_digest_raises(build, store, cluster):
     build()
     manifest = read_sharded_manifest(cluster)
     entry = dataclasses.replace(manifest.shards[0], sha256="../../../elsewhere")
     forged = dataclasses.replace(manifest, shards=[entry])
-    fsspec.filesystem("memory").pipe_file("/bucket/cluster/CLUSTER.json", sharded_manifest_bytes(forged))
+    fsspec.filesystem("memory").pipe_file("/bucket/cluster/SHARDS.json", sharded_manifest_bytes(forged))
     with pytest.raises(CorruptIndex, match=r"memory://bucket/cluster: .*shards\[0\]\.sha256 must be"):
         Searcher.open(URL)
 
@@ -354,20 +354,20 @@ def test_a_forged_digest_leads_nowhere(build, store, cluster):
 @pytest.mark.parametrize(
     "content", [b"", b"{}", b"no JSON", b"[" * 100_000, b"x" * (object_store.MAX_MANIFEST_BYTES + 1)]
 )
-def test_a_manifest_that_is_none_is_refused_in_a_sentence(content, store):
-    fsspec.filesystem("memory").pipe_file("/bucket/cluster/CLUSTER.json", content)
+def test_an_invalid_manifest_raises_a_clear_error(content, store):
+    fsspec.filesystem("memory").pipe_file("/bucket/cluster/SHARDS.json", content)
     with pytest.raises((CorruptIndex, RemoteStorageError), match="memory://bucket/cluster"):
         Searcher.open(URL)
 
 
-def test_urls_that_are_none_are_refused(tmp_path):
-    with pytest.raises(BadInput, match="is a folder of this machine"):
+def test_invalid_urls_raise(tmp_path):
+    with pytest.raises(BadInput, match="is a local folder; give its path"):
         RemoteShardedIndex(f"file://{tmp_path}")
     with pytest.raises(BadInput, match="cannot be opened"):
         RemoteShardedIndex("nosuch://bucket/cluster")
 
 
-def test_commands_take_a_url(store, catalogue, model, touch, capsys):
+def test_commands_accept_a_url(store, catalogue, model, touch, capsys):
     build = ["build-index", str(catalogue), "--model", str(model), "--out", URL]
     assert main([*build, "--preview"]) == 2
     assert main(build) == 0
@@ -382,7 +382,7 @@ def test_commands_take_a_url(store, catalogue, model, touch, capsys):
     assert '"path": "memory://bucket/cluster"' in named
     assert '"path": "memory://bucket/cluster"' in capsys.readouterr().out
     assert main([*query, "--index", "memory://bucket/nowhere"]) != 0
-    assert "there is no cluster here; run `retrieve build-index" in capsys.readouterr().err
+    assert "there is no sharded index here; run `retrieve build-index" in capsys.readouterr().err
 
 
 # A real S3 server -----------------------------------------------------------------------------------------------------
@@ -390,7 +390,7 @@ def test_commands_take_a_url(store, catalogue, model, touch, capsys):
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_photos_on_s3_become_a_cluster_on_s3_whatever_it_refuses_and_tears(
+def test_photos_on_s3_become_a_sharded_index_on_s3_despite_failed_and_incomplete_requests(
     s3_server, catalogue, model, searcher, grasps
 ):
     s3.put(catalogue, "photos/catalog")
@@ -411,8 +411,8 @@ def test_photos_on_s3_become_a_cluster_on_s3_whatever_it_refuses_and_tears(
 
 @pytest.fixture
 def switches(s3_server, cluster):
-    """Two builds that have both looked at a cluster on S3, one that was there or none: what each would put, and a
-    function that has the first switch, the second doing so between the first one's last look and its request."""
+    """Two concurrent builds of an index on S3: a function that lets the first switch, the second doing so
+    between the first one's check and its request, and the manifest of each."""
     s3_server.refuse = s3_server.tear = None
     s3.put(cluster, "photos/else")
     manifest = read_sharded_manifest(cluster)
@@ -422,16 +422,16 @@ def switches(s3_server, cluster):
         first, second = RemoteShardedIndex(url), RemoteShardedIndex(url)
         if before:
             first.switch(None, manifest)
-        seen, put, left = first.manifest(), first._system.pipe_file, [theirs]
+        current, put, remaining = first.manifest(), first._system.pipe_file, [theirs]
 
         def meanwhile(path, content, **how):
-            if left:
-                second.switch(seen, left.pop())
+            if remaining:
+                second.switch(current, remaining.pop())
             put(path, content, **how)
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(first._system, "pipe_file", meanwhile)
-            first.switch(seen, mine)
+            first.switch(current, mine)
 
     yield switch, mine, theirs
     s3_server.conditions = "honoured"
@@ -439,12 +439,12 @@ def switches(s3_server, cluster):
 
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 @pytest.mark.parametrize("before", [False, True], ids=["created", "replaced"])
-def test_of_two_that_both_looked_the_store_lets_one_switch(before, switches, s3_server):
+def test_the_store_lets_one_of_two_concurrent_builds_switch(before, switches, s3_server):
     if before:
-        pytest.importorskip("moto", "5.1.5", reason="this moto replaces a file whatever the condition")
+        pytest.importorskip("moto", "5.1.5", reason="this moto ignores the condition")
     switch, _, theirs = switches
     url = f"s3://photos/raced-{before}"
-    with pytest.raises(RemoteStorageError, match=rf"{url}: another build put its own cluster there meanwhile"):
+    with pytest.raises(RemoteStorageError, match=rf"{url}: another build switched this index in the meantime"):
         switch(url, before)
     assert RemoteShardedIndex(url).manifest() == sharded_manifest_bytes(theirs)
     assert s3_server.conditional >= 2
@@ -453,25 +453,25 @@ def test_of_two_that_both_looked_the_store_lets_one_switch(before, switches, s3_
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
 @pytest.mark.parametrize("conditions", ["unknown", "ignored"])
-def test_a_store_without_conditional_writes_is_looked_at_before_the_switch(conditions, switches, s3_server):
-    """Between that look and the switch it cannot be helped: the second to switch stays."""
+def test_a_store_without_conditional_writes_is_checked_before_the_switch(conditions, switches, s3_server):
+    """A switch between the check and the write is not detected: the last write remains."""
     switch, mine, theirs = switches
     s3_server.conditions = conditions
     url = f"s3://photos/{conditions}"
     switch(url, True)
     stored = RemoteShardedIndex(url)
     assert stored.manifest() == sharded_manifest_bytes(mine)
-    with pytest.raises(RemoteStorageError, match="another build put its own cluster there meanwhile"):
+    with pytest.raises(RemoteStorageError, match="another build switched this index in the meantime"):
         stored.switch(b"an older one", theirs)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_a_switch_that_was_torn_or_not_answered_is_made_again(switches, s3_server):
+def test_an_incomplete_or_unanswered_switch_is_repeated(switches, s3_server):
     _, mine, theirs = switches
     stored = RemoteShardedIndex("s3://photos/torn")
     stored.switch(None, theirs)
-    seen, put, failures = stored.manifest(), stored._system.pipe_file, ["torn", "not answered"]
+    current, put, failures = stored.manifest(), stored._system.pipe_file, ["torn", "not answered"]
 
     def failing(path, content, **how):
         torn = failures and failures.pop(0) == "torn"
@@ -481,15 +481,15 @@ def test_a_switch_that_was_torn_or_not_answered_is_made_again(switches, s3_serve
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stored._system, "pipe_file", failing)
-        stored.switch(seen, mine)
+        stored.switch(current, mine)
     assert (stored.manifest(), failures) == (sharded_manifest_bytes(mine), [])
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")  # Ray's own warnings
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra `cluster`")
-def test_ray_builds_into_and_holds_a_cluster_on_s3(s3_server, catalogue, model, searcher, grasps):
-    """Whoever holds a shard fetches it."""
+def test_ray_builds_and_serves_a_sharded_index_on_s3(s3_server, catalogue, model, searcher, grasps):
+    """Each replica fetches its shard."""
     from retrieval.cluster.building import ray_runner
     from retrieval.cluster.serving import Deployments, ReplicaSettings
     from retrieval.cluster.session import ray_session
@@ -501,11 +501,11 @@ def test_ray_builds_into_and_holds_a_cluster_on_s3(s3_server, catalogue, model, 
         report = build_sharded("s3://photos/catalog", checkpoint, url, 2, quiet=True, run=ray_runner(workers=1))
         assert (report.photos, report.embedded) == (24, 24)
         another_machine()
-        held = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=120.0))
-        with Searcher.open(url, shards=held.open) as opened:
+        served = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=120.0))
+        with Searcher.open(url, shards=served.open) as opened:
             for own in grasps:
                 ours, theirs = opened.query(own), searcher.query(own)
                 assert [match.object_id for match in ours.results] == [match.object_id for match in theirs.results]
                 assert ours.index["searched"] == 1.0
-        held.close()
+        served.close()
     assert len(list((cache_folder() / "shards").glob("*/*/shard-*/gen-*"))) == 2

@@ -1,4 +1,4 @@
-"""Reference touches in an index: that they are encoded, kept, asked and told beside photos."""
+"""Reference touches in an index: encoding, storage, scoring and display next to photos."""
 
 import json
 import math
@@ -25,30 +25,28 @@ from tests.reference_model import NAMES, POSTERIOR, REFERENCE_CALIBRATION, write
 
 @pytest.fixture
 def calibrated_model(tmp_path):
-    return write_reference_model(tmp_path / "felt.safetensors")
+    return write_reference_model(tmp_path / "model.safetensors")
 
 
-def answered(catalogue, model, index, files, **asked):
+def query_new_index(catalogue, model, index, files, **options):
     build_index(catalogue, model, index, quiet=True)
     with Searcher.open(index) as searcher:
-        return searcher.query(files, **{"top": 8, **asked})
+        return searcher.query(files, **{"top": 8, **options})
 
 
-def test_a_touch_that_is_a_reference_itself_is_the_nearest_and_is_named(
-    catalogue_with_touches, calibrated_model, tmp_path, touches
-):
-    result = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[1]][1])
+def test_a_touch_that_is_itself_a_reference_is_the_nearest(catalogue_with_touches, calibrated_model, tmp_path, touches):
+    result = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[1]][1])
     best = {match.object_id: match for match in result.results}[NAMES[1]]
     assert best.reference.touch == (f"{NAMES[1]}/touch_1_a.png", f"{NAMES[1]}/touch_1_b.png")
-    assert best.reference.cosine == pytest.approx(1.0, abs=1e-3)  # halves are float16
+    assert best.reference.cosine == pytest.approx(1.0, abs=1e-3)  # partial activations are float16
     assert [match.reference is None for match in result.results].count(False) == 4
 
 
 def test_an_object_without_photos_is_found_by_its_touches(catalogue_with_touches, calibrated_model, tmp_path, touches):
-    result = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[2]][0])
+    result = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[2]][0])
     touch_only = {match.object_id: match for match in result.results}[NAMES[2]]
     assert touch_only.reference.adds is None
-    assert touch_only.photo == f"{NAMES[2]}/touch_0_a.png"  # which shows it to people
+    assert touch_only.photo == f"{NAMES[2]}/touch_0_a.png"  # displayed in place of a photo
     cosines = [1.0, other_cosine(calibrated_model, touches[NAMES[2]][:2])]
     near = math.log(sum(math.exp(SHARPNESS * one) for one in cosines) / 2) / SHARPNESS
     ratio = REFERENCE_CALIBRATION.touch_only.slope * near + REFERENCE_CALIBRATION.touch_only.offset
@@ -65,20 +63,20 @@ def other_cosine(model, grasps):
     return float(codes[0] @ codes[1])
 
 
-def test_photos_and_references_of_an_object_add_up_as_reckoned_by_hand(
+def test_photos_and_references_of_an_object_combine_as_computed_by_hand(
     catalogue_with_touches, calibrated_model, tmp_path, touches
 ):
     files = touches[NAMES[0]][2]
     index = tmp_path / "index"
-    result = answered(catalogue_with_touches, calibrated_model, index, files)
+    result = query_new_index(catalogue_with_touches, calibrated_model, index, files)
     match = {one.object_id: one for one in result.results}[NAMES[0]]
     with Searcher.open(index) as searcher:
         partials = searcher.encode(files).partials
         rows = [at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == NAMES[0]]
         photos = searcher.scorer.logits(partials, searcher.generation.arrays["partials"][rows])
         mine = [at for at, row in enumerate(searcher.generation.documents["references"]["touches"]) if at < 2]
-        kept = touch_embeddings(searcher.generation.documents["touches"][mine], 32)
-    cosines = touch_embeddings(partials, 32) @ kept.T
+        stored = touch_embeddings(searcher.generation.documents["touches"][mine], 32)
+    cosines = touch_embeddings(partials, 32) @ stored.T
     near = math.log(np.exp(SHARPNESS * cosines.astype(float)).mean()) / SHARPNESS
     slope = REFERENCE_CALIBRATION.with_photos.slope
     photo_logits = math.log(np.exp(slope * (photos.astype(float) + REFERENCE_CALIBRATION.weight * near)).mean()) / slope
@@ -88,19 +86,19 @@ def test_photos_and_references_of_an_object_add_up_as_reckoned_by_hand(
     assert match.reference.adds == pytest.approx(match.logit - bare, abs=1e-4)
 
 
-def test_objects_without_references_are_scored_as_before(
+def test_logits_of_objects_without_references_do_not_change(
     catalogue_copy, catalogue_with_touches, calibrated_model, tmp_path, touches
 ):
-    with_them = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
+    with_them = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
     for path in catalogue_with_touches.rglob("touch_*"):
         path.unlink()
-    without = answered(catalogue_with_touches, calibrated_model, tmp_path / "bare", touches[NAMES[0]][2])
+    without = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "bare", touches[NAMES[0]][2])
     before, after = ({match.object_id: match.logit for match in one.results} for one in (without, with_them))
     assert [after[name] for name in NAMES[4:]] == pytest.approx([before[name] for name in NAMES[4:]], abs=1e-5)
 
 
-def test_all_that_may_be_adds_up_to_one(catalogue_with_touches, calibrated_model, tmp_path, touches):
-    result = answered(
+def test_all_probabilities_add_up_to_one(catalogue_with_touches, calibrated_model, tmp_path, touches):
+    result = query_new_index(
         catalogue_with_touches, calibrated_model, tmp_path / "index", [touches[NAMES[0]][2], touches[NAMES[0]][1]]
     )
     whole = result.none_probability + sum(match.probability for match in result.results)
@@ -110,46 +108,54 @@ def test_all_that_may_be_adds_up_to_one(catalogue_with_touches, calibrated_model
 def test_photos_of_the_nearest_reference_are_always_scored(
     catalogue_with_touches, calibrated_model, tmp_path, touches, monkeypatch
 ):
-    judged = []
+    scored = []
     whole = FolderShard._score_objects
-    monkeypatch.setattr(FolderShard, "_score_objects", lambda *asked: judged.append(asked[2]) or whole(*asked))
+    monkeypatch.setattr(
+        FolderShard, "_score_objects", lambda *arguments: scored.append(arguments[2]) or whole(*arguments)
+    )
     build_index(catalogue_with_touches, calibrated_model, tmp_path / "index", quiet=True)
     with Searcher.open(tmp_path / "index") as searcher:
         for name in NAMES[:4]:
             searcher.query(touches[name][0], top=1, candidates=1)
-            rows = judged.pop().tolist()
-            catalogue_copy = {at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == name}
-            assert catalogue_copy <= set(rows)
-            assert len(rows) <= len(catalogue_copy) + 1
+            rows = scored.pop().tolist()
+            photos = {at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == name}
+            assert photos <= set(rows)
+            assert len(rows) <= len(photos) + 1
 
 
-def test_the_answer_says_what_it_rests_on_and_is_read_again(
+def test_the_result_has_the_reference_calibration_and_reads_back(
     catalogue_with_touches, calibrated_model, tmp_path, touches
 ):
-    result = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
-    told = result.posterior["references"]
-    assert (told["touches"], told["objects"], told["by"]) == (8, 4, "objects that the model was not fitted to")
-    assert ReferenceCalibration.from_dict(told["calibration"]) == REFERENCE_CALIBRATION
+    result = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
+    references = result.posterior["references"]
+    assert (references["touches"], references["objects"], references["by"]) == (
+        8,
+        4,
+        "objects that the model was not fitted to",
+    )
+    assert ReferenceCalibration.from_dict(references["calibration"]) == REFERENCE_CALIBRATION
     document = json.loads(json.dumps(result.to_dict()))
     assert QueryResult.from_dict(document).to_dict() == result.to_dict()
 
 
-def test_the_page_of_formats_names_what_is_written_of_references(
+def test_the_documented_keys_of_references_are_those_written(
     catalogue_with_touches, calibrated_model, tmp_path, touches
 ):
-    said = text_of(ROOT / "docs" / "formats.md").split("| with reference touches |")[1].split("\n\n")[0]
-    result = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2]).to_dict()
+    documented = text_of(ROOT / "docs" / "formats.md").split("| with reference touches |")[1].split("\n\n")[0]
+    result = query_new_index(
+        catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2]
+    ).to_dict()
     generation = IndexStore(tmp_path / "index").open()
     about = {name: generation.manifest.about[name] for name in ("references", "reference_calibration")}
     keys = {f"about.{name}.{key}" for name, part in about.items() for key in part}
     keys |= {f"reference.{key}" for key in result["results"][0]["reference"]}
-    assert keys | {"posterior.references"} == set(re.findall(r"`([a-z_0-9]+\.[\w.]+)`", said))
+    assert keys | {"posterior.references"} == set(re.findall(r"`([a-z_0-9]+\.[\w.]+)`", documented))
     assert set(result["posterior"]["references"]) == {key.rsplit(".")[-1] for key in keys if key.startswith("about")}
     assert {"references.json", "touches.npy"} <= {path.name for path in generation.folder.iterdir()}
 
 
 def test_pages_and_tables_show_the_nearest_touch(catalogue_with_touches, calibrated_model, tmp_path, touches, capsys):
-    result = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
+    result = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
     page = query_html(result, catalogue_with_touches)
     assert page.count('alt="reference touch"') == 8  # two fingers of each of four objects
     assert "no photo: by touches alone" in page
@@ -161,7 +167,7 @@ def test_pages_and_tables_show_the_nearest_touch(catalogue_with_touches, calibra
 
 
 def test_without_touches_nothing_mentions_references(catalogue_copy, calibrated_model, tmp_path, touches, capsys):
-    result = answered(catalogue_copy, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
+    result = query_new_index(catalogue_copy, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
     generation = IndexStore(tmp_path / "index").open()
     assert list(generation.documents) == ["calibration"]
     assert not {"references", "reference_calibration"} & set(generation.manifest.about)
@@ -191,19 +197,19 @@ def test_only_new_touches_are_encoded_again(catalogue_with_touches, calibrated_m
     assert (more.written, more.embedded, more.references["touches"], more.references["encoded"]) == (True, 0, 9, 1)
 
 
-def test_without_the_touches_the_index_is_what_it_was_before_them(catalogue_copy, calibrated_model, tmp_path, touches):
+def test_removing_the_touches_restores_the_results(catalogue_copy, calibrated_model, tmp_path, touches):
     index = tmp_path / "index"
-    before = answered(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2])
+    before = query_new_index(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2])
     synthetic.put_touch(catalogue_copy, NAMES[0], 0, touches[NAMES[0]][0])
-    assert answered(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2]).results != before.results
+    assert query_new_index(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2]).results != before.results
     (catalogue_copy / NAMES[0] / "touch_0_a.png").unlink()
     (catalogue_copy / NAMES[0] / "touch_0_b.png").unlink()
-    assert answered(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2]).results == before.results
+    assert query_new_index(catalogue_copy, calibrated_model, index, touches[NAMES[0]][2]).results == before.results
 
 
-def test_what_cannot_be_compared_is_left_out_with_its_reason(catalogue_with_touches, calibrated_model, tmp_path):
+def test_unusable_touches_are_left_out_with_a_reason(catalogue_with_touches, calibrated_model, tmp_path):
     (catalogue_with_touches / NAMES[0] / "touch_0_b.png").unlink()
-    (catalogue_with_touches / NAMES[1] / "touch_0_a.png").write_bytes(b"no picture")
+    (catalogue_with_touches / NAMES[1] / "touch_0_a.png").write_bytes(b"not an image")
     for path in (catalogue_with_touches / NAMES[2]).glob("touch_*"):
         path.write_bytes(b"")
     report = build_index(catalogue_with_touches, calibrated_model, tmp_path / "index", quiet=True)
@@ -211,50 +217,50 @@ def test_what_cannot_be_compared_is_left_out_with_its_reason(catalogue_with_touc
     assert "1 gel image(s), the model takes 2: names end in _a and _b" in reasons[f"{NAMES[0]}/touch_0_a.png"]
     assert len(reasons) == 4
     assert report.references["touches"] == 4
-    assert report.without_photo == [NAMES[2]]  # neither photo nor touch of it can be used
+    assert report.without_photo == [NAMES[2]]  # no photo or touch of it is usable
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"cosine": False}, "this model cannot compare touches"),
         ({"posterior": None}, "this model cannot compare touches"),
-        ({}, "8 reference touches are worth"),
+        ({}, "8 reference touches cannot be calibrated"),
     ],
 )
-def test_a_model_without_reference_calibration_builds_nothing(catalogue_with_touches, tmp_path, changed, said):
+def test_a_model_without_reference_calibration_builds_nothing(catalogue_with_touches, tmp_path, changed, message):
     model = write_reference_model(tmp_path / "other.safetensors", references=None, **changed)
-    with pytest.raises(BadInput, match=said):
+    with pytest.raises(BadInput, match=message):
         build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
-    with pytest.raises(BadInput, match="in shards the model must say"):
-        build_sharded(catalogue_with_touches, model, tmp_path / "cluster", 2, quiet=True)
+    with pytest.raises(BadInput, match="needs a model with a calibration for them"):
+        build_sharded(catalogue_with_touches, model, tmp_path / "sharded", 2, quiet=True)
     assert not (tmp_path / "index" / "CURRENT").exists()
 
 
 def test_references_are_calibrated_on_the_catalogue_if_the_model_is_not(tmp_path):
-    model = write_reference_model(tmp_path / "untold.safetensors", references=None)
+    model = write_reference_model(tmp_path / "uncalibrated.safetensors", references=None)
     objects = synthetic.make_objects(11, seed=4)
     catalogue = synthetic.write_catalogue(tmp_path / "catalog", objects, 1)
-    for name, catalogue_copy in synthetic.write_queries(tmp_path / "felt", objects, 2).items():
-        for number, files in enumerate(catalogue_copy):
+    for name, grasps in synthetic.write_queries(tmp_path / "touches", objects, 2).items():
+        for number, files in enumerate(grasps):
             synthetic.put_touch(catalogue, name, number, files)
     report = build_index(catalogue, model, tmp_path / "index", quiet=True)
     assert report.references["by"] == "the catalogue's own touches"
-    told = IndexStore(tmp_path / "index").open().manifest.about["reference_calibration"]["calibration"]
-    worth = ReferenceCalibration.from_dict(told)
-    assert (worth.objects, worth.touches) == (11, 11)
-    assert worth.with_photos is not None
+    document = IndexStore(tmp_path / "index").open().manifest.about["reference_calibration"]["calibration"]
+    calibration = ReferenceCalibration.from_dict(document)
+    assert (calibration.objects, calibration.touches) == (11, 11)
+    assert calibration.with_photos is not None
 
 
-# Several shards, and what others wrote ------------------------------------------------------------------------------
+# Several shards, and forged documents -------------------------------------------------------------------------------
 
 
-def test_a_cluster_answers_as_one_folder_does(catalogue_with_touches, calibrated_model, tmp_path, touches):
+def test_a_sharded_index_gives_the_results_of_one_folder(catalogue_with_touches, calibrated_model, tmp_path, touches):
     files = touches[NAMES[1]][2]
-    whole = answered(catalogue_with_touches, calibrated_model, tmp_path / "index", files)
-    report = build_sharded(catalogue_with_touches, calibrated_model, tmp_path / "cluster", 3, quiet=True)
+    whole = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", files)
+    report = build_sharded(catalogue_with_touches, calibrated_model, tmp_path / "sharded", 3, quiet=True)
     assert (report.references["touches"], report.references["touch_only"]) == (8, 1)
-    with Searcher.open(tmp_path / "cluster") as searcher:
+    with Searcher.open(tmp_path / "sharded") as searcher:
         divided = searcher.query(files, top=8)
     assert [one.object_id for one in divided.results] == [one.object_id for one in whole.results]
     for mine, other in zip(divided.results, whole.results, strict=True):
@@ -264,18 +270,18 @@ def test_a_cluster_answers_as_one_folder_does(catalogue_with_touches, calibrated
 
 
 def forged(index, **changed):
-    """The index written again with another list of touches, other halves or another worth."""
+    """Rewrite the index with other reference touches, partial activations or calibration."""
     store = IndexStore(index)
-    there = store.open()
-    rows = list(there.rows)
-    documents = {name: changed.get(name, content) for name, content in there.documents.items()}
-    about = {**there.manifest.about, **{name: changed[name] for name in changed if name == "reference_calibration"}}
+    current = store.open()
+    rows = list(current.rows)
+    documents = {name: changed.get(name, content) for name, content in current.documents.items()}
+    about = {**current.manifest.about, **{name: changed[name] for name in changed if name == "reference_calibration"}}
     store.write(
         rows,
-        there.embeddings[there.slots],
-        {name: np.array(part) for name, part in there.arrays.items()},
+        current.embeddings[current.slots],
+        {name: np.array(part) for name, part in current.arrays.items()},
         documents,
-        fingerprint=there.fingerprint,
+        fingerprint=current.fingerprint,
         about=about,
     )
 
@@ -299,7 +305,7 @@ TOUCH = {"object_id": NAMES[0], "touch": ["a.png"], "digests": ["0"]}
         {"reference_calibration": [1]},
     ],
 )
-def test_forged_references_are_refused_in_a_sentence(catalogue_with_touches, calibrated_model, tmp_path, changed):
+def test_forged_references_raise_a_clear_error(catalogue_with_touches, calibrated_model, tmp_path, changed):
     index = tmp_path / "index"
     build_index(catalogue_with_touches, calibrated_model, index, quiet=True)
     forged(index, **changed)

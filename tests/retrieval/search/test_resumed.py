@@ -1,4 +1,4 @@
-"""`build-index` stopped or killed at any moment: what was embedded until then is not embedded again."""
+"""`build-index` stopped or killed at any moment: finished embeddings are reused."""
 
 import os
 import shutil
@@ -42,38 +42,36 @@ build_index(Path(catalogue), load_checkpoint(Path(model)), Path(index), quiet=Tr
 
 
 def killed(catalogue, model, index, call):
-    """Build in a process that SIGKILL ends as it encodes its batch number `call`."""
+    """Build in a process that is killed when it encodes batch number `call`."""
     arguments = [sys.executable, "-c", KILLED, *map(str, (catalogue, model, index, call, BATCH))]
     done = subprocess.run(arguments, capture_output=True, timeout=300, check=False)
     assert done.returncode == -signal.SIGKILL, done.stderr
 
 
 def same(one, other):
-    """Both generations hold the same rows, and what is made of them; another batch sums in another order."""
+    """Check that both generations have equal rows and codes, up to the order of sums in other batches."""
     assert one.rows == other.rows
     np.testing.assert_allclose(one.arrays["partials"][:], other.arrays["partials"][:], rtol=2e-3, atol=2e-3)
     np.testing.assert_allclose(one.embeddings[one.slots], other.embeddings[other.slots], atol=1e-5)
 
 
 @pytest.mark.parametrize("call", [1, 2, 6])
-def test_a_first_build_that_was_killed_goes_on_where_it_was(call, catalogue_copy, model, tmp_path, embedded):
+def test_a_killed_first_build_is_resumed(call, catalogue_copy, model, tmp_path, embedded):
     index, checkpoint = tmp_path / "index", load_checkpoint(model)
     killed(catalogue_copy, model, index, call)
     assert not (index / "CURRENT").exists()
-    left = BATCH * (call - 1)
+    stored = BATCH * (call - 1)
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
-    assert sum(embedded) == PHOTOS - left
-    assert (report.embedded, report.resumed, report.reused) == (PHOTOS - left, left, left)
+    assert sum(embedded) == PHOTOS - stored
+    assert (report.embedded, report.resumed, report.reused) == (PHOTOS - stored, stored, stored)
     assert not (index / NAME).exists()
     assert list(index.glob("*.tmp-*")) == []
     whole = build_index(catalogue_copy, checkpoint, tmp_path / "whole", quiet=True)
     same(IndexStore(index).open(), IndexStore(tmp_path / "whole").open())
-    assert report.partial_error == pytest.approx(whole.partial_error, rel=0.05)  # the batches were others
+    assert report.partial_error == pytest.approx(whole.partial_error, rel=0.05)  # in other batches
 
 
-def test_two_kills_one_after_the_other_lose_nothing_though_photos_are_renamed_between(
-    catalogue_copy, model, tmp_path, embedded
-):
+def test_two_kills_lose_nothing_even_if_photos_are_renamed_between_them(catalogue_copy, model, tmp_path, embedded):
     index = tmp_path / "index"
     killed(catalogue_copy, model, index, 3)
     for number, photo in enumerate(sorted(catalogue_copy.rglob("*.jpg"))):
@@ -83,23 +81,23 @@ def test_two_kills_one_after_the_other_lose_nothing_though_photos_are_renamed_be
     assert (sum(embedded), report.resumed) == (PHOTOS - 4 * BATCH, 4 * BATCH)
 
 
-def test_a_killed_rebuild_leaves_the_old_index_and_what_it_had_embedded(catalogue_copy, model, tmp_path, embedded):
+def test_a_killed_rebuild_leaves_the_old_index_and_its_finished_embeddings(catalogue_copy, model, tmp_path, embedded):
     index, checkpoint = tmp_path / "index", load_checkpoint(model)
     objects = sorted(catalogue_copy.iterdir())
     away = shutil.move(objects[0], tmp_path / "away")
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     shutil.move(away, objects[0])
     for path in objects[1].iterdir():
-        path.write_bytes(path.read_bytes() + b"other content, the same picture")
+        path.write_bytes(path.read_bytes() + b"other content, the same image")
     killed(catalogue_copy, model, index, 2)
     assert IndexStore(index).open().count == PHOTOS - 3
     embedded.clear()
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (sum(embedded), report.embedded, report.resumed, report.reused) == (2, 2, 4, 22)
-    assert "2 embedded, 4 from a build that was cut off, 18 unchanged, 0 removed" in next(report.lines())
+    assert "2 embedded, 4 from an interrupted build, 18 unchanged, 0 removed" in next(report.lines())
 
 
-def test_what_another_model_left_is_not_taken(catalogue_copy, model, tmp_path, embedded):
+def test_codes_of_another_model_are_not_resumed(catalogue_copy, model, tmp_path, embedded):
     index, other = tmp_path / "index", tmp_path / "other.safetensors"
     killed(catalogue_copy, model, index, 4)
     from tests.retrieval.search.test_build import changed_model
@@ -109,7 +107,9 @@ def test_what_another_model_left_is_not_taken(catalogue_copy, model, tmp_path, e
     assert not (index / NAME).exists()
 
 
-def test_ctrl_c_keeps_what_was_embedded_and_says_so(catalogue_copy, model, tmp_path, embedded, monkeypatch, capsys):
+def test_ctrl_c_keeps_the_finished_embeddings_and_reports_it(
+    catalogue_copy, model, tmp_path, embedded, monkeypatch, capsys
+):
     index, keep = tmp_path / "index", embed.UnfinishedBuild.add
 
     def interrupted(self, *arguments):

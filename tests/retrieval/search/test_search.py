@@ -1,4 +1,4 @@
-"""From gel images to ranked objects, against two plain loops over the whole network."""
+"""From gel images to ranked objects, compared with two plain loops over the whole network."""
 
 import copy
 import dataclasses
@@ -24,10 +24,10 @@ from retrieval.search.query.searcher import Searcher
 from retrieval.search.query.shard import combined_embedding
 from tests import synthetic
 
-HALF_STEP = 2**-11
+FLOAT16_ROUNDING = 2**-11
 """Largest relative rounding of a float16 number."""
 STEEP = Posterior(slope=2.0, offset=-1.5, dependence=0.25, tests=1)
-"""Of a model that tells objects apart, which the fixture's, hastily trained, does not: its own slope is near 0."""
+"""Posterior of a model that distinguishes objects. The fixture's model does not: its own slope is near 0."""
 
 
 @pytest.fixture(scope="module")
@@ -45,20 +45,20 @@ def grasps(tmp_path_factory):
 
 @pytest.fixture
 def searches(monkeypatch):
-    """One entry for each candidate search: how many photos it was asked for."""
-    asked = []
+    """Number of requested photos of each candidate search."""
+    requested = []
 
     def counted(generation, queries, k):
-        asked.append(k)
+        requested.append(k)
         return search(generation, queries, k)
 
     search = Generation.candidates
     monkeypatch.setattr(Generation, "candidates", counted)
-    return asked
+    return requested
 
 
 def variant(model, path, **changes):
-    """The same weights under other settings, given as "part__name"."""
+    """The same weights with other settings, given as "part__name"."""
     checkpoint = load_checkpoint(model)
     config = checkpoint.config
     for key, value in changes.items():
@@ -74,7 +74,7 @@ def variant(model, path, **changes):
 
 @pytest.fixture(scope="module")
 def oracle(searcher, matcher, catalogue):
-    """Touches -> {photo path: sum of match logits}: the full network on every touch with every photo, pair by pair."""
+    """Touches -> {photo path: sum of match logits}, by the full network on every pair of touch and photo."""
     pre = searcher.checkpoint.config.preprocessing
     photos = {path.relative_to(catalogue).as_posix(): pre.load_photo(path) for path in catalogue.rglob("*.jpg")}
 
@@ -88,39 +88,39 @@ def oracle(searcher, matcher, catalogue):
 
 
 def weight(posterior, grasps):
-    """What a sum of match logits over so many grasps is worth, by hand."""
+    """The weight of a sum of match logits over several grasps, by hand."""
     return posterior.slope / (1 + posterior.dependence * (grasps - 1))
 
 
 def best_by_object(logits, posterior, grasps, photos=3):
     """[(object, best photo, log mean exp of its photos' logits)] by plain loops, best first; ties by object.
 
-    photos: of each object; one that `logits` leaves out counts as no match at all.
+    Each object has `photos` photos; one that is missing in `logits` has zero likelihood.
     """
-    by_object, worth = {}, weight(posterior, grasps)
+    by_object, scale = {}, weight(posterior, grasps)
     for photo in sorted(logits):
         by_object.setdefault(photo.split("/")[0], []).append(photo)
     found = []
     for name, own in by_object.items():
-        mean = math.fsum(math.exp(worth * logits[photo]) for photo in own) / photos
-        found.append((name, max(own, key=lambda photo: logits[photo]), math.log(mean) / worth))
+        mean = math.fsum(math.exp(scale * logits[photo]) for photo in own) / photos
+        found.append((name, max(own, key=lambda photo: logits[photo]), math.log(mean) / scale))
     return sorted(found, key=lambda item: (-item[2], item[0]))
 
 
 @pytest.fixture(params=["the model's own", "steep"])
-def meaning(request, searcher, monkeypatch):
-    """The posterior by which the searcher judges."""
+def posterior(request, searcher, monkeypatch):
+    """The posterior of the searcher."""
     if request.param == "steep":
         monkeypatch.setattr(searcher, "posterior", STEEP)
     return searcher.posterior
 
 
-def half_tolerance(searcher, grasps):
-    """How far rounding the halves can move a logit: through |second| and |out|, as ReLU never enlarges a change.
+def logit_tolerance(searcher, grasps):
+    """Largest change of a logit by rounding partial activations, through |second| and |out|; ReLU enlarges no change.
 
-    Neither does a log mean exp: an object's logit moves no further than its photos'.
+    A log mean exp does not either: an object's logit changes at most as much as its photos' logits.
     """
-    moved = np.abs(np.asarray(searcher.generation.arrays["partials"], np.float32)).max(axis=0) * HALF_STEP
+    moved = np.abs(np.asarray(searcher.generation.arrays["partials"], np.float32)).max(axis=0) * FLOAT16_ROUNDING
     return grasps * float(np.abs(searcher.scorer.out) @ (np.abs(searcher.scorer.second) @ moved)) + 1e-5
 
 
@@ -128,17 +128,17 @@ def half_tolerance(searcher, grasps):
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_the_ranking_is_that_of_the_full_network_on_every_pair(count, meaning, searcher, grasps, oracle):
+def test_the_ranking_equals_the_full_network_on_every_pair(count, posterior, searcher, grasps, oracle):
     touches = grasps[:count]
     photos = oracle(touches)
     result = searcher.query(touches)
-    tolerance = half_tolerance(searcher, count)
+    tolerance = logit_tolerance(searcher, count)
     assert tolerance < 0.01
-    theirs = best_by_object(photos, meaning, count)
+    theirs = best_by_object(photos, posterior, count)
     logits = {name: logit for name, _, logit in theirs}
     best = {name: photo for name, photo, _ in theirs}
     assert len(result.results) == len(theirs) == 8
-    # Where logits differ by more than the rounding, the order is theirs; closer ones may change places.
+    # The order is equal if logits differ by more than the rounding; closer ones may be swapped.
     for match, (_, _, logit) in zip(result.results, theirs, strict=True):
         assert match.logit == pytest.approx(logits[match.object_id], abs=tolerance)
         assert logits[match.object_id] == pytest.approx(logit, abs=2 * tolerance)
@@ -147,12 +147,12 @@ def test_the_ranking_is_that_of_the_full_network_on_every_pair(count, meaning, s
 
 
 def test_with_exact_partials_the_order_equals_the_oracle(
-    meaning, searcher, matcher, grasps, oracle, catalogue, monkeypatch
+    posterior, searcher, matcher, grasps, oracle, catalogue, monkeypatch
 ):
-    """The rounding taken away, what is left is ranking: no tie, no tolerance."""
-    expected = best_by_object(oracle(grasps[:1]), meaning, 1)
+    """Without rounding, the rankings are equal without a tolerance."""
+    expected = best_by_object(oracle(grasps[:1]), posterior, 1)
     logits = np.array([logit for _, _, logit in expected])
-    assert np.diff(-logits).min() > 1e-6  # the drawn pictures give no near ties
+    assert np.diff(-logits).min() > 1e-6  # the synthetic photos give no near ties
     checkpoint, rows = searcher.checkpoint, searcher.generation.rows
     photos = [checkpoint.config.preprocessing.load_photo(catalogue / row["path"]) for row in rows]
     with torch.inference_mode():
@@ -164,18 +164,18 @@ def test_with_exact_partials_the_order_equals_the_oracle(
     np.testing.assert_allclose([match.logit for match in result.results], logits, atol=1e-5)
 
 
-@pytest.mark.parametrize("posterior", [None, STEEP])
-def test_several_grasps_add_their_logits(posterior, catalogue, model, grasps, tmp_path, monkeypatch):
-    """Of an object with one photo, the sum over grasps is the sum of the single answers, whatever it is worth."""
+@pytest.mark.parametrize("given_posterior", [None, STEEP])
+def test_several_grasps_add_their_logits(given_posterior, catalogue, model, grasps, tmp_path, monkeypatch):
+    """With one photo for each object, the logits of several grasps are the sums of the single ones."""
     for path in sorted(catalogue.rglob("1.jpg")):
         (tmp_path / "catalog" / path.parent.name).mkdir(parents=True)
         shutil.copy(path, tmp_path / "catalog" / path.parent.name)
     build_index(tmp_path / "catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
     searcher = Searcher.open(tmp_path / "index")
-    monkeypatch.setattr(searcher, "posterior", posterior)
+    monkeypatch.setattr(searcher, "posterior", given_posterior)
     single = [logits_by_object(searcher.query([grasp])) for grasp in grasps]
     np.testing.assert_allclose(logits_by_object(searcher.query(grasps)), np.sum(single, axis=0), atol=1e-6)
-    assert np.ptp(single, axis=0).max() > 1e-4  # the grasps are told apart at all
+    assert np.ptp(single, axis=0).max() > 1e-4  # the grasps differ
 
 
 def logits_by_object(result):
@@ -190,12 +190,12 @@ def test_the_order_of_the_grasps_does_not_matter(searcher, grasps):
     np.testing.assert_allclose([m.logit for m in ways[0]], [m.logit for m in ways[1]], atol=1e-6)
 
 
-def test_the_fingers_are_told_apart(searcher, touch):
+def test_swapped_fingers_give_another_logit(searcher, touch):
     a, b = touch
     assert searcher.query([(a, b)]).results[0].logit != searcher.query([(b, a)]).results[0].logit
 
 
-def test_equal_photos_of_two_objects_both_come_back_in_the_order_of_their_ids(catalogue, model, touch, tmp_path):
+def test_equal_photos_of_several_objects_are_all_found_in_the_order_of_their_ids(catalogue, model, touch, tmp_path):
     own = tmp_path / "catalog"
     for name in ("zebra", "ant", "mule"):
         (own / name).mkdir(parents=True)
@@ -209,7 +209,7 @@ def test_equal_photos_of_two_objects_both_come_back_in_the_order_of_their_ids(ca
         assert [match.rank for match in results] == [1, 2, 3]
 
 
-def test_a_reader_keeps_the_index_it_opened(catalogue, model, touch, tmp_path):
+def test_a_reader_continues_with_the_generation_it_opened(catalogue, model, touch, tmp_path):
     own, index = shutil.copytree(catalogue, tmp_path / "catalog"), tmp_path / "index"
     build_index(own, load_checkpoint(model), index, quiet=True)
     reader = Searcher.open(index)
@@ -221,7 +221,7 @@ def test_a_reader_keeps_the_index_it_opened(catalogue, model, touch, tmp_path):
 
 
 @pytest.mark.parametrize("top", [1, 3, 8, 50])
-def test_top_gives_the_first_of_the_ranking_and_never_more_than_there_are(top, searcher, touch):
+def test_top_limits_the_ranking(top, searcher, touch):
     whole = searcher.query([touch], top=8).results
     assert searcher.query([touch], top=top).results == whole[:top]
 
@@ -241,11 +241,11 @@ def test_the_ranking_does_not_depend_on_the_number_of_threads(searcher, grasps):
 
 
 @pytest.mark.parametrize("candidates", [None, 24, 1000])
-def test_no_candidate_stage_runs_where_it_would_leave_nothing_out(
+def test_no_candidate_stage_runs_if_it_covers_all_photos(
     candidates, searcher, catalogue, model, touch, tmp_path, searches
 ):
     assert searcher.query([touch], candidates=candidates).index["scored"] == 24
-    if candidates is None:  # nor where embeddings were not trained
+    if candidates is None:  # nor without trained embeddings
         checkpoint = variant(model, tmp_path / "paper.safetensors", training__weights={})
         build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)
         assert Searcher.open(tmp_path / "index").query([touch], candidates=2, top=1).index["scored"] == 24
@@ -253,7 +253,7 @@ def test_no_candidate_stage_runs_where_it_would_leave_nothing_out(
 
 
 @pytest.mark.parametrize(("candidates", "top", "stage"), [(1, 1, 1), (9, 1, 9), (23, 1, 23), (2, 5, 5)])
-def test_one_candidate_stage_for_as_many_photos_as_asked_for_runs_where_it_leaves_something_out(
+def test_one_candidate_stage_with_the_requested_number_runs_if_it_omits_photos(
     candidates, top, stage, searcher, grasps, searches
 ):
     result = searcher.query(grasps, candidates=candidates, top=top)
@@ -264,10 +264,10 @@ def test_one_candidate_stage_for_as_many_photos_as_asked_for_runs_where_it_leave
 @pytest.mark.parametrize(("candidates", "completed"), [(5, 1), (2, 1), (2, 20)])
 @torch.inference_mode()
 def test_the_candidates_are_the_photos_nearest_to_all_grasps_together(
-    candidates, completed, meaning, searcher, matcher, grasps, oracle, monkeypatch
+    candidates, completed, posterior, searcher, matcher, grasps, oracle, monkeypatch
 ):
-    """Plain loops: the best sums of inner products, the full network on these, and on the other photos of the objects
-    that come first by them."""
+    """Plain loops: the best sums of inner products, the full network on these photos, and on the other photos of the
+    best objects among them."""
     monkeypatch.setattr("retrieval.search.query.shard.MIN_COMPLETED_OBJECTS", completed)
     checkpoint, generation = searcher.checkpoint, searcher.generation
     load, products = checkpoint.config.preprocessing.load_touch, np.zeros(24)
@@ -276,18 +276,18 @@ def test_the_candidates_are_the_photos_nearest_to_all_grasps_together(
         products += generation.embeddings[generation.slots] @ matcher.touch_search_encoding(touch).embedding[0].numpy()
     near = {generation.rows[row]["path"] for row in np.argsort(-products)[:candidates]}
     logits = oracle(grasps)
-    first = best_by_object({photo: logits[photo] for photo in near}, meaning, 3)
+    first = best_by_object({photo: logits[photo] for photo in near}, posterior, 3)
     whole = {name for name, _, _ in first[: max(2, completed)]}
-    judged = {photo: logit for photo, logit in logits.items() if photo in near or photo.split("/")[0] in whole}
-    expected = best_by_object(judged, meaning, 3)
+    scored = {photo: logit for photo, logit in logits.items() if photo in near or photo.split("/")[0] in whole}
+    expected = best_by_object(scored, posterior, 3)
     result = searcher.query(grasps, candidates=candidates, top=2)
-    assert result.index["scored"] == len(judged) < 24
+    assert result.index["scored"] == len(scored) < 24
     assert result.posterior["scored_objects"] == len(expected) < 8
     assert [(match.object_id, match.photo) for match in result.results] == [item[:2] for item in expected[:2]]
 
 
-def test_grasps_name_candidates_by_the_sum_of_their_cosines_and_by_the_first_where_they_cancel_out():
-    """A photo between two grasps is nearer to both together than the photo that is nearest to either."""
+def test_the_combined_embedding_orders_by_sums_of_cosines_and_is_the_first_if_they_cancel():
+    """A photo between two grasps is nearer to both together than the photos nearest to one of them."""
     grasps = np.array([[1, 0, 0], [0, 1, 0]], dtype=np.float32)
     between = np.sqrt(0.5) * grasps.sum(0)
     np.testing.assert_allclose(combined_embedding(grasps), [between], atol=1e-7)
@@ -296,7 +296,7 @@ def test_grasps_name_candidates_by_the_sum_of_their_cosines_and_by_the_first_whe
     assert (grasps @ photos.T).argmax(1).tolist() == [0, 1]
     assert (combined_embedding(grasps) @ photos.T).argmax() == (grasps @ photos.T).sum(0).argmax() == 2
     grasp = np.array([[0.6, 0.8]], dtype=np.float32)
-    for off in (0, 1e-6):  # the sum's direction would be that of its rounding, or 0 / 0
+    for off in (0, 1e-6):  # the direction of the sum would be that of its rounding, or 0 / 0
         np.testing.assert_array_equal(combined_embedding(np.concatenate([grasp, off - grasp])), grasp)
 
 
@@ -305,13 +305,13 @@ def test_grasps_name_candidates_by_the_sum_of_their_cosines_and_by_the_first_whe
 
 @pytest.mark.parametrize("none_prior", [0.5, 0.2, 0.0])
 @pytest.mark.parametrize("count", [1, 3])
-def test_the_probability_is_the_objects_share_beside_none_of_these_and_follows_the_logits_order(
-    count, none_prior, meaning, searcher, grasps
+def test_probabilities_equal_normalised_likelihoods_with_none_of_these_and_follow_the_logits(
+    count, none_prior, posterior, searcher, grasps
 ):
     """Of 8 objects, each with the prior (1 - p) / 8: its likelihood ratio times the prior, over the sum of all."""
     result = searcher.query(grasps[:count], none_prior=none_prior)
-    worth = weight(meaning, count)
-    terms = [(1 - none_prior) / 8 * math.exp(worth * match.logit + meaning.offset) for match in result.results]
+    scale = weight(posterior, count)
+    terms = [(1 - none_prior) / 8 * math.exp(scale * match.logit + posterior.offset) for match in result.results]
     total = none_prior + math.fsum(terms)
     probabilities = [match.probability for match in result.results]
     assert probabilities == pytest.approx([term / total for term in terms], abs=1e-12)
@@ -322,58 +322,58 @@ def test_the_probability_is_the_objects_share_beside_none_of_these_and_follows_t
     assert if_present == pytest.approx([term / math.fsum(terms) for term in terms], abs=1e-12)
 
 
-def test_the_probability_if_present_does_not_fade_where_none_of_these_is_certain(searcher, touch, monkeypatch):
-    alone = searcher.query([touch], none_prior=0)
+def test_the_probability_if_present_is_unchanged_if_none_of_these_is_certain(searcher, touch, monkeypatch):
+    without_none = searcher.query([touch], none_prior=0)
     monkeypatch.setattr(searcher, "posterior", dataclasses.replace(searcher.posterior, offset=-1000.0))
     result = searcher.query([touch])
     assert (result.none_probability, result.top.probability) == (1.0, 0.0)
     shown = [match.probability_if_present for match in result.results]
-    assert shown == pytest.approx([match.probability for match in alone.results], abs=1e-12)
+    assert shown == pytest.approx([match.probability for match in without_none.results], abs=1e-12)
 
 
 @pytest.mark.parametrize(
     ("missing", "scale", "more"),
     [
-        (110, 10_000, 1),  # of half dependent grasps with logit 100, two weigh 133, three 150, five 167
+        (110, 10_000, 1),  # with dependence 0.5 and logit 100, two grasps weigh 133, three 150, five 167
         (140, 10_000, 2),
         (200, 10_000, None),
-        (110, 0.01, None),  # one more would do, but the ranking is not clear
+        (110, 0.01, None),  # one more would suffice, but the ranking is not clear
     ],
 )
-def test_more_grasps_are_named_where_the_ranking_is_clear_and_so_few_suffice(
+def test_more_grasps_is_the_number_needed_if_the_ranking_is_clear_and_few_suffice(
     missing, scale, more, searcher, touch, monkeypatch
 ):
-    """The best object has logit 100, and `missing` is the evidence that a match needs."""
+    """The best object has logit 100, and a match needs the evidence `missing`."""
     head = searcher.scorer
     scaled = dataclasses.replace(head, out=scale * head.out, out_bias=scale * head.out_bias)
-    monkeypatch.setattr(searcher.shard, "judge", scaled)
+    monkeypatch.setattr(searcher.shard, "scorer", scaled)
     monkeypatch.setattr(searcher, "posterior", Posterior(1.0, math.log(8) - missing, dependence=0.5))
     lift = 100 - searcher.query([touch]).top.logit
-    monkeypatch.setattr(searcher.shard, "judge", dataclasses.replace(scaled, out_bias=scaled.out_bias + lift))
+    monkeypatch.setattr(searcher.shard, "scorer", dataclasses.replace(scaled, out_bias=scaled.out_bias + lift))
     result = searcher.query([touch])
     assert result.top.logit == pytest.approx(100, rel=1e-4)
     assert (result.verdict, result.more_grasps) == ("none of these", more)
     assert result.to_dict()["more_grasps"] == more
 
 
-def test_the_answer_says_by_what_numbers_its_probabilities_came_about(searcher, grasps, monkeypatch):
+def test_the_result_has_the_numbers_of_its_probabilities(searcher, grasps, monkeypatch):
     monkeypatch.setattr(searcher, "posterior", STEEP)
-    said = searcher.query(grasps, none_prior=0.25).to_dict()["posterior"]
-    assert said.pop("formula").startswith("P(o) ~ (1 - none_prior) / objects * exp(w * logit + offset)")
+    formula = searcher.query(grasps, none_prior=0.25).to_dict()["posterior"]
+    assert formula.pop("formula").startswith("P(o) ~ (1 - none_prior) / objects * exp(w * logit + offset)")
     numbers = {"slope": 2.0, "offset": -1.5, "dependence": 0.25, "tests": 1}
     about = {"none_prior": 0.25, "grasps": 3, "objects": 8, "scored_objects": 8, "unscored_probability": 0.0}
-    assert said == numbers | about
+    assert formula == numbers | about
 
 
 def test_objects_with_equal_probabilities_are_still_ranked_by_logit(searcher, touch, monkeypatch):
-    """float64 shares of logits that lie 745 behind all equal 0: ranked by probability, they would be one tie."""
+    """Float64 probabilities of logits that are 745 below the best are all 0; ranked by probability, they would tie."""
     head, partials = searcher.scorer, searcher.encode(touch).partials
     larger = dataclasses.replace(head, out=10_000 * head.out, out_bias=10_000 * head.out_bias)
-    monkeypatch.setattr(searcher.shard, "judge", larger)
+    monkeypatch.setattr(searcher.shard, "scorer", larger)
     monkeypatch.setattr(searcher, "posterior", Posterior(slope=100.0))
     result = searcher.query([touch])
     assert [match.probability for match in result.results[-2:]] == [0.0, 0.0]
-    # With so large a slope an object's logit is its best photo's, less log 3 / 100 for each alike.
+    # With this slope an object's logit is that of its best photo, minus log 3 / 100 for each object.
     best, logits = {}, head.logits(partials, searcher.generation.arrays["partials"])
     for row, logit in zip(searcher.generation.rows, logits, strict=True):
         best[row["object_id"]] = max(float(logit), best.get(row["object_id"], -math.inf))
@@ -387,10 +387,10 @@ def test_the_verdict_compares_the_best_with_none_of_these(offset, none_prior, ve
     monkeypatch.setattr(searcher, "posterior", dataclasses.replace(searcher.posterior, offset=offset))
     result = searcher.query([touch], none_prior=none_prior)
     assert (result.verdict, result.none_probability == 0) == (verdict, none_prior == 0)
-    assert len(result.results) == 8  # the nearest are shown all the same
+    assert len(result.results) == 8  # the nearest objects are listed anyway
 
 
-def test_a_model_that_was_never_calibrated_gives_no_probability(searcher, touch, monkeypatch):
+def test_an_uncalibrated_model_gives_no_probability(searcher, touch, monkeypatch):
     monkeypatch.setattr(searcher, "posterior", None)
     result = searcher.query([touch])
     assert result.verdict == "uncalibrated"
@@ -398,7 +398,7 @@ def test_a_model_that_was_never_calibrated_gives_no_probability(searcher, touch,
     assert (result.none_probability, result.posterior) == (None, None)
 
 
-def test_the_document_says_what_was_asked_of_what_and_how_long_it_took(searcher, grasps, index):
+def test_the_document_has_the_query_the_index_and_the_timing(searcher, grasps, index):
     document = searcher.query(grasps).to_dict()
     touches = [[str(path) for path in touch] for touch in grasps]
     assert document["query"] == {"touches": touches, "grasps": ["contact"] * 3}
@@ -414,7 +414,7 @@ def test_the_document_says_what_was_asked_of_what_and_how_long_it_took(searcher,
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_the_number_of_gel_images_must_be_the_models(count, searcher, touch):
+def test_the_number_of_gel_images_must_match_the_model(count, searcher, touch):
     files = (*touch, *touch)[:count]
     with pytest.raises(BadInput, match=rf"takes 2 gel image\(s\) for one touch; got {count}: .*a\.png"):
         searcher.query([touch, files])
@@ -428,11 +428,11 @@ def test_top_and_candidates_must_be_whole_and_positive(numbers, searcher, touch)
         searcher.query([touch], **numbers)
 
 
-def test_the_first_bad_gel_image_is_named_however_long_each_takes(searcher, touch, tmp_path):
+def test_the_first_bad_gel_image_is_reported_for_any_decoding_times(searcher, touch, tmp_path):
     a, b = touch
     cut, text, none = (tmp_path / f"{name}.png" for name in ("cut", "text", "none"))
     cut.write_bytes(b.read_bytes()[:400])
-    text.write_text("no picture" * 1_000_000)
+    text.write_text("not an image" * 1_000_000)
     for path, reason in ((none, "no such file"), (cut, "truncated"), (text, "not a PNG")):
         with pytest.raises(ImageError, match=rf"{path.name}: .*{reason}"):
             searcher.query([touch, (a, path), (none, b)])
@@ -440,7 +440,7 @@ def test_the_first_bad_gel_image_is_named_however_long_each_takes(searcher, touc
 
 @pytest.fixture(scope="module")
 def subtracting(catalogue, model, tmp_path_factory):
-    """A searcher whose model takes the untouched gel off."""
+    """A searcher whose model subtracts the no-contact frame."""
     folder = tmp_path_factory.mktemp("background")
     checkpoint = variant(model, folder / "difference.safetensors", preprocessing__background="difference")
     build_index(catalogue, checkpoint, folder / "index", quiet=True)
@@ -448,14 +448,14 @@ def subtracting(catalogue, model, tmp_path_factory):
 
 
 def test_the_background_is_subtracted_from_each_finger(subtracting, touch, tmp_path):
-    """The touch as its own background leaves nothing: every touch is then the same."""
+    """With itself as background every touch gives the same input."""
     frames = [Path(shutil.copy(path, tmp_path / path.name)) for path in touch]
     nothing = subtracting.query([touch], background=touch).results
     assert subtracting.query([frames], background=frames).results == nothing
     assert subtracting.query([touch], background=frames[::-1]).results != nothing
 
 
-def test_there_must_be_one_background_for_each_finger_where_one_is_looked_at(subtracting, searcher, touch):
+def test_a_model_that_uses_a_background_needs_one_for_each_finger(subtracting, searcher, touch):
     with pytest.raises(BadInput, match=r'background = "difference".* give a no-contact frame for each finger'):
         subtracting.query([touch])
     for count in (1, 3):
@@ -468,7 +468,7 @@ def test_there_must_be_one_background_for_each_finger_where_one_is_looked_at(sub
 # Index and model -------------------------------------------------------------------------------------------------
 
 
-def test_another_model_than_the_indexs_is_refused(index, model, tmp_path):
+def test_another_model_than_the_indexs_raises(index, model, tmp_path):
     other = variant(model, tmp_path / "other.safetensors", training__seed=5)
     with pytest.raises(MismatchedIndex, match="made with checkpoint"):
         Searcher.open(index, model=other.path)
@@ -476,7 +476,7 @@ def test_another_model_than_the_indexs_is_refused(index, model, tmp_path):
 
 @pytest.fixture
 def moved(catalogue, model, tmp_path):
-    """An index whose model was moved away: (index, where the model lies now)."""
+    """An index whose model was moved: (index, new path of the model)."""
     here, there = tmp_path / "here.safetensors", tmp_path / "there.safetensors"
     shutil.copy(model, here)
     build_index(catalogue, load_checkpoint(here), tmp_path / "index", quiet=True)
@@ -484,7 +484,7 @@ def moved(catalogue, model, tmp_path):
     return tmp_path / "index", there
 
 
-def test_a_model_that_was_moved_is_asked_for_unless_it_is_the_default(moved, touch):
+def test_a_moved_model_must_be_given_unless_it_is_the_default(moved, touch):
     index, there = moved
     with pytest.raises(CheckpointError, match=r"no longer at .*here\.safetensors; name it with --model"):
         Searcher.open(index)
@@ -494,7 +494,7 @@ def test_a_model_that_was_moved_is_asked_for_unless_it_is_the_default(moved, tou
 
 
 @pytest.mark.parametrize("default", ["none", "damaged"])
-def test_a_moved_model_is_asked_for_whatever_the_default_is(default, moved, tmp_path, monkeypatch):
+def test_a_moved_model_must_be_given_if_the_default_is_unusable(default, moved, tmp_path, monkeypatch):
     index, there = moved
     monkeypatch.setattr(defaults, "shipped_model", lambda: tmp_path / "absent")
     if default == "damaged":
@@ -507,22 +507,22 @@ def test_a_moved_model_is_asked_for_whatever_the_default_is(default, moved, tmp_
 # The best of each object -----------------------------------------------------------------------------------------
 
 
-def by_plain_loops(owners, rows, logits, worth):
-    """{object's number: (row of its best photo, log mean exp over all its photos)}; the first of equal photos."""
+def by_plain_loops(owners, rows, logits, scale):
+    """{object number: (row of its best photo, log mean exp over all its photos)}; ties take the first photo."""
     best, terms = {}, {}
     for row, logit in zip(rows.tolist(), logits.tolist(), strict=True):
         owner = owners[row]
-        terms.setdefault(owner, []).append(math.exp(worth * logit))
+        terms.setdefault(owner, []).append(math.exp(scale * logit))
         if owner not in best or logit > best[owner][1]:
             best[owner] = (row, logit)
     return {
-        owner: (row, math.log(math.fsum(terms[owner]) / owners.count(owner)) / worth)
+        owner: (row, math.log(math.fsum(terms[owner]) / owners.count(owner)) / scale)
         for owner, (row, _) in best.items()
     }
 
 
 def made_up_objects(searcher, rng):
-    """500 photos of 40 objects that are named in another order than they are numbered."""
+    """500 photos of 40 objects whose names and numbers have different orders."""
     names = [f"object-{number:02}" for number in rng.permutation(40)]
     owners = np.concatenate([np.arange(40), rng.integers(0, 40, 460)])
     made_up = copy.copy(searcher.objects)
@@ -536,12 +536,12 @@ def made_up_objects(searcher, rng):
 
 @pytest.mark.parametrize("grasps", [1, 3])
 @pytest.mark.parametrize("levels", [1, 3, 10_000])
-def test_the_logit_and_the_best_photo_of_each_object_are_those_of_plain_loops(levels, grasps, searcher):
+def test_the_logit_and_the_best_photo_of_each_object_equal_plain_loops(levels, grasps, searcher):
     rng = np.random.default_rng(levels)
     made_up, _ = made_up_objects(searcher, rng)
     rows = np.sort(rng.choice(500, 300, replace=False))
     logits = rng.integers(0, levels, 300).astype(np.float32) / levels
-    found = made_up.judged(rows, logits, STEEP, grasps)
+    found = made_up.aggregate(rows, logits, STEEP, grasps)
     expected = by_plain_loops(made_up._of_row.tolist(), rows, logits, weight(STEEP, grasps))
     assert found.numbers.tolist() == sorted(expected)
     assert found.rows.tolist() == [expected[number][0] for number in sorted(expected)]
@@ -549,27 +549,27 @@ def test_the_logit_and_the_best_photo_of_each_object_are_those_of_plain_loops(le
 
 
 @pytest.mark.parametrize("photos", [1, 2, 3, 7, 24, 29])
-def test_equal_photos_give_an_object_the_same_logit_however_many_it_has(photos, searcher):
-    """Their mean is any one of them; a rounding in the last bit would put the later of two names first."""
+def test_equal_photos_give_the_same_logit_for_any_number_of_them(photos, searcher):
+    """Their mean equals each of them; rounding in the last bit would put the later of two names first."""
     made_up = copy.copy(searcher.objects)
     made_up._of_row = np.array([0] * photos + [1])
     made_up._photos = np.bincount(made_up._of_row)
     logits = np.full(photos + 1, 1.3, dtype=np.float32)
-    many, one = made_up.judged(np.arange(photos + 1), logits, Posterior(slope=0.9), 1).logits
+    many, one = made_up.aggregate(np.arange(photos + 1), logits, Posterior(slope=0.9), 1).logits
     assert many == one
 
 
 @pytest.mark.parametrize("levels", [1, 3, 10_000])
 @pytest.mark.parametrize("top", [1, 2, 7, 40, 1000])
-def test_the_best_objects_are_those_of_a_plain_sort(top, levels, searcher):
+def test_the_best_objects_equal_a_plain_sort(top, levels, searcher):
     """By logit, then by name."""
     rng = np.random.default_rng(top + levels)
     made_up, names = made_up_objects(searcher, rng)
     numbers = np.sort(rng.choice(40, 30, replace=False))
     logits = rng.integers(0, levels, 30).astype(np.float64)
-    judged = ScoredObjects(numbers, logits, numbers)  # the photo of row n is one of object n
+    scored = ScoredObjects(numbers, logits, numbers)  # the photo of row n belongs to object n
     expected = sorted(range(30), key=lambda place: (-logits[place], names[numbers[place]]))
-    assert made_up.best(judged, top).tolist() == expected[:top]
+    assert made_up.best(scored, top).tolist() == expected[:top]
 
 
 def test_equal_photos_get_the_logit_of_the_first_scored_one(searcher):
@@ -593,7 +593,7 @@ def test_the_index_sets_the_number_of_candidates_unless_the_query_does(
     assert searches == [*expected, 9]
 
 
-def test_a_damaged_model_is_told_from_another_one(moved):
+def test_a_damaged_model_is_distinguished_from_another_one(moved):
     index, there = moved
     data = bytearray(there.read_bytes())
     data[-3] ^= 1

@@ -1,4 +1,4 @@
-"""What is searched may be one index folder, or several that are one catalogue: answers are the same."""
+"""Sharded indexes: a catalogue in several index folders gives the results of one folder."""
 
 import dataclasses
 import json
@@ -33,13 +33,13 @@ def divided(cluster):
 
 
 def without_times(document):
-    """A query's document without what differs by name and by time."""
+    """A query's document without names and times that differ."""
     index = {name: document["index"][name] for name in ("photos", "objects", "scored", "catalogue", "model")}
     return {**document, "index": index, "timing_ms": None}
 
 
 def same_answers(ours, theirs):
-    """Rankings, photos and verdicts are equal; numbers within the rounding of float32 products of other shapes."""
+    """Check that rankings, photos and verdicts are equal, and numbers up to the rounding of float32 products."""
     ours, theirs = without_times(ours.to_dict()), without_times(theirs.to_dict())
     for document in (ours, theirs):
         document["numbers"] = [
@@ -55,7 +55,7 @@ def same_answers(ours, theirs):
     assert ours == theirs
 
 
-# The suite: the same over every implementation of `Shard` -------------------------------------------------------------
+# Tests of every implementation of `Shard` -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("posterior", ["the model's own", STEEP, None], ids=["own", "steep", "none"])
@@ -66,30 +66,30 @@ def test_with_all_photos_scored_answers_equal_those_of_one_folder(
     if posterior != "the model's own":
         for one in (divided, searcher):
             monkeypatch.setattr(one, "posterior", posterior)
-    for catalogue_copy in grasps:
+    for own in grasps:
         same_answers(
-            divided.query(catalogue_copy[:count], none_prior=0.3),
-            searcher.query(catalogue_copy[:count], none_prior=0.3),
+            divided.query(own[:count], none_prior=0.3),
+            searcher.query(own[:count], none_prior=0.3),
         )
 
 
-def test_the_best_of_a_few_are_the_best_of_all(divided, searcher, grasps):
+def test_the_best_of_all_shards_are_the_best_of_the_catalogue(divided, searcher, grasps):
     same_answers(divided.query(grasps[0], top=2), searcher.query(grasps[0], top=2))
 
 
 def test_with_as_many_candidates_in_each_shard_the_exhaustive_top1_is_found_at_least_as_often(
     divided, searcher, grasps
 ):
-    for catalogue_copy in grasps:
+    for own in grasps:
         for candidates in (1, 2, 5):
-            best = searcher.query(catalogue_copy, top=1).top
-            found = divided.query(catalogue_copy, top=1, candidates=candidates)
-            alone = searcher.query(catalogue_copy, top=1, candidates=candidates)
-            assert (found.top.photo == best.photo) >= (alone.top.photo == best.photo)
-            assert found.top.logit >= alone.top.logit - 1e-5
+            best = searcher.query(own, top=1).top
+            found = divided.query(own, top=1, candidates=candidates)
+            whole = searcher.query(own, top=1, candidates=candidates)
+            assert (found.top.photo == best.photo) >= (whole.top.photo == best.photo)
+            assert found.top.logit >= whole.top.logit - 1e-5
 
 
-def test_probabilities_add_up_to_one_whatever_was_scored(divided, grasps, monkeypatch):
+def test_probabilities_add_up_to_one_for_any_number_of_candidates(divided, grasps, monkeypatch):
     monkeypatch.setattr("retrieval.search.query.shard.MIN_COMPLETED_OBJECTS", 1)
     for candidates in (1, 2, 3, 100):
         answer = divided.query(grasps[0], top=8, candidates=candidates)
@@ -100,25 +100,25 @@ def test_probabilities_add_up_to_one_whatever_was_scored(divided, grasps, monkey
             assert math.fsum(match.probability_if_present for match in answer.results) == pytest.approx(1, abs=1e-9)
 
 
-def test_several_objects_and_growing_answers_are_merged_too(divided, searcher, grasps):
+def test_results_of_several_objects_and_cumulative_queries_are_merged(divided, searcher, grasps):
     for ours, theirs in zip(divided.query_many(grasps), searcher.query_many(grasps), strict=True):
         same_answers(ours, theirs)
     for ours, theirs in zip(divided.query_cumulative(grasps[0]), searcher.query_cumulative(grasps[0]), strict=True):
         same_answers(ours, theirs)
 
 
-def test_rows_are_found_in_whatever_shard_they_lie(divided, searcher):
+def test_rows_are_found_in_every_shard(divided, searcher):
     ids = [row["id"] for row in searcher.generation.rows]
-    asked = [*ids[::5], "absent/1.jpg"]
-    assert divided.shard.rows(asked) == searcher.shard.rows(asked)
-    assert divided.shard.rows(asked)[-1] is None
+    requested = [*ids[::5], "absent/1.jpg"]
+    assert divided.shard.rows(requested) == searcher.shard.rows(requested)
+    assert divided.shard.rows(requested)[-1] is None
 
 
-def test_an_answer_says_of_how_many_shards_and_what_concerns_one_folder_is_refused(divided, searcher, touch, cluster):
+def test_a_result_has_the_number_of_shards_and_folder_attributes_raise(divided, searcher, touch, cluster):
     index = divided.query(touch).index
     assert (index["shards"], index["searched"]) == (len(read_sharded_manifest(cluster).shards), 1.0)
     assert "shards" not in searcher.query(touch).index
-    with pytest.raises(BadInput, match="is a cluster of index folders"):
+    with pytest.raises(BadInput, match="is a sharded index, but one index folder is required"):
         _ = divided.generation
 
 
@@ -138,16 +138,16 @@ def test_merged_objects_are_ordered_by_logit_then_by_name():
 
 
 def test_masses_of_parts_give_the_probabilities_of_the_whole():
-    """By hand: two parts of two objects each, of which the second has one that was not judged."""
+    """By hand: two parts of two objects each; the second part has one unscored object."""
     logits = [math.log(4), 0.0, math.log(2)]
     parts = [STEEP.mass(logits[:2]), STEEP.mass(logits[2:], unscored=1, sample=[math.log(3)])]
-    belief = STEEP.probabilities_given(logits, EvidenceMass.merged(parts), none_prior=0.4)
+    probabilities = STEEP.probabilities_given(logits, EvidenceMass.merged(parts), none_prior=0.4)
     terms = [0.4, *(0.6 / 4 * math.exp(2 * logit - 1.5) for logit in [*logits, math.log(3)])]
     expected = [term / math.fsum(terms) for term in terms]
-    assert [belief.none, *belief.objects, belief.unscored] == pytest.approx(expected, abs=1e-12)
+    assert [probabilities.none, *probabilities.objects, probabilities.unscored] == pytest.approx(expected, abs=1e-12)
 
 
-def test_objects_of_which_nothing_is_known_weigh_what_the_others_do_on_average():
+def test_unknown_objects_have_the_average_mass_of_the_others():
     mass = STEEP.mass([0.0, math.log(3)], unscored=1, sample=[math.log(2)]).extrapolated(6)
     assert mass.objects == 9
     assert math.exp(mass.scored + mass.top) == pytest.approx(1 + 9)
@@ -159,42 +159,42 @@ def test_objects_of_which_nothing_is_known_weigh_what_the_others_do_on_average()
 
 
 def rows_of(cluster):
-    """{shard: its rows}, as the cluster's manifest names them."""
+    """{shard: its rows} of the shards in the manifest."""
     return {
         entry.folder: list(IndexStore(cluster / entry.folder).open(name=entry.generation).rows)
         for entry in read_sharded_manifest(cluster).shards
     }
 
 
-def test_every_photo_lies_in_the_shard_of_its_object_and_in_no_other(cluster, searcher):
+def test_every_photo_is_only_in_the_shard_of_its_object(cluster, searcher):
     shards = rows_of(cluster)
     for folder, rows in shards.items():
         assert {shard_number(row["object_id"], 4) for row in rows} == {int(folder.split("-")[1])}
     together = sorted((row for rows in shards.values() for row in rows), key=lambda row: row["id"])
     assert together == sorted(searcher.generation.rows, key=lambda row: row["id"])
-    said = read_sharded_manifest(cluster)
-    assert (said.photos, said.objects) == (24, 8)
+    manifest = read_sharded_manifest(cluster)
+    assert (manifest.photos, manifest.objects) == (24, 8)
 
 
-def test_a_shard_is_an_index_folder_that_answers_by_itself(cluster, divided, touch):
+def test_a_shard_is_a_searchable_index_folder(cluster, divided, touch):
     entry = read_sharded_manifest(cluster).shards[0]
-    with Searcher.open(cluster / entry.folder) as alone:
-        names = {match.object_id for match in alone.query(touch).results}
+    with Searcher.open(cluster / entry.folder) as opened:
+        names = {match.object_id for match in opened.query(touch).results}
     assert names == {row["object_id"] for row in rows_of(cluster)[entry.folder]}
     assert names < {match.object_id for match in divided.query(touch).results}
 
 
 @pytest.fixture
 def catalogue_copy(catalogue, cluster, tmp_path):
-    """A copy of the catalogue, whose cluster is a copy too."""
+    """Copies of the catalogue and of its sharded index."""
     shutil.copytree(catalogue, tmp_path / "catalog")
     shutil.copytree(cluster, tmp_path / "cluster")
     return tmp_path / "catalog", tmp_path / "cluster"
 
 
-def test_a_build_over_the_same_photos_embeds_nothing_and_switches_only_what_is_new(catalogue_copy, model, embedded):
+def test_a_rebuild_of_the_same_photos_embeds_nothing_and_switches_only_changed_shards(catalogue_copy, model, embedded):
     catalog, cluster = catalogue_copy
-    build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)  # the catalogue lies elsewhere now
+    build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)  # the catalogue has another path now
     before = read_sharded_manifest(cluster)
     again = build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)
     assert (again.written, again.embedded, again.reused) == (False, 0, 24)
@@ -205,8 +205,8 @@ def test_a_build_over_the_same_photos_embeds_nothing_and_switches_only_what_is_n
     after = read_sharded_manifest(cluster)
     assert (changed.written, changed.photos, changed.embedded) == (True, 25, int(changed.renamed == 0))
     assert number(after) == number(before) + 1
-    moved = {one.folder for one, other in zip(after.shards, before.shards, strict=True) if one != other}
-    assert moved == {f"shard-{shard_number(name, 4):02d}-of-04"}
+    changed_shards = {one.folder for one, other in zip(after.shards, before.shards, strict=True) if one != other}
+    assert changed_shards == {f"shard-{shard_number(name, 4):02d}-of-04"}
     assert embedded == ([1] if changed.embedded else [])
 
 
@@ -214,7 +214,7 @@ def number(manifest):
     return int(manifest.generation.split("-")[1])
 
 
-def test_another_number_of_shards_takes_every_code_over(catalogue_copy, model, embedded, touch):
+def test_another_number_of_shards_reuses_every_code(catalogue_copy, model, embedded, touch):
     catalog, cluster = catalogue_copy
     with Searcher.open(cluster) as searcher:
         expected = searcher.query(touch)
@@ -225,7 +225,7 @@ def test_another_number_of_shards_takes_every_code_over(catalogue_copy, model, e
     assert [(one.object_id, one.photo) for one in found.results] == [
         (one.object_id, one.photo) for one in expected.results
     ]
-    assert sorted(path.name for path in cluster.glob("shard-*-of-04"))  # who reads them may still
+    assert sorted(path.name for path in cluster.glob("shard-*-of-04"))  # for current readers
     build_sharded(catalog, load_checkpoint(model), cluster, 3, quiet=True)
     assert not list(cluster.glob("shard-*-of-04"))
 
@@ -235,32 +235,32 @@ class Killed(Exception):
 
 
 @pytest.mark.parametrize("after", [0, 1, 2, 3])
-def test_killed_between_shards_the_cluster_is_as_it_was_and_the_next_build_embeds_what_is_missing(
+def test_killed_between_shards_the_index_is_unchanged_and_the_next_build_embeds_the_rest(
     after, catalogue, model, tmp_path, embedded, monkeypatch
 ):
     from retrieval.search.sharding import build_sharded as module
 
-    made, build = [], module.build_shard
+    finished, build = [], module.build_shard
 
     def killed(job, checkpoint):
-        if len(made) == after:
+        if len(finished) == after:
             raise Killed
-        made.append(build(job, checkpoint))
-        return made[-1]
+        finished.append(build(job, checkpoint))
+        return finished[-1]
 
     monkeypatch.setattr(module, "build_shard", killed)
     with pytest.raises(Killed):
         build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True)
     assert not (tmp_path / "c" / "SHARDS.json").exists()
     monkeypatch.setattr(module, "build_shard", build)
-    done = sum(one.report.photos for one in made)
+    done = sum(one.report.photos for one in finished)
     embedded.clear()
     report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True)
     assert (report.photos, sum(embedded)) == (24, 24 - done)
 
 
-def test_killed_before_the_switch_the_old_generations_answer_however_often(catalogue_copy, model, touch, monkeypatch):
-    """Each time a shard has another photo, so that its folder goes through many generations."""
+def test_killed_before_every_switch_the_old_generations_answer(catalogue_copy, model, touch, monkeypatch):
+    """A shard gets a new photo in each turn, so its folder has many generations."""
     from retrieval.search.sharding import build_sharded as module
 
     catalog, cluster = catalogue_copy
@@ -281,12 +281,12 @@ def test_killed_before_the_switch_the_old_generations_answer_however_often(catal
             assert searcher.info.photos == 24
 
 
-def test_bad_photos_are_named_and_too_many_of_them_leave_the_cluster_as_it_was(catalogue_copy, model):
+def test_bad_photos_are_listed_and_too_many_leave_the_index_unchanged(catalogue_copy, model):
     catalog, cluster = catalogue_copy
     before = read_sharded_manifest(cluster)
     bad = next(catalog.glob("*/2.jpg"))
-    bad.write_bytes(b"no picture")
-    with pytest.raises(TooManyUnreadable, match=r"1 of 24 photos cannot be read, more than the share of 0\.01"):
+    bad.write_bytes(b"not an image")
+    with pytest.raises(TooManyUnreadable, match=r"1 of 24 photos cannot be read, more than the allowed fraction 0\.01"):
         build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True, max_unreadable=0.01)
     assert read_sharded_manifest(cluster) == before
     report = build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True)
@@ -294,88 +294,93 @@ def test_bad_photos_are_named_and_too_many_of_them_leave_the_cluster_as_it_was(c
     assert report.photos == 23
 
 
-def test_a_shard_none_of_whose_photos_can_be_read_is_left_out(catalogue_copy, model):
+def test_a_shard_without_a_readable_photo_is_left_out(catalogue_copy, model):
     catalog, cluster = catalogue_copy
-    lost = [path.name for path in catalog.iterdir() if shard_number(path.name, 4) == shard_number("spare", 4)]
-    lost = lost or [next(catalog.iterdir()).name]
+    affected = [path.name for path in catalog.iterdir() if shard_number(path.name, 4) == shard_number("spare", 4)]
+    affected = affected or [next(catalog.iterdir()).name]
     gone = {
-        name for name in (path.name for path in catalog.iterdir()) if shard_number(name, 4) == shard_number(lost[0], 4)
+        name
+        for name in (path.name for path in catalog.iterdir())
+        if shard_number(name, 4) == shard_number(affected[0], 4)
     }
     for name in gone:
         for photo in (catalog / name).iterdir():
-            photo.write_bytes(b"no picture")
+            photo.write_bytes(b"not an image")
     report = build_sharded(catalog, load_checkpoint(model), cluster, 4, quiet=True, max_unreadable=1)
     assert report.without_photo == sorted(gone)
     assert report.photos == 24 - 3 * len(gone)
     assert read_sharded_manifest(cluster).photos == report.photos
 
 
-def test_a_number_of_shards_that_is_none_and_an_index_folder_are_refused(catalogue, model, index, tmp_path):
+def test_an_invalid_number_of_shards_or_an_index_folder_raises(catalogue, model, index, tmp_path):
     for shards in (0, -1, 5000):
         with pytest.raises(BadInput, match="shards must be from 1 to 4096"):
             build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", shards, quiet=True)
-    with pytest.raises(BadInput, match="is an index folder; give another one"):
+    with pytest.raises(BadInput, match="is an index folder; give another folder"):
         build_sharded(catalogue, load_checkpoint(model), index, 2, quiet=True)
 
 
-# Built side by side ---------------------------------------------------------------------------------------------------
+# Building with Ray ----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def failing(monkeypatch):
-    """Ray that fails as a whole, so many times and after so many shards each: what it was asked for."""
-    building, asked, plain = pytest.importorskip("retrieval.cluster.building"), [], build_shard
+    """Make Ray fail as a whole several times, each time after some shards; returns the requested shards."""
+    building, requested, plain = pytest.importorskip("retrieval.cluster.building"), [], build_shard
 
     def fail(times, after):
-        def answers(ray, jobs, checkpoint, processes):
-            asked.append([job.folder for job in jobs])
+        def results(ray, jobs, checkpoint, processes):
+            requested.append([job.folder for job in jobs])
             for number, job in enumerate(jobs):
-                if number == after and len(asked) <= times:
+                if number == after and len(requested) <= times:
                     raise KeyError("ObjectRef(00ff)")
                 yield plain(job, checkpoint)
 
-        monkeypatch.setattr(building, "_answers", answers)
-        return asked
+        monkeypatch.setattr(building, "_results", results)
+        return requested
 
     parts = SimpleNamespace(data=SimpleNamespace(DataContext=SimpleNamespace(get_current=SimpleNamespace)))
     monkeypatch.setattr(building, "ray_session", lambda cpus: nullcontext(parts))
     return fail
 
 
-def test_where_ray_fails_as_a_whole_only_what_is_missing_is_built_again(failing, catalogue, model, tmp_path, embedded):
+def test_after_a_failure_of_ray_only_missing_shards_are_built_again(failing, catalogue, model, tmp_path, embedded):
     from retrieval.cluster.building import ray_runner
 
-    asked = failing(times=2, after=1)
+    requested = failing(times=2, after=1)
     report = build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=ray_runner(1, 1))
     assert (report.photos, sum(embedded), len(report.shards)) == (24, 24, 4)
-    assert [len(jobs) for jobs in asked] == [4, 3, 2]
-    assert asked[2] == asked[0][2:]
+    assert [len(jobs) for jobs in requested] == [4, 3, 2]
+    assert requested[2] == requested[0][2:]
 
 
-def test_ray_that_goes_on_failing_ends_the_build_in_a_sentence(failing, catalogue, model, tmp_path):
+def test_repeated_failures_of_ray_end_the_build_with_a_clear_error(failing, catalogue, model, tmp_path):
     from retrieval.cluster.building import MAX_FAILURES, ray_runner
 
-    asked = failing(times=99, after=0)
-    with pytest.raises(RetrievalError, match=r"Ray failed 4 times without a shard \(KeyError: .*goes on where it"):
+    requested = failing(times=99, after=0)
+    with pytest.raises(
+        RetrievalError,
+        match=r"Ray failed 4 times without a finished shard \(KeyError: .*same command again to continue",
+    ):
         build_sharded(catalogue, load_checkpoint(model), tmp_path / "c", 4, quiet=True, run=ray_runner(1, 1))
-    assert len(asked) == MAX_FAILURES + 1
+    assert len(requested) == MAX_FAILURES + 1
 
 
 # Damage ---------------------------------------------------------------------------------------------------------------
 
 
-def test_a_missing_shard_is_named_and_another_ones_generation_refused_in_its_place(catalogue_copy):
+def test_a_missing_shard_or_the_generation_of_another_one_is_corrupt(catalogue_copy):
     _, cluster = catalogue_copy
     first, second = read_sharded_manifest(cluster).shards[:2]
     shutil.rmtree(cluster / first.folder / first.generation)
     with pytest.raises(CorruptIndex, match=f"{first.folder}: the generation {first.generation} is missing"):
         Searcher.open(cluster)
     shutil.copytree(cluster / second.folder / second.generation, cluster / first.folder / first.generation)
-    with pytest.raises(CorruptIndex, match=r"is not the generation that .* was written for"):
+    with pytest.raises(CorruptIndex, match=r"is not the generation that .* lists"):
         Searcher.open(cluster)
 
 
-def test_a_shard_of_another_model_is_refused(catalogue_copy):
+def test_a_sharded_index_of_another_model_raises(catalogue_copy):
     _, cluster = catalogue_copy
     manifest = read_sharded_manifest(cluster)
     write_sharded_manifest(
@@ -386,7 +391,7 @@ def test_a_shard_of_another_model_is_refused(catalogue_copy):
 
 
 @pytest.mark.parametrize("cut", np.linspace(0, 0.98, 8))
-def test_a_manifest_cut_short_is_refused_in_a_sentence(cut, catalogue_copy):
+def test_a_truncated_manifest_is_corrupt(cut, catalogue_copy):
     _, cluster = catalogue_copy
     path = cluster / "SHARDS.json"
     path.write_bytes(path.read_bytes()[: int(cut * path.stat().st_size)])
@@ -410,19 +415,19 @@ ENTRY = {"folder": "shard-00-of-01", "generation": "gen-000001", "sha256": "0" *
         ("of", 0),
     ],
 )
-def test_a_forged_manifest_is_refused(field, value, catalogue_copy):
-    """Whoever alters it can write the digest that fits."""
+def test_a_forged_manifest_is_corrupt(field, value, catalogue_copy):
+    """Software that alters the manifest can also write the right digest."""
     _, cluster = catalogue_copy
     manifest = read_sharded_manifest(cluster)
     made_up = object.__new__(type(manifest))
     for one in dataclasses.fields(manifest):
         object.__setattr__(made_up, one.name, value if one.name == field else getattr(manifest, one.name))
     write_sharded_manifest(cluster, made_up)
-    with pytest.raises(CorruptIndex, match=rf"CLUSTER\.{field}.* must be"):
+    with pytest.raises(CorruptIndex, match=rf"SHARDS\.{field}.* must be"):
         Searcher.open(cluster)
 
 
-def test_another_format_is_refused(catalogue_copy):
+def test_another_format_raises(catalogue_copy):
     _, cluster = catalogue_copy
     path = cluster / "SHARDS.json"
     content = json.loads(path.read_text())
@@ -430,5 +435,5 @@ def test_another_format_is_refused(catalogue_copy):
     content.pop("sha256")
     content["sha256"] = content_digest(content)
     path.write_text(json.dumps(content))
-    with pytest.raises(UnsupportedFormat, match="has the newer format 99, this software reads 1; update"):
+    with pytest.raises(UnsupportedFormat, match="has the newer format 99, this software reads 2; update"):
         Searcher.open(cluster)

@@ -1,4 +1,4 @@
-"""Files that look as they did are not read again; what changed is found all the same."""
+"""Unchanged files are not read again, and every change is detected."""
 
 import os
 import random
@@ -25,14 +25,14 @@ def index(tmp_path):
 
 @pytest.fixture
 def an_hour_later(monkeypatch):
-    """Builds run when no file has changed for long."""
+    """Make all files an hour old for builds."""
     now = time.time_ns
     monkeypatch.setattr(stat_cache.time, "time_ns", lambda: now() + HOUR_NS)
 
 
 @pytest.fixture
 def read(monkeypatch):
-    """Paths of the files that were read, in no order."""
+    """Paths of the files that were read, unordered."""
     paths = []
 
     def noted(catalogue, photo):
@@ -51,24 +51,24 @@ def named(catalogue_copy, path):
 
 
 @pytest.mark.usefixtures("an_hour_later")
-def test_an_unchanged_catalogue_is_not_read_again_unless_asked_for(catalogue_copy, checkpoint, index, read):
+def test_an_unchanged_catalogue_is_not_read_again_without_verify(catalogue_copy, checkpoint, index, read):
     first = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (len(read), first.unread, "--verify" in "\n".join(first.lines())) == (24, 0, False)
     read.clear()
     again = build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert (read, again.unread, again.written) == ([], 24, False)
-    assert any("24 photos are taken to be what they were" in line for line in again.lines())
+    assert any("24 photos were not read, because size, times and inode" in line for line in again.lines())
     assert build_index(catalogue_copy, checkpoint, index, verify=True, quiet=True).unread == 0
     assert len(read) == 24
 
 
 @pytest.mark.usefixtures("an_hour_later")
-def test_only_files_with_a_changed_status_are_read(catalogue_copy, checkpoint, index, read):
+def test_only_files_with_a_changed_stat_are_read(catalogue_copy, checkpoint, index, read):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     photos = sorted(catalogue_copy.rglob("*.jpg"))
     other_picture(photos[3])
     photos[7].touch()
-    photos[9].chmod(0o600)  # changes no content, but a time
+    photos[9].chmod(0o600)  # changes a time, but not the content
     moved = photos[11].rename(photos[11].with_name("moved.jpg"))
     read.clear()
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
@@ -80,9 +80,7 @@ def test_only_files_with_a_changed_status_are_read(catalogue_copy, checkpoint, i
 
 
 @pytest.mark.usefixtures("an_hour_later")
-def test_another_picture_of_the_same_size_and_time_is_found_by_the_time_of_its_change(
-    catalogue_copy, checkpoint, index
-):
+def test_a_new_image_with_the_same_size_and_mtime_is_detected_by_its_ctime(catalogue_copy, checkpoint, index):
     photo = first_photo(catalogue_copy)
     content = photo.read_bytes()
     photo.write_bytes(content + b"ab")
@@ -95,14 +93,14 @@ def test_another_picture_of_the_same_size_and_time_is_found_by_the_time_of_its_c
 
 
 @pytest.mark.usefixtures("an_hour_later")
-def test_another_model_reads_all_and_so_does_another_index(catalogue_copy, checkpoint, index, read, tmp_path):
+def test_another_model_or_another_index_reads_all_files(catalogue_copy, checkpoint, index, read, tmp_path):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert build_index(catalogue_copy, checkpoint, tmp_path / "other", quiet=True).unread == 0
     assert len(read) == 48
 
 
 @pytest.mark.usefixtures("an_hour_later")
-def test_shards_know_their_own_files(catalogue_copy, checkpoint, tmp_path, read):
+def test_shards_have_their_own_stat_caches(catalogue_copy, checkpoint, tmp_path, read):
     build_sharded(catalogue_copy, checkpoint, tmp_path / "cluster", 2, quiet=True)
     read.clear()
     other_picture(catalogue_copy / "newcomer" / "1.jpg")
@@ -111,11 +109,11 @@ def test_shards_know_their_own_files(catalogue_copy, checkpoint, tmp_path, read)
     assert build_sharded(catalogue_copy, checkpoint, tmp_path / "cluster", 2, verify=True, quiet=True).unread == 0
 
 
-# A clock that has not ticked ---------------------------------------------------------------------------------------
+# Changes within one clock tick -----------------------------------------------------------------------------------
 
 
 def written_within_a_tick(catalogue_copy, checkpoint, index, monkeypatch):
-    """Build, change a photo while the disk's clock stands still, build again."""
+    """Build, change a photo within the same tick of the disk's clock, and build again."""
     photo, stat = first_photo(catalogue_copy), os.stat
     content = photo.read_bytes()
     photo.write_bytes(content + b"ab")
@@ -123,26 +121,26 @@ def written_within_a_tick(catalogue_copy, checkpoint, index, monkeypatch):
     before = photo.stat()
     photo.write_bytes(content + b"cd")
 
-    def still(path, **how):
+    def frozen(path, **how):
         return before if path == named(catalogue_copy, photo) else stat(path, **how)
 
-    monkeypatch.setattr(stat_cache.os, "stat", still)
+    monkeypatch.setattr(stat_cache.os, "stat", frozen)
     return build_index(catalogue_copy, checkpoint, index, quiet=True)
 
 
-def test_a_photo_written_in_the_tick_in_which_it_was_read_is_read_again(catalogue_copy, checkpoint, index, monkeypatch):
+def test_a_photo_written_in_the_tick_of_its_reading_is_read_again(catalogue_copy, checkpoint, index, monkeypatch):
     for path in catalogue_copy.rglob("*.jpg"):
         path.touch()
     assert written_within_a_tick(catalogue_copy, checkpoint, index, monkeypatch).embedded == 1
 
 
-def test_trusting_every_status_would_miss_it(catalogue_copy, checkpoint, index, monkeypatch):
+def test_trusting_every_stat_would_miss_the_change(catalogue_copy, checkpoint, index, monkeypatch):
     monkeypatch.setattr(stat_cache, "MIN_AGE_NS", -HOUR_NS)
     assert written_within_a_tick(catalogue_copy, checkpoint, index, monkeypatch).embedded == 0
 
 
 @pytest.mark.usefixtures("an_hour_later")
-def test_times_before_1970_and_after_now_are_times_too(catalogue_copy, checkpoint, index, read):
+def test_times_before_1970_and_in_the_future_are_handled(catalogue_copy, checkpoint, index, read):
     old, new = sorted(catalogue_copy.rglob("*.jpg"))[:2]
     os.utime(old, ns=(-5 * 10**9, -5 * 10**9))
     os.utime(new, ns=(time.time_ns() + 5 * HOUR_NS,) * 2)
@@ -152,11 +150,11 @@ def test_times_before_1970_and_after_now_are_times_too(catalogue_copy, checkpoin
     assert read == [named(catalogue_copy, new)]
 
 
-# What was noted ------------------------------------------------------------------------------------------------------
+# Stat records ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("an_hour_later")
-def test_an_index_of_an_older_version_is_read_whole_once_and_that_is_said(catalogue_copy, checkpoint, index, read):
+def test_an_index_without_stat_records_is_read_completely_once_and_reported(catalogue_copy, checkpoint, index, read):
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     (index / FILES).unlink()
     read.clear()
@@ -166,28 +164,26 @@ def test_an_index_of_an_older_version_is_read_whole_once_and_that_is_said(catalo
     assert build_index(catalogue_copy, checkpoint, index, quiet=True).unread == 24
 
 
-def test_only_files_that_have_settled_are_noted(catalogue_copy, checkpoint, index):
+def test_only_files_older_than_the_minimum_age_are_recorded(catalogue_copy, checkpoint, index):
     for path in catalogue_copy.rglob("*.jpg"):
         path.touch()
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     assert len(StatRecords(index).records) == 0
 
 
-# Rows that are taken over as they lie --------------------------------------------------------------------------------
+# Rows that are copied unchanged ----------------------------------------------------------------------------------
 
 
 @pytest.mark.usefixtures("an_hour_later")
 @pytest.mark.parametrize("seed", range(4))
-def test_after_any_changes_the_index_is_that_of_a_build_from_nothing(
-    seed, catalogue_copy, checkpoint, index, tmp_path, monkeypatch
-):
+def test_after_any_changes_the_index_equals_a_new_build(seed, catalogue_copy, checkpoint, index, tmp_path, monkeypatch):
     monkeypatch.setattr(stat_cache, "MIN_RUN", 2)
     draw = random.Random(seed)
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     for round_ in range(3):
         photos = sorted(catalogue_copy.rglob("*.jpg"))
-        gone, changed, moved = draw.sample(photos, 3)
-        gone.unlink()
+        removed, changed, moved = draw.sample(photos, 3)
+        removed.unlink()
         other_picture(changed, seed=100 + round_)
         moved.rename(draw.choice(photos).with_name(f"moved-{round_}.jpg"))
         other_picture(catalogue_copy / draw.choice(["aaa", "mmm", "zzz"]) / f"{round_}.jpg", seed=200 + round_)
@@ -202,15 +198,13 @@ def test_after_any_changes_the_index_is_that_of_a_build_from_nothing(
     assert again.rows.find([row["id"] for row in fresh.rows]).tolist() == list(range(fresh.count))
     for name in ("id", "digest", "object_id"):
         np.testing.assert_array_equal(again.rows.keys(name), fresh.rows.keys(name))
-    # Another batch of the tower sums in another order: 1e-5 in float32, then one step of float16.
+    # In another batch the tower adds in another order: 1e-5 in float32, then one step of float16.
     np.testing.assert_allclose(again.arrays["partials"], fresh.arrays["partials"], rtol=2e-3, atol=2e-3)
     np.testing.assert_allclose(again.embeddings[again.slots], fresh.embeddings[fresh.slots], atol=1e-5)
 
 
 @pytest.mark.usefixtures("an_hour_later")
-def test_other_words_about_a_photo_are_written_though_nothing_is_read(
-    catalogue_copy, checkpoint, index, read, monkeypatch
-):
+def test_new_metadata_is_written_without_reading_photos(catalogue_copy, checkpoint, index, read, monkeypatch):
     monkeypatch.setattr(stat_cache, "MIN_RUN", 2)
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     name = first_photo(catalogue_copy).parent.name
@@ -218,8 +212,8 @@ def test_other_words_about_a_photo_are_written_though_nothing_is_read(
     for words in ('"price": 1', '"price": 2', '"price": 2, "metadata": {}', '"metadata": {}'):
         (catalogue_copy / "metadata.jsonl").write_text(f'{{"object_id": "{name}", {words}}}\n')
         assert build_index(catalogue_copy, checkpoint, index, quiet=True).written
-        told = [repr(row["metadata"]) for row in rows_of(index).values() if row["object_id"] == name]
-        assert len(set(told)) == 1
+        documents = [repr(row["metadata"]) for row in rows_of(index).values() if row["object_id"] == name]
+        assert len(set(documents)) == 1
     (catalogue_copy / "metadata.jsonl").unlink()
     assert build_index(catalogue_copy, checkpoint, index, quiet=True).written
     assert all(row["metadata"] == {} for row in rows_of(index).values())
@@ -227,7 +221,7 @@ def test_other_words_about_a_photo_are_written_though_nothing_is_read(
 
 
 @pytest.mark.usefixtures("an_hour_later")
-def test_a_run_is_as_long_as_rows_follow_each_other(catalogue_copy, checkpoint, index, monkeypatch):
+def test_a_run_ends_where_rows_are_not_consecutive(catalogue_copy, checkpoint, index, monkeypatch):
     monkeypatch.setattr(stat_cache, "MIN_RUN", 5)
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     photos = sorted(catalogue_copy.rglob("*.jpg"))
@@ -241,7 +235,7 @@ def test_a_run_is_as_long_as_rows_follow_each_other(catalogue_copy, checkpoint, 
 
 
 @pytest.mark.usefixtures("an_hour_later")
-def test_a_photo_before_all_others_breaks_no_run(catalogue_copy, checkpoint, index, monkeypatch):
+def test_a_new_first_photo_does_not_end_a_run(catalogue_copy, checkpoint, index, monkeypatch):
     monkeypatch.setattr(stat_cache, "MIN_RUN", 5)
     build_index(catalogue_copy, checkpoint, index, quiet=True)
     other_picture(catalogue_copy / "aaa" / "0.jpg")

@@ -1,4 +1,4 @@
-"""Verdicts of the shipped checkpoint: untouched gels, black images, noise and photos name no object, on any way in."""
+"""Verdicts of the shipped checkpoint: no-contact frames, black images, noise and photos match no object."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from retrieval.search.query.searcher import Searcher
 from robot.collection import CollectSettings, collect
 from robot.rig import load_rig
 
-SEED = 41_000  # a world of its own
+SEED = 41_000  # an object set of its own
 
 
 @pytest.fixture(scope="module")
@@ -31,9 +31,9 @@ def grasps(tmp_path_factory):
 def index(grasps, tmp_path_factory):
     folder = tmp_path_factory.mktemp("verdicts")
     for number, grasp in enumerate(grasps):
-        shown = folder / "catalog" / grasp.object_id / f"{number}{grasp.photo.suffix}"
-        shown.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(grasp.photo, shown)
+        photo = folder / "catalog" / grasp.object_id / f"{number}{grasp.photo.suffix}"
+        photo.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(grasp.photo, photo)
     assert main(["build-index", str(folder / "catalog"), "--out", str(folder / "index")]) == 0
     return folder / "index"
 
@@ -56,9 +56,9 @@ def picture(kind):
 
 def test_a_touch_is_scored_and_probabilities_add_up_to_one(searcher, grasps):
     results = {grasp.grasp_id: searcher.query(grasp.touches, top=99) for grasp in grasps}
-    refused = [name for name, result in results.items() if result.grasps != ["contact"]]
-    assert len(refused) <= 1, refused  # a finger that hardly presses a smooth object may feel nothing
-    for result in (result for name, result in results.items() if name not in refused):
+    rejected = [name for name, result in results.items() if result.grasps != ["contact"]]
+    assert len(rejected) <= 1, rejected  # a finger that hardly presses a smooth object may show no contact
+    for result in (result for name, result in results.items() if name not in rejected):
         assert result.none_probability + sum(match.probability for match in result.results) == pytest.approx(1)
         best = result.results[0].probability
         assert result.verdict == ("match" if best > result.none_probability else "none of these")
@@ -69,47 +69,47 @@ def test_no_contact_frames_match_no_object(searcher, grasps):
         result = searcher.query(grasp.backgrounds)
         assert (result.verdict, result.results, result.none_probability) == ("no contact", [], None)
         assert result.top is None
-        assert verdict_sentence(result).startswith("no contact: the gels look untouched")
+        assert verdict_sentence(result).startswith("no contact: the gels show no contact")
 
 
 @pytest.mark.parametrize("kind", ["black", "white", "noise"])
-def test_pictures_that_are_no_gel_images_name_nobody(searcher, kind):
+def test_images_that_are_not_gel_images_match_no_object(searcher, kind):
     result = searcher.query([picture(kind)] * 2)
     assert (result.verdict, result.results, result.grasps) == ("not a gel image", [], ["not a gel image"])
 
 
-def test_one_foreign_picture_among_good_grasps_refuses_them_all_and_is_named(searcher, grasps):
+def test_one_foreign_image_among_good_grasps_rejects_all_and_is_reported(searcher, grasps):
     good = grasps[0].touches
     result = searcher.query([good, (good[0], picture("black"))])
     assert (result.verdict, result.grasps) == ("not a gel image", ["contact", "not a gel image"])
-    assert "grasp 2 does not look like a gel" in verdict_sentence(result)
+    assert "grasp 2 does not look like the gels" in verdict_sentence(result)
 
 
 def test_a_grasp_without_contact_is_left_out(searcher, grasps):
     grasp = grasps[0]
-    alone, with_air = searcher.query(grasp.touches), searcher.query([grasp.touches, grasp.backgrounds])
+    single, with_air = searcher.query(grasp.touches), searcher.query([grasp.touches, grasp.backgrounds])
     assert with_air.grasps == ["contact", "no contact"]
-    assert [match.object_id for match in with_air.results] == [match.object_id for match in alone.results]
+    assert [match.object_id for match in with_air.results] == [match.object_id for match in single.results]
     assert [match.logit for match in with_air.results] == pytest.approx(
-        [match.logit for match in alone.results], abs=1e-4
+        [match.logit for match in single.results], abs=1e-4
     )
     assert "left out: 2" in verdict_sentence(with_air)
 
 
-def test_a_no_contact_frame_tells_contact_by_itself(searcher, grasps):
+def test_contact_is_detected_by_comparison_with_a_no_contact_frame(searcher, grasps):
     grasp, later = grasps[0], grasps[1]
     assert searcher.query(grasp.touches, background=grasp.backgrounds).grasps == ["contact"]
-    # The same gels, untouched, at another moment.
+    # No-contact frames of the same gels at another moment.
     assert searcher.query(later.backgrounds, background=grasp.backgrounds).grasps == ["no contact"]
 
 
-def test_several_objects_at_once_have_each_their_own_verdict(searcher, grasps):
+def test_several_objects_have_separate_verdicts(searcher, grasps):
     results = searcher.query_many([grasps[0].touches, grasps[0].backgrounds, [picture("black")] * 2])
     assert [result.verdict for result in results][1:] == ["no contact", "not a gel image"]
     assert results[0].results
 
 
-def test_the_command_says_the_verdict_by_its_exit_code_in_json_and_on_the_page(index, grasps, tmp_path, capsys):
+def test_the_command_gives_the_verdict_as_exit_code_in_json_and_on_the_page(index, grasps, tmp_path, capsys):
     Image.fromarray(picture("black")).save(tmp_path / "black.png")
     black = [str(tmp_path / "black.png")] * 2
     for files, verdict in (
@@ -120,24 +120,24 @@ def test_the_command_says_the_verdict_by_its_exit_code_in_json_and_on_the_page(i
         page = tmp_path / "page.html"
         words = ["query", "--gelsight", *map(str, files), "--index", str(index), "--json", "--html", str(page)]
         assert main(words) == EXIT_CODES[verdict]
-        said = json.loads(capsys.readouterr().out)
-        assert (said["verdict"], said["results"], said["none_probability"]) == (verdict, [], None)
+        document = json.loads(capsys.readouterr().out)
+        assert (document["verdict"], document["results"], document["none_probability"]) == (verdict, [], None)
         assert verdict in page.read_text("utf-8").lower()
         assert "Most likely" not in page.read_text("utf-8")
 
 
-def test_unscored_objects_keep_their_probability(index, grasps):
-    """With two candidates the answer is near the one that judges every photo, as the rest is estimated."""
+def test_the_probability_of_unscored_objects_is_estimated(index, grasps):
+    """With two candidates, the result is close to exhaustive scoring, because the rest is estimated."""
     with Searcher.open(index) as searcher:
-        whole, pruned = (searcher.query(grasps[0].touches, candidates=count, top=2) for count in (99, 2))
-        assert pruned.posterior["scored_objects"] < whole.posterior["scored_objects"] == 4
-        assert pruned.none_probability == pytest.approx(whole.none_probability, abs=0.05)
-        total = pruned.none_probability + sum(match.probability for match in pruned.results)
-        assert total + pruned.posterior["unscored_probability"] == pytest.approx(1)
+        exhaustive, with_two = (searcher.query(grasps[0].touches, candidates=count, top=2) for count in (99, 2))
+        assert with_two.posterior["scored_objects"] < exhaustive.posterior["scored_objects"] == 4
+        assert with_two.none_probability == pytest.approx(exhaustive.none_probability, abs=0.05)
+        total = with_two.none_probability + sum(match.probability for match in with_two.results)
+        assert total + with_two.posterior["unscored_probability"] == pytest.approx(1)
 
 
 @pytest.mark.parametrize("fingers", SHIPPED)
-def test_the_card_of_a_shipped_checkpoint_is_its_own_and_says_how_often_its_check_errs(fingers):
+def test_the_card_of_a_shipped_checkpoint_has_its_digest_and_the_error_rates_of_its_check(fingers):
     path = shipped_model(fingers)
     stored, card = read_checkpoint_info(path), path.with_suffix(".md").read_text("utf-8")
     assert card.startswith(f"# {path.name}")
