@@ -1,9 +1,9 @@
 """Verdicts and match logits from encodings, in numpy.
 
-Two questions precede matching: is this a gel image, and is there a contact? A linear layer on touch tower's features
-(`retrieval.model.fusion.GelHead`) classifies each finger's image into the classes of its training: gels in contact,
-no-contact gels, and pictures that are not gel images. With a no-contact frame, contact is the difference from that
-frame, which needs no model.
+Two questions precede matching: is this a gel image, and is there a contact? A linear layer on the touch tower's
+features (`retrieval.model.fusion.GelHead`) classifies each finger's image into the classes of its training: gels in
+contact, no-contact gels, and pictures that are not gel images. With a no-contact frame, contact is the difference from
+that frame, which needs no model.
 
 Pairs are scored from stored partial activations, with the photos in blocks. The head's layers after the partial
 activations are one matrix product for all photos of a block. The rest is done in place, so the product takes most of

@@ -359,8 +359,8 @@ class IdentificationTrials:
         """
         ratios, losses = self.log_ratios(posterior), []
         for catalogue in self.catalogues:
-            ours = np.take_along_axis(ratios, catalogue, 1) - math.log(catalogue.shape[1] - 1)
-            for part, truth in ((ours[:, :-1], 1), (ours[:, 1:], 0)):
+            odds = np.take_along_axis(ratios, catalogue, 1) - math.log(catalogue.shape[1] - 1)
+            for part, truth in ((odds[:, :-1], 1), (odds[:, 1:], 0)):
                 logs = np.column_stack([np.zeros(len(part)), part])
                 logs = logs - np.logaddexp.reduce(logs, axis=1, keepdims=True)
                 losses.append(-((1 - smooth) * logs[:, truth] + smooth * logs.mean(1)).mean())
