@@ -146,12 +146,12 @@ def find_export(checkpoint: CheckpointInfo, threads: int | None = None) -> OnnxE
         checkpoint: The header of the checkpoint.
         threads: Threads of ONNX Runtime; None leaves the choice to it.
     """
-    beside = checkpoint.path.with_suffix(EXPORT_SUFFIX)
-    path = beside if beside.is_file() else cached_export_path(checkpoint.digest)
+    adjacent = checkpoint.path.with_suffix(EXPORT_SUFFIX)
+    path = adjacent if adjacent.is_file() else cached_export_path(checkpoint.digest)
     if path is None or not path.is_file() or find_spec("onnxruntime") is None:
         return None
     try:
-        if path == beside:
+        if path == adjacent:
             return OnnxEncoder(path, checkpoint.digest, threads, [checkpoint.path.stat().st_uid])
         require_private(path.parent, path.parent.stat())
         return OnnxEncoder(path, checkpoint.digest, threads)

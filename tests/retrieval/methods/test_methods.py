@@ -250,10 +250,10 @@ def test_a_worth_is_never_made_of_scores_that_are_not_finite(bad):
 
 def test_every_object_has_its_share_of_the_grasps_to_choose_by():
     features = planted(5, 3, each=40)
-    rows = validation_rows(features, most=50)
+    rows = validation_rows(features, max_rows=50)
     assert np.bincount(features.owner[rows]).tolist() == [10] * 5
     assert len(np.unique(rows)) == 50
-    assert np.bincount(features.owner[validation_rows(features, most=3)]).tolist() == [2] * 5
+    assert np.bincount(features.owner[validation_rows(features, max_rows=3)]).tolist() == [2] * 5
 
 
 def test_features_are_standardised_by_the_training_grasps_and_constant_ones_left_out():
