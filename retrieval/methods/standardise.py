@@ -30,7 +30,7 @@ class Standardiser:
 
     @classmethod
     def fit(cls, x: NDArray[Any]) -> "Standardiser":
-        """Return the statistics of x (n, ...), flattened to (n, F), in float64. Raises BadInput if no feature varies."""
+        """Return the statistics of x (n, ...), flattened to (n, F), in float64. Raises BadInput if all are constant."""
         x = _flat(x)
         mean, scale = x.mean(0), x.std(0)
         columns = np.flatnonzero(scale > MIN_RELATIVE_SPREAD * np.abs(x).max(0))

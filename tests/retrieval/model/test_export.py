@@ -64,7 +64,7 @@ def touches_of(count, fingers, px):
 
 
 def export_random_matcher(path, config, seed=0, *, gel_head=False):
-    """Return a matcher with random weights, and its export_random_matcher encoder."""
+    """Return a matcher with random weights, and its exported encoder."""
     torch.manual_seed(seed)
     matcher = Matcher(config.matcher)
     if gel_head:
@@ -360,7 +360,7 @@ def test_nothing_is_written_if_onnx_runtime_is_not_faster_and_an_older_export_st
     model_copy.with_suffix(".onnx").write_bytes(with_checksum(b"older"))
     timed(monkeypatch, 1.0, 1.0)
     assert main(["export", str(model_copy)]) == 1
-    assert "nothing is export_random_matcher, because PyTorch is as fast on this machine" in capsys.readouterr().err
+    assert "nothing is exported, because PyTorch is as fast on this machine" in capsys.readouterr().err
     assert model_copy.with_suffix(".onnx").read_bytes() == with_checksum(b"older")
 
 
