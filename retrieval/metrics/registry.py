@@ -76,22 +76,26 @@ def k_way_measure(table: ScoreTable | None, k: int, seed: int, photos: int = 1) 
     return protocols.k_way(table, k, photos=photos, seed=seed) if table and len(table.objects) >= k else None
 
 
-def _of_set(count: int) -> Metric:
+def _grasps_metric(count: int) -> Metric:
     words = f"{count} grasp{'s' * (count > 1)}"
     label = f"5-way top-1 accuracy, {words}, {PHOTOS_PER_CANDIDATE} photos"
     return Metric(
-        label, words, "grasps", lambda of: k_way_measure(of.sets.get(count), 5, of.seed, PHOTOS_PER_CANDIDATE)
+        label,
+        words,
+        "grasps",
+        lambda tables: k_way_measure(tables.sets.get(count), 5, tables.seed, PHOTOS_PER_CANDIDATE),
     )
 
 
-def _of_photos(count: int) -> Metric:
+def _photos_metric(count: int) -> Metric:
     words = f"{count} photos"
-    return Metric(f"5-way top-1 accuracy, {words}", words, "photos", lambda of: _if_enough_photos(of, count))
+    label = f"5-way top-1 accuracy, {words}"
+    return Metric(label, words, "photos", lambda tables: _if_enough_photos(tables, count))
 
 
-def _if_enough_photos(of: MethodScoreTables, count: int) -> Measure | None:
-    """Return None if a candidate has fewer photos: the mean of fewer scores varies more than those of its rivals."""
-    return k_way_measure(of.test, 5, of.seed, count) if of.test.min_photos >= count else None
+def _if_enough_photos(tables: MethodScoreTables, count: int) -> Measure | None:
+    """Return the 5-way measure; None if a candidate has too few photos: the mean of fewer scores varies more."""
+    return k_way_measure(tables.test, 5, tables.seed, count) if tables.test.min_photos >= count else None
 
 
 def _paired(table: ScoreTable, k: int) -> Measure | None:
@@ -101,11 +105,11 @@ def _paired(table: ScoreTable, k: int) -> Measure | None:
 TOUCH_TO_PHOTO, PHOTO_TO_TOUCH = "touch to photo", "photo to touch"
 
 
-def _of_gallery(prefix: str, section: str, table: Callable[[MethodScoreTables], ScoreTable]) -> dict[str, Metric]:
+def _gallery_metrics(prefix: str, section: str, table: Callable[[MethodScoreTables], ScoreTable]) -> dict[str, Metric]:
     """Return the measures of the whole gallery in one direction."""
 
     def metric(column: str, compute: Callable[[ScoreTable], Measure]) -> Metric:
-        return Metric(f"{column}, {section}", column, section, lambda of: compute(table(of)))
+        return Metric(f"{column}, {section}", column, section, lambda tables: compute(table(tables)))
 
     return {
         **{f"{prefix}recall_{k}": metric(f"R@{k}", partial(protocols.recall, k=k)) for k in (1, 5, 10)},
@@ -119,39 +123,45 @@ METRICS: dict[str, Metric] = {
         "pair accuracy",
         "pair accuracy",
         "main",
-        lambda of: protocols.pair_accuracy(of.test, of.rule) if of.rule else None,
+        lambda tables: protocols.pair_accuracy(tables.test, tables.rule) if tables.rule else None,
     ),
-    "pair_auc": Metric("pair AUC", "pair AUC", "main", lambda of: protocols.pair_auc(of.test)),
+    "pair_auc": Metric("pair AUC", "pair AUC", "main", lambda tables: protocols.pair_auc(tables.test)),
     "topn_k5": Metric(
-        "5-way top-1 accuracy", "5-way top-1 accuracy", "main", lambda of: k_way_measure(of.test, 5, of.seed)
+        "5-way top-1 accuracy",
+        "5-way top-1 accuracy",
+        "main",
+        lambda tables: k_way_measure(tables.test, 5, tables.seed),
     ),
     "topn_k10": Metric(
-        "10-way top-1 accuracy", "10-way top-1 accuracy", "main", lambda of: k_way_measure(of.test, 10, of.seed)
+        "10-way top-1 accuracy",
+        "10-way top-1 accuracy",
+        "main",
+        lambda tables: k_way_measure(tables.test, 10, tables.seed),
     ),
     "topn_k5_all_objects": Metric(
         "5-way top-1 accuracy, all objects",
         "5-way top-1 accuracy, all objects",
         "main",
-        lambda of: k_way_measure(of.all_objects, 5, of.seed),
+        lambda tables: k_way_measure(tables.all_objects, 5, tables.seed),
     ),
-    **{grasps_metric_name(count): _of_set(count) for count in SET_SIZES},
-    **{photos_metric_name(count): _of_photos(count) for count in PHOTO_COUNTS if count > 1},
-    **_of_gallery("", TOUCH_TO_PHOTO, lambda of: of.test),
-    **_of_gallery("photo_to_touch_", PHOTO_TO_TOUCH, lambda of: of.photos),
+    **{grasps_metric_name(count): _grasps_metric(count) for count in SET_SIZES},
+    **{photos_metric_name(count): _photos_metric(count) for count in PHOTO_COUNTS if count > 1},
+    **_gallery_metrics("", TOUCH_TO_PHOTO, lambda tables: tables.test),
+    **_gallery_metrics("photo_to_touch_", PHOTO_TO_TOUCH, lambda tables: tables.photos),
     "objectfolder_touch_to_photo": Metric(
         "mAP, touch to photo",
         "mAP, touch to photo",
         "objectfolder",
-        lambda of: protocols.average_precision(of.test.with_own()),
+        lambda tables: protocols.average_precision(tables.test.with_own()),
     ),
     "objectfolder_photo_to_touch": Metric(
         "mAP, photo to touch",
         "mAP, photo to touch",
         "objectfolder",
-        lambda of: protocols.average_precision(of.photos.with_own()),
+        lambda tables: protocols.average_precision(tables.photos.with_own()),
     ),
-    "paired_top1": Metric("top 1", "top 1", "paired", lambda of: _paired(of.test, 1)),
-    "paired_top5": Metric("top 5", "top 5", "paired", lambda of: _paired(of.test, 5)),
+    "paired_top1": Metric("top 1", "top 1", "paired", lambda tables: _paired(tables.test, 1)),
+    "paired_top5": Metric("top 5", "top 5", "paired", lambda tables: _paired(tables.test, 5)),
 }
 """Name in results.json -> metric, in the order of every table."""
 

@@ -152,8 +152,8 @@ def object_scores(
         for place, name in enumerate(table.objects):
             columns = rng.permutation(np.flatnonzero(table.photo_owner == name))
             mine = np.flatnonzero(table.touch_owner == name)
-            found[draw, :, place] = _of_photos(*_window(table.scores, columns, photos, rng), pool)
-            found[draw, mine, place] = _of_photos(*_without_own(table, mine, columns, photos, rng), pool)
+            found[draw, :, place] = _pooled_scores(*_window(table.scores, columns, photos, rng), pool)
+            found[draw, mine, place] = _pooled_scores(*_without_own(table, mine, columns, photos, rng), pool)
     return found
 
 
@@ -180,7 +180,7 @@ def _without_own(
     return np.take_along_axis(scores, order, 1), ~np.take_along_axis(own, order, 1)
 
 
-def _of_photos(scores: NDArray[np.float64], shown: NDArray[np.bool_], pool: Pooling | None) -> NDArray[np.float64]:
+def _pooled_scores(scores: NDArray[np.float64], shown: NDArray[np.bool_], pool: Pooling | None) -> NDArray[np.float64]:
     """Return the scores (T,) of the photos that each row is shown."""
     if pool is None:
         return np.asarray((scores * shown).sum(1) / shown.sum(1))

@@ -250,7 +250,7 @@ class Config:
         )
 
     def with_candidate_encoder_of(self, other: "Config") -> "Config":
-        """Return a copy with the candidate encoder of `other`; linear only as far as this logit has a cosine."""
+        """Return a copy with the candidate encoder of `other`, but no linear components without a cosine."""
         source = other.matcher
         linear = min(source.candidate_linear, self.matcher.embedding_dim - 1) if self.matcher.cosine else 0
         matcher = dataclasses.replace(self.matcher, candidate_width=source.candidate_width, candidate_linear=linear)

@@ -65,7 +65,7 @@ def onnx_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder | None:
 
 
 def fastest_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
-    """Return the faster of the two encoders: PyTorch's, unless ONNX Runtime computes the same partial activations.
+    """Return the faster of the two encoders, or PyTorch's if the partial activations differ.
 
     Do not call this while other threads encode: the export would also record their operations.
     """

@@ -244,10 +244,10 @@ def require_prior(none_prior: float) -> None:
         raise BadInput(f'the prior of "none of these" must be at least 0 and less than 1; got {none_prior}')
 
 
-def _finite(values: ArrayLike, what: str) -> Floats:
+def _finite(values: ArrayLike, name: str) -> Floats:
     array = np.asarray(values, dtype=np.float64)
     if not np.isfinite(array).all():
-        raise NumericalError(f"{what} must be finite; got {array[~np.isfinite(array)][0]}")
+        raise NumericalError(f"{name} must be finite; got {array[~np.isfinite(array)][0]}")
     return array
 
 
@@ -322,7 +322,7 @@ class IdentificationTrials:
 
     @classmethod
     def of(cls, scored: ScoredTouches, sets: Numbers, seed: int = 0) -> "IdentificationTrials":
-        """Return the trials of sets (S, G) of touches. Raises BadInput without sets or with under three objects."""
+        """Return the trials of sets (S, G) of touches. Raises BadInput for no sets or fewer than 3 objects."""
         objects, owner = np.unique(scored.photo_owner, return_inverse=True)
         if len(objects) < MIN_OBJECTS or not len(sets):
             raise BadInput(
