@@ -197,7 +197,6 @@ class EncodedTouches(NamedTuple):
         embeddings: (N, embedding_dim) unit vectors for candidate search.
         partials: (N, partial) partial activations, from which pairs are scored.
 
-
     >>> with retrieval.open("index") as searcher:
     ...     embeddings, partials = searcher.encode([["a.png", "b.png"], ["a2.png", "b2.png"]])
     >>> len(embeddings), len(partials), embeddings.dtype.name
@@ -304,8 +303,7 @@ class TouchReader:
     def no_contact_frames(self, background: Sequence[AnyImage] | None) -> Sequence[GelImage | None]:
         """Return the no-contact frame of each finger, None for a model that uses none.
 
-        Raises:
-            BadInput: The frames are missing, or given to a model that would ignore them.
+        Raises BadInput if the frames are missing, or given to a model that would ignore them.
         """
         policy = self._preprocessing.background
         if background is None and policy != "none":
@@ -379,12 +377,7 @@ class TouchReader:
             return [[job.result() for job in grasp] for grasp in jobs]
 
     def _gel_image(self, source: InputImage, compares_contact: bool) -> GelImage:
-        """Return an image at the sizes of this model, with blocks if `compares_contact`.
-
-        Raises:
-            ImageError: The image is not readable.
-            IncompleteSearch: The image was read for another model.
-        """
+        """Return an image at this model's sizes. Raises ImageError; IncompleteSearch if read for another model."""
         px = self._preprocessing.touch_px
         if not isinstance(source.image, GelImage):
             return GelImage.of(source.read(), px, compares_contact)
