@@ -83,7 +83,7 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> ExportReport:
         raise BadInput(f"an export must be named *{EXPORT_SUFFIX}; got {path}")
     require_ours(path, EXPORT)
     require_folder(path)
-    unverified = path.with_name(f".{path.name}.unsettled")
+    unverified = path.with_name(f".{path.name}.unverified")
     try:
         write_atomically(unverified, with_checksum(touch_encoder_to_onnx(checkpoint)))
         unverified.chmod(unverified.stat().st_mode & ~(stat.S_IWGRP | stat.S_IWOTH))  # a query requires this

@@ -17,7 +17,7 @@ from retrieval.metrics.table import ScoreTable
 from retrieval.model.fusion import FusionHead, score_partials
 from tests.hard_case import HardCase, error_of
 
-_TOP, _MEASURES, _PARTIALS, _INTERVALS = "top k", "rank measures", "partial activations", "intervals"
+_TOP, _MEASURES, _PARTIALS, _INTERVALS = "top k", "rank measures", "partials", "intervals"
 
 
 def hard_cases() -> Iterator[HardCase]:
