@@ -21,7 +21,7 @@ class ScoreTable:
         photo_owner: (N,) object of each column.
         own: (T, N) whether the photo was taken in a grasp of that row. Such photos are not shown to it, except where a
             protocol includes them.
-        object_words: What descriptions of the gallery call the objects.
+        object_words: Noun for the objects in descriptions of the gallery.
         row_words: The same for the rows.
         column_words: The same for the columns.
 

@@ -2,7 +2,7 @@
 
     gained     sum of P log2(P / P0): the Kullback-Leibler divergence of the posterior P from the prior P0
     remaining  sum of -P log2 P: the entropy of the posterior
-    possible   log2(objects / (1 - none_prior)): what is gained where one object becomes certain
+    possible   log2(objects / (1 - none_prior)): the gain if one object becomes certain
     next grasp remaining * (1 - exp(w(n) - w(n + 1))),  w(n) = n / (1 + dependence * (n - 1))
 
 w(n) is the number of independent grasps that are equivalent to n grasps of one object. We model that each independent
@@ -25,7 +25,7 @@ class Information:
     Attributes:
         gained_bits: As above, like the next three.
         remaining_bits: Entropy of the posterior.
-        possible_bits: Gain where one object becomes certain.
+        possible_bits: Gain if one object becomes certain.
         next_grasp_bits: Expected gain of one more grasp.
         next_effective_grasps: w(n + 1).
     """

@@ -97,7 +97,7 @@ def parse_grasps(touches: AnyTouches, fingers: int, *, noun: str = "touch", of: 
     Args:
         touches: One grasp or several, nested as described above.
         fingers: Images per grasp.
-        noun: What messages call one grasp.
+        noun: Noun for one grasp in messages.
         of: Prefix of messages, such as "object 3, ".
 
     Raises:

@@ -137,7 +137,7 @@ def test_a_checkpoint_that_names_a_model_without_its_architecture_downloads_noth
 
 
 @pytest.mark.parametrize("family", ["timm", "transformers"])
-def test_without_the_package_the_error_says_what_to_install(family, monkeypatch):
+def test_without_the_package_the_error_names_what_to_install(family, monkeypatch):
     monkeypatch.setitem(sys.modules, family, None)
     with pytest.raises(ConfigError, match=rf"a tower of {family} needs the package.*pip install .*{family}"):
         Config().using(tower=f"{family}:something")
