@@ -1,6 +1,6 @@
-"""Methods to compare: each says how well a touch and a photo go together, fitted on the same grasps.
+"""Methods to compare: each scores touches with photos, fitted on the same grasps.
 
-A new method is one file and one row of `METHODS`, or a class in a user's own package: the behaviour suite runs over the
+A new method is one file and one row of `METHODS`, or a class in a user's own package. The behaviour suite runs over the
 table.
 """
 
@@ -33,4 +33,4 @@ METHODS: "Registry[type[Method]]" = Registry(
 )
 
 TRIVIAL_BASELINES = frozenset({"chance", "constant"})
-"""Methods that do not look at their input."""
+"""Methods that ignore their input."""

@@ -1,8 +1,8 @@
-"""Canonical correlation analysis (Hotelling, Biometrika 1936), as retrieval needs it.
+"""Canonical correlation analysis (Hotelling, Biometrika 1936) for retrieval.
 
-Three things make it a rival instead of a straw man: a ridge (with fewer grasps than features the plain method fits any
-noise with correlation 1), dimensions weighted by rho^p (Gong et al., IJCV 2014: cosine would count noise dimensions in
-full), and settings chosen by ranking on validation objects. Everything is computed in float64 from the singular value
+Three measures make it a strong baseline: a ridge (with fewer grasps than features the plain method fits any noise with
+correlation 1), dimensions weighted by rho^p (Gong et al., IJCV 2014: a plain cosine would give noise dimensions full
+weight), and settings chosen by ranking on validation objects. All computations are in float64 from the singular value
 decomposition of the centred data; X'X would square the condition number.
 """
 
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 Matrix = NDArray[np.float64]
 
 RANK_CUT = 1e-7
-"""Directions thinner than this share of the widest are the rounding of float32 features."""
+"""Directions below this fraction of the widest one are rounding errors of float32 features."""
 LEADING_CUT = 1e-6
-"""The same where singular values come from a squared matrix."""
+"""The same for singular values from a squared matrix."""
 MAX_ROWS, MAX_DIRECTIONS = 2048, 512
-"""From so many items on only so many directions are kept: all of them take minutes, and a ridge silences the others."""
+"""Above so many items, only so many directions are used: all of them take minutes, and a ridge damps the others."""
 RIDGES = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2)
 COMPONENTS = (8, 16, 32, 64, 128, 256)
 POWERS = (0, 1, 2, 4)
@@ -39,7 +39,11 @@ POWERS = (0, 1, 2, 4)
 class CcaView:
     """One modality of n items, standardised and decomposed: `left * singular @ right` of rank r.
 
-    left (n, r), singular (r,) falling, right (r, F').
+    Attributes:
+        standardise: The standardisation of the features.
+        left: (n, r) left singular vectors.
+        singular: (r,) singular values, descending.
+        right: (r, F') right singular vectors.
     """
 
     standardise: Standardiser
@@ -49,20 +53,25 @@ class CcaView:
 
     @property
     def rank(self) -> int:
-        """In how many directions the items vary."""
+        """Number of directions in which the items vary."""
         return len(self.singular)
 
     def regularised_deviations(self, ridge: float) -> Matrix:
-        """(r,) standard deviations after a ridge of `ridge` times the mean variance of the features."""
+        """Return standard deviations (r,) after a ridge of `ridge` times the mean variance of the features."""
         variance = self.singular**2 / len(self.left)
         return np.asarray(np.sqrt(variance + ridge * variance.sum() / self.right.shape[1]))
 
 
 @dataclass(frozen=True, eq=False)
 class CanonicalCorrelations:
-    """correlations (k,) falling, within 0..1; touch_weights, photo_weights (F', k): standardised features to variates.
+    """Result of a canonical correlation analysis.
 
-    In each column the weight of largest size, touch or photo, is positive.
+    In each column the weight of largest absolute value, touch or photo, is positive.
+
+    Attributes:
+        correlations: (k,) within 0..1, descending.
+        touch_weights: (F', k) from standardised features to variates.
+        photo_weights: (F', k) the same for photos.
     """
 
     correlations: Matrix
@@ -70,33 +79,41 @@ class CanonicalCorrelations:
     photo_weights: Matrix
 
 
-def decompose(x: NDArray[Any], most: int | None = None) -> CcaView:
-    """View of items x (n, ...), of at most the `most` widest directions. Raises NumericalError unless finite, BadInput
-    unless something varies.
+def decompose(x: NDArray[Any], max_directions: int | None = None) -> CcaView:
+    """Standardise and decompose items.
+
+    Args:
+        x: (n, ...) items.
+        max_directions: Number of the widest directions to keep; None for all.
+
+    Raises:
+        NumericalError: A feature is not finite.
+        BadInput: No feature varies.
     """
     if not np.isfinite(x).all():
-        raise NumericalError("features must be finite to be correlated; got a NaN or infinite one")
-    return decompose_standardised(x, Standardiser.fit(x), most)
+        raise NumericalError("features must be finite for a correlation; got a NaN or infinite one")
+    return decompose_standardised(x, Standardiser.fit(x), max_directions)
 
 
-def decompose_standardised(x: NDArray[Any], standardise: Standardiser, most: int | None = None) -> CcaView:
-    """The same of finite items, standardised as is said.
+def decompose_standardised(x: NDArray[Any], standardise: Standardiser, max_directions: int | None = None) -> CcaView:
+    """Decompose finite items with a given standardisation, as `decompose` does.
 
-    Equal items, such as a photo that several grasps share, are decomposed once, weighted by their number.
+    Equal items, such as a photo of several grasps, are decomposed once, weighted by their number.
     """
     first, place, counts = _distinct(x)
     weight = np.sqrt(counts)[:, None]
-    shown = standardise(x[first]) * weight
-    whole = most is None and len(x) <= MAX_ROWS
-    left, singular, right = svd(shown) if whole else leading_svd(shown, most or MAX_DIRECTIONS)
-    rank = min(int((singular > (RANK_CUT if whole else LEADING_CUT) * singular[0]).sum()), most or len(singular))
+    scaled = standardise(x[first]) * weight
+    exact = max_directions is None and len(x) <= MAX_ROWS
+    left, singular, right = svd(scaled) if exact else leading_svd(scaled, max_directions or MAX_DIRECTIONS)
+    rank = int((singular > (RANK_CUT if exact else LEADING_CUT) * singular[0]).sum())
+    rank = min(rank, max_directions or len(singular))
     return CcaView(standardise, (left[:, :rank] / weight)[place], singular[:rank], right[:rank])
 
 
 def _distinct(x: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """The first row of each distinct item, the place of every item among these, and how often each is there."""
-    seen: dict[bytes, int] = {}
-    place = np.array([seen.setdefault(row.tobytes(), len(seen)) for row in np.ascontiguousarray(x)])
+    """Return the first row of each distinct item, the index of every item among these, and their counts."""
+    index_of: dict[bytes, int] = {}
+    place = np.array([index_of.setdefault(row.tobytes(), len(index_of)) for row in np.ascontiguousarray(x)])
     first = np.unique(place, return_index=True)[1]
     return first, place, np.bincount(place)
 
@@ -104,19 +121,27 @@ def _distinct(x: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], ND
 def canonical_correlations(
     touch: CcaView, photo: CcaView, owner: NDArray[np.int64], ridge: float = 0.0, photo_ridge: float | None = None
 ) -> CanonicalCorrelations:
-    """Canonical correlations of touches with photos, each touch paired with every photo of its object.
+    """Return the canonical correlations of touches with photos, each touch paired with every photo of its object.
 
-    owner (n,): object of each row, from 0; `arange(n)` pairs row with row. A pair of an object with m grasps weighs
-    1/m, so every grasp counts the same, and pairing is the block average B = E'E, E (objects, n) with rows
-    1/sqrt(m): the cross-covariance X'BY needs object means only, and its rank is below the number of objects. Its
-    whitened form is factored by QR of both sides. photo_ridge: that of photos, where it is not that of touches. Raises
-    BadInput for a negative ridge or too few rows.
+    A pair of an object with m grasps has weight 1/m, so every grasp has the same total weight. Pairing is the block
+    average B = E'E, E (objects, n) with rows 1/sqrt(m): the cross-covariance X'BY needs only object means, and its rank
+    is below the number of objects. Its whitened form is factored by QR of both sides.
+
+    Args:
+        touch: Decomposed touches.
+        photo: Decomposed photos.
+        owner: (n,) object of each row, from 0; `arange(n)` pairs row with row.
+        ridge: Ridge, as a fraction of the mean variance.
+        photo_ridge: Ridge of the photos, if it differs from that of the touches.
+
+    Raises:
+        BadInput: A ridge is negative, or the numbers of rows differ.
     """
     photo_ridge = ridge if photo_ridge is None else photo_ridge
     if min(ridge, photo_ridge) < 0 or not len(touch.left) == len(photo.left) == len(owner):
         raise BadInput(
-            f"a canonical analysis needs a ridge from 0 and one owner a row; got ridge {min(ridge, photo_ridge)}, "
-            f"{len(touch.left)} touches, {len(photo.left)} photos and {len(owner)} owners"
+            "canonical correlations need a ridge of at least 0 and one owner per row; got ridge "
+            f"{min(ridge, photo_ridge)}, {len(touch.left)} touches, {len(photo.left)} photos and {len(owner)} owners"
         )
     touch_q, touch_r = np.linalg.qr(_whitened_means(touch, owner, ridge))
     photo_q, photo_r = np.linalg.qr(_whitened_means(photo, owner, photo_ridge))
@@ -131,7 +156,7 @@ def canonical_correlations(
 
 
 def svd(x: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-    """Thin singular value decomposition (left, singular values, right).
+    """Return the thin singular value decomposition (left, singular values, right).
 
     LAPACK's fast driver, gesdd, does not converge on some finite matrices of low rank; its slow one, gesvd, does.
     """
@@ -142,24 +167,24 @@ def svd(x: Matrix) -> tuple[Matrix, Matrix, Matrix]:
     return left, singular, right
 
 
-def leading_svd(x: Matrix, most: int = MAX_DIRECTIONS) -> tuple[Matrix, Matrix, Matrix]:
-    """The same for the `most` widest directions of many items, from the eigenvectors of X'X or, where that is smaller,
-    of XX'.
+def leading_svd(x: Matrix, max_directions: int = MAX_DIRECTIONS) -> tuple[Matrix, Matrix, Matrix]:
+    """Return the thin decomposition in the widest directions of many items.
 
-    Its squared condition number costs the thinnest directions, which are not asked for.
+    It uses the eigenvectors of X'X or, if that is smaller, of XX'. The squared condition number affects only the
+    narrowest directions, which are not returned.
     """
     width = x.shape[1]
     if len(x) < width:
-        right, singular, left = leading_svd(x.T, most)
+        right, singular, left = leading_svd(x.T, max_directions)
         return left.T, singular, right.T
-    values, vectors = scipy.linalg.eigh(x.T @ x, subset_by_index=(max(width - most, 0), width - 1))
+    values, vectors = scipy.linalg.eigh(x.T @ x, subset_by_index=(max(width - max_directions, 0), width - 1))
     singular = np.sqrt(np.maximum(values[::-1], (RANK_CUT * RANK_CUT) * values[-1]))
     right = vectors.T[::-1]
     return x @ right.T / singular, singular, right
 
 
 def _whitened_means(view: CcaView, owner: NDArray[np.int64], ridge: float) -> Matrix:
-    """(r, objects): E times the whitened left vectors, turned over."""
+    """Return the transpose (r, objects) of E times the whitened left vectors."""
     objects, place, counts = np.unique(owner, return_inverse=True, return_counts=True)
     sums = np.eye(len(objects))[:, place] @ view.left
     shrink = view.singular / np.sqrt(len(view.left)) / view.regularised_deviations(ridge)
@@ -172,19 +197,19 @@ def _signs(weights: Matrix) -> Matrix:
 
 
 def unit_rows(x: Matrix) -> Array:
-    """Rows at norm 1, float32; a row of zeros stays one."""
+    """Return the rows at norm 1, float32; a row of zeros stays zero."""
     norms = np.linalg.norm(x, axis=1, keepdims=True)
     return np.asarray(x / np.where(norms > 0, norms, 1.0), dtype=np.float32)
 
 
 def cosine(touch_encodings: Array, photo_encodings: Array) -> Array:
-    """Cosines (T, N) of unit codes."""
+    """Return cosines (T, N) of unit encodings."""
     return touch_encodings @ photo_encodings.T
 
 
 @dataclass(frozen=True)
 class CcaGridPoint:
-    """One cell of the grid, and how well it ranks photos of validation objects."""
+    """One cell of the grid, and the AUC of its ranking of photos of validation objects."""
 
     ridge: float
     components: int
@@ -205,13 +230,13 @@ class Cca(Method):
         # The decompositions are made once; a ridge only damps them.
         found = ((ridge, canonical_correlations(touch, photo, train.owner, ridge)) for ridge in RIDGES)
         cells = (cell for ridge, one in found for cell in self._cells(ridge, one, Validator.of(validation)))
-        choice, found_by = max(cells, key=lambda cell: cell[0].auc)
+        choice, correlations = max(cells, key=lambda cell: cell[0].auc)
         if self.settings.fit_on_validation:
             known = train.concatenate(validation)
             touch, photo = (decompose(part, self.max_directions) for part in (known.touch, known.photo))
             self._standardise = touch.standardise, photo.standardise
-            found_by = canonical_correlations(touch, photo, known.owner, choice.ridge)
-        self._store(choice, found_by)
+            correlations = canonical_correlations(touch, photo, known.owner, choice.ridge)
+        self._store(choice, correlations)
         self.best_params["rank"] = {"touch": touch.rank, "photo": photo.rank}
 
     def _cells(
@@ -250,16 +275,16 @@ class Cca(Method):
 
 
 class CcaPca(Cca):
-    """`Cca` after principal components, as many as `max_directions` of touch and of photo: for few objects.
+    """`Cca` after principal components, at most `max_directions` of touch and of photo: for few objects.
 
-    A few dozen objects do not say which of a thousand features correlate across touch and photo: the ridge of `Cca`
-    damps the thin directions, this leaves them out. On 36 everyday objects of VT60 it is no better than `Cca`
-    (docs/real.md), and takes less time, so the controls of the benchmark of real data use it.
+    A few dozen objects do not determine which of a thousand features correlate across touch and photo. The ridge of
+    `Cca` damps the narrow directions; this method drops them. On 36 everyday objects of VT60 it is no better than `Cca`
+    (docs/real.md) but faster, so the controls of the benchmark on real data use it.
     """
 
     max_directions = 96
 
 
-def component_counts(counts: tuple[int, ...], most: int) -> list[int]:
-    """The counts up to `most`, and `most` itself in place of larger ones."""
-    return sorted({min(count, most) for count in counts})
+def component_counts(counts: tuple[int, ...], limit: int) -> list[int]:
+    """Return the counts up to `limit`, and `limit` itself in place of larger ones."""
+    return sorted({min(count, limit) for count in counts})

@@ -1,10 +1,11 @@
-"""CCA of towers side by side, for few objects: what `retrieve adapt` fits.
+"""CCA of concatenated towers, for few objects: the method that `retrieve adapt` fits.
 
-Features of each tower are first reduced to their widest directions, every tower weighing the same; then come canonical
-correlations with a ridge (`retrieval.methods.cca`). On a few dozen objects nothing with more freedom did better
-(docs/adapting.md). A map of maps is one matrix, so that the result is stored as the projections of an ordinary matcher.
+The features of each tower are reduced to their widest directions, with equal weight for every tower. Canonical
+correlations with a ridge follow (`retrieval.methods.cca`). On a few dozen objects no method with more freedom was
+better (docs/adapting.md). The composed maps are one matrix, so the result is stored as the projections of an ordinary
+matcher.
 
-Settings are chosen from `GRID` by training objects that are held out (`select_settings`), never by objects that test.
+Settings are chosen from `GRID` on held-out training objects (`select_settings`), never on test objects.
 """
 
 from collections.abc import Iterator, Sequence
@@ -42,19 +43,22 @@ Matrix = NDArray[np.float64]
 Rows = NDArray[np.float32]
 Numbers = NDArray[np.int64]
 TowerWidths = tuple[Sequence[int], Sequence[int]]
-"""How wide the features are of towers that stand side by side, of a touch and of a photo."""
+"""Feature widths of concatenated towers, of a touch and of a photo."""
 COMPONENTS = 64
 MAX_CHOICE_TOUCHES = 240
-"""Touches of a fold that settings are chosen by."""
+"""Touches of a fold with which settings are chosen."""
 MAX_CALIBRATION_TOUCHES = 60
-"""Touches of an object that a posterior is fitted on."""
+"""Touches per object with which a posterior is fitted."""
 
 
 class CcaSettings(NamedTuple):
     """Settings of one fit.
 
-    ridge, photo_ridge: shares of the mean variance, of touches and of photos. directions: kept of each tower's
-    features. power: of the correlation by which a canonical variate is weighted.
+    Attributes:
+        ridge: Ridge of touches, as a fraction of the mean variance.
+        photo_ridge: The same for photos.
+        directions: Directions of each tower's features.
+        power: Power of the correlation that weights a canonical variate.
     """
 
     ridge: float = 0.3
@@ -74,22 +78,22 @@ class AffineMap(NamedTuple):
     bias: Matrix
 
     def __call__(self, x: NDArray[np.floating]) -> Matrix:
-        """(n, k) of rows x (n, F)."""
+        """Return (n, k) for rows x (n, F)."""
         return np.asarray(x @ self.weight + self.bias)
 
     def compose(self, other: "AffineMap") -> "AffineMap":
-        """This map and another after it, as one."""
+        """Return this map followed by another, as one map."""
         return AffineMap(self.weight @ other.weight, self.bias @ other.weight + other.bias)
 
 
 class CcaProjections(NamedTuple):
-    """How touches and photos become codes whose cosine is high where they show one object."""
+    """Maps from touches and photos to encodings whose cosine is high for one object."""
 
     touch: AffineMap
     photo: AffineMap
 
     def cosines(self, touch: NDArray[np.floating], photo: NDArray[np.floating]) -> Rows:
-        """(T, N) of features (T, F) and (N, F')."""
+        """Return cosines (T, N) of features (T, F) and (N, F')."""
         return unit_rows(self.touch(touch)) @ unit_rows(self.photo(photo)).T
 
 
@@ -97,28 +101,28 @@ class CcaProjections(NamedTuple):
 class ReducedFeatures:
     """One modality of n items in the widest directions of each tower's features.
 
-    views: a decomposition for each tower, of `MAX_GRID_DIRECTIONS` directions at most. widths: how wide each tower's features are.
+    Attributes:
+        views: A decomposition for each tower, of at most `MAX_GRID_DIRECTIONS` directions.
+        widths: Feature width of each tower.
     """
 
     views: tuple[CcaView, ...]
     widths: tuple[int, ...]
 
     @classmethod
-    def of(cls, x: Rows, blocks: Sequence[int], most: int = MAX_GRID_DIRECTIONS) -> Self:
-        """The reduction of features x (n, F), which come from towers that stand side by side, as wide as `blocks`
-        say.
-        """
+    def of(cls, x: Rows, blocks: Sequence[int], max_directions: int = MAX_GRID_DIRECTIONS) -> Self:
+        """Return the reduction of features x (n, F) of concatenated towers, whose widths are `blocks`."""
         parts = np.split(x, np.cumsum(blocks)[:-1], axis=1)
-        return cls(tuple(decompose(part, most) for part in parts), tuple(blocks))
+        return cls(tuple(decompose(part, max_directions) for part in parts), tuple(blocks))
 
     def items(self, directions: int) -> Matrix:
-        """(n, k): the items in so many directions of each tower, the variances of each tower adding up to 1."""
-        shown = slice(directions)
-        parts = [view.left[:, shown] * view.singular[shown] / _size(view, directions) for view in self.views]
+        """Return the items (n, k) in so many directions of each tower; the variances of each tower add up to 1."""
+        columns = slice(directions)
+        parts = [view.left[:, columns] * view.singular[columns] / _size(view, directions) for view in self.views]
         return np.concatenate(parts, axis=1)
 
     def map(self, directions: int) -> AffineMap:
-        """The map from features to `items`."""
+        """Return the map from features to `items`."""
         ranks = [min(view.rank, directions) for view in self.views]
         weight, bias = np.zeros((sum(self.widths), sum(ranks))), []
         row = column = 0
@@ -137,12 +141,17 @@ def _size(view: CcaView, directions: int) -> float:
 def fit_projections(
     touch: Rows, photo: Rows, owner: Numbers, blocks: TowerWidths, settings: Sequence[CcaSettings] = GRID
 ) -> Iterator[tuple[CcaSettings, CcaProjections]]:
-    """Codes of each of the settings, from features of grasps: touch (n, F), photo (n, F'), owner (n,) objects from 0.
+    """Yield the projections of each of the settings.
 
-    blocks: how wide the towers' features are that stand side by side, of touches and of photos.
+    Args:
+        touch: (n, F) touch features of grasps.
+        photo: (n, F') photo features.
+        owner: (n,) objects, from 0.
+        blocks: Feature widths of the concatenated towers, of touches and of photos.
+        settings: The settings to fit.
     """
-    most = max(one.directions for one in settings)
-    touch_view, photo_view = ReducedFeatures.of(touch, blocks[0], most), ReducedFeatures.of(photo, blocks[1], most)
+    limit = max(one.directions for one in settings)
+    touch_view, photo_view = ReducedFeatures.of(touch, blocks[0], limit), ReducedFeatures.of(photo, blocks[1], limit)
     for one, projections in _fit(touch_view, photo_view, np.arange(len(owner)), owner, settings):
         maps = touch_view.map(one.directions), photo_view.map(one.directions)
         yield one, CcaProjections(maps[0].compose(projections.touch), maps[1].compose(projections.photo))
@@ -151,7 +160,7 @@ def fit_projections(
 def _fit(
     touch: ReducedFeatures, photo: ReducedFeatures, rows: Numbers, owner: Numbers, settings: Sequence[CcaSettings]
 ) -> Iterator[tuple[CcaSettings, CcaProjections]]:
-    """Codes of reduced items, from some of their rows."""
+    """Yield the projections of reduced items, fitted on the given rows."""
     for directions, some in groupby(sorted(settings, key=lambda one: one.directions), lambda one: one.directions):
         items = [part.items(directions)[rows] for part in (touch, photo)]
         means = [part.mean(0) for part in items]
@@ -170,7 +179,7 @@ def _fit(
 
 
 def _centred_view(x: Matrix) -> CcaView:
-    """The decomposition of items that are centred already and are not to be scaled: their spread has a meaning."""
+    """Decompose centred items without scaling them: their spread is meaningful."""
     return decompose_standardised(
         x, Standardiser(np.arange(x.shape[1]), np.zeros(x.shape[1]), np.ones(x.shape[1])), MAX_DIRECTIONS
     )
@@ -178,11 +187,14 @@ def _centred_view(x: Matrix) -> CcaView:
 
 @dataclass(frozen=True, eq=False)
 class CcaSelection:
-    """Settings that were chosen by objects held out of a fit.
+    """Settings that were chosen on held-out objects.
 
-    auc: their mean AUC on these. codes: fitted to all objects. held_out: for each fold, cosines of its touches with its
-    photos by codes that its objects did not teach, and the codes of these touches, as a posterior and the worth of
-    reference touches are fitted on them.
+    Attributes:
+        settings: The chosen settings.
+        auc: Their mean AUC over the folds.
+        projections: The maps, fitted to all objects.
+        held_out_touches: For each fold, the cosines of its touches with its photos by maps that were fitted without its
+            objects, and the encodings of these touches: the input of the fit of a posterior and of reference touches.
     """
 
     settings: CcaSettings
@@ -194,30 +206,35 @@ class CcaSelection:
 def select_settings(
     features: "Features", blocks: TowerWidths, folds: Sequence[Sequence[str]], settings: Sequence[CcaSettings] = GRID
 ) -> CcaSelection:
-    """Choose the settings that rank photos of held-out objects best; of equals the largest.
+    """Choose the settings that rank photos of held-out objects best; among ties, the largest.
 
-    folds: objects of `features` that are held out together; the others are fitted on. Only the reduction to the widest
-    directions, which knows no object, sees all of them.
+    Only the reduction to the widest directions, which ignores objects, is computed from all of them.
+
+    Args:
+        features: Features of grasps.
+        blocks: Feature widths of the concatenated towers, of touches and of photos.
+        folds: Objects of `features` that are held out together; the others are fitted on.
+        settings: The settings to choose from.
     """
     touch_view, photo_view = (
         ReducedFeatures.of(_rows(features), blocks[0]),
         ReducedFeatures.of(features.photo, blocks[1]),
     )
-    shown = {one: (touch_view.items(one), photo_view.items(one)) for one in {each.directions for each in settings}}
+    items = {one: (touch_view.items(one), photo_view.items(one)) for one in {each.directions for each in settings}}
     found: dict[CcaSettings, list[tuple[float, CcaProjections]]] = {one: [] for one in settings}
     rows_of = [np.flatnonzero(np.isin(features.object_ids, fold)) for fold in folds]
     for rows in rows_of:
-        out = features.select(rows)
-        some = validation_rows(out, MAX_CHOICE_TOUCHES)
-        scored, places = Validator(out.select(some)), rows[some]
+        held_out = features.select(rows)
+        some = validation_rows(held_out, MAX_CHOICE_TOUCHES)
+        validator, places = Validator(held_out.select(some)), rows[some]
         others = np.setdiff1d(np.arange(len(features)), rows)
         for one, projections in _fit(touch_view, photo_view, others, features.owner, settings):
-            touch, photo = shown[one.directions]
-            found[one].append((scored.touch_auc(projections.cosines(touch[places], photo[places])), projections))
+            touch, photo = items[one.directions]
+            found[one].append((validator.touch_auc(projections.cosines(touch[places], photo[places])), projections))
     aucs = {one: float(np.mean([auc for auc, _ in each])) for one, each in found.items()}
     best = max(aucs, key=lambda one: (aucs[one], one))
     parts = [
-        held_out_touches(features.select(rows), projections, *(part[rows] for part in shown[best.directions]))
+        held_out_touches(features.select(rows), projections, *(part[rows] for part in items[best.directions]))
         for rows, (_, projections) in zip(rows_of, found[best], strict=True)
     ]
     every = np.arange(len(features))
@@ -231,8 +248,13 @@ def select_settings(
 def held_out_touches(
     features: "Features", projections: CcaProjections, touch: NDArray[np.floating], photo: NDArray[np.floating]
 ) -> ReferenceTouches:
-    """Touches (n, k) and photos (n, k') of objects that the codes have not seen: of each object at most
-    `MAX_CALIBRATION_TOUCHES` grasps, evenly spaced.
+    """Return touches of objects that the projections were fitted without, for the fit of a posterior.
+
+    Args:
+        features: The grasps. Of each object at most `MAX_CALIBRATION_TOUCHES` are used, evenly spaced.
+        projections: The maps.
+        touch: (n, k) reduced touches.
+        photo: (n, k') reduced photos.
     """
     rows = validation_rows(features, MAX_CALIBRATION_TOUCHES * len(set(features.object_ids)))
     owner, own = features.owner[rows], np.eye(len(rows), dtype=np.bool_)
@@ -241,14 +263,14 @@ def held_out_touches(
 
 
 class CcaTowers(Method):
-    """CCA on the features of towers that stand side by side: a pair's score is the cosine of its two codes.
+    """CCA on the features of concatenated towers: a pair's score is the cosine of its two encodings.
 
-    Settings are chosen by ranking on validation objects; where all objects teach, by cross-validation within them, and
-    the same held-out objects say what a cosine means (the "posterior" among what was chosen).
+    Settings are chosen by ranking on validation objects. With `fit_on_validation` they are chosen by cross-validation
+    within all objects, and the held-out objects also calibrate the cosines ("posterior" in `best_params`).
 
-    Where features of a reference touch stand behind those of each photo, a catalogue's entry is both. A touch's cosine
-    with the photo and its cosine with the reference, which is encoded as a touch, are then weighed as the log-odds of
-    one object on validation objects say.
+    If the features of a reference touch follow those of each photo, an entry of the catalogue is both. The touch's
+    cosines with the photo and with the reference, which is encoded as a touch, are then weighted by logistic regression
+    on validation objects.
     """
 
     is_seeded = False
@@ -256,8 +278,8 @@ class CcaTowers(Method):
     def _fit(self, train: "Features", validation: "Features") -> None:
         blocks = tower_widths(self.settings.config, train)
         self._width = sum(blocks[1])
-        photo_view, shown = (replace(part, photo=part.photo[:, : self._width]) for part in (train, validation))
-        known, folds = photo_view.concatenate(shown), [tuple(sorted(set(shown.object_ids)))]
+        photos_only, held_out = (replace(part, photo=part.photo[:, : self._width]) for part in (train, validation))
+        known, folds = photos_only.concatenate(held_out), [tuple(sorted(set(held_out.object_ids)))]
         if self.settings.fit_on_validation:
             folds = held_out_folds(known, self.settings.kind_of, seed=self.settings.seed)
         choice = select_settings(known, blocks, folds)
@@ -267,7 +289,7 @@ class CcaTowers(Method):
         with_references = self._width < train.photo.shape[1]
         if with_references or not self.settings.fit_on_validation:
             projections = dict(
-                fit_projections(_rows(photo_view), photo_view.photo, photo_view.owner, blocks, [choice.settings])
+                fit_projections(_rows(photos_only), photos_only.photo, photos_only.owner, blocks, [choice.settings])
             )[choice.settings]
             if with_references:
                 self._weights = _weights(projections, Validator.of(validation).features, self._width)
@@ -280,15 +302,16 @@ class CcaTowers(Method):
                 self.best_params["posterior"] = posterior.to_dict()
 
     def _encode_touch(self, touch: Array) -> Array:
-        code = unit_rows(self._projections.touch(touch.reshape(len(touch), -1)))
-        return code if self._weights is None else np.tile(code, 2)
+        encoding = unit_rows(self._projections.touch(touch.reshape(len(touch), -1)))
+        return encoding if self._weights is None else np.tile(encoding, 2)
 
     def _encode_photo(self, photo: Array) -> Array:
-        code = unit_rows(self._projections.photo(photo[:, : self._width]))
+        encoding = unit_rows(self._projections.photo(photo[:, : self._width]))
         if self._weights is None:
-            return code
+            return encoding
         reference = unit_rows(self._projections.touch(photo[:, self._width :]))
-        return np.concatenate([weight * one for weight, one in zip(self._weights, (code, reference), strict=True)], 1)
+        parts = zip(self._weights, (encoding, reference), strict=True)
+        return np.concatenate([weight * part for weight, part in parts], 1)
 
     def _score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
         return cosine(touch_encodings, photo_encodings)
@@ -298,28 +321,32 @@ def _rows(features: "Features") -> Rows:
     return features.touch.reshape(len(features), -1)
 
 
-def _weights(projections: CcaProjections, shown: "Features", width: int) -> list[float]:
-    """What the cosine with a photo and that with a reference touch add to the log-odds of one object: logistic
-    regression over all pairs of a touch and an entry, where pairs of one object weigh as much as the others. No weight
-    is negative.
+def _weights(projections: CcaProjections, validation: "Features", width: int) -> list[float]:
+    """Return the weights of the cosine with a photo and with a reference touch in the log-odds of one object.
+
+    Logistic regression over all pairs of a touch and an entry; pairs of one object have the same total weight as the
+    others. No weight is negative.
     """
     from sklearn.linear_model import LogisticRegression  # slow to import
 
-    touch, entries = _rows(shown), shown.photo
+    touch, entries = _rows(validation), validation.photo
     touch_view = unit_rows(projections.touch(touch))
     cosines = (
         projections.cosines(touch, entries[:, :width]),
         touch_view @ unit_rows(projections.touch(entries[:, width:])).T,
     )
-    same = shown.owner[:, None] == shown.owner
+    same = validation.owner[:, None] == validation.owner
     found = LogisticRegression(C=1e4, class_weight="balanced").fit(np.stack(cosines, -1).reshape(-1, 2), same.ravel())
     return [max(0.0, float(weight)) for weight in found.coef_[0]]
 
 
 def tower_widths(config: Config, features: "Features") -> TowerWidths:
-    """How wide the features of each tower of `config` are, of a touch and of a photo, without those of a reference
-    touch behind a photo; touches alone may stand in place of photos. Raises BadInput for features that are not of these
-    towers.
+    """Return the feature widths of each tower of `config`, of a touch and of a photo.
+
+    The features of a reference touch behind a photo are not counted. Touches may also take the place of photos.
+
+    Raises:
+        BadInput: The features are not from these towers.
     """
     import torch
 
@@ -327,11 +354,11 @@ def tower_widths(config: Config, features: "Features") -> TowerWidths:
         matcher = config.matcher
         widths = feature_counts_of(build_tower(matcher.tower, matcher.tower_output, matcher.architectures))
     touch_view, photo_view = widths * features.touch.shape[1], widths * len(config.preprocessing.views)
-    wanted, got = (sum(touch_view), sum(photo_view)), (_rows(features).shape[1], features.photo.shape[1])
-    shown = {sum(photo_view) + sum(touch_view): photo_view, sum(touch_view): touch_view, sum(photo_view): photo_view}
-    if wanted[0] != got[0] or got[1] not in shown:
+    expected, got = (sum(touch_view), sum(photo_view)), (_rows(features).shape[1], features.photo.shape[1])
+    accepted = {sum(photo_view) + sum(touch_view): photo_view, sum(touch_view): touch_view, sum(photo_view): photo_view}
+    if expected[0] != got[0] or got[1] not in accepted:
         raise BadInput(
             f"features must be those of the towers {config.matcher.tower} ({config.matcher.tower_output}), "
-            f"{wanted[0]} of a touch and {wanted[1]} of a photo; got {got[0]} and {got[1]}; encode with these"
+            f"{expected[0]} of a touch and {expected[1]} of a photo; got {got[0]} and {got[1]}; encode with these"
         )
-    return touch_view, shown[got[1]]
+    return touch_view, accepted[got[1]]

@@ -1,4 +1,4 @@
-"""Two projections into one metric space, pulled together by a contrastive loss over given tower features."""
+"""Two projections into one metric space, trained by a contrastive loss on fixed tower features."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 MAX_STEPS, VALIDATE_EVERY = 800, 40
 LEARNING_RATE = 1e-3
 OBJECTS_PER_BATCH, IMAGES_PER_OBJECT = 64, 2
-"""A batch holds each object at most once, with so many of its touches and as many of its photos."""
+"""A batch contains each object at most once, with so many of its touches and as many of its photos."""
 REGULARISATIONS = ((0.5, 0.0), (0.8, 0.0), (0.9, 0.0), (0.8, 1.0))
-"""Dropout of features and weight decay, to be chosen from."""
+"""Pairs of feature dropout and weight decay to choose from."""
 
 
 class Projections(nn.Module):
-    """Standardised features to unit embeddings: a linear map each, as the matcher has, with dropout before it."""
+    """Linear maps from standardised features to unit embeddings, as in the matcher, with dropout before them."""
 
     log_scale_init, bias_init = LOG_SCALE_INIT, 0.0
 
@@ -40,37 +40,37 @@ class Projections(nn.Module):
         self.bias = nn.Parameter(torch.tensor(self.bias_init))
 
     def forward(self, features: Tensor, projection: nn.Linear) -> Tensor:
-        """Unit embeddings (B, dim) of features (B, F)."""
+        """Return unit embeddings (B, dim) of features (B, F)."""
         embedding: Tensor = projection(self.dropout(features))
         return functional.normalize(embedding, dim=-1, eps=1e-6)
 
     def loss(self, touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:
-        """Loss (scalar) of a batch of embeddings. InfoNCE compares photos of one touch, so its bias stays 0."""
+        """Return the loss (scalar) of a batch of embeddings. InfoNCE compares photos of one touch: its bias stays 0."""
         return contrastive_loss(touch, photo, touch_objects, photo_objects, self.log_scale)
 
     @torch.no_grad()
     def clamp_scale(self) -> None:
-        """Hold the scale at 100 at most; on the parameter, so that it can come back."""
+        """Clamp the parameter of the scale to at most 100, so that its gradient can reduce it again."""
         self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
 
     @torch.no_grad()
     def logit_map(self) -> tuple[float, float]:
-        """Scale and bias that make logits of cosines."""
+        """Return scale and bias that map cosines to logits."""
         return self.log_scale.exp().item(), self.bias.item()
 
 
 class SigmoidProjections(Projections):
-    """The same with the sigmoid loss and its learned bias."""
+    """Projections with the sigmoid loss and its learned bias."""
 
     log_scale_init, bias_init = SIGMOID_LOG_SCALE_INIT, SIGMOID_BIAS_INIT
 
     def loss(self, touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:
-        """Loss (scalar) of a batch of embeddings."""
+        """Return the loss (scalar) of a batch of embeddings."""
         return sigmoid_loss(touch, photo, touch_objects, photo_objects, self.log_scale, self.bias)
 
 
 class ContrastiveEmbedding(Method):
-    """Scaled cosine of embeddings trained with InfoNCE; regularisation and steps by ranking on validation objects."""
+    """Scaled cosine of InfoNCE embeddings; regularisation and steps are chosen by ranking on validation objects."""
 
     name = "contrastive"
     projections: type[Projections] = Projections
@@ -81,8 +81,8 @@ class ContrastiveEmbedding(Method):
         steps = min(self.settings.config.training.iterations, MAX_STEPS)
         with Bar(f"fit {self.name}", steps * len(REGULARISATIONS), "steps", quiet=self.settings.quiet) as bar:
             fits = [self._train(train, validator, *cell, steps, bar) for cell in REGULARISATIONS]
-        best_of = [best.value for _, best in fits]
-        place = best_of.index(max(best_of))
+        aucs = [best.value for _, best in fits]
+        place = aucs.index(max(aucs))
         self._module, best = fits[place]
         scale, bias = self._module.logit_map()
         self.best_params = {
@@ -97,7 +97,7 @@ class ContrastiveEmbedding(Method):
     def _train(
         self, train: "Features", validator: Validator, dropout: float, weight_decay: float, steps: int, bar: Bar
     ) -> tuple[Projections, BestStep]:
-        """Projections trained with one regularisation, as they were at their best step."""
+        """Return projections trained with one regularisation, at their best step."""
         with seeded_generator(self.settings.seed) as generator:
             dim = self.settings.config.matcher.embedding_dim
             module = self.projections(len(self._touch.columns), len(self._photo.columns), dim, dropout)
@@ -152,7 +152,7 @@ class ContrastiveEmbedding(Method):
 
 
 class SigmoidEmbedding(ContrastiveEmbedding):
-    """The same, trained with the sigmoid loss: its scores are log-odds of a match by themselves."""
+    """Contrastive embeddings with the sigmoid loss: the scores are log-odds of a match."""
 
     name = "contrastive_sigmoid"
     projections = SigmoidProjections

@@ -1,4 +1,4 @@
-"""Late fusion (Lin, Calandra, Levine, ICRA 2019): the head that judges a pair, trained as `retrieve train` does."""
+"""Late fusion (Lin, Calandra, Levine, ICRA 2019): a head that scores pairs, trained as in `retrieve train`."""
 
 import dataclasses
 import tempfile
@@ -20,18 +20,18 @@ from retrieval.training.state import finish_training, unfinished_path
 from retrieval.training.train import Trainer, build_matcher
 
 SOURCE = "features of a recording"
-"""What a checkpoint says it was trained on."""
+"""Training source in the checkpoint's provenance."""
 
 
 class LateFusion(Method):
-    """Match logits of a fusion head over frozen towers. A code is a half: a modality's share of the first layer."""
+    """Match logits of a fusion head over frozen towers. The encodings are partial activations of its first layer."""
 
     @classmethod
     def of_checkpoint(cls, checkpoint: Checkpoint, settings: MethodSettings) -> Self:
-        """The method as a checkpoint has it; it is not fitted again."""
+        """Return the method with the model of a checkpoint, already fitted."""
         method = cls(settings)
         method._use_checkpoint(checkpoint)
-        if checkpoint.posterior is not None:  # where a photo's object is as likely as one that the catalogue lacks
+        if checkpoint.posterior is not None:  # the logit at which the likelihood ratio is 1
             method.best_params["pair_threshold"] = float(checkpoint.posterior.logit_of(np.zeros(1), 1)[0])
         fingers, touch, photo = _feature_counts(checkpoint.matcher)
         method._shapes, method.fitted = ((fingers, touch), (photo,)), True
@@ -58,14 +58,18 @@ class LateFusion(Method):
 
 
 def trained_checkpoint(settings: MethodSettings, train: Features, validation: Features) -> Checkpoint:
-    """Train on features and keep the checkpoint in `settings.folder`; one that is there from the same fit is taken as
-    it is, an unfinished one gone on with. It has no candidate_encoder: judging every photo needs none.
+    """Train on features and store the checkpoint in `settings.folder`.
 
-    The towers of the checkpoint are those of `frozen_matcher`: it serves as any other where they made the features.
-    Raises BadInput for features that no such towers make, JobInterrupted after Ctrl-C.
+    A checkpoint of the same fit in that folder is reused, an unfinished one is continued. The model has no candidate
+    encoder, because every photo is scored. The towers of the checkpoint are those of `frozen_matcher`; it works like
+    any other if the features come from them.
+
+    Raises:
+        BadInput: The features are not from such towers.
+        JobInterrupted: The user pressed Ctrl-C.
     """
     known = train.concatenate(validation)
-    # Grasps to draw pairs from; their files are names, which nobody opens.
+    # Grasps to draw pairs from. Their files are only names and are never opened.
     grasps = [
         Grasp(grasp_id, object_id, None, photo=Path(grasp_id), touches=(), backgrounds=())
         for grasp_id, object_id in zip(known.grasp_ids, known.object_ids, strict=True)
@@ -76,32 +80,34 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
     config = dataclasses.replace(
         config,
         matcher=dataclasses.replace(config.matcher, fingers=train.touch.shape[1]),
-        # Labelled pairs are among the features.
+        # The features already include the labelled pairs.
         training=dataclasses.replace(config.training, seed=settings.seed, freeze_towers=True, photos="", touches=""),
     )
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
-        done = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
-        trainer = Trainer(config, split, grasps, unfinished_path(done), SOURCE, known)
-        wanted, got = _feature_counts(trainer.matcher), (*known.touch.shape[1:], *known.photo.shape[1:])
-        if wanted != got:
+        path = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
+        trainer = Trainer(config, split, grasps, unfinished_path(path), SOURCE, known)
+        expected, got = _feature_counts(trainer.matcher), (*known.touch.shape[1:], *known.photo.shape[1:])
+        if expected != got:
             raise BadInput(
-                f"late fusion takes features of its own towers, {wanted[1]} of a finger and {wanted[2]} of a photo "
+                f"late fusion takes features of its own towers, {expected[1]} of a finger and {expected[2]} of a photo "
                 f"({config.matcher.tower}, {config.matcher.tower_output}); got {got[1]} and {got[2]}; encode with these"
             )
         towers = frozen_matcher(settings.config)
         trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
         trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
-        return finish_training(trainer, done, settings.quiet)
+        return finish_training(trainer, path, settings.quiet)
 
 
 def frozen_matcher(config: Config) -> Matcher:
-    """A matcher whose towers are to make features. What of them is random hangs on the configuration's own seed, not
-    on that of a head: one set of features serves heads of every seed.
+    """Return a matcher whose towers compute features.
+
+    Random weights depend on the configuration's seed, not on that of a head: one set of features serves heads of every
+    seed.
     """
     torch.manual_seed(config.training.seed)
     return build_matcher(config).eval()
 
 
 def _feature_counts(matcher: Matcher) -> tuple[int, int, int]:
-    """Fingers, features of one finger, features of a photo."""
+    """Return the fingers, the features of one finger, and the features of a photo."""
     return matcher.config.fingers, matcher.touch_tower.feature_count, matcher.head.photo_partial.in_features

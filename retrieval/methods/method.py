@@ -1,4 +1,4 @@
-"""What every method owes the harness; a method only writes `_fit`, `_encode_touch`, `_encode_photo` and `_score`."""
+"""Base class of every method; a method only implements `_fit`, `_encode_touch`, `_encode_photo` and `_score`."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -20,12 +20,17 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class MethodSettings:
-    """What a method is made with.
+    """Settings of a method.
 
-    folder: where it may keep files, such as a checkpoint; None: it keeps nothing. quiet: no progress on stderr.
-    fit_on_validation: a method that can (`cca_towers`, `cca`, `cca_pca`) learns from validation objects, too, once its settings
-    are chosen; what is calibrated on their scores is then too sure. kind_of: the kind of each object, where the
-    recording names it: half of each kind is then held out together to choose settings.
+    Attributes:
+        config: Towers, head and training.
+        seed: Seed of the fit.
+        folder: Where the method may store files, such as a checkpoint; None: it stores nothing.
+        quiet: Show no progress on stderr.
+        fit_on_validation: A method that can (`cca_towers`, `cca`, `cca_pca`) also fits on validation objects once its
+            settings are chosen. A calibration on their scores is then overconfident.
+        kind_of: The kind of each object, if the recording names it. Half of each kind is then held out together to
+            choose settings.
 
     >>> retrieval.MethodSettings(retrieval.load_config("tiny")).seed
     0
@@ -40,10 +45,11 @@ class MethodSettings:
 
 
 class Method(ABC):
-    """A way to say how well a touch and a photo go together: a higher score is a better match.
+    """Scores touches with photos: a higher score is a better match.
 
-    Scores are ranked, equal ones by expected rank; only calibration gives them a unit. `best_params` says after `fit` what
-    was chosen on validation objects, in JSON types. A method that comes fitted (from a checkpoint) sets `fitted`.
+    Scores are ranked, ties by expected rank; only calibration gives them a unit. After `fit`, `best_params` contains
+    the values chosen on validation objects, in JSON types. A method that is already fitted (from a checkpoint) sets
+    `fitted`.
 
     >>> import numpy as np
     >>> class Brightness(retrieval.Method):
@@ -61,7 +67,7 @@ class Method(ABC):
     """
 
     is_seeded: ClassVar[bool] = True
-    """Whether fits differ by seed; where they do not, one is enough."""
+    """Whether fits differ by seed; otherwise one fit is enough."""
 
     def __init__(self, settings: MethodSettings) -> None:
         self.settings = settings
@@ -70,10 +76,11 @@ class Method(ABC):
         self._shapes: tuple[tuple[int, ...], tuple[int, ...]] | None = None
 
     def fit(self, train: "Features", validation: "Features") -> None:
-        """Learn from the grasps of training objects; choose whatever is to be chosen on those of validation objects.
+        """Fit on the grasps of training objects; choose settings on those of validation objects.
 
-        Raises BadInput unless both hold at least two objects and share none, NumericalError for features that are
-        not finite.
+        Raises:
+            BadInput: One of the two has fewer than two objects, or they have a common object.
+            NumericalError: A feature is not finite.
         """
         _require_fit(train, validation)
         self._fit(train, validation)
@@ -81,38 +88,41 @@ class Method(ABC):
         self.fitted = True
 
     def encode_touch(self, touch: NDArray[Any]) -> Array:
-        """Codes (T, ...) of touch features (T, fingers, F). Raises BadInput for another shape than fitted on."""
+        """Return encodings (T, ...) of touch features (T, fingers, F). Raises BadInput unless shaped as in the fit."""
         self._require_fitted()
         touch = _checked("touch features", touch, 3, self._shapes and self._shapes[0])
         return _checked_encodings(self._encode_touch(touch), len(touch))
 
     def encode_photo(self, photo: NDArray[Any]) -> Array:
-        """Codes (N, ...) of photo features (N, F). Raises BadInput for another shape than fitted on."""
+        """Return encodings (N, ...) of photo features (N, F). Raises BadInput unless shaped as in the fit."""
         self._require_fitted()
         photo = _checked("photo features", photo, 2, self._shapes and self._shapes[1])
         return _checked_encodings(self._encode_photo(photo), len(photo))
 
     def score(self, touch_encodings: Array, photo_encodings: Array) -> Array:
-        """Scores (T, N) of every touch with every photo. Raises NumericalError for one that is not finite."""
+        """Return scores (T, N) of every touch with every photo. Raises NumericalError for one that is not finite."""
         self._require_fitted()
         return _checked_scores(
             self._score(touch_encodings, photo_encodings), len(touch_encodings), len(photo_encodings)
         )
 
     def score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
-        """Scores (S, N) of sets of grasps of one object with every photo.
+        """Return scores (S, N) of sets of grasps of one object with every photo.
 
-        sets (S, G): rows of `touch_encodings`. Unless a method fuses otherwise, the sum over the set of `score`: log-odds
-        of grasps that are independent given the object add.
+        By default this is the sum of `score` over the set: log-odds add for grasps that are independent given the
+        object.
+
+        Args:
+            touch_encodings: (T, ...) encodings.
+            photo_encodings: (N, ...) encodings.
+            sets: (S, G) rows of `touch_encodings`.
         """
         self._require_fitted()
         if sets.ndim != 2 or sets.shape[1] < 1 or not np.issubdtype(sets.dtype, np.integer):
-            raise BadInput(
-                f"sets of grasps must be whole numbers of shape (S, G), G >= 1; got {sets.dtype} {sets.shape}"
-            )
+            raise BadInput(f"sets of grasps must be integers of shape (S, G), G >= 1; got {sets.dtype} {sets.shape}")
         if sets.size and (sets.min() < 0 or sets.max() >= len(touch_encodings)):
             raise BadInput(
-                f"sets must name rows of the {len(touch_encodings)} touch codes; got {sets.min()}..{sets.max()}"
+                f"sets must index the {len(touch_encodings)} touch encodings; got {sets.min()}..{sets.max()}"
             )
         return _checked_scores(
             self._score_sets(touch_encodings, photo_encodings, sets), len(sets), len(photo_encodings)
@@ -136,13 +146,11 @@ class Method(ABC):
 
     def _require_fitted(self) -> None:
         if not self.fitted:
-            raise BadInput(f"a method must be fitted before it is used; call fit on this {type(self).__name__} first")
+            raise BadInput(f"a method must be fitted before use; call fit on this {type(self).__name__} first")
 
 
 def sum_over_sets(scores: Array, sets: NDArray[np.int64]) -> Array:
-    """(S, N) sums over sets (S, G) of rows of scores (T, N); in float64, for the order of a set must not decide
-    near-ties.
-    """
+    """Return sums (S, N) over sets (S, G) of rows of scores (T, N), in float64: order must not decide near-ties."""
     total = np.zeros((len(sets), scores.shape[1]))
     for rows in sets.T:
         total += scores[rows]
@@ -158,24 +166,24 @@ def _require_fit(train: "Features", validation: "Features") -> None:
         _checked(f"photo features of {name} objects", part.photo, 2, train.photo.shape[1:])
     if shared := set(train.object_ids) & set(validation.object_ids):
         raise BadInput(
-            f"training and validation objects must be apart; {min(shared)!r} is in both; split the grasps by object"
+            f"training and validation objects must differ; {min(shared)!r} is in both; split the grasps by object"
         )
 
 
-def _checked(what: str, array: NDArray[Any], ndim: int, shape: tuple[int, ...] | None) -> Array:
+def _checked(name: str, array: NDArray[Any], ndim: int, shape: tuple[int, ...] | None) -> Array:
     array = np.asarray(array, dtype=np.float32)
     if array.ndim != ndim or (shape is not None and array.shape[1:] != shape):
-        wanted = f"of shape (B, {', '.join(map(str, shape))})" if shape is not None else f"with {ndim} axes"
-        raise BadInput(f"{what} must be an array {wanted}, as fitted on; got {array.shape}")
-    _require_finite(what, array)
+        expected = f"of shape (B, {', '.join(map(str, shape))})" if shape is not None else f"with {ndim} axes"
+        raise BadInput(f"{name} must be an array {expected}, as in the fit; got {array.shape}")
+    _require_finite(name, array)
     return array
 
 
 def _checked_encodings(encodings: Array, count: int) -> Array:
     encodings = np.asarray(encodings, dtype=np.float32)
     if len(encodings) != count:
-        raise BadInput(f"a method must give one code for each item; got {len(encodings)} for {count}")
-    _require_finite("codes", encodings)
+        raise BadInput(f"a method must return one encoding per item; got {len(encodings)} for {count}")
+    _require_finite("encodings", encodings)
     return encodings
 
 
@@ -187,8 +195,8 @@ def _checked_scores(scores: Array, touches: int, photos: int) -> Array:
     return scores
 
 
-def _require_finite(what: str, array: Array) -> None:
-    """Sorting would rank a NaN first."""
+def _require_finite(name: str, array: Array) -> None:
+    """Raise NumericalError for a NaN or infinite value: sorting would rank a NaN first."""
     if not np.isfinite(array).all():
         place = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise NumericalError(f"{what} must be finite; got {array[place]} at {place}")
+        raise NumericalError(f"{name} must be finite; got {array[place]} at {place}")

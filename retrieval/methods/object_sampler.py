@@ -1,4 +1,4 @@
-"""What the small learned methods draw their batches with."""
+"""Batch sampling for the small learned methods."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,16 +9,22 @@ from torch import Tensor
 
 @contextmanager
 def seeded_generator(seed: int) -> Iterator[torch.Generator]:
-    """A generator for what is drawn, and torch's own stream (first weights, dropout) seeded, its state put back."""
+    """Yield a seeded generator for draws; seed torch's own stream (initial weights, dropout), and restore it after."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield torch.Generator().manual_seed(seed)
 
 
 class ObjectSampler:
-    """Draws of grasps by object, without a loop over items. owner (n,): object of each row, from 0."""
+    """Samples grasps by object, without a loop over items."""
 
     def __init__(self, owner: Tensor, generator: torch.Generator) -> None:
+        """Index the rows.
+
+        Args:
+            owner: (n,) object of each row, from 0.
+            generator: Source of the draws.
+        """
         self._rows = torch.argsort(owner, stable=True)
         self._counts = torch.bincount(owner)
         self._starts = self._counts.cumsum(0) - self._counts
@@ -26,28 +32,28 @@ class ObjectSampler:
         self.objects = len(self._counts)
 
     def distinct_objects(self, count: int) -> Tensor:
-        """(count,) objects, each at most once."""
+        """Return (count,) objects, each at most once."""
         return torch.randperm(self.objects, generator=self._generator)[:count]
 
     def other_objects(self, objects: Tensor, each: int) -> Tensor:
-        """(B, each) for each of `objects` (B,) so many others, uniformly, with replacement."""
+        """Return (B, each): for each of `objects` (B,) so many others, uniformly, with replacement."""
         drawn = torch.randint(self.objects - 1, (len(objects), each), generator=self._generator)
         return drawn + (drawn >= objects[:, None])
 
     def rows(self, objects: Tensor) -> Tensor:
-        """One row of each of `objects` (any shape), uniformly."""
+        """Return one row of each of `objects` (any shape), uniformly."""
         drawn = torch.rand(objects.shape, generator=self._generator, dtype=torch.float64)
         return self._rows[self._starts[objects] + (drawn * self._counts[objects]).long()]
 
-    def sets(self, objects: Tensor, most: int) -> tuple[Tensor, Tensor]:
-        """Sets of 1..most distinct rows of each of `objects` (B,): (B, most) rows and (B, most) which of them count.
+    def sets(self, objects: Tensor, max_size: int) -> tuple[Tensor, Tensor]:
+        """Return sets of 1..max_size distinct rows of each of `objects` (B,): rows (B, max_size) and a mask of members.
 
-        A set's size is uniform, but no larger than its object's number of rows.
+        A set's size is uniform, but at most its object's number of rows.
         """
         counts = self._counts[objects]
-        order = torch.rand(len(objects), max(int(counts.max()), most), generator=self._generator)
+        order = torch.rand(len(objects), max(int(counts.max()), max_size), generator=self._generator)
         order[torch.arange(order.shape[1]) >= counts[:, None]] = torch.inf
-        places = order.argsort(1)[:, :most]
-        sizes = torch.randint(1, most + 1, (len(objects),), generator=self._generator).minimum(counts)
-        counted = torch.arange(most) < sizes[:, None]
+        places = order.argsort(1)[:, :max_size]
+        sizes = torch.randint(1, max_size + 1, (len(objects),), generator=self._generator).minimum(counts)
+        counted = torch.arange(max_size) < sizes[:, None]
         return self._rows[self._starts[objects][:, None] + places.where(counted, 0)], counted

@@ -13,17 +13,17 @@ if TYPE_CHECKING:
     from retrieval.training.features import Features
 
 MAX_PRINCIPAL_COMPONENTS = 256
-"""Principal components kept of each modality. Every step of the power iteration passes over all features of all rows:
-with 2,560 + 1,280 of them 100 components would take minutes, and the directions left out vary least."""
+"""Principal components of each modality. Every step of the power iteration passes over all features of all rows: with
+2,560 + 1,280 of them 100 components would take minutes, and the omitted directions vary least."""
 COMPONENTS = (4, 8, 16, 32, 64, 100)
-"""The last is what ObjectFolder uses."""
+"""The last number is ObjectFolder's."""
 
 
 class Plsca(Method):
-    """Cosine of canonical PLS scores; the number of components by ranking on validation objects.
+    """Cosine of canonical PLS scores; the number of components is chosen by ranking on validation objects.
 
-    A row of the fit is a touch with the photo of the object's next grasp, as scikit-learn wants rows in pairs: with
-    its own photo the fit would lean on what the two share beyond the object, the pose of that grasp.
+    scikit-learn requires rows in pairs. A row of the fit is a touch with the photo of the object's next grasp: with its
+    own photo the fit would use the common pose of the grasp.
     """
 
     is_seeded = False
@@ -34,7 +34,7 @@ class Plsca(Method):
         maps = _rotations(self._touch(train.touch), self._photo(train.photo)[next_rows_of_object(train.owner, 2)[:, 1]])
         validator = Validator.of(validation)
         touch, photo = self._touch(validator.features.touch) @ maps[0], self._photo(validator.features.photo) @ maps[1]
-        # Components are found one after another, so those of a smaller number are the first of a larger one.
+        # Components are found one after another, so a smaller number of them is a prefix of a larger one.
         aucs = {
             count: validator.touch_auc(cosine(unit_rows(touch[:, :count]), unit_rows(photo[:, :count])))
             for count in component_counts(COMPONENTS, maps[0].shape[1])
@@ -59,7 +59,7 @@ class Plsca(Method):
 
 
 class _PrincipalComponents:
-    """Standardised features in their principal directions, at most `MAX_PRINCIPAL_COMPONENTS` and no more than vary."""
+    """Standardised features in their principal directions, at most `MAX_PRINCIPAL_COMPONENTS`."""
 
     def __init__(self, x: Array) -> None:
         view = decompose(x)
@@ -71,18 +71,18 @@ class _PrincipalComponents:
 
 
 def _rotations(touch: Matrix, photo: Matrix) -> tuple[Matrix, Matrix]:
-    """(r, k) maps of either view to its k components.
+    """Return maps (r, k) of either view to its k components.
 
-    By power iteration: the other algorithm of scikit-learn decomposes the deflated cross matrix in full, and LAPACK's
-    gesdd has been seen not to converge on one of ImageNet features after 20 components.
+    They come from power iteration. scikit-learn's other algorithm decomposes the deflated cross matrix in full, and
+    LAPACK's gesdd did not converge on one of ImageNet features after 20 components.
     """
     from sklearn.cross_decomposition import PLSCanonical  # slow to import
     from sklearn.exceptions import ConvergenceWarning
 
-    # Centring takes one dimension of the rows; more components than the smaller view has directions do not exist.
-    most = min(COMPONENTS[-1], touch.shape[1], photo.shape[1], len(touch) - 1)
+    # Centring removes one dimension of the rows; the smaller view's directions also limit the components.
+    limit = min(COMPONENTS[-1], touch.shape[1], photo.shape[1], len(touch) - 1)
     with warnings.catch_warnings():
-        # Two directions of nearly equal covariance: either serves, and validation chooses how many are kept.
+        # Two directions of nearly equal covariance: either is valid, and validation chooses the number of components.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        model = PLSCanonical(most, scale=False).fit(touch, photo)
+        model = PLSCanonical(limit, scale=False).fit(touch, photo)
     return model.x_rotations_, model.y_rotations_

@@ -1,4 +1,4 @@
-"""What users run: candidates by the embedding, judged by the match logit; shares late fusion's training."""
+"""Retrieve and rerank, as in a user's query: candidates by embedding, scored by match logit; trained as late fusion."""
 
 import numpy as np
 import torch
@@ -15,24 +15,30 @@ RERANKED_FRACTION = 0.25
 
 
 class RetrieveRerank(LateFusion):
-    """Search as `retrieve query` does: only the nearest photos by embedding are judged by match logit.
+    """Search as `retrieve query` does: only the nearest photos by embedding get a match logit.
 
-    share: of the gallery that is judged. The others stand behind these, in the order of their embeddings. Of a set the
-    photos nearest to all its grasps together are judged, as search does. A model without trained embeddings judges
-    every photo. A code is the half and, behind it, the embedding.
+    The other photos follow in the order of their embeddings. For a set of grasps the photos nearest to all of them
+    together are reranked. A model without trained embeddings scores every photo. An encoding is the partial activation
+    followed by the embedding.
     """
 
     def __init__(self, settings: MethodSettings, reranked_fraction: float = RERANKED_FRACTION) -> None:
+        """Make an unfitted method.
+
+        Args:
+            settings: Settings of the method.
+            reranked_fraction: Fraction of the gallery that is reranked.
+        """
         super().__init__(settings)
         self.reranked_fraction = reranked_fraction
 
     def _fit(self, train: Features, validation: Features) -> None:
-        made = trained_checkpoint(self.settings, train, validation)
+        checkpoint = trained_checkpoint(self.settings, train, validation)
         if self.settings.config.matcher.candidate_width:
-            config = made.config.with_candidate_encoder_of(self.settings.config)
-            partials = (feature_partials(made.matcher, part) for part in (train, validation))
-            made = with_candidate_encoder(made, config, *partials, quiet=self.settings.quiet)
-        self._use_checkpoint(made)
+            config = checkpoint.config.with_candidate_encoder_of(self.settings.config)
+            partials = (feature_partials(checkpoint.matcher, part) for part in (train, validation))
+            checkpoint = with_candidate_encoder(checkpoint, config, *partials, quiet=self.settings.quiet)
+        self._use_checkpoint(checkpoint)
 
     def _use_checkpoint(self, checkpoint: Checkpoint) -> None:
         super()._use_checkpoint(checkpoint)
@@ -59,31 +65,34 @@ class RetrieveRerank(LateFusion):
         return np.array(scores)
 
     def _score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
-        """As for single touches. Sets share touches, so that here all photos are judged, once for each touch."""
+        """Score sets as single touches. Sets have touches in common, so all photos are scored once per touch."""
         used, place = np.unique(sets, return_inverse=True)
         touch_partials, partials, nearness = self._parts(touch_encodings[used], photo_encodings)
         logits = super()._score(touch_partials, partials)
         scores = []
-        for best_params in place.reshape(sets.shape):
-            rows = nearest_photos(nearness[best_params], self._count(len(partials)))
-            summed = logits[np.ix_(best_params, rows)].sum(0, dtype=np.float64).astype(np.float32)
-            scores.append(merge_scores(nearness[best_params], rows, summed))
+        for members in place.reshape(sets.shape):
+            rows = nearest_photos(nearness[members], self._count(len(partials)))
+            summed = logits[np.ix_(members, rows)].sum(0, dtype=np.float64).astype(np.float32)
+            scores.append(merge_scores(nearness[members], rows, summed))
         return np.array(scores)
 
     def _parts(self, touch_encodings: Array, photo_encodings: Array) -> tuple[Array, Array, Array]:
-        """Partials of touches and of photos, and cosines (T, N) of their embeddings."""
-        partial = self._matcher.config.partial_width
-        nearness = touch_encodings[:, partial:] @ photo_encodings[:, partial:].T
-        return touch_encodings[:, :partial], np.ascontiguousarray(photo_encodings[:, :partial]), nearness
+        """Return partial activations of touches and of photos, and cosines (T, N) of their embeddings."""
+        width = self._matcher.config.partial_width
+        nearness = touch_encodings[:, width:] @ photo_encodings[:, width:].T
+        return touch_encodings[:, :width], np.ascontiguousarray(photo_encodings[:, :width]), nearness
 
     def _count(self, photos: int) -> int:
         return max(1, round(self.reranked_fraction * photos))
 
 
 def merge_scores(nearness: Array, rows: NDArray[np.int64], logits: Array) -> Array:
-    """Scores (N,) of all photos: logits of those at `rows`, all others below these by their mean cosine.
+    """Return scores (N,) of all photos: the reranked ones by logit, all others below them by mean cosine.
 
-    nearness (G, N): cosines of each grasp's embedding with each photo's; they are 1 at most.
+    Args:
+        nearness: (G, N) cosines of each grasp's embedding with each photo's, at most 1.
+        rows: The reranked photos.
+        logits: Their match logits.
     """
     scores = logits.min() - 1 - (1 - nearness.mean(0))
     scores[rows] = logits
@@ -91,5 +100,5 @@ def merge_scores(nearness: Array, rows: NDArray[np.int64], logits: Array) -> Arr
 
 
 def nearest_photos(nearness: Array, count: int) -> NDArray[np.int64]:
-    """The `count` photos nearest to all grasps together; equals by row. nearness (G, N)."""
+    """Return the `count` photos nearest to all grasps together, from nearness (G, N); among ties the first rows."""
     return np.sort(np.argsort(-nearness.sum(0), kind="stable")[:count])

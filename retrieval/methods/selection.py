@@ -1,4 +1,4 @@
-"""How a method chooses its settings: by ranking on objects held out of its fit, never by the fit itself."""
+"""Choice of a method's settings by ranking on held-out objects, never on the objects of the fit."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from retrieval.training.features import Features
 MAX_VALIDATION_ROWS = 512
 
 
-def validation_rows(validation: Features, most: int = MAX_VALIDATION_ROWS) -> NDArray[np.int64]:
-    """Rows of the grasps to choose by: of each object as many, evenly spaced, about `most` in all (2 at least)."""
-    each = max(most // (int(validation.owner.max()) + 1), 2)
+def validation_rows(validation: Features, max_rows: int = MAX_VALIDATION_ROWS) -> NDArray[np.int64]:
+    """Return rows for the choice: equally many per object, evenly spaced, about `max_rows` in all (at least 2 each)."""
+    each = max(max_rows // (int(validation.owner.max()) + 1), 2)
     parts = [np.flatnonzero(validation.owner == owner) for owner in range(int(validation.owner.max()) + 1)]
     return np.concatenate([part[np.linspace(0, len(part) - 1, min(each, len(part))).astype(int)] for part in parts])
 
@@ -25,13 +25,21 @@ def ranking_auc(
     scores: NDArray[np.floating[Any]],
     touch_owner: NDArray[np.int64],
     photo_owner: NDArray[np.int64],
-    left_out: NDArray[np.bool_],
+    excluded: NDArray[np.bool_],
 ) -> float:
-    """How often a photo of the touched object scores above one of another object; equals count half.
+    """Return how often a photo of the touched object scores above one of another object; ties count half.
 
-    scores (T, N); left_out (T, N): photos taken in the row's own grasps, which do not count (where the object has no
-    other, they do). Mean over the pairs of a touch, over the touches of an object, over objects; a constant scorer
-    has exactly 0.5. Raises NumericalError for a score that is not finite: in a count of what is higher a NaN is a loss.
+    The mean is taken over the pairs of a touch, over the touches of an object, and over objects. A constant scorer has
+    exactly 0.5.
+
+    Args:
+        scores: (T, N).
+        touch_owner: (T,) objects.
+        photo_owner: (N,) objects.
+        excluded: (T, N) photos of the row's own grasps, which do not count unless the object has no other.
+
+    Raises:
+        NumericalError: A score is not finite. A NaN would count as a loss.
     """
     bad = np.flatnonzero(~np.isfinite(scores).all(axis=1))
     if len(bad):
@@ -39,7 +47,7 @@ def ranking_auc(
     values = np.empty(len(scores))
     for row, (score, owner) in enumerate(zip(scores, touch_owner, strict=True)):
         same = photo_owner == owner
-        own = same & ~left_out[row]
+        own = same & ~excluded[row]
         others = score[~same]
         values[row] = weight_below(score[own if own.any() else same], others).mean() / len(others)
     return float(np.mean([values[touch_owner == owner].mean() for owner in np.unique(touch_owner)]))
@@ -47,38 +55,38 @@ def ranking_auc(
 
 @dataclass(frozen=True, eq=False)
 class Validator:
-    """The validation grasps to choose by; both methods give the area that the scores of their touches are worth."""
+    """Validation grasps with which settings are chosen, by the AUC of their scores."""
 
     features: Features
 
     @classmethod
     def of(cls, validation: Features) -> "Validator":
-        """A validator by as many of the validation grasps as are enough."""
+        """Return a validator with a sufficient subset of the validation grasps."""
         return cls(validation.select(validation_rows(validation)))
 
     def touch_auc(self, scores: NDArray[np.floating[Any]]) -> float:
-        """Worth of scores (n, n) of every touch with every photo."""
+        """Return the AUC of scores (n, n) of every touch with every photo."""
         return self.set_auc(scores, np.arange(len(self.features))[:, None])
 
     def set_auc(self, scores: NDArray[np.floating[Any]], sets: NDArray[np.int64]) -> float:
-        """Worth of scores (S, n) of sets (S, G) of touches with every photo."""
-        left_out = np.zeros(scores.shape, dtype=np.bool_)
-        np.put_along_axis(left_out, sets, True, axis=1)
+        """Return the AUC of scores (S, n) of sets (S, G) of touches with every photo."""
+        excluded = np.zeros(scores.shape, dtype=np.bool_)
+        np.put_along_axis(excluded, sets, True, axis=1)
         owner = self.features.owner
-        return ranking_auc(scores, owner[sets[:, 0]], owner, left_out)
+        return ranking_auc(scores, owner[sets[:, 0]], owner, excluded)
 
 
-def next_rows_of_object(owner: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """(n, most) for each row itself and the next rows of its object, round."""
-    groups = np.empty((len(owner), most), dtype=np.int64)
+def next_rows_of_object(owner: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return (n, count): each row and the next rows of its object, cyclically."""
+    groups = np.empty((len(owner), count), dtype=np.int64)
     for name in np.unique(owner):
         rows = np.flatnonzero(owner == name)
-        groups[rows] = rows[(np.arange(len(rows))[:, None] + np.arange(most)) % len(rows)]
+        groups[rows] = rows[(np.arange(len(rows))[:, None] + np.arange(count)) % len(rows)]
     return groups
 
 
 MIN_OBJECTS_FOR_FOUR_FOLDS = 12
-"""Objects that four folds need, three in each; fewer make two folds."""
+"""Objects that four folds need, three in each; fewer objects make two folds."""
 
 
 def held_out_folds(
@@ -87,13 +95,17 @@ def held_out_folds(
     linked: Iterable[Sequence[str]] = (),
     seed: int = 0,
 ) -> list[tuple[str, ...]]:
-    """The objects in four folds, or two: of each kind every second object stands in one fold, the others in another.
+    """Return the objects in four folds, or two: of each kind, every second object is in one fold, the rest in another.
 
-    A held-out object, all of whose look-alikes train, is told more easily than one that a user adds tomorrow. So half
-    of the objects of a kind are held out together, while the other half trains.
+    A held-out object is easier to identify than a user's next object if all similar objects are in the training set. So
+    half of the objects of a kind are held out together, while the other half trains.
 
-    kind_of: the kind of each object, where the recording names it; otherwise objects that look alike are of one kind
-    (`appearance_order`). linked: objects that stay together, such as those of one sequence.
+    Args:
+        features: Features of grasps.
+        kind_of: The kind of each object, if the recording names it; otherwise similar objects are of one kind
+            (`appearance_order`).
+        linked: Objects that stay together, such as those of one sequence.
+        seed: Seed of the order within a kind.
     """
     names = sorted(set(features.object_ids))
     if kind_of is not None and all(name in kind_of for name in names):
@@ -111,8 +123,10 @@ def held_out_folds(
 
 
 def appearance_order(features: Features) -> list[str]:
-    """The objects in an order in which neighbours look alike: leaves of average linkage, in optimal order (Bar-Joseph,
-    Gifford and Jaakkola 2001), of the mean photo features of each object, standardised over the objects.
+    """Return the objects in an order in which neighbours look alike.
+
+    The order is that of the leaves of average linkage, optimally ordered (Bar-Joseph, Gifford and Jaakkola 2001), over
+    the mean photo features of each object, standardised over the objects.
     """
     from scipy.cluster.hierarchy import leaves_list, linkage  # slow to import
 
@@ -121,6 +135,6 @@ def appearance_order(features: Features) -> list[str]:
         return names
     means = np.stack([features.photo[owner == place].mean(0, dtype=np.float64) for place in range(len(names))])
     spread = means.std(0)
-    shown = (means - means.mean(0))[:, spread > 0] / spread[spread > 0]
-    shown = shown / np.maximum(np.linalg.norm(shown, axis=1, keepdims=True), 1e-12)
-    return [names[place] for place in leaves_list(linkage(shown, "average", optimal_ordering=True))]
+    scaled = (means - means.mean(0))[:, spread > 0] / spread[spread > 0]
+    scaled = scaled / np.maximum(np.linalg.norm(scaled, axis=1, keepdims=True), 1e-12)
+    return [names[place] for place in leaves_list(linkage(scaled, "average", optimal_ordering=True))]

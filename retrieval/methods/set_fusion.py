@@ -1,6 +1,6 @@
 """Late fusion with a learned pooling of the grasps of one object: one match logit for a set of 1..8 touches.
 
-The paper names it as future work. Adding up logits takes grasps as independent; a pooling can learn what repeats.
+The paper names it as future work. Adding logits assumes independent grasps; a pooling can learn their redundancy.
 """
 
 from collections.abc import Callable
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 MAX_GRASPS, VALIDATION_GRASPS = 8, 5
 MAX_STEPS, VALIDATE_EVERY = 1000, 50
 OBJECTS_PER_BATCH, PHOTOS = 24, 4
-"""Sets in a batch, and photos of its own object and of other objects that each is paired with."""
+"""Sets in a batch; photos of its own object and photos of other objects that each set is paired with."""
 PAIRS_PER_BLOCK = 16_384
 
 
 class SetHead(FusionHead):
-    """The paper's head over a pooled touch half.
+    """The paper's head over a pooled touch partial activation.
 
-    The pooling of halves h_1..h_n is `mean + A (attention - mean) + M (max - mean) + log(n) s`: the same for any
-    order, defined for any n, and for n = 1 the half itself, so a set of one is judged as late fusion judges a touch.
+    The pooling of h_1..h_n is `mean + A (attention - mean) + M (max - mean) + log(n) s`. It does not depend on the
+    order and is defined for any n. For n = 1 it is the identity, so a set of one is scored like a touch in late fusion.
     A, M and s start at 0.
     """
 
@@ -47,7 +47,12 @@ class SetHead(FusionHead):
             nn.init.zeros_(layer.weight)
 
     def pool(self, partials: Tensor, counted: Tensor) -> Tensor:
-        """Pooled halves (S, hidden) of sets (S, G, hidden); held (S, G): which count, at least one of each set."""
+        """Return pooled partial activations (S, hidden) of sets (S, G, hidden).
+
+        Args:
+            partials: Partial activations of the touches.
+            counted: (S, G) mask of the members, at least one per set.
+        """
         outside = ~counted[..., None]
         count = counted.sum(1, keepdim=True)
         mean = partials.masked_fill(outside, 0.0).sum(1) / count
@@ -59,7 +64,7 @@ class SetHead(FusionHead):
 
 
 class SetFusion(Method):
-    """Match logits of sets of grasps; the number of steps by ranking on validation objects, sets of 1 and of 5."""
+    """Match logits of sets of grasps; steps are chosen by ranking on validation objects, with sets of 1 and of 5."""
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         self._touch, self._photo = Standardiser.fit(train.touch), Standardiser.fit(train.photo)
@@ -75,7 +80,7 @@ class SetFusion(Method):
         self.best_params = {"steps": best.step, "validation_auc": best.value}
 
     def _training_loss(self, train: "Features", generator: torch.Generator) -> Callable[[int], Tensor]:
-        """The loss of a fresh batch: each set with as many photos of its own object as of others."""
+        """Return the loss of a fresh batch: each set with as many photos of its own object as of others."""
         touch, photo = self._touch.tensor(train.touch), self._photo.tensor(train.photo)
         draws = ObjectSampler(torch.from_numpy(train.owner), generator)
 
@@ -83,9 +88,9 @@ class SetFusion(Method):
             objects = draws.distinct_objects(OBJECTS_PER_BATCH)
             rows, counted = draws.sets(objects, MAX_GRASPS)
             pooled = self._head.pool(self._head.touch_partial(touch[rows]), counted)
-            shown = torch.cat([objects[:, None].expand(-1, PHOTOS), draws.other_objects(objects, PHOTOS)], 1)
-            logits = self._head(pooled[:, None], self._head.photo_partial(photo[draws.rows(shown)]))
-            return match_loss(logits.flatten(), (shown == objects[:, None]).flatten())
+            photo_objects = torch.cat([objects[:, None].expand(-1, PHOTOS), draws.other_objects(objects, PHOTOS)], 1)
+            logits = self._head(pooled[:, None], self._head.photo_partial(photo[draws.rows(photo_objects)]))
+            return match_loss(logits.flatten(), (photo_objects == objects[:, None]).flatten())
 
         return loss
 
@@ -115,14 +120,14 @@ class SetFusion(Method):
 
     @torch.inference_mode()
     def _score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
-        # In a fixed order: sums in another order round otherwise, and a set has none.
+        # Sorted, because the rounding of sums depends on their order and a set has none.
         ordered = torch.tensor(touch_encodings)[torch.from_numpy(np.sort(sets, axis=1))]
         pooled = self._head.pool(ordered, torch.ones(sets.shape, dtype=torch.bool))
         return self._logits(pooled, torch.tensor(photo_encodings))
 
     @torch.inference_mode()
     def _logits(self, touch: Tensor, photo: Tensor) -> Array:
-        """Match logits (T, N) in blocks: touches by photos by hidden units would not fit into memory."""
+        """Return match logits (T, N) in blocks: touches x photos x hidden units would not fit into memory."""
         logits = np.empty((len(touch), len(photo)), dtype=np.float32)
         rows = max(PAIRS_PER_BLOCK // max(len(photo), 1), 1)
         for start in range(0, len(touch), rows):

@@ -1,4 +1,4 @@
-"""Trivial baselines: what the harness says of scores that know nothing."""
+"""Trivial baselines: scores without information, which show the values of every metric by chance."""
 
 from hashlib import blake2b
 from typing import TYPE_CHECKING
@@ -14,9 +14,9 @@ DIM = 64
 
 
 class Chance(Method):
-    """Cosines of random directions, drawn for each touch and photo by the seed and its own bytes.
+    """Cosines of random directions; each depends only on the seed and on the bytes of the touch or photo.
 
-    So a score depends on nothing else: not on the other items, nor on their order or batch.
+    Scores are thus independent of other items, of their order and of the batch.
     """
 
     def _fit(self, train: "Features", validation: "Features") -> None:

@@ -1,4 +1,4 @@
-"""Guess curves of K-way tests and exact intervals; equals count by their expected place."""
+"""Top-n accuracy of K-way tests, and exact intervals; tied scores count by their expected rank."""
 
 from collections.abc import Sequence
 from math import comb
@@ -11,12 +11,23 @@ from retrieval.errors import BadInput, NumericalError
 
 
 def k_way_accuracy(true_score: float, other_scores: ArrayLike, k: int) -> NDArray[np.float64]:
-    """Chance that the true photo is found within 1..k guesses, when k - 1 of the others are drawn as rivals.
+    """Return the probability that the true photo ranks within the top 1..k, among k - 1 random others.
 
-    Exact over all draws without replacement, so nothing is left to a random seed: of n others, b score higher and e
-    equal; a rival set holds i of the b and j of the e with hypergeometric probability, and among j + 1 equals every
-    place is as likely. Returns (k,) values that end at 1. A constant scorer gives 1/k, 2/k, ..., 1. Raises BadInput
-    for fewer than k - 1 others, NumericalError for a score that is not finite.
+    The value is exact over all draws without replacement, so it does not depend on a seed. Of n others, b score higher
+    and e equal. A draw contains i of the b and j of the e with hypergeometric probability, and among j + 1 equal scores
+    every rank is equally likely. A constant scorer gives 1/k, 2/k, ..., 1.
+
+    Args:
+        true_score: Score of the true photo.
+        other_scores: Scores of the others, at least k - 1.
+        k: Candidates of the test.
+
+    Returns:
+        (k,) values that end at 1.
+
+    Raises:
+        BadInput: There are fewer than k - 1 others.
+        NumericalError: A score is not finite.
     """
     others = np.asarray(other_scores, dtype=np.float64)
     if not (np.isfinite(others).all() and np.isfinite(true_score)):
@@ -26,15 +37,16 @@ def k_way_accuracy(true_score: float, other_scores: ArrayLike, k: int) -> NDArra
 
 
 def k_way_accuracies(higher: NDArray[np.int64], equal: NDArray[np.int64], others: int, k: int) -> NDArray[np.float64]:
-    """`k_way_accuracy` (Q, k) of many queries: of `others` rivals, so many (Q,) score higher and so many the same."""
+    """Return `k_way_accuracy` (Q, k) of many queries, from the counts (Q,) of others that score higher and equal."""
     if k < 1 or others < k - 1:
-        raise BadInput(f"a {k}-way test needs k >= 1 and {k - 1} rivals; got {others}")
+        raise BadInput(f"a {k}-way test needs k >= 1 and {k - 1} other candidates; got {others}")
     cases, place = np.unique(np.stack([higher, equal], axis=1), axis=0, return_inverse=True)
     curves = [_curve(int(above), int(tied), others, k) for above, tied in cases]
     return np.array(curves)[place]
 
 
 def _curve(higher: int, equal: int, others: int, k: int) -> NDArray[np.float64]:
+    """Return the top-n accuracies (k,) of one query."""
     curve = np.zeros(k)
     for above in range(min(higher, k - 1) + 1):
         for tied in range(min(equal, k - 1 - above) + 1):
@@ -45,34 +57,34 @@ def _curve(higher: int, equal: int, others: int, k: int) -> NDArray[np.float64]:
     return curve
 
 
-def grouped_interval(right: Sequence[Sequence[bool]]) -> tuple[float, float]:
-    """95 % interval of the share of right answers, given group by group (as object by object).
+def grouped_interval(correct: Sequence[Sequence[bool]]) -> tuple[float, float]:
+    """Return the 95 % interval of the fraction of correct answers, given group by group (such as by object).
 
-    Answers of one group are alike, so it is the exact binomial interval for as many answers as would be worth these
-    if they were independent (Korn and Graubard 1998): their number over the design effect, the variance between
-    groups over that of independent answers. Where all answers are right, or all wrong, groups show no difference,
-    and every answer counts. Few groups cannot show how much groups differ: of 1,500 samples with 20 answers a group and
-    shares drawn as Beta(2.8, 1.2) it held the truth in 79 % with 2 groups, in 86, 89, 92, 92, 92 and 93 % with 3 to 8,
-    and in 94 % with 9 and 10. Raises BadInput for no answers.
+    Answers of one group are correlated, so this is the exact binomial interval for the equivalent number of independent
+    answers (Korn and Graubard 1998): their number over the design effect, which is the variance between groups over
+    that of independent answers. If all answers are correct, or all wrong, groups show no difference, and every answer
+    counts. A few groups do not show how much groups differ: over 1,500 samples with 20 answers a group and proportions
+    drawn as Beta(2.8, 1.2), coverage was 79 % with 2 groups, 86, 89, 92, 92, 92 and 93 % with 3 to 8, and 94 % with 9
+    and 10. Raises BadInput without answers.
     """
-    total, correct = sum(map(len, right)), sum(map(sum, right))
-    if not 0 < correct < total or len(right) < 2:
-        return binomial_interval(correct, total)
-    share = correct / total
-    squares = sum((sum(part) - share * len(part)) ** 2 for part in right) * len(right) / (len(right) - 1)
-    worth = total / max(1.0, squares / (total * share * (1 - share)))
-    return clopper_pearson(share * worth, worth, 0.95)
+    total, successes = sum(map(len, correct)), sum(map(sum, correct))
+    if not 0 < successes < total or len(correct) < 2:
+        return binomial_interval(successes, total)
+    fraction = successes / total
+    squares = sum((sum(part) - fraction * len(part)) ** 2 for part in correct) * len(correct) / (len(correct) - 1)
+    effective = total / max(1.0, squares / (total * fraction * (1 - fraction)))
+    return clopper_pearson(fraction * effective, effective, 0.95)
 
 
 def binomial_interval(successes: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Exact interval of a share (Clopper and Pearson 1934): never too narrow for independent trials."""
+    """Return the exact interval of a proportion (Clopper and Pearson 1934): conservative for independent trials."""
     if not 0 <= successes <= trials or trials < 1:
         raise BadInput(f"successes must lie within 0..trials, and trials be at least 1; got {successes} of {trials}")
     return clopper_pearson(successes, trials, level)
 
 
 def clopper_pearson(successes: float, trials: float, level: float) -> tuple[float, float]:
-    """The interval of `binomial_interval`, for numbers that need not be whole."""
+    """Return the interval of `binomial_interval` for numbers that need not be whole."""
     tail = (1 - level) / 2
     low = betaincinv(successes, trials - successes + 1, tail) if successes else 0.0
     high = betaincinv(successes + 1, trials - successes, 1 - tail) if successes < trials else 1.0

@@ -1,4 +1,4 @@
-"""What a measure says of every query, its means by object, and how often one score beats another."""
+"""Values of a measure by query, their means by object, and how often one score exceeds another."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,11 +12,13 @@ from retrieval.errors import BadInput, NumericalError
 
 @dataclass(frozen=True, eq=False)
 class Measure:
-    """Values of one protocol, query by query; shares, so that they lie between 0 and 1 on average.
+    """Values of one protocol by query: fractions, which lie between 0 and 1 on average.
 
-    values (Q, m): m = 1, or K for a guess curve; owner (Q,): object of the query, which is what intervals resample;
-    chance (m,): what a constant scorer gets, in closed form, averaged as the values are (objects alike);
-    gallery: what was searched, in plain words.
+    Attributes:
+        values: (Q, m); m is 1, or K for a top-n curve.
+        owner: (Q,) object of each query: the unit that intervals resample.
+        chance: (m,) values of a constant scorer, in closed form, averaged like the values (each object with weight 1).
+        gallery: Description of the searched items.
     """
 
     values: NDArray[np.float64]
@@ -25,28 +27,34 @@ class Measure:
     gallery: str
 
     def __post_init__(self) -> None:
-        wanted = (len(self.owner), len(self.chance))
-        if self.values.shape != wanted or 0 in wanted:
+        shape = (len(self.owner), len(self.chance))
+        if self.values.shape != shape or 0 in shape:
             raise BadInput(
-                f"a measure must have values of shape {wanted}, and a query at least; got {self.values.shape}"
+                f"a measure must have values of shape {shape}, and at least one query; got {self.values.shape}"
             )
         if not np.isfinite(self.values).all():
             raise NumericalError("every value of a measure must be finite; one is not")
 
     def by_object(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Numbers of the objects (R,), ascending, and the mean value of the queries of each (R, m)."""
+        """Return the objects (R,), ascending, and the mean value (R, m) of the queries of each."""
         return object_means(self.values, self.owner)
 
 
 def pooled(parts: Sequence[Measure], units: Sequence[Mapping[int, int]] | None = None) -> Measure:
-    """One measure of queries that were asked in several galleries, such as those of folds.
+    """Return one measure of queries against several galleries, such as those of folds.
 
-    units: for each part, what stands for an object's number in the whole: the object, or a group of objects that only
-    together say how much others differ; None: numbers stand for themselves. Values keep their order within a unit;
-    chance is averaged as they are. Raises BadInput for no parts.
+    Values keep their order within a unit. Chance is averaged like the values.
+
+    Args:
+        parts: The measures.
+        units: For each part, the unit that replaces an object's number: the object, or a group of objects that are
+            correlated. None keeps the numbers.
+
+    Raises:
+        BadInput: There are no parts.
     """
     if not parts:
-        raise BadInput("measures are pooled of one gallery at least; got none")
+        raise BadInput("pooling needs at least one measure; got none")
     owners = [part.owner for part in parts]
     if units is not None:
         owners = [np.array([unit[name] for name in own.tolist()]) for own, unit in zip(owners, units, strict=True)]
@@ -64,7 +72,7 @@ def pooled(parts: Sequence[Measure], units: Sequence[Mapping[int, int]] | None =
 def object_means(
     values: NDArray[np.float64], owner: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Numbers of the objects (R,), ascending, and the mean of the rows of `values` (Q, m) that each owns, (R, m)."""
+    """Return the objects (R,), ascending, and the mean (R, m) of the rows of `values` (Q, m) of each."""
     objects, place = np.unique(owner, return_inverse=True)
     means = np.zeros((len(objects), values.shape[1]))
     np.add.at(means, place, values)
@@ -72,7 +80,7 @@ def object_means(
 
 
 def object_weights(owner: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(Q,) weights that sum to 1 and make every object count alike, however many queries it has."""
+    """Return weights (Q,) that sum to 1 and give every object the same total, however many queries it has."""
     _, place, counts = np.unique(owner, return_inverse=True, return_counts=True)
     return np.asarray(1 / (counts[place] * len(counts)))
 
@@ -80,12 +88,15 @@ def object_weights(owner: NDArray[np.int64]) -> NDArray[np.float64]:
 def weight_below(
     values: NDArray[np.floating[Any]], others: NDArray[np.floating[Any]], weights: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """(V,) weight of the `others` that each of `values` is above; of equals half (Mann and Whitney).
+    """Return the weight (V,) of the `others` below each of `values`; equal ones count half (Mann and Whitney).
 
-    weights: 1 for each where None.
+    With weights that sum to 1, or divided by the number of others, the mean over values is the AUC. Scores must be
+    finite: a NaN exceeds nothing.
 
-    With weights that sum to 1, or divided by the number of others, the mean over values is the area. Scores must be
-    finite: a NaN is above nothing.
+    Args:
+        values: (V,) scores.
+        others: (O,) scores.
+        weights: (O,) weights of the others; 1 each if None.
     """
     order = np.argsort(others)
     below = np.append(0.0, np.cumsum(np.ones(len(others)) if weights is None else weights[order]))

@@ -1,6 +1,6 @@
-"""From match logits to probabilities, and how well pairs are told apart, on objects held out for the purpose.
+"""Probabilities from match logits, and the accuracy of match decisions on pairs, on held-out objects.
 
-Ranking uses logits and never what stands here; probabilities are for people to read.
+Ranking uses logits and never these probabilities, which are for people to read.
 """
 
 import dataclasses
@@ -22,9 +22,16 @@ _LARGEST = float(np.finfo(np.float32).max)
 class Calibration:
     """`log_odds = slope * logit + intercept`, fitted on validation pairs at even odds.
 
-    reject_log_odds: below it the pair is better called "no match" (largest balanced accuracy on those pairs).
-    positives, negatives: how many pairs it was fitted on. nll_*, ece_*: mean negative log-likelihood in nats and
-    expected calibration error (15 equal bins) on the same pairs, before and after.
+    Attributes:
+        slope: Factor of the logit.
+        intercept: Offset.
+        reject_log_odds: Threshold of "no match": largest balanced accuracy on those pairs.
+        positives: Pairs of one object in the fit.
+        negatives: Pairs of two objects in the fit.
+        nll_before: Mean negative log-likelihood in nats on the same pairs, before the fit.
+        nll_after: The same after the fit.
+        ece_before: Expected calibration error (15 equal bins) on the same pairs, before the fit.
+        ece_after: The same after the fit.
     """
 
     slope: float
@@ -38,8 +45,10 @@ class Calibration:
     ece_after: float
 
     def log_odds(self, logit: ArrayLike) -> NDArray[np.float64]:
-        """Calibrated log-odds of match logits. Raises NumericalError for one that is not finite: it is above no
-        threshold, and would count as "no match".
+        """Return the calibrated log-odds of match logits.
+
+        Raises:
+            NumericalError: A logit is not finite. It would exceed no threshold, and count as "no match".
         """
         z = np.asarray(logit, dtype=np.float64)
         if not np.isfinite(z).all():
@@ -47,11 +56,11 @@ class Calibration:
         return self.slope * z + self.intercept
 
     def probability(self, logit: ArrayLike) -> NDArray[np.float64]:
-        """Probability of a match at even odds, for people; never rank by it."""
+        """Return the probability of a match at even odds, for people; never rank by it."""
         return _expit(self.log_odds(logit))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary, as in `results.json`."""
+        """Return a plain dictionary, as in `results.json`."""
         return dataclasses.asdict(self)
 
 
@@ -62,16 +71,23 @@ class Threshold:
     at: float
 
     def log_odds(self, score: ArrayLike) -> NDArray[np.float64]:
-        """How far scores lie above the threshold."""
+        """Return how far scores lie above the threshold."""
         return np.asarray(score, dtype=np.float64) - self.at
 
 
 def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
     """Fit slope and intercept by maximum likelihood with Platt's smoothed targets (Platt 1999, section 2.2).
 
-    logits (P,), labels (P,) of 0 and 1. Smoothing gives separable data a finite optimum, and the slope is kept within
-    `SLOPE_BOUNDS`: at the lower one where logits say nothing, or the opposite. Raises BadInput unless both classes
-    are there, NumericalError for a logit that is not a finite float32.
+    Smoothing gives separable data a finite optimum. The slope is kept within `SLOPE_BOUNDS`; it is at the lower bound
+    if the logits carry no information, or wrong information.
+
+    Args:
+        logits: (P,) match logits.
+        labels: (P,) of 0 and 1.
+
+    Raises:
+        BadInput: A class is missing.
+        NumericalError: A logit is not a finite float32.
     """
     z, y = _checked(logits, labels)
     slope, intercept = _likeliest(z, y)
@@ -90,17 +106,17 @@ def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
 
 
 def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Slope within its bounds, and intercept, of the smallest loss; two root searches, one inside the other.
+    """Return slope, within its bounds, and intercept of the smallest loss, by two nested root searches.
 
-    The loss is convex in both, so its derivative by the intercept grows with the intercept, and at the best intercept
-    its derivative by the slope grows with the slope. Bracketed roots are found at any scale and offset of the logits;
-    a quasi-Newton search of both at once stops early at logits of 1000 +- 1.
+    The loss is convex in both. Its derivative by the intercept grows with the intercept, and at the best intercept its
+    derivative by the slope grows with the slope. Bracketed roots are found at any scale and offset of the logits; a
+    quasi-Newton search over both stops early at logits of 1000 +- 1.
     """
-    from scipy.optimize import brentq  # slow to import, and no query needs it
+    from scipy.optimize import brentq  # slow to import; queries do not need it
 
     positives, negatives = y.sum(), (1 - y).sum()
     targets = np.where(y == 1, (positives + 1) / (positives + 2), 1 / (negatives + 2))
-    # Both classes weigh the same, whatever their counts: the odds are even by definition.
+    # Both classes have the same weight, whatever their counts: the odds are even by definition.
     weights = np.where(y == 1, 0.5 / positives, 0.5 / negatives)
     centre = float(np.median(z))
     z = z - centre
@@ -109,7 +125,7 @@ def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, f
         return np.asarray(weights * (_expit(slope * z + intercept) - targets))
 
     def best_intercept(slope: float) -> float:
-        reach = slope * float(np.abs(z).max()) + 50  # there every probability is 0 (or 1) and the targets are not
+        reach = slope * float(np.abs(z).max()) + 50  # where every probability is 0 (or 1) and the targets are not
         return float(brentq(lambda intercept: slack(slope, intercept).sum(), -reach, reach, maxiter=1000))
 
     def derivative(log_slope: float) -> float:
@@ -125,16 +141,16 @@ def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, f
 
 
 def pair_accuracy(logits: ArrayLike, labels: ArrayLike) -> float:
-    """Share of pairs on the right side of logit 0; a logit of exactly 0 is half right, as a coin would be."""
+    """Return the fraction of pairs on the correct side of logit 0; a logit of exactly 0 counts half."""
     z, y = _checked(logits, labels)
-    right = np.where(z == 0, 0.5, (z > 0) == (y == 1))
-    return float(right.mean())
+    correct = np.where(z == 0, 0.5, (z > 0) == (y == 1))
+    return float(correct.mean())
 
 
 def pair_auc(logits: ArrayLike, labels: ArrayLike) -> float:
-    """Chance that a random true pair has a higher logit than a random false one; equals count half.
+    """Return the probability that a random true pair has a higher logit than a random false one; ties count half.
 
-    It needs no threshold; a constant scorer has exactly 0.5.
+    No threshold is needed. A constant scorer has exactly 0.5.
     """
     z, y = _checked(logits, labels)
     true, false = z[y == 1], z[y == 0]
@@ -142,22 +158,27 @@ def pair_auc(logits: ArrayLike, labels: ArrayLike) -> float:
 
 
 def reliability_bins(probability: ArrayLike, outcomes: ArrayLike) -> dict[str, Any]:
-    """{"ece", "bins": [{"probability", "share", "count"}]}: means over 15 equal bins, empty ones left out.
+    """Return the expected calibration error and the means over 15 equal bins, empty ones left out.
 
-    probability, came_true (P,): 1 or 0, or a share where equals were settled by a draw. Expected calibration error:
-    the mean over all of |probability - share| of its bin.
+    Args:
+        probability: (P,) predicted probabilities.
+        outcomes: (P,) 1 or 0, or a fraction where ties were broken at random.
+
+    Returns:
+        {"ece", "bins": [{"probability", "frequency", "count"}]}. The expected calibration error is the mean of
+        |probability - frequency| of the bin over all predictions.
     """
     p, y = np.asarray(probability, dtype=np.float64), np.asarray(outcomes, dtype=np.float64)
     if p.shape != y.shape or p.ndim != 1 or not len(p) or not ((p >= 0) & (p <= 1)).all():
-        raise BadInput(f"probabilities between 0 and 1 and as many outcomes are needed; got {p.shape} and {y.shape}")
+        raise BadInput(f"give probabilities between 0 and 1 and as many outcomes; got {p.shape} and {y.shape}")
     which = np.minimum((p * BINS).astype(int), BINS - 1)
     used, place, counts = np.unique(which, return_inverse=True, return_counts=True)
-    mean_probability, share = (np.bincount(place, weights=values) / counts for values in (p, y))
+    mean_probability, frequency = (np.bincount(place, weights=values) / counts for values in (p, y))
     bins = [
-        {"probability": float(mean_probability[row]), "frequency": float(share[row]), "count": int(counts[row])}
+        {"probability": float(mean_probability[row]), "frequency": float(frequency[row]), "count": int(counts[row])}
         for row in range(len(used))
     ]
-    return {"ece": float((np.abs(mean_probability - share) * counts).sum() / len(p)), "bins": bins}
+    return {"ece": float((np.abs(mean_probability - frequency) * counts).sum() / len(p)), "bins": bins}
 
 
 def _checked(logits: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -174,11 +195,11 @@ def _checked(logits: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64],
 
 
 def _best_threshold(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """The smallest value to accept for the largest balanced accuracy: midway down to the next one, if there is one."""
+    """Return the lowest accepted value of the largest balanced accuracy: midway to the next lower value, if any."""
     values, place = np.unique(x, return_inverse=True)
     true_below = np.cumsum(np.bincount(place, weights=y)) / y.sum()
     false_below = np.cumsum(np.bincount(place, weights=1 - y)) / (1 - y).sum()
-    # Accepting from values[i] on gains what lies below it; from values[0] on is to accept everything, which gains 0.
+    # Accepting from values[i] on gains the pairs below it. Accepting from values[0] on accepts everything and gains 0.
     best = int(np.argmax(np.append(0.0, (false_below - true_below)[:-1])))
     middle = (values[best] + values[max(best - 1, 0)]) / 2
     return float(middle if best == 0 or middle > values[best - 1] else values[best])
@@ -189,6 +210,6 @@ def _nll(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
 
 
 def _expit(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """1 / (1 + exp(-x)) without overflow; scipy.special has it too, at a fifth of a second a query for its import."""
+    """Return 1 / (1 + exp(-x)) without overflow; importing scipy.special for it would cost a query 0.2 s."""
     small = np.exp(-np.abs(x))
     return np.asarray(np.where(x >= 0, 1, small) / (1 + small))

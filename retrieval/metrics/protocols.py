@@ -1,8 +1,8 @@
-"""Protocols: from a table of scores to the values of every query, each with its gallery and its chance.
+"""Protocols: from a table of scores to the values of every query, with gallery and chance.
 
-The gallery of a row never holds photos of its own grasps, except in the two protocols of others that define it so
-(`with_own`, `paired`): object, light and pose stand there as in no other. A row that has nothing else to find is
-not asked, and the gallery's words count such rows. Objects count alike: each is a rival as often as any other.
+The gallery of a row excludes the photos of its own grasps, which have object, light and pose in common with it. The
+protocols `with_own` and `paired` of other benchmarks include them. A row without any other photo of its object is no
+query; the description of the gallery counts such rows. Objects have equal weight: each is as often a rival.
 """
 
 import numpy as np
@@ -19,10 +19,13 @@ from retrieval.metrics.table import ScoreTable, object_scores
 def pair_accuracy(table: ScoreTable, rule: Calibration | Threshold) -> Measure:
     """The paper's test, half true and half false pairs, in closed form over ALL pairs.
 
-    A row is right on a photo of its object where the calibrated log-odds are above 0, on another object's where they
-    are below; exactly 0 is half right, as a coin would be. Value: half the share over its object's photos and half
-    that over other photos (the object uniform, then its photo). rule: a calibration of rows like these, fitted on
-    validation objects, or a threshold that comes with the scores. Chance is 1/2.
+    A row is correct on a photo of its object if the calibrated log-odds are above 0, and on another object's photo if
+    they are below; exactly 0 counts half. The value is the mean of two fractions: over its object's photos, and over
+    other photos (a uniform object, then a uniform photo of it). Chance is 1/2.
+
+    Args:
+        table: The scores.
+        rule: A calibration that was fitted on such rows of validation objects, or a threshold of the scores.
     """
     queries = table.with_targets
     odds = rule.log_odds(queries.scores)
@@ -31,9 +34,9 @@ def pair_accuracy(table: ScoreTable, rule: Calibration | Threshold) -> Measure:
 
 
 def pair_auc(table: ScoreTable) -> Measure:
-    """Chance that a photo of the row's object scores higher than another object's; equals count half.
+    """Probability that a photo of the row's object scores higher than another object's; ties count half.
 
-    The other object is drawn uniformly, then its photo. Needs no threshold and no calibration. Chance is 1/2.
+    The other object is drawn uniformly, then its photo. Neither threshold nor calibration is needed. Chance is 1/2.
     """
     queries = table.with_targets
     weights = _rival_weights(queries)
@@ -45,27 +48,27 @@ def pair_auc(table: ScoreTable) -> Measure:
 def _own_and_other_means(
     table: ScoreTable, values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Means (T,) of values (T, N) over a row's own object and over the others, its own photos left out."""
+    """Return means (T,) of values (T, N) over a row's own object and over the others, without its own photos."""
     mine = table.relevant & ~table.own
     return (values * mine).sum(1) / mine.sum(1), (values * _rival_weights(table)).sum(1)
 
 
 def _rival_weights(table: ScoreTable) -> NDArray[np.float64]:
-    """(T, N) weights that sum to 1 over a row's other objects: each object alike, then each of its photos."""
+    """Return weights (T, N) that sum to 1 over a row's other objects: equal for objects, then for their photos."""
     columns = object_weights(table.photo_owner)
     weights = np.where(table.relevant, 0, columns)
     total = weights.sum(1, keepdims=True)
     if not total.all():
-        raise BadInput(f"a test needs {table.column_words} of two objects at least; a row is shown its own alone")
+        raise BadInput(f"a test needs {table.column_words} of at least two objects; a row has only its own")
     return np.asarray(weights / total)
 
 
 def k_way(table: ScoreTable, k: int, *, photos: int = 1, draws: int = 16, seed: int = 0) -> Measure:
-    """Guess curve (m = k): the object found within 1..k guesses among k candidates, itself and k - 1 others.
+    """Top-n accuracy (m = k) for n in 1..k among k candidates: the row's object and k - 1 others.
 
-    Every candidate is shown by `photos` photos (`object_scores`) and scored by their mean. Photos are drawn `draws`
-    times for every row; over the rivals the mean is exact (`k_way_accuracy`). Chance is 1/k, 2/k, ..., 1. Raises
-    BadInput for fewer than k objects.
+    Every candidate is represented by `photos` photos (`object_scores`) and scored by their mean. Photos are drawn
+    `draws` times for every row; over the other candidates the mean is exact (`k_way_accuracy`). Chance is 1/k, 2/k,
+    ..., 1. Raises BadInput for fewer than k objects.
     """
     queries = table.with_targets
     scores = object_scores(queries, photos, draws, seed)
@@ -73,14 +76,14 @@ def k_way(table: ScoreTable, k: int, *, photos: int = 1, draws: int = 16, seed: 
     higher, equal = (scores > true).sum(2).ravel(), (scores == true).sum(2).ravel() - 1
     curves = k_way_accuracies(higher, equal, len(queries.objects) - 1, k).reshape(draws, -1, k).mean(0)
     shown = "a photo" if photos == 1 else f"{photos} photos (fewer where it has no more)"
-    words = f"{k} of these objects, each shown by {shown}: {table.gallery}"
+    words = f"{k} of these objects, each with {shown}: {table.gallery}"
     return Measure(curves, queries.touch_owner, np.arange(1, k + 1) / k, words)
 
 
 def recall(table: ScoreTable, k: int) -> Measure:
-    """Whether any photo of the object stands among the first k of the whole gallery, own photos left out.
+    """Whether any photo of the object is among the first k of the whole gallery, without own photos.
 
-    Photos ask for touches with `table.transposed()`.
+    For photos as queries and touches as gallery, use `table.transposed()`.
     """
     queries = table.with_targets
     return _measure(
@@ -89,17 +92,17 @@ def recall(table: ScoreTable, k: int) -> Measure:
 
 
 def reciprocal_rank(table: ScoreTable) -> Measure:
-    """1 / rank of the first photo of the object in the whole gallery, own photos left out."""
+    """1 / rank of the first photo of the object in the whole gallery, without own photos."""
     queries = table.with_targets
     chance = ranking.chance_of_reciprocal_rank(queries.relevant, ~queries.own)
     return _measure(table, ranking.reciprocal_rank(queries.first), chance)
 
 
 def average_precision(table: ScoreTable) -> Measure:
-    """Average precision over the whole gallery, own photos left out.
+    """Average precision over the whole gallery, without own photos.
 
-    The cross-sensory retrieval of the ObjectFolder benchmark is that of `table.with_own()`: its gallery holds every
-    instance of the other modality, that of the query's own grasp included.
+    With `table.with_own()` this is the cross-sensory retrieval of the ObjectFolder benchmark, whose gallery contains
+    every instance of the other modality, that of the query's own grasp included.
     """
     queries = table.with_targets
     values = ranking.average_precision(queries.scores, queries.relevant, ~queries.own)
@@ -107,10 +110,10 @@ def average_precision(table: ScoreTable) -> Measure:
 
 
 def paired(table: ScoreTable, k: int) -> Measure:
-    """Top k of the whole set as one batch, both directions averaged, as TVL measures.
+    """Top-k accuracy of the whole set as one batch, averaged over both directions, as TVL measures.
 
-    What must be found is the photo (the touch) of the very same grasp; other photos of the object are wrong answers.
-    Raises BadInput unless rows and columns are the same grasps.
+    Only the photo (or touch) of the same grasp is correct; other photos of the object are wrong. Raises BadInput unless
+    rows and columns are the same grasps.
     """
     if not is_paired(table):
         raise BadInput("a paired batch needs one photo for each touch; give a table of single grasps and their photos")
@@ -118,49 +121,47 @@ def paired(table: ScoreTable, k: int) -> Measure:
     there = ranking.first_relevant(table.scores, table.own, every)
     back = ranking.first_relevant(table.scores.T, table.own.T, every)
     values = (ranking.recall_at(k, there) + ranking.recall_at(k, back)[table.own.argmax(1)]) / 2
-    words = (
-        f"{count} grasps in one batch, {len(table.objects)} {table.object_words}; that of the same grasp is asked for"
-    )
+    words = f"{count} grasps in one batch, {len(table.objects)} {table.object_words}; only the same grasp is correct"
     return Measure(values[:, None], table.touch_owner, np.array([min(1.0, k / count)]), words)
 
 
 def is_paired(table: ScoreTable) -> bool:
-    """Whether rows and columns are the same grasps, each once: photos that grasps share have no one touch."""
+    """Whether rows and columns are the same grasps, each once. Photos that several grasps share are not paired."""
     square = table.own.shape[0] == table.own.shape[1]
     return square and bool((table.own.sum(1) == 1).all() and (table.own.sum(0) == 1).all())
 
 
 def _measure(table: ScoreTable, values: NDArray[np.float64], chance: NDArray[np.float64] | float) -> Measure:
-    """One value for each row that is asked; the chance of queries is averaged as their values are."""
+    """Return one value for each query; chance is averaged like the values."""
     owner = table.with_targets.touch_owner
     level = np.sum(object_weights(owner) * chance)
     return Measure(values[:, None], owner, np.array([level]), table.gallery)
 
 
 def per_object(measure: Measure, column: int = 0) -> dict[int, float]:
-    """Mean value of each object's queries, by its number; of a guess curve, column 0 is the first guess."""
+    """Return the mean value of the queries of each object; of a top-n curve, column 0 is the top-1 accuracy."""
     objects, means = measure.by_object()
     return dict(zip(objects.tolist(), means[:, column].tolist(), strict=True))
 
 
 def confusions(table: ScoreTable, *, photos: int = 1, draws: int = 16, seed: int = 0) -> list[tuple[int, int, float]]:
-    """Who took an object's first place: (object, mistaken for, share of its first guesses), largest share first.
+    """Return the objects that rank first: (object, confused with, fraction of its queries), largest fraction first.
 
-    All objects of the gallery are candidates, each shown by `photos` photos drawn `draws` times; equals share the
-    place. Right guesses are not listed, so an object's shares add up to 1 less its share of right ones.
+    All objects of the gallery are candidates, each represented by `photos` photos that are drawn `draws` times. Tied
+    objects divide the rank. Correct results are not listed, so an object's fractions add up to 1 minus its accuracy.
     """
     queries = table.with_targets
     scores = object_scores(queries, photos, draws, seed)
     first = scores == scores.max(2, keepdims=True)
-    shares = (first / first.sum(2, keepdims=True)).mean(0)
-    objects, means = object_means(shares, queries.touch_owner)
+    fractions = (first / first.sum(2, keepdims=True)).mean(0)
+    objects, means = object_means(fractions, queries.touch_owner)
     names = queries.objects
     found = [(int(objects[row]), int(names[column]), float(means[row, column])) for row, column in np.argwhere(means)]
     return sorted((item for item in found if item[0] != item[1]), key=lambda item: (-item[2], *item[:2]))
 
 
 def true_ranks(table: ScoreTable) -> NDArray[np.float64]:
-    """(T,) expected rank, from 1, of the first photo of a row's object, own photos left out; NaN where it has none."""
+    """Return the expected rank (T,), from 1, of the first photo of a row's object without own photos; NaN if none."""
     ranks = np.full(len(table.has_target), np.nan)
     ranks[table.has_target] = ranking.first_rank(table.with_targets.first)
     return ranks

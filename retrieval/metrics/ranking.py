@@ -1,7 +1,7 @@
-"""Measures of a ranking by their expected value where scores tie, and what chance gives them, in closed form.
+"""Measures of a ranking by their expected value under ties, and their values by chance, in closed form.
 
-A row ranks the items that it is shown; some are relevant. Recall at k is "any relevant item among the first k".
-Among equal scores every order is as likely, so a constant scorer has exactly the value of chance.
+A row ranks the items that it is shown; some are relevant. Recall at k is "any relevant item among the first k". All
+orders of equal scores are equally likely, so a constant scorer has exactly the value of chance.
 """
 
 from typing import NamedTuple
@@ -16,8 +16,12 @@ Mask = NDArray[np.bool_]
 
 
 class FirstRelevant(NamedTuple):
-    """Where the first relevant item of each row (Q,) stands: `before` items score higher, and among the `tied` that
-    score the same (itself included) `right` are relevant. What scores higher is then never relevant.
+    """Position of the first relevant item of each row (Q,).
+
+    Attributes:
+        before: Items that score higher; none of them is relevant.
+        tied: Items with the same score, itself included.
+        right: Relevant ones among these.
     """
 
     before: NDArray[np.int64]
@@ -26,10 +30,16 @@ class FirstRelevant(NamedTuple):
 
 
 def first_relevant(scores: Scores, relevant: Mask, shown: Mask) -> FirstRelevant:
-    """Where the best relevant entry of each query stands.
+    """Return the position of the best relevant item of each query.
 
-    scores, relevant, shown: all (Q, N). Raises BadInput where a row is shown nothing relevant, NumericalError for a
-    score that is not finite.
+    Args:
+        scores: (Q, N).
+        relevant: (Q, N).
+        shown: (Q, N) the items that the row ranks.
+
+    Raises:
+        BadInput: A row is shown nothing relevant.
+        NumericalError: A score is not finite.
     """
     good = _checked(relevant, shown)
     _require_finite(scores)
@@ -39,37 +49,37 @@ def first_relevant(scores: Scores, relevant: Mask, shown: Mask) -> FirstRelevant
 
 
 def _require_finite(scores: Scores) -> None:
-    """A NaN is neither above nor equal to anything: measures would count it away without a word."""
+    """Raise NumericalError for a NaN or infinite score: a NaN compares false with everything and would go unnoticed."""
     bad = np.flatnonzero(~np.isfinite(scores).all(axis=1))
     if len(bad):
-        raise NumericalError(f"every score must be finite to be ranked; row {bad[0]} holds a NaN or infinite one")
+        raise NumericalError(f"every score must be finite for ranking; row {bad[0]} contains a NaN or infinite one")
 
 
 def _checked(relevant: Mask, shown: Mask) -> Mask:
     good = relevant & shown
     empty = np.flatnonzero(~good.any(1))
     if len(empty):
-        raise BadInput(f"every query must be shown something relevant; row {empty[0]} is not: leave it out, and say so")
+        raise BadInput(f"every query must be shown a relevant item; row {empty[0]} is not: leave it out, and report it")
     return good
 
 
 def recall_at(k: int, first: FirstRelevant) -> NDArray[np.float64]:
-    """(Q,) chance that a relevant item stands among the first k.
+    """Return the probability (Q,) that a relevant item is among the first k.
 
-    Hypergeometric: of m tied items, r of them relevant, the first j hold none with probability
+    Hypergeometric: of m tied items, r of them relevant, the first j contain none with probability
     prod_{i<j} (m - r - i) / (m - i).
     """
     none = np.ones(len(first.before))
     for turn in range(k):
-        # The first `before` places are taken by what scores higher; past the tied ones a relevant item was found.
+        # Higher scores take the first `before` places; after the tied items a relevant one was certainly found.
         left = first.tied - turn
-        share = np.clip((left - first.right) / np.maximum(left, 1), 0, 1)
-        none *= np.where(turn < k - first.before, share, 1)
+        fraction = np.clip((left - first.right) / np.maximum(left, 1), 0, 1)
+        none *= np.where(turn < k - first.before, fraction, 1)
     return 1 - none
 
 
 def reciprocal_rank(first: FirstRelevant) -> NDArray[np.float64]:
-    """(Q,) expected 1 / rank of the first relevant item, over all orders of equals."""
+    """Return the expected 1 / rank (Q,) of the first relevant item, over all orders of ties."""
     expected = 1 / (first.before + 1.0)
     rows = np.flatnonzero(first.tied > first.right)
     cases, place = np.unique(np.transpose(first)[rows], axis=0, return_inverse=True)
@@ -79,7 +89,7 @@ def reciprocal_rank(first: FirstRelevant) -> NDArray[np.float64]:
 
 
 def _expected_reciprocal(before: int, tied: int, right: int) -> float:
-    """Sum over j of P(j irrelevant come first) / (before + 1 + j)."""
+    """Return the sum over j of P(j irrelevant come first) / (before + 1 + j)."""
     j = np.arange(tied - right + 1)
     # P(0) = r / m, and P(j + 1) = P(j) (m - r - j) / (m - 1 - j).
     steps = (tied - right - j[:-1]) / (tied - 1.0 - j[:-1])
@@ -88,28 +98,36 @@ def _expected_reciprocal(before: int, tied: int, right: int) -> float:
 
 
 def first_rank(first: FirstRelevant) -> NDArray[np.float64]:
-    """(Q,) expected rank, from 1, of the first relevant item."""
+    """Return the expected rank (Q,), from 1, of the first relevant item."""
     return np.asarray(first.before + 1 + (first.tied - first.right) / (first.right + 1))
 
 
 def average_precision(scores: Scores, relevant: Mask, shown: Mask) -> NDArray[np.float64]:
-    """(Q,) expected average precision over the FULL ranking (McSherry and Najork 2008, section 2.5).
+    """Return the expected average precision (Q,) over the FULL ranking (McSherry and Najork 2008, section 2.5).
 
-    scores, relevant, shown: all (Q, N). Cut at some rank, average precision is another measure and does not compare.
-    Raises as `first_relevant` does.
+    Average precision at a cutoff is a different measure; the two do not compare.
+
+    Args:
+        scores: (Q, N).
+        relevant: (Q, N).
+        shown: (Q, N) the items that the row ranks.
+
+    Raises:
+        BadInput: A row is shown nothing relevant.
+        NumericalError: A score is not finite.
     """
     good = _checked(relevant, shown)
     _require_finite(scores)
     harmonic = np.append(0.0, np.cumsum(1 / np.arange(1.0, scores.shape[1] + 1)))
     rows = zip(scores, good, shown, strict=True)
-    return np.array([_precision_of_row(row[seen], row[mine], harmonic) for row, mine, seen in rows])
+    return np.array([_precision_of_row(row[visible], row[mine], harmonic) for row, mine, visible in rows])
 
 
 def _precision_of_row(every: Scores, relevant: Scores, harmonic: NDArray[np.float64]) -> float:
-    """Group by group of equal scores: n tied items, r of them relevant, behind a others, b of them relevant.
+    """Average precision by groups of equal scores: n tied items, r relevant, after a others, b of them relevant.
 
-    At place i of the group an item is relevant with probability r / n, and then 1 + b + (i - 1) (r - 1) / (n - 1)
-    relevant items are expected up to it, among a + i in all; summed over i = 1..n.
+    At place i of the group an item is relevant with probability r / n. The expected number of relevant items up to it
+    is then 1 + b + (i - 1) (r - 1) / (n - 1), among a + i in all. The precisions are summed over i = 1..n.
     """
     every, relevant = np.sort(every), np.sort(relevant)
     values, r = np.unique(relevant, return_counts=True)
@@ -122,21 +140,24 @@ def _precision_of_row(every: Scores, relevant: Scores, harmonic: NDArray[np.floa
 
 
 def chance_of_recall(k: int, relevant: Mask, shown: Mask) -> NDArray[np.float64]:
-    """(Q,) `recall_at` of a constant scorer."""
+    """Return `recall_at` (Q,) of a constant scorer."""
     return recall_at(k, _all_tied(relevant, shown))
 
 
 def chance_of_reciprocal_rank(relevant: Mask, shown: Mask) -> NDArray[np.float64]:
-    """(Q,) `reciprocal_rank` of a constant scorer."""
+    """Return `reciprocal_rank` (Q,) of a constant scorer."""
     return reciprocal_rank(_all_tied(relevant, shown))
 
 
 def chance_of_average_precision(relevant: Mask, shown: Mask) -> NDArray[np.float64]:
-    """(Q,) average precision of a constant scorer: with R of N relevant, p + (1 - p) H_N / N, p = (R - 1) / (N - 1)."""
+    """Return the average precision (Q,) of a constant scorer.
+
+    With R of N relevant it is p + (1 - p) H_N / N, p = (R - 1) / (N - 1).
+    """
     _, count, right = _all_tied(relevant, shown)
     harmonic = np.cumsum(1 / np.arange(1.0, shown.shape[1] + 1))[count - 1]
-    share = (right - 1) / np.maximum(count - 1, 1)
-    return np.asarray(np.where(count == right, 1.0, share + (1 - share) * harmonic / count))
+    p = (right - 1) / np.maximum(count - 1, 1)
+    return np.asarray(np.where(count == right, 1.0, p + (1 - p) * harmonic / count))
 
 
 def _all_tied(relevant: Mask, shown: Mask) -> FirstRelevant:

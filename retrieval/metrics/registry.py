@@ -1,4 +1,4 @@
-"""Every metric of an evaluation: its name in results.json, what the report calls it, and how it is taken.
+"""Registry of the metrics of an evaluation: name in results.json, labels in the report, and function.
 
 A new metric is one function from a `ScoreTable` to a `Measure` (`retrieval.metrics.protocols`) and one row here.
 """
@@ -13,20 +13,23 @@ from retrieval.metrics.pairs import Calibration, Threshold
 from retrieval.metrics.table import ScoreTable
 
 SET_SIZES = (1, 2, 3, 5, 8, 12, 20)
-"""Grasps in a set."""
+"""Numbers of grasps in a query."""
 PHOTOS_PER_CANDIDATE = 3
-"""Photos of a candidate where sets of grasps are judged."""
+"""Photos of a candidate in the metrics of several grasps."""
 PHOTO_COUNTS = (1, 2, 3, 5, 10, 20)
-"""Photos of a candidate where one grasp asks."""
+"""Photos of a candidate in the metrics of one grasp."""
 
 
 @dataclass(frozen=True, eq=False)
 class MethodScoreTables:
-    """What metrics are taken of: the scores of one method and seed, as tables.
+    """Scores of one method and seed as tables: the input of the metrics.
 
-    test: touches with photos of test objects; all_objects: the same touches with the photos of all objects; sets: by
-    number of grasps, sets of test touches with photos of test objects; rule: which pairs of a single touch and a photo
-    are called matches, None where nothing says so; seed: of what is drawn.
+    Attributes:
+        test: Touches with photos of test objects.
+        all_objects: The same touches with the photos of all objects.
+        sets: By number of grasps, sets of test touches with photos of test objects.
+        rule: Decides which pairs of a touch and a photo are matches; None without a rule.
+        seed: Seed of random draws.
     """
 
     test: ScoreTable
@@ -37,16 +40,19 @@ class MethodScoreTables:
 
     @cached_property
     def photos(self) -> ScoreTable:
-        """Photos of test objects that ask for touches."""
+        """Photos of test objects as queries, touches as gallery."""
         return self.test.transposed()
 
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric, as results and reports hold it.
+    """A metric, as results and reports use it.
 
-    label: what the report calls it. column: what stands above it in its own table. section: which table that is. take:
-    gives its values; None where it cannot be asked of these scores.
+    Attributes:
+        label: Name in the report.
+        column: Heading in its own table.
+        section: Name of that table.
+        compute: Returns its values; None if these scores do not allow it.
     """
 
     label: str
@@ -56,36 +62,40 @@ class Metric:
 
 
 def grasps_metric_name(count: int) -> str:
-    """The metric of a query of so many grasps, three photos of each candidate."""
+    """Return the name of the metric of a query of so many grasps, with three photos of each candidate."""
     return f"topn_k5_g{count}_p{PHOTOS_PER_CANDIDATE}"
 
 
 def photos_metric_name(count: int) -> str:
-    """The metric of a query of one grasp, so many photos of each candidate."""
+    """Return the name of the metric of a query of one grasp, with so many photos of each candidate."""
     return "topn_k5" if count == 1 else f"topn_k5_p{count}"
 
 
 def k_way_measure(table: ScoreTable | None, k: int, seed: int, photos: int = 1) -> Measure | None:
-    """`protocols.k_way`, or None where there are fewer objects than candidates."""
+    """Return `protocols.k_way`, or None if there are fewer objects than candidates."""
     return protocols.k_way(table, k, photos=photos, seed=seed) if table and len(table.objects) >= k else None
 
 
-def _of_set(count: int) -> Metric:
+def _grasps_metric(count: int) -> Metric:
     words = f"{count} grasp{'s' * (count > 1)}"
-    label = f"first guess of 5, {words}, {PHOTOS_PER_CANDIDATE} photos"
+    label = f"5-way top-1 accuracy, {words}, {PHOTOS_PER_CANDIDATE} photos"
     return Metric(
-        label, words, "grasps", lambda of: k_way_measure(of.sets.get(count), 5, of.seed, PHOTOS_PER_CANDIDATE)
+        label,
+        words,
+        "grasps",
+        lambda tables: k_way_measure(tables.sets.get(count), 5, tables.seed, PHOTOS_PER_CANDIDATE),
     )
 
 
-def _of_photos(count: int) -> Metric:
+def _photos_metric(count: int) -> Metric:
     words = f"{count} photos"
-    return Metric(f"first guess of 5, {words}", words, "photos", lambda of: _if_enough_photos(of, count))
+    label = f"5-way top-1 accuracy, {words}"
+    return Metric(label, words, "photos", lambda tables: _if_enough_photos(tables, count))
 
 
-def _if_enough_photos(of: MethodScoreTables, count: int) -> Measure | None:
-    """None where some candidate has fewer photos: the mean of fewer scores lies further out than its rivals'."""
-    return k_way_measure(of.test, 5, of.seed, count) if of.test.min_photos >= count else None
+def _if_enough_photos(tables: MethodScoreTables, count: int) -> Measure | None:
+    """Return the 5-way measure; None if a candidate has too few photos: the mean of fewer scores varies more."""
+    return k_way_measure(tables.test, 5, tables.seed, count) if tables.test.min_photos >= count else None
 
 
 def _paired(table: ScoreTable, k: int) -> Measure | None:
@@ -95,11 +105,11 @@ def _paired(table: ScoreTable, k: int) -> Measure | None:
 TOUCH_TO_PHOTO, PHOTO_TO_TOUCH = "touch to photo", "photo to touch"
 
 
-def _of_gallery(prefix: str, section: str, table: Callable[[MethodScoreTables], ScoreTable]) -> dict[str, Metric]:
-    """Measures of the whole gallery, in one direction."""
+def _gallery_metrics(prefix: str, section: str, table: Callable[[MethodScoreTables], ScoreTable]) -> dict[str, Metric]:
+    """Return the measures of the whole gallery in one direction."""
 
     def metric(column: str, compute: Callable[[ScoreTable], Measure]) -> Metric:
-        return Metric(f"{column}, {section}", column, section, lambda of: compute(table(of)))
+        return Metric(f"{column}, {section}", column, section, lambda tables: compute(table(tables)))
 
     return {
         **{f"{prefix}recall_{k}": metric(f"R@{k}", partial(protocols.recall, k=k)) for k in (1, 5, 10)},
@@ -113,42 +123,50 @@ METRICS: dict[str, Metric] = {
         "pair accuracy",
         "pair accuracy",
         "main",
-        lambda of: protocols.pair_accuracy(of.test, of.rule) if of.rule else None,
+        lambda tables: protocols.pair_accuracy(tables.test, tables.rule) if tables.rule else None,
     ),
-    "pair_auc": Metric("pair AUC", "pair AUC", "main", lambda of: protocols.pair_auc(of.test)),
-    "topn_k5": Metric("first guess of 5", "first guess of 5", "main", lambda of: k_way_measure(of.test, 5, of.seed)),
+    "pair_auc": Metric("pair AUC", "pair AUC", "main", lambda tables: protocols.pair_auc(tables.test)),
+    "topn_k5": Metric(
+        "5-way top-1 accuracy",
+        "5-way top-1 accuracy",
+        "main",
+        lambda tables: k_way_measure(tables.test, 5, tables.seed),
+    ),
     "topn_k10": Metric(
-        "first guess of 10", "first guess of 10", "main", lambda of: k_way_measure(of.test, 10, of.seed)
+        "10-way top-1 accuracy",
+        "10-way top-1 accuracy",
+        "main",
+        lambda tables: k_way_measure(tables.test, 10, tables.seed),
     ),
     "topn_k5_all_objects": Metric(
-        "first guess of 5, all objects",
-        "first guess of 5, all objects",
+        "5-way top-1 accuracy, all objects",
+        "5-way top-1 accuracy, all objects",
         "main",
-        lambda of: k_way_measure(of.all_objects, 5, of.seed),
+        lambda tables: k_way_measure(tables.all_objects, 5, tables.seed),
     ),
-    **{grasps_metric_name(count): _of_set(count) for count in SET_SIZES},
-    **{photos_metric_name(count): _of_photos(count) for count in PHOTO_COUNTS if count > 1},
-    **_of_gallery("", TOUCH_TO_PHOTO, lambda of: of.test),
-    **_of_gallery("photo_to_touch_", PHOTO_TO_TOUCH, lambda of: of.photos),
+    **{grasps_metric_name(count): _grasps_metric(count) for count in SET_SIZES},
+    **{photos_metric_name(count): _photos_metric(count) for count in PHOTO_COUNTS if count > 1},
+    **_gallery_metrics("", TOUCH_TO_PHOTO, lambda tables: tables.test),
+    **_gallery_metrics("photo_to_touch_", PHOTO_TO_TOUCH, lambda tables: tables.photos),
     "objectfolder_touch_to_photo": Metric(
         "mAP, touch to photo",
         "mAP, touch to photo",
         "objectfolder",
-        lambda of: protocols.average_precision(of.test.with_own()),
+        lambda tables: protocols.average_precision(tables.test.with_own()),
     ),
     "objectfolder_photo_to_touch": Metric(
         "mAP, photo to touch",
         "mAP, photo to touch",
         "objectfolder",
-        lambda of: protocols.average_precision(of.photos.with_own()),
+        lambda tables: protocols.average_precision(tables.photos.with_own()),
     ),
-    "paired_top1": Metric("top 1", "top 1", "paired", lambda of: _paired(of.test, 1)),
-    "paired_top5": Metric("top 5", "top 5", "paired", lambda of: _paired(of.test, 5)),
+    "paired_top1": Metric("top 1", "top 1", "paired", lambda tables: _paired(tables.test, 1)),
+    "paired_top5": Metric("top 5", "top 5", "paired", lambda tables: _paired(tables.test, 5)),
 }
-"""Name in results.json -> what it is, in the order of every table."""
+"""Name in results.json -> metric, in the order of every table."""
 
 
 def compute(scored: MethodScoreTables, names: Iterable[str] = METRICS) -> dict[str, Measure]:
-    """The metrics of these names that can be asked of a method's scores."""
+    """Return the metrics of these names that a method's scores allow."""
     found = {name: METRICS[name].compute(scored) for name in names}
     return {name: measure for name, measure in found.items() if measure is not None}

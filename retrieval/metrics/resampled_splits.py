@@ -1,10 +1,10 @@
-"""Values over several choices of test objects: the mean, the range, and an interval that covers the choice.
+"""Values over several random splits into training and test objects: mean, range, and an interval that covers the split.
 
-Two choices that share objects are not independent, so that the spread of their values alone gives intervals that are
-far too narrow. The variance of their mean is therefore taken as `(1 / J + test / train) * s^2` (the corrected resampled
-t-test; Nadeau and Bengio 2003, Machine Learning 52, eq. 15), J choices, s^2 the variance of their values, test and
-train the numbers of objects of a choice. It covers other objects that test AND other objects that train, drawn from the
-same collection; not another sensor, and not classes that the collection lacks.
+Splits that share objects are not independent, so the spread of their values alone gives intervals that are far too
+narrow. The variance of their mean is estimated as `(1 / J + test / train) * s^2` (the corrected resampled t-test;
+Nadeau and Bengio 2003, Machine Learning 52, eq. 15), with J splits, s^2 the variance of their values, and test and
+train the numbers of objects of a split. It covers other test objects AND other training objects from the same
+collection. It does not cover another sensor, nor classes that the collection lacks.
 """
 
 from collections.abc import Sequence
@@ -20,10 +20,17 @@ from retrieval.metrics.measure import Measure
 
 
 def summarise_splits(splits: Sequence[Measure], ratio: float) -> dict[str, Any]:
-    """The "summary" of results.json over choices: one measure for each choice of test objects.
+    """Return the "summary" of results.json over splits.
 
-    ratio: test objects of a choice for each training object. As `intervals.summarise`, with "by_choice" [[m], ...],
-    "least" and "most" [m] in place of "by_seed".
+    Args:
+        splits: One measure per split.
+        ratio: Test objects per training object of a split.
+
+    Returns:
+        The keys of `intervals.summarise`, with "by_split" [[m], ...], "min" and "max" [m] in place of "by_seed".
+
+    Raises:
+        BadInput: There are fewer than two splits.
     """
     means = _means(splits)
     value, margin = means.mean(0), _margin(means, ratio)
@@ -43,8 +50,20 @@ def summarise_splits(splits: Sequence[Measure], ratio: float) -> dict[str, Any]:
 
 
 def compare_splits(a: Sequence[Measure], b: Sequence[Measure], ratio: float, *, column: int = 0) -> dict[str, Any]:
-    """Two methods on the same choices, paired by choice: {"difference": a - b, "low", "high", "least", "most",
-    "few_objects", "p"}; p is that of the same corrected t-test, two-sided.
+    """Compare two methods on the same splits, paired by split.
+
+    Args:
+        a: Measures of the first method, one per split.
+        b: Measures of the second.
+        ratio: Test objects per training object of a split.
+        column: Column of the values; of a top-n curve, 0 is the top-1 accuracy.
+
+    Returns:
+        {"difference": a - b, "low", "high", "min", "max", "few_objects", "p"}; p is that of the corrected t-test,
+        two-sided.
+
+    Raises:
+        BadInput: There are fewer than two splits.
     """
     differences = (_means(a) - _means(b))[:, [column]]
     value, margin = float(differences.mean()), float(_margin(differences, ratio)[0])
@@ -62,9 +81,9 @@ def compare_splits(a: Sequence[Measure], b: Sequence[Measure], ratio: float, *, 
 
 
 def _means(splits: Sequence[Measure]) -> NDArray[np.float64]:
-    """(J, m): the value of each choice, whose objects count alike."""
+    """Return the values (J, m) of the splits, with objects of equal weight."""
     if len(splits) < 2:
-        raise BadInput(f"a spread over choices of test objects needs two choices at least; got {len(splits)}")
+        raise BadInput(f"a spread over splits needs at least two splits; got {len(splits)}")
     return np.array([one.by_object()[1].mean(0) for one in splits])
 
 

@@ -1,1 +1,1 @@
-"""The matcher: towers, fusion, its file, and what a touch or a photo becomes in it."""
+"""The matcher: towers, fusion head and checkpoint, and the encoding of touches and photos."""

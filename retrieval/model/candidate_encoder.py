@@ -1,10 +1,10 @@
-"""Embeddings for candidate search that foretell the match logit: small networks on halves, taught by the classifier.
+"""Candidate encoder: embeddings for candidate search that predict the order of the match logits.
 
-An embedding trained by a contrastive loss orders photos in its own way, and the photo that the classifier would rank
-first lies deep in that order. The networks here are taught the classifier's own order, as students are
-(`retrieval.training.distil`), and read halves, so that an index can be given new embeddings without looking at a photo
-again. Where the cosine of the contrastive embeddings is part of the logit, some of the numbers are linear in these:
-their principal axes, which hold nearly all of that cosine, so that the networks have the rest alone to learn.
+An embedding trained by a contrastive loss orders photos differently from the fusion head: the photo that the head ranks
+first lies deep in that order. The two small networks here are distilled from the head (`retrieval.training.distil`).
+They read partial activations, so an index gets new embeddings without reading a photo again. Where the logit contains
+the cosine of the contrastive embeddings, some of the output components are linear in these embeddings: their principal
+axes, which carry nearly all of that cosine. The networks then learn only the rest.
 """
 
 from typing import NamedTuple, Self
@@ -15,13 +15,20 @@ from torch.nn import functional
 
 
 class CandidateEncoder(nn.Module):
-    """One network with one hidden layer for each modality, and linear numbers beside what it puts out; the inner
-    product of both orders photos.
+    """One network with one hidden layer per modality, with linear components appended to its output.
+
+    The inner product of a touch's and a photo's output orders the photos.
     """
 
     def __init__(self, partial: int, width: int, embedding_dim: int, linear: int = 0) -> None:
-        """linear: of the `embedding_dim` numbers, so many are linear in the last `embedding_dim` numbers of a half,
-        which then hold the contrastive embedding.
+        """Make the networks, with random weights.
+
+        Args:
+            partial: Width of a partial activation.
+            width: Hidden units of each network.
+            embedding_dim: Components of an embedding.
+            linear: Number of components that are linear in the last `embedding_dim` numbers of a partial activation.
+                These numbers must then be the contrastive embedding.
         """
         super().__init__()
         self.touch_network, self.photo_network = (
@@ -31,23 +38,23 @@ class CandidateEncoder(nn.Module):
         self.touch_linear, self.photo_linear = (nn.Linear(embedding_dim, linear) if linear else None for _ in range(2))
 
     def touch(self, partial: Tensor) -> Tensor:
-        """Embeddings (B, embedding_dim) of norm 1 of touch halves (B, half)."""
+        """Return unit embeddings (B, embedding_dim) of touch partial activations (B, partial)."""
         return functional.normalize(_concatenated(self.touch_network, self.touch_linear, partial), dim=-1, eps=1e-6)
 
     def photo(self, partial: Tensor) -> Tensor:
-        """Embeddings (B, embedding_dim) of norm 1 of photo halves (B, half)."""
+        """Return unit embeddings (B, embedding_dim) of photo partial activations (B, partial)."""
         return functional.normalize(_concatenated(self.photo_network, self.photo_linear, partial), dim=-1, eps=1e-6)
 
     def scores(self, touch_partials: Tensor, photo_partials: Tensor) -> Tensor:
-        """(T, N) scores in the classifier's unit, log-odds up to a constant of each touch: what is taught.
+        """Return scores (T, N) in the unit of the match logit, up to a constant per touch: the training target.
 
-        A touch's length is its own sharpness and moves no photo past another, so embeddings need not keep it.
+        The norm of a touch's output is its sharpness. It does not reorder photos, so embeddings drop it.
         """
         return _concatenated(self.touch_network, self.touch_linear, touch_partials) @ self.photo(photo_partials).T
 
     @torch.no_grad()
     def fold_statistics(self, touch: "PartialStatistics", photo: "PartialStatistics") -> None:
-        """Change the first layers to read halves as they are, where so far they read them centred and scaled."""
+        """Fold the standardisation of the inputs into the first layers, which then read raw partial activations."""
         for network, axes, spread in (
             (self.touch_network, self.touch_linear, touch),
             (self.photo_network, self.photo_linear, photo),
@@ -59,8 +66,14 @@ class CandidateEncoder(nn.Module):
 
     @torch.no_grad()
     def initialise_linear(self, partials: Tensor, touch: "PartialStatistics", photo: "PartialStatistics") -> None:
-        """Let the linear numbers be the principal axes of the contrastive embeddings at the end of photo halves
-        (N, half), for a candidate_encoder that reads halves centred and scaled; nothing where it has none.
+        """Set the linear components to the principal axes of the contrastive embeddings.
+
+        The networks must still read standardised partial activations. Without linear components this does nothing.
+
+        Args:
+            partials: Photo partial activations (N, partial) that end with their contrastive embeddings.
+            touch: Statistics of the touch partial activations.
+            photo: Statistics of the photo partial activations.
         """
         if self.touch_linear is None or self.photo_linear is None:
             return
@@ -74,15 +87,23 @@ class CandidateEncoder(nn.Module):
 
 
 class PartialStatistics(NamedTuple):
-    """Mean (half,) of halves, and (half,) the standard deviation of all units of the share or embedding each is of."""
+    """Statistics by which partial activations are standardised.
+
+    Attributes:
+        mean: (partial,) mean of each unit.
+        scale: (partial,) standard deviation over all units of the head's term, or of the embedding at the end.
+    """
 
     mean: Tensor
     scale: Tensor
 
     @classmethod
     def of(cls, partials: Tensor, embedding_dim: int = 0) -> Self:
-        """The spread of halves (N, half), of which the last `embedding_dim` numbers are an embedding; what does not
-        vary is not scaled up.
+        """Return the statistics of partial activations; a part that does not vary has scale 1.
+
+        Args:
+            partials: (N, partial).
+            embedding_dim: Count of numbers at the end of each row that are an embedding.
         """
         end = partials.shape[1] - embedding_dim
         parts = [part for part in (partials[:, :end], partials[:, end:]) if part.shape[1]]
@@ -90,11 +111,11 @@ class PartialStatistics(NamedTuple):
         return cls(partials.mean(0), scale.where(scale > 1e-6, 1.0))
 
     def __call__(self, partials: Tensor) -> Tensor:
-        """Centred and scaled halves: what a network learns from at its ordinary learning rate."""
+        """Return centred and scaled partial activations."""
         return (partials - self.mean) / self.scale
 
 
 def _concatenated(network: nn.Module, axes: nn.Linear | None, partial: Tensor) -> Tensor:
-    """What a network makes of halves and what is linear in their embeddings, in one array (B, embedding_dim)."""
-    made: Tensor = network(partial)
-    return made if axes is None else torch.cat([made, axes(partial[..., -axes.in_features :])], dim=-1)
+    """Concatenate a network's output and the linear components to (B, embedding_dim)."""
+    output: Tensor = network(partial)
+    return output if axes is None else torch.cat([output, axes(partial[..., -axes.in_features :])], dim=-1)

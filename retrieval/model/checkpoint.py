@@ -1,6 +1,6 @@
 """Checkpoints: one `.safetensors` file with the weights, and everything needed to use them in its header.
 
-Nothing is unpickled. A file is written beside its place, flushed to disk, then renamed: it is whole or absent.
+Nothing is unpickled. A file is written under a temporary name, flushed to disk, then renamed: it is complete or absent.
 """
 
 import hashlib
@@ -53,14 +53,20 @@ _DTYPES = {
 
 @dataclass(frozen=True)
 class Checkpoint(CheckpointInfo):
-    """A matcher ready for use (in evaluation mode) and what its file says of it.
+    """A matcher in evaluation mode, with the contents of its file.
 
-    * `config`: settings of towers, head and preprocessing. `provenance`: step, seed, data digest, metrics of its
-      training. `split`: the objects that it was trained, validated and tested on.
-    * `posterior`: what its logits mean; None where it was never calibrated. `gel_check`: what tells a touch from an
-      untouched gel and from no gel; None without one.
-    * `references`: what reference touches are worth; None where nothing could tell.
-    * `queries`: (Q, half) halves of touches of validation objects, by which an index can measure its own search.
+    Attributes:
+        path: The file.
+        digest: SHA-256 of the file, in hexadecimal.
+        config: Settings of towers, head and preprocessing.
+        provenance: Step, seed, data digest and metrics of the training.
+        gel_check: Thresholds that separate touches, no-contact gels and other images; None without a gel head.
+        matcher: The towers, the fusion head and the projections.
+        split: Training, validation and test objects; None where the training had no split.
+        posterior: Calibration of the logits; None for an uncalibrated model.
+        queries: (Q, partial) partial activations of touches of validation objects, with which an index measures its
+            own search.
+        references: Calibration of reference touches; None where the data did not suffice.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> checkpoint.config.preprocessing.background, len(checkpoint.digest)
@@ -87,9 +93,22 @@ def save_checkpoint(
     references: ReferenceCalibration | None = None,
     float16: bool = False,
 ) -> None:
-    """Write `path` and its model card (its name ends in .md) atomically. Raises CheckpointError where it cannot.
+    """Write `path` and its model card (the same name with .md) atomically.
 
-    float16: weights are stored so, at half the size, and float32 again when they are loaded.
+    Args:
+        path: A name that ends in .safetensors.
+        matcher: The model to store.
+        config: Its settings.
+        split: Its training, validation and test objects.
+        provenance: Source, step, seed, data digest and metrics of the training.
+        posterior: Calibration of its logits.
+        gel_check: Thresholds of its gel head.
+        queries: (Q, partial) partial activations of validation touches.
+        references: Calibration of reference touches.
+        float16: Store weights as float16, which halves the file. Loading converts them to float32.
+
+    Raises:
+        CheckpointError: The file cannot be written, or a weight exceeds float16.
     """
     require_writable(path)
     header = {
@@ -104,7 +123,7 @@ def save_checkpoint(
     if float16:
         state = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in state.items()}
         if over := [name for name, tensor in state.items() if not bool(torch.isfinite(tensor).all())]:
-            raise CheckpointError(f"{path} cannot hold {over[0]} as float16, which ends at 65504; store it as float32")
+            raise CheckpointError(f"{path}: {over[0]} exceeds 65504, the limit of float16; store it as float32")
     if queries is not None:
         state[_QUERIES] = torch.from_numpy(queries)
     write_tensors(path, state, header)
@@ -112,17 +131,17 @@ def save_checkpoint(
 
 
 CHECKPOINT_FIELDS = ("split", "provenance", "posterior", "gel_check", "queries", "references")
-"""What is stored of a checkpoint beside matcher and configuration."""
+"""Fields of a checkpoint that are stored in addition to matcher and configuration."""
 
 
 def store_checkpoint(checkpoint: Checkpoint, path: Path, *, float16: bool = False) -> None:
-    """Write a checkpoint that is held to `path`, as `save_checkpoint` does."""
-    about = {name: getattr(checkpoint, name) for name in CHECKPOINT_FIELDS}
-    save_checkpoint(path, checkpoint.matcher, checkpoint.config, **about, float16=float16)
+    """Write a loaded checkpoint to `path`, as `save_checkpoint` does."""
+    fields = {name: getattr(checkpoint, name) for name in CHECKPOINT_FIELDS}
+    save_checkpoint(path, checkpoint.matcher, checkpoint.config, **fields, float16=float16)
 
 
 def require_writable(path: Path) -> None:
-    """Raise CheckpointError where no checkpoint can be written to `path`; asked before hours are spent on one."""
+    """Raise CheckpointError if no checkpoint can be written to `path`: checked before hours of training."""
     if path.is_dir():
         raise CheckpointError(f"{path} is a folder; name the file to write, such as {path / 'model.safetensors'}")
     if path.suffix != ".safetensors":
@@ -138,15 +157,20 @@ def require_writable(path: Path) -> None:
 
 
 def sibling_file(path: Path, ending: str) -> Path:
-    """The file that goes with a checkpoint: `model.safetensors` and ".md" give `model.md`, `v1.2` gives `v1.2.md`."""
+    """Return the file that goes with a checkpoint: `model.safetensors` and ".md" give `model.md`, `v1.2` `v1.2.md`."""
     return path.with_name(path.name.removesuffix(".safetensors") + ending)
 
 
 def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> Checkpoint:
-    """Read a checkpoint. Raises CheckpointError with what is wrong and what to do.
+    """Read a checkpoint.
 
-    known: what `read_checkpoint_info` said of this file, where its digest was found to be that of a whole one; then neither
-    digest nor checksum is computed again.
+    Args:
+        path: The .safetensors file.
+        info: Result of `read_checkpoint_info` for this file, if its digest was already verified. Digest and checksum
+            are then not computed again.
+
+    Raises:
+        CheckpointError: The file is missing, damaged or unusable. The message names the remedy.
 
     >>> retrieval.load_checkpoint("model.safetensors").config.matcher.fingers
     2
@@ -156,33 +180,33 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
     """
     path = Path(path)
     state, header = read_tensors(path, check=info is None)
-    about = info or checkpoint_info(path, header)
+    info = info or checkpoint_info(path, header)
     try:
         split = None if header["split"] is None else Split.from_dict(header["split"])
         posterior = None if header.get("posterior") is None else Posterior.from_dict(header["posterior"])
         references = header.get("references")
         references = None if references is None else ReferenceCalibration.from_dict(references)
         queries = state.pop(_QUERIES, None)
-        partial = about.config.matcher.partial_width
+        partial = info.config.matcher.partial_width
         if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (partial,)):
             raise CheckpointError(
                 f"{_QUERIES} must be float16 (touches, {partial}); got {queries.dtype} {tuple(queries.shape)}"
             )
         try:
-            with torch.device("meta"):  # shapes alone: a header may ask for more memory than there is
-                _require_fit(_empty_matcher(about.config, state), state)
+            with torch.device("meta"):  # shapes only: a header may describe more weights than fit into memory
+                _require_fit(_empty_matcher(info.config, state), state)
         except (RuntimeError, TypeError, ValueError, OverflowError) as error:
-            raise CheckpointError("its configuration asks for weights that are too large to be counted") from error
-        matcher = _empty_matcher(about.config, state)
+            raise CheckpointError("its configuration describes weights that are too large to count") from error
+        matcher = _empty_matcher(info.config, state)
         matcher.load_state_dict(state)
     except BadInput as error:
         raise unusable(path, error) from error
     return Checkpoint(
         path,
-        about.digest,
-        about.config,
-        about.provenance,
-        about.gel_check,
+        info.digest,
+        info.config,
+        info.provenance,
+        info.gel_check,
         matcher.eval(),
         split,
         posterior,
@@ -192,7 +216,7 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
 
 
 def _empty_matcher(config: Config, state: Mapping[str, Tensor]) -> Matcher:
-    """A matcher as it is configured; its gel head is there where the file has one."""
+    """Return a matcher as configured, with a gel head if the file contains one."""
     matcher = Matcher(config.matcher, len(config.preprocessing.views))
     if any(name.startswith(_GEL_HEAD) for name in state):
         matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
@@ -200,35 +224,44 @@ def _empty_matcher(config: Config, state: Mapping[str, Tensor]) -> Matcher:
 
 
 def load_weights(module: nn.Module, state: Mapping[str, Tensor]) -> None:
-    """Load `state`; every tensor must be there in its shape, and no other. Raises CheckpointError."""
+    """Load `state` into `module`. Raises CheckpointError unless names and shapes are exactly the module's."""
     _require_fit(module, state)
     module.load_state_dict(state)
 
 
 def _require_fit(module: nn.Module, state: Mapping[str, Tensor]) -> None:
-    got, wanted = ({name: tuple(item.shape) for name, item in part.items()} for part in (state, module.state_dict()))
-    for name in sorted(got.keys() | wanted.keys()):
-        if got.get(name) != wanted.get(name):
+    got, expected = ({name: tuple(item.shape) for name, item in part.items()} for part in (state, module.state_dict()))
+    for name in sorted(got.keys() | expected.keys()):
+        if got.get(name) != expected.get(name):
             raise CheckpointError(
                 f"its weights do not fit its configuration: {name} is {got.get(name, 'absent')}, "
-                f"must be {wanted.get(name, 'absent')}"
+                f"must be {expected.get(name, 'absent')}"
             )
 
 
 def write_tensors(path: Path, state: dict[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write tensors, of any device and layout, and a JSON header as one safetensors file with a checksum over both,
-    atomically.
+    """Write tensors and a JSON header as one safetensors file with a checksum over both, atomically.
+
+    The tensors may be on any device and in any memory layout.
     """
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in state.items()}
     content = {"format": FORMAT, "software": __version__, **header}
-    # Over both, as the format itself takes a flipped bit in a weight or a setting for what it is.
+    # The checksum covers both: the safetensors format does not detect a flipped bit.
     text = json.dumps({**content, "sha256": tensors_digest(state, json.dumps(content))}, allow_nan=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, save(state, {HEADER: text}))
 
 
 def read_tensors(path: Path, *, check: bool = True) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what `write_tensors` wrote; check: that it is what was written. Raises CheckpointError."""
+    """Read a file of `write_tensors`: its tensors and its header.
+
+    Args:
+        path: The .safetensors file.
+        check: Verify the checksum, and that every weight is finite.
+
+    Raises:
+        CheckpointError: The file is missing or damaged, or has a data type that checkpoints do not use.
+    """
     header = read_header(path)
     try:
         with safe_open(path, framework="pt") as file:
@@ -237,18 +270,18 @@ def read_tensors(path: Path, *, check: bool = True) -> tuple[dict[str, Tensor], 
         raise unreadable(path, error) from error
     for name, tensor in state.items():
         if tensor.dtype not in _DTYPES:
-            raise CheckpointError(f"{path} holds {name} as {tensor.dtype}, which no checkpoint of ours does")
+            raise CheckpointError(f"{path}: {name} is {tensor.dtype}, a data type that checkpoints never contain")
     checksum = header.pop("sha256", None)
     if check and checksum != tensors_digest(state, json.dumps(header)):
-        raise CheckpointError(f"{path} is damaged: its checksum does not fit; restore the file or train again")
+        raise CheckpointError(f"{path} is damaged: its checksum does not match; restore the file or train again")
     if check and any(not bool(torch.isfinite(tensor).all()) for tensor in state.values()):
-        raise CheckpointError(f"{path} holds a NaN or infinite weight; train again with a lower learning rate")
+        raise CheckpointError(f"{path} contains a NaN or infinite weight; train again with a lower learning rate")
     return state, header
 
 
-def tensors_digest(state: Mapping[str, Tensor], about: str) -> str:
-    """SHA-256 (hex) of `about` and of tensors, whose names, types and shapes count."""
-    digest = hashlib.sha256(about.encode())
+def tensors_digest(state: Mapping[str, Tensor], description: str) -> str:
+    """Return the SHA-256 (hex) of `description` and of the tensors with their names, types and shapes."""
+    digest = hashlib.sha256(description.encode())
     for name in sorted(state):
         tensor = state[name].cpu().contiguous()
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())

@@ -1,4 +1,4 @@
-"""What a checkpoint's file says of itself, read without PyTorch: enough for a query whose towers run elsewhere."""
+"""The header of a checkpoint's file, read without PyTorch: enough for a query whose towers run elsewhere."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,8 +20,14 @@ _SCORER_TENSORS = ("head.second.weight", "head.second.bias", "head.out.weight", 
 
 @dataclass(frozen=True)
 class CheckpointInfo:
-    """A checkpoint's file. digest: its SHA-256. provenance: step, seed, data digest, metrics and so on. gel_check:
-    thresholds for what its gel head reads; None without one.
+    """The header of a checkpoint's file.
+
+    Attributes:
+        path: The file.
+        digest: SHA-256 of the file, in hexadecimal.
+        config: Settings of towers, head and preprocessing.
+        provenance: Step, seed, data digest, metrics and so on.
+        gel_check: Thresholds on the readings of the gel head; None without one.
     """
 
     path: Path
@@ -32,20 +38,22 @@ class CheckpointInfo:
 
 
 def fingerprint(checkpoint: CheckpointInfo) -> dict[str, str]:
-    """What must be the same for an index to be searched with a checkpoint."""
+    """Return the digests that an index and the checkpoint that searches it must share."""
     return {"checkpoint": checkpoint.digest, "preprocessing": checkpoint.config.preprocessing.digest()}
 
 
 PARTIALS_FROM = "partials_from"
-"""In the provenance: digests of checkpoints with the same towers, head and preprocessing, whose halves these are."""
+"""Key of the provenance: digests of checkpoints with the same towers, head and preprocessing, so the same partial
+activations."""
 
 
 def can_reuse_partials(checkpoint: CheckpointInfo, made_by: Mapping[str, str]) -> bool:
-    """Whether the halves of an index with that fingerprint are those that this checkpoint would make again, and its
-    embeddings alone are others, which a candidate_encoder makes of these.
+    """Whether an index with the fingerprint `made_by` contains the partial activations of this checkpoint.
+
+    Only its embeddings then differ. The candidate encoder recomputes them from the partial activations.
     """
-    before = checkpoint.provenance.get(PARTIALS_FROM)
-    same = isinstance(before, list) and made_by.get("checkpoint") in before
+    sources = checkpoint.provenance.get(PARTIALS_FROM)
+    same = isinstance(sources, list) and made_by.get("checkpoint") in sources
     return (
         same
         and checkpoint.config.matcher.candidate_width > 0
@@ -54,25 +62,29 @@ def can_reuse_partials(checkpoint: CheckpointInfo, made_by: Mapping[str, str]) -
 
 
 def read_checkpoint_info(path: Path) -> CheckpointInfo:
-    """Read what a checkpoint says of itself. Its weights are neither read nor checked: whoever knows the digest that
-    the file must have compares it. Raises CheckpointError.
+    """Read the header of a checkpoint.
+
+    The weights are neither read nor checked. A caller that knows the file's digest compares it.
+
+    Raises:
+        CheckpointError: The file is missing, or not a checkpoint of this version.
     """
     return checkpoint_info(path, read_header(path))
 
 
 def checkpoint_info(path: Path, header: dict[str, Any]) -> CheckpointInfo:
-    """What the header of a matcher's file says. Raises CheckpointError for that of another file."""
+    """Parse the header of a matcher's file. Raises CheckpointError for the header of another file."""
     if "task" in header:
         raise CheckpointError(
-            f"{path} is a {header['task']} classifier, not a matcher; `retrieve collect --gate` takes it, "
-            "`retrieve train` makes matchers"
+            f"{path} is a {header['task']} classifier, not a matcher; use it with `retrieve collect --gate`, "
+            "or train a matcher with `retrieve train`"
         )
     if not isinstance(header.get("provenance", {}), dict):
         raise unusable(path, "its provenance must be an object")
     if lacking := [name for name in ("config", "split", "provenance") if name not in header]:
         raise CheckpointError(
-            f"{path} is not a checkpoint: its header has no {lacking[0]}; a file in .state.safetensors is the state of "
-            "an unfinished training, the checkpoint lies beside it"
+            f"{path} is not a checkpoint: its header has no {lacking[0]}; a .state.safetensors file is the state of "
+            "an unfinished training, and the checkpoint is in the same folder"
         )
     try:
         config = Config.from_dict(header["config"])
@@ -83,23 +95,23 @@ def checkpoint_info(path: Path, header: dict[str, Any]) -> CheckpointInfo:
 
 
 def read_scorer(path: Path) -> FusionScorer:
-    """The layers of a checkpoint's head that judge pairs of halves. Raises CheckpointError."""
+    """Read the layers of a checkpoint's head that score pairs of partial activations. Raises CheckpointError."""
     try:
         with safe_open(path, framework="np") as file:
             parts = [file.get_tensor(name) for name in _SCORER_TENSORS]
-    except (SafetensorError, OSError, TypeError) as error:  # TypeError: numbers that numpy does not know
+    except (SafetensorError, OSError, TypeError) as error:  # TypeError: data types that numpy does not have
         raise unreadable(path, error) from error
     hidden = parts[1].size
-    wanted = [(hidden, hidden), (hidden,), (1, hidden), (1,)]
-    for name, part, shape in zip(_SCORER_TENSORS, parts, wanted, strict=True):
+    shapes = [(hidden, hidden), (hidden,), (1, hidden), (1,)]
+    for name, part, shape in zip(_SCORER_TENSORS, parts, shapes, strict=True):
         if part.shape != shape or part.dtype.kind != "f":
-            raise unusable(path, f"{name} is {part.dtype} {part.shape}, must be of floats {shape}")
+            raise unusable(path, f"{name} is {part.dtype} {part.shape}, must be floats of shape {shape}")
     second, second_bias, out, out_bias = (part.astype(np.float32) for part in parts)
     return FusionScorer(second, second_bias, out[0], out_bias)
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """Our JSON header of a `.safetensors` file, "sha256" among it. Raises CheckpointError where there is none."""
+    """Read our JSON header of a `.safetensors` file, with its "sha256". Raises CheckpointError if there is none."""
     try:
         open_regular(path).close()
     except FileNotFoundError as error:
@@ -115,8 +127,8 @@ def read_header(path: Path) -> dict[str, Any]:
         raise unreadable(path, error) from error
     if text is None:
         raise CheckpointError(
-            f"{path} holds weights but not our header; only checkpoints of `retrieve train` work here "
-            "(give other weights to `retrieve train --init`)"
+            f"{path} contains weights but no header of ours; only checkpoints of `retrieve train` work here "
+            "(use other weights with `retrieve train --init`)"
         )
     try:
         header = parse_json(text)
@@ -132,10 +144,10 @@ def read_header(path: Path) -> dict[str, Any]:
 
 
 def unreadable(path: Path, error: Exception) -> CheckpointError:
-    """What to raise where the format itself is broken."""
+    """Return the error for a file that is not valid safetensors."""
     return CheckpointError(f"{path} is not a readable .safetensors file ({error}); it may be truncated")
 
 
 def unusable(path: Path, error: object) -> CheckpointError:
-    """What to raise where a file holds what no matcher of this version is made of."""
+    """Return the error for a file that this version cannot build a matcher from."""
     return CheckpointError(f"{path} is not a checkpoint that this version can use: {error}")

@@ -24,34 +24,40 @@ if TYPE_CHECKING:
     from retrieval.model.towers.tower import Tower
 
 Count = Annotated[int, Meta(ge=1)]
-Share = Annotated[float, Meta(ge=0, lt=1)]
+Fraction = Annotated[float, Meta(ge=0, lt=1)]
 Weight = Annotated[float, Meta(ge=0)]
 
 
-# How the touch is fused with the photo; what a checkpoint needs to be rebuilt.
+# Settings from which a checkpoint rebuilds its matcher.
 
 
 @dataclass(frozen=True)
 class MatcherConfig:
     """Architecture of a matcher.
 
-    tower: backbone of both towers (`retrieval.model.towers`). architectures: of those that `transformers` builds, by
-    their names, so that a checkpoint needs neither their files nor a network; `Config.using` fills it in. tower_output:
-    "classes" (the paper: the 1000-way outputs are fused) or "pooled". fingers: gel images in one touch (training takes
-    it from the recording). hidden: width of the fusion head. standardise: centre and scale the features by their
-    statistics over the training batches, which lets towers trained from random weights leave the plateau at chance; the
-    paper does not. embedding_dim: length of the unit embeddings for candidate search. candidate_width: hidden units of the
-    networks that make these embeddings from halves after training (`retrieval.model.candidate_encoder`); 0: they are the
-    contrastive ones. candidate_linear: how many of the embedding_dim numbers are linear in the contrastive embedding,
-    which needs cosine. cosine: add the scaled cosine of the contrastive embeddings to the match logit; the paper does
-    not.
+    Attributes:
+        tower: Backbone of both towers (`retrieval.model.towers`).
+        tower_output: "classes" (the paper: the 1000-way outputs are fused), "pooled" or "stages".
+        fingers: Gel images in one touch. Training takes the number from the recording.
+        hidden: Width of the fusion head.
+        dropout: Dropout probability in the fusion head.
+        standardise: Centre and scale the features by their statistics over the training batches. Towers trained from
+            random weights then leave the plateau at chance. The paper does not do this.
+        embedding_dim: Length of the unit embeddings for candidate search.
+        candidate_width: Hidden units of the candidate encoder (`retrieval.model.candidate_encoder`), which maps partial
+            activations to embeddings after training. 0: search uses the contrastive embeddings.
+        candidate_linear: Number of the embedding_dim components that are linear in the contrastive embedding. Requires
+            `cosine`.
+        cosine: Add the scaled cosine of the contrastive embeddings to the match logit. The paper does not do this.
+        architectures: Architecture by name of each backbone that another library builds, so that a checkpoint needs
+            neither its files nor a network. `Config.using` fills it in.
     """
 
     tower: str = "resnet50"
     tower_output: str = "classes"
     fingers: Count = 2
     hidden: Count = 1024
-    dropout: Share = 0.5
+    dropout: Fraction = 0.5
     standardise: bool = False
     embedding_dim: Count = 128
     candidate_width: Annotated[int, Meta(ge=0)] = 0
@@ -61,41 +67,57 @@ class MatcherConfig:
 
     @property
     def partial_width(self) -> int:
-        """Numbers in a half: the share of the head's first layer, and the scaled embedding where its cosine counts."""
+        """Width of a partial activation: the head's term, then the scaled embedding if the logit adds its cosine."""
         return self.hidden + (self.embedding_dim if self.cosine else 0)
 
     def __post_init__(self) -> None:
         check_fields(self, "matcher", ConfigError)
-        most = self.embedding_dim - 1 if self.cosine else 0
+        limit = self.embedding_dim - 1 if self.cosine else 0
         _require(
-            0 <= self.candidate_linear <= most,
-            f"matcher.candidate_linear must be from 0 to {most} (below embedding_dim, and 0 without cosine), got "
+            0 <= self.candidate_linear <= limit,
+            f"matcher.candidate_linear must be from 0 to {limit} (below embedding_dim, and 0 without cosine), got "
             f"{self.candidate_linear}",
         )
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How a matcher is trained.
+    """Settings of a training run.
 
-    init: "random", "imagenet", "shipped" or the path of a state dict. init_touch, init_photo: the same for one tower
-    alone, where they are not empty (`retrieval.training.relief` makes such weights); of towers side by side the part
-    "init" is what init says. photos, touches: folders of labelled pictures
-    whose objects are paired by their labels and trained on beside the recording's (`retrieval.data.labelled_pictures`);
-    both or neither. iterations: optimiser steps. touches_per_batch times (positives_per_touch + negatives_per_touch)
-    pairs make a batch. weights: of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`), in
-    files `contrastive_weight` and so on; 0 for each is exactly the paper's loss, and without one on embeddings these
-    stay untrained. shuffle_fingers: feed the fingers of a touch in a random order, as gripping the other way
-    round would; not in the paper. negatives: "dataset" draws a touch's from all photos of other objects, as in the
-    paper; "batch" from the photos that stand in the batch anyway, half as many to encode (`PairSampler`); "auto" is
-    "batch" where towers are trained. freeze_batch_norm: keep the batch statistics of the initial weights.
-    freeze_towers: train only what comes after the towers; every image is then encoded once for the whole training.
-    distil_steps: steps of teaching the candidate_encoder after training, where the matcher has one (`retrieval.training.distil`).
-    validation_fraction, test_fraction: shares of the objects.
+    With every weight 0 the loss is exactly the paper's. Without a loss on embeddings these stay untrained. No result
+    depends on `workers`, `prefetch` and `pinned_memory`, so checkpoints and caches omit them.
 
-    The loader has three settings that no result depends on, so that checkpoints and caches leave them out. workers:
-    threads that decode images, "auto" for one on each core. prefetch: batches that are loaded ahead of the step.
-    pinned_memory: copy batches to a GPU from page-locked memory while it computes.
+    Attributes:
+        init: Initial weights of the towers: "random", "imagenet", "shipped" or the path of a state dict.
+        init_touch: Initial weights of the touch tower, if not empty (`retrieval.training.relief` makes such weights).
+            For concatenated towers the part "init" stands for the value of `init`.
+        init_photo: The same for the photo tower.
+        photos: Folder of labelled photos that are paired with `touches` by label and trained on in addition to the
+            recording (`retrieval.data.labelled_pictures`). Set both or neither.
+        touches: Folder of labelled touches.
+        iterations: Optimiser steps.
+        touches_per_batch: Touches in a batch. Each forms pairs with its positives and negatives.
+        positives_per_touch: Photos of the touch's object in a batch.
+        negatives_per_touch: Photos of other objects in a batch.
+        learning_rate: Learning rate of the optimiser.
+        schedule: Name of a learning rate schedule in `SCHEDULES`.
+        weights: Weights of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`). Configuration
+            files name them `contrastive_weight` and so on.
+        shuffle_fingers: Permute the fingers of a touch randomly, like a grip from the other side. Not in the paper.
+        negatives: "dataset" draws the negatives of a touch from all photos of other objects, as in the paper. "batch"
+            takes them from the photos of the batch, so half as many are encoded (`PairSampler`). "auto" is "batch"
+            where towers are trained.
+        freeze_batch_norm: Keep the batch statistics of the initial weights.
+        freeze_towers: Train only the layers after the towers. Every image is then encoded once per training.
+        distil_steps: Steps that distil the candidate encoder after training (`retrieval.training.distil`).
+        validation_fraction: Fraction of the objects that validate.
+        test_fraction: Fraction of the objects that test.
+        validate_every: Steps between two validations.
+        precision: "float32", "bfloat16" or "auto" (`retrieval.model.encode.autocast`).
+        seed: Seed of all random choices.
+        workers: Threads that decode images; "auto" for one per core.
+        prefetch: Batches that are loaded ahead of the step.
+        pinned_memory: Copy batches to a GPU from page-locked memory while it computes.
     """
 
     init: str = "imagenet"
@@ -115,8 +137,8 @@ class TrainingConfig:
     freeze_batch_norm: bool = False
     freeze_towers: bool = False
     distil_steps: Count = 600
-    validation_fraction: Share = 0.1
-    test_fraction: Share = 0.184
+    validation_fraction: Fraction = 0.1
+    test_fraction: Fraction = 0.184
     validate_every: Count = 500
     precision: str = "auto"
     seed: Annotated[int, Meta(ge=0, lt=2**32)] = 0
@@ -138,7 +160,8 @@ class TrainingConfig:
             _require(value in known, f"training.{name} must be one of {', '.join(known)}, got {value!r}")
         _require(
             bool(self.photos) == bool(self.touches),
-            f"labelled photos are paired with labelled touches; got photos {self.photos!r}, touches {self.touches!r}",
+            f"labelled photos and labelled touches must be given together; got photos {self.photos!r}, touches "
+            f"{self.touches!r}",
         )
         held_out = (self.validation_fraction, self.test_fraction)
         _require(
@@ -146,19 +169,20 @@ class TrainingConfig:
         )
 
     def tower_init(self, of_one: str) -> str:
-        """First weights of one tower, from `init_touch` or `init_photo`."""
+        """Return the initial weights of one tower, given its `init_touch` or `init_photo`."""
         return TOWER_SEPARATOR.join(
             self.init if part == "init" else part for part in (of_one or "init").split(TOWER_SEPARATOR)
         )
 
     @property
     def trains_embeddings(self) -> bool:
-        """Whether the contrastive projections learn anything."""
+        """Whether a loss trains the contrastive projections."""
         return any(weight > 0 for name, weight in self.weights.items() if name not in LOGIT_LOSSES)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary, as in a TOML file, without the settings of the loader: each weight is a setting of its own,
-        `<loss>_weight`.
+        """Return a plain dictionary, as in a TOML file, without the settings of the loader.
+
+        Each loss weight is a setting of its own, `<loss>_weight`.
         """
         table: dict[str, Any] = {}
         for name, value in dataclasses.asdict(self).items():
@@ -173,38 +197,38 @@ class TrainingConfig:
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> "TrainingConfig":
-        """Inverse of `to_dict`; a setting left out keeps its default. Raises ConfigError."""
+        """Inverse of `to_dict`; a missing setting keeps its default. Raises ConfigError."""
         weights = {
             name.removesuffix(WEIGHT_SUFFIX): value for name, value in table.items() if name.endswith(WEIGHT_SUFFIX)
         }
         rest = {name: value for name, value in table.items() if not name.endswith(WEIGHT_SUFFIX)}
         known = {*cls().to_dict(), *LOADER_SETTINGS}
         if unknown := [name for name in rest if name not in known]:
-            raise ConfigError(f"training has no setting {unknown[0]!r}; it knows {', '.join(sorted(known))}")
+            raise ConfigError(f"training has no setting {unknown[0]!r}; use one of {', '.join(sorted(known))}")
         return cls(**rest, weights=weights)
 
     def with_iterations(self, iterations: int) -> "TrainingConfig":
-        """The same with so many optimiser steps, and at most as many to teach the candidate_encoder."""
+        """Return a copy with so many optimiser steps, and at most as many distillation steps."""
         return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
 
 
 LOADER_SETTINGS = ("workers", "prefetch", "pinned_memory")
-"""Settings of the loader, which decide no result."""
+"""Settings of the loader, which change no result."""
 WEIGHT_SUFFIX = "_weight"
-"""What ends the setting of a loss's weight."""
+"""Suffix of the settings that are weights of losses."""
 SCHEDULES: dict[str, Callable[[int, int], float]] = {
     "constant": lambda step, steps: 1.0,
     "cosine": lambda step, steps: 0.5 * (1 + math.cos(math.pi * step / steps)),
     "halving": lambda step, steps: 0.5 ** (4 * step // steps),
 }
-"""Name -> the share of the learning rate that a step, from 0, of so many takes; halving: after each quarter."""
+"""Name -> factor of the learning rate at a step (from 0) of so many steps; "halving" halves after each quarter."""
 NEGATIVES = ("auto", "batch", "dataset")
 PRECISIONS = ("auto", "float32", "bfloat16")
 
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that decides what a training run makes, but the recording.
+    """All inputs of a training run except the recording.
 
     >>> retrieval.load_config("paper").matcher.tower
     'resnet50'
@@ -216,20 +240,20 @@ class Config:
 
     @property
     def has_embeddings(self) -> bool:
-        """Whether embeddings are trained, so that candidates can be searched by them."""
+        """Whether embeddings are trained, so that candidate search can use them."""
         return self.matcher.candidate_width > 0 or self.training.trains_embeddings
 
     def without_candidate_encoder(self) -> "Config":
-        """The same with no candidate_encoder to be taught."""
+        """Return a copy without a candidate encoder."""
         return dataclasses.replace(
             self, matcher=dataclasses.replace(self.matcher, candidate_width=0, candidate_linear=0)
         )
 
     def with_candidate_encoder_of(self, other: "Config") -> "Config":
-        """The same with a candidate_encoder as `other` has it, as far as this logit has a cosine to be linear in."""
-        wanted = other.matcher
-        linear = min(wanted.candidate_linear, self.matcher.embedding_dim - 1) if self.matcher.cosine else 0
-        matcher = dataclasses.replace(self.matcher, candidate_width=wanted.candidate_width, candidate_linear=linear)
+        """Return a copy with the candidate encoder of `other`, but no linear components without a cosine."""
+        source = other.matcher
+        linear = min(source.candidate_linear, self.matcher.embedding_dim - 1) if self.matcher.cosine else 0
+        matcher = dataclasses.replace(self.matcher, candidate_width=source.candidate_width, candidate_linear=linear)
         return dataclasses.replace(self, matcher=matcher)
 
     def using(
@@ -238,31 +262,31 @@ class Config:
         tower: "str | type[Tower] | None" = None,
         losses: "Mapping[str, float] | Mapping[str | type[Loss], float] | None" = None,
     ) -> "Config":
-        """Return the configuration with another tower, or with other losses beside the match loss.
+        """Return the configuration with another tower, or with other losses in addition to the match loss.
 
         Args:
             tower: A name, "module:Class", or a class.
-            losses: Of each, a name, "module:Class", or a class, with its weight; those left out weigh nothing.
+            losses: Weight by loss. A loss is a name, "module:Class", or a class; losses that are not listed weigh 0.
 
         Raises:
-            ConfigError: For an unknown name.
+            ConfigError: A name is unknown.
 
         >>> config = retrieval.load_config("small").using(tower="resnet18", losses={"sigmoid": 0.5})
         >>> config.matcher.tower, config.training.weights["sigmoid"]
         ('resnet18', 0.5)
         """
-        made = self
+        config = self
         if tower is not None:
             name = tower_name(tower)
-            matcher = dataclasses.replace(made.matcher, tower=name, architectures=architectures_of(name))
-            made = dataclasses.replace(made, matcher=matcher)
+            matcher = dataclasses.replace(config.matcher, tower=name, architectures=architectures_of(name))
+            config = dataclasses.replace(config, matcher=matcher)
         if losses is not None:
             weights = {LOSSES.name_of(loss): weight for loss, weight in losses.items()}
-            made = dataclasses.replace(made, training=dataclasses.replace(made.training, weights=weights))
-        return made
+            config = dataclasses.replace(config, training=dataclasses.replace(config.training, weights=weights))
+        return config
 
     def without_paths(self) -> dict[str, Any]:
-        """As `to_dict`, of files and folders the names alone: where they lay on this machine concerns nobody."""
+        """Return `to_dict` with the names of files and folders in place of their paths on this machine."""
         tables = self.to_dict()
         for name in ("init", "init_photo", "init_touch", "photos", "touches"):
             parts = tables["training"][name].split(TOWER_SEPARATOR)
@@ -276,7 +300,7 @@ class Config:
         return tables
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain nested dictionary, as in a TOML file."""
+        """Return a plain nested dictionary, as in a TOML file."""
         return {
             "matcher": dataclasses.asdict(self.matcher),
             "training": self.training.to_dict(),
@@ -285,9 +309,9 @@ class Config:
 
     @classmethod
     def from_dict(cls, tables: Mapping[str, Any]) -> "Config":
-        """Build from nested tables; a key left out keeps its default, an unknown one raises ConfigError."""
+        """Build from nested tables; a missing key keeps its default, an unknown one raises ConfigError."""
         training = tables.get("training") if isinstance(tables, Mapping) else None
-        if isinstance(training, Mapping):  # whose weights are settings of their own in a file
+        if isinstance(training, Mapping):  # in a file, each loss weight is a setting of its own
             tables = {**tables, "training": TrainingConfig.from_dict(training)}
         return typed(tables, cls, error=ConfigError)
 
@@ -304,7 +328,7 @@ def load_config(name_or_path: str) -> Config:
     file = Path(name_or_path)
     if name_or_path in preset_names():
         file = Path(str(resources.files("retrieval") / "configs" / f"{name_or_path}.toml"))
-    elif os.path.isdir(file) or not os.path.exists(file):  # False, and no error, for a name that no disk takes
+    elif os.path.isdir(file) or not os.path.exists(file):  # False, without an error, for an invalid file name
         raise ConfigError(
             f"--config must be one of {', '.join(preset_names())} or a TOML file; there is no {name_or_path!r}"
         )
@@ -312,20 +336,20 @@ def load_config(name_or_path: str) -> Config:
         config = Config.from_dict(tomllib.loads(read_regular(file).decode()))
     except OSError as error:
         raise ConfigError(f"{name_or_path} cannot be read: {error.strerror}") from error
-    except ValueError as error:  # what TOML or UTF-8 forbids
+    except ValueError as error:  # invalid TOML or UTF-8
         raise ConfigError(f"{name_or_path} is not valid TOML: {error}") from error
     return config.using(tower=config.matcher.tower, losses=dict(config.training.weights))
 
 
 def named_config(config: Config | str, name: str | None = None) -> tuple[Config, str]:
-    """Return a configuration, given as such or as `load_config` takes it, and what it is called."""
+    """Return a configuration, given itself or as in `load_config`, and its name."""
     if isinstance(config, Config):
         return config, name or "own"
     return load_config(config), name or Path(config).stem
 
 
 def preset_names() -> list[str]:
-    """Names of the presets that come with the package."""
+    """Return the names of the presets in the package."""
     files = (resources.files("retrieval") / "configs").iterdir()
     return sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml"))
 

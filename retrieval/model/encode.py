@@ -1,9 +1,9 @@
-"""Images in, halves and embeddings out: the forward pass of the towers, in batches.
+"""Forward pass of the towers in batches: images to partial activations and embeddings.
 
-Nothing is learned here, so the towers run in another form than in training: batch normalisation folded into the
-convolution before it, weights laid out with channels last. The arithmetic stays float32 on every machine: bfloat16,
-where hardware multiplies it, moves the shipped checkpoint's halves by up to an eighth of the largest, and a query
-there would not meet an index made elsewhere.
+Inference runs the towers in another form than training: batch normalisation folded into the preceding convolution, and
+weights laid out with channels last. The arithmetic is float32 on every machine. bfloat16 hardware would move the
+partial activations of the shipped checkpoint by up to an eighth of the largest, and a query would then not match an
+index that was built elsewhere.
 """
 
 import copy
@@ -29,7 +29,7 @@ from retrieval.model.towers.tower import Tower
 T = TypeVar("T")
 Image = NDArray[np.float32]
 
-# A fork has none of the threads with which OpenMP computed before, and would wait for them for ever.
+# A forked process has no OpenMP threads and would wait for them for ever.
 os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
@@ -48,11 +48,12 @@ TOWERS = ("touch_tower", "photo_tower")
 
 
 def for_inference(matcher: Matcher, towers: Sequence[str] = TOWERS) -> Matcher:
-    """A matcher that gives the same halves and embeddings faster; for forward passes without gradients.
+    """Return a matcher with the same outputs that runs faster; for forward passes without gradients.
 
-    Its towers are copies, made again only after a weight of theirs changed; the rest is shared. Their features are as
-    near to the exact ones as the plain towers' are: on the shipped checkpoint the two differ by 3e-5 of the largest
-    at most. A tower in training mode, whose batch normalisation looks at the batch, stays as it is.
+    The named towers are copies that are rebuilt only when one of their weights changes. The rest is shared. Their
+    features are as close to the exact ones as those of the plain towers: on the shipped checkpoint the two differ by at
+    most 3e-5 of the largest feature. A tower in training mode is used unchanged, because its batch normalisation
+    depends on the batch.
     """
     fast = copy.copy(matcher)
     fast._modules = dict(matcher._modules)
@@ -63,7 +64,13 @@ def for_inference(matcher: Matcher, towers: Sequence[str] = TOWERS) -> Matcher:
 
 @dataclass(frozen=True)
 class _InferenceTower:
-    """A tower as it runs fastest; made from `tensors`, kept so that no other takes their identity, at `versions`."""
+    """The fast form of a tower.
+
+    Attributes:
+        tensors: Tensors of the original, referenced so that their ids are not reused.
+        versions: Data pointer and version of each tensor when `tower` was built.
+        tower: The fast form.
+    """
 
     tensors: list[Tensor]
     versions: list[tuple[int, int]]
@@ -76,7 +83,7 @@ _cache: WeakKeyDictionary[nn.Module, _InferenceTower] = WeakKeyDictionary()
 def _inference_tower(tower: nn.Module) -> nn.Module:
     if tower.training:
         return tower
-    # `parameters()` and `buffers()` take three times as long, a twentieth of a forward pass.
+    # `parameters()` and `buffers()` take three times as long: a twentieth of a forward pass.
     named = (group for module in tower.modules() for group in (module._parameters, module._buffers))
     tensors = [tensor for group in named for tensor in group.values() if tensor is not None]
     versions = [(tensor.data_ptr(), 0 if tensor.is_inference() else tensor._version) for tensor in tensors]
@@ -87,8 +94,10 @@ def _inference_tower(tower: nn.Module) -> nn.Module:
 
 
 def _fold_batch_norm(module: nn.Module) -> nn.Module:
-    """A twin that shares all tensors but those of convolutions, which have channels last and have taken in the batch
-    normalisation that is registered right after them. Copying everything takes ten times as long.
+    """Return a copy with batch normalisations folded into convolutions, which have channels last.
+
+    A batch normalisation is folded if it is registered right after its convolution. All other tensors are shared:
+    copying everything takes ten times as long.
     """
     if isinstance(module, Tower) and not module.can_fold_batch_norm:
         return module
@@ -126,14 +135,14 @@ def _channels_last(weight: Tensor) -> nn.Parameter:
 
 
 def touch_features(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> Tensor:
-    """Features (B, fingers * features) of touches, each a sequence of finger images (H, W, 3) in 0..1."""
+    """Return features (B, fingers * features) of touches, each a sequence of finger images (H, W, 3) in 0..1."""
     fast = for_inference(matcher, ["touch_tower"])
     device = next(fast.parameters()).device
     return _in_batches(touches, batch, lambda part: fast.touch_features(touch_batch(part, device)))
 
 
 def photo_features(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -> Tensor:
-    """Features (B, features) of photos (H, W, 3) in 0..1."""
+    """Return features (B, features) of photos (H, W, 3) in 0..1."""
     fast = for_inference(matcher, ["photo_tower"])
     device = next(fast.parameters()).device
     return _in_batches(photos, batch, lambda part: fast.photo_features(to_batch(part, device)))
@@ -141,50 +150,53 @@ def photo_features(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -
 
 @torch.inference_mode()
 def encode_touches(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> ImageEncoding:
-    """Partials and embeddings of touches, each a sequence of finger images (H, W, 3), on the CPU.
+    """Return partial activations and embeddings of touches, each a sequence of finger images (H, W, 3), on the CPU.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> gels = [checkpoint.config.preprocessing.load_touch(file) for file in ("a.png", "b.png")]
     >>> retrieval.encode_touches(checkpoint.matcher, [gels]).embedding.shape
     torch.Size([1, 16])
     """
-    code = matcher.touch_search_encoding(touch_features(matcher, touches, batch))
-    return ImageEncoding(code.partial.cpu(), code.embedding.cpu())
+    encoding = matcher.touch_search_encoding(touch_features(matcher, touches, batch))
+    return ImageEncoding(encoding.partial.cpu(), encoding.embedding.cpu())
 
 
 @torch.inference_mode()
 def encode_photos(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -> ImageEncoding:
-    """Partials and embeddings of photos (H, W, 3), on the CPU.
+    """Return partial activations and embeddings of photos (H, W, 3), on the CPU.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> photo = checkpoint.config.preprocessing.load_photo("catalog/mug/1.jpg")
     >>> retrieval.encode_photos(checkpoint.matcher, [photo]).partial.shape
     torch.Size([1, 32])
     """
-    code = matcher.photo_search_encoding(photo_features(matcher, photos, batch))
-    return ImageEncoding(code.partial.cpu(), code.embedding.cpu())
+    encoding = matcher.photo_search_encoding(photo_features(matcher, photos, batch))
+    return ImageEncoding(encoding.partial.cpu(), encoding.embedding.cpu())
 
 
 class TorchEncoder:
-    """The touch encoder of one query after another: `encode_touches` of a model that does not change.
-
-    threads: with which PyTorch computes from then on, here and in whatever else the process does; None leaves it.
-    """
+    """Touch encoder for a sequence of queries to one unchanging model: `encode_touches` in PyTorch."""
 
     name = "torch"
 
     def __init__(self, matcher: Matcher, threads: int | None = None) -> None:
+        """Prepare the towers.
+
+        Args:
+            matcher: The model.
+            threads: Threads that PyTorch computes with from then on, in the whole process; None changes nothing.
+        """
         self._fast, self._threads = for_inference(matcher, ["touch_tower"]), threads
 
     @torch.inference_mode()
     def encode(self, touches: Sequence[Sequence[Image]]) -> TouchEncodings:
-        """The codes of grasps, each given as its fingers' images."""
+        """Encode grasps, each a sequence of its fingers' images."""
         if self._threads is not None:
-            torch.set_num_threads(self._threads)  # which holds for the calling thread
+            torch.set_num_threads(self._threads)  # applies to the calling thread
         features = self._fast.touch_features(touch_batch(touches))
-        code, readings = self._fast.touch_search_encoding(features), self._fast.gel_readings(features)
+        encoding, readings = self._fast.touch_search_encoding(features), self._fast.gel_readings(features)
         return TouchEncodings(
-            code.partial.numpy(), code.embedding.numpy(), None if readings is None else readings.numpy()
+            encoding.partial.numpy(), encoding.embedding.numpy(), None if readings is None else readings.numpy()
         )
 
 
@@ -194,21 +206,23 @@ def _in_batches(items: Iterable[T], batch: int, encode: Callable[[list[T]], Tens
 
 
 def batches(items: Iterable[T], size: int) -> Iterator[list[T]]:
-    """Lists of `size` items, the last one shorter."""
+    """Yield lists of `size` items, the last one possibly shorter."""
     iterator = iter(items)
     while part := list(itertools.islice(iterator, size)):
         yield part
 
 
 def default_device() -> torch.device:
-    """CUDA where there is one, else the CPU."""
+    """Return CUDA if available, else the CPU."""
     return torch.device("cuda", torch.cuda.current_device()) if torch.cuda.is_available() else torch.device("cpu")
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """PyTorch computes on the calling thread alone. Its workers wait for each other many times a step, and where one
-    finds its core taken by another program all the others spin: milliseconds become hundreds.
+    """Make PyTorch compute only on the calling thread.
+
+    PyTorch's workers wait for each other many times a step. If another program takes the core of one worker, all others
+    spin: milliseconds become hundreds.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -219,15 +233,19 @@ def one_thread() -> Iterator[None]:
 
 
 def autocast(device: torch.device, precision: str) -> AbstractContextManager[Any]:
-    """Context for the towers' arithmetic in training.
+    """Return the context for the towers' arithmetic in training.
 
-    precision: "float32", "bfloat16", or "auto": bfloat16 where the hardware multiplies it, float32 elsewhere (a CPU
-    without such instructions emulates bfloat16, ten times slower than float32). Raises ConfigError for bfloat16 asked
-    for where it is only emulated.
+    Args:
+        device: Where the towers compute.
+        precision: "float32", "bfloat16", or "auto": bfloat16 where the hardware multiplies it, else float32. A CPU
+            without such instructions emulates bfloat16, ten times slower than float32.
+
+    Raises:
+        ConfigError: `precision` is bfloat16 and the device only emulates it.
     """
     fast = has_fast_bfloat16(device)
     if precision == "bfloat16" and not fast:
-        raise ConfigError(f"precision bfloat16 needs hardware for it, which {device} has not; use auto or float32")
+        raise ConfigError(f"precision bfloat16 needs hardware support, which {device} lacks; use auto or float32")
     return torch.autocast(device.type, torch.bfloat16, enabled=fast and precision != "float32")
 
 

@@ -1,4 +1,4 @@
-"""`retrieve export`: the touch encoder as ONNX, if it is faster so on this machine."""
+"""`retrieve export`: the touch encoder as ONNX, if ONNX Runtime is faster on this machine."""
 
 import logging
 import stat
@@ -34,13 +34,19 @@ from retrieval.model.onnx_encoder import (
 log = logging.getLogger(__name__)
 ROUNDS = 9
 TOLERANCE = 1e-3
-"""Largest difference of a half from PyTorch's, relative to the largest half, and of an embedding's component."""
+"""Largest accepted difference from PyTorch: of partial activations relative to the largest, of embeddings absolute."""
 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What came of an export. Times are medians for one touch; differences are the largest, of halves relative to the
-    largest half.
+    """Result of an export. Times are medians for one touch.
+
+    Attributes:
+        path: The ONNX file.
+        torch_ms: Milliseconds that PyTorch takes.
+        onnx_ms: Milliseconds that ONNX Runtime takes.
+        partial_difference: Largest difference of a partial activation, relative to the largest partial activation.
+        embedding_difference: Largest difference of an embedding's component.
     """
 
     path: str
@@ -51,18 +57,23 @@ class ExportReport:
 
     def __str__(self) -> str:
         return (
-            f"{self.path}: a touch is encoded in {self.onnx_ms:.1f} ms by ONNX Runtime, in {self.torch_ms:.1f} ms by "
-            f"PyTorch ({self.torch_ms / self.onnx_ms:.2f} times); halves differ by {self.partial_difference:.1g} of the "
-            f"largest, embeddings by {self.embedding_difference:.1g}"
+            f"{self.path}: ONNX Runtime encodes a touch in {self.onnx_ms:.1f} ms, PyTorch in {self.torch_ms:.1f} ms "
+            f"({self.torch_ms / self.onnx_ms:.2f} times); partial activations differ by {self.partial_difference:.1g} "
+            f"of the largest, embeddings by {self.embedding_difference:.1g}"
         )
 
 
 def export(checkpoint: Checkpoint, out: Path | None = None) -> ExportReport:
-    """Write the touch encoder of a checkpoint as ONNX: beside the checkpoint, where `retrieve query` looks for it, or
-    to `out`.
+    """Write the touch encoder of a checkpoint as ONNX.
 
-    Raises BadInput where `onnx` or `onnxruntime` is missing; RetrievalError, and nothing is written, where ONNX
-    Runtime is not the faster one here or gives other numbers than PyTorch.
+    Args:
+        checkpoint: The model.
+        out: The file to write; by default the name next to the checkpoint that `retrieve query` looks up.
+
+    Raises:
+        BadInput: `onnx` or `onnxruntime` is missing.
+        RetrievalError: ONNX Runtime is not faster on this machine, or its results differ from PyTorch's. Nothing is
+            written.
     """
     lacking = [name for name in ("onnx", "onnxruntime") if find_spec(name) is None]
     if lacking:
@@ -72,15 +83,15 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> ExportReport:
         raise BadInput(f"an export must be named *{EXPORT_SUFFIX}; got {path}")
     require_ours(path, EXPORT)
     require_folder(path)
-    unverified = path.with_name(f".{path.name}.unsettled")
+    unverified = path.with_name(f".{path.name}.unverified")
     try:
         write_atomically(unverified, with_checksum(touch_encoder_to_onnx(checkpoint)))
-        unverified.chmod(unverified.stat().st_mode & ~(stat.S_IWGRP | stat.S_IWOTH))  # else no query takes it
+        unverified.chmod(unverified.stat().st_mode & ~(stat.S_IWGRP | stat.S_IWOTH))  # a query requires this
         result = compare(checkpoint, unverified, path)
         if not max(result.partial_difference, result.embedding_difference) <= TOLERANCE:
-            raise RetrievalError(f"nothing is exported, as ONNX Runtime gives other numbers. {result}")
+            raise RetrievalError(f"nothing is exported, because ONNX Runtime gives other numbers. {result}")
         if result.onnx_ms >= result.torch_ms:
-            raise RetrievalError(f"nothing is exported, as PyTorch is as fast on this machine. {result}")
+            raise RetrievalError(f"nothing is exported, because PyTorch is as fast on this machine. {result}")
         unverified.replace(path)
     finally:
         unverified.unlink(missing_ok=True)
@@ -88,11 +99,13 @@ def export(checkpoint: Checkpoint, out: Path | None = None) -> ExportReport:
 
 
 def export_to_cache(checkpoint: Checkpoint) -> ExportReport | None:
-    """Write the export of a checkpoint to the user's cache, where queries look for it too: once, and only where none
-    lies beside the checkpoint. For a checkpoint in the folder of an installed package, which is not ours to write to.
+    """Export a checkpoint to the user's cache, unless an export is already there or next to the checkpoint.
 
-    None where there is nothing to do, or nothing can be done: a query works without it. A folder that is open to other
-    users is left alone, and a warning says so.
+    For checkpoints in the folder of an installed package, which we must not write to. Queries also look in the cache.
+
+    Returns:
+        The report; None where an export exists or none can be written. Queries work without it. A cache folder that
+        other users can write to is not used; a warning is logged.
     """
     path = cached_export_path(checkpoint.digest)
     if path is None or checkpoint.path.with_suffix(EXPORT_SUFFIX).is_file():
@@ -101,16 +114,16 @@ def export_to_cache(checkpoint: Checkpoint) -> ExportReport | None:
         make_cache_folder(path.parent)
         require_private(path.parent, path.parent.stat())
     except BadInput as error:
-        log.warning("%s; no export for queries is kept there", error)
+        log.warning("%s; the cache gets no export for queries", error)
         return None
     except OSError as error:
         log.info("no export for queries: %s", error)
         return None
-    with suppress(CheckpointError):  # none yet, a damaged one, or one that others could write to
+    with suppress(CheckpointError):  # absent, damaged, or writable by others
         read_checked_export(path)
         return None
     try:
-        path.unlink(missing_ok=True)  # of the cache everything is ours, whatever it holds by now
+        path.unlink(missing_ok=True)  # every file of the cache is ours
         return export(checkpoint, path)
     except (OSError, RetrievalError) as error:
         log.info("no export for queries: %s", error)
@@ -118,14 +131,14 @@ def export_to_cache(checkpoint: Checkpoint) -> ExportReport | None:
 
 
 def touch_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
-    """The touch encoder as an ONNX model that carries the checkpoint's digest; any number of touches at once."""
+    """Return the touch encoder as an ONNX model with the checkpoint's digest, for any number of touches at once."""
     side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
     outputs = ["partial", "embedding"] + (["readings"] if checkpoint.matcher.gel_head else [])
     return _trace(_TouchEncoder(checkpoint.matcher), (fingers, side, side, 3), outputs, checkpoint.digest)
 
 
 def photo_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
-    """The same of the photo encoder: images (B, H, views * W, 3) to halves and embeddings."""
+    """Return the photo encoder as ONNX: images (B, H, views * W, 3) to partial activations and embeddings."""
     side, views = checkpoint.config.preprocessing.photo_px, checkpoint.matcher.views
     encoder = _PhotoEncoder(checkpoint.matcher)
     return _trace(encoder, (side, views * side, 3), ["partial", "embedding"], checkpoint.digest)
@@ -135,9 +148,9 @@ def _trace(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], diges
     import onnx
 
     with TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore")  # the exporter by tracing is the old one; the new one needs one more package
+        warnings.simplefilter("ignore")  # the tracing exporter is deprecated; the new one needs one more package
         torch.onnx.export(
-            encoder.eval(),  # the exporter leaves modules, shared ones too, as it found this
+            encoder.eval(),  # the exporter leaves all modules, shared ones too, in the mode of this one
             (torch.zeros(1, *shape),),
             str(Path(folder, "model.onnx")),
             input_names=["images"],
@@ -152,8 +165,9 @@ def _trace(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], diges
 
 
 class _TouchEncoder(nn.Module):
-    """Images (B, fingers, H, W, 3) to halves, embeddings and what the gel head reads, where the matcher has one;
-    without the checks of values, which ONNX has not.
+    """Images (B, fingers, H, W, 3) to partial activations, embeddings and, with a gel head, readings.
+
+    ONNX cannot check values, so the checks of `Tower.forward` are left out.
     """
 
     def __init__(self, matcher: Matcher) -> None:
@@ -165,12 +179,13 @@ class _TouchEncoder(nn.Module):
         pictures = images.permute(0, 1, 4, 2, 3).flatten(0, 1)
         features = tower._encode((pictures - tower.mean) / tower.std)
         features = features.reshape(-1, self.matcher.config.fingers * tower.feature_count)
-        code, readings = self.matcher.touch_search_encoding(features), self.matcher.gel_readings(features)
-        return (code.partial, code.embedding) if readings is None else (code.partial, code.embedding, readings)
+        encoding, readings = self.matcher.touch_search_encoding(features), self.matcher.gel_readings(features)
+        outputs = encoding.partial, encoding.embedding
+        return outputs if readings is None else (*outputs, readings)
 
 
 class _PhotoEncoder(nn.Module):
-    """Images (B, H, views * W, 3) to halves and embeddings."""
+    """Images (B, H, views * W, 3) to partial activations and embeddings."""
 
     def __init__(self, matcher: Matcher) -> None:
         super().__init__()
@@ -181,12 +196,12 @@ class _PhotoEncoder(nn.Module):
         side = images.shape[1]
         pictures = images.reshape(-1, side, views, side, 3).permute(0, 2, 4, 1, 3).flatten(0, 1)
         features = tower._encode((pictures - tower.mean) / tower.std)
-        code = self.matcher.photo_search_encoding(features.reshape(-1, views * tower.feature_count))
-        return code.partial, code.embedding
+        encoding = self.matcher.photo_search_encoding(features.reshape(-1, views * tower.feature_count))
+        return encoding.partial, encoding.embedding
 
 
 def _exportable_matcher(matcher: Matcher, side: str) -> Matcher:
-    """A matcher whose tower is folded, and whose normalisation of features is plain arithmetic."""
+    """Return a matcher whose tower is folded and whose feature normalisation is plain arithmetic."""
     fast = for_inference(matcher, [f"{side}_tower"])
     norm = matcher.get_submodule(f"{side}_norm")
     if isinstance(norm, Standardise):
@@ -195,7 +210,7 @@ def _exportable_matcher(matcher: Matcher, side: str) -> Matcher:
 
 
 class _FrozenNorm(nn.Module):
-    """Normalisation of features in evaluation mode: the exporter wants to know the width of its input."""
+    """Feature normalisation in evaluation mode: the exporter requires the width of its input."""
 
     def __init__(self, norm: Standardise) -> None:
         super().__init__()
@@ -206,12 +221,21 @@ class _FrozenNorm(nn.Module):
 
 
 def compare(checkpoint: Checkpoint, written: Path, path: Path) -> ExportReport:
-    """Encode the same touch by both in turns; `path` is what `written` will be called."""
-    ours, theirs = TorchEncoder(checkpoint.matcher), OnnxEncoder(written, checkpoint.digest)
+    """Encode the same touch with PyTorch and ONNX Runtime, alternately.
+
+    Args:
+        checkpoint: The model.
+        written: The ONNX file.
+        path: Its final name, for the report.
+    """
+    torch_encoder, onnx_encoder = TorchEncoder(checkpoint.matcher), OnnxEncoder(written, checkpoint.digest)
     side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
     touch = list(np.random.default_rng(0).random((fingers, side, side, 3), dtype=np.float32))
-    (partial, embedding, *_), (other_partial, other_embedding, *_) = ours.encode([touch]), theirs.encode([touch])
-    times = [(_ms(lambda: ours.encode([touch])), _ms(lambda: theirs.encode([touch]))) for _ in range(ROUNDS)]
+    partial, embedding, *_ = torch_encoder.encode([touch])
+    other_partial, other_embedding, *_ = onnx_encoder.encode([touch])
+    times = [
+        (_ms(lambda: torch_encoder.encode([touch])), _ms(lambda: onnx_encoder.encode([touch]))) for _ in range(ROUNDS)
+    ]
     torch_ms, onnx_ms = (statistics.median(arm) for arm in zip(*times, strict=True))
     partial_difference = float(np.abs(partial - other_partial).max() / np.abs(partial).max())
     return ExportReport(

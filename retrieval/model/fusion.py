@@ -1,9 +1,9 @@
-"""The matcher: two towers, the fusion head that judges a pair, and the projections for candidate search.
+"""The matcher: two towers, the fusion head that scores a pair, and the projections for candidate search.
 
-The first layer of the head is linear in the concatenation of the modalities, so it is stored as two halves:
-`W [t; v] + b = (W_t t + b) + W_v v`. A photo's half can be computed once, stored, and added to any touch's. Where the
-cosine of the embeddings counts too (`MatcherConfig.cosine`), a half ends with its embedding times the root of the
-scale, so that halves are still all that is stored of a photo.
+The first layer of the head is linear in the concatenation of the modalities, so it is stored as two layers:
+`W [t; v] + b = (W_t t + b) + W_v v`. Each term is a partial activation. A photo's partial activation is computed once,
+stored, and added to any touch's. Where the logit adds the cosine of the embeddings (`MatcherConfig.cosine`), a partial
+activation ends with its embedding times the root of the scale. The index then still stores nothing else of a photo.
 """
 
 import math
@@ -23,13 +23,15 @@ from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX
 from retrieval.model.towers import build_tower
 
 COSINE_SCALE_INIT = 4.0
-"""What a cosine of 1 adds to the logit before anything is learned."""
+"""Initial amount that a cosine of 1 adds to the logit."""
 
 
 class ImageEncoding(NamedTuple):
-    """What the matcher keeps of one image: its share of the head's first layer and its place in the metric space.
+    """Encoding of images: partial activations and embeddings, float32.
 
-    half (B, half) and embedding (B, embedding_dim), float32; embeddings have norm 1.
+    Attributes:
+        partial: (B, partial) terms of the head's first layer.
+        embedding: (B, embedding_dim) unit vectors of the metric space.
     """
 
     partial: Tensor
@@ -37,21 +39,21 @@ class ImageEncoding(NamedTuple):
 
 
 MIN_RELATIVE_DEVIATION = 0.02
-"""A feature that varies by less than this share of its mean is not scaled up to vary by 1."""
+"""Features whose standard deviation is below this fraction of their mean are not scaled up to a deviation of 1."""
 
 
 class Standardise(nn.BatchNorm1d):
-    """Each feature centred and scaled by its statistics over the training batches; without parameters.
+    """Centre and scale each feature by its statistics over the training batches; no parameters.
 
-    A channel that hardly varies around a large mean would be scaled up until the rounding of its weights to float16,
-    a thousandth of the mean, is as large as what it says: quiet features stay quiet.
+    A channel that hardly varies around a large mean is not scaled up to unit variance. Rounding its weights to float16
+    changes it by a thousandth of the mean, which would then be as large as the signal.
     """
 
     def __init__(self, features: int) -> None:
         super().__init__(features, affine=False)
 
     def forward(self, features: Tensor) -> Tensor:
-        """(B, F) of features (B, F)."""
+        """Return standardised features (B, F)."""
         scaled: Tensor = super().forward(features)
         mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
         if self.training:
@@ -59,12 +61,12 @@ class Standardise(nn.BatchNorm1d):
         return scaled * ((variance + self.eps) / self._floored_variance(mean, variance)).sqrt()
 
     def mean_and_scale(self) -> tuple[Tensor, Tensor]:
-        """Mean (F,) and scale (F,): in evaluation mode this is `(features - mean) * scale`."""
+        """Return mean (F,) and scale (F,): in evaluation mode the output is `(features - mean) * scale`."""
         mean, variance = self.get_buffer("running_mean"), self.get_buffer("running_var")
         return mean, torch.rsqrt(self._floored_variance(mean, variance))
 
     def _floored_variance(self, mean: Tensor, variance: Tensor) -> Tensor:
-        """(F,) variances, those of quiet features raised."""
+        """Return variances (F,), raised where a feature hardly varies."""
         return torch.maximum(variance + self.eps, (MIN_RELATIVE_DEVIATION * mean).square())
 
 
@@ -84,7 +86,7 @@ class FusionHead(nn.Module):
             nn.init.uniform_(parameter, -bound, bound)
 
     def forward(self, touch_partial: Tensor, photo_partial: Tensor) -> Tensor:
-        """Match logits (P,) of pairs of halves (P, half); either side broadcasts from (1, half)."""
+        """Return match logits (P,) of pairs of partial activations (P, partial); (1, partial) broadcasts."""
         hidden = self.second.in_features
         x = self.dropout(functional.relu(touch_partial[..., :hidden] + photo_partial[..., :hidden]))
         x = functional.relu(self.second(x))
@@ -93,34 +95,40 @@ class FusionHead(nn.Module):
 
 
 class Matcher(nn.Module):
-    """Touch and photo in, halves and embeddings out; halves in, match logit out."""
+    """Maps touches and photos to partial activations and embeddings, and partial activations to match logits."""
 
     def __init__(self, config: MatcherConfig, views: int = 1) -> None:
-        """views: pictures of a photo that stand side by side (`retrieval.data.views`)."""
+        """Build the layers with random weights.
+
+        Args:
+            config: Sizes and options.
+            views: Views of a photo, side by side in its image (`retrieval.data.views`).
+        """
         super().__init__()
         self.views = views
         self.config = config
-        # One set of weights for all fingers.
+        # All fingers use one set of weights.
         self.touch_tower = build_tower(config.tower, config.tower_output, config.architectures)
         self.photo_tower = build_tower(config.tower, config.tower_output, config.architectures)
         touch_features = config.fingers * self.touch_tower.feature_count
         photo_features = views * self.photo_tower.feature_count
         self.head = FusionHead(touch_features, photo_features, config.hidden, config.dropout)
-        # After the head, so that their initial weights do not change the paper's.
+        # Created after the head, so that the head's random initial weights equal the paper's model.
         self.touch_projection = nn.Linear(touch_features, config.embedding_dim)
         self.photo_projection = nn.Linear(photo_features, config.embedding_dim)
-        # At use a fixed affine map, so halves stay sums of shares.
+        # In evaluation mode a fixed affine map, so the head's first layer remains a sum of two terms.
         norm = Standardise if config.standardise else nn.Identity
         self.touch_norm, self.photo_norm = norm(touch_features), norm(photo_features)
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
         self.cosine_scale = nn.Parameter(torch.tensor(COSINE_SCALE_INIT)) if config.cosine else None
         self.candidate_encoder = candidate_encoder_of(config) if config.candidate_width else None
-        self.gel_head: GelHead | None = None  # fitted when the training is over (`retrieval.training.verdicts`)
+        self.gel_head: GelHead | None = None  # fitted after training (`retrieval.training.verdicts`)
 
     def touch_features(self, touches: Tensor) -> Tensor:
-        """Features (B, fingers * features) of touches (B, fingers, 3, H, W) in 0..1, fingers in order a, b.
+        """Return features (B, fingers * features) of touches (B, fingers, 3, H, W) in 0..1, fingers in order a, b.
 
-        Raises BadInput where the number of images is not the number of fingers this matcher was built for.
+        Raises:
+            BadInput: A touch has another number of images than this matcher has fingers.
         """
         fingers = self.config.fingers
         if touches.ndim != 5 or touches.shape[1] != fingers:
@@ -130,9 +138,9 @@ class Matcher(nn.Module):
         return features.float().view(len(touches), -1)
 
     def photo_features(self, photos: Tensor) -> Tensor:
-        """Features (B, views * features) of photos (B, 3, H, views * W) in 0..1."""
+        """Return features (B, views * features) of photos (B, 3, H, views * W) in 0..1."""
         if self.views > 1:
-            # Copied once, with channels last: convolutions in training take 1.4 times as long otherwise.
+            # One copy with channels last: without it, convolutions in training take 1.4 times as long.
             count, _, height, _ = photos.shape
             side_by_side = photos.permute(0, 2, 3, 1).reshape(count, height, self.views, -1, 3)
             photos = side_by_side.transpose(1, 2).flatten(0, 1).permute(0, 3, 1, 2)
@@ -140,59 +148,59 @@ class Matcher(nn.Module):
         return features.float().view(len(photos) // self.views, -1)
 
     def touch_encoding(self, features: Tensor) -> ImageEncoding:
-        """Half of touch features, and their embedding by the contrastive projection."""
+        """Return partial activations of touch features, and their embeddings by the contrastive projection."""
         features = self.touch_norm(features)
         return self._encoding(self.head.touch_partial(features), _unit(self.touch_projection(features)))
 
     def photo_encoding(self, features: Tensor) -> ImageEncoding:
-        """Half of photo features, and their embedding by the contrastive projection."""
+        """Return partial activations of photo features, and their embeddings by the contrastive projection."""
         features = self.photo_norm(features)
         return self._encoding(self.head.photo_partial(features), _unit(self.photo_projection(features)))
 
-    def _encoding(self, share: Tensor, embedding: Tensor) -> ImageEncoding:
+    def _encoding(self, term: Tensor, embedding: Tensor) -> ImageEncoding:
         if self.cosine_scale is None:
-            return ImageEncoding(share, embedding)
-        return ImageEncoding(torch.cat([share, embedding * self.cosine_scale.clamp(min=0.0).sqrt()], dim=-1), embedding)
+            return ImageEncoding(term, embedding)
+        return ImageEncoding(torch.cat([term, embedding * self.cosine_scale.clamp(min=0.0).sqrt()], dim=-1), embedding)
 
     def touch_search_encoding(self, features: Tensor) -> ImageEncoding:
-        """Half and embedding for candidate search of touch features."""
-        code = self.touch_encoding(features)
+        """Return partial activations and search embeddings of touch features."""
+        encoding = self.touch_encoding(features)
         return (
-            code
+            encoding
             if self.candidate_encoder is None
-            else ImageEncoding(code.partial, self.candidate_encoder.touch(code.partial))
+            else ImageEncoding(encoding.partial, self.candidate_encoder.touch(encoding.partial))
         )
 
     def gel_readings(self, features: Tensor) -> Tensor | None:
-        """(B, fingers, 2) what touch features say of each finger's image (`GelHead`); None without a check."""
+        """Return the readings (B, fingers, 2) of each finger's features (`GelHead`); None without a gel head."""
         if self.gel_head is None:
             return None
         readings: Tensor = self.gel_head(features.view(-1, self.config.fingers, self.touch_tower.feature_count))
         return readings
 
     def photo_search_encoding(self, features: Tensor) -> ImageEncoding:
-        """Half and embedding for candidate search of photo features: what an index keeps."""
-        code = self.photo_encoding(features)
+        """Return partial activations and search embeddings of photo features, as an index stores them."""
+        encoding = self.photo_encoding(features)
         return (
-            code
+            encoding
             if self.candidate_encoder is None
-            else ImageEncoding(code.partial, self.candidate_encoder.photo(code.partial))
+            else ImageEncoding(encoding.partial, self.candidate_encoder.photo(encoding.partial))
         )
 
     def forward(self, touches: Tensor, photos: Tensor) -> Tensor:
-        """Match logits (P,) of pairs: touches (P, fingers, 3, H, W) with photos (P, 3, H, W)."""
+        """Return match logits (P,) of pairs: touches (P, fingers, 3, H, W) with photos (P, 3, H, W)."""
         touch = self.touch_encoding(self.touch_features(touches))
         photo = self.photo_encoding(self.photo_features(photos))
         return self.head(touch.partial, photo.partial)  # type: ignore[no-any-return]
 
     @torch.no_grad()
     def clamp_scale(self) -> None:
-        """Hold the scale of the contrastive scores at 100 at most; on the parameter, so that it can come back."""
+        """Clamp the parameter of the contrastive scale to at most 100, so that its gradient can reduce it again."""
         self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
 
 
 def candidate_encoder_of(config: MatcherConfig) -> CandidateEncoder:
-    """An untaught candidate_encoder of a matcher."""
+    """Return an untrained candidate encoder with the sizes of a matcher."""
     return CandidateEncoder(config.partial_width, config.candidate_width, config.embedding_dim, config.candidate_linear)
 
 
@@ -201,8 +209,9 @@ def _unit(x: Tensor) -> Tensor:
 
 
 def scorer_of(head: FusionHead) -> FusionScorer:
-    """What follows the halves of a head, dropout off whatever its mode; a view of its weights where they lie on the
-    CPU.
+    """Return the scorer of a head: its layers after the partial activations, without dropout.
+
+    It shares the head's weights if these are on the CPU.
     """
     parts = (head.second.weight, head.second.bias, head.out.weight[0], head.out.bias)
     return FusionScorer(*(part.detach().cpu().numpy() for part in parts))
@@ -214,25 +223,37 @@ def score_partials(
     photo_partials: NDArray[np.floating[Any]],
     rows: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float32]:
-    """`FusionScorer.logits` of a head in PyTorch and touch halves (G, half)."""
+    """Return `FusionScorer.logits` for a head in PyTorch.
+
+    Args:
+        head: The fusion head.
+        touch_partials: (G, partial) partial activations of the grasps.
+        photo_partials: (N, partial) partial activations of the photos.
+        rows: Photos to score; None for all.
+
+    Returns:
+        Summed match logits (len(rows),).
+    """
     return scorer_of(head).logits(touch_partials.detach().cpu().numpy(), photo_partials, rows)
 
 
 GEL_CLASSES = ("contact", "no_contact", "foreign")
-"""What the gel head tells apart."""
+"""Classes of the gel head."""
 
 
 class GelHead(nn.Module):
-    """A linear layer to one logit for each of KINDS."""
+    """A linear layer to one logit for each of `GEL_CLASSES`."""
 
     def __init__(self, features: int) -> None:
         super().__init__()
         self.classifier = nn.Linear(features, len(GEL_CLASSES))
 
     def forward(self, features: Tensor) -> Tensor:
-        """Readings (B, fingers, 2) of features (B, fingers, F): log-odds of "no gel image" against both others, and of
-        contact against an untouched gel.
+        """Return readings (B, fingers, 2) of features (B, fingers, F).
+
+        The first is the log-odds of "no gel image" against both other classes, the second that of contact against a
+        no-contact gel.
         """
         contact, no_contact, foreign = self.classifier(features).unbind(-1)
-        gel = torch.logsumexp(torch.stack([contact, no_contact], dim=-1), dim=-1)  # ONNX knows no logaddexp
+        gel = torch.logsumexp(torch.stack([contact, no_contact], dim=-1), dim=-1)  # ONNX has no logaddexp
         return torch.stack([foreign - gel, contact - no_contact], dim=-1)

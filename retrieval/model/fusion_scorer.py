@@ -1,12 +1,13 @@
-"""What is judged of codes, in numpy: what a grasp shows, and whether a touch and a photo show one object.
+"""Verdicts and match logits from encodings, in numpy.
 
-Before the matcher is asked: is this a gel image at all, and does it feel anything? Each finger's image is told apart by
-a linear reading of the touch tower's features (`retrieval.model.fusion.GelHead`) into what the checkpoint saw in
-training: gels in contact, untouched gels, and pictures that are no gel image. Where a no-contact frame is given,
-contact is what differs from it, which needs no model.
+Two questions precede matching: is this a gel image, and is there a contact? A linear layer on the touch tower's
+features (`retrieval.model.fusion.GelHead`) classifies each finger's image into the classes of its training: gels in
+contact, no-contact gels, and pictures that are not gel images. With a no-contact frame, contact is the difference from
+that frame, which needs no model.
 
-Then pairs, from stored halves, photos in blocks: the head's layers after the halves are one matrix product for all
-photos at once; what comes before and after it is done in place, so that the product is most of the time.
+Pairs are scored from stored partial activations, with the photos in blocks. The head's layers after the partial
+activations are one matrix product for all photos of a block. The rest is done in place, so the product takes most of
+the time.
 """
 
 import dataclasses
@@ -29,12 +30,14 @@ Bounded = Annotated[float, Meta(ge=-1e6, le=1e6)]
 
 @dataclass(frozen=True)
 class GelCheck:
-    """Thresholds, from validation objects; None for what the recording could not teach.
+    """Thresholds of the gel check, chosen on validation objects; None where the recording had no examples.
 
-    foreign_above: a finger's log-odds of "no gel image" beyond which a grasp is refused. contact_above: log-odds of
-    contact, the larger of the fingers', from which on a grasp has felt something. level_above: the same for what a gel
-    image differs from its no-contact frame, in grey levels of 255 (`contact_level`). shares: of what was refused of
-    validation touches, untouched gels and foreign pictures.
+    Attributes:
+        foreign_above: A grasp is refused if a finger's log-odds of "no gel image" exceed this.
+        contact_above: A grasp is a contact from this log-odds of contact on; the larger of the fingers' counts.
+        level_above: The same for the difference of a gel image from its no-contact frame, in grey levels of 255
+            (`contact_level`).
+        rates: Fractions of validation touches, no-contact gels and foreign pictures that were refused.
     """
 
     foreign_above: Bounded | None
@@ -43,10 +46,11 @@ class GelCheck:
     rates: Mapping[str, Bounded]
 
     def classify(self, readings: NDArray[np.float32], levels: NDArray[np.float32] | None = None) -> list[str]:
-        """What each grasp is: CONTACT, NO_CONTACT or NOT_A_GEL.
+        """Classify each grasp as CONTACT, NO_CONTACT or NOT_A_GEL.
 
-        readings (G, fingers, 2): log-odds of "no gel image" and of contact. levels (G, fingers): grey levels by which
-        the images differ from their no-contact frames, where these were given.
+        Args:
+            readings: (G, fingers, 2) log-odds of "no gel image" and of contact.
+            levels: (G, fingers) differences of the images from their no-contact frames in grey levels, if available.
         """
         if levels is not None and self.level_above is not None:
             has_contact = levels.max(1) >= self.level_above
@@ -54,16 +58,16 @@ class GelCheck:
             has_contact = readings[..., 1].max(1) >= self.contact_above
         else:
             has_contact = np.ones(len(readings), dtype=bool)
-        known = np.ones(len(readings), dtype=bool)
+        is_gel = np.ones(len(readings), dtype=bool)
         if self.foreign_above is not None:
-            known = readings[..., 0].max(1) <= self.foreign_above
+            is_gel = readings[..., 0].max(1) <= self.foreign_above
         return [
-            (CONTACT if feels else NO_CONTACT) if gel else NOT_A_GEL
-            for gel, feels in zip(known, has_contact, strict=True)
+            (CONTACT if contact else NO_CONTACT) if gel else NOT_A_GEL
+            for gel, contact in zip(is_gel, has_contact, strict=True)
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary, as stored in checkpoints."""
+        """Return a plain dictionary, as stored in checkpoints."""
         return dataclasses.asdict(self)
 
     @classmethod
@@ -73,9 +77,9 @@ class GelCheck:
 
 
 def contact_level(touch: RgbImage, no_contact: RgbImage) -> float:
-    """By how many grey levels of 255 a gel image differs from its no-contact frame, where it differs most.
+    """Return the largest difference of a gel image from its no-contact frame, in grey levels of 255.
 
-    Both (H, W, 3) in 0..1; compared in 16 x 16 blocks, whose means leave the noise of single pixels out.
+    Both images are (H, W, 3) in 0..1. They are compared in 16 x 16 blocks, whose means suppress pixel noise.
     """
     size = (BLOCKS, BLOCKS)
     return 255 * float(np.abs(resize(touch, size) - resize(no_contact, size)).max())
@@ -88,10 +92,16 @@ BLOCK = 2048
 
 @dataclass(frozen=True)
 class FusionScorer:
-    """The layers of a fusion head that follow its halves: `out . relu(second relu(touch + photo) + bias) + out_bias`,
-    of the first H numbers; what follows them in a half adds its inner product.
+    """The layers of a fusion head after its partial activations.
 
-    second (H, H), second_bias (H,), out (H,), out_bias (1,), all float32.
+    On the first H numbers: `out . relu(second relu(touch + photo) + bias) + out_bias`. The inner product of the
+    remaining numbers is added.
+
+    Attributes:
+        second: (H, H) weights of the second layer. All arrays are float32.
+        second_bias: (H,) its bias.
+        out: (H,) weights of the output.
+        out_bias: (1,) its bias.
     """
 
     second: Floats
@@ -100,15 +110,22 @@ class FusionScorer:
     out_bias: Floats
 
     def logits(self, touch_partials: Floats, photo_partials: Partials, rows: NDArray[np.int64] | None = None) -> Floats:
-        """Sum over grasps of the match logits of the photos at `rows` (all where None): (len(rows),).
+        """Return the match logits of photos, summed over grasps: (len(rows),).
 
-        touch_partials (G, half) of G grasps of ONE object; photo_partials (N, half) in any float type, memory-mapped or
-        not, read in blocks and computed with in float32. Adding logits takes the grasps as independent given the
-        object, and a flat prior. Raises NumericalError for a NaN or infinite logit: sorting would rank it first.
+        The sum assumes that grasps are independent given the object, and a flat prior. Photos are read in blocks and
+        converted to float32.
+
+        Args:
+            touch_partials: (G, partial) partial activations of G grasps of ONE object.
+            photo_partials: (N, partial) in any float type, possibly memory-mapped.
+            rows: Photos to score; None for all.
+
+        Raises:
+            NumericalError: A logit is NaN or infinite: sorting would rank it first.
         """
         count = len(photo_partials) if rows is None else len(rows)
         scores = np.empty(count, dtype=np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):  # told by name below
+        with np.errstate(over="ignore", invalid="ignore"):  # the check below names the row
             for start in range(0, count, BLOCK):
                 part = slice(start, min(start + BLOCK, count))
                 photos = photo_partials[part] if rows is None else photo_partials[rows[part]]
@@ -135,15 +152,18 @@ class FusionScorer:
 
 
 def as_float32(values: Partials) -> Floats:
-    """`values` in float32, exactly. Partials are finite float16, which numpy converts one by one, slower than the
-    arithmetic on them: five shifted bits of exponent and ten of fraction are the number over 2^112, subnormals too.
+    """Return `values` in float32, exactly.
+
+    Partial activations are finite float16. numpy converts these one by one, which takes longer than the arithmetic on
+    them. Shifting the five bits of the exponent and the ten of the fraction gives the number over 2^112, subnormals
+    included.
     """
     if values.dtype != np.float16:
         return np.ascontiguousarray(values, dtype=np.float32)
     bits = np.ascontiguousarray(values).view(np.int16)
     if ((bits & _EXPONENT) == _EXPONENT).any():  # NaN or infinite
         return values.astype(np.float32)
-    wide = bits.astype(np.int32)  # the sign is copied to all upper bits
+    wide = bits.astype(np.int32)  # copies the sign to all upper bits
     wide <<= 13
     wide &= _SIGN_AND_VALUE
     floats: Floats = wide.view(np.float32)

@@ -2,13 +2,13 @@
 
     gained     sum of P log2(P / P0): the Kullback-Leibler divergence of the posterior P from the prior P0
     remaining  sum of -P log2 P: the entropy of the posterior
-    possible   log2(objects / (1 - none_prior)): what is gained where one object becomes certain
+    possible   log2(objects / (1 - none_prior)): the gain if one object becomes certain
     next grasp remaining * (1 - exp(w(n) - w(n + 1))),  w(n) = n / (1 + dependence * (n - 1))
 
-w(n) is the number of independent grasps that n grasps of one object are worth. We model that each independent grasp
-leaves 1/e of the remaining bits; docs/service.md compares this estimate with what next grasps told.
+w(n) is the number of independent grasps that are equivalent to n grasps of one object. We model that each independent
+grasp leaves 1/e of the remaining bits; docs/service.md compares this estimate with measured grasps.
 
-An answer may list some of the objects only. The others are taken to have equal probabilities.
+An answer may list only some of the objects. The others are assumed to have equal probabilities.
 """
 
 import math
@@ -22,8 +22,12 @@ from retrieval.model.posterior import Posterior
 class Information:
     """Information of an answer to n grasps.
 
-    * `gained_bits`, `remaining_bits`, `possible_bits`, `next_grasp_bits`: as above.
-    * `next_effective_grasps`: w(n + 1).
+    Attributes:
+        gained_bits: As above, like the next three.
+        remaining_bits: Entropy of the posterior.
+        possible_bits: Gain if one object becomes certain.
+        next_grasp_bits: Expected gain of one more grasp.
+        next_effective_grasps: w(n + 1).
     """
 
     gained_bits: float
@@ -48,12 +52,12 @@ def information(
     """
     unlisted = objects - len(listed)
     prior = (1 - none_prior) / objects
-    # (posterior, prior) of each hypothesis, and how many objects share these probabilities equally.
+    # (posterior, prior) of each hypothesis, and the number of objects that have equal parts of these probabilities.
     hypotheses = [(none, none_prior, 1), *((probability, prior, 1) for probability in listed)]
     hypotheses.append((unlisted_probability(none, listed), unlisted * prior, unlisted))
-    hypotheses = [(now, before, share) for now, before, share in hypotheses if now > 0 and before > 0]
+    hypotheses = [(now, before, count) for now, before, count in hypotheses if now > 0 and before > 0]
     gained = math.fsum(now * math.log2(now / before) for now, before, _ in hypotheses)
-    remaining = math.fsum(-now * math.log2(now / share) for now, _, share in hypotheses)
+    remaining = math.fsum(-now * math.log2(now / count) for now, _, count in hypotheses)
     return Information(
         max(0.0, gained),
         max(0.0, remaining),
@@ -69,11 +73,11 @@ def unlisted_probability(none: float, listed: Sequence[float]) -> float:
 
 
 def effective_grasps(posterior: Posterior, grasps: int) -> float:
-    """Return the number of independent grasps that this many grasps of one object are worth, w(n)."""
+    """Return the number of independent grasps that are equivalent to this many grasps of one object, w(n)."""
     return grasps * posterior.weight(grasps) / posterior.slope
 
 
 def next_grasp_bits(posterior: Posterior, grasps: int, remaining_bits: float) -> float:
-    """Return the bits that a further grasp is expected to give after `grasps` ones that leave `remaining_bits`."""
+    """Return the expected gain in bits of one more grasp, after `grasps` grasps that leave `remaining_bits`."""
     gain = effective_grasps(posterior, grasps + 1) - effective_grasps(posterior, grasps)
     return remaining_bits * -math.expm1(-gain)

@@ -1,4 +1,4 @@
-"""The photo encoder of a long build: ONNX Runtime where it is installed, gives the same and is faster here."""
+"""The photo encoder of a long build: ONNX Runtime if it is installed, agrees with PyTorch and is faster."""
 
 import logging
 import statistics
@@ -19,34 +19,39 @@ log = logging.getLogger(__name__)
 Floats = NDArray[np.float32]
 ROUNDS, SAMPLE = 3, 8
 TOLERANCE = 2e-4
-"""Largest difference of a half from PyTorch's, relative to the largest half: float16, in which it is stored, rounds by
-more."""
+"""Largest accepted difference of a partial activation from PyTorch's, relative to the largest. Storage as float16
+rounds by more."""
 
 
 class PhotoEncodings(NamedTuple):
-    """What an index keeps of photos: halves (B, half) and embeddings (B, embedding_dim)."""
+    """Encoding of photos as an index stores it, float32.
+
+    Attributes:
+        partial: (B, partial) partial activations.
+        embedding: (B, embedding_dim) unit embeddings.
+    """
 
     partial: Floats
     embedding: Floats
 
 
 PhotoEncoder = Callable[[Sequence[Image]], PhotoEncodings]
-"""Of images (H, views * W, 3); it computes on the thread that calls it, and several may call it at once."""
+"""Encodes images (H, views * W, 3) on the calling thread; several threads may call it at once."""
 
 
 def torch_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
-    """An encoder by the checkpoint's own towers."""
+    """Return an encoder by the checkpoint's own towers."""
 
     def encode(images: Sequence[Image]) -> PhotoEncodings:
         with one_thread():
-            code = encode_photos(checkpoint.matcher, images, len(images))
-        return PhotoEncodings(code.partial.numpy(), code.embedding.numpy())
+            encoding = encode_photos(checkpoint.matcher, images, len(images))
+        return PhotoEncodings(encoding.partial.numpy(), encoding.embedding.numpy())
 
     return encode
 
 
 def onnx_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder | None:
-    """An encoder by ONNX Runtime; None where it or `onnx` is not installed, or cannot run these towers."""
+    """Return an encoder by ONNX Runtime; None if it or `onnx` is not installed, or cannot run these towers."""
     if any(find_spec(name) is None for name in ("onnx", "onnxruntime")):
         return None
     from retrieval.model.export import photo_encoder_to_onnx
@@ -60,8 +65,9 @@ def onnx_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder | None:
 
 
 def fastest_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
-    """The faster encoder of the two; PyTorch's unless the other one gives the same halves. Not to be called while other
-    threads encode: the export would record what they do, too.
+    """Return the faster of the two encoders, or PyTorch's if the partial activations differ.
+
+    Do not call this while other threads encode: the export would also record their operations.
     """
     settings = checkpoint.config.preprocessing
     shape = SAMPLE, settings.photo_px, len(settings.views) * settings.photo_px, 3
@@ -71,11 +77,11 @@ def fastest_photo_encoder(checkpoint: Checkpoint) -> PhotoEncoder:
         return torch
     partial, other = torch(images).partial, onnx(images).partial
     if not np.abs(partial - other).max() <= TOLERANCE * np.abs(partial).max():
-        log.warning("ONNX Runtime gives other halves than PyTorch, which encodes the photos")
+        log.warning("ONNX Runtime gives other partial activations than PyTorch; PyTorch encodes the photos")
         return torch
     times = [[_seconds(each, images) for each in (torch, onnx)] for _ in range(ROUNDS)]
-    ours, theirs = (statistics.median(arm) for arm in zip(*times, strict=True))
-    return onnx if theirs < ours else torch
+    torch_s, onnx_s = (statistics.median(column) for column in zip(*times, strict=True))
+    return onnx if onnx_s < torch_s else torch
 
 
 def _seconds(encode: PhotoEncoder, images: Sequence[Image]) -> float:

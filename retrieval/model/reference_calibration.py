@@ -1,19 +1,19 @@
-"""What reference touches are worth: touches of the catalogue's objects, with which a query's touch is compared.
+"""Calibration of reference touches: touches of catalogue objects with which a query's touch is compared.
 
     c(g, o) = 1 / SHARPNESS * log mean exp(SHARPNESS * cosine)   grasp g with object o, over the references of o
     C(o)    = sum of c(g, o) over the grasps
 
-The cosine is that of the contrastive embeddings of two touches; a reference is one touch of its object, each as likely,
-so a copy of a reference changes nothing. What C says is fitted as match logits are (`retrieval.model.posterior`), on
-objects whose touches are in part references and in part ask:
+The cosine is that of the contrastive embeddings of two touches. The references of an object are equally likely, so a
+copy of a reference changes nothing. C is calibrated like match logits (`retrieval.model.posterior`), on objects some of
+whose touches are references and the others queries:
 
-    an object shown by touches alone    log likelihood ratio = w_a C + offset_a
-    an object shown by photos, too      log likelihood ratio = w_b (l_b + weight C) + offset_b
+    an object with touches only       log likelihood ratio = w_a C + offset_a
+    an object with photos, too        log likelihood ratio = w_b (l_b + weight C) + offset_b
 
-w_a, offset_a and w_b, offset_b are those of two posteriors, l_b the object's logit over its photos by the second one.
-The second is fitted on sums of both, for photo and reference are asked by one and the same touch and do not count as
-two witnesses. Told as the logit that an object with photos alone would have for that ratio, all objects of a catalogue
-are ranked and believed by one formula, whatever shows them.
+w_a, offset_a and w_b, offset_b are those of two posteriors, and l_b is the object's logit over its photos by the second
+one. The second is fitted on the sums, because photo and reference meet the same touch and are not independent evidence.
+Each ratio is converted to the logit at which an object with photos only would have it. One formula then ranks all
+objects of a catalogue and gives their probabilities, whatever represents them.
 """
 
 import dataclasses
@@ -40,21 +40,27 @@ from retrieval.model.posterior import (
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.int64]
 REFERENCE_ROWS, REFERENCE_PARTIALS, REFERENCE_CALIBRATION = "references", "touches", "reference_calibration"
-"""Names in an index: of the document that lists its reference touches (and in the manifest, of their number), of their
-partial activations, and in the manifest, of their calibration."""
+"""Names in an index: of the document that lists its reference touches (and, in the manifest, of their number), of their
+partial activations and, in the manifest, of their calibration."""
 SHARPNESS = 16.0
-"""How far the nearest of an object's references counts before the others; of simulated unseen objects 8, 16 and the
-nearest alone found the object equally often."""
+"""Weight of the nearest of an object's references relative to the others. With 8, with 16 and with only the nearest,
+unseen simulated objects were found equally often."""
 MAX_REFERENCES = 3
-"""Of an object, when it is fitted what they are worth: as many as somebody takes who takes few."""
+"""Largest number of references of an object in the fit: as many as a user takes who takes few."""
 WEIGHT_BOUNDS = (0.01, 1000.0)
-"""Within which the weight beside photos is looked for."""
+"""Search range of the weight of C next to photos."""
 
 
 @dataclass(frozen=True)
 class ReferenceCalibration:
-    """The numbers of the formulas above. alone: of objects without photos; weight, beside: of those with photos, None
-    where no object had both. objects, touches: on how many it was fitted, and how many touches of these asked.
+    """Parameters of the formulas above.
+
+    Attributes:
+        touch_only: Posterior of objects without photos.
+        weight: Weight of C for objects with photos; None where no object had both.
+        with_photos: Posterior of objects with photos; None where no object had both.
+        objects: Number of objects of the fit.
+        touches: Number of their query touches.
     """
 
     touch_only: Posterior
@@ -66,10 +72,10 @@ class ReferenceCalibration:
     def __post_init__(self) -> None:
         check_fields(self, "references", BadInput)
         if (self.weight is None) != (self.with_photos is None):
-            raise BadInput("a weight beside photos and its posterior go together; one of them is missing")
+            raise BadInput("weight and with_photos must both be present or both be absent; one of them is missing")
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary, as stored in checkpoints and in the manifests of indexes."""
+        """Return a plain dictionary, as stored in checkpoints and in the manifests of indexes."""
         return dataclasses.asdict(self)
 
     @classmethod
@@ -79,15 +85,19 @@ class ReferenceCalibration:
 
 
 def touch_embeddings(partials: NDArray[np.floating[Any]], hidden: int) -> Floats:
-    """Unit contrastive embeddings (G, d) of touches, from halves (G, hidden + d) that end with them; d is 0 for a model
-    whose logit counts no cosine.
+    """Return the unit contrastive embeddings (G, d) of touches.
+
+    Args:
+        partials: (G, hidden + d) partial activations, which end with the scaled embeddings. d is 0 for a model whose
+            logit has no cosine.
+        hidden: Width of the fusion head.
     """
     embeddings = np.asarray(partials[:, hidden:], dtype=np.float32)
     return np.asarray(embeddings / np.maximum(np.linalg.norm(embeddings, axis=1, keepdims=True), np.float32(1e-6)))
 
 
 def reference_similarity(cosines: NDArray[np.floating[Any]], starts: Numbers) -> NDArray[np.float64]:
-    """C (G, O) of cosines (G, R) of grasps with references, those of an object side by side from `starts` (O,) on."""
+    """Return C (G, O) of cosines (G, R) of grasps with references; an object's columns begin at `starts` (O,)."""
     scaled = SHARPNESS * cosines.astype(np.float64)
     counts = np.diff(np.append(starts, scaled.shape[1]))
     top = np.maximum.reduceat(scaled, starts, axis=1)
@@ -100,8 +110,11 @@ def reference_similarity(cosines: NDArray[np.floating[Any]], starts: Numbers) ->
 
 @dataclass(frozen=True, eq=False)
 class ReferenceTouches:
-    """Touches of known objects in the order of capture, with their codes (T, d) and what photos say of them; there may
-    be no photo.
+    """Touches of known objects in the order of capture, for the fit.
+
+    Attributes:
+        scored: Match logits of the touches with photos, possibly none.
+        embeddings: (T, d) embeddings of the touches.
     """
 
     scored: ScoredTouches
@@ -110,45 +123,50 @@ class ReferenceTouches:
 
 @dataclass(frozen=True, eq=False)
 class _ReferenceTrials:
-    """Objects some of whose touches are references: C of the others, alone, and these with the photos' logits."""
+    """Trials on objects some of whose touches are references: C of the others, and their match logits with photos."""
 
     touch_only: ScoredTouches
     photos: ScoredTouches
 
     @property
     def both(self) -> NDArray[np.float64]:
-        """(T, N): C of each touch with the object of each photo."""
+        """C (T, N) of each touch with the object of each photo."""
         return np.asarray(self.touch_only.logits[:, self.photos.photo_owner])
 
     @property
     def can_fit_photos(self) -> bool:
-        """Whether it can be asked which object it was of those with photos."""
+        """Whether identification trials among the objects with photos are possible."""
         own = self.photos.photo_owner == self.photos.touch_owner[:, None]
         return len(np.unique(self.photos.photo_owner)) >= MIN_OBJECTS and bool((own & ~self.photos.own).any())
 
 
 def fit_reference_calibration(*parts: ReferenceTouches, seed: int = 0) -> ReferenceCalibration | None:
-    """What references are worth, by touches of objects that have two at least; None for fewer than three such objects,
-    and for codes of nothing.
+    """Fit on touches of objects that have at least two.
 
-    parts: as `retrieval.model.posterior.fit_posterior` takes them. References are of an object's first half of touches,
-    of many touches of the first quarter, at most `MAX_REFERENCES`; the last half asks. Where there are enough, so, no
-    touch is asked beside its neighbour. All is asked once more of one reference of each object, so that what is fitted
-    holds between: fitted to three alone, one is believed too much.
+    References come from the first half of an object's touches, or from the first quarter if that suffices, at most
+    `MAX_REFERENCES`. The queries are the second half, so with enough touches no query neighbours a reference. All
+    trials are repeated with one reference per object, because a fit to three alone is overconfident for one.
+
+    Args:
+        parts: Touches of one matcher or several, as in `retrieval.model.posterior.fit_posterior`.
+        seed: Seed of the trials.
+
+    Returns:
+        The calibration; None for fewer than three such objects, or for a model without embeddings.
     """
-    coded = [part for part in parts if part.embeddings.shape[1]]
+    encoded = [part for part in parts if part.embeddings.shape[1]]
     many, one = (
-        [found for part in coded if (found := _reference_trials(part, max_references)) is not None]
+        [found for part in encoded if (found := _reference_trials(part, max_references)) is not None]
         for max_references in (MAX_REFERENCES, 1)
     )
     if not many:
         return None
     trials = [*many, *one]
-    seen = [part for part in trials if part.can_fit_photos]
-    weight = _weight(seen, seed) if seen else None
+    with_both = [part for part in trials if part.can_fit_photos]
+    weight = _weight(with_both, seed) if with_both else None
     with_photos = None
     if weight is not None:
-        sums = (dataclasses.replace(part.photos, logits=part.photos.logits + weight * part.both) for part in seen)
+        sums = (dataclasses.replace(part.photos, logits=part.photos.logits + weight * part.both) for part in with_both)
         with_photos = fit_posterior(*sums, seed=seed)
     return ReferenceCalibration(
         fit_posterior(*(part.touch_only for part in trials), seed=seed),
@@ -160,40 +178,38 @@ def fit_reference_calibration(*parts: ReferenceTouches, seed: int = 0) -> Refere
 
 
 def _reference_trials(part: ReferenceTouches, max_references: int) -> _ReferenceTrials | None:
-    """With at most so many references of each object."""
+    """Return the trials with at most so many references per object; None for too few objects."""
     scored = part.scored
     rows = [np.flatnonzero(scored.touch_owner == name) for name in np.unique(scored.touch_owner)]
     rows = [mine for mine in rows if len(mine) > 1]
     if len(rows) < MIN_OBJECTS:
         return None
-    shown = [
+    references = [
         _evenly_spaced(mine[: max(len(mine) // 4, min(MAX_REFERENCES, len(mine) // 2))], max_references)
         for mine in rows
     ]
-    asking = np.concatenate([mine[len(mine) // 2 :] for mine in rows])
+    queries = np.concatenate([mine[len(mine) // 2 :] for mine in rows])
     owner = np.repeat(np.arange(len(rows)), [len(mine) - len(mine) // 2 for mine in rows])
-    cosines = part.embeddings[asking] @ part.embeddings[np.concatenate(shown)].T
-    near = reference_similarity(cosines, np.cumsum([0, *(len(some) for some in shown[:-1])]))
+    cosines = part.embeddings[queries] @ part.embeddings[np.concatenate(references)].T
+    near = reference_similarity(cosines, np.cumsum([0, *(len(some) for some in references[:-1])]))
     number = {int(scored.touch_owner[mine[0]]): place for place, mine in enumerate(rows)}
     known = np.flatnonzero(np.isin(scored.photo_owner, list(number)))
     photo_owner = np.array([number[int(name)] for name in scored.photo_owner[known]], np.int64)
     return _ReferenceTrials(
         ScoredTouches(near, owner, np.arange(len(rows)), np.zeros(near.shape, np.bool_)),
-        ScoredTouches(scored.logits[np.ix_(asking, known)], owner, photo_owner, scored.own[np.ix_(asking, known)]),
+        ScoredTouches(scored.logits[np.ix_(queries, known)], owner, photo_owner, scored.own[np.ix_(queries, known)]),
     )
 
 
 def _evenly_spaced(rows: Numbers, max_references: int) -> Numbers:
-    """At most so many of the rows, evenly spaced."""
+    """Return at most so many of the rows, evenly spaced."""
     places = np.linspace(0, len(rows) - 1, min(max_references, len(rows)))
     return np.asarray(rows[places.round().astype(np.int64)])
 
 
 def _weight(trials: Sequence[_ReferenceTrials], seed: int) -> float:
-    """How many match logits a C of 1 is worth: the likeliest weight for "which object was it, or none", asked of single
-    touches.
-    """
-    from scipy.optimize import minimize_scalar  # slow to import, and no query needs it
+    """Return the most likely weight of C, in match logits, over identification trials with single touches."""
+    from scipy.optimize import minimize_scalar  # slow to import; queries do not need it
 
     photos = [next(identification_trials(part.photos, seed)) for part in trials]
     near = [next(identification_trials(dataclasses.replace(part.photos, logits=part.both), seed)) for part in trials]
@@ -202,8 +218,8 @@ def _weight(trials: Sequence[_ReferenceTrials], seed: int) -> float:
     def loss(log_weight: float) -> float:
         weight = math.exp(log_weight)
         sums = [
-            dataclasses.replace(seen, scores=seen.scores + weight * felt.scores)
-            for seen, felt in zip(photos, near, strict=True)
+            dataclasses.replace(photo, scores=photo.scores + weight * touch.scores)
+            for photo, touch in zip(photos, near, strict=True)
         ]
         posterior = fit_posterior_to_trials(sums)
         return sum(len(one.scores) * one.loss(posterior, 1 / (count + 2)) for one in sums) / count

@@ -1,8 +1,8 @@
-"""Gel images however they are given, and what the matcher makes of them: halves, embeddings and readings.
+"""Gel images in any form, and their encoding by the matcher: partial activations, embeddings and readings.
 
-Files, bytes, Pillow images or arrays, one grasp or several.
+An image is a file, bytes, a Pillow image or an array. A query has one grasp or several.
 
-How deep the lists are nested says what is meant, so nothing is guessed:
+The nesting of the lists decides, so nothing is guessed:
 
     [a, b]             one grasp: an image for each finger of the model
     [[a, b], [a, b]]   several grasps of one object
@@ -31,10 +31,10 @@ from retrieval.model.fusion_scorer import contact_level
 from retrieval.model.gel_images import GelImage
 
 AnyImage: TypeAlias = str | os.PathLike[str] | bytes | bytearray | memoryview | Image.Image | NDArray[Any] | GelImage
-"""A path (text is one), the bytes of a file, a Pillow image, an array (H, W, 3) uint8, red first, or a gel image that
-another process read."""
+"""A path (as text or `PathLike`), the bytes of a file, a Pillow image, an array (H, W, 3) uint8 in RGB order, or a gel
+image that another process read."""
 AnyTouches: TypeAlias = AnyImage | Sequence[AnyImage] | Sequence[Sequence[AnyImage]]
-"""One grasp or several, as the text above says. An array of 4 or 5 axes is a list of those below it."""
+"""One grasp or several, nested as described above. An array with 4 or 5 axes is a list of its entries."""
 
 _IMAGE_TYPES = "a path, the bytes of a file, a Pillow image or a uint8 array (height, width, 3)"
 _NESTING_HINT = "one grasp is a list with an image for each finger, several grasps are a list of such lists"
@@ -42,20 +42,30 @@ _NESTING_HINT = "one grasp is a list with an image for each finger, several gras
 
 @dataclass(frozen=True, eq=False)
 class InputImage:
-    """An image as it was given, not read yet. name: how answers and messages call it, a file by its path."""
+    """An input image that is not read yet.
+
+    Attributes:
+        image: The image.
+        name: Its name in answers and messages; for a file, the path.
+    """
 
     image: AnyImage
     name: str
 
     def read(self) -> RgbImage:
-        """(H, W, 3) float32 RGB in 0..1; the same numbers however a picture is given. Raises ImageError."""
+        """Return (H, W, 3) float32 RGB in 0..1, the same for all forms of a picture. Raises ImageError."""
         return read_image(self.image, self.name)
 
 
 def read_image(image: AnyImage, name: str) -> RgbImage:
-    """An image however it is given as (H, W, 3) float32 RGB in 0..1; `name` stands for it where it is no file.
+    """Return an image of any form as (H, W, 3) float32 RGB in 0..1.
 
-    Raises ImageError. Arrays must be uint8: of other types the range would have to be guessed.
+    Args:
+        image: The image. Arrays must be uint8: the range of other types would have to be guessed.
+        name: Its name in messages, if it is not a file.
+
+    Raises:
+        ImageError: The image is not readable.
     """
     if isinstance(image, str | os.PathLike):
         return read_rgb(os.fspath(image))
@@ -68,40 +78,46 @@ def read_image(image: AnyImage, name: str) -> RgbImage:
     if image.dtype != np.uint8:
         raise ImageError(
             name,
-            f"an array must hold uint8 samples in 0..255, got {image.dtype}; make them of samples in 0..1 by "
+            f"an array must contain uint8 samples in 0..255, got {image.dtype}; convert samples in 0..1 with "
             "np.rint(255 * image).astype(np.uint8)",
         )
     if image.ndim != 3 or image.shape[2] != 3:
         raise ImageError(
             name,
-            f"an array must be (height, width, 3), red first, got {image.shape}; repeat a grey image by "
-            "np.stack([image] * 3, axis=-1), leave an alpha channel out, and put channels last",
+            f"an array must be (height, width, 3) in RGB order, got {image.shape}; repeat a grey image with "
+            "np.stack([image] * 3, axis=-1), drop an alpha channel, and put channels last",
         )
     check_pixels((image.shape[1], image.shape[0]), name)
     return np.ascontiguousarray(to_float(np.asarray(image)))
 
 
-def parse_grasps(given: AnyTouches, fingers: int, *, what: str = "touch", of: str = "") -> list[list[InputImage]]:
-    """The grasps in what was given for one object, each with an image for each finger; no image is read.
+def parse_grasps(touches: AnyTouches, fingers: int, *, noun: str = "touch", of: str = "") -> list[list[InputImage]]:
+    """Return the grasps of one object, each with an image per finger. No image is read.
 
-    what: how one grasp is called in messages. of: what they begin with, such as "object 3, ". Raises BadInput where
-    the nesting or the number of images is not as the text above says.
+    Args:
+        touches: One grasp or several, nested as described above.
+        fingers: Images per grasp.
+        noun: Noun for one grasp in messages.
+        of: Prefix of messages, such as "object 3, ".
+
+    Raises:
+        BadInput: The nesting or the number of images is wrong.
     """
-    if _is_image(given):
-        grasps: list[list[Any]] = [[given]]
+    if _is_image(touches):
+        grasps: list[list[Any]] = [[touches]]
     else:
-        items = _items(given, of)
+        items = _items(touches, of)
         images = [_is_image(item) for item in items]
         if any(images) and not all(images):
-            raise BadInput(f"{of}images and lists of images stand side by side; {_NESTING_HINT}")
+            raise BadInput(f"{of}a list mixes images with lists of images; {_NESTING_HINT}")
         grasps = [items] if any(images) else [_items(item, of) for item in items]
     if wrong := [image for grasp in grasps for image in grasp if not _is_image(image)]:
         raise BadInput(
-            f"{of}an image must be {_IMAGE_TYPES}, got {type(wrong[0]).__name__}; {_NESTING_HINT}; several objects go to "
-            "query_many"
+            f"{of}an image must be {_IMAGE_TYPES}, got {type(wrong[0]).__name__}; {_NESTING_HINT}; query several "
+            "objects with query_many"
         )
     if not grasps:
-        raise BadInput(f"{of}give at least one {what}: {_NESTING_HINT}")
+        raise BadInput(f"{of}give at least one {noun}: {_NESTING_HINT}")
     named = [
         [InputImage(image, _name(image, f"{of}grasp {g}, finger", f)) for f, image in enumerate(grasp)]
         for g, grasp in enumerate(grasps, start=1)
@@ -109,9 +125,9 @@ def parse_grasps(given: AnyTouches, fingers: int, *, what: str = "touch", of: st
     for grasp in named:
         if len(grasp) != fingers:
             raise BadInput(
-                f"{of}this model takes {fingers} gel image(s) for one {what}; got {len(grasp)}: "
-                f"{', '.join(image.name for image in grasp)} ({_NESTING_HINT}; on the command line each grasp has a "
-                "--gelsight of its own)"
+                f"{of}this model takes {fingers} gel image(s) for one {noun}; got {len(grasp)}: "
+                f"{', '.join(image.name for image in grasp)} ({_NESTING_HINT}; on the command line, use one --gelsight "
+                "for each grasp)"
             )
     return named
 
@@ -122,10 +138,10 @@ def _is_image(item: object) -> bool:
     return isinstance(item, str | os.PathLike | bytes | bytearray | memoryview | Image.Image | GelImage)
 
 
-def _items(given: object, of: str) -> list[Any]:
-    if isinstance(given, Sequence | np.ndarray):
-        return list(given)
-    raise BadInput(f"{of}an image must be {_IMAGE_TYPES}, got {type(given).__name__}; {_NESTING_HINT}")
+def _items(value: object, of: str) -> list[Any]:
+    if isinstance(value, Sequence | np.ndarray):
+        return list(value)
+    raise BadInput(f"{of}an image must be {_IMAGE_TYPES}, got {type(value).__name__}; {_NESTING_HINT}")
 
 
 def _name(image: AnyImage, place: str, finger: int) -> str:
@@ -142,15 +158,19 @@ def _name(image: AnyImage, place: str, finger: int) -> str:
 
 
 BATCH = 32
-"""Grasps whose images are in memory, and in the encoder, at once."""
-DECODERS = 2  # a touch has as many images
+"""Largest number of grasps whose images are in memory, and in the encoder, at once."""
+DECODERS = 2  # a touch has two images
 Floats = NDArray[np.float32]
 
 
 class TouchEncodings(NamedTuple):
-    """What is made of G grasps, float32: halves (G, half), embeddings (G, embedding_dim), and what tells whether they
-    are touches: readings (G, fingers, 2) of a model with a gel head, levels (G, fingers) of grey by which images differ
-    from their no-contact frames, where these were given (`retrieval.model.fusion_scorer`).
+    """Encoding of G grasps, float32.
+
+    Attributes:
+        partials: (G, partial) partial activations.
+        embeddings: (G, embedding_dim) unit embeddings.
+        readings: (G, fingers, 2) log-odds of the gel head, if the model has one (`retrieval.model.fusion_scorer`).
+        levels: (G, fingers) differences in grey levels from the no-contact frames, if given.
     """
 
     partials: Floats
@@ -160,19 +180,22 @@ class TouchEncodings(NamedTuple):
 
 
 class TouchEncoder(Protocol):
-    """What makes codes of touches: PyTorch or ONNX Runtime."""
+    """Encoder of touches: PyTorch or ONNX Runtime."""
 
     @property
     def name(self) -> str:
-        """How it is called in the answer."""
+        """Its name in the answer."""
 
     def encode(self, touches: Sequence[Sequence[RgbImage]]) -> TouchEncodings:
-        """Encode grasps, each its fingers' images."""
+        """Encode grasps, each a sequence of its fingers' images."""
 
 
 class EncodedTouches(NamedTuple):
-    """What the matcher keeps of images, a row each: unit `embeddings` (N, embedding_dim), by which candidates are
-    found, and `partials` (N, half), by which it judges pairs. float32.
+    """Encoding of images, one row each, float32.
+
+    Attributes:
+        embeddings: (N, embedding_dim) unit vectors for candidate search.
+        partials: (N, partial) partial activations, from which pairs are scored.
 
     >>> with retrieval.open("index") as searcher:
     ...     embeddings, partials = searcher.encode([["a.png", "b.png"], ["a2.png", "b2.png"]])
@@ -185,7 +208,7 @@ class EncodedTouches(NamedTuple):
 
 
 class Stopwatch:
-    """Milliseconds of named stages and in total."""
+    """Milliseconds of named stages and the total."""
 
     def __init__(self) -> None:
         self._start = time.perf_counter()
@@ -193,29 +216,32 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
+        """Time the block as part of `stage`."""
         start = time.perf_counter()
         yield
         self.add({stage: 1e3 * (time.perf_counter() - start)})
 
     def add(self, timing_ms: Mapping[str, float]) -> None:
-        """Count stages that another watch took."""
+        """Add stages that another stopwatch timed."""
         for stage, ms in timing_ms.items():
             self._stages[stage] = self._stages.get(stage, 0.0) + ms
 
-    def finish(self, shares: int) -> dict[str, float]:
-        """One of so many equal shares: of the stages in their order, and of "total" since it was made."""
+    def finish(self, parts: int) -> dict[str, float]:
+        """Return the stages in their order and the "total" since construction, each divided by `parts`."""
         everything = {**self._stages, "total": 1e3 * (time.perf_counter() - self._start)}
-        return {stage: ms / shares for stage, ms in everything.items()}
+        return {stage: ms / parts for stage, ms in everything.items()}
 
 
 MAX_FORK_WAIT_S = 10.0
-"""For computations to end before a fork; one that is forked all the same may wait for a lock for ever."""
+"""Longest wait for computations to end before a fork. A process forked later may wait for a lock for ever."""
 
 
 class _ForkGuard:
-    """A fork copies the locks of the libraries that compute as they are, and nobody in it opens one that another thread
-    held. So a process that forks waits until no touch is read or encoded, and until threads that did so are gone: one
-    that Python has joined still gives back its memory for a while, under an allocator's lock.
+    """Delays a fork until no touch is read or encoded.
+
+    A fork copies the locks of the computing libraries in their current state. In the child nobody releases a lock that
+    another thread held. Threads that computed must also be gone: a thread that Python has joined still returns its
+    memory for a while, under an allocator's lock.
     """
 
     def __init__(self) -> None:
@@ -223,7 +249,7 @@ class _ForkGuard:
 
     @contextmanager
     def computing(self) -> Iterator[None]:
-        """Around what a fork must not come between."""
+        """Mark a block during which no fork may happen."""
         with self._idle:
             self._computing += 1
             self._threads.add(threading.get_native_id())
@@ -235,7 +261,7 @@ class _ForkGuard:
                 self._idle.notify_all()
 
     def before(self) -> None:
-        """Wait, and keep others from beginning until the fork is made."""
+        """Wait for computations to end, and block new ones until the fork is done."""
         self._idle.acquire()
         deadline = time.monotonic() + MAX_FORK_WAIT_S
         self._idle.wait_for(lambda: self._computing == 0, MAX_FORK_WAIT_S)
@@ -246,11 +272,11 @@ class _ForkGuard:
         self._threads &= alive
 
     def after_in_parent(self) -> None:
-        """Let other threads go on."""
+        """Let other threads continue."""
         self._idle.release()
 
     def after_in_child(self) -> None:
-        """Begin anew: no thread of the parent is here, and nothing is computed yet."""
+        """Reset the state: the child has no thread of the parent and computes nothing yet."""
         self._idle, self._computing, self._threads = threading.Condition(), 0, set()
 
 
@@ -261,28 +287,35 @@ os.register_at_fork(
 
 
 class TouchReader:
-    """Reads and encodes the touches of a model."""
+    """Reads and encodes touches for a model."""
 
     def __init__(self, config: Config, encoder: TouchEncoder, compares_contact: bool = False) -> None:
-        """compares: whether a touch is compared with its no-contact frame, to see if there is a contact."""
+        """Prepare a reader.
+
+        Args:
+            config: Settings of the model.
+            encoder: Its touch encoder.
+            compares_contact: Compare each touch with its no-contact frame to decide whether there is a contact.
+        """
         self.encoder, self.fingers, self._compares_contact = encoder, config.matcher.fingers, compares_contact
         self._preprocessing = config.preprocessing
 
     def no_contact_frames(self, background: Sequence[AnyImage] | None) -> Sequence[GelImage | None]:
-        """The no-contact frame of each finger, None for a model that looks at no such frame. Raises BadInput for one
-        that is missing, and for one that would not be looked at.
+        """Return the no-contact frame of each finger, None for a model that uses none.
+
+        Raises BadInput if the frames are missing, or given to a model that would ignore them.
         """
         policy = self._preprocessing.background
         if background is None and policy != "none":
             raise BadInput(
-                f'this model subtracts the untouched gel (background = "{policy}"): give a no-contact frame for each '
+                f'this model subtracts the no-contact gel (background = "{policy}"): give a no-contact frame for each '
                 "finger with --background"
             )
         if background is None:
             return [None] * self.fingers
         if policy == "none" and not self._compares_contact:
-            raise BadInput("this model takes gel images as they are and would not look at --background; leave it out")
-        frames = parse_grasps(background, self.fingers, what="background")
+            raise BadInput("this model uses gel images unchanged and would ignore --background; leave it out")
+        frames = parse_grasps(background, self.fingers, noun="background")
         if len(frames) != 1:
             raise BadInput(f"give one background, with a no-contact frame for each finger; got {len(frames)}")
         return [self._gel_image(frame, True) for frame in frames[0]]
@@ -290,8 +323,12 @@ class TouchReader:
     def encode(
         self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[GelImage | None], clock: Stopwatch
     ) -> TouchEncodings:
-        """The codes of grasps, made in batches; the clock counts the stages "decode" and "encode". references: the
-        no-contact frame of each finger, or None.
+        """Encode grasps in batches.
+
+        Args:
+            grasps: The images of each grasp.
+            no_contact_frames: The no-contact frame of each finger, or None.
+            clock: Times the stages "decode" and "encode".
         """
         parts, levels = [], []
         for start in range(0, len(grasps), BATCH):
@@ -303,7 +340,7 @@ class TouchReader:
         partials, embeddings = (np.concatenate([part[place] for part in parts]) for place in (0, 1))
         readings = [part.readings for part in parts if part.readings is not None]
         return TouchEncodings(
-            _finite(partials, "partial"),
+            _finite(partials, "partial activation"),
             _finite(embeddings, "embedding"),
             np.concatenate(readings) if readings else None,
             None if no_contact_frames[0] is None else np.array(levels, dtype=np.float32),
@@ -312,21 +349,21 @@ class TouchReader:
     def _preprocessed(
         self, grasps: Sequence[Sequence[InputImage]], no_contact_frames: Sequence[GelImage | None]
     ) -> list[list[tuple[RgbImage, float]]]:
-        """The images of grasps as the tower sees them, and how far each is from its no-contact frame (0 without one);
-        made side by side; of several bad ones the first is told.
+        """Return the preprocessed images of grasps, each with its difference from its no-contact frame (0 without one).
 
-        The threads end with the call, for a fork of the process would not have them.
+        The images are decoded in parallel. Of several bad ones, the first is reported. The threads end with the call,
+        because a forked process would not have them.
         """
         subtracts = self._preprocessing.background != "none"
-        for given in (given for grasp in grasps for given in grasp):
-            # A Pillow image reads its file when it is first asked for pixels, which two threads must not do at once.
-            if isinstance(given.image, Image.Image):
-                with suppress(Exception):  # told by `read`
-                    given.image.load()
+        for source in (source for grasp in grasps for source in grasp):
+            # A Pillow image reads its file on the first access to its pixels, which two threads must not do at once.
+            if isinstance(source.image, Image.Image):
+                with suppress(Exception):  # `read` reports it
+                    source.image.load()
 
-        def view(given: InputImage, reference: GelImage | None) -> tuple[RgbImage, float]:
+        def view(source: InputImage, reference: GelImage | None) -> tuple[RgbImage, float]:
             with _fork_guard.computing():
-                image = self._gel_image(given, reference is not None)
+                image = self._gel_image(source, reference is not None)
                 if reference is None:
                     return self._preprocessing.touch(image.touch), 0.0
                 level = contact_level(_blocks(image), _blocks(reference))
@@ -334,31 +371,29 @@ class TouchReader:
 
         with ThreadPoolExecutor(DECODERS, "decode") as threads:
             jobs = [
-                [threads.submit(view, given, frame) for given, frame in zip(grasp, no_contact_frames, strict=True)]
+                [threads.submit(view, source, frame) for source, frame in zip(grasp, no_contact_frames, strict=True)]
                 for grasp in grasps
             ]
             return [[job.result() for job in grasp] for grasp in jobs]
 
-    def _gel_image(self, given: InputImage, compares_contact: bool) -> GelImage:
-        """An image at the sizes of this model. compares: with a no-contact frame. Raises ImageError, and IncompleteSearch for
-        one that was read for another model.
-        """
+    def _gel_image(self, source: InputImage, compares_contact: bool) -> GelImage:
+        """Return an image at this model's sizes. Raises ImageError; IncompleteSearch if read for another model."""
         px = self._preprocessing.touch_px
-        if not isinstance(given.image, GelImage):
-            return GelImage.of(given.read(), px, compares_contact)
-        if given.image.touch.shape != (px, px, 3):
-            raise IncompleteSearch("an index of another model was opened meanwhile; ask again")
-        return given.image
+        if not isinstance(source.image, GelImage):
+            return GelImage.of(source.read(), px, compares_contact)
+        if source.image.touch.shape != (px, px, 3):
+            raise IncompleteSearch("an index of another model was opened in the meantime; repeat the query")
+        return source.image
 
 
 def _blocks(image: GelImage) -> RgbImage:
     if image.blocks is None:
-        raise BadInput("a gel image was read without the blocks that are compared with a no-contact frame")
+        raise BadInput("a gel image was read without the blocks for the comparison with a no-contact frame")
     return image.blocks
 
 
 def _finite(values: Floats, name: str) -> Floats:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
-        raise NumericalError(f"the {name} of touch {bad[0] + 1} holds a NaN or infinite number; the model is unfit")
+        raise NumericalError(f"the {name} of touch {bad[0] + 1} contains a NaN or infinite number; the model is unfit")
     return values

@@ -1,7 +1,7 @@
-"""Losses on logits and unit embeddings, a file each, in float32 whatever comes in.
+"""Losses on logits and unit embeddings, one per file, computed in float32 for every input type.
 
-A loss of training is a `Loss` (`retrieval.model.losses.loss`) and a row of `LOSSES`, or a class in a user's own
-package. It is added to the match loss with the weight `<name>_weight` of the configuration.
+A training loss is a `Loss` (`retrieval.model.losses.loss`) with a row in `LOSSES`, or a class in a user's own package.
+It is added to the match loss with the weight `<name>_weight` of the configuration.
 """
 
 from typing import TYPE_CHECKING
@@ -25,4 +25,4 @@ LOSSES: "Registry[type[Loss]]" = Registry(
 )
 
 LOGIT_LOSSES = frozenset({"listwise"})
-"""Losses of match logits alone. Every other one trains the embeddings by which candidates are searched."""
+"""Losses on match logits only. Every other one trains the embeddings for candidate search."""

@@ -12,7 +12,7 @@ LOG_SCALE_MAX = math.log(100.0)
 
 
 class ContrastiveLoss(Loss):
-    """`contrastive_loss` of the embeddings of a batch. Its learnt scale is the matcher's, which checkpoints keep."""
+    """`contrastive_loss` of the embeddings of a batch. Its learned scale belongs to the matcher and its checkpoints."""
 
     def forward(self, batch: EncodedBatch) -> Tensor:
         """Return the loss (scalar) of a batch."""
@@ -23,14 +23,20 @@ class ContrastiveLoss(Loss):
 def contrastive_loss(
     touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor, log_scale: Tensor
 ) -> Tensor:
-    """Symmetric cross-entropy between unit embeddings of touches (T, d) and photos (N, d); scores are exp(log_scale)
-    times their cosines. `*_objects` are integer labels (T,), (N,).
+    """Return the symmetric cross-entropy between unit embeddings of touches and of photos (InfoNCE).
 
     Each touch must pick each photo of its own object out of that photo and the photos of OTHER objects: photos of the
     same object are never negatives of each other (InfoNCE with several positives: Khosla et al., NeurIPS 2020, eq. 2,
-    with the other positives taken out of the denominator). Mean over a touch's photos, then over the touches that have
-    a photo of their own object and one of another. The same is asked of each photo among the touches, and the loss is
-    the mean of the two; a way in which nobody has both adds zero.
+    with the other positives removed from the denominator). The loss is averaged over a touch's photos, then over the
+    touches that have a photo of their own object and one of another. The other direction does the same for each photo
+    among the touches, and the result is the mean of the two. A direction without such rows contributes zero.
+
+    Args:
+        touch: (T, d) unit embeddings.
+        photo: (N, d) unit embeddings.
+        touch_objects: (T,) integer labels.
+        photo_objects: (N,) integer labels.
+        log_scale: Scores are exp(log_scale) times the cosines.
     """
     scores = log_scale.float().exp() * touch.float() @ photo.float().T
     return listwise_loss(scores, touch_objects, photo_objects)

@@ -1,4 +1,4 @@
-"""Each touch picks the photos of its object out of all photos of a batch, and each photo its touches."""
+"""Listwise loss: each touch picks the photos of its object out of all photos of a batch, each photo its touches."""
 
 import torch
 from torch import Tensor
@@ -17,15 +17,15 @@ class ListwiseLoss(Loss):
 
 
 def listwise_loss(scores: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:
-    """`contrastive_loss` of any scores (T, N) of touches with photos, such as match logits: it asks for order alone."""
+    """Return `contrastive_loss` of any scores (T, N) of touches with photos, such as match logits."""
     same = touch_objects[:, None] == photo_objects[None, :]
     return (pick_loss(scores.float(), same) + pick_loss(scores.float().T, same.T)) / 2
 
 
 def pick_loss(scores: Tensor, same: Tensor) -> Tensor:
-    """Mean over rows of the mean over a row's positives of -log softmax(positive among itself and the negatives)."""
+    """Return the mean over rows of a row's mean of -log softmax(positive among itself and the negatives)."""
     negatives = torch.logsumexp(scores.masked_fill(same, -torch.inf), dim=1, keepdim=True)
-    # log(1 + exp(negatives - positive)) without overflow, for every cell; cells that are no positives weigh nothing.
+    # log(1 + exp(negatives - positive)) without overflow, for every cell; cells of negatives have weight 0.
     losses = functional.softplus(negatives - scores)
     usable = same & torch.isfinite(negatives)
     per_row = torch.where(usable, losses, 0.0).sum(1) / usable.sum(1).clamp(min=1)

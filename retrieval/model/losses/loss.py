@@ -1,4 +1,4 @@
-"""What a loss of training is given, and what it returns."""
+"""Contract of a training loss: its input and its output."""
 
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -11,9 +11,12 @@ if TYPE_CHECKING:
 class EncodedBatch(NamedTuple):
     """The distinct touches (T) and photos (N) of a batch.
 
-    matcher: the model in training, for its head. touch, photo: `half` (T or N, half), `embedding` (T or N,
-    embedding_dim) of norm 1. touch_objects (T,), photo_objects (N,): their objects as integers from 0, the same in
-    every batch.
+    Attributes:
+        matcher: The model in training, for its head.
+        touch: `partial` (T, partial) and unit `embedding` (T, embedding_dim) of the touches.
+        photo: The same for the photos, with N rows.
+        touch_objects: (T,) objects as integers from 0, the same in every batch.
+        photo_objects: (N,) objects of the photos.
     """
 
     matcher: "Matcher"
@@ -24,10 +27,10 @@ class EncodedBatch(NamedTuple):
 
 
 class Loss(nn.Module):
-    """A term of the training loss, with parameters of its own where it has any.
+    """A term of the training loss, possibly with parameters of its own.
 
-    The optimiser trains its parameters together with the matcher's, and the state of an unfinished training keeps them;
-    a checkpoint does not. A subclass writes `forward`.
+    The optimiser trains its parameters together with the matcher's. The state of an unfinished training stores them; a
+    checkpoint does not. A subclass implements `forward`.
 
     >>> import torch
     >>> class Proxies(retrieval.Loss):
@@ -43,11 +46,11 @@ class Loss(nn.Module):
     """
 
     def __init__(self, embedding_dim: int, objects: int) -> None:
-        """Make the loss of a training.
+        """Make the loss for a training.
 
         Args:
             embedding_dim: Length of an embedding.
-            objects: How many objects are trained on.
+            objects: Number of training objects.
         """
         super().__init__()
 
@@ -56,4 +59,4 @@ class Loss(nn.Module):
         raise NotImplementedError
 
     def clamp(self) -> None:
-        """Hold parameters within their range, after each step."""
+        """Clamp parameters to their range, after each step."""

@@ -1,12 +1,12 @@
-"""The paper's loss of pairs, in every training."""
+"""The paper's loss of pairs, part of every training."""
 
 from torch import Tensor
 from torch.nn import functional
 
 
 def match_loss(logits: Tensor, labels: Tensor) -> Tensor:
-    """Mean binary cross-entropy of match logits (P,) against labels (P,) of 0 and 1.
+    """Return the mean binary cross-entropy of match logits (P,) against labels (P,) of 0 and 1.
 
-    Computed from logits; `log(sigmoid(z))` is -inf below z = -104 in float32, and its gradient NaN.
+    It is computed from logits: `log(sigmoid(z))` is -inf below z = -104 in float32, and its gradient NaN.
     """
     return functional.binary_cross_entropy_with_logits(logits.float(), labels.float())

@@ -1,4 +1,4 @@
-"""The loss of every touch with every photo as a pair of its own."""
+"""Sigmoid loss: every touch with every photo is a pair of its own."""
 
 import math
 
@@ -9,12 +9,12 @@ from torch.nn import functional
 from retrieval.model.losses.contrastive import LOG_SCALE_MAX
 from retrieval.model.losses.loss import EncodedBatch, Loss
 
-# Where it starts: with most pairs negative, a bias of 0 would begin far from their log-odds.
+# Initial values: most pairs are negative, so a bias of 0 would start far from their log-odds.
 SIGMOID_LOG_SCALE_INIT, SIGMOID_BIAS_INIT = math.log(10.0), -10.0
 
 
 class SigmoidLoss(Loss):
-    """`sigmoid_loss` of the embeddings of a batch, with its own learnt scale and bias."""
+    """`sigmoid_loss` of the embeddings of a batch, with its own learned scale and bias."""
 
     def __init__(self, embedding_dim: int, objects: int) -> None:
         super().__init__(embedding_dim, objects)
@@ -28,17 +28,25 @@ class SigmoidLoss(Loss):
 
     @torch.no_grad()
     def clamp(self) -> None:
-        """Hold the scale at 100 at most."""
+        """Clamp the scale to at most 100."""
         self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
 
 
 def sigmoid_loss(
     touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor, log_scale: Tensor, bias: Tensor
 ) -> Tensor:
-    """Binary cross-entropy of every touch with every photo, summed over the photos of a touch, mean over touches.
+    """Return the binary cross-entropy of every touch with every photo, summed over photos, averaged over touches.
 
     Zhai et al., ICCV 2023 (SigLIP), eq. in section 3.2, with logits `exp(log_scale) * cosine + bias`, and every photo
-    of the touch's object a positive. touch (T, d) and photo (N, d) are unit embeddings, `*_objects` integer labels.
+    of the touch's object a positive.
+
+    Args:
+        touch: (T, d) unit embeddings.
+        photo: (N, d) unit embeddings.
+        touch_objects: (T,) integer labels.
+        photo_objects: (N,) integer labels.
+        log_scale: Scalar.
+        bias: Scalar.
     """
     logits = log_scale.float().exp() * touch.float() @ photo.float().T + bias.float()
     same = touch_objects[:, None] == photo_objects[None, :]

@@ -1,9 +1,9 @@
-"""Towers: one encoder per modality. A new backbone is one file and one row of `TOWERS`, or a class in a user's own
-package.
+"""Towers: one encoder per modality.
 
-A tower is named by its row, by "module:Class", or by a family and a model: "transformers:facebook/dinov2-small". Names
-joined by `TOWER_SEPARATOR` are backbones side by side (`retrieval.model.towers.concatenated`), and so are their first weights:
-tower "mobilenet_v2+mobilenet_v2", init "relief.safetensors+imagenet".
+A new backbone is one file and one row of `TOWERS`, or a class in a user's own package. A tower is named by its row, by
+"module:Class", or by a family and a model: "transformers:facebook/dinov2-small". Names joined by `TOWER_SEPARATOR` are
+concatenated backbones (`retrieval.model.towers.concatenated`). Their initial weights are joined in the same way: tower
+"mobilenet_v2+mobilenet_v2", init "relief.safetensors+imagenet".
 """
 
 from collections.abc import Mapping
@@ -38,25 +38,24 @@ FAMILIES: "Registry[type[TowerFamily]]" = Registry(
     error=ConfigError,
     base="retrieval.model.towers.tower:TowerFamily",
 )
-"""Other libraries of backbones; what they build is named "family:model"."""
+"""Other libraries of backbones; their models are named "family:model"."""
 
 TOWER_SEPARATOR = "+"
 OUTPUTS = ("classes", "pooled", "stages")
 
 
 def build_tower(name: str, output: str = "pooled", architectures: Mapping[str, Any] | None = None) -> "Tower":
-    """Build the tower `name`, or several side by side, with random weights.
+    """Build the tower `name`, or several concatenated ones, with random weights.
 
     Args:
         name: A row of `TOWERS`, "module:Class" of an imported module, or "family:model".
         output: "pooled" gives the globally averaged features of the last stage; "classes" keeps the 1000-way linear
-        layer
-            that ImageNet checkpoints carry, whose outputs the paper concatenates; "stages" gives mean, deviation and
+            layer of ImageNet checkpoints, whose outputs the paper concatenates; "stages" gives mean, deviation and
             maximum over the maps of several stages, from edges to parts.
-        architectures: What `architectures_of` found of the models of families.
+        architectures: Results of `architectures_of` for the models of families.
 
     Raises:
-        ConfigError: For an unknown name or output, or a model whose architecture is not given.
+        ConfigError: The name or output is unknown, or a model's architecture is missing.
     """
     if TOWER_SEPARATOR in name:
         from retrieval.model.towers.concatenated import ConcatenatedTowers
@@ -68,13 +67,13 @@ def build_tower(name: str, output: str = "pooled", architectures: Mapping[str, A
         return TOWERS.load(name)(output)
     if name not in (architectures or {}):
         raise ConfigError(
-            f"the architecture of {name} must be known; name it by load_config or Config.using(tower={name!r})"
+            f"the architecture of {name} is missing; set the tower with load_config or Config.using(tower={name!r})"
         )
     return FAMILIES.load(family)(output, name.partition(":")[2], (architectures or {})[name])
 
 
 def tower_name(choice: "str | type[Tower]") -> str:
-    """Return the name of a tower, or of several, that a user gives. Raises ConfigError for an unknown one."""
+    """Return the name of one tower or several, given by name or class. Raises ConfigError for an unknown one."""
     if not isinstance(choice, str):
         return TOWERS.name_of(choice)
     for part in choice.split(TOWER_SEPARATOR):
@@ -84,9 +83,10 @@ def tower_name(choice: "str | type[Tower]") -> str:
 
 
 def architectures_of(name: str) -> dict[str, Any]:
-    """Return what a checkpoint keeps of the models of families, by their names: enough to build them again elsewhere.
+    """Return the architectures of the models of families in `name`, from which a checkpoint builds them elsewhere.
 
-    Raises ConfigError for a model that its family does not know.
+    Raises:
+        ConfigError: A family has no such model.
     """
     families = {part: _family_of(part) for part in name.split(TOWER_SEPARATOR)}
     return {
@@ -95,6 +95,6 @@ def architectures_of(name: str) -> dict[str, Any]:
 
 
 def _family_of(name: str) -> str | None:
-    """The family of a "family:model"; None for the name of a tower."""
+    """Return the family of a "family:model"; None for the name of a tower."""
     family, colon, _ = name.partition(":")
     return family if colon and family in FAMILIES.names() else None

@@ -1,4 +1,4 @@
-"""Several backbones that look at one image, their features side by side: what one was taught, the other may lack."""
+"""Several backbones on one image, with concatenated features: differently pretrained ones complement each other."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from retrieval.model.towers.tower import Tower
 
 
 class ConcatenatedTowers(Tower):
-    """A tower of towers. `parts` see the image alike; a feature vector is theirs, one after the other."""
+    """A tower of towers: all `parts` encode the same image, and their features are concatenated."""
 
     def __init__(self, parts: Sequence[Tower]) -> None:
         super().__init__()
@@ -18,7 +18,7 @@ class ConcatenatedTowers(Tower):
 
     @property
     def widths(self) -> list[int]:
-        """How many features each part gives."""
+        """Number of features of each part."""
         return [part.feature_count for part in self.parts]  # type: ignore[misc]
 
     def _encode(self, images: Tensor) -> Tensor:
@@ -26,5 +26,5 @@ class ConcatenatedTowers(Tower):
 
 
 def feature_counts_of(tower: Tower) -> list[int]:
-    """How many features each of the towers that stand side by side gives, or the one."""
+    """Return the number of features of each concatenated tower, or of a single tower."""
     return tower.widths if isinstance(tower, ConcatenatedTowers) else [tower.feature_count]

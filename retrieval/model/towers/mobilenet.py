@@ -20,7 +20,7 @@ _STAGES = (
 # Layers that end the stages of 32, 64, 96 and 320 channels, at strides 8, 16, 16 and 32.
 _STAGE_OUTPUTS = {6: 32, 10: 64, 13: 96, 17: 320}
 _FLOAT32_LAYERS = 3
-"""Layers of the strides up to 4."""
+"""Layers up to stride 4, computed in float32."""
 
 
 def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
@@ -47,12 +47,13 @@ class InvertedResidual(nn.Module):
         self.has_shortcut = stride == 1 and inputs == outputs
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return the block's output (B, outputs, H', W') of maps (B, inputs, H, W)."""
         y: Tensor = self.conv(x)
         return x + y if self.has_shortcut else y
 
 
 class MobileNetV2(Tower):
-    """Nineteen convolutional features, global average, and the 1000-way layer where it is asked for.
+    """Nineteen convolutional features, global average, and the 1000-way layer for the output "classes".
 
     1280 pooled features, 1536 of stages; 3,504,872 parameters with the 1000-way layer.
     """
@@ -99,7 +100,7 @@ class MobileNetV2(Tower):
 
     @staticmethod
     def rename_state(state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Map the flat key layout of early checkpoints (`features.1.conv.3.weight`) to today's nested one."""
+        """Map the flat key layout of early checkpoints (`features.1.conv.3.weight`) to the current nested one."""
         if "features.2.conv.0.0.weight" in state or "features.2.conv.0.weight" not in state:
             return state
         renamed = {}

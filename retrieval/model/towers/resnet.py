@@ -26,6 +26,7 @@ class BasicBlock(nn.Module):
         self.downsample = _shortcut(inputs, width, stride)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return the block's output (B, C', H', W') of maps (B, C, H, W)."""
         y = self.relu(self.bn1(self.conv1(x)))
         y = self.bn2(self.conv2(y))
         shortcut = x if self.downsample is None else self.downsample(x)
@@ -50,6 +51,7 @@ class Bottleneck(nn.Module):
         self.downsample = _shortcut(inputs, outputs, stride)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Return the block's output (B, C', H', W') of maps (B, C, H, W)."""
         y = self.relu(self.bn1(self.conv1(x)))
         y = self.relu(self.bn2(self.conv2(y)))
         y = self.bn3(self.conv3(y))
@@ -64,7 +66,7 @@ def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:
 
 
 class ResNet(Tower):
-    """Stem, four stages, global average, and the 1000-way layer where it is asked for."""
+    """Stem, four stages, global average, and the 1000-way layer for the output "classes"."""
 
     optional_prefixes = ("fc.",)
     block: ClassVar[type[BasicBlock | Bottleneck]]
@@ -87,10 +89,10 @@ class ResNet(Tower):
                 inputs = width * self.block.expansion
             self.add_module(f"layer{stage + 1}", nn.Sequential(*blocks))
         self.fc = nn.Linear(inputs, 1000) if output == "classes" else None
-        # Stages 2 to 4, at strides 8, 16 and 32; each has twice the channels of the one before.
+        # Stages 2 to 4, at strides 8, 16 and 32; each has twice the channels of the previous one.
         counts = {"classes": 1000, "pooled": inputs, "stages": 3 * (inputs + inputs // 2 + inputs // 4)}
         self.feature_count = counts[output]
-        # He initialisation by fan-out, as for the published weights; the linear layer keeps PyTorch's own.
+        # He initialisation by fan-out, as for the published weights; the linear layer keeps PyTorch's default.
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")

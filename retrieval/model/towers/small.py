@@ -1,6 +1,6 @@
 """A tower for tests, the demo and two CPU cores: four strided convolutions with group normalisation.
 
-Group normalisation keeps every image's output independent of the rest of its batch, in training too.
+Group normalisation makes every image's output independent of the rest of its batch, in training too.
 """
 
 from collections.abc import Iterator
@@ -12,23 +12,25 @@ from retrieval.model.towers.tower import Tower, stage_statistics, without_autoca
 
 _WIDTHS = (24, 48, 96, 128)
 _FLOAT32_LAYERS = 3
-"""The first convolution, its norm and rectifier."""
+"""The first convolution, its norm and its ReLU."""
 
 
 class GroupNorm(nn.GroupNorm):
-    """In the weights' float32 also where convolutions multiply in bfloat16, as on a GPU: with channels last PyTorch's
-    own for bfloat16 is so slow on a CPU that a step takes 1.4 times as long.
+    """Group normalisation in the weights' float32, also where convolutions multiply in bfloat16.
+
+    With channels last, PyTorch's bfloat16 version is so slow on a CPU that a step takes 1.4 times as long.
     """
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, C, H, W) in the type of the weights."""
+        """Return normalised maps (B, C, H, W) in the type of the weights."""
         with without_autocast(x):
             return super().forward(x.to(self.weight.dtype))
 
 
 class SmallTower(Tower):
-    """Four 3 x 3 convolutions of stride 2 (the first 5 x 5); mean and maximum over the last map: 256 features, 888
-    of stages.
+    """Four 3 x 3 convolutions of stride 2 (the first 5 x 5), then mean and maximum over the last map.
+
+    256 features, or 888 for the output "stages".
     """
 
     optional_prefixes = ("fc.",)

@@ -12,8 +12,9 @@ from retrieval.model.towers.weights import State
 
 
 class TimmTower(TowerFamily):
-    """A model of timm. "pooled" is what it gives without its classifier, "stages" the statistics of its feature
-    maps.
+    """A model of timm.
+
+    "pooled" is its output without the classifier, "stages" the statistics of its feature maps.
     """
 
     def __init__(self, output: str, model: str, architecture: Mapping[str, Any]) -> None:
@@ -30,7 +31,7 @@ class TimmTower(TowerFamily):
 
     @classmethod
     def architecture(cls, model: str) -> dict[str, Any]:
-        """Return the normalisation of a model; its name says the rest. Raises ConfigError."""
+        """Return the normalisation of a model; its name determines the rest. Raises ConfigError."""
         timm = _timm()
         if not timm.is_model(model):
             raise ConfigError(f"timm:{model} must be a model of timm {timm.__version__}; see timm.list_models()")
@@ -44,12 +45,12 @@ class TimmTower(TowerFamily):
         try:
             found = timm.create_model(self.model_name, pretrained=True, **options)
         except (OSError, RuntimeError) as error:
-            raise CheckpointError(f"the weights of timm:{self.model_name} cannot be had: {error}") from error
+            raise CheckpointError(f"the weights of timm:{self.model_name} are not available: {error}") from error
         return {f"model.{name}": value for name, value in found.state_dict().items()}
 
     def _encode(self, images: Tensor) -> Tensor:
-        made = self.model(images)
-        return stage_statistics(made) if self.output == "stages" else made
+        output = self.model(images)
+        return stage_statistics(output) if self.output == "stages" else output
 
 
 def _timm() -> Any:

@@ -1,4 +1,4 @@
-"""What every tower owes its callers; a backbone only writes `_encode`."""
+"""Base class of every tower; a backbone only implements `_encode`."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
@@ -19,7 +19,7 @@ class Tower(nn.Module):
     """Encoder of one modality: RGB images to feature vectors.
 
     A subclass takes an output (`retrieval.model.towers.OUTPUTS`), sets `feature_count`, the length of a vector, and
-    writes `_encode`.
+    implements `_encode`.
 
     >>> import torch
     >>> class Average(retrieval.Tower):
@@ -35,30 +35,34 @@ class Tower(nn.Module):
 
     feature_count: int
     optional_prefixes: ClassVar[tuple[str, ...]] = ()
-    """What the names of weights begin with that published checkpoints hold and some outputs of the tower do not need,
-    the 1000-way layer first."""
+    """Prefixes of weights that published checkpoints contain and some outputs of the tower do not need; the 1000-way
+    layer first."""
     can_fold_batch_norm: ClassVar[bool] = True
-    """Whether a batch normalisation that is registered right after a convolution takes that one's output, so that the
-    two can be made one for inference."""
+    """Whether a batch normalisation that is registered right after a convolution takes its output, so that the two can
+    be folded for inference."""
     url: ClassVar[str | None] = None
-    """Where the published ImageNet weights are."""
+    """URL of the published ImageNet weights."""
     mean: Tensor
     std: Tensor
 
     def __init__(self, output: str = "pooled") -> None:
-        """Make what every tower has; a subclass makes its layers, for this output of
-        `retrieval.model.towers.OUTPUTS`.
+        """Make the parts that all towers have; a subclass makes its layers.
+
+        Args:
+            output: One of `retrieval.model.towers.OUTPUTS`.
         """
         super().__init__()
         self.output = output
-        # Not persistent: the state dict holds exactly the keys that ImageNet checkpoints hold.
+        # Not persistent: the state dict has exactly the keys of ImageNet checkpoints.
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
     def forward(self, images: Tensor) -> Tensor:
         """Encode images (B, 3, H, W), float32 RGB within -1..1 (0..1 unless differences), to (B, feature_count).
 
-        Raises BadInput for another shape, type or range, NumericalError for a NaN or infinite pixel.
+        Raises:
+            BadInput: Another shape, type or range.
+            NumericalError: A NaN or infinite pixel.
         """
         if images.ndim != 4 or images.shape[1] != 3:
             raise BadInput(f"a tower takes RGB images shaped (B, 3, H, W); got {tuple(images.shape)}")
@@ -78,19 +82,19 @@ class Tower(nn.Module):
         raise NotImplementedError
 
     def published_weights(self) -> State:
-        """Return the weights that are published for this architecture. Raises CheckpointError where there are none."""
+        """Return the weights that are published for this architecture. Raises CheckpointError if there are none."""
         if self.url is None:
             raise CheckpointError(f"no weights are published for {type(self).__name__}; give a file, or `random`")
         return download(self.url)
 
     @staticmethod
     def rename_state(state: State) -> State:
-        """Map the keys of a known older layout to today's; the identity unless a backbone has one."""
+        """Map the keys of a known older layout to the current one; by default the identity."""
         return state
 
 
 class TowerFamily(Tower, ABC):
-    """A tower around any of the models that another library builds."""
+    """A tower around any model that another library builds."""
 
     can_fold_batch_norm = False
 
@@ -98,9 +102,9 @@ class TowerFamily(Tower, ABC):
         """Build a model.
 
         Args:
-            output: As of any tower.
-            model: What stands behind "family:".
-            architecture: What `architecture(model)` returned when the training was configured.
+            output: One of `retrieval.model.towers.OUTPUTS`.
+            model: The part of the name after "family:".
+            architecture: The result of `architecture(model)` when the training was configured.
         """
         super().__init__(output)
         self.model_name = model
@@ -108,16 +112,19 @@ class TowerFamily(Tower, ABC):
     @classmethod
     @abstractmethod
     def architecture(cls, model: str) -> dict[str, Any]:
-        """Return plain JSON from which a model can be built again, without its files. Raises ConfigError for an unknown
-        one.
+        """Return plain JSON from which a model can be built without its files.
+
+        Raises:
+            ConfigError: The model is unknown.
         """
 
 
 def without_autocast(images: Tensor) -> AbstractContextManager[Any]:
-    """What the first layers are computed in: float32 also where the others multiply in bfloat16.
+    """Return a context that computes the first layers in float32, also where the others use bfloat16.
 
-    Gels differ by a few grey levels, which is what bfloat16 rounds away from an image: the gradient of MobileNetV2 in
-    bfloat16 then has a cosine of 0.75 with that in float32, and of 0.96 with the layers up to stride 4 in float32.
+    Gels differ by a few grey levels, which rounding an image to bfloat16 removes. The gradient of MobileNetV2 in
+    bfloat16 then has a cosine of 0.75 with the gradient in float32, and of 0.96 with the layers up to stride 4 in
+    float32.
     """
     if torch.is_autocast_enabled(images.device.type):
         return torch.autocast(images.device.type, enabled=False)
@@ -125,12 +132,12 @@ def without_autocast(images: Tensor) -> AbstractContextManager[Any]:
 
 
 def stage_statistics(maps: Iterable[Tensor]) -> Tensor:
-    """Mean, standard deviation and maximum over each of several maps (B, C, H, W), side by side: (B, 3 * all C).
+    """Return mean, standard deviation and maximum over each map (B, C, H, W), concatenated: (B, 3 * all C).
 
-    The mean alone thins out what covers a small part of an image; deviation and maximum keep it.
+    The mean alone dilutes a feature that covers a small part of an image; deviation and maximum preserve it.
     """
     parts = []
     for x in maps:
-        # Not the root of the variance, whose slope is infinite where a map is constant; that of `std` is 0 there.
+        # Not the root of the variance, whose slope is infinite where a map is constant; the slope of `std` is 0 there.
         parts += [x.mean((2, 3)), x.std((2, 3), correction=0), x.amax((2, 3))]
     return torch.cat(parts, dim=1)

@@ -14,13 +14,13 @@ from retrieval.model.towers.weights import State
 
 log = logging.getLogger(__name__)
 STAGE_COUNT = 4
-"""Of how many layers "stages" takes statistics, evenly chosen: of all stages of a network that has four."""
+"""Number of layers, evenly chosen, whose statistics are the output "stages": all stages of a network that has four."""
 
 
 class TransformersTower(TowerFamily):
-    """A vision model (DINOv2, ConvNeXt, ViT, SigLIP, ...), without the head of its task.
+    """A vision model (DINOv2, ConvNeXt, ViT, SigLIP, ...) without its task head.
 
-    "pooled" is what the model itself pools, or the mean over its last map or tokens.
+    "pooled" is the model's own pooled output, or the mean over its last map or tokens.
     """
 
     def __init__(self, output: str, model: str, architecture: Mapping[str, Any]) -> None:
@@ -31,7 +31,7 @@ class TransformersTower(TowerFamily):
         config = models.AutoConfig.for_model(**architecture["config"])
         self.model = models.AutoModel.from_config(config).float()
         takes = inspect.signature(self.model.forward).parameters
-        # Models for one size of image interpolate their position embeddings only when told to.
+        # Models for one image size interpolate their position embeddings only with this option.
         self._options = {"interpolate_pos_encoding": True} if "interpolate_pos_encoding" in takes else {}
         for name in ("mean", "std"):
             setattr(self, name, torch.tensor(architecture[name]).view(1, 3, 1, 1))
@@ -63,7 +63,7 @@ class TransformersTower(TowerFamily):
             raise CheckpointError(f"the weights of transformers:{self.model_name} cannot be read: {error}") from error
         if report["missing_keys"]:
             log.warning(
-                "%s holds no %s: that starts random", self.model_name, ", ".join(sorted(report["missing_keys"]))
+                "%s lacks %s: this part starts random", self.model_name, ", ".join(sorted(report["missing_keys"]))
             )
         return {f"model.{name}": value for name, value in found.state_dict().items()}
 
@@ -71,19 +71,19 @@ class TransformersTower(TowerFamily):
         return self._features(self.model, images)
 
     def _features(self, model: Any, images: Tensor) -> Tensor:
-        """Features (B, F) of images (B, 3, H, W) by `model`, which is this tower's or a twin of it."""
-        made = model(images, output_hidden_states=self.output == "stages", **self._options)
+        """Return features (B, F) of images (B, 3, H, W) by `model`: this tower's own, or a twin of it."""
+        output = model(images, output_hidden_states=self.output == "stages", **self._options)
         if self.output == "stages":
-            maps = made.hidden_states[1:]
+            maps = output.hidden_states[1:]
             every = max(1, len(maps) // STAGE_COUNT)
             return stage_statistics([_as_map(each) for each in maps[every - 1 :: every]])
-        pooled = getattr(made, "pooler_output", None)
-        features: Tensor = _as_map(made.last_hidden_state).mean((2, 3)) if pooled is None else pooled.flatten(1)
+        pooled = getattr(output, "pooler_output", None)
+        features: Tensor = _as_map(output.last_hidden_state).mean((2, 3)) if pooled is None else pooled.flatten(1)
         return features
 
 
 def _as_map(hidden: Tensor) -> Tensor:
-    """(B, C, H, W) of maps as they are, (B, C, N, 1) of N tokens (B, N, C)."""
+    """Return maps (B, C, H, W) unchanged, or N tokens (B, N, C) as (B, C, N, 1)."""
     return hidden if hidden.ndim == 4 else hidden.transpose(1, 2)[..., None]
 
 

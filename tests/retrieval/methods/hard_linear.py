@@ -26,7 +26,7 @@ def hard_cases() -> Iterator[HardCase]:
     yield _more_components_than_rank()
     yield _nan_feature()
     yield _partial_least_squares()
-    yield _thin_direction()
+    yield _narrow_direction()
     yield _constant_feature()
     yield _far_feature()
     yield _cosine_of_zero()
@@ -34,7 +34,7 @@ def hard_cases() -> Iterator[HardCase]:
 
 
 def _views(count: int, features: int, seed: int = 11) -> tuple[Matrix, Matrix]:
-    """Two views of `count` items that share three factors."""
+    """Return two views of `count` items with three common factors."""
     rng = np.random.default_rng([seed])
     factors = rng.normal(size=(count, 3))
     touch, photo = (factors @ rng.normal(size=(3, features)) + rng.normal(size=(count, features)) for _ in range(2))
@@ -42,7 +42,7 @@ def _views(count: int, features: int, seed: int = 11) -> tuple[Matrix, Matrix]:
 
 
 def naive_correlations(touch: Matrix, photo: Matrix) -> Matrix:
-    """Canonical correlations as they are printed: roots of the eigenvalues of Cxx^-1 Cxy Cyy^-1 Cyx."""
+    """Return the textbook canonical correlations: roots of the eigenvalues of Cxx^-1 Cxy Cyy^-1 Cyx."""
     x, y = touch - touch.mean(0), photo - photo.mean(0)
     cross = x.T @ y
     product = np.linalg.inv(x.T @ x) @ cross @ np.linalg.inv(y.T @ y) @ cross.T
@@ -54,7 +54,7 @@ def _correlations(touch: Matrix, photo: Matrix) -> CanonicalCorrelations:
 
 
 def _tried(work: Callable[[], Matrix]) -> Matrix:
-    """What a naive formula gives; NaN where it raised."""
+    """Return the result of a naive formula; NaN where it raised."""
     try:
         return work()
     except np.linalg.LinAlgError:
@@ -62,7 +62,7 @@ def _tried(work: Callable[[], Matrix]) -> Matrix:
 
 
 def _text(values: Matrix) -> str:
-    """The first three numbers."""
+    """Return the first three numbers as text."""
     return ", ".join(f"{value:.6g}" for value in values[:3])
 
 
@@ -78,60 +78,62 @@ def _fewer_items_than_features() -> HardCase:
     views = _views(30, 50)
     naive, found = _tried(lambda: naive_correlations(*views)), _correlations(*views)
     holds = _in_bounds(found.correlations) and bool(np.isfinite(found.touch_weights).all())
-    wanted = "correlations within 0..1, finite weights"
+    expected = "correlations within 0..1, finite weights"
     return HardCase(
-        _CCA, "30 items, 50 features", wanted, _text(naive), _text(found.correlations), holds, _in_bounds(naive)
+        _CCA, "30 items, 50 features", expected, _text(naive), _text(found.correlations), holds, _in_bounds(naive)
     )
 
 
 def _duplicates_and_constants() -> HardCase:
-    """A feature twice, one nearly twice and one that never varies change nothing."""
+    """A duplicate feature, a near duplicate and a constant one must change nothing."""
     touch, photo = _views(200, 4)
     must = _correlations(touch, photo).correlations
     near = touch[:, :1] * (1 + 1e-9 * np.sign(touch[:, 1:2]))
     wide = np.concatenate([touch, touch[:, :1], near, np.full((200, 1), 7.0)], axis=1)
     naive, ours = _tried(lambda: naive_correlations(wide, photo)), _correlations(wide, photo).correlations
-    right = [bool(np.allclose(found[:3], must[:3], rtol=1e-6)) for found in (naive, ours)]
+    correct = [bool(np.allclose(found[:3], must[:3], rtol=1e-6)) for found in (naive, ours)]
     case = "columns that are equal, nearly equal, constant"
-    return HardCase(_CCA, case, f"{_text(must)}, as without", _text(naive), _text(ours), right[1], right[0])
+    return HardCase(_CCA, case, f"{_text(must)}, as without", _text(naive), _text(ours), correct[1], correct[0])
 
 
 def _every_scale() -> HardCase:
-    """Units of features must not matter; X'X squares their range, and float32 ends there."""
+    """Units of features must not matter; X'X squares their range beyond float32."""
     touch, photo = _views(200, 6)
     must = _correlations(touch, photo).correlations
     scaled = touch * 10.0 ** np.linspace(-6, 6, 6)
     naive = _tried(lambda: _by_eigenvectors(scaled, photo))
     ours = _correlations(scaled, photo).correlations
-    right = [bool(np.allclose(found[:3], must[:3], rtol=1e-6)) for found in (naive, ours)]
-    wanted = f"{_text(must)}, as unscaled"
-    return HardCase(_CCA, "features in units of 1e-6 to 1e6", wanted, _text(naive), _text(ours), right[1], right[0])
+    correct = [bool(np.allclose(found[:3], must[:3], rtol=1e-6)) for found in (naive, ours)]
+    expected = f"{_text(must)}, as unscaled"
+    return HardCase(
+        _CCA, "features in units of 1e-6 to 1e6", expected, _text(naive), _text(ours), correct[1], correct[0]
+    )
 
 
 def _by_eigenvectors(touch: Matrix, photo: Matrix) -> Matrix:
-    """Canonical correlations from whitening by the eigenvectors of X'X, in the features' float32."""
+    """Return canonical correlations from whitening by the eigenvectors of X'X, in the features' float32."""
     x, y = (whitened_by_eigenvectors((one - one.mean(0)).astype(np.float32)) for one in (touch, photo))
     return np.asarray(np.linalg.svd(x.T @ y)[1], np.float64)
 
 
 def whitened_by_eigenvectors(x: NDArray[Any]) -> NDArray[Any]:
-    """Centred x (n, F) at unit covariance by (X'X)^-1/2; small eigenvalues drown in the rounding of the large."""
+    """Return centred x (n, F) at unit covariance by (X'X)^-1/2; rounding of large eigenvalues hides the small ones."""
     values, vectors = np.linalg.eigh(x.T @ x)
     return np.asarray(x @ vectors / np.sqrt(values))
 
 
 def _more_components_than_rank() -> HardCase:
-    """Ten features made of three: there are three correlations, and dividing by the other deviations gives noise."""
+    """Ten features of rank three: there are three correlations; dividing by the other deviations gives noise."""
     rng = np.random.default_rng([12])
     factors, photo = rng.normal(size=(100, 3)), rng.normal(size=(100, 10))
     touch = factors @ rng.normal(size=(3, 10))
     naive = _tried(lambda: naive_correlations(touch, photo))
     found = _correlations(touch, photo).correlations
     holds = len(found) == 3 and _in_bounds(found)
-    wanted = "3 correlations within 0..1"
+    expected = "3 correlations within 0..1"
     words, ours = f"{len(naive)}: {_text(naive)}", f"{len(found)}: {_text(found)}"
     naive_holds = len(naive) == 3 and _in_bounds(naive)
-    return HardCase(_CCA, "10 components of rank 3", wanted, words, ours, holds, naive_holds)
+    return HardCase(_CCA, "10 components of rank 3", expected, words, ours, holds, naive_holds)
 
 
 def _nan_feature() -> HardCase:
@@ -143,7 +145,7 @@ def _nan_feature() -> HardCase:
 
 
 def naive_pls(touch: Matrix, photo: Matrix, components: int) -> Matrix:
-    """Touch weights (F, components) by power iteration and deflation, however many directions there are."""
+    """Return touch weights (F, components) by power iteration and deflation, for any number of directions."""
     x, y = touch - touch.mean(0), photo - photo.mean(0)
     weights = []
     for _ in range(components):
@@ -161,7 +163,7 @@ def naive_pls(touch: Matrix, photo: Matrix, components: int) -> Matrix:
 
 
 def _partial_least_squares() -> HardCase:
-    """A touch that tells two things apart has one component; after it nothing is left, and 0/0 is NaN."""
+    """A touch with two values has one component; after it the residual is zero, and 0/0 is NaN."""
     rng = np.random.default_rng([13])
     objects = np.repeat(np.arange(10), 4)
     touch = np.stack([objects % 2 * 2.0 - 1, np.zeros(40)], axis=1).astype(np.float32)
@@ -172,54 +174,66 @@ def _partial_least_squares() -> HardCase:
     method.fit(features.of_objects(map(str, range(8))), features.of_objects(["8", "9"]))
     encodings, columns = method.encode_touch(touch[:, None]), int(method.best_params["max_components"])
     finite = bool(np.isfinite(encodings).all())
-    wanted = "1 component, codes that are finite"
+    expected = "1 component, finite encodings"
     words = f"4 components: {_text(naive[0])}"
-    said = f"{columns} component, codes {'finite' if finite else 'NaN'}"
+    text = f"{columns} component, encodings {'finite' if finite else 'NaN'}"
     return HardCase(
-        "PLS", "4 components of rank 1", wanted, words, said, finite and columns == 1, bool(np.isfinite(naive).all())
+        "PLS", "4 components of rank 1", expected, words, text, finite and columns == 1, bool(np.isfinite(naive).all())
     )
 
 
 # Whitening and standardising ---------------------------------------------------------------------------------
 
 
-def _thin_direction() -> HardCase:
-    """Deviations of 1 and of 1e-6: whitened, both are 1. The covariance squares their ratio."""
+def _narrow_direction() -> HardCase:
+    """Deviations of 1 to 1e-6 are all 1 after whitening. The covariance squares their ratio."""
     rng = np.random.default_rng([14])
     turn = np.linalg.qr(rng.normal(size=(5, 5)))[0]
     x = (rng.normal(size=(400, 5)) * [1, 1, 1e-2, 1e-4, 1e-6]) @ turn
-    # Of one standard deviation in every feature, so that standardising changes nothing but the mean.
+    # With unit deviation in every feature, standardising changes only the mean.
     x = (x - x.mean(0)) / x.std(0)
     view = decompose(x)
     found = (whitened_by_eigenvectors(x), view.left / view.regularised_deviations(0.0) * view.singular)
     error = [float(np.abs(one.T @ one - np.eye(5) * (one.T @ one)[0, 0]).max() / (one.T @ one)[0, 0]) for one in found]
     naive, ours = (f"off by {value:.1e}" for value in error)
-    wanted = "covariance 1 to 1e-9"
-    return HardCase("whitening", "deviations of 1 to 1e-6", wanted, naive, ours, error[1] < 1e-9, error[0] < 1e-9)
+    expected = "covariance 1 to 1e-9"
+    return HardCase("whitening", "deviations of 1 to 1e-6", expected, naive, ours, error[1] < 1e-9, error[0] < 1e-9)
 
 
 def _constant_feature() -> HardCase:
-    """A dead unit of a network: 0.1 for every item, up to its last digit."""
+    """A dead unit of a network: 0.1 for every item, except the last digit."""
     x = np.random.default_rng([15]).normal(size=(50, 2)).astype(np.float32)
     x[:, 1] = np.float32(0.1) * (1 + np.float32(6e-8) * (np.arange(50) % 2))
     naive = float(np.abs((x - x.mean(0)) / x.std(0)).max(0)[1])
     columns = Standardiser.fit(x).columns.tolist()
-    wanted = "dropped"
-    words = f"its last digit blown up to {naive:.3g} deviations"
+    expected = "dropped"
+    words = f"its last digit amplified to {naive:.3g} deviations"
     return HardCase(
-        "standardising", "a feature of 0.1 + rounding", wanted, words, f"kept: {columns}", columns == [0], naive < 1e-3
+        "standardising",
+        "a feature of 0.1 + rounding",
+        expected,
+        words,
+        f"columns {columns}",
+        columns == [0],
+        naive < 1e-3,
     )
 
 
 def _far_feature() -> HardCase:
-    """10,000 +- 0.1: the mean of squares less the square of the mean cancels in float32."""
+    """10,000 +- 0.1: the mean of squares minus the square of the mean cancels in float32."""
     x = (1e4 + 0.1 * np.random.default_rng([16]).normal(size=(400, 1))).astype(np.float32)
     naive = float(np.sqrt((x * x).mean() - x.mean() ** 2))
     ours = float(Standardiser.fit(x).scale[0])
     must = float(x.astype(np.float64).std())
-    right = [abs(value - must) < 1e-6 * must for value in (naive, ours)]
+    correct = [abs(value - must) < 1e-6 * must for value in (naive, ours)]
     return HardCase(
-        "standardising", "a feature of 10000 +- 0.1", f"{must:.6g}", f"{naive:.6g}", f"{ours:.6g}", right[1], right[0]
+        "standardising",
+        "a feature of 10000 +- 0.1",
+        f"{must:.6g}",
+        f"{naive:.6g}",
+        f"{ours:.6g}",
+        correct[1],
+        correct[0],
     )
 
 
@@ -235,11 +249,11 @@ def _cosine_of_zero() -> HardCase:
     x = np.array([[0.0, 0.0], [1.0, 0.0]])
     naive, unit = _naive_cosine(x.astype(np.float32)), unit_rows(x)
     ours = float(cosine(unit, unit)[0, 1])
-    return HardCase(_COSINE, "with a code of zeros", "0", f"{naive}", f"{ours}", ours == 0, naive == 0)
+    return HardCase(_COSINE, "with an encoding of zeros", "0", f"{naive}", f"{ours}", ours == 0, naive == 0)
 
 
 def _cosine_of_extremes() -> Iterator[HardCase]:
-    """Two vectors of one direction, of float32's largest and smallest numbers: cosine 1."""
+    """Two equal vectors of float32's largest and smallest numbers: cosine 1."""
     for size in (3e38, 1e-30, 1e-42):
         x = np.full((2, 2), size, np.float32)
         unit, naive = unit_rows(x.astype(np.float64)), _naive_cosine(x)

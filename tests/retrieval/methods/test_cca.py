@@ -1,4 +1,4 @@
-"""Canonical correlations against closed forms, plain loops and scikit-learn, and where scikit-learn's break."""
+"""Canonical correlations against closed forms, plain loops and scikit-learn, and inputs where scikit-learn fails."""
 
 import warnings
 
@@ -19,7 +19,7 @@ from retrieval.training.features import Features
 
 
 def linked(rhos, n=200, touch=12, photo=10, seed=0):
-    """Two views whose sample canonical correlations are exactly `rhos` and 0: mixed orthogonal columns."""
+    """Return two views whose sample canonical correlations are exactly `rhos` and 0: mixed orthogonal columns."""
     rng = np.random.default_rng(seed)
     columns = np.column_stack([np.ones(n), rng.standard_normal((n, touch + photo))])
     basis = np.linalg.qr(columns)[0][:, 1:] * np.sqrt(n)
@@ -42,7 +42,7 @@ def correlation(a, b):
 
 
 def sklearn_cca(x, y, components, **options):
-    """Correlations that scikit-learn's variates have, and what it warned of."""
+    """Return the correlations of scikit-learn's variates, and its warnings."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         a, b = CCA(components, **options).fit(x, y).transform(x, y)
@@ -50,8 +50,8 @@ def sklearn_cca(x, y, components, **options):
     return rho, [str(warning.message) for warning in caught]
 
 
-def test_noise_correlates_in_sample_and_not_on_held_out_items():
-    """50 + 50 features of 60 items span everything: the training correlation says nothing."""
+def test_noise_correlates_in_the_sample_and_not_on_held_out_items():
+    """50 + 50 features of 60 items span everything: the training correlation carries no information."""
     rng = np.random.default_rng(0)
     x, y = rng.standard_normal((60, 50)), rng.standard_normal((60, 50))
     found = paired(x, y)
@@ -75,7 +75,7 @@ def test_planted_correlations_are_recovered():
 
 
 @pytest.mark.parametrize("ridge", [0.0, 0.1])
-def test_many_items_of_few_directions_give_what_the_whole_decomposition_gives(monkeypatch, ridge):
+def test_many_items_of_few_directions_give_the_same_as_the_whole_decomposition(monkeypatch, ridge):
     x, y = linked([0.95, 0.9, 0.8, 0.3])
     x, y = np.column_stack([x, x[:, :3]]), np.column_stack([y, np.ones(len(y))])  # 12 and 10 directions of 15 and 11
     whole = paired(x, y, ridge)
@@ -86,11 +86,11 @@ def test_many_items_of_few_directions_give_what_the_whole_decomposition_gives(mo
         np.testing.assert_allclose(np.abs(mine[:, :4]), np.abs(theirs[:, :4]), atol=1e-5)
 
 
-def test_of_a_view_the_widest_directions_are_kept_where_so_many_are_asked():
+def test_a_view_with_a_limit_has_its_widest_directions():
     x = np.random.default_rng(0).standard_normal((50, 12)) * np.arange(1, 13)
     whole, few = decompose(x), decompose(x, 4)
     assert (whole.rank, few.rank) == (12, 4)
-    np.testing.assert_allclose(few.singular, whole.singular[:4], rtol=1e-12)  # by eigenvectors, which round otherwise
+    np.testing.assert_allclose(few.singular, whole.singular[:4], rtol=1e-12)  # eigenvectors round differently
     assert decompose(x, 96).rank == 12
 
 
@@ -102,7 +102,7 @@ def test_fewer_items_than_features_give_the_same_widest_directions_as_the_whole_
     np.testing.assert_allclose((left * singular) @ right, (whole[0][:, :5] * whole[1][:5]) @ whole[2][:5], atol=1e-10)
 
 
-def test_photos_may_have_a_ridge_of_their_own():
+def test_photos_may_have_their_own_ridge():
     x, y = linked((0.9, 0.6))
     views, owner = (decompose(x), decompose(y)), np.arange(len(x))
     both, one = canonical_correlations(*views, owner, 0.5), canonical_correlations(*views, owner, 0.1, 0.5)
@@ -114,9 +114,9 @@ def test_photos_may_have_a_ridge_of_their_own():
         canonical_correlations(*views, owner, 0.1, -1)
 
 
-def test_of_many_items_only_the_widest_directions_are_kept(monkeypatch):
+def test_of_many_items_only_the_widest_directions_are_used(monkeypatch):
     monkeypatch.setattr(cca, "MAX_ROWS", 100)
-    monkeypatch.setattr(cca, "LEADING", 3)
+    monkeypatch.setattr(cca, "MAX_DIRECTIONS", 3)
     x = np.random.default_rng(0).standard_normal((200, 3)) @ np.random.default_rng(1).standard_normal((3, 8))
     x += 1e-3 * np.random.default_rng(2).standard_normal(x.shape)
     view = decompose(x)
@@ -126,7 +126,7 @@ def test_of_many_items_only_the_widest_directions_are_kept(monkeypatch):
 
 
 @pytest.mark.parametrize("ridge", [0.0, 0.1])
-def test_it_solves_the_eigenproblem_of_the_covariances(ridge):
+def test_the_correlations_solve_the_eigenproblem_of_the_covariances(ridge):
     """(C_xx + ridge)^-1/2 C_xy (C_yy + ridge)^-1/2 on standardised features, whose mean variance is 1."""
     x, y = (Standardiser.fit(view)(view) for view in linked([0.9, 0.5], n=80, touch=5, photo=4, seed=3))
     roots = [np.linalg.inv(scipy.linalg.sqrtm(v.T @ v / len(v) + ridge * np.eye(v.shape[1]))) for v in (x, y)]
@@ -134,7 +134,7 @@ def test_it_solves_the_eigenproblem_of_the_covariances(ridge):
     np.testing.assert_allclose(paired(x, y, ridge).correlations, expected, atol=1e-9)
 
 
-def test_it_is_what_scikit_learn_finds_where_that_is_well_posed():
+def test_the_correlations_equal_scikit_learns_on_well_posed_input():
     x, y = linked([0.95, 0.8, 0.6], n=300)
     rho, messages = sklearn_cca(x, y, 3)
     assert not messages
@@ -142,8 +142,8 @@ def test_it_is_what_scikit_learn_finds_where_that_is_well_posed():
 
 
 @pytest.mark.parametrize("ridge", [0.0, 0.5])
-def test_pairing_by_object_is_what_every_pair_enumerated_gives(ridge):
-    """Objects with 1 to 6 grasps; each pair of an object with m grasps weighs 1 / m."""
+def test_pairing_by_object_equals_that_over_every_pair(ridge):
+    """Objects with 1 to 6 grasps; each pair of an object with m grasps has weight 1 / m."""
     rng = np.random.default_rng(5)
     owner = np.repeat(np.arange(9), [1, 2, 3, 6, 4, 4, 2, 5, 6])[rng.permutation(33)]
     latent = rng.standard_normal((9, 3))[owner]
@@ -164,7 +164,7 @@ def test_pairing_by_object_is_what_every_pair_enumerated_gives(ridge):
 
 
 def spoiled(name, x):
-    """The same information, badly put."""
+    """Return the same information in an ill-conditioned form."""
     rng = np.random.default_rng(9)
     return {
         "duplicated": lambda: np.column_stack([x, x, 3 * x[:, :4] - 7]),
@@ -180,7 +180,7 @@ SPOILED = ["duplicated", "constant", "collinear", "nearly duplicated", "scaled 1
 
 
 @pytest.mark.parametrize("name", SPOILED)
-def test_features_badly_put_give_the_same_correlations(name):
+def test_ill_conditioned_features_give_the_same_correlations(name):
     rhos = [0.95, 0.9, 0.8]
     x, y = linked(rhos)
     found = paired(spoiled(name, x), y)
@@ -191,7 +191,7 @@ def test_features_badly_put_give_the_same_correlations(name):
 
 @pytest.mark.parametrize("name", SPOILED)
 @pytest.mark.parametrize("ridge", [0.0, 1e-3, 100.0])
-def test_fewer_items_than_features_give_finite_answers(name, ridge):
+def test_fewer_items_than_features_give_finite_results(name, ridge):
     rng = np.random.default_rng(2)
     x, y = spoiled(name, rng.standard_normal((30, 40))), rng.standard_normal((30, 60))
     found = paired(x, y, ridge)
@@ -200,7 +200,7 @@ def test_fewer_items_than_features_give_finite_answers(name, ridge):
     assert ((found.correlations >= 0) & (found.correlations <= 1)).all()
 
 
-def test_the_scale_of_a_column_changes_nothing_where_normal_equations_break():
+def test_the_scale_of_a_column_does_not_matter_although_normal_equations_fail():
     """Whitening by the eigenvalues of X'X, as is common, squares a condition number of 1e12 past float64."""
     rhos = [0.95, 0.9, 0.8]
     x, y = linked(rhos)
@@ -208,14 +208,14 @@ def test_the_scale_of_a_column_changes_nothing_where_normal_equations_break():
     whitened = []
     for view in (scaled - scaled.mean(0), y - y.mean(0)):
         values, vectors = np.linalg.eigh(view.T @ view)
-        kept = values > values.max() * len(values) * np.finfo(float).eps
-        whitened.append(view @ vectors[:, kept] / np.sqrt(values[kept]))
+        large = values > values.max() * len(values) * np.finfo(float).eps
+        whitened.append(view @ vectors[:, large] / np.sqrt(values[large]))
     naive = np.linalg.svd(whitened[0].T @ whitened[1])[1]
     assert abs(naive[2] - 0.8) > 0.05
     np.testing.assert_allclose(paired(scaled, y).correlations, paired(x, y).correlations, atol=1e-9)
 
 
-def test_scikit_learn_loses_correlations_to_duplicates_where_ours_keeps_them():
+def test_duplicates_do_not_change_the_correlations_although_they_change_scikit_learns():
     x, y = linked([0.95, 0.9, 0.8])
     rng = np.random.default_rng(1)
     spoiled = np.column_stack([x, x, x[:, :1] + 1e-7 * rng.standard_normal((200, 1)), np.ones(200)])
@@ -224,7 +224,7 @@ def test_scikit_learn_loses_correlations_to_duplicates_where_ours_keeps_them():
     np.testing.assert_allclose(paired(spoiled, y).correlations[:3], [0.95, 0.9, 0.8], atol=1e-5)
 
 
-def test_scikit_learn_loses_correlations_to_units_where_ours_keeps_them():
+def test_units_do_not_change_the_correlations_although_they_change_scikit_learns():
     x, y = linked([0.95, 0.9, 0.8])
     scaled = x * np.logspace(-6, 6, 12)
     rho, _ = sklearn_cca(scaled, y, 3, scale=False)
@@ -232,30 +232,30 @@ def test_scikit_learn_loses_correlations_to_units_where_ours_keeps_them():
     np.testing.assert_allclose(paired(scaled, y).correlations[:3], [0.95, 0.9, 0.8], atol=1e-6)
 
 
-def test_scikit_learn_gives_components_beyond_the_rank_where_ours_gives_fewer():
+def test_there_are_no_components_beyond_the_rank_although_scikit_learn_gives_some():
     rng = np.random.default_rng(4)
     latent = rng.standard_normal((100, 3))
     x = latent @ rng.standard_normal((3, 8))
     y = latent @ rng.standard_normal((3, 8)) + 0.1 * rng.standard_normal((100, 8))
     rho, _ = sklearn_cca(x, y, 5)
-    assert not (rho[3:] > 0.5).any()  # two of five dimensions are rounding, and cosine would count them in full
+    assert not (rho[3:] > 0.5).any()  # two of five dimensions are rounding errors; a cosine would give them full weight
     assert len(paired(x, y).correlations) == 3
 
 
-def test_a_view_in_which_nothing_varies_is_refused():
+def test_a_constant_view_is_refused():
     with pytest.raises(BadInput, match="all 4 are constant over 50"):
         decompose(np.ones((50, 4)))
 
 
-def test_equal_correlations_are_found_as_one_subspace():
-    """Any rotation of it is right, so the planes are compared by their principal angles, not by columns."""
+def test_equal_correlations_span_one_subspace():
+    """Any rotation of it is valid, so the planes are compared by principal angles, not by columns."""
     x, y = linked([0.9, 0.9, 0.4], n=300)
     a, _ = variates(paired(x, y), x, y)
     more, _ = variates(paired(spoiled("collinear", x), y), spoiled("collinear", x), y)
     assert np.max(scipy.linalg.subspace_angles(a[:, :2], more[:, :2])) < 1e-6
 
 
-def test_signs_are_fixed_by_the_largest_weight_and_the_same_for_both_views():
+def test_the_largest_weight_fixes_the_sign_of_both_views():
     x, y = linked([0.95, 0.7, 0.5])
     found = paired(x, y)
     both = np.concatenate([found.touch_weights, found.photo_weights])
@@ -281,7 +281,7 @@ def test_a_negative_ridge_and_rows_without_an_owner_are_refused():
         canonical_correlations(x, y, np.arange(199))
 
 
-def test_where_the_fast_decomposition_fails_the_slow_one_answers(monkeypatch):
+def test_if_the_fast_decomposition_fails_the_slow_one_is_used(monkeypatch):
     x, y = linked([0.95, 0.9, 0.8])
     expected = paired(x, y).correlations
 
@@ -297,7 +297,7 @@ def first_hits(touch, photo):
 
 
 def test_cosine_needs_dimensions_weighted_by_their_correlation():
-    """Of 60 canonical dimensions 6 are real; unweighted, the other 54 drown them."""
+    """Of 60 canonical dimensions 6 are real; unweighted, the other 54 dominate."""
     rng = np.random.default_rng(7)
     maps = rng.standard_normal((6, 60)), rng.standard_normal((6, 60))
 
@@ -314,9 +314,9 @@ def test_cosine_needs_dimensions_weighted_by_their_correlation():
 
 
 def features(objects, each, seed, name, touch=8, photo=10, noise=0.3):
-    """Touch and photo features that are linear in three numbers of the object, and noise."""
-    world, rng = np.random.default_rng(77), np.random.default_rng(seed)
-    maps = world.standard_normal((3, 2 * touch)), world.standard_normal((3, photo))
+    """Return touch and photo features that are linear in three numbers of the object, with noise."""
+    shared, rng = np.random.default_rng(77), np.random.default_rng(seed)
+    maps = shared.standard_normal((3, 2 * touch)), shared.standard_normal((3, photo))
     latent = np.repeat(rng.standard_normal((objects, 3)), each, axis=0)
     n = objects * each
     views = [(latent @ m + noise * rng.standard_normal((n, m.shape[1]))).astype(np.float32) for m in maps]
@@ -329,7 +329,7 @@ def features(objects, each, seed, name, touch=8, photo=10, noise=0.3):
 
 
 @pytest.mark.parametrize("method", [Cca, Plsca])
-def test_what_was_chosen_is_said_and_never_exceeds_what_there_is(method):
+def test_the_best_parameters_are_reported_and_do_not_exceed_the_rank(method):
     fitted = method(MethodSettings(Config()))
     fitted.fit(features(6, 5, 0, "train"), features(4, 5, 1, "validation"))
     best_params = fitted.best_params
@@ -340,7 +340,7 @@ def test_what_was_chosen_is_said_and_never_exceeds_what_there_is(method):
         assert best_params["rank"] == {"touch": 16, "photo": 10}
 
 
-def test_one_grasp_for_each_object_is_plain_canonical_correlation_and_can_be_fitted():
+def test_one_grasp_per_object_is_plain_canonical_correlation_and_can_be_fitted():
     fitted = Cca(MethodSettings(Config()))
     fitted.fit(features(30, 1, 0, "train"), features(5, 1, 1, "validation"))
     assert fitted.best_params["validation_auc"] > 0.8

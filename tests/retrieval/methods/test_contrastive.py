@@ -1,4 +1,4 @@
-"""The two towers of projections: what is kept of training, and how logits are made of cosines."""
+"""The two projections: best step, logits from cosines, and the draws of batches."""
 
 import numpy as np
 import pytest
@@ -17,11 +17,11 @@ CONFIG = Config(matcher=MatcherConfig(embedding_dim=4), training=TrainingConfig(
 
 
 def planted(objects, seed, each=6):
-    """Touch and photo features that see two numbers of the object, and noise."""
-    world, rng = np.random.default_rng(11), np.random.default_rng(seed)
+    """Return touch and photo features that are linear in two numbers of the object, with noise."""
+    shared, rng = np.random.default_rng(11), np.random.default_rng(seed)
     latent = np.repeat(rng.standard_normal((objects, 2)), each, axis=0)
     touch, photo = (
-        latent @ world.standard_normal((2, d)) + 0.3 * rng.standard_normal((len(latent), d)) for d in (6, 5)
+        latent @ shared.standard_normal((2, d)) + 0.3 * rng.standard_normal((len(latent), d)) for d in (6, 5)
     )
     return Features(
         tuple(f"{seed}-{row}" for row in range(len(latent))),
@@ -50,7 +50,7 @@ def test_scores_are_scaled_cosines_with_the_learned_bias(method):
 
 
 @pytest.mark.slow
-def test_what_was_chosen_is_among_what_was_tried():
+def test_the_best_parameters_are_among_the_candidates():
     fitted = ContrastiveEmbedding(MethodSettings(CONFIG))
     fitted.fit(TRAIN, VALIDATION)
     assert (fitted.best_params["dropout"], fitted.best_params["weight_decay"]) in module.REGULARISATIONS
@@ -63,7 +63,7 @@ def test_the_sigmoid_loss_starts_from_its_own_scale_and_bias():
     assert SigmoidProjections(3, 3, 2, 0.0).logit_map() == (pytest.approx(10, rel=1e-6), SIGMOID_BIAS_INIT)
 
 
-def test_the_scale_is_held_at_a_hundred_and_can_come_back():
+def test_the_scale_is_clamped_at_a_hundred_and_has_a_gradient_there():
     projections = Projections(3, 3, 2, 0.0)
     with torch.no_grad():
         projections.log_scale.fill_(7.0)
@@ -74,14 +74,14 @@ def test_the_scale_is_held_at_a_hundred_and_can_come_back():
     assert gradient.item() > 1  # a clamp of the forward value would have none
 
 
-def test_a_feature_vector_of_zeros_has_an_embedding_of_its_own_bias_and_no_nan():
+def test_a_feature_vector_of_zeros_has_the_embedding_of_its_bias_and_no_nan():
     projections = Projections(3, 3, 2, 0.0)
     with torch.no_grad():
         projections.touch.bias.zero_()
     assert projections(torch.zeros(1, 3), projections.touch).tolist() == [[0.0, 0.0]]
 
 
-def test_fitting_leaves_the_random_stream_of_others_alone():
+def test_a_fit_does_not_change_the_global_random_stream():
     torch.manual_seed(3)
     expected = torch.rand(4)
     torch.manual_seed(3)
@@ -93,7 +93,7 @@ def draws(owner, seed=0):
     return ObjectSampler(torch.tensor(owner), torch.Generator().manual_seed(seed))
 
 
-def test_rows_are_drawn_of_the_asked_objects_and_each_row_alike():
+def test_rows_are_drawn_from_the_requested_objects_uniformly():
     owner = [0, 1, 0, 2, 1, 1]
     drawn = draws(owner).rows(torch.tensor([0, 1, 2]).repeat(3000))
     assert all(owner[row] == place % 3 for place, row in enumerate(drawn.tolist()))
@@ -104,7 +104,7 @@ def test_rows_are_drawn_of_the_asked_objects_and_each_row_alike():
     assert counts[3] == 3000
 
 
-def test_a_batch_holds_an_object_once_and_others_are_others():
+def test_a_batch_contains_an_object_once_and_other_objects_differ():
     drawn = draws([0, 1, 2, 3])
     assert sorted(drawn.distinct_objects(10).tolist()) == [0, 1, 2, 3]
     assert len(set(drawn.distinct_objects(2).tolist())) == 2
@@ -114,13 +114,13 @@ def test_a_batch_holds_an_object_once_and_others_are_others():
     assert all(len(set(row)) == 3 for row in others.tolist())
 
 
-def test_sets_hold_distinct_grasps_of_one_object_of_every_size_it_allows():
+def test_sets_contain_distinct_grasps_of_one_object_in_every_possible_size():
     owner = [0] * 12 + [1] * 3 + [2]
     objects = torch.tensor([0, 1, 2]).repeat(400)
-    rows, held = draws(owner).sets(objects, 8)
-    sizes = held.sum(1)
+    rows, counted = draws(owner).sets(objects, 8)
+    sizes = counted.sum(1)
     for place in range(len(objects)):
-        taken = rows[place][held[place]].tolist()
+        taken = rows[place][counted[place]].tolist()
         assert len(set(taken)) == len(taken)
         assert all(owner[row] == objects[place] for row in taken)
     assert set(sizes[objects == 0].tolist()) == set(range(1, 9))
@@ -128,7 +128,7 @@ def test_sets_hold_distinct_grasps_of_one_object_of_every_size_it_allows():
     assert set(sizes[objects == 2].tolist()) == {1}
 
 
-def test_one_seed_draws_alike():
+def test_equal_seeds_draw_the_same():
     with seeded_generator(4) as one:
         first = torch.rand(3, generator=one), torch.rand(3)
     with seeded_generator(4) as other:

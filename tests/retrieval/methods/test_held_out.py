@@ -1,4 +1,4 @@
-"""Which objects are held out together: half of each kind, so that some of its look-alikes train and some do not."""
+"""Folds of held-out objects: half of each kind, so that some similar objects train and some do not."""
 
 from itertools import pairwise
 
@@ -12,14 +12,14 @@ KINDS = [[f"{kind}{number}" for number in range(4)] for kind in "abcdefghi"]
 NAMES = sorted(name for kind in KINDS for name in kind)
 
 
-def photographed(kinds, noise=0.3, seed=0):
-    """Objects whose photos show their kind, and themselves a little; three photos of each."""
+def features_of(kinds, noise=0.3, seed=0):
+    """Return objects whose photo features are those of their kind with some of their own; three photos each."""
     rng = np.random.default_rng(seed)
     names, photos = [], []
     for members in kinds:
-        shared = rng.standard_normal(20)
+        of_kind = rng.standard_normal(20)
         for name in members:
-            own = shared + noise * rng.standard_normal(20)
+            own = of_kind + noise * rng.standard_normal(20)
             for _ in range(3):
                 names.append(name)
                 photos.append(own + 0.1 * rng.standard_normal(20))
@@ -28,47 +28,48 @@ def photographed(kinds, noise=0.3, seed=0):
 
 
 @pytest.mark.parametrize("named", [False, True])
-def test_half_of_each_kind_is_held_out_together_though_nobody_names_the_kinds(named):
+def test_half_of_each_kind_is_held_out_together_even_without_named_kinds(named):
     kind_of = {name: name[0] for name in NAMES} if named else None
-    folds = held_out_folds(photographed(KINDS), kind_of)
+    folds = held_out_folds(features_of(KINDS), kind_of)
     assert sorted(name for fold in folds for name in fold) == NAMES
     assert list(map(len, folds)) == [9, 9, 9, 9]
-    shares = [sorted(len(set(kind) & set(fold)) for fold in folds) for kind in KINDS]
-    assert shares.count([0, 0, 2, 2]) == 8  # of four look-alikes two are held out, two train
-    assert shares.count([1, 1, 1, 1]) == 1  # and the kind in the middle, which the chunks cut
+    overlaps = [sorted(len(set(kind) & set(fold)) for fold in folds) for kind in KINDS]
+    assert overlaps.count([0, 0, 2, 2]) == 8  # of four similar objects two are held out, two train
+    assert overlaps.count([1, 1, 1, 1]) == 1  # except the kind in the middle, which the chunks divide
 
 
 def test_objects_that_look_alike_are_neighbours():
-    order = appearance_order(photographed(KINDS))
+    order = appearance_order(features_of(KINDS))
     assert sorted(order) == NAMES
     assert sum(one[0] != other[0] for one, other in pairwise(order)) == len(KINDS) - 1
 
 
-def test_kinds_that_are_named_go_before_looks_and_a_kind_that_is_missing_for_one_object_counts_for_none():
-    crossed = {name: name[1] for name in NAMES}  # not what the photos show
-    seen = photographed(KINDS)
-    parts = held_out_folds(seen, crossed)
+def test_named_kinds_override_appearance_unless_the_kind_of_an_object_is_missing():
+    crossed = {name: name[1] for name in NAMES}  # differs from the photos
+    features = features_of(KINDS)
+    parts = held_out_folds(features, crossed)
     assert {sum(name[1] == number for fold in parts[:2] for name in fold) for number in "0123"} <= {4, 5}
-    assert held_out_folds(seen, {name: name[1] for name in NAMES[1:]}) == held_out_folds(seen)
+    assert held_out_folds(features, {name: name[1] for name in NAMES[1:]}) == held_out_folds(features)
 
 
-def test_kinds_of_odd_numbers_even_out_over_the_held_out_folds():
+def test_kinds_of_odd_size_give_folds_of_equal_size():
     kinds = [["a1", "a2", "a3"], ["b1"], ["c1", "c2", "c3"], ["d1"]]
-    parts = held_out_folds(photographed(kinds), {name: name[0] for kind in kinds for name in kind})
+    parts = held_out_folds(features_of(kinds), {name: name[0] for kind in kinds for name in kind})
     assert list(map(len, parts)) == [4, 4]
     assert {sum(name[0] == "a" for name in part) for part in parts} == {1, 2}
 
 
-def test_objects_of_one_sequence_stay_together_though_they_are_of_two_kinds():
-    parts = held_out_folds(photographed(KINDS), linked=[["a0", "b3"]])
+def test_objects_of_one_sequence_stay_together_although_they_are_of_two_kinds():
+    parts = held_out_folds(features_of(KINDS), linked=[["a0", "b3"]])
     assert any({"a0", "b3"} <= set(part) for part in parts)
     assert sorted(name for fold in parts for name in fold) == NAMES
 
 
-def test_the_seed_draws_other_held_out_folds_of_named_kinds():
-    seen, kind_of = photographed(KINDS), {name: name[0] for name in NAMES}
-    assert held_out_folds(seen, kind_of) == held_out_folds(seen, kind_of) != held_out_folds(seen, kind_of, seed=1)
+def test_the_seed_changes_the_folds_of_named_kinds():
+    features, kind_of = features_of(KINDS), {name: name[0] for name in NAMES}
+    first = held_out_folds(features, kind_of)
+    assert held_out_folds(features, kind_of) == first != held_out_folds(features, kind_of, seed=1)
 
 
-def test_two_objects_are_a_half_each():
-    assert held_out_folds(photographed([["a", "b"]])) == [("a",), ("b",)]
+def test_two_objects_give_two_folds_of_one():
+    assert held_out_folds(features_of([["a", "b"]])) == [("a",), ("b",)]

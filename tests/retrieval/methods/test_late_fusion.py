@@ -1,4 +1,4 @@
-"""Late fusion in the harness is what `retrieve train` trains and `retrieve query` runs, on features for images."""
+"""Late fusion among the methods is the model of `retrieve train` and `retrieve query`, on features of images."""
 
 import dataclasses
 
@@ -47,9 +47,9 @@ def fitted(parts, tmp_path_factory):
 
 
 def fit(method, parts, folder, config=FROZEN):
-    made = method(MethodSettings(config, folder=folder))
-    made.fit(*parts[:2])
-    return made
+    fitted_method = method(MethodSettings(config, folder=folder))
+    fitted_method.fit(*parts[:2])
+    return fitted_method
 
 
 def encodings(method, part):
@@ -62,13 +62,13 @@ def no_training(monkeypatch):
 
 @torch.inference_mode()
 def two_loops(matcher, part):
-    """Match logits of every touch with every photo, pair by pair."""
+    """Return match logits of every touch with every photo, pair by pair."""
     table = np.empty((len(part), len(part)))
-    for row, touch in enumerate(part.touch):
-        for column, photo in enumerate(part.photo):
-            touched = matcher.touch_encoding(torch.from_numpy(touch).reshape(1, -1))
-            seen = matcher.photo_encoding(torch.from_numpy(photo)[None])
-            table[row, column] = matcher.head(touched.partial, seen.partial).item()
+    for row, touch_features in enumerate(part.touch):
+        for column, photo_features in enumerate(part.photo):
+            touch = matcher.touch_encoding(torch.from_numpy(touch_features).reshape(1, -1))
+            photo = matcher.photo_encoding(torch.from_numpy(photo_features)[None])
+            table[row, column] = matcher.head(touch.partial, photo.partial).item()
     return table
 
 
@@ -86,16 +86,16 @@ def test_a_set_of_grasps_scores_the_sum_of_its_logits(fitted, parts):
     np.testing.assert_allclose(fitted.score_sets(touch, photo, sets), expected, rtol=1e-5, atol=1e-6)
 
 
-def test_the_harness_trains_what_the_command_line_trains(recording, split, fitted, tmp_path):
+def test_the_method_trains_the_same_model_as_the_command_line(recording, split, fitted, tmp_path):
     ours = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors")
     theirs = train(recording, tmp_path / "m.safetensors", FROZEN, split=split, quiet=True)
     assert (ours.provenance["step"], ours.config) == (theirs.provenance["step"], theirs.config)
     for name, weight in theirs.matcher.state_dict().items():
-        # The same steps on features that were encoded in batches of another size.
+        # The same steps, on features from batches of another size.
         torch.testing.assert_close(ours.matcher.state_dict()[name], weight, rtol=1e-3, atol=2e-4)
 
 
-def test_a_fit_leaves_a_checkpoint_that_an_index_is_built_with(fitted, catalogue, tmp_path):
+def test_a_fit_stores_a_checkpoint_that_can_build_an_index(fitted, catalogue, tmp_path):
     from retrieval.search.build.build_index import build_index
 
     report = build_index(
@@ -104,7 +104,7 @@ def test_a_fit_leaves_a_checkpoint_that_an_index_is_built_with(fitted, catalogue
     assert report.to_dict()["photos"] == 24
 
 
-def test_what_is_finished_is_not_trained_again(fitted, parts, monkeypatch):
+def test_a_finished_fit_is_not_trained_again(fitted, parts, monkeypatch):
     no_training(monkeypatch)
     again = fit(LateFusion, parts, fitted.settings.folder)
     assert again.best_params == fitted.best_params
@@ -112,7 +112,7 @@ def test_what_is_finished_is_not_trained_again(fitted, parts, monkeypatch):
     assert fit(RetrieveRerank, parts, fitted.settings.folder).best_params["step"] == fitted.best_params["step"]
 
 
-def test_another_setting_or_other_features_are_trained_anew(parts, tmp_path):
+def test_another_setting_or_other_features_are_trained_again(parts, tmp_path):
     first = fit(LateFusion, parts, tmp_path)
     slower = with_training(FROZEN, learning_rate=1e-4)
     assert fit(LateFusion, parts, tmp_path, slower).best_params != first.best_params
@@ -131,7 +131,7 @@ class Own(retrieval.Loss):
 """
 
 
-def test_a_loss_of_ones_own_that_was_edited_is_trained_with_anew(parts, tmp_path, monkeypatch):
+def test_after_an_edit_of_a_users_own_loss_the_method_is_trained_again(parts, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     module = tmp_path / "edited_loss.py"
     module.write_text(LOSS)
@@ -145,7 +145,7 @@ def test_a_loss_of_ones_own_that_was_edited_is_trained_with_anew(parts, tmp_path
 
 
 def stopped(parts, folder, monkeypatch, config=FROZEN):
-    """A fit that a power cut ends in its fourth step, after the state of the third is on disk."""
+    """Interrupt a fit in its fourth step, after the state of the third is on disk."""
     loss = Trainer.loss
 
     def failing(self, loaded):
@@ -161,25 +161,26 @@ def stopped(parts, folder, monkeypatch, config=FROZEN):
     assert not (folder / "late_fusion-0.safetensors").exists()
 
 
-def test_a_fit_that_was_stopped_goes_on_and_ends_bit_for_bit_alike(fitted, parts, tmp_path, monkeypatch):
+def test_an_interrupted_fit_continues_and_ends_bit_for_bit_the_same(fitted, parts, tmp_path, monkeypatch):
     stopped(parts, tmp_path, monkeypatch)
     fit(LateFusion, parts, tmp_path)
-    done = tmp_path / "late_fusion-0.safetensors"
-    assert done.read_bytes() == (fitted.settings.folder / done.name).read_bytes()
-    assert not state_path(unfinished_path(done)).exists()
+    path = tmp_path / "late_fusion-0.safetensors"
+    assert path.read_bytes() == (fitted.settings.folder / path.name).read_bytes()
+    assert not state_path(unfinished_path(path)).exists()
 
 
-def test_what_another_fit_left_unfinished_makes_room(fitted, parts, tmp_path, monkeypatch):
+def test_the_unfinished_state_of_another_fit_is_replaced(fitted, parts, tmp_path, monkeypatch):
     stopped(parts, tmp_path, monkeypatch, with_training(FROZEN, learning_rate=1e-4))
     assert fit(LateFusion, parts, tmp_path).best_params == fitted.best_params
 
 
-def test_no_folder_keeps_nothing_and_comes_out_alike(fitted, parts):
-    alone = fit(LateFusion, parts, None)
-    np.testing.assert_array_equal(alone.score(*encodings(alone, parts[2])), fitted.score(*encodings(fitted, parts[2])))
+def test_a_fit_without_a_folder_stores_nothing_and_gives_the_same(fitted, parts):
+    unstored = fit(LateFusion, parts, None)
+    expected = fitted.score(*encodings(fitted, parts[2]))
+    np.testing.assert_array_equal(unstored.score(*encodings(unstored, parts[2])), expected)
 
 
-def test_seeds_come_out_apart(parts, tmp_path):
+def test_different_seeds_give_different_fits(parts, tmp_path):
     methods = [LateFusion(MethodSettings(FROZEN, seed=seed, folder=tmp_path)) for seed in (0, 1)]
     for method in methods:
         method.fit(*parts[:2])
@@ -189,16 +190,16 @@ def test_seeds_come_out_apart(parts, tmp_path):
 
 
 @pytest.mark.parametrize("method", [LateFusion, RetrieveRerank])
-def test_a_method_of_a_checkpoint_needs_no_fit_and_scores_alike(method, fitted, parts, monkeypatch):
+def test_a_method_from_a_checkpoint_needs_no_fit_and_scores_the_same(method, fitted, parts, monkeypatch):
     no_training(monkeypatch)
     checkpoint = load_checkpoint(fitted.settings.folder / "late_fusion-0.safetensors")
-    given = method.of_checkpoint(checkpoint, MethodSettings(FROZEN))
+    loaded = method.of_checkpoint(checkpoint, MethodSettings(FROZEN))
     expected = fit(method, parts, fitted.settings.folder)
     np.testing.assert_array_equal(
-        given.score(*encodings(given, parts[2])), expected.score(*encodings(expected, parts[2]))
+        loaded.score(*encodings(loaded, parts[2])), expected.score(*encodings(expected, parts[2]))
     )
-    with pytest.raises(BadInput, match="as fitted on"):
-        given.encode_touch(parts[2].touch[:, :1])
+    with pytest.raises(BadInput, match="as in the fit"):
+        loaded.encode_touch(parts[2].touch[:, :1])
 
 
 def test_features_of_other_towers_are_refused(parts):
@@ -213,15 +214,15 @@ def test_a_fit_on_features_reads_no_image(parts, tmp_path, monkeypatch):
     fit(LateFusion, parts, tmp_path)
 
 
-def expected_pruned(logits, nearness, count):
-    """The photos nearest to all grasps of the set by their summed logit, the others below, by nearness."""
+def expected_order(logits, nearness, count):
+    """Return the photos nearest to all grasps of the set by their summed logit, then the others by nearness."""
     mean = nearness.mean(0)
     nearest = sorted(range(len(mean)), key=lambda column: (-mean[column], column))
     return sorted(nearest[:count], key=lambda column: -logits[column]) + nearest[count:]
 
 
 @pytest.mark.parametrize("grasps", [1, 2, 3])
-def test_pruning_ranks_candidates_by_logit_and_the_rest_behind_by_embedding(grasps, fitted, parts):
+def test_reranking_orders_candidates_by_logit_and_the_rest_after_them_by_embedding(grasps, fitted, parts):
     every = Features(
         parts[0].grasp_ids + parts[2].grasp_ids,
         parts[0].object_ids + parts[2].object_ids,
@@ -237,14 +238,14 @@ def test_pruning_ranks_candidates_by_logit_and_the_rest_behind_by_embedding(gras
     sets = np.arange(4 * grasps).reshape(4, grasps)
     scores = method.score_sets(*encodings(method, every), sets)
     count = round(0.25 * len(every))
-    for row, best_params in enumerate(sets):
+    for row, members in enumerate(sets):
         ranked = np.argsort(-scores[row], kind="stable").tolist()
-        assert ranked == expected_pruned(logits[best_params].sum(0, dtype=np.float64), nearness[best_params], count)
+        assert ranked == expected_order(logits[members].sum(0, dtype=np.float64), nearness[members], count)
     if grasps == 1:
         np.testing.assert_allclose(method.score(*encodings(method, every))[:4], scores, rtol=1e-4, atol=1e-5)
 
 
-def test_judging_every_photo_is_late_fusion(fitted, parts):
+def test_reranking_every_photo_equals_late_fusion(fitted, parts):
     method = RetrieveRerank(fitted.settings, reranked_fraction=1.0)
     method.fit(*parts[:2])
     np.testing.assert_array_equal(
@@ -252,7 +253,7 @@ def test_judging_every_photo_is_late_fusion(fitted, parts):
     )
 
 
-def test_a_model_without_trained_embeddings_judges_every_photo(parts, tmp_path):
+def test_a_model_without_trained_embeddings_scores_every_photo(parts, tmp_path):
     method = fit(RetrieveRerank, parts, tmp_path, with_training(FROZEN, weights={}))
     assert method.best_params["reranked_fraction"] == 1.0
     late = fit(LateFusion, parts, tmp_path, with_training(FROZEN, weights={}))
@@ -265,7 +266,7 @@ def test_equally_near_photos_are_taken_by_row():
     assert nearest_photos(nearness[1:], 2).tolist() == [0, 1]
 
 
-def test_steps_on_features_are_computed_on_one_thread_and_others_are_not():
+def test_one_thread_limits_pytorch_to_one_thread_and_restores_the_number():
     before = torch.get_num_threads()
     with one_thread():
         assert torch.get_num_threads() == 1
@@ -273,10 +274,12 @@ def test_steps_on_features_are_computed_on_one_thread_and_others_are_not():
 
 
 def test_a_matcher_of_several_views_is_fitted_on_the_features_of_all(recording, split, tmp_path):
-    seen = dataclasses.replace(FROZEN, preprocessing=dataclasses.replace(FROZEN.preprocessing, views=("whole", "zoom")))
+    config = dataclasses.replace(
+        FROZEN, preprocessing=dataclasses.replace(FROZEN.preprocessing, views=("whole", "zoom"))
+    )
     torch.manual_seed(0)
-    features = encode_recording(load_grasps(recording), build_matcher(seen), seen, None, quiet=True)
+    features = encode_recording(load_grasps(recording), build_matcher(config), config, None, quiet=True)
     both = tuple(features.of_objects(part) for part in (split.train, split.validation, split.test))
-    made = fit(LateFusion, both, tmp_path, seen)
-    touches, photos = encodings(made, both[2])
-    assert made.score(touches, photos).shape == (len(both[2]), len(both[2]))
+    method = fit(LateFusion, both, tmp_path, config)
+    touches, photos = encodings(method, both[2])
+    assert method.score(touches, photos).shape == (len(both[2]), len(both[2]))

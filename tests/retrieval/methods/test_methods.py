@@ -1,4 +1,4 @@
-"""What every method owes the harness: one behaviour suite over the table of methods."""
+"""The contract of every method: one behaviour suite over the table of methods."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -17,7 +17,7 @@ from retrieval.training.features import Features
 
 TRIVIAL = {"chance", "constant"}
 LEARNS = [name for name in METHODS if name not in TRIVIAL]
-FEATURES = 256  # what the small tower gives
+FEATURES = 256  # of the small tower
 CONFIG = Config(
     matcher=MatcherConfig(
         tower="small", tower_output="pooled", hidden=32, dropout=0.2, standardise=True, embedding_dim=16
@@ -36,12 +36,12 @@ CONFIG = Config(
 
 
 def planted(objects, seed, each=8, noise=0.5):
-    """Objects with three numbers of their own, seen linearly by both modalities, and noise: an easy problem."""
-    world, rng = np.random.default_rng(5), np.random.default_rng(seed)
+    """Return an easy problem: objects with three numbers, linear in both modalities, and noise."""
+    shared, rng = np.random.default_rng(5), np.random.default_rng(seed)
     latent = np.repeat(rng.standard_normal((objects, 3)), each, axis=0)
     n = len(latent)
     touch, photo = (
-        latent @ world.standard_normal((3, width)) + noise * rng.standard_normal((n, width))
+        latent @ shared.standard_normal((3, width)) + noise * rng.standard_normal((n, width))
         for width in (2 * FEATURES, FEATURES)
     )
     return Features(
@@ -81,7 +81,7 @@ def test_every_touch_gets_a_finite_score_with_every_photo(name):
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name.startswith("contrastive") else ()) for name in METHODS]
 )
-def test_two_fits_with_one_seed_score_alike_bit_for_bit(name):
+def test_two_fits_with_one_seed_give_the_same_scores_bit_for_bit(name):
     again = METHODS.load(name)(MethodSettings(CONFIG))
     again.fit(TRAIN, VALIDATION)
     np.testing.assert_array_equal(again.score(*encodings(again)), fitted(name).score(*encodings(fitted(name))))
@@ -93,7 +93,7 @@ def test_photos_of_the_touched_object_score_higher(name):
     assert Validator.of(TEST).touch_auc(fitted(name).score(*encodings(fitted(name)))) > 0.8
 
 
-def test_the_constant_is_exactly_chance_and_chance_is_about_chance():
+def test_the_constant_is_exactly_at_chance_and_random_scores_are_close_to_it():
     assert Validator.of(TEST).touch_auc(fitted("constant").score(*encodings(fitted("constant")))) == 0.5
     values = [
         Validator.of(TEST).touch_auc(fitted("chance", seed).score(*encodings(fitted("chance", seed))))
@@ -102,13 +102,13 @@ def test_the_constant_is_exactly_chance_and_chance_is_about_chance():
     assert np.mean(values) == pytest.approx(0.5, abs=4 * np.std(values) / np.sqrt(len(values)))
 
 
-# Pruning looks at the whole gallery.
+# Reranking depends on the whole gallery.
 @pytest.mark.parametrize("name", [name for name in METHODS if name != "retrieve_rerank"])
 def test_a_score_depends_on_its_touch_and_photo_only(name):
     touch, photo = encodings(fitted(name))
     whole = fitted(name).score(touch, photo)
-    alone = np.concatenate([fitted(name).encode_touch(TEST.touch[row : row + 1]) for row in (5, 3)])
-    part = fitted(name).score(alone, photo[10:14])
+    plain = np.concatenate([fitted(name).encode_touch(TEST.touch[row : row + 1]) for row in (5, 3)])
+    part = fitted(name).score(plain, photo[10:14])
     np.testing.assert_allclose(part, whole[[5, 3], 10:14], rtol=1e-4, atol=1e-4)  # float32 sums in other blocks
 
 
@@ -121,7 +121,7 @@ def test_the_order_of_the_grasps_of_a_set_does_not_matter(name):
 
 
 @every_method
-def test_a_set_of_one_grasp_scores_as_the_grasp(name):
+def test_a_set_of_one_grasp_scores_like_the_grasp(name):
     touch, photo = encodings(fitted(name))
     sets = np.array([[7], [0], [40]])
     scores = fitted(name).score(touch, photo)[sets[:, 0]]
@@ -138,7 +138,7 @@ def test_a_set_scores_the_sum_over_its_grasps(name):
 
 
 @pytest.mark.parametrize("name", LEARNS)
-def test_five_grasps_tell_more_than_one(name):
+def test_five_grasps_rank_better_than_one(name):
     noisy = planted(6, 2, noise=6.0)
     validator = Validator.of(noisy)
     touch, photo = encodings(fitted(name), noisy)
@@ -149,7 +149,7 @@ def test_five_grasps_tell_more_than_one(name):
 
 
 @every_method
-def test_it_must_be_fitted_before_use(name):
+def test_a_method_must_be_fitted_before_use(name):
     method = METHODS.load(name)(MethodSettings(CONFIG))
     with pytest.raises(BadInput, match="fitted before"):
         method.encode_touch(TEST.touch)
@@ -168,13 +168,13 @@ def test_features_that_are_not_finite_are_refused(name, value):
     photo[3, 5] = value
     with pytest.raises(NumericalError, match=r"photo features must be finite; got .* at \(3, 5\)"):
         fitted(name).encode_photo(photo)
-    # Nothing can be fitted to them: there are no `Features` that hold them.
+    # A fit never gets such features: `Features` refuses them.
     with pytest.raises(NumericalError, match="photo features must be finite; grasp "):
         Features(TEST.grasp_ids, TEST.object_ids, TEST.touch, photo)
 
 
 @every_method
-def test_features_of_another_shape_than_fitted_on_are_refused(name):
+def test_features_of_another_shape_than_in_the_fit_are_refused(name):
     with pytest.raises(BadInput, match=r"touch features must be an array of shape \(B, 2, 256\)"):
         fitted(name).encode_touch(TEST.touch[:, :1])
     with pytest.raises(BadInput, match=r"photo features must be an array of shape \(B, 256\)"):
@@ -198,68 +198,68 @@ def test_sets_of_another_shape_are_refused(sets):
 
 
 @pytest.mark.parametrize("row", [-1, len(TEST)])
-def test_sets_that_name_no_touch_are_refused(row):
-    with pytest.raises(BadInput, match="rows of the 48 touch codes"):
+def test_sets_that_index_no_touch_are_refused(row):
+    with pytest.raises(BadInput, match="index the 48 touch encodings"):
         fitted("constant").score_sets(*encodings(fitted("constant")), np.array([[0, row]]))
 
 
-def test_a_method_whose_scores_are_not_finite_or_of_another_shape_is_caught():
+def test_scores_of_a_method_that_are_not_finite_or_of_another_shape_are_refused():
     class Broken(type(fitted("constant"))):
         def _score(self, touch_encodings, photo_encodings):
-            return self.answer
+            return self.output
 
     broken = Broken(MethodSettings(CONFIG))
     broken.fit(TRAIN, VALIDATION)
-    broken.answer = np.full((48, 48), np.nan)
+    broken.output = np.full((48, 48), np.nan)
     with pytest.raises(NumericalError, match=r"scores must be finite; got nan at \(0, 0\)"):
         broken.score(*encodings(broken))
-    broken.answer = np.zeros((48, 47))
+    broken.output = np.zeros((48, 47))
     with pytest.raises(BadInput, match=r"shape \(48, 48\)"):
         broken.score(*encodings(broken))
 
 
-def test_an_unknown_method_is_told_the_known_ones():
+def test_the_error_about_an_unknown_method_lists_the_known_ones():
     with pytest.raises(ConfigError, match=r"late_fusion, set_fusion, .*, constant; got 'oracle'"):
         METHODS.load("oracle")(MethodSettings(CONFIG))
 
 
-def test_the_worth_of_scores_is_what_loops_count():
+def test_the_ranking_auc_equals_that_of_loops():
     rng = np.random.default_rng(3)
     touch_owner, photo_owner = np.array([0, 0, 1, 2]), np.array([0, 0, 1, 1, 2])
     scores = rng.integers(0, 4, (4, 5)).astype(float)
-    left_out = np.zeros((4, 5), bool)
-    left_out[[0, 1, 2, 3], [0, 1, 2, 4]] = True
+    excluded = np.zeros((4, 5), bool)
+    excluded[[0, 1, 2, 3], [0, 1, 2, 4]] = True
     by_object = {}
     for i in range(4):
-        own = [j for j in range(5) if photo_owner[j] == touch_owner[i] and not left_out[i, j]]
+        own = [j for j in range(5) if photo_owner[j] == touch_owner[i] and not excluded[i, j]]
         own = own or [j for j in range(5) if photo_owner[j] == touch_owner[i]]  # object 2 has one photo only
         others = [j for j in range(5) if photo_owner[j] != touch_owner[i]]
         wins = [(scores[i, a] > scores[i, b]) + (scores[i, a] == scores[i, b]) / 2 for a in own for b in others]
         by_object.setdefault(touch_owner[i], []).append(np.mean(wins))
     expected = np.mean([np.mean(values) for values in by_object.values()])
-    assert ranking_auc(scores, touch_owner, photo_owner, left_out) == pytest.approx(expected, abs=1e-12)
+    assert ranking_auc(scores, touch_owner, photo_owner, excluded) == pytest.approx(expected, abs=1e-12)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_worth_is_never_made_of_scores_that_are_not_finite(bad):
+def test_a_ranking_auc_of_scores_that_are_not_finite_is_refused(bad):
     scores = np.zeros((2, 3))
     scores[1, 2] = bad
     with pytest.raises(NumericalError, match="every score must be finite; touch 1 has"):
         ranking_auc(scores, np.array([0, 1]), np.array([0, 1, 1]), np.zeros((2, 3), dtype=bool))
 
 
-def test_every_object_has_its_share_of_the_grasps_to_choose_by():
+def test_every_object_has_equally_many_validation_rows():
     features = planted(5, 3, each=40)
-    rows = validation_rows(features, most=50)
+    rows = validation_rows(features, max_rows=50)
     assert np.bincount(features.owner[rows]).tolist() == [10] * 5
     assert len(np.unique(rows)) == 50
-    assert np.bincount(features.owner[validation_rows(features, most=3)]).tolist() == [2] * 5
+    assert np.bincount(features.owner[validation_rows(features, max_rows=3)]).tolist() == [2] * 5
 
 
-def test_features_are_standardised_by_the_training_grasps_and_constant_ones_left_out():
+def test_features_are_standardised_by_the_training_grasps_and_constant_ones_dropped():
     x = np.array([[1.0, 5.0, 1e4], [3.0, 5.0, 1e4 + 1e-3], [5.0, 5.0, 1e4]], dtype=np.float32)
     standardise = Standardiser.fit(x)
-    assert standardise.columns.tolist() == [0]  # the last one varies by its float32 rounding only
+    assert standardise.columns.tolist() == [0]  # the last one varies only by float32 rounding
     np.testing.assert_allclose(standardise(np.array([[3.0, 9.0, 0.0]])), [[0.0]])
     np.testing.assert_allclose(standardise(x).std(0), 1.0)
 
@@ -268,40 +268,42 @@ def settings_of(method):
     return CcaSettings(*(method.best_params[name] for name in CcaSettings._fields))
 
 
-def test_once_settings_are_chosen_towers_side_by_side_are_fitted_on_validation_objects_too():
+def test_concatenated_towers_are_also_fitted_on_validation_objects_after_the_settings_are_chosen():
     both = TRAIN.concatenate(VALIDATION)
     method = METHODS.load("cca_towers")(MethodSettings(CONFIG, fit_on_validation=True))
     method.fit(TRAIN, VALIDATION)
     blocks = tower_widths(CONFIG, TRAIN)
     assert blocks == ([FEATURES, FEATURES], [FEATURES])
     best_params = settings_of(method)
-    codes_of = dict(fit_projections(both.touch.reshape(len(both), -1), both.photo, both.owner, blocks, [best_params]))
-    wanted = codes_of[best_params].cosines(TEST.touch.reshape(len(TEST), -1), TEST.photo)
-    np.testing.assert_array_equal(method.score(*encodings(method)), wanted)
+    projections = dict(
+        fit_projections(both.touch.reshape(len(both), -1), both.photo, both.owner, blocks, [best_params])
+    )
+    expected = projections[best_params].cosines(TEST.touch.reshape(len(TEST), -1), TEST.photo)
+    np.testing.assert_array_equal(method.score(*encodings(method)), expected)
 
 
 @pytest.mark.parametrize("name", ["cca", "cca_pca"])
-def test_where_all_objects_teach_cca_is_fitted_on_validation_objects_too(name):
-    alone, taught = fitted(name), METHODS.load(name)(MethodSettings(CONFIG, fit_on_validation=True))
-    taught.fit(TRAIN, VALIDATION)
-    assert {**taught.best_params, "rank": None, "max_components": None} == {
-        **alone.best_params, "rank": None, "max_components": None
+def test_with_fit_on_validation_cca_is_fitted_on_validation_objects_too(name):
+    plain, both = fitted(name), METHODS.load(name)(MethodSettings(CONFIG, fit_on_validation=True))
+    both.fit(TRAIN, VALIDATION)
+    assert {**both.best_params, "rank": None, "max_components": None} == {
+        **plain.best_params, "rank": None, "max_components": None
     }  # fmt: skip
-    assert taught.best_params["max_components"] == 12 + 4 - 1 > alone.best_params["max_components"]
+    assert both.best_params["max_components"] == 12 + 4 - 1 > plain.best_params["max_components"]
 
 
 @pytest.mark.parametrize("fit_on_validation", [False, True])
-def test_settings_are_chosen_by_objects_that_are_held_out_of_the_fit_and_by_no_others(fit_on_validation, monkeypatch):
+def test_settings_are_chosen_on_held_out_objects_and_no_others(fit_on_validation, monkeypatch):
     calls = []
-    monkeypatch.setattr(cca_towers, "select_settings", lambda *asked: calls.append(asked) or select_settings(*asked))
+    monkeypatch.setattr(cca_towers, "select_settings", lambda *args: calls.append(args) or select_settings(*args))
     method = METHODS.load("cca_towers")(MethodSettings(CONFIG, fit_on_validation=fit_on_validation))
     method.fit(TRAIN, VALIDATION)
     ((features, _, folds),) = calls
     known = {*TRAIN.object_ids, *VALIDATION.object_ids}
     assert set(features.object_ids) == known
-    held = [name for fold in folds for name in fold]
-    assert len(held) == len(set(held))
-    assert set(held) == (known if fit_on_validation else set(VALIDATION.object_ids))
+    held_out = [name for fold in folds for name in fold]
+    assert len(held_out) == len(set(held_out))
+    assert set(held_out) == (known if fit_on_validation else set(VALIDATION.object_ids))
     assert method.best_params["validation_auc"] == pytest.approx(
         select_settings(features, tower_widths(CONFIG, TRAIN), folds).auc
     )
@@ -311,41 +313,41 @@ def test_the_setting_that_ranks_held_out_objects_best_is_chosen_not_the_one_that
     hard = planted(12, 7, noise=4.0)
     folds = [tuple(sorted(set(hard.object_ids)))[start::2] for start in range(2)]
     blocks = tower_widths(CONFIG, hard)
-    alone = {one: select_settings(hard, blocks, folds, [one]).auc for one in GRID}
+    plain = {one: select_settings(hard, blocks, folds, [one]).auc for one in GRID}
     choice = select_settings(hard, blocks, folds)
-    assert choice.auc == pytest.approx(max(alone.values()))
-    assert alone[choice.settings] == pytest.approx(choice.auc)
-    assert len({round(one, 6) for one in alone.values()}) > 1
+    assert choice.auc == pytest.approx(max(plain.values()))
+    assert plain[choice.settings] == pytest.approx(choice.auc)
+    assert len({round(one, 6) for one in plain.values()}) > 1
 
 
 def with_references(features):
-    """Each photo with the touch of the next grasp of its object behind it."""
-    beside = next_rows_of_object(features.owner, 2)[:, 1]
-    touches = features.touch[beside].reshape(len(features), -1)
+    """Append to each photo the touch of the next grasp of its object."""
+    following = next_rows_of_object(features.owner, 2)[:, 1]
+    touches = features.touch[following].reshape(len(features), -1)
     return replace(features, photo=np.concatenate([features.photo, touches], axis=1))
 
 
-def test_a_reference_touch_behind_a_photo_is_encoded_as_a_touch_and_weighed_by_validation_objects():
+def test_a_reference_touch_after_a_photo_is_encoded_as_a_touch_and_weighted_on_validation_objects():
     train, validation, test = (with_references(part) for part in (TRAIN, VALIDATION, TEST))
     method = METHODS.load("cca_towers")(MethodSettings(CONFIG))
     method.fit(train, validation)
-    alone = fitted("cca_towers")
-    assert method.best_params["ridge"] == alone.best_params["ridge"]
+    plain = fitted("cca_towers")
+    assert method.best_params["ridge"] == plain.best_params["ridge"]
     weights = method.best_params["photo_weight"], method.best_params["reference_weight"]
     assert min(weights) >= 0 < max(weights)
-    felt = alone.encode_touch(test.touch)
-    references = alone.encode_touch(test.photo[:, TEST.photo.shape[1] :].reshape(test.touch.shape))
-    wanted = weights[0] * alone.score(*encodings(alone)) + weights[1] * (felt @ references.T)
+    touches = plain.encode_touch(test.touch)
+    references = plain.encode_touch(test.photo[:, TEST.photo.shape[1] :].reshape(test.touch.shape))
+    expected = weights[0] * plain.score(*encodings(plain)) + weights[1] * (touches @ references.T)
     found = method.score(method.encode_touch(test.touch), method.encode_photo(test.photo))
-    np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-4)  # float32 sums of some hundred terms
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-4)  # float32 sums of some hundred terms
 
 
-def test_touches_in_place_of_photos_are_taken_too():
+def test_touches_may_take_the_place_of_photos():
     touches = replace(TRAIN, photo=TRAIN.touch.reshape(len(TRAIN), -1))
     assert tower_widths(CONFIG, touches) == ([FEATURES, FEATURES], [FEATURES, FEATURES])
 
 
-def test_towers_side_by_side_take_features_of_their_own_alone():
+def test_concatenated_towers_accept_only_their_own_features():
     other = Features(TRAIN.grasp_ids, TRAIN.object_ids, TRAIN.touch, TRAIN.photo[:, 1:])
     with pytest.raises(BadInput, match=r"towers small \(pooled\), 512 of a touch and 256 of a photo; got 512 and 255"):
         tower_widths(CONFIG, other)

@@ -1,4 +1,4 @@
-"""Logits where probabilities are all 1, and fits whose likelihood has no largest value."""
+"""Logits whose probabilities are all 1, and fits whose likelihood has no maximum."""
 
 from collections.abc import Callable, Iterator
 
@@ -15,11 +15,11 @@ from tests.hard_case import HardCase, error_of
 Matrix = NDArray[np.float64]
 _LOGITS, _CALIBRATION = "logits", "calibration"
 _ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
-"""Takes logits as they are, and grasps as independent."""
+"""Uses logits unchanged, and assumes independent grasps."""
 
 
 def hard_cases() -> Iterator[HardCase]:
-    """Cases of the logits and of what is made of them."""
+    """Cases of the logits and of probabilities from them."""
     yield _probabilities_tie()
     yield _sure_and_wrong()
     yield _many_grasps()
@@ -27,7 +27,7 @@ def hard_cases() -> Iterator[HardCase]:
     yield _far_from_zero()
     yield _one_class()
     yield _nan_logit()
-    yield _choices_that_never_err()
+    yield _choices_without_errors()
     yield _odds_of_a_gallery()
     yield _last_bin()
 
@@ -41,9 +41,9 @@ def _probabilities_tie() -> HardCase:
     ones = int((expit(logits) == 1).sum())
     order = np.argsort(-logits)
     naive, ours = f"{ones} of 4 probabilities are exactly 1", f"by logit: {', '.join(map(str, order))}"
-    wanted = "photos 1, 3, 2, 0"
+    expected = "photos 1, 3, 2, 0"
     return HardCase(
-        _LOGITS, "ranking logits 20 to 50, float32", wanted, naive, ours, order.tolist() == [1, 3, 2, 0], ones < 2
+        _LOGITS, "ranking logits 20 to 50, float32", expected, naive, ours, order.tolist() == [1, 3, 2, 0], ones < 2
     )
 
 
@@ -59,22 +59,22 @@ def _sure_and_wrong() -> HardCase:
 
 
 def _many_grasps() -> HardCase:
-    """Eight grasps of two objects, the second a little less unlikely: e^0.8 to 1 that it is that one."""
+    """Eight grasps and two objects, the second slightly less unlikely: its odds are e^0.8 to 1."""
     logits = np.array([[-100.0] * 8, [-99.9] * 8])
     naive = expit(logits.astype(np.float32)).prod(axis=1)
     ours = _ADDING.probabilities(logits.sum(axis=1), grasps=8, none_prior=0).objects
-    said = f"probabilities {ours[0]:.3f} and {ours[1]:.3f}"
+    text = f"probabilities {ours[0]:.3f} and {ours[1]:.3f}"
     products = f"products {naive[0]:g} and {naive[1]:g}"
     must = float(expit(0.8))
     holds = [abs(float(pair[1] / pair.sum()) - must) < 1e-9 for pair in (ours, naive)]
-    return HardCase(_LOGITS, "8 grasps at logit -100", f"the second object with {must:.3f}", products, said, *holds)
+    return HardCase(_LOGITS, "8 grasps at logit -100", f"the second object with {must:.3f}", products, text, *holds)
 
 
 # Calibration -----------------------------------------------------------------------------------------------
 
 
 def naive_fit(logits: Matrix, labels: NDArray[np.int64]) -> tuple[float, float]:
-    """Slope and intercept of the plain likelihood, by a quasi-Newton search from 1 and 0."""
+    """Return slope and intercept of the plain likelihood, by a quasi-Newton search from 1 and 0."""
 
     def loss(x: Matrix) -> float:
         odds = x[0] * logits + x[1]
@@ -85,30 +85,30 @@ def naive_fit(logits: Matrix, labels: NDArray[np.int64]) -> tuple[float, float]:
 
 
 def _separable() -> HardCase:
-    """Twenty true pairs above twenty false ones: nobody has seen enough to be surer than 21 to 1.
+    """Twenty true pairs above twenty false ones: too few for odds above 21 to 1.
 
-    The likelihood has no largest value: the search stops where its own arithmetic ends.
+    The likelihood has no maximum: the search stops where its own arithmetic ends.
     """
     logits, labels = np.append(np.linspace(1, 2, 20), np.linspace(-2, -1, 20)), np.repeat([1, 0], 20)
     slope, intercept = naive_fit(logits, labels)
     fitted = fit_calibration(logits, labels)
     odds = [float(slope * 1.5 + intercept), float(fitted.log_odds(1.5))]
-    right = [value < np.log(40) for value in odds]
+    correct = [value < np.log(40) for value in odds]
     naive, ours = (f"odds of {np.exp(value):.3g} to 1" for value in odds)
-    wanted = "a usual true pair at no more than 40 to 1"
-    return HardCase(_CALIBRATION, "separable pairs, 20 of each kind", wanted, naive, ours, right[1], right[0])
+    expected = "a usual true pair at no more than 40 to 1"
+    return HardCase(_CALIBRATION, "separable pairs, 20 of each kind", expected, naive, ours, correct[1], correct[0])
 
 
 def _far_from_zero() -> HardCase:
-    """The same pairs a thousand higher up: the same slope."""
+    """The same pairs with logits a thousand higher: the same slope."""
     rng = np.random.default_rng([8])
     logits, labels = np.append(rng.normal(1, 1, 200), rng.normal(-1, 1, 200)), np.repeat([1, 0], 200)
     must = fit_calibration(logits, labels).slope
     slopes = [naive_fit(logits + 1000, labels)[0], fit_calibration(logits + 1000, labels).slope]
-    right = [abs(slope - must) < 1e-6 * must for slope in slopes]
+    correct = [abs(slope - must) < 1e-6 * must for slope in slopes]
     naive, ours = (f"{slope:.6g}" for slope in slopes)
-    wanted = f"slope {must:.6g}, as without the 1000"
-    return HardCase(_CALIBRATION, "logits of 1000 +- 1", wanted, naive, ours, right[1], right[0])
+    expected = f"slope {must:.6g}, as without the 1000"
+    return HardCase(_CALIBRATION, "logits of 1000 +- 1", expected, naive, ours, correct[1], correct[0])
 
 
 def _one_class() -> HardCase:
@@ -123,64 +123,64 @@ def _nan_logit() -> HardCase:
     logits, labels = np.array([0.2, np.nan, 0.9, -1.0]), np.array([1, 1, 0, 0])
     naive = naive_fit(logits, labels)[0]
     ours, holds = error_of(lambda: fit_calibration(logits, labels), "pair 1")
-    wanted = "refused, the pair named"
-    return HardCase(_CALIBRATION, "one logit is NaN", wanted, f"slope {naive}", ours, holds, False)
+    expected = "refused, the pair named"
+    return HardCase(_CALIBRATION, "one logit is NaN", expected, f"slope {naive}", ours, holds, False)
 
 
 # Choices ---------------------------------------------------------------------------------------------------
 
 
 def naive_slope(scores: Matrix) -> float:
-    """Factor of the scores (Q, k), the true one first, by Newton steps on the plain likelihood of their softmax."""
+    """Return the factor of the scores (Q, k), true one first, by Newton steps on the plain softmax likelihood."""
     slope = 1.0
     for _ in range(100):
-        shares = np.exp(slope * scores)
-        shares /= shares.sum(axis=1, keepdims=True)
-        mean = (shares * scores).sum(axis=1)
-        spread = (shares * scores**2).sum(axis=1) - mean**2
+        softmax_of = np.exp(slope * scores)
+        softmax_of /= softmax_of.sum(axis=1, keepdims=True)
+        mean = (softmax_of * scores).sum(axis=1)
+        spread = (softmax_of * scores**2).sum(axis=1) - mean**2
         slope += float((scores[:, 0] - mean).sum() / spread.sum())
     return slope
 
 
-def _choices_that_never_err() -> HardCase:
-    """Thirty choices among five, all right: the larger the factor the likelier, until the arithmetic ends."""
+def _choices_without_errors() -> HardCase:
+    """Thirty choices among five, all correct: the likelihood grows with the factor until the arithmetic ends."""
     scores = np.tile([2.0, 1.0, 0.0, -1.0, -2.0], (30, 1))
     fitted = fit_posterior(scored_choices(scores))
-    shares = [softmax(naive_slope(scores) * scores[0]), fitted.probabilities(scores[0]).objects]
-    wrong = [float(1 - share[0]) for share in shares]
-    naive, ours = (f"wrong with probability {share:.2g}" for share in wrong)
-    wanted = "wrong once in 100, or more often"
-    return HardCase("softmax", "30 of 30 choices right", wanted, naive, ours, wrong[1] > 0.01, wrong[0] > 0.01)
+    probabilities = [softmax(naive_slope(scores) * scores[0]), fitted.probabilities(scores[0]).objects]
+    wrong = [float(1 - each[0]) for each in probabilities]
+    naive, ours = (f"wrong with probability {each:.2g}" for each in wrong)
+    expected = "wrong once in 100, or more often"
+    return HardCase("softmax", "30 of 30 choices right", expected, naive, ours, wrong[1] > 0.01, wrong[0] > 0.01)
 
 
 def scored_choices(scores: Matrix) -> ScoredTouches:
-    """The choices (Q, k), the true one first, as touches of k objects with one photo each; objects take turns."""
+    """Return the choices (Q, k), true one first, as touches of k objects with one photo each, in rotation."""
     owner = np.arange(len(scores)) % scores.shape[1]
     logits = np.stack([np.roll(row, place) for row, place in zip(scores, owner, strict=True)])
     return ScoredTouches(logits, owner, np.arange(scores.shape[1]), np.zeros(logits.shape, dtype=bool))
 
 
 def _odds_of_a_gallery() -> HardCase:
-    """Log of the mean odds over 2 objects of 3, of which one has log-odds 1000: 1000 - log 2."""
+    """Log of the mean odds over 2 objects of 3, one with log-odds 1000: 1000 - log 2."""
     log_odds, own = np.array([[1000.0, -3.0, -3.0]]), np.array([[True, False, False]])
     naive = float(np.log(np.mean(np.exp(log_odds[0, :2]))))
     ours = float(statistic(galleries(log_odds, own).present)[0])
     must = 1000 - np.log(2)
-    right = [abs(value - must) < 1e-9 for value in (naive, ours)]
+    correct = [abs(value - must) < 1e-9 for value in (naive, ours)]
     return HardCase(
-        "is it in the gallery", "log-odds of 1000", f"{must:.6f}", f"{naive}", f"{ours:.6f}", right[1], right[0]
+        "is it in the gallery", "log-odds of 1000", f"{must:.6f}", f"{naive}", f"{ours:.6f}", correct[1], correct[0]
     )
 
 
 def naive_bins(probability: Matrix, outcomes: Matrix) -> Matrix:
-    """Sums of probability less truth in 15 equal bins."""
+    """Return sums of probability minus outcome in 15 equal bins."""
     sums = np.zeros(15)
     np.add.at(sums, (probability * 15).astype(int), probability - outcomes)
     return sums
 
 
 def _last_bin() -> HardCase:
-    """A probability of exactly 1, as every sure pair has, lies in the last bin."""
+    """A probability of exactly 1, as of every certain pair, is in the last bin."""
     p, y = np.array([1.0, 0.5]), np.array([1.0, 0.5])
     ours = reliability_bins(p, y)["ece"]
     naive = _raised(lambda: naive_bins(p, y))
@@ -188,7 +188,7 @@ def _last_bin() -> HardCase:
 
 
 def _raised(work: Callable[[], object]) -> str:
-    """Type and text of the exception of a naive formula; empty where there was none."""
+    """Return type and text of the exception of a naive formula; empty without one."""
     try:
         work()
     except (IndexError, ValueError, ArithmeticError) as error:

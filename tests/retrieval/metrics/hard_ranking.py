@@ -1,4 +1,4 @@
-"""Rankings with NaN and with equal scores, halves at the ends of float16, and intervals of very few objects."""
+"""Rankings with NaN and with ties, partial activations at the limits of float16, and intervals of very few objects."""
 
 from collections.abc import Iterator
 
@@ -17,7 +17,7 @@ from retrieval.metrics.table import ScoreTable
 from retrieval.model.fusion import FusionHead, score_partials
 from tests.hard_case import HardCase, error_of
 
-_TOP, _MEASURES, _HALVES, _INTERVALS = "top k", "rank measures", "partials", "intervals"
+_TOP, _MEASURES, _PARTIALS, _INTERVALS = "top k", "rank measures", "partials", "intervals"
 
 
 def hard_cases() -> Iterator[HardCase]:
@@ -34,11 +34,11 @@ def hard_cases() -> Iterator[HardCase]:
     yield _equal_differences()
 
 
-# Partials ----------------------------------------------------------------------------------------------------
+# Partial activations -----------------------------------------------------------------------------------------
 
 
 def _adding_head(hidden: int) -> FusionHead:
-    """A head whose logit is the sum over units of relu(touch half + photo half)."""
+    """Return a head whose logit is the sum over units of relu(touch partial + photo partial)."""
     head = FusionHead(1, 1, hidden, 0.0)
     with torch.no_grad():
         nn.init.eye_(head.second.weight)
@@ -53,8 +53,9 @@ def _nan_partial() -> HardCase:
     logits = np.maximum(partials[:, 0], 0)
     naive = np.argsort(logits)[::-1]
     ours, holds = error_of(lambda: score_partials(_adding_head(1), torch.zeros(1, 1), partials), "photo row 1")
-    words = f"photos {', '.join(map(str, naive))}: the NaN is best"
-    return HardCase(_TOP, "one of three halves is NaN", "refused, the row named", words, ours, holds, naive[0] == 2)
+    text = f"photos {', '.join(map(str, naive))}: the NaN is best"
+    case = "one of three partial activations is NaN"
+    return HardCase(_TOP, case, "refused, the row named", text, ours, holds, naive[0] == 2)
 
 
 def _nan_score() -> HardCase:
@@ -67,29 +68,30 @@ def _nan_score() -> HardCase:
 
 
 def _sum_of_partials() -> HardCase:
-    """40000 + 40000 in float16 is infinite; stored so and added in float32 it is 80000."""
+    """40000 + 40000 is infinite in float16; stored in float16 and added in float32 it is 80000."""
     partials, touch = np.array([[4e4]], np.float16), torch.tensor([[4e4]])
     naive = float((partials + touch.numpy().astype(np.float16))[0, 0])
     ours = float(score_partials(_adding_head(1), touch, partials)[0])
-    return HardCase(_HALVES, "two halves of 40000", "logit 80000", f"{naive:g}", f"{ours:g}", ours == 8e4, naive == 8e4)
+    case = "two partial activations of 40000"
+    return HardCase(_PARTIALS, case, "logit 80000", f"{naive:g}", f"{ours:g}", ours == 8e4, naive == 8e4)
 
 
 def _subnormal_partials() -> HardCase:
-    """Partials of 1e-6 to 8e-6, below float16's normal numbers, beside a touch of 1: added in float16 all photos tie."""
+    """1e-6 to 8e-6 are below float16's normal numbers: added to a touch of 1 in float16, all photos tie."""
     partials, touch = (np.arange(1, 9)[:, None] * 2.0**-20).astype(np.float16), torch.ones(1, 1)
     naive = (partials + np.float16(1))[:, 0]
     ours = score_partials(_adding_head(1), touch, partials)
-    words, said = (f"{len(np.unique(scores))} distinct" for scores in (naive, ours))
+    naive_text, text = (f"{len(np.unique(scores))} distinct" for scores in (naive, ours))
     holds, tied = ours.tolist() == [1 + row * 2.0**-20 for row in range(1, 9)], len(np.unique(naive)) < 8
-    wanted = "8 distinct logits, 1e-6 apart"
-    return HardCase(_HALVES, "8 photos 1e-6 apart", wanted, words, said, holds, not tied)
+    expected = "8 distinct logits, 1e-6 apart"
+    return HardCase(_PARTIALS, "8 photos 1e-6 apart", expected, naive_text, text, holds, not tied)
 
 
 # Measures --------------------------------------------------------------------------------------------------
 
 
 def _constant_scorer() -> HardCase:
-    """Who says the same of all of a hundred photos knows nothing; sorted, the true photo may just stand first."""
+    """A scorer that gives all of a hundred photos the same score; after sorting, the true photo may come first."""
     scores, relevant = np.zeros((1, 100)), np.arange(100)[None] == 0
     shown = np.ones_like(relevant)
     place = int(np.flatnonzero(np.argsort(-scores[0], kind="stable") == 0)[0])
@@ -99,24 +101,24 @@ def _constant_scorer() -> HardCase:
     chance = [0.01, *2 * [float((1 / np.arange(1, 101)).mean())]]
     holds = bool(np.allclose(ours, chance, rtol=1e-9))
     naive = f"recall {1.0 * (place == 0)}, reciprocal rank {1 / (place + 1)}, precision {1 / (place + 1)}"
-    said = "recall {:.4g}, reciprocal rank {:.4g}, precision {:.4g}".format(*ours)
-    wanted = "recall {:.4g}, reciprocal rank {:.4g}, precision {:.4g}: chance".format(*chance)
-    return HardCase(_MEASURES, "all of 100 photos score the same", wanted, naive, said, holds, place != 0)
+    text = "recall {:.4g}, reciprocal rank {:.4g}, precision {:.4g}".format(*ours)
+    expected = "recall {:.4g}, reciprocal rank {:.4g}, precision {:.4g}: chance".format(*chance)
+    return HardCase(_MEASURES, "all of 100 photos score the same", expected, naive, text, holds, place != 0)
 
 
 def _constant_scorer_by_area() -> HardCase:
-    """Area under the ROC of a constant scorer: a half."""
+    """Area under the ROC of a constant scorer: 0.5."""
     labels = np.array([1, 0, 0, 0])
     naive = float((np.zeros(1)[:, None] > np.zeros(3)).mean())
     owners = np.array([0]), np.arange(4)
     ours = pair_auc(np.zeros(4), labels), ranking_auc(np.zeros((1, 4)), *owners, np.zeros((1, 4), bool))
-    said = ", ".join(f"{value:g}" for value in ours)
+    text = ", ".join(f"{value:g}" for value in ours)
     return HardCase(
         _MEASURES,
         "area where all scores are equal",
         "0.5",
         f"{naive:g}, counting >",
-        said,
+        text,
         ours == (0.5, 0.5),
         naive == 0.5,
     )
@@ -128,31 +130,31 @@ def _many_rivals() -> HardCase:
     naive = float(special.comb(4998, 999) / special.comb(5000, 999))
     ours = float(k_way_accuracy(0.0, scores, 1000)[0])
     must = 4001 * 4000 / (5000 * 4999)  # neither of the two is drawn
-    right = [abs(value - must) < 1e-12 for value in (naive, ours)]
-    said, wanted = f"{ours:.6g}", f"{must:.6g}"
-    return HardCase(_MEASURES, "first guess among 1000 of 5000", wanted, f"{naive}", said, right[1], right[0])
+    correct = [abs(value - must) < 1e-12 for value in (naive, ours)]
+    text, expected = f"{ours:.6g}", f"{must:.6g}"
+    return HardCase(_MEASURES, "top-1 among 1000 of 5000", expected, f"{naive}", text, correct[1], correct[0])
 
 
 # Intervals -------------------------------------------------------------------------------------------------
 
 
 def naive_interval(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Percentiles of the means of resampled values (n,)."""
+    """Return percentiles of the means of resampled values (n,)."""
     drawn = np.random.default_rng(0).integers(len(values), size=(1000, len(values)))
     low, high = np.percentile(values[drawn].mean(1), [2.5, 97.5])
     return float(low), float(high)
 
 
 def _one_object() -> HardCase:
-    """Forty touches of one object, 30 of them right, say nothing of other objects."""
+    """Forty touches of one object, 30 of them correct, carry no information about other objects."""
     touches = np.repeat([1.0, 0.0], [30, 10])
     naive = naive_interval(touches)
     low, high = (float(end[0]) for end in bootstrap_interval(touches.mean(keepdims=True)[:, None]))
-    wanted = "an interval that holds 0 and 1"
+    expected = "an interval that contains 0 and 1"
     return HardCase(
         "bootstrap",
         "one object, 40 touches",
-        wanted,
+        expected,
         f"{naive[0]:.3g} to {naive[1]:.3g}, resampling touches",
         f"{low} to {high}",
         low <= 0 and high >= 1,
@@ -162,17 +164,17 @@ def _one_object() -> HardCase:
 
 def _all_right() -> HardCase:
     """Twenty of twenty: the interval must not be a point."""
-    share, ours = 1.0, binomial_interval(20, 20)
-    wide = 1.96 * np.sqrt(share * (1 - share) / 20)
-    naive = f"{share - wide:.3g} to {share + wide:.3g} (p +- 1.96 s)"
+    proportion, ours = 1.0, binomial_interval(20, 20)
+    wide = 1.96 * np.sqrt(proportion * (1 - proportion) / 20)
+    naive = f"{proportion - wide:.3g} to {proportion + wide:.3g} (p +- 1.96 s)"
     must = 0.025 ** (1 / 20)  # all 20 right with probability 2.5 %
     holds = abs(ours[0] - must) < 1e-9 and ours[1] == 1
-    wanted, said = f"{must:.4g} to 1", f"{ours[0]:.4g} to {ours[1]:.4g}"
-    return HardCase(_INTERVALS, "20 right of 20", wanted, naive, said, holds, bool(wide > 0))
+    expected, text = f"{must:.4g} to 1", f"{ours[0]:.4g} to {ours[1]:.4g}"
+    return HardCase(_INTERVALS, "20 right of 20", expected, naive, text, holds, bool(wide > 0))
 
 
 def _equal_differences() -> HardCase:
-    """Three objects on which one method leads by .1, .2 and .3: as far from 0 only with all signs turned, 2 of 8."""
+    """Three objects on which one method leads by .1, .2 and .3: as far from 0 only with equal signs, 2 of 8."""
     differences = np.array([0.1, 0.2, 0.3])
     signs = np.array(np.meshgrid(*3 * [[1, -1]])).reshape(3, -1).T
     sums = np.array([(row * differences)[::-1].sum() for row in signs])

@@ -17,18 +17,18 @@ FLOAT32_MAX = float(np.finfo(np.float32).max)
 
 
 def overlapping(count=200, offset=0.0, scale=1.0, seed=0):
-    """Half of the pairs true, their logits one deviation higher."""
+    """Return logits and labels; half of the pairs are true, their logits one deviation higher."""
     labels = np.arange(count) % 2
     return scale * (np.random.default_rng(seed).normal(size=count) + labels) + offset, labels
 
 
 def softplus(x):
-    """log(1 + e^x) without overflow."""
+    """Return log(1 + e^x) without overflow."""
     return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
 
 
 def smoothed_loss(logits, labels, slope, intercept, smooth=True):
-    """What the fit makes small, one pair at a time: each class weighs a half, targets are Platt's (or 1 and 0)."""
+    """Return the objective of the fit, pair by pair: classes of equal weight, Platt's targets (or 1 and 0)."""
     counts = {1: sum(labels), 0: len(labels) - sum(labels)}
     target = {1: (counts[1] + 1) / (counts[1] + 2), 0: 1 / (counts[0] + 2)} if smooth else {1: 1.0, 0: 0.0}
     total = 0.0
@@ -38,7 +38,7 @@ def smoothed_loss(logits, labels, slope, intercept, smooth=True):
     return total
 
 
-# What must be given ----------------------------------------------------------------------------------------
+# Input -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("function", [fit_calibration, pair_accuracy, pair_auc])
@@ -52,13 +52,13 @@ def smoothed_loss(logits, labels, slope, intercept, smooth=True):
         ([0, 1, math.nan], "of 3, 1 are 1 and 1 0"),
     ],
 )
-def test_both_classes_and_no_other_are_needed(function, labels, counts):
+def test_pairs_of_both_classes_and_no_other_labels_are_required(function, labels, counts):
     with pytest.raises(BadInput, match=f"pairs of both classes are needed, labelled 0 and 1; {counts}"):
         function([0.1, 0.2, 0.3], labels)
 
 
 @pytest.mark.parametrize("function", [fit_calibration, pair_accuracy, pair_auc])
-def test_no_pairs_and_odd_shapes_are_refused(function):
+def test_empty_input_and_unequal_shapes_are_refused(function):
     with pytest.raises(BadInput, match="of 0, 0 are 1 and 0 0"):
         function([], [])
     with pytest.raises(BadInput, match=r"vectors of one length; got \(2,\) and \(3,\)"):
@@ -69,7 +69,7 @@ def test_no_pairs_and_odd_shapes_are_refused(function):
 
 @pytest.mark.parametrize("function", [fit_calibration, pair_accuracy, pair_auc])
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 1e39])
-def test_a_logit_that_is_no_finite_float32_is_refused_and_named(function, bad):
+def test_a_logit_that_is_not_a_finite_float32_is_refused_and_named(function, bad):
     with pytest.raises(NumericalError, match=r"must be a finite float32; pair 2 has "):
         function([0.1, 0.2, bad, bad], [0, 1, 0, 1])
 
@@ -104,37 +104,37 @@ def test_no_point_of_a_fine_grid_has_a_smaller_loss(logits, labels):
 
 
 def test_one_pair_of_each_class_gives_its_smoothed_targets():
-    """Two parameters meet two targets: (1 + 1) / (1 + 2) for the true pair, 1 / (1 + 2) for the false one."""
+    """Two parameters fit two targets: (1 + 1) / (1 + 2) for the true pair, 1 / (1 + 2) for the false one."""
     fitted = fit_calibration([-1.0, 3.0], [0, 1])
     np.testing.assert_allclose(fitted.probability([-1.0, 3.0]), [1 / 3, 2 / 3], rtol=1e-9)
     assert fitted.slope == pytest.approx(2 * math.log(2) / 4)
     assert (fitted.positives, fitted.negatives) == (1, 1)
 
 
-def test_separable_logits_stay_finite_where_the_plain_likelihood_runs_away():
+def test_separable_logits_have_a_finite_fit_although_the_plain_likelihood_has_none():
     logits = np.concatenate([np.linspace(-9, -6, 50), np.linspace(6, 9, 50)])
     labels = [0] * 50 + [1] * 50
     plain = [smoothed_loss(logits, labels, slope, 0.0, smooth=False) for slope in (0.5, 1, 2, 4)]
-    assert plain == sorted(plain, reverse=True)  # naive: the steeper the better, without end
+    assert plain == sorted(plain, reverse=True)  # naive: always better with a steeper slope
     assert plain[-1] < 1e-9
     fitted = fit_calibration(logits, labels)
     assert SLOPE_BOUNDS[0] < fitted.slope < 1
     assert abs(fitted.intercept) < 0.1
-    # 50 pairs without a mistake: the smoothed share, 51 / 52, lies between the least and the most certain of them.
+    # 50 pairs without an error: the smoothed target, 51 / 52, lies between the least and the most certain of them.
     assert fitted.probability(6.0) < 51 / 52 < fitted.probability(9.0) < 0.999
 
 
-def test_pairs_that_are_rarer_do_not_shift_the_probability_for_the_odds_are_even():
+def test_rarer_true_pairs_do_not_shift_the_probability_because_the_odds_are_even():
     logits, labels = overlapping(400)
     rare = np.concatenate([np.flatnonzero(labels == 0), np.flatnonzero(labels == 1)[:40]])
     even, few = fit_calibration(logits, labels), fit_calibration(logits[rare], labels[rare])
     assert (few.positives, few.negatives) == (40, 200)
-    # Naively, the log-odds at any logit would fall by log(5) = 1.6 with the share of true pairs.
+    # Naively, the log-odds at any logit would fall by log(5) = 1.6 with the fraction of true pairs.
     assert abs(few.log_odds(0.5) - even.log_odds(0.5)) < 0.5
 
 
-def test_true_odds_are_found_again():
-    """Two normal distributions at distance 1, deviation 1: the log-odds of a logit z are z - 1/2."""
+def test_the_fit_recovers_the_true_odds():
+    """Two normal distributions at distance 1 with deviation 1: the log-odds of a logit z are z - 1/2."""
     fitted = fit_calibration(*overlapping(100_000))
     assert fitted.slope == pytest.approx(1.0, abs=0.03)  # the standard error is about 0.01
     assert fitted.intercept == pytest.approx(-0.5, abs=0.03)
@@ -148,7 +148,7 @@ def test_true_odds_are_found_again():
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("scale", [1e-30, 1e-3, 1.0, 1e3, 1e4, 1e30, FLOAT32_MAX / 10])
 @pytest.mark.parametrize("offset", [0.0, 3.0, -1e3])
-def test_the_fit_is_finite_within_bounds_and_keeps_the_order_at_any_scale(scale, offset, seed):
+def test_the_fit_is_finite_within_bounds_and_preserves_the_order_at_any_scale(scale, offset, seed):
     logits, labels = overlapping(offset=0.0, seed=seed)
     logits = logits * scale + offset * min(scale, 1e30)
     fitted = fit_calibration(logits, labels)
@@ -161,8 +161,8 @@ def test_the_fit_is_finite_within_bounds_and_keeps_the_order_at_any_scale(scale,
 
 
 @pytest.mark.parametrize("offset", [1e3, -1e5, 1e6])
-def test_an_offset_of_all_logits_changes_the_intercept_alone(offset):
-    """A quasi-Newton fit of both at once gave slope 0.89 for 1.21 at an offset of 1000."""
+def test_an_offset_of_all_logits_changes_only_the_intercept(offset):
+    """A quasi-Newton fit of both parameters gave slope 0.89 instead of 1.21 at an offset of 1000."""
     (logits, labels), plain = overlapping(), fit_calibration(*overlapping())
     fitted = fit_calibration(logits + offset, labels)
     assert fitted.slope == pytest.approx(plain.slope, rel=1e-6)
@@ -170,7 +170,7 @@ def test_an_offset_of_all_logits_changes_the_intercept_alone(offset):
 
 
 @pytest.mark.parametrize("scale", [0.05, 7.0, 60.0])
-def test_scaling_all_logits_scales_the_slope_and_leaves_the_probabilities(scale):
+def test_scaling_all_logits_scales_the_slope_and_preserves_the_probabilities(scale):
     (logits, labels), plain = overlapping(), fit_calibration(*overlapping())
     fitted = fit_calibration(scale * logits, labels)
     assert fitted.slope == pytest.approx(plain.slope / scale, rel=1e-6)
@@ -178,28 +178,28 @@ def test_scaling_all_logits_scales_the_slope_and_leaves_the_probabilities(scale)
 
 
 @pytest.mark.parametrize(("scale", "bound"), [(1e-3, 1), (1e3, 0), (1e30, 0)])
-def test_a_slope_beyond_its_bounds_stops_at_them_exactly(scale, bound):
+def test_a_slope_beyond_its_bounds_is_exactly_the_bound(scale, bound):
     logits, labels = overlapping(scale=scale)
     assert fit_calibration(logits, labels).slope == SLOPE_BOUNDS[bound]
 
 
 @pytest.mark.parametrize("value", [0.0, 5.0, -1e4, 1e30])
-def test_constant_logits_say_nothing_so_both_answers_are_as_likely(value):
+def test_constant_logits_make_both_answers_equally_likely(value):
     fitted = fit_calibration([value] * 6, [0, 1, 0, 1, 1, 0])
     assert fitted.slope == SLOPE_BOUNDS[0]
     assert fitted.probability(value) == 0.5
     assert fitted.nll_after == pytest.approx(math.log(2))
 
 
-def test_logits_that_say_the_opposite_get_the_smallest_slope_and_never_a_negative_one():
+def test_logits_with_wrong_information_get_the_smallest_slope_and_never_a_negative_one():
     logits, labels = overlapping()
     fitted = fit_calibration(-logits, labels)
     assert fitted.slope == SLOPE_BOUNDS[0]
     assert fitted.probability(0.0) == pytest.approx(0.5, abs=0.01)
 
 
-def test_one_wild_logit_flattens_the_slope_and_leaves_the_others_undecided():
-    """A smoothed target is never certain, so that even a false pair that lies rightly far below costs by its slope."""
+def test_one_extreme_logit_flattens_the_slope_and_leaves_the_others_undecided():
+    """A smoothed target is never certain, so even a false pair with a very low logit adds loss by its slope."""
     logits, labels = overlapping()
     logits[0] = -1e30
     fitted = fit_calibration(logits, labels)
@@ -229,7 +229,7 @@ def test_any_finite_logits_of_both_classes_can_be_calibrated(pairs, one, two):
 FITTED = Calibration(2.0, -0.5, 0.3, 10, 12, 0.7, 0.6, 0.2, 0.1)
 
 
-def test_log_odds_and_probability_are_what_the_formula_says():
+def test_log_odds_and_probability_equal_the_formula():
     assert FITTED.log_odds(1.25) == 2.0
     assert FITTED.probability(1.25) == pytest.approx(1 / (1 + math.exp(-2)))
     np.testing.assert_array_equal(FITTED.log_odds([0.0, 1.0]), [-0.5, 1.5])
@@ -265,36 +265,36 @@ def test_the_reject_threshold_has_the_largest_balanced_accuracy_of_all_threshold
     assert balanced_accuracy(fitted.reject_log_odds) == best == expected
 
 
-def test_the_reject_threshold_lies_midway_between_what_it_parts():
+def test_the_reject_threshold_is_midway_between_the_classes():
     fitted = fit_calibration([-2.0, -1.0, 3.0, 4.0], [0, 0, 1, 1])
     assert fitted.reject_log_odds == pytest.approx(float(fitted.log_odds(1.0)))
 
 
-def test_expected_calibration_error_by_hand():
-    """Probabilities .1, .9, .95 in 15 bins: the first alone in bin 1; .9 in bin 13, .95 in bin 14."""
+def test_the_expected_calibration_error_equals_that_by_hand():
+    """Probabilities .1, .9, .95 in 15 bins: .1 in bin 1, .9 in bin 13, .95 in bin 14."""
     logits = np.log([0.1 / 0.9, 0.9 / 0.1, 0.95 / 0.05])
     fitted = fit_calibration(logits, [0, 1, 0])
     assert fitted.ece_before == pytest.approx((0.1 + 0.1 + 0.95) / 3)
 
 
-def test_within_a_bin_errors_cancel_and_between_bins_they_do_not():
-    """Probability 0.7 twice, one true of two: off by 0.2 on average; naively, pair by pair, it would be 0.5."""
+def test_errors_cancel_within_a_bin_and_not_between_bins():
+    """Probability 0.7 twice, one true of two: off by 0.2 on average; pair by pair it would be 0.5."""
     logit = math.log(0.7 / 0.3)
     assert fit_calibration([logit, logit], [0, 1]).ece_before == pytest.approx(0.2)
 
 
-def test_certain_and_right_is_an_error_of_zero_and_certain_and_wrong_of_one():
+def test_certain_and_correct_is_an_error_of_zero_and_certain_and_wrong_of_one():
     assert fit_calibration([-1e30, 1e30], [0, 1]).ece_before == 0.0
     assert fit_calibration([1e30, -1e30], [0, 1]).ece_before == 1.0
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_logit_that_is_not_finite_has_no_odds(bad):
-    """Compared with a threshold, a NaN is never above it: it would be called "no match" without a word."""
+    """A NaN is never above a threshold: it would silently count as "no match"."""
     assert not math.nan >= 0.0
-    for ask in (FITTED.log_odds, FITTED.probability):
+    for function in (FITTED.log_odds, FITTED.probability):
         with pytest.raises(NumericalError, match="every logit must be finite to be calibrated; got"):
-            ask([0.0, bad])
+            function([0.0, bad])
 
 
 # Metrics ---------------------------------------------------------------------------------------------------
@@ -319,29 +319,29 @@ few_values = st.sampled_from([-1e30, -1.0, 0.0, 1e-30, 1.0, 2.0])
     one=few_values,
     two=few_values,
 )
-def test_the_area_is_the_count_of_won_comparisons_with_ties_as_halves(pairs, one, two):
+def test_the_auc_is_the_fraction_of_won_comparisons_with_ties_as_one_half(pairs, one, two):
     logits, labels = zip(*pairs, (one, 0), (two, 1), strict=True)
     assert pair_auc(logits, labels) == pytest.approx(auc_by_loops(logits, labels), abs=1e-15)
 
 
 @pytest.mark.parametrize(("true", "false"), [(1, 1), (3, 7), (50, 1), (333, 1001)])
-def test_a_constant_scorer_has_exactly_half_the_area(true, false):
+def test_a_constant_scorer_has_exactly_an_auc_of_one_half(true, false):
     labels = [1] * true + [0] * false
     assert pair_auc([2.5] * len(labels), labels) == 0.5
     assert pair_auc([2.5] * len(labels), labels[::-1]) == 0.5
-    # Naively, from a sort of the pairs, the constant scorer's area is that of the order they came in.
+    # Naively, after a sort of the pairs, the constant scorer's AUC is that of their input order.
     order = np.argsort(np.full(len(labels), -2.5), kind="stable")
     below = [sum(labels[j] == 0 for j in order[place + 1 :]) for place, i in enumerate(order) if labels[i] == 1]
     assert sum(below) / (true * false) == 1.0
 
 
-def test_the_area_does_not_change_with_the_scale_where_probabilities_tie():
+def test_the_auc_does_not_change_with_the_scale_although_probabilities_tie():
     logits, labels = np.array([17.5, 18.0, 25.0, 40.0]) * 3, [0, 1, 0, 1]
     assert pair_auc(logits, labels) == pair_auc(logits * 1e30, labels) == 0.75
     assert pair_auc(expit(logits), labels) == 0.5  # naive: all are exactly 1
 
 
-def test_pair_accuracy_by_hand_with_a_coin_at_zero():
+def test_pair_accuracy_equals_that_by_hand_and_counts_zero_as_one_half():
     assert pair_accuracy([2.0, -1.0, 0.0, 3.0], [1, 1, 1, 0]) == (1 + 0 + 0.5 + 0) / 4
     assert pair_accuracy([0.0] * 4, [0, 1, 1, 1]) == 0.5
     assert pair_accuracy([-0.0, 1e-30, -1e-30, 1e30], [1, 1, 0, 1]) == 3.5 / 4

@@ -1,4 +1,4 @@
-"""Intervals by object: against loops, a published table, scipy, and how often they hold the truth."""
+"""Intervals by object: against loops, a published table, scipy, and their coverage."""
 
 import json
 from itertools import product
@@ -13,7 +13,7 @@ from retrieval.metrics.measure import Measure
 
 
 def measure_of(by_object, chance=(0.5,)):
-    """Values of queries, object by object."""
+    """Return values of queries, object by object."""
     values = np.array([value for part in by_object for value in part], dtype=float).reshape(-1, len(chance))
     owner = np.repeat(np.arange(len(by_object)), [len(part) for part in by_object])
     return Measure(values, owner, np.array(chance), "18 objects")
@@ -27,25 +27,25 @@ def some_objects(count=12, queries=7, seed=0):
 # Summaries -------------------------------------------------------------------------------------------------
 
 
-def test_a_value_is_the_mean_of_the_objects_means_and_an_object_with_many_queries_is_worth_no_more():
+def test_a_value_is_the_mean_of_the_objects_means_so_an_object_with_many_queries_counts_no_more():
     found = summarise([measure_of([[1, 1, 1, 1, 1, 1, 1, 1], [0, 0], [0]])])
     assert found["value"] == [pytest.approx(1 / 3)]  # naively, over queries, 8 / 11
     assert (found["queries"], found["objects"], found["chance"], found["gallery"]) == (11, 3, [0.5], "18 objects")
 
 
-def test_seeds_are_averaged_object_by_object_and_told_one_by_one():
+def test_seeds_are_averaged_by_object_and_listed_one_by_one():
     parts = [measure_of(some_objects(seed=seed)) for seed in range(3)]
     found = summarise(parts)
     each = [np.mean([np.mean(part.values[part.owner == name]) for name in range(12)]) for part in parts]
     np.testing.assert_allclose(np.ravel(found["by_seed"]), each)
     assert found["value"][0] == pytest.approx(np.mean(each))
-    alone = summarise(parts[:1])
+    one_seed = summarise(parts[:1])
     # Naively, three seeds would count as three times as many objects.
-    assert found["high"][0] - found["low"][0] > 0.4 * (alone["high"][0] - alone["low"][0])
-    assert summarise([parts[0]] * 3)["low"] == pytest.approx(alone["low"])
+    assert found["high"][0] - found["low"][0] > 0.4 * (one_seed["high"][0] - one_seed["low"][0])
+    assert summarise([parts[0]] * 3)["low"] == pytest.approx(one_seed["low"])
 
 
-def test_a_guess_curve_has_an_interval_for_each_guess_and_all_of_it_is_json():
+def test_a_top_n_curve_has_an_interval_for_each_n_and_is_json():
     rng = np.random.default_rng(0)
     curves = np.cumsum(rng.dirichlet(np.ones(5), 60), axis=1)
     measure = Measure(curves, np.repeat(np.arange(12), 5), np.arange(1, 6) / 5, "")
@@ -64,7 +64,7 @@ def test_one_seed_gives_the_same_interval_and_another_seed_nearly_the_same():
     assert first["low"][0] == pytest.approx(other["low"][0], abs=0.02)
 
 
-def test_measures_of_other_queries_are_not_put_together():
+def test_measures_of_different_queries_are_not_combined():
     one, other = measure_of(some_objects()), measure_of(some_objects(count=11))
     with pytest.raises(BadInput, match="the same queries"):
         summarise([one, other])
@@ -77,7 +77,7 @@ def test_measures_of_other_queries_are_not_put_together():
 # The interval ----------------------------------------------------------------------------------------------
 
 
-def test_the_interval_is_that_of_a_loop_over_resamples():
+def test_the_interval_equals_that_of_a_loop_over_resamples():
     means = np.random.default_rng(0).random(9)
     rng = np.random.default_rng(1)
     drawn = [np.mean(rng.choice(means, 9)) for _ in range(20_000)]
@@ -86,44 +86,44 @@ def test_the_interval_is_that_of_a_loop_over_resamples():
     np.testing.assert_allclose([low[0], high[0]], np.quantile(drawn, (tail, 1 - tail)), atol=0.01)
 
 
-def test_for_many_objects_it_is_the_normal_interval():
+def test_for_many_objects_the_interval_is_the_normal_interval():
     means = np.random.default_rng(0).normal(size=(300, 1))
     low, high = bootstrap_interval(means)
-    half = 1.96 * means.std() / np.sqrt(300)
-    np.testing.assert_allclose([low[0], high[0]], [means.mean() - half, means.mean() + half], atol=0.006)
+    margin = 1.96 * means.std() / np.sqrt(300)
+    np.testing.assert_allclose([low[0], high[0]], [means.mean() - margin, means.mean() + margin], atol=0.006)
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, 1 / 3])
-def test_objects_that_are_all_equal_have_an_interval_without_width(value):
+def test_objects_with_equal_values_have_an_interval_without_width(value):
     found = summarise([measure_of([[value] * 4] * 7)])
     assert found["low"] == found["high"] == [value]
 
 
-def test_one_object_says_nothing_of_others():
+def test_one_object_gives_the_widest_interval():
     found = summarise([measure_of([[0.5, 0.7, 0.9]])])
     assert (found["low"], found["value"], found["high"]) == ([0.0], [pytest.approx(0.7)], [1.0])
 
 
-def test_two_objects_give_an_interval_that_reaches_from_one_to_the_other():
+def test_two_objects_give_an_interval_from_one_to_the_other():
     found = summarise([measure_of([[0.2], [0.6]])])
     assert (found["low"], found["high"]) == ([pytest.approx(0.2)], [pytest.approx(0.6)])
 
 
-def test_values_that_stand_beyond_1_do_not_carry_the_interval_there():
+def test_values_above_1_do_not_extend_the_interval_beyond_1():
     found = summarise([measure_of([[1.02, 1.01], [0.99], [0.97, 1.02]])])
     assert found["high"] == [1.0]
 
 
 def coverage(interval_of, trials=400, objects=18, queries=20):
-    """How often the interval holds .7, the mean of the distribution that objects are drawn from."""
+    """Return how often the interval contains .7, the mean of the distribution of objects."""
     rng = np.random.default_rng(0)
-    held = 0
+    covered = 0
     for _ in range(trials):
-        share = rng.beta(0.7 * 4, 0.3 * 4, objects)
-        hits = rng.binomial(1, share[:, None], (objects, queries)).astype(float)
+        rates = rng.beta(0.7 * 4, 0.3 * 4, objects)
+        hits = rng.binomial(1, rates[:, None], (objects, queries)).astype(float)
         low, high = interval_of(hits)
-        held += low <= 0.7 <= high
-    return held / trials
+        covered += low <= 0.7 <= high
+    return covered / trials
 
 
 def by_object(hits):
@@ -141,8 +141,8 @@ def plain_percentile(hits):
     return np.quantile(drawn, (0.025, 0.975))
 
 
-def test_the_interval_holds_the_truth_as_often_as_it_says_and_one_by_query_does_not():
-    """Of 18 objects whose shares of hits differ; 400 trials tell a share of .95 to +- .03."""
+def test_the_interval_has_its_nominal_coverage_and_one_by_query_does_not():
+    """18 objects with different hit rates; 400 trials measure a coverage of .95 to +- .03."""
     assert 0.92 <= coverage(by_object) <= 0.98
     assert coverage(by_query, trials=100) < 0.75
 
@@ -154,14 +154,14 @@ def test_with_few_objects_the_plain_percentile_interval_is_too_narrow_and_ours_i
 
 
 @pytest.mark.parametrize(("objects", "stated"), [(2, 0.50), (3, 0.74), (4, 0.87), (5, 0.91), (7, 0.94), (10, 0.94)])
-def test_how_often_the_interval_of_few_objects_holds_the_truth_is_as_stated(objects, stated):
-    """1,500 samples of normal object means, whose shares scatter by 0.013."""
+def test_the_coverage_for_few_objects_is_as_documented(objects, stated):
+    """1,500 samples of normal object means; the measured coverage has a standard error of 0.013."""
     means = np.random.default_rng(objects).normal(size=(objects, 1500))
     low, high = bootstrap_interval(means, draws=1000)
     assert np.mean((low <= 0) & (high >= 0)) == pytest.approx(stated, abs=0.04)
 
 
-def test_results_of_fewer_than_five_objects_say_so():
+def test_results_of_fewer_than_five_objects_are_marked():
     for objects, few in ((1, True), (2, True), (4, True), (5, False), (12, False)):
         measure = measure_of(some_objects(objects))
         assert summarise([measure])["few_objects"] is few
@@ -171,7 +171,7 @@ def test_results_of_fewer_than_five_objects_say_so():
 # Comparisons -----------------------------------------------------------------------------------------------
 
 
-def test_the_permutation_test_is_that_of_every_flip_and_of_scipy():
+def test_the_permutation_test_equals_that_over_every_flip_and_scipys():
     differences = np.random.default_rng(2).normal(0.4, 1, 9)
     found = sign_flip_p(differences)
     flips = [abs(np.dot(signs, differences)) for signs in product((-1, 1), repeat=9)]
@@ -182,15 +182,15 @@ def test_the_permutation_test_is_that_of_every_flip_and_of_scipy():
     assert found == pytest.approx(theirs.pvalue)
 
 
-def test_sampled_flips_come_near_to_all_flips_and_never_say_0():
+def test_sampled_flips_are_close_to_all_flips_and_never_give_0():
     differences = np.random.default_rng(2).normal(0.3, 1, 18)
     exact = sign_flip_p(differences)
-    doubled = np.append(differences, np.zeros(1))  # an object without a difference changes nothing but the count
+    doubled = np.append(differences, np.zeros(1))  # an object without a difference changes only the count
     assert sign_flip_p(doubled, draws=20_000) == pytest.approx(exact, abs=0.015)
     assert sign_flip_p(np.ones(40), draws=999) == 1 / 1000
 
 
-def test_p_by_hand():
+def test_p_equals_that_by_hand():
     assert sign_flip_p(np.ones(6)) == 2 / 64
     assert sign_flip_p(np.array([0.1, 0.2, 0.3])) == 2 / 8
     assert sign_flip_p(np.array([0.1, 0.2, -0.3])) == 1
@@ -198,20 +198,20 @@ def test_p_by_hand():
     assert sign_flip_p(np.array([0.4])) == 1
 
 
-def test_a_flip_that_flips_nothing_counts_though_its_sum_is_rounded_otherwise():
+def test_the_identity_flip_counts_although_its_sum_is_rounded_differently():
     differences = np.full(10, 0.1)
-    assert sum(differences) < differences.sum()  # naively, no flip would reach the sum, and p be 0
+    assert sum(differences) < differences.sum()  # naively, no flip would reach the sum, and p would be 0
     assert sign_flip_p(differences) == 2 / 1024
 
 
-def test_p_is_even_where_methods_do_not_differ():
+def test_p_is_uniform_if_methods_do_not_differ():
     rng = np.random.default_rng(0)
     values = np.array([sign_flip_p(rng.normal(size=10)) for _ in range(400)])
     assert np.mean(values < 0.05) == pytest.approx(0.05, abs=0.035)
     assert np.mean(values < 0.5) == pytest.approx(0.5, abs=0.08)
 
 
-def test_a_small_difference_on_every_object_is_seen_where_the_intervals_of_both_overlap_widely():
+def test_a_small_difference_on_every_object_is_significant_although_the_intervals_overlap():
     parts = some_objects(count=18)
     better = [[value + 0.02 for value in part] for part in parts]
     a, b = measure_of(better), measure_of(parts)
@@ -230,7 +230,7 @@ def test_a_method_does_not_differ_from_itself():
     assert compare([measure], [measure]) == same
 
 
-def test_another_guess_of_the_curve_can_be_compared():
+def test_another_column_of_the_curve_can_be_compared():
     curves = np.array([[0.2, 0.6], [0.4, 0.9], [0.1, 0.5]])
     a = Measure(curves, np.arange(3), np.array([0.2, 0.4]), "")
     b = Measure(curves - [0, 0.1], np.arange(3), np.array([0.2, 0.4]), "")
@@ -238,7 +238,7 @@ def test_another_guess_of_the_curve_can_be_compared():
     assert compare([a], [b], column=1)["difference"] == pytest.approx(0.1)
 
 
-def test_a_value_never_lies_outside_its_interval_by_rounding():
+def test_rounding_never_puts_a_value_outside_its_interval():
     values = np.full((9, 1), 0.1 + 0.2)  # the mean of nine of these is rounded
     for count in (3, 7, 9):
         measure = Measure(values[:count], np.arange(count), np.array([0.5]), "objects")

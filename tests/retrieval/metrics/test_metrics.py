@@ -1,4 +1,4 @@
-"""Guess curves against every draw enumerated, and intervals against published values."""
+"""Top-n curves against an enumeration of every draw, and intervals against published values."""
 
 from itertools import combinations, permutations
 
@@ -12,7 +12,7 @@ from retrieval.metrics.k_way import binomial_interval, grouped_interval, k_way_a
 
 
 def curve_by_enumeration(true_score, others, k):
-    """Every set of rivals, every order of equals: how often the true photo stands among the first n."""
+    """Return how often the true photo is among the first n, over every set of rivals and every order of ties."""
     found, cases = np.zeros(k), 0
     for rivals in combinations(range(len(others)), k - 1):
         scores = [true_score, *(others[rival] for rival in rivals)]
@@ -25,7 +25,7 @@ def curve_by_enumeration(true_score, others, k):
 
 @settings(max_examples=40)
 @given(st.integers(0, 3), st.lists(st.integers(0, 3), min_size=3, max_size=5), st.integers(1, 4))
-def test_the_curve_is_what_every_draw_and_every_order_of_equals_gives(true_score, others, k):
+def test_the_curve_equals_that_over_every_draw_and_every_order_of_ties(true_score, others, k):
     np.testing.assert_allclose(
         k_way_accuracy(true_score, others, k), curve_by_enumeration(true_score, others, k), atol=1e-12
     )
@@ -36,12 +36,12 @@ def test_a_constant_scorer_is_exactly_chance(k):
     np.testing.assert_allclose(k_way_accuracy(0.0, np.zeros(40), k), np.arange(1, k + 1) / k)
 
 
-def test_the_best_and_the_worst_photo():
+def test_the_best_and_the_worst_photo_have_curves_of_ones_and_zeros():
     assert k_way_accuracy(1.0, np.zeros(9), 5).tolist() == [1, 1, 1, 1, 1]
     assert k_way_accuracy(-1.0, np.zeros(9), 5).tolist() == [0, 0, 0, 0, 1]
 
 
-def test_curves_of_many_queries_are_those_of_each():
+def test_curves_of_many_queries_equal_those_of_single_queries():
     rng = np.random.default_rng(0)
     scores = rng.integers(0, 4, (30, 9))
     higher, equal = (scores[:, 1:] > scores[:, :1]).sum(1), (scores[:, 1:] == scores[:, :1]).sum(1)
@@ -50,7 +50,7 @@ def test_curves_of_many_queries_are_those_of_each():
 
 
 def test_too_few_rivals_and_scores_that_are_not_finite_are_refused():
-    with pytest.raises(BadInput, match="needs k >= 1 and 4 rivals; got 3"):
+    with pytest.raises(BadInput, match="needs k >= 1 and 4 other candidates; got 3"):
         k_way_accuracy(0.0, np.zeros(3), 5)
     with pytest.raises(NumericalError):
         k_way_accuracy(np.nan, np.zeros(9), 5)
@@ -61,10 +61,10 @@ def test_too_few_rivals_and_scores_that_are_not_finite_are_refused():
     [
         (0, 10, 0.0, 0.3084971078),  # 1 - 0.025 ** (1 / 10)
         (10, 10, 0.6915028922, 1.0),
-        (4, 20, 0.0573, 0.4366),  # printed to four digits in tables of the method
+        (4, 20, 0.0573, 0.4366),  # four digits in printed tables of the method
     ],
 )
-def test_the_interval_is_that_of_clopper_and_pearson(successes, trials, low, high):
+def test_the_interval_equals_that_of_clopper_and_pearson(successes, trials, low, high):
     assert binomial_interval(successes, trials) == pytest.approx((low, high), abs=5e-5)
 
 
@@ -73,15 +73,17 @@ def test_an_interval_needs_trials():
         binomial_interval(1, 0)
 
 
-def test_answers_that_are_no_more_alike_within_a_group_than_between_count_in_full():
+def test_answers_that_are_uncorrelated_within_groups_count_in_full():
     assert grouped_interval([[True, False]] * 10) == pytest.approx(binomial_interval(10, 20))
     assert grouped_interval([[True] * 7, [True] * 5]) == binomial_interval(12, 12)
     assert grouped_interval([[True] * 3 + [False]]) == binomial_interval(3, 4)
 
 
-def test_groups_that_are_right_or_wrong_as_a_whole_count_as_one_answer_each():
-    """Ten groups of 50, half of them all wrong: by hand the design effect is 50 * 10 / 9, so they are worth 9 answers,
-    4.5 of them right. Taken for 500 independent answers, the interval would be seven times too narrow."""
+def test_groups_that_are_entirely_right_or_wrong_count_as_one_answer_each():
+    """Ten groups of 50, five of them all wrong: by hand the design effect is 50 * 10 / 9, so 9 answers remain.
+
+    4.5 of these are right. As 500 independent answers, the interval would be seven times too narrow.
+    """
     low, high = grouped_interval([[True] * 50] * 5 + [[False] * 50] * 5)
     assert binomial_interval(4, 9)[0] < low < binomial_interval(5, 9)[0]
     assert binomial_interval(4, 9)[1] < high < binomial_interval(5, 9)[1]

@@ -1,4 +1,4 @@
-"""Protocols against two plain loops, by hand, and with scorers that know nothing or everything."""
+"""Protocols against two plain loops, by hand, and with scorers without or with complete information."""
 
 from itertools import combinations, product
 
@@ -33,7 +33,7 @@ EVEN = Calibration(1.0, 0.0, 0.0, 1, 1, 0.0, 0.0, 0.0, 0.0)
 
 
 def full_gallery(table):
-    """Every measure of the whole gallery."""
+    """Return every measure of the whole gallery."""
     recalls = {f"recall_{k}": recall(table, k) for k in (1, 5, 10)}
     return {**recalls, "mrr": reciprocal_rank(table), "map": average_precision(table)}
 
@@ -47,14 +47,14 @@ def table_of(scores, touch_owner, photo_owner=None, own=None):
 
 
 def uneven(seed=0, values=5):
-    """Four objects of 2, 3, 4 and 5 grasps in mixed order; few distinct scores, so that many are equal."""
+    """Return four objects of 2, 3, 4 and 5 grasps in mixed order, with few distinct scores and so many ties."""
     rng = np.random.default_rng(seed)
     owner = rng.permutation(np.repeat([3, 5, 8, 9], [2, 3, 4, 5]))
     return table_of(rng.integers(-values, values + 1, (14, 14)), owner)
 
 
-def knowing(objects=6, grasps=4):
-    """Every photo of the object above every other."""
+def perfect(objects=6, grasps=4):
+    """Return scores with every photo of the object above every other."""
     owner = np.repeat(np.arange(objects), grasps)
     return table_of(np.where(owner[:, None] == owner, 3.0, -3.0), owner)
 
@@ -65,7 +65,7 @@ def constant(objects=6, grasps=4, value=0.0):
 
 
 def others_of(table, row):
-    """{object: its columns} without the row's own object."""
+    """Return {object: its columns} without the row's own object."""
     mine = table.touch_owner[row]
     return {name: np.flatnonzero(table.photo_owner == name) for name in np.unique(table.photo_owner) if name != mine}
 
@@ -85,45 +85,45 @@ def values_of(measure):
 # Pairs -----------------------------------------------------------------------------------------------------
 
 
-def test_pair_accuracy_is_that_of_two_loops():
+def test_pair_accuracy_equals_that_of_two_loops():
     table = uneven()
     calibration = Calibration(2.0, -2.0, 0.0, 1, 1, 0.0, 0.0, 0.0, 0.0)  # exactly 0 at a score of 1
     found = values_of(pair_accuracy(table, calibration))
     for row in range(14):
-        true = np.mean([right(2 * table.scores[row, column] - 2) for column in mine_of(table, row)])
+        true = np.mean([correctness(2 * table.scores[row, column] - 2) for column in mine_of(table, row)])
         false = np.mean(
             [
-                np.mean([1 - right(2 * table.scores[row, column] - 2) for column in columns])
+                np.mean([1 - correctness(2 * table.scores[row, column] - 2) for column in columns])
                 for columns in others_of(table, row).values()
             ]
         )
         assert found[row] == pytest.approx((true + false) / 2, abs=1e-12)
 
 
-def right(log_odds):
+def correctness(log_odds):
     return 0.5 if log_odds == 0 else float(log_odds > 0)
 
 
-def test_pair_accuracy_by_hand():
-    """Row 0 has photo 1 (right) and, of objects 1 and 2, photos 2 (right), 3 (a coin), 4 (wrong): (1 + 3/8) / 2."""
+def test_pair_accuracy_equals_that_by_hand():
+    """Row 0 has photo 1 (correct) and, of objects 1 and 2, photos 2 (correct), 3 (half), 4 (wrong): (1 + 3/8) / 2."""
     scores = np.full((5, 5), -1.0)
     scores[0] = [-9, 2, -1, 0, 4]
     found = pair_accuracy(table_of(scores, [0, 0, 1, 1, 2], own=np.eye(5)), EVEN)
     assert found.values[0, 0] == (1 + (0.75 + 0) / 2) / 2
 
 
-def test_pair_auc_is_that_of_two_loops():
+def test_pair_auc_equals_that_of_two_loops():
     table = uneven()
     found = values_of(pair_auc(table))
     for row in range(14):
-        won = []
+        wins = []
         for columns in others_of(table, row).values():
             pairs = [(table.scores[row, a], table.scores[row, b]) for a in mine_of(table, row) for b in columns]
-            won.append(np.mean([1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs]))
-        assert found[row] == pytest.approx(np.mean(won), abs=1e-12)
+            wins.append(np.mean([1.0 if a > b else 0.5 if a == b else 0.0 for a, b in pairs]))
+        assert found[row] == pytest.approx(np.mean(wins), abs=1e-12)
 
 
-def test_an_object_with_many_photos_is_no_more_of_a_rival_than_one_with_few():
+def test_an_object_with_many_photos_is_a_rival_as_often_as_one_with_few():
     """Naively, over photos, the area would be 10/11: object 2 has ten photos below, object 1 has one above."""
     owner = [0, 0, 1] + [2] * 10
     table = table_of([[0, 5, 9, *[1] * 10]], [0], owner, own=[[1] + [0] * 12])
@@ -135,7 +135,7 @@ def test_an_object_with_many_photos_is_no_more_of_a_rival_than_one_with_few():
 
 
 def k_way_by_enumeration(table, row, k, photos):
-    """Every choice of photos and of rivals, equals in every order: the exact guess curve of a row."""
+    """Return the exact top-n curve of a row, over every choice of photos and rivals and every order of ties."""
     shown = [
         [np.mean(table.scores[row, list(chosen)]) for chosen in combinations(columns, min(photos, len(columns)))]
         for columns in [mine_of(table, row), *others_of(table, row).values()]
@@ -144,13 +144,13 @@ def k_way_by_enumeration(table, row, k, photos):
     for true, *others in product(*shown):
         for rivals in combinations(others, k - 1):
             above, tied = sum(rival > true for rival in rivals), sum(rival == true for rival in rivals)
-            curve += [min(max((guess - above) / (tied + 1), 0), 1) for guess in range(1, k + 1)]
+            curve += [min(max((rank - above) / (tied + 1), 0), 1) for rank in range(1, k + 1)]
             cases += 1
     return curve / cases
 
 
 @pytest.mark.parametrize(("k", "photos"), [(3, 1), (2, 2), (4, 3)])
-def test_k_way_curves_come_to_those_of_every_draw_enumerated(k, photos):
+def test_k_way_curves_converge_to_those_over_every_draw(k, photos):
     table = uneven(values=2)
     found = k_way(table, k, photos=photos, draws=1500)
     for row in range(14):
@@ -158,22 +158,22 @@ def test_k_way_curves_come_to_those_of_every_draw_enumerated(k, photos):
         np.testing.assert_allclose(found.values[row], exact, atol=0.065)  # five standard errors of 1,500 draws
 
 
-def test_k_way_is_exact_where_every_object_shows_all_it_has():
+def test_k_way_is_exact_if_every_object_uses_all_its_photos():
     table = uneven(values=2)
     found = k_way(table, 3, photos=5, draws=1)
     for row in range(14):
         np.testing.assert_allclose(found.values[row], k_way_by_enumeration(table, row, 3, 5), atol=1e-12)
 
 
-def test_a_k_way_test_by_hand():
-    """Of three rivals one scores higher: among two of them it stands two times in three."""
+def test_a_k_way_test_equals_that_by_hand():
+    """Of three rivals one scores higher: with two of them it takes part two times in three."""
     scores = [[0, 5, 9, 1, 2]]
     table = table_of(scores, [0], [0, 0, 1, 2, 3], own=[[1, 0, 0, 0, 0]])
     np.testing.assert_allclose(k_way(table, 3).values, [[1 / 3, 1, 1]])
     np.testing.assert_allclose(k_way(table, 4).values, [[0, 1, 1, 1]])
 
 
-def test_more_photos_help_a_scorer_whose_photos_err_on_their_own():
+def test_more_photos_help_a_scorer_with_independent_errors():
     rng = np.random.default_rng(0)
     owner = np.repeat(np.arange(12), 8)
     table = table_of((owner[:, None] == owner) + rng.normal(size=(96, 96)), owner)
@@ -182,7 +182,7 @@ def test_more_photos_help_a_scorer_whose_photos_err_on_their_own():
 
 
 def test_a_test_of_more_candidates_than_objects_is_refused():
-    with pytest.raises(BadInput, match="7-way test needs k >= 1 and 6 rivals; got 5"):
+    with pytest.raises(BadInput, match="7-way test needs k >= 1 and 6 other candidates; got 5"):
         k_way(constant(), 7)
 
 
@@ -190,7 +190,7 @@ def test_a_test_of_more_candidates_than_objects_is_refused():
 
 
 def ranked_places(table, row, own_shown, order):
-    """Places of the row's object in one of the orders that its scores allow."""
+    """Return the places of the row's object in one of the orders that its scores allow."""
     columns = [column for column in order if own_shown or not table.own[row, column]]
     ranked = sorted(columns, key=lambda column: -table.scores[row, column])
     owner = table.photo_owner[ranked]
@@ -198,7 +198,7 @@ def ranked_places(table, row, own_shown, order):
 
 
 def full_by_loops(table, row, own_shown=False):
-    """Mean over 2,000 random orders of equals."""
+    """Return means over 2,000 random orders of ties."""
     rng = np.random.default_rng(row)
     columns = len(table.photo_owner)
     cases = [ranked_places(table, row, own_shown, rng.permutation(columns)) for _ in range(2000)]
@@ -207,13 +207,13 @@ def full_by_loops(table, row, own_shown=False):
         "recall_5": np.mean([places[0] <= 5 for places in cases]),
         "recall_10": np.mean([places[0] <= 10 for places in cases]),
         "mrr": np.mean([1 / places[0] for places in cases]),
-        "map": np.mean([np.mean([seen / place for seen, place in enumerate(places, 1)]) for places in cases]),
+        "map": np.mean([np.mean([count / place for count, place in enumerate(places, 1)]) for places in cases]),
         "rank": np.mean([places[0] for places in cases]),
     }
 
 
 @pytest.mark.parametrize("transposed", [False, True], ids=["touch to photo", "photo to touch"])
-def test_the_full_gallery_is_that_of_two_loops(transposed):
+def test_measures_of_the_full_gallery_equal_those_of_two_loops(transposed):
     table = uneven(values=3)
     table = table.transposed() if transposed else table
     found = full_gallery(table)
@@ -225,7 +225,7 @@ def test_the_full_gallery_is_that_of_two_loops(transposed):
         assert ranks[row] == pytest.approx(expected["rank"], abs=0.2)
 
 
-def test_without_equals_one_order_is_all_there_is():
+def test_without_ties_the_full_gallery_has_one_order():
     rng = np.random.default_rng(3)
     table = uneven()
     table = table_of(rng.permutation(196).reshape(14, 14), table.touch_owner)
@@ -234,15 +234,15 @@ def test_without_equals_one_order_is_all_there_is():
         places = ranked_places(table, row, False, range(14))
         assert found["mrr"].values[row, 0] == 1 / places[0]
         assert found["recall_5"].values[row, 0] == (places[0] <= 5)
-        precisions = [seen / place for seen, place in enumerate(places, 1)]
+        precisions = [count / place for count, place in enumerate(places, 1)]
         assert found["map"].values[row, 0] == pytest.approx(np.mean(precisions), rel=1e-12)
         places = ranked_places(table, row, True, range(14))
-        precisions = [seen / place for seen, place in enumerate(places, 1)]
+        precisions = [count / place for count, place in enumerate(places, 1)]
         assert shown.values[row, 0] == pytest.approx(np.mean(precisions), rel=1e-12)
 
 
-def test_the_own_photo_would_flatter_a_scorer_that_knows_the_lighting_of_each_grasp_and_nothing_else():
-    """Its own photo first, all else equal: chance where that is left out, more than twice chance where it is not."""
+def test_with_the_own_photo_a_scorer_that_only_recognises_each_grasps_lighting_would_beat_chance():
+    """Its own photo first, all else tied: chance without the own photo, more than twice chance with it."""
     blind = constant(objects=10, grasps=4)
     table = table_of(np.eye(40), blind.touch_owner)
     left_out, included = full_gallery(table)["map"], average_precision(table.with_own())
@@ -253,7 +253,7 @@ def test_the_own_photo_would_flatter_a_scorer_that_knows_the_lighting_of_each_gr
 
 
 def paired_by_loops(table, k):
-    """Expected share of rows, and of columns, that find their partner within k places."""
+    """Return the expected fraction of rows, and of columns, that find their partner within k places."""
     found = []
     for scores in (table.scores, table.scores.T):
         hits = []
@@ -265,7 +265,7 @@ def paired_by_loops(table, k):
     return np.mean(found, axis=0)
 
 
-def test_a_paired_batch_is_that_of_two_loops_both_ways():
+def test_a_paired_batch_equals_that_of_two_loops_in_both_directions():
     table = uneven(values=4)
     for k in (1, 5):
         found = paired(table, k)
@@ -273,13 +273,13 @@ def test_a_paired_batch_is_that_of_two_loops_both_ways():
         assert found.chance[0] == k / 14
 
 
-def test_in_a_paired_batch_another_photo_of_the_object_is_a_wrong_answer():
-    table = knowing()
+def test_in_a_paired_batch_another_photo_of_the_object_is_wrong():
+    table = perfect()
     assert values_of(paired(table, 1)).mean() == pytest.approx(1 / 4)
     assert values_of(full_gallery(table)["recall_1"]).mean() == 1
 
 
-def test_photos_in_another_order_are_paired_all_the_same():
+def test_the_order_of_photos_does_not_matter_in_a_paired_batch():
     table = uneven()
     order = np.random.default_rng(1).permutation(14)
     for k in (1, 5):
@@ -297,17 +297,17 @@ def test_a_paired_batch_needs_one_photo_for_each_touch():
 # The table of metrics --------------------------------------------------------------------------------------
 
 
-def test_every_metric_is_taken_of_scores_that_can_be_asked_all_of_them():
-    table = knowing(objects=10, grasps=21)
+def test_scores_that_allow_every_metric_get_every_metric():
+    table = perfect(objects=10, grasps=21)
     taken = compute(MethodScoreTables(table, table, dict.fromkeys(SET_SIZES, table), EVEN, seed=0))
     assert list(taken) == list(METRICS)
     labels = [(metric.section, metric.column) for metric in METRICS.values()]
     assert len(set(labels)) == len(labels)
 
 
-def test_a_metric_that_cannot_be_asked_is_left_out():
-    """Four objects make no test of five, no sets were drawn, and two grasps share each photo."""
-    table = knowing(objects=4, grasps=4)
+def test_a_metric_that_the_scores_do_not_allow_is_left_out():
+    """Four objects do not suffice for 5-way tests, no sets were drawn, and two grasps have the same photo."""
+    table = perfect(objects=4, grasps=4)
     shared = table.select(np.arange(16), np.arange(0, 16, 2))
     shared.own[np.arange(1, 16, 2), np.arange(8)] = True
     taken = set(compute(MethodScoreTables(shared, shared, {}, EVEN, seed=0)))
@@ -316,15 +316,15 @@ def test_a_metric_that_cannot_be_asked_is_left_out():
     assert not taken & (left_out | set(map(grasps_metric_name, SET_SIZES)))
 
 
-def test_so_many_photos_of_a_candidate_are_shown_only_where_every_candidate_has_them_beside_a_rows_own():
-    table = knowing(objects=6, grasps=4)
+def test_a_number_of_photos_is_used_only_if_every_candidate_has_as_many_besides_a_rows_own():
+    table = perfect(objects=6, grasps=4)
     assert table.min_photos == 3
     assert table.with_own().min_photos == 4
     taken = compute(MethodScoreTables(table, table, {}, EVEN, seed=0))
     assert {photos_metric_name(1), photos_metric_name(2), photos_metric_name(3)} <= set(taken)
     assert photos_metric_name(5) not in taken
     fewer = table.select(np.arange(24), np.delete(np.arange(24), [4, 5]))
-    assert fewer.min_photos == 1  # of the second object, of whose two photos a row's own is left out
+    assert fewer.min_photos == 1  # the second object has two photos, one of which is a row's own
 
 
 # Chance and certainty --------------------------------------------------------------------------------------
@@ -352,30 +352,30 @@ def test_a_constant_scorer_is_exactly_at_chance_in_every_protocol(value):
         np.testing.assert_allclose(means.mean(0), measure.chance, atol=1e-12, err_msg=name)
 
 
-def test_a_scorer_that_knows_is_right_in_every_protocol_but_the_paired_one():
-    for name, measure in every_measure(knowing()).items():
+def test_a_perfect_scorer_is_right_in_every_protocol_but_the_paired_one():
+    for name, measure in every_measure(perfect()).items():
         if not name.startswith("paired"):
             np.testing.assert_allclose(measure.values, 1, atol=1e-12, err_msg=name)
 
 
-def test_scores_of_any_size_give_what_their_order_gives():
+def test_only_the_order_of_scores_matters_at_any_scale():
     table = uneven()
     huge = table_of(table.scores.astype(np.float64) * 6e37, table.touch_owner)
     mild = every_measure(table)
     for name, measure in every_measure(huge).items():
-        if name != "k4p3":  # a mean of photos is no matter of order alone
+        if name != "k4p3":  # a mean over photos depends on more than the order
             np.testing.assert_allclose(measure.values, mild[name].values, err_msg=name)
 
 
-# Who is asked, and among what ------------------------------------------------------------------------------
+# Queries and galleries -------------------------------------------------------------------------------------
 
 
-def test_rows_without_another_photo_of_their_object_are_counted_and_neither_dropped_in_silence_nor_scored_0():
+def test_rows_without_another_photo_of_their_object_are_counted_and_neither_hidden_nor_scored_0():
     table = table_of(np.arange(16).reshape(4, 4), [0, 0, 1, 2])
     measures = {**every_measure_of_few(table), "auc": pair_auc(table)}
     for name, measure in measures.items():
         assert measure.owner.tolist() == [0, 0], name
-        assert measure.gallery.endswith("; 2 touches not asked, which have no other"), name
+        assert measure.gallery.endswith("; 2 touches left out, which have no other"), name
     assert np.isnan(true_ranks(table)).tolist() == [False, False, True, True]
     with pytest.raises(BadInput, match="from another grasp; none has"):
         pair_auc(table_of(np.zeros((2, 2)), [0, 1]))
@@ -388,27 +388,27 @@ def every_measure_of_few(table):
 def test_a_gallery_of_one_object_is_refused_where_rivals_are_needed():
     table = table_of(np.zeros((3, 3)), [0, 0, 0])
     for protocol in (pair_auc, lambda table: pair_accuracy(table, EVEN)):
-        with pytest.raises(BadInput, match="two objects at least"):
+        with pytest.raises(BadInput, match="at least two objects"):
             protocol(table)
-    with pytest.raises(BadInput, match="1 rivals; got 0"):
+    with pytest.raises(BadInput, match="1 other candidates; got 0"):
         k_way(table, 2)
 
 
-def test_the_gallery_is_said_in_plain_words():
+def test_the_gallery_is_described_in_plain_words():
     table = ScoreTable(
         np.zeros((4, 4), dtype=np.float32), np.array([0, 0, 1, 1]), np.array([0, 0, 1, 1]), np.eye(4, dtype=bool),
         object_words="unseen objects",
     )  # fmt: skip
     assert pair_auc(table).gallery == "2 unseen objects, 4 photos; those of the same grasp left out"
     assert full_gallery(table.transposed())["map"].gallery.startswith("2 unseen objects, 4 touches; ")
-    assert k_way(table, 2).gallery.startswith("2 of these objects, each shown by a photo: 2 unseen objects, 4 photos")
-    assert "each shown by 3 photos" in k_way(table, 2, photos=3).gallery
+    assert k_way(table, 2).gallery.startswith("2 of these objects, each with a photo: 2 unseen objects, 4 photos")
+    assert "each with 3 photos" in k_way(table, 2, photos=3).gallery
 
 
 # By object -------------------------------------------------------------------------------------------------
 
 
-def test_means_by_object_are_those_of_a_loop():
+def test_means_by_object_equal_those_of_a_loop():
     table = uneven()
     measure = k_way(table, 3)
     for column in (0, 1):
@@ -418,20 +418,20 @@ def test_means_by_object_are_those_of_a_loop():
             assert value == pytest.approx(np.mean(measure.values[measure.owner == name, column]))
 
 
-def test_confusions_are_those_of_a_loop():
+def test_confusions_equal_those_of_a_loop():
     table = uneven(values=2)
-    found = {(a, b): share for a, b, share in confusions(table, photos=9, draws=1)}
+    found = {(a, b): fraction for a, b, fraction in confusions(table, photos=9, draws=1)}
     scores = object_scores(table, 9, 1, seed=0)[0]
     for name in table.objects:
         rows = [row for row in range(14) if table.touch_owner[row] == name]
         for place, other in enumerate(table.objects):
-            shares = [(scores[row, place] == max(scores[row])) / sum(scores[row] == max(scores[row])) for row in rows]
-            assert name == other or found.get((name, other), 0) == pytest.approx(np.mean(shares), abs=1e-12)
+            first = [(scores[row, place] == max(scores[row])) / sum(scores[row] == max(scores[row])) for row in rows]
+            assert name == other or found.get((name, other), 0) == pytest.approx(np.mean(first), abs=1e-12)
 
 
-def test_the_largest_confusion_comes_first_and_a_right_guess_is_none():
+def test_the_largest_confusion_comes_first_and_correct_results_are_not_listed():
     scores = np.array([[0, 5, 9, 0, 0], [5, 0, 9, 0, 0], [0, 0, 5, 5, 0], [0, 0, 5, 5, 5], [9, 9, 9, 9, 0]])
     found = confusions(table_of(scores, [0, 0, 1, 1, 2], own=np.zeros((5, 5))), photos=2, draws=1)
-    # Object 0: means 2.5, 4.5, 0 twice. Object 1: a right guess; then 0, 5, 5, equals. Object 2: 9, 9, 0, equals.
+    # Object 0: means 2.5, 4.5, 0 twice. Object 1: one correct, then 0, 5, 5, a tie. Object 2: 9, 9, 0, a tie.
     assert found == [(0, 1, 1.0), (2, 0, 0.5), (2, 1, 0.5), (1, 2, 0.25)]
-    assert confusions(knowing()) == []
+    assert confusions(perfect()) == []

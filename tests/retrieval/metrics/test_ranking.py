@@ -1,4 +1,4 @@
-"""Measures of a ranking: by hand, by every order of equals, against another library; chance in closed form."""
+"""Measures of a ranking: by hand, over every order of ties, against another library; chance in closed form."""
 
 from itertools import pairwise, permutations
 from math import comb
@@ -23,7 +23,7 @@ from retrieval.metrics.ranking import (
 
 
 def measures(scores, relevant, shown=None):
-    """All measures of one row."""
+    """Return all measures of one row."""
     scores, relevant = np.array([scores], dtype=float), np.array([relevant], dtype=bool)
     shown = np.ones_like(relevant) if shown is None else np.array([shown], dtype=bool)
     first = first_relevant(scores, relevant, shown)
@@ -35,19 +35,19 @@ def measures(scores, relevant, shown=None):
 
 
 def measures_of_order(relevant_in_order):
-    """By two plain loops, in a ranking without equals."""
+    """Return the measures of a ranking without ties, by two plain loops."""
     first = next(place for place, good in enumerate(relevant_in_order, 1) if good)
-    precisions, seen = [], 0
+    precisions, count = [], 0
     for place, good in enumerate(relevant_in_order, 1):
-        seen += good
+        count += good
         if good:
-            precisions.append(seen / place)
+            precisions.append(count / place)
     found = {k: float(first <= k) for k in (1, 2, 3, 5)}
     return found | {"mrr": 1 / first, "rank": float(first), "map": sum(precisions) / len(precisions)}
 
 
 def measures_by_enumeration(scores, relevant):
-    """Every order that the scores allow, equally likely."""
+    """Return the mean over every order that the scores allow, all equally likely."""
     orders = [
         order for order in permutations(range(len(scores))) if all(scores[a] >= scores[b] for a, b in pairwise(order))
     ]
@@ -55,7 +55,7 @@ def measures_by_enumeration(scores, relevant):
     return {name: sum(case[name] for case in cases) / len(cases) for name in cases[0]}
 
 
-def test_a_ranking_counted_by_hand():
+def test_a_ranking_has_the_measures_counted_by_hand():
     """Relevant at places 2, 3 and 5 of 5: average precision is (1/2 + 2/3 + 3/5) / 3."""
     found = measures([9, 8, 7, 6, 5], [0, 1, 1, 0, 1])
     assert [found[k] for k in (1, 2, 3, 5)] == [0, 1, 1, 1]
@@ -64,8 +64,8 @@ def test_a_ranking_counted_by_hand():
     assert found["map"] == pytest.approx((1 / 2 + 2 / 3 + 3 / 5) / 3, rel=1e-12)
 
 
-def test_equals_counted_by_hand():
-    """One relevant item shares places 2 and 3 with another: each is as likely."""
+def test_ties_have_the_measures_counted_by_hand():
+    """One relevant item is tied with another on places 2 and 3: both orders are equally likely."""
     found = measures([9, 5, 5, 1], [0, 0, 1, 0])
     assert found[1] == 0
     assert found[2] == pytest.approx(0.5)
@@ -74,15 +74,15 @@ def test_equals_counted_by_hand():
     assert found["rank"] == 2.5
 
 
-def test_naively_a_stable_sort_gives_a_constant_scorer_the_order_it_was_handed():
+def test_a_stable_sort_would_give_a_constant_scorer_the_order_of_its_input():
     relevant = np.array([1, 0, 0, 0, 0], dtype=bool)
     naive = relevant[np.argsort(-np.zeros(5), kind="stable")]
     assert measures_of_order(naive)["mrr"] == 1
     assert measures(np.zeros(5), relevant)["mrr"] == pytest.approx((1 + 1 / 2 + 1 / 3 + 1 / 4 + 1 / 5) / 5)
 
 
-def test_naively_an_average_precision_of_equals_from_its_first_and_last_order_is_neither_their_mean():
-    """McSherry and Najork's point: the expectation needs every order; the two ends do not give it."""
+def test_the_average_precision_of_ties_is_not_the_mean_of_its_best_and_worst_order():
+    """McSherry and Najork's point: the expectation needs every order."""
     scores, relevant = [1, 1, 1, 1], [1, 1, 0, 0]
     ends = [measures_of_order(order)["map"] for order in ([1, 1, 0, 0], [0, 0, 1, 1])]
     expected = measures_by_enumeration(scores, relevant)["map"]
@@ -92,7 +92,7 @@ def test_naively_an_average_precision_of_equals_from_its_first_and_last_order_is
 
 @settings(max_examples=120)
 @given(st.lists(st.tuples(st.integers(0, 2), st.booleans()), min_size=1, max_size=6))
-def test_equals_count_by_the_mean_over_every_order(items):
+def test_ties_count_by_the_mean_over_every_order(items):
     scores, relevant = zip(*items, strict=True)
     if not any(relevant):
         relevant = (True, *relevant[1:])
@@ -100,7 +100,7 @@ def test_equals_count_by_the_mean_over_every_order(items):
     assert found == pytest.approx(expected, rel=1e-12, abs=1e-14)
 
 
-def test_without_equals_an_independent_library_says_the_same():
+def test_without_ties_an_independent_library_gives_the_same():
     from torch import from_numpy as tensor
     from torchmetrics.functional import retrieval as library
 
@@ -116,12 +116,12 @@ def test_without_equals_an_independent_library_says_the_same():
             theirs = [float(library.retrieval_hit_rate(*row, top_k=k)) for row in rows]
             np.testing.assert_allclose(recall_at(k, first), theirs)
         theirs = [float(library.retrieval_reciprocal_rank(*row)) for row in rows]
-        np.testing.assert_allclose(reciprocal_rank(first), theirs, rtol=1e-6)  # theirs is float32
+        np.testing.assert_allclose(reciprocal_rank(first), theirs, rtol=1e-6)  # the library uses float32
         theirs = [float(library.retrieval_average_precision(*row)) for row in rows]
         np.testing.assert_allclose(average_precision(scores, relevant, every), theirs, rtol=1e-5)
 
 
-def test_what_is_not_shown_takes_no_place():
+def test_an_item_that_is_not_shown_takes_no_place():
     assert measures([9, 8, 7, 6], [0, 1, 0, 1], [0, 0, 1, 1]) == measures([7, 6], [0, 1])
     # An own photo that scores highest would otherwise count as found.
     assert measures([9, 8, 7, 6], [1, 0, 0, 1], [0, 1, 1, 1])["mrr"] == pytest.approx(1 / 3)
@@ -133,22 +133,22 @@ def test_a_score_that_is_not_finite_is_refused_and_its_row_named(bad):
     scores[1, 0] = bad
     shown = np.ones_like(relevant)
     for measure in (first_relevant, average_precision):
-        with pytest.raises(NumericalError, match="every score must be finite to be ranked; row 1"):
+        with pytest.raises(NumericalError, match="every score must be finite for ranking; row 1"):
             measure(scores, relevant, shown)
 
 
-def test_a_query_with_nothing_to_find_is_refused_and_named():
+def test_a_query_without_a_relevant_item_is_refused_and_named():
     scores, shown = np.zeros((2, 3)), np.ones((2, 3), dtype=bool)
     relevant = np.array([[1, 0, 0], [0, 1, 0]], dtype=bool)
     shown[1, 1] = False
     for function in (first_relevant, average_precision):
-        with pytest.raises(BadInput, match="shown something relevant; row 1 is not"):
+        with pytest.raises(BadInput, match="shown a relevant item; row 1 is not"):
             function(scores, relevant, shown)
 
 
 @settings(max_examples=60)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 5), st.sampled_from([0.0, 7.5, -1e30]))
-def test_chance_is_what_a_constant_scorer_gets(count, right, hidden, value):
+def test_chance_equals_the_value_of_a_constant_scorer(count, right, hidden, value):
     relevant = np.zeros((1, count + hidden), dtype=bool)
     relevant[:, : min(right, count)] = True
     shown = np.ones_like(relevant)
@@ -178,8 +178,8 @@ def test_with_one_true_photo_chance_of_mean_average_precision_is_the_harmonic_me
         assert chance_of_reciprocal_rank(relevant, every)[0] == pytest.approx(expected, abs=5e-5)
 
 
-def test_many_equals_neither_overflow_nor_lose_precision():
-    """Binomials of 4,000 items overflow a float; the products do not. By one simulated mean of 20,000 orders."""
+def test_many_ties_neither_overflow_nor_lose_precision():
+    """Binomials of 4,000 items overflow a float; the products do not. Compared with the mean over 20,000 orders."""
     with pytest.raises(OverflowError):
         float(comb(4000, 2000))
     first = FirstRelevant(*(np.array([value]) for value in (5, 4000, 44)))
@@ -190,7 +190,7 @@ def test_many_equals_neither_overflow_nor_lose_precision():
     assert recall_at(10, first)[0] == pytest.approx((drawn < 5).mean(), abs=0.006)
 
 
-def test_extreme_scores_rank_as_mild_ones_do():
+def test_extreme_scores_rank_like_moderate_ones():
     relevant = [0, 1, 0, 1, 0]
     mild = measures([3, 2, 1, 0, -1], relevant)
     assert measures([3e38, 1e30, 1e-30, 0, -3e38], relevant) == mild

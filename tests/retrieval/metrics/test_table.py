@@ -1,4 +1,4 @@
-"""The table of scores that protocols take, what a measure is, and which photos stand for an object."""
+"""Score tables, measures, and the photos that represent an object."""
 
 import math
 from itertools import product
@@ -15,7 +15,7 @@ from tests.retrieval.metrics.test_protocols import mine_of, others_of, table_of,
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_score_that_is_not_finite_is_refused_where_naively_a_nan_would_be_the_best(bad):
+def test_a_score_that_is_not_finite_is_refused_although_sorting_would_rank_a_nan_first(bad):
     scores = np.zeros((3, 3))
     scores[1, 2] = bad
     if math.isnan(bad):
@@ -34,13 +34,13 @@ def test_shapes_that_do_not_fit_are_refused(scores, own):
 
 
 def test_an_empty_table_and_an_own_photo_of_another_object_are_refused():
-    with pytest.raises(BadInput, match="one at least"):
+    with pytest.raises(BadInput, match="at least one each"):
         table_of(np.zeros((0, 3)), [], [0, 0, 1])
     with pytest.raises(BadInput, match="check the ids"):
         table_of(np.zeros((2, 2)), [0, 1], own=[[0, 1], [0, 0]])
 
 
-def test_rows_and_columns_are_selected_with_all_that_belongs_to_them():
+def test_a_selection_has_the_owners_and_own_photos_of_its_rows_and_columns():
     table = uneven()
     rows, columns = np.array([5, 2]), np.arange(14) % 2 == 0
     part = table.select(rows, columns)
@@ -57,16 +57,16 @@ def test_a_measure_needs_a_finite_value_for_each_query():
         Measure(np.full((2, 1), np.nan), np.array([0, 1]), np.array([0.5]), "")
 
 
-# Which photos stand for an object --------------------------------------------------------------------------
+# Photos that represent an object ---------------------------------------------------------------------------
 
 
-def test_an_object_is_shown_by_photos_of_its_own_without_replacement_and_never_by_the_row_s_own():
-    """Scores are powers of two, so the mean of three photos tells which three they were."""
+def test_an_object_is_represented_by_its_own_photos_without_replacement_and_never_by_the_row_s_own():
+    """Scores are powers of two, so the mean of three photos identifies them."""
     owner = np.repeat([0, 1], 6)
     table = table_of(np.tile(2.0 ** np.arange(12), (12, 1)), owner)
-    seen = np.rint(object_scores(table, 3, 40, seed=0) * 3).astype(int)
+    drawn = np.rint(object_scores(table, 3, 40, seed=0) * 3).astype(int)
     for row, name in product(range(12), (0, 1)):
-        sets = {int(value) for value in seen[:, row, name]}
+        sets = {int(value) for value in drawn[:, row, name]}
         assert all(value.bit_count() == 3 for value in sets)
         assert all(6 * name <= bit < 6 * name + 6 for value in sets for bit in bits(value))
         assert not any(value >> row & 1 for value in sets)
@@ -77,18 +77,18 @@ def bits(value):
     return [bit for bit in range(value.bit_length()) if value >> bit & 1]
 
 
-def test_every_photo_is_shown_equally_often():
+def test_every_photo_is_drawn_equally_often():
     owner = np.repeat([0, 1], 4)
     table = table_of(np.tile(2.0 ** np.arange(8), (8, 1)), owner)
-    seen = np.rint(object_scores(table, 2, 4000, seed=0) * 2).astype(int)
+    drawn = np.rint(object_scores(table, 2, 4000, seed=0) * 2).astype(int)
     for row, name in product(range(8), (0, 1)):
         allowed = [column for column in range(4 * name, 4 * name + 4) if column != row]
         for column in allowed:
-            share = np.mean(seen[:, row, name] >> column & 1)
-            assert share == pytest.approx(2 / len(allowed), abs=0.05)  # six standard errors
+            frequency = np.mean(drawn[:, row, name] >> column & 1)
+            assert frequency == pytest.approx(2 / len(allowed), abs=0.05)  # six standard errors
 
 
-def test_an_object_with_fewer_photos_shows_all_it_has():
+def test_an_object_with_fewer_photos_is_represented_by_all_of_them():
     table = uneven()
     found = object_scores(table, 100, 1, seed=0)[0]
     for row in range(14):
@@ -97,7 +97,7 @@ def test_an_object_with_fewer_photos_shows_all_it_has():
             assert found[row, place] == pytest.approx(np.mean(table.scores[row, columns], dtype=float), abs=1e-12)
 
 
-def test_what_is_drawn_hangs_on_the_seed_and_not_on_the_scores():
+def test_the_draws_depend_on_the_seed_and_not_on_the_scores():
     table = uneven()
     doubled = ScoreTable(2 * table.scores, table.touch_owner, table.photo_owner, table.own)
     first = object_scores(table, 1, 3, seed=4)

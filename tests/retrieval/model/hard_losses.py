@@ -1,4 +1,4 @@
-"""Losses at logits where exponentials overflow, and gradients at points where square roots have none."""
+"""Losses at logits whose exponentials overflow, and gradients where square roots have none."""
 
 from collections.abc import Callable, Iterator
 
@@ -29,7 +29,7 @@ def hard_cases() -> Iterator[HardCase]:
     yield _one_object()
     yield _listwise()
     yield _sigmoid()
-    yield _taught_order()
+    yield _distilled_order()
     yield _runaway_scale()
     yield _constant_map()
     yield _zero_embedding()
@@ -56,10 +56,10 @@ def _case(
     ours: Callable[[Tensor], Tensor],
     must: tuple[float, list[float]],
 ) -> HardCase:
-    """A loss and its gradient, which are known."""
+    """Return the case of a loss with a known value and gradient."""
     found = [_with_slope(loss, at) for loss in (naive, ours)]
-    right = [_near(value, must[0]) and all(map(_near, slope, must[1])) for value, slope in found]
-    return HardCase(kernel, case, _text(*must), _text(*found[0]), _text(*found[1]), right[1], right[0])
+    correct = [_near(value, must[0]) and all(map(_near, slope, must[1])) for value, slope in found]
+    return HardCase(kernel, case, _text(*must), _text(*found[0]), _text(*found[1]), correct[1], correct[0])
 
 
 def _near(value: float, must: float) -> bool:
@@ -70,7 +70,7 @@ def _near(value: float, must: float) -> bool:
 
 
 def _sure_and_wrong() -> HardCase:
-    """-log(sigmoid(z)) is -z here, and its slope -1."""
+    """-log(sigmoid(z)) is -z here, with slope -1."""
     return _case(
         "match loss",
         "a true pair at logit -200",
@@ -96,16 +96,16 @@ def _half_precision_logit() -> HardCase:
 
 
 def _hard_negatives() -> HardCase:
-    """The photo of the object looks away (cosine -1), those of two others are the touch itself (cosine 1), scale 100.
+    """The photo of the object is opposite (cosine -1), those of two others equal the touch (cosine 1), scale 100.
 
-    -log softmax is 200 + log 2 for the touch and log 1 = 0 for its photo, which has no other touch to be drawn to.
+    -log softmax is 200 + log 2 for the touch, and log 1 = 0 for its photo, which has no other touch to compare with.
     """
     photo = torch.tensor([[-1.0, 0.0], [1.0, 0.0], [1.0, 0.0]])
     objects = torch.tensor([0, 1, 2])
 
     def naive(touch: Tensor) -> Tensor:
-        shares = (100 * touch @ photo.T).exp()
-        return -torch.log(shares[0, 0] / shares.sum() + torch.finfo(torch.float32).tiny) / 2
+        exponentials = (100 * touch @ photo.T).exp()
+        return -torch.log(exponentials[0, 0] / exponentials.sum() + torch.finfo(torch.float32).tiny) / 2
 
     def ours(touch: Tensor) -> Tensor:
         return contrastive_loss(touch, photo, _ONE, objects, _HARD_SCALE)
@@ -115,19 +115,19 @@ def _hard_negatives() -> HardCase:
 
 
 def _several_photos_of_an_object() -> HardCase:
-    """Two touches and two photos of one object, two of another, all in place: nothing is left to learn."""
+    """Two touches and two photos of one object, two of another, all perfectly aligned: the loss must be 0."""
     touch, objects = torch.eye(2).repeat_interleave(2, 0), torch.tensor([0, 0, 1, 1])
     scores = 100 * touch @ touch.T
     naive = functional.cross_entropy(scores, torch.arange(4)).item()
     ours = contrastive_loss(touch, touch, objects, objects, _HARD_SCALE).item()
-    wanted = "0: photos of one object are no rivals"
+    expected = "0: photos of one object are no rivals"
     return HardCase(
-        "InfoNCE", "two photos of each object", wanted, f"{naive:.3g}", f"{ours:.3g}", ours < 1e-6, naive < 1e-6
+        "InfoNCE", "two photos of each object", expected, f"{naive:.3g}", f"{ours:.3g}", ours < 1e-6, naive < 1e-6
     )
 
 
 def _one_object() -> HardCase:
-    """No rivals: nothing to learn. The naive mean is one over no rows."""
+    """Without rivals the loss is 0. The naive mean is taken over no rows."""
     photo = torch.tensor([[0.0, 1.0]])
 
     def naive(touch: Tensor) -> Tensor:
@@ -145,8 +145,8 @@ def _listwise() -> HardCase:
     objects = torch.tensor([0, 1])
 
     def naive(scores: Tensor) -> Tensor:
-        shares = scores.exp()
-        return -torch.log(shares[0, 0] / shares.sum()) / 2
+        exponentials = scores.exp()
+        return -torch.log(exponentials[0, 0] / exponentials.sum()) / 2
 
     def ours(scores: Tensor) -> Tensor:
         return listwise_loss(scores, _ONE, objects)
@@ -156,7 +156,7 @@ def _listwise() -> HardCase:
 
 
 def _sigmoid() -> HardCase:
-    """A pair of one object at right angles to what it should be: its logit is -100 - 10."""
+    """A pair of one object with opposite embeddings: its logit is -100 - 10."""
     photo, scale, bias = torch.tensor([[1.0, 0.0]]), _HARD_SCALE, torch.tensor(-10.0)
 
     def naive(touch: Tensor) -> Tensor:
@@ -169,23 +169,23 @@ def _sigmoid() -> HardCase:
     return _case("sigmoid loss", "opposite photo", torch.tensor([[-1.0, 0.0]]), naive, ours, must)
 
 
-def _taught_order() -> HardCase:
-    """A student that says the opposite of a teacher whose logits are 1e4 apart.
+def _distilled_order() -> HardCase:
+    """A student whose order is opposite to that of a teacher with logits 1e4 apart.
 
     Divergence 1e4, and 0.3 of the squared error 1e8 over the teacher's variance 5e7.
     """
     teacher = torch.tensor([[-1e4, 0.0]])
 
     def naive(scores: Tensor) -> Tensor:
-        taught, learnt = (one.exp() / one.exp().sum(1, keepdim=True) for one in (teacher, scores))
-        return (taught * (taught / learnt).log()).sum(1).mean()
+        target, learned = (one.exp() / one.exp().sum(1, keepdim=True) for one in (teacher, scores))
+        return (target * (target / learned).log()).sum(1).mean()
 
     def ours(scores: Tensor) -> Tensor:
         return distillation_loss(scores, teacher)
 
     must = 1e4 + 0.3 * 2, [1.0, -1.0]
     return _case(
-        "candidate_encoder loss", "student opposite to logits of 1e4", torch.tensor([[0.0, -1e4]]), naive, ours, must
+        "candidate encoder loss", "student opposite to logits of 1e4", torch.tensor([[0.0, -1e4]]), naive, ours, must
     )
 
 
@@ -197,9 +197,9 @@ def _runaway_scale() -> HardCase:
         naive = float(module.log_scale.exp() * torch.tensor(0.0))
         module.clamp_scale()
         ours = module.logit_map()[0]
-    holds, said = abs(ours - 100) < 1e-3, f"scale {ours:.6g}"
+    holds, text = abs(ours - 100) < 1e-3, f"scale {ours:.6g}"
     return HardCase(
-        "InfoNCE", "log of the scale at 90", "scale 100", f"infinite: 0 x scale is {naive}", said, holds, naive == 0
+        "InfoNCE", "log of the scale at 90", "scale 100", f"infinite: 0 x scale is {naive}", text, holds, naive == 0
     )
 
 
@@ -207,7 +207,7 @@ def _runaway_scale() -> HardCase:
 
 
 def _constant_map() -> HardCase:
-    """An untouched gel: the deviation over a constant map is 0, and so must be its gradient."""
+    """A no-contact gel: the deviation over a constant map is 0, and its gradient must be 0."""
     return _case(
         "tower statistics",
         "deviation of a constant map",
@@ -219,7 +219,7 @@ def _constant_map() -> HardCase:
 
 
 def _zero_embedding() -> HardCase:
-    """A black picture may give a vector of zeros: it must have a finite embedding, and a finite gradient."""
+    """A black picture may give a zero vector: its embedding and its gradient must be finite."""
     module = Projections(2, 2, 2, 0.0).eval()
     nn.init.zeros_(module.touch.bias)
     nn.init.eye_(module.touch.weight)
@@ -227,9 +227,9 @@ def _zero_embedding() -> HardCase:
     naive = _with_slope(lambda x: (x / (x * x).sum().sqrt())[0, 0], zero)
     ours = _with_slope(lambda x: module(x, module.touch)[0, 0], zero)
     finite = [all(map(_finite, (value, *slope))) for value, slope in (naive, ours)]
-    wanted = "0, and a gradient that is finite"
+    expected = "0, and a finite gradient"
     holds = finite[1] and ours[0] == 0
-    return HardCase("cosine", "an embedding of zeros", wanted, _text(*naive), _text(*ours), holds, finite[0])
+    return HardCase("cosine", "an embedding of zeros", expected, _text(*naive), _text(*ours), holds, finite[0])
 
 
 def _finite(value: float) -> bool:
@@ -237,19 +237,19 @@ def _finite(value: float) -> bool:
 
 
 def _padded_set() -> HardCase:
-    """A set of one touch in a batch of larger sets: what stands in the empty places must not count."""
+    """A set of one touch in a batch of larger sets: values in the empty places must not count."""
     torch.manual_seed(0)
     head = SetHead(2, 2, 2, 0.0)
-    touch, held = torch.tensor([[[1.0, -2.0], [torch.inf, torch.nan]]]), torch.tensor([[True, False]])
-    naive = ((touch * held[..., None]).sum(1) / held.sum(1, keepdim=True))[0].tolist()
+    touch, counted = torch.tensor([[[1.0, -2.0], [torch.inf, torch.nan]]]), torch.tensor([[True, False]])
+    naive = ((touch * counted[..., None]).sum(1) / counted.sum(1, keepdim=True))[0].tolist()
     with torch.no_grad():
-        ours = head.pool(touch, held)[0].tolist()
-    wanted = "[1.0, -2.0], the touch itself"
+        ours = head.pool(touch, counted)[0].tolist()
+    expected = "[1.0, -2.0], the touch itself"
     return HardCase(
         "pooling of grasps",
-        "infinity and NaN where no grasp is",
-        wanted,
-        f"half x mask: {naive}",
+        "infinity and NaN in empty places",
+        expected,
+        f"partial activation x mask: {naive}",
         f"{ours}",
         ours == [1, -2],
         naive == [1, -2],

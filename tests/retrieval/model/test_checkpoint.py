@@ -1,4 +1,4 @@
-"""Checkpoints: what is written is read back, damage of every kind is one clear error, a crash leaves the old file."""
+"""Checkpoints: round trips, one clear error for every kind of damage, and a crash that leaves the old file."""
 
 import ast
 import dataclasses
@@ -26,7 +26,7 @@ from retrieval.model.checkpoint import (
     store_checkpoint,
     write_tensors,
 )
-from retrieval.model.checkpoint_info import read_checkpoint_info
+from retrieval.model.checkpoint_info import FORMAT, read_checkpoint_info
 from retrieval.model.fusion import GelHead, Matcher
 from retrieval.model.fusion_scorer import GelCheck
 from retrieval.model.posterior import Posterior
@@ -51,15 +51,15 @@ def save(path, **changes):
     matcher = Matcher(TINY.matcher)
     if changes.get("gel_check"):
         matcher.gel_head = GelHead(matcher.touch_tower.feature_count)
-    given = {"split": SPLIT, "posterior": POSTERIOR, "provenance": PROVENANCE} | changes
-    save_checkpoint(path, matcher, TINY, **given)
+    contents = {"split": SPLIT, "posterior": POSTERIOR, "provenance": PROVENANCE} | changes
+    save_checkpoint(path, matcher, TINY, **contents)
     return matcher
 
 
 def rewrite(path, *, tensors=None, **header):
     """Write the checkpoint again, well formed, with other tensors or header entries."""
-    state, kept = read_tensors(path)
-    write_tensors(path, {**state, **(tensors or {})}, kept | header)
+    state, stored = read_tensors(path)
+    write_tensors(path, {**state, **(tensors or {})}, stored | header)
 
 
 def header_of(path):
@@ -76,7 +76,7 @@ def saved(tmp_path):
 # Round trip ------------------------------------------------------------------------------------------------
 
 
-def test_every_tensor_and_everything_said_comes_back(tmp_path):
+def test_every_tensor_and_every_header_entry_comes_back(tmp_path):
     matcher = save(tmp_path / "deep" / "er" / "m.safetensors")
     loaded = load_checkpoint(tmp_path / "deep" / "er" / "m.safetensors")
     before, after = matcher.state_dict(), loaded.matcher.state_dict()
@@ -95,7 +95,7 @@ def test_every_tensor_and_everything_said_comes_back(tmp_path):
 def test_float16_halves_the_file_and_gives_nearly_the_same_logits(tmp_path):
     matcher = save(tmp_path / "whole.safetensors").eval()
     save(tmp_path / "half.safetensors", float16=True)
-    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("whole", "partial")]
+    sizes = [(tmp_path / f"{name}.safetensors").stat().st_size for name in ("whole", "half")]
     assert sizes[1] < 0.55 * sizes[0]
     again = load_checkpoint(tmp_path / "half.safetensors").matcher
     assert {tensor.dtype for tensor in again.state_dict().values()} <= {torch.float32, torch.int64}
@@ -104,33 +104,33 @@ def test_float16_halves_the_file_and_gives_nearly_the_same_logits(tmp_path):
         torch.testing.assert_close(again(touch, photo), matcher(touch, photo), atol=5e-3, rtol=5e-3)
 
 
-def test_a_weight_that_float16_cannot_hold_is_refused_before_a_file_is_there(tmp_path):
+def test_a_weight_that_exceeds_float16_is_refused_before_a_file_is_written(tmp_path):
     matcher = Matcher(TINY.matcher)
     with torch.no_grad():
         next(matcher.parameters()).fill_(1e6)
-    given = {"split": SPLIT, "posterior": POSTERIOR, "provenance": PROVENANCE}
+    contents = {"split": SPLIT, "posterior": POSTERIOR, "provenance": PROVENANCE}
     with pytest.raises(CheckpointError, match="float16"):
-        save_checkpoint(tmp_path / "m.safetensors", matcher, TINY, float16=True, **given)
+        save_checkpoint(tmp_path / "m.safetensors", matcher, TINY, float16=True, **contents)
     assert not (tmp_path / "m.safetensors").exists()
 
 
-def test_a_checkpoint_without_split_posterior_and_gel_check_says_none(tmp_path):
+def test_a_checkpoint_without_split_posterior_and_gel_check_has_none_for_each(tmp_path):
     save(tmp_path / "m.safetensors", split=None, posterior=None)
     loaded = load_checkpoint(tmp_path / "m.safetensors")
     assert (loaded.split, loaded.posterior, loaded.gel_check, loaded.matcher.gel_head) == (None,) * 4
 
 
-def test_the_check_of_gel_images_comes_back_with_its_layer_and_is_known_without_the_weights(tmp_path):
+def test_the_gel_check_comes_back_with_its_layer_and_is_readable_without_the_weights(tmp_path):
     path = tmp_path / "m.safetensors"
-    layer = save(path, gel_check=GEL_CHECK).gel_head.kinds
+    layer = save(path, gel_check=GEL_CHECK).gel_head.classifier
     loaded = load_checkpoint(path)
-    assert torch.equal(loaded.matcher.gel_head.kinds.weight, layer.weight)
-    assert torch.equal(loaded.matcher.gel_head.kinds.bias, layer.bias)
+    assert torch.equal(loaded.matcher.gel_head.classifier.weight, layer.weight)
+    assert torch.equal(loaded.matcher.gel_head.classifier.bias, layer.bias)
     assert loaded.gel_check == read_checkpoint_info(path).gel_check == GEL_CHECK
 
 
-def test_a_checkpoint_of_before_there_were_posteriors_ranks_and_has_none(saved):
-    """Its header has a calibration of pairs, which says nothing of a catalogue."""
+def test_a_checkpoint_without_a_posterior_entry_loads_and_has_none(saved):
+    """Its header has a calibration of pairs, which does not apply to a catalogue."""
     state, header = read_tensors(saved)
     older = {name: value for name, value in header.items() if name not in ("posterior", "gel_check")}
     write_tensors(saved, state, older | {"calibration": {"slope": 1.0}})
@@ -139,7 +139,7 @@ def test_a_checkpoint_of_before_there_were_posteriors_ranks_and_has_none(saved):
     assert loaded.split == SPLIT
 
 
-def test_what_is_held_is_stored_as_it_was_read(tmp_path):
+def test_storing_a_loaded_checkpoint_gives_the_same_file(tmp_path):
     queries = np.ones((2, TINY.matcher.partial_width), np.float16)
     save(tmp_path / "a.safetensors", gel_check=GEL_CHECK, queries=queries)
     store_checkpoint(load_checkpoint(tmp_path / "a.safetensors"), tmp_path / "b.safetensors")
@@ -166,7 +166,7 @@ def test_the_digest_is_the_files_and_equal_content_makes_equal_files(tmp_path):
 def test_the_header_is_readable_json_with_the_version_that_wrote_it(saved):
     (text,) = header_of(saved).values()
     header = json.loads(text)
-    assert header["format"] == 1
+    assert header["format"] == FORMAT
     assert header["software"] == __version__
     assert header["config"]["matcher"]["tower"] == "small"
 
@@ -175,7 +175,7 @@ def test_tensors_of_every_kind_come_back(tmp_path):
     state = {
         "scalar": torch.tensor(3),
         "empty": torch.zeros(0, 4),
-        "partial": torch.arange(3, dtype=torch.bfloat16),
+        "bfloat": torch.arange(3, dtype=torch.bfloat16),
         "double": torch.tensor([1e300], dtype=torch.float64),
         "strided": torch.arange(6.0).view(2, 3).T.contiguous(),
         "flags": torch.tensor([True, False]),
@@ -186,7 +186,7 @@ def test_tensors_of_every_kind_come_back(tmp_path):
     assert all(
         torch.equal(tensors[name], value) and tensors[name].dtype == value.dtype for name, value in state.items()
     )
-    assert header == {"format": 1, "software": __version__, "step": 7, "best": None}
+    assert header == {"format": FORMAT, "software": __version__, "step": 7, "best": None}
 
 
 def test_a_header_with_a_nan_is_not_written(tmp_path):
@@ -198,14 +198,14 @@ def test_a_header_with_a_nan_is_not_written(tmp_path):
 # Model card ------------------------------------------------------------------------------------------------
 
 
-def test_the_model_card_says_what_the_model_is(saved):
+def test_the_model_card_describes_the_model(saved):
     assert saved.with_suffix(".md").read_text().splitlines() == [
         "# m.safetensors",
         "",
         "Matches touches of 2 gel image(s) with photos. Tower `small`, output `pooled`.",
         "",
         "* Trained on: a rig (data digest `0123456789abcdef`)",
-        "* Kept step: 4 of 6, seed 0",
+        "* Best step: 4 of 6, seed 0",
         "* Objects: 2 train, 2 validation, 2 test",
         "* validation auc: 0.9877",
         "* pairs: 12",
@@ -214,13 +214,13 @@ def test_the_model_card_says_what_the_model_is(saved):
     ]
 
 
-def test_the_model_card_leaves_out_what_there_is_not(tmp_path):
+def test_the_model_card_leaves_out_absent_parts(tmp_path):
     save(tmp_path / "m.safetensors", split=None, posterior=None, provenance=PROVENANCE | {"metrics": {}})
     card = (tmp_path / "m.md").read_text()
     assert not any(word in card for word in ("Objects", "Probabilities", "Check of gel images"))
     save(tmp_path / "m.safetensors", gel_check=GEL_CHECK)
     last = (tmp_path / "m.md").read_text().splitlines()[-1]
-    assert last == "* Check of gel images, on validation objects: touches called foreign 0.062"
+    assert last == "* Check of gel images, on validation objects: touches rejected as foreign 0.062"
 
 
 @pytest.mark.parametrize("name", ["m.md", "m.txt", "m"])
@@ -233,7 +233,7 @@ def test_a_checkpoint_is_not_written_to_a_file_of_another_kind_such_as_its_model
 # Damage ----------------------------------------------------------------------------------------------------
 
 
-def test_no_file_and_a_folder_are_told_apart(tmp_path):
+def test_a_missing_file_and_a_folder_have_different_errors(tmp_path):
     with pytest.raises(CheckpointError, match=r"no checkpoint at .*none\.safetensors; `retrieve train` makes one"):
         load_checkpoint(tmp_path / "none.safetensors")
     with pytest.raises(CheckpointError, match=r"is a folder, not a file\); give the \.safetensors file"):
@@ -256,7 +256,7 @@ def test_a_file_cut_at_any_length_is_refused(tmp_path):
 
 
 def test_a_flipped_bit_in_any_byte_is_refused_or_changes_nothing(tmp_path):
-    """Naively, most flips in a weight or in a digit of the header load without a word."""
+    """A naive reader loads most flips in a weight or in a digit of the header without an error."""
     path = small_file(tmp_path)
     data, (tensors, header) = path.read_bytes(), read_tensors(path)
     silent = 0
@@ -264,10 +264,10 @@ def test_a_flipped_bit_in_any_byte_is_refused_or_changes_nothing(tmp_path):
         path.write_bytes(data[:place] + bytes([data[place] ^ 1 << place % 8]) + data[place + 1 :])
         silent += loads_naively(path)
         try:
-            got, said = read_tensors(path)
+            got, found = read_tensors(path)
         except CheckpointError:
             continue
-        assert said == header  # 1E-05 for 1e-05
+        assert found == header  # 1E-05 for 1e-05
         assert all(torch.equal(got[name], value) for name, value in tensors.items())
     assert silent > 50
 
@@ -283,12 +283,12 @@ def loads_naively(path):
 
 
 def with_header(text):
-    """The bytes of a well-formed file with that text where our header stands; None: without one."""
+    """Return the bytes of a well-formed file with that text as our header; without one if None."""
     return safetensors.torch.save({"weight": torch.ones(2)}, None if text is None else {"touch_retrieval": text})
 
 
-FOREIGN = r"holds weights but not our header; .*`retrieve train --init`"
-DEEP = '{"format": 1, "a": ' + "[" * 900 + "]" * 900 + "}"
+FOREIGN = r"contains weights but no header of ours; .*`retrieve train --init`"
+DEEP = f'{{"format": {FORMAT}, "a": ' + "[" * 900 + "]" * 900 + "}"
 OTHERS = {
     "no header": (with_header(None), FOREIGN),
     "no tensors": (b"\x08" + bytes(7) + b"{}      ", FOREIGN),
@@ -308,24 +308,24 @@ OTHERS = {
             "{}",
             "null",
             "[" * 100_000,
-            '{"format": 1, "a": ' + "[" * 900 + "]" * 900 + "}",
+            DEEP,
         )
     },
     **{
         f"format {version}": (
             with_header(json.dumps({"format": version, "software": "9.9"})),
-            rf"has checkpoint format {version}, this version reads 1; install the touch-retrieval that wrote it "
+            rf"has checkpoint format {version}, this version reads {FORMAT}; install the touch-retrieval that wrote it "
             r"\(9\.9\)",
         )
-        for version in (0, 2, "1", None)
+        for version in (0, 1, str(FORMAT), FORMAT + 1, None)
     },
 }
 
 
-@pytest.mark.parametrize(("content", "said"), OTHERS.values(), ids=[name[:20] for name in OTHERS])
-def test_a_file_that_is_no_checkpoint_of_this_version_is_called_what_it_is(tmp_path, content, said):
+@pytest.mark.parametrize(("content", "message"), OTHERS.values(), ids=[name[:20] for name in OTHERS])
+def test_a_file_that_is_not_a_checkpoint_of_this_version_gets_an_error_that_names_its_kind(tmp_path, content, message):
     (tmp_path / "m.safetensors").write_bytes(content)
-    with pytest.raises(CheckpointError, match=said):
+    with pytest.raises(CheckpointError, match=message):
         load_checkpoint(tmp_path / "m.safetensors")
 
 
@@ -334,7 +334,7 @@ def test_a_weight_that_is_not_finite_is_refused(saved, value):
     weight = read_tensors(saved)[0]["head.second.weight"].clone()
     weight[3, 4] = value
     rewrite(saved, tensors={"head.second.weight": weight})
-    with pytest.raises(CheckpointError, match="holds a NaN or infinite weight; train again with a lower learning rate"):
+    with pytest.raises(CheckpointError, match="contains a NaN or infinite weight; train again with a lower learning"):
         load_checkpoint(saved)
 
 
@@ -374,7 +374,7 @@ def test_the_state_of_a_training_is_not_a_checkpoint(saved, name):
         ),
     ],
 )
-def test_a_header_of_another_version_is_refused_by_what_is_in_it(saved, entry, message):
+def test_a_header_of_another_version_is_refused_with_the_wrong_entry(saved, entry, message):
     rewrite(saved, **entry)
     with pytest.raises(
         CheckpointError, match=rf"m\.safetensors is not a checkpoint that this version can use: .*{message}"
@@ -382,7 +382,7 @@ def test_a_header_of_another_version_is_refused_by_what_is_in_it(saved, entry, m
         load_checkpoint(saved)
 
 
-def test_weights_that_do_not_fit_the_configuration_are_told_on_one_line(saved):
+def test_weights_that_do_not_fit_the_configuration_give_a_one_line_error(saved):
     config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, hidden=64))
     rewrite(saved, config=config.to_dict())
     with pytest.raises(CheckpointError, match=r"head\.out\.weight is \(1, 32\), must be \(1, 64\)$"):
@@ -411,7 +411,7 @@ def fail(error):
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "Ctrl-C"])
 @pytest.mark.parametrize("where", ["os.fsync", "pathlib.Path.replace"])
-def test_a_write_that_fails_leaves_the_old_checkpoint_and_nothing_beside_it(saved, monkeypatch, where, error):
+def test_a_failed_write_leaves_the_old_checkpoint_and_no_other_file(saved, monkeypatch, where, error):
     before, files = saved.read_bytes(), sorted(os.listdir(saved.parent))
     with monkeypatch.context() as patch:
         patch.setattr(where, fail(error))
@@ -436,7 +436,7 @@ def test_the_file_is_on_the_disk_before_it_takes_its_name(tmp_path, monkeypatch)
 SOURCES = sorted(
     path for package in (retrieval, indexes, robot) for path in Path(package.__file__).parent.rglob("*.py")
 )
-# What must be said to a loader that would otherwise run code from the file.
+# The argument without which a loader would run code from the file.
 SAFE = {"torch.load": ("weights_only", True), "np.load": ("allow_pickle", False), "numpy.load": ("allow_pickle", False)}
 
 

@@ -1,4 +1,4 @@
-"""The towers as they run in a query and in a build, against the towers as they are trained."""
+"""The towers in the form of queries and builds, compared with their form in training."""
 
 import copy
 
@@ -29,7 +29,7 @@ SMALL = MatcherConfig(tower="small", tower_output="pooled", hidden=8)
 
 
 def matcher_with_statistics(tower, output):
-    """A matcher in evaluation mode whose batch normalisations have seen pictures, and scale and shift."""
+    """Return a matcher in evaluation mode whose batch normalisations have statistics, scale and shift."""
     torch.manual_seed(0)
     matcher = Matcher(MatcherConfig(tower=tower, tower_output=output, hidden=16, standardise=True, candidate_width=8))
     for module in matcher.modules():
@@ -48,8 +48,8 @@ def images(count, seed=1):
 
 @pytest.mark.parametrize("tower", sorted(TOWERS))
 @torch.inference_mode()
-def test_folded_towers_are_as_near_to_float64_as_the_plain_ones(tower):
-    """These weights were never trained, and 50 layers of them enlarge any rounding; they do so for both."""
+def test_folded_towers_are_as_close_to_float64_as_the_plain_ones(tower):
+    """These weights are random, and 50 layers of them amplify any rounding, in both forms."""
     matcher, photos = matcher_with_statistics(tower, "stages"), images(2)
     plain, ours = matcher.photo_features(to_batch(photos)), photo_features(matcher, photos)
     double = copy.deepcopy(matcher.photo_tower).double()
@@ -68,33 +68,33 @@ def test_every_output_of_a_tower_and_a_touch_of_two_fingers_stay_the_same(output
 
 
 @torch.inference_mode()
-def test_the_shipped_model_gives_the_halves_and_embeddings_of_its_plain_towers():
+def test_the_shipped_model_gives_the_partial_activations_and_embeddings_of_its_plain_towers():
     matcher = load_checkpoint(shipped_model()).matcher
     photos = smooth_pictures()
     plain, ours = (
         matcher.photo_search_encoding(matcher.photo_features(to_batch(photos))),
         encode_photos(matcher, photos),
     )
-    # Quiet features are scaled up fifty times, and with them what single precision rounds off their large means.
+    # Features that hardly vary are scaled up fifty times, and with them the float32 rounding of their large means.
     assert float((ours.partial - plain.partial).abs().max() / plain.partial.abs().max()) <= 1e-4
     assert float((ours.embedding - plain.embedding).abs().max()) <= 1e-4
 
 
 def smooth_pictures():
-    """Smooth pictures, nearer to photos than noise is."""
+    """Return smooth pictures, which are closer to photos than noise."""
     axis = np.linspace(0, 6, 224, dtype=np.float32)
     waves = [np.sin(k * axis)[:, None] * np.cos((k + 1) * axis)[None] for k in range(1, 5)]
     return [np.stack([wave, wave.T, wave**2], axis=2) / 2 + 0.5 for wave in waves]
 
 
 @pytest.mark.parametrize("tower", sorted(TOWERS))
-def test_no_batch_normalisation_is_left_in_a_tower_that_runs(tower):
+def test_no_batch_normalisation_is_left_in_a_tower_for_inference(tower):
     fast = for_inference(matcher_with_statistics(tower, "pooled"))
     for name in ("touch_tower", "photo_tower"):
         assert not [part for part in fast.get_submodule(name).modules() if isinstance(part, nn.BatchNorm2d)]
 
 
-def test_the_matcher_itself_stays_as_it_is():
+def test_encoding_leaves_the_matcher_unchanged():
     matcher = matcher_with_statistics("resnet18", "pooled")
     before = copy.deepcopy(matcher.state_dict())
     encode_photos(matcher, images(2))
@@ -137,7 +137,7 @@ def one_step_of_training(matcher):
 
 
 @pytest.mark.parametrize("change", [written_in_place, loaded, replaced, given_other_data, one_step_of_training])
-def test_weights_that_change_are_the_ones_that_run_next(change):
+def test_changed_weights_are_used_in_the_next_encoding(change):
     torch.manual_seed(0)
     matcher = Matcher(SMALL).eval()
     before = photo_features(matcher, images(2))
@@ -150,7 +150,7 @@ def test_weights_that_change_are_the_ones_that_run_next(change):
     assert not torch.equal(before, expected)
 
 
-def test_a_head_or_pruner_that_changes_is_used_at_once():
+def test_a_changed_head_or_candidate_encoder_is_used_at_once():
     matcher = matcher_with_statistics("small", "pooled")
     before = encode_touches(matcher, [images(2)])
     with torch.no_grad():
@@ -162,23 +162,23 @@ def test_a_head_or_pruner_that_changes_is_used_at_once():
     assert torch.equal(encode_touches(matcher, [images(2)]).embedding, expected)
 
 
-def test_a_tower_in_training_mode_is_not_folded_as_its_normalisation_looks_at_the_batch():
+def test_a_tower_in_training_mode_is_not_folded_because_its_normalisation_depends_on_the_batch():
     matcher = matcher_with_statistics("resnet18", "pooled").train()
     fast = for_inference(matcher)
     assert fast.photo_tower is matcher.photo_tower
     batch = to_batch(images(4))
     with torch.inference_mode():
         together, alone = matcher.photo_features(batch)[:1], matcher.eval().photo_features(batch[:1])
-    assert not torch.allclose(together, alone, rtol=0.01)  # folding would give the second
+    assert not torch.allclose(together, alone, rtol=0.01)  # folding would give `alone`
 
 
-def test_the_code_does_not_depend_on_the_batch():
+def test_the_encoding_does_not_depend_on_the_batch():
     matcher = matcher_with_statistics("mobilenet_v2", "stages")
     photos = images(7)
-    ways = [encode_photos(matcher, photos, batch) for batch in (1, 3, 7)]
-    for way in ways[1:]:
-        torch.testing.assert_close(way.partial, ways[0].partial, rtol=1e-5, atol=1e-5)
-        torch.testing.assert_close(way.embedding, ways[0].embedding, rtol=1e-5, atol=1e-5)
+    encodings = [encode_photos(matcher, photos, batch) for batch in (1, 3, 7)]
+    for encoding in encodings[1:]:
+        torch.testing.assert_close(encoding.partial, encodings[0].partial, rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(encoding.embedding, encodings[0].embedding, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -1,4 +1,4 @@
-"""The touch encoder as ONNX: the same numbers, no PyTorch in a query, and nothing stale or damaged in use."""
+"""The touch encoder as ONNX: the same numbers, no PyTorch in a query, and no stale or damaged file in use."""
 
 import json
 import os
@@ -37,19 +37,19 @@ PROVENANCE = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics":
 
 
 def timed(monkeypatch, torch_ms, onnx_ms):
-    """The two encoders take these times; the clock decides nothing in a test."""
+    """Set the times of the two encoders, so that no clock decides a test."""
     times = [torch_ms, onnx_ms] * exporting.ROUNDS
     monkeypatch.setattr(exporting, "_ms", lambda function: times.pop(0))
 
 
 @pytest.fixture
-def onnx_wins(monkeypatch):
+def onnx_is_faster(monkeypatch):
     timed(monkeypatch, 2.0, 1.0)
 
 
 @pytest.fixture
 def model_copy(model, tmp_path):
-    """A copy of the model, to lay files beside."""
+    """A copy of the model, whose folder may get more files."""
     return Path(shutil.copy(model, tmp_path / "m.safetensors"))
 
 
@@ -63,8 +63,8 @@ def touches_of(count, fingers, px):
     return np.random.default_rng(3).random((count, fingers, px, px, 3), dtype=np.float32)
 
 
-def exported(path, config, seed=0, *, gel_head=False):
-    """A matcher with random weights, and its exported encoder."""
+def export_random_matcher(path, config, seed=0, *, gel_head=False):
+    """Return a matcher with random weights, and its exported encoder."""
     torch.manual_seed(seed)
     matcher = Matcher(config.matcher)
     if gel_head:
@@ -89,23 +89,23 @@ MAKES += [{"fingers": 1}, {"standardise": False}, {"candidate_width": 0}]
 def test_the_exported_encoder_gives_pytorchs_numbers_for_any_number_of_touches(make, tmp_path):
     plain = {"tower": "small", "tower_output": "pooled", "hidden": 24, "standardise": True, "embedding_dim": 8}
     config = Config(MatcherConfig(**plain | {"candidate_width": 8} | make), preprocessing=Preprocessing(touch_px=32))
-    matcher, encoder = exported(tmp_path / "m.safetensors", config)
+    matcher, encoder = export_random_matcher(tmp_path / "m.safetensors", config)
     for count in (1, 3):
         touches = touches_of(count, config.matcher.fingers, 32)
-        code, (partial, embedding, readings, levels) = encode_touches(matcher, touches), encoder.encode(touches)
+        encoding, (partial, embedding, readings, levels) = encode_touches(matcher, touches), encoder.encode(touches)
         assert readings is levels is None  # without a gel head, and without no-contact frames
         # float32 in another order; random weights are worse conditioned than trained ones.
-        assert np.abs(partial - code.partial.numpy()).max() <= 1e-4 * float(code.partial.abs().max())
-        np.testing.assert_allclose(embedding, code.embedding.numpy(), atol=1e-4)
+        assert np.abs(partial - encoding.partial.numpy()).max() <= 1e-4 * float(encoding.partial.abs().max())
+        np.testing.assert_allclose(embedding, encoding.embedding.numpy(), atol=1e-4)
 
 
 @pytest.mark.parametrize("fingers", [1, 2])
-def test_what_tells_gel_images_from_others_is_exported_too(fingers, tmp_path):
+def test_the_gel_head_is_exported_too(fingers, tmp_path):
     config = Config(
         MatcherConfig(tower="small", tower_output="pooled", hidden=8, fingers=fingers),
         preprocessing=Preprocessing(touch_px=32),
     )
-    matcher, encoder = exported(tmp_path / "m.safetensors", config, gel_head=True)
+    matcher, encoder = export_random_matcher(tmp_path / "m.safetensors", config, gel_head=True)
     for count in (1, 3):
         touches = touches_of(count, fingers, 32)
         with torch.inference_mode():
@@ -115,19 +115,19 @@ def test_what_tells_gel_images_from_others_is_exported_too(fingers, tmp_path):
             np.testing.assert_allclose(ours.encode(touches).readings, expected, atol=1e-5)
 
 
-def test_the_encoder_in_pytorch_gives_what_encode_touches_gives(model):
+def test_the_torch_encoder_gives_the_same_as_encode_touches(model):
     matcher = load_checkpoint(model).matcher
     touches = touches_of(2, 2, 32)
     partial, embedding, *_ = TorchEncoder(matcher).encode(touches)
-    code = encode_touches(matcher, touches)
-    assert np.array_equal(partial, code.partial.numpy())
-    assert np.array_equal(embedding, code.embedding.numpy())
+    encoding = encode_touches(matcher, touches)
+    assert np.array_equal(partial, encoding.partial.numpy())
+    assert np.array_equal(embedding, encoding.embedding.numpy())
 
 
 # In a query ------------------------------------------------------------------------------------------------------
 
 
-def test_a_query_takes_the_export_that_lies_beside_the_model_and_ranks_the_same(model_copy, index, touch, onnx_wins):
+def test_a_query_uses_the_export_next_to_the_model_and_ranks_the_same(model_copy, index, touch, onnx_is_faster):
     by_torch = Searcher.open(index).query([touch])
     export(load_checkpoint(model_copy))
     by_onnx = Searcher.open(index).query([touch])
@@ -137,7 +137,7 @@ def test_a_query_takes_the_export_that_lies_beside_the_model_and_ranks_the_same(
         assert ours.logit == pytest.approx(theirs.logit, abs=1e-4)
 
 
-def test_a_query_runs_with_torch_blocked_where_there_is_an_export(model_copy, index, touch, onnx_wins, tmp_path):
+def test_with_an_export_a_query_runs_with_torch_blocked(model_copy, index, touch, onnx_is_faster, tmp_path):
     files = [str(path) for path in touch]
     arguments = ["query", "--gelsight", *files, "--index", str(index), "--none-prior", "0", "--json"]
     code = f"import sys\nfrom retrieval.commands.main import main\nsys.exit(main({arguments!r}))"
@@ -152,8 +152,8 @@ def test_a_query_runs_with_torch_blocked_where_there_is_an_export(model_copy, in
     assert len(document["results"]) == 8
 
 
-def test_a_stale_export_is_not_used_and_a_warning_says_so(
-    model_copy, index, touch, onnx_wins, catalogue, tmp_path, caplog
+def test_a_stale_export_is_not_used_and_a_warning_is_logged(
+    model_copy, index, touch, onnx_is_faster, catalogue, tmp_path, caplog
 ):
     export(load_checkpoint(model_copy))
     checkpoint = load_checkpoint(model_copy)
@@ -165,18 +165,20 @@ def test_a_stale_export_is_not_used_and_a_warning_says_so(
 
 
 @pytest.mark.parametrize("place", [10, -5, 0.5])
-def test_an_export_with_a_flipped_bit_is_not_used_where_onnx_runtime_takes_it(place, model_copy, onnx_wins, caplog):
+def test_an_export_with_a_flipped_bit_is_not_used_although_onnx_runtime_opens_it(
+    place, model_copy, onnx_is_faster, caplog
+):
     checkpoint = load_checkpoint(model_copy)
     path = Path(export(checkpoint).path)
     data = bytearray(path.read_bytes())
     data[int(place * len(data)) if isinstance(place, float) else place] ^= 1
     path.write_bytes(data)
     assert onnx_encoder.find_export(checkpoint) is None
-    assert "is damaged or no export" in caplog.text
+    assert "is damaged, or not a file of `retrieve export`" in caplog.text
 
 
-def test_the_naive_way_loads_a_weight_with_a_flipped_bit(model_copy, onnx_wins):
-    """What the checksum is for: ONNX Runtime opens the damaged model and answers with other numbers."""
+def test_the_naive_way_loads_a_weight_with_a_flipped_bit(model_copy, onnx_is_faster):
+    """The reason for the checksum: ONNX Runtime opens the damaged model and gives other numbers."""
     import onnxruntime
 
     path = Path(export(load_checkpoint(model_copy)).path)
@@ -187,48 +189,48 @@ def test_the_naive_way_loads_a_weight_with_a_flipped_bit(model_copy, onnx_wins):
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
-        *[(with_checksum(b"model" * 100)[:length], "damaged or no export") for length in (0, 5, 100)],
+        *[(with_checksum(b"model" * 100)[:length], "damaged, or not a file") for length in (0, 5, 100)],
         (with_checksum(b"model" * 100), "cannot be opened by ONNX Runtime"),
     ],
 )
-def test_a_truncated_export_and_a_sealed_file_that_is_no_onnx_model_are_refused(content, said, tmp_path):
+def test_a_truncated_export_and_a_sealed_file_that_is_not_onnx_are_refused(content, message, tmp_path):
     (tmp_path / "m.onnx").write_bytes(content)
-    with pytest.raises(CheckpointError, match=said):
+    with pytest.raises(CheckpointError, match=message):
         OnnxEncoder(tmp_path / "m.onnx", "0" * 64)
 
 
-def test_without_onnx_runtime_pytorch_serves(model_copy, onnx_wins, monkeypatch):
+def test_without_onnx_runtime_pytorch_encodes(model_copy, onnx_is_faster, monkeypatch):
     checkpoint = load_checkpoint(model_copy)
     export(checkpoint)
     monkeypatch.setattr(onnx_encoder, "find_spec", lambda name: None)
     assert onnx_encoder.find_export(checkpoint) is None
 
 
-@pytest.mark.parametrize("part", ["partial", "embedding"])
+@pytest.mark.parametrize("part", ["partial activation", "embedding"])
 def test_an_encoder_that_gives_a_nan_is_refused_with_the_touch_named(part, model_copy, index, touch, monkeypatch):
     searcher = Searcher.open(index)
-    codes = searcher.encoder.encode(touches_of(2, 2, 32))
-    (codes.partials if part == "partial" else codes.embeddings)[1, 3] = np.nan
-    monkeypatch.setattr(searcher.encoder, "encode", lambda touches: codes)
-    with pytest.raises(NumericalError, match=f"the {part} of touch 2 holds a NaN"):
+    encodings = searcher.encoder.encode(touches_of(2, 2, 32))
+    (encodings.embeddings if part == "embedding" else encodings.partials)[1, 3] = np.nan
+    monkeypatch.setattr(searcher.encoder, "encode", lambda touches: encodings)
+    with pytest.raises(NumericalError, match=f"the {part} of touch 2 contains a NaN"):
         searcher.query([touch, touch])
 
 
 # The user's cache ------------------------------------------------------------------------------------------------
 
 
-def test_a_checkpoint_without_an_export_beside_it_has_one_in_the_cache_once(model_copy, index, touch, onnx_wins):
+def test_a_checkpoint_without_an_export_gets_one_in_the_cache_once(model_copy, index, touch, onnx_is_faster):
     checkpoint = load_checkpoint(model_copy)
-    made = exporting.export_to_cache(checkpoint)
-    assert Path(made.path) == onnx_encoder.cached_export_path(checkpoint.digest)
+    report = exporting.export_to_cache(checkpoint)
+    assert Path(report.path) == onnx_encoder.cached_export_path(checkpoint.digest)
     assert Searcher.open(index).query([touch]).index["encoder"] == "onnx"
     assert exporting.export_to_cache(checkpoint) is None
     assert not model_copy.with_suffix(".onnx").exists()
 
 
-def test_the_export_beside_a_checkpoint_comes_first(model_copy, monkeypatch):
+def test_the_export_next_to_a_checkpoint_comes_first(model_copy, monkeypatch):
     timed(monkeypatch, 2.0, 1.0)
     checkpoint = load_checkpoint(model_copy)
     export(checkpoint)
@@ -236,40 +238,40 @@ def test_the_export_beside_a_checkpoint_comes_first(model_copy, monkeypatch):
     assert not onnx_encoder.cached_export_path(checkpoint.digest).exists()
 
 
-def given_away(path):
-    """Another user's file, by its owner's id: that of nobody here."""
+def change_owner(path):
+    """Give the file to another user, by an id that nobody here has."""
     os.chown(path, 4242, -1)
 
 
-needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can change owners")
 OPEN_TO_OTHERS = {
     "a file that its group can write": lambda path: path.chmod(0o664),
     "a file that all can write": lambda path: path.chmod(0o646),
     "a folder that all can write": lambda path: path.parent.chmod(0o1777),
-    "a file of another user": given_away,
-    "a folder of another user": lambda path: given_away(path.parent),
+    "a file of another user": change_owner,
+    "a folder of another user": lambda path: change_owner(path.parent),
 }
 
 
 @pytest.mark.parametrize(
     "how", [pytest.param(how, marks=[needs_root] * ("of another user" in how)) for how in OPEN_TO_OTHERS]
 )
-def test_an_export_in_the_cache_that_others_may_have_written_is_not_used(
-    how, model_copy, index, touch, onnx_wins, caplog
+def test_an_export_in_the_cache_that_others_can_write_is_not_used(
+    how, model_copy, index, touch, onnx_is_faster, caplog
 ):
-    """Whoever can write there can write its checksum too: this one would give other halves."""
+    """A user who can write there can also write its checksum: this file would give other partial activations."""
     checkpoint = load_checkpoint(model_copy)
     path = onnx_encoder.cached_export_path(checkpoint.digest)
     exporting.export_to_cache(checkpoint)
     OPEN_TO_OTHERS[how](path)
     assert Searcher.open(index).query([touch]).index["encoder"] == "torch"
     (line,) = caplog.messages
-    assert re.search(r"(belongs to another user|can be written to by other users).*PyTorch is used instead", line)
+    assert re.search(r"(belongs to another user|can be written to by other users).*PyTorch encodes instead", line)
 
 
 @pytest.mark.parametrize("how", ["a folder that all can write", "a file that all can write"])
-def test_what_others_may_have_written_to_the_cache_is_made_again_where_only_the_user_writes(
-    how, model_copy, onnx_wins, caplog, monkeypatch
+def test_an_export_that_others_can_write_is_replaced_if_only_the_user_can_write_the_folder(
+    how, model_copy, onnx_is_faster, caplog, monkeypatch
 ):
     checkpoint = load_checkpoint(model_copy)
     path = onnx_encoder.cached_export_path(checkpoint.digest)
@@ -277,48 +279,46 @@ def test_what_others_may_have_written_to_the_cache_is_made_again_where_only_the_
     path.write_bytes(with_checksum(b"hostile"))
     OPEN_TO_OTHERS[how](path)
     timed(monkeypatch, 2.0, 1.0)
-    made = exporting.export_to_cache(checkpoint)
+    report = exporting.export_to_cache(checkpoint)
     if "folder" in how:
-        assert made is None
+        assert report is None
         assert "can be written to by other users (mode 1777" in caplog.text
         assert path.read_bytes() == with_checksum(b"hostile")
     else:
-        assert made.path == str(path)
+        assert report.path == str(path)
         assert (path.stat().st_mode & 0o777, OnnxEncoder(path, checkpoint.digest).name) == (0o644, "onnx")
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o002, 0o277])
-def test_the_cache_and_every_export_are_for_the_user_alone_to_write_whatever_the_umask(
-    umask, model_copy, index, onnx_wins
-):
+def test_with_any_umask_only_the_user_can_write_the_cache_and_exports(umask, model_copy, index, onnx_is_faster):
     checkpoint = load_checkpoint(model_copy)
     folder = onnx_encoder.cached_export_path(checkpoint.digest).parent
     before = os.umask(umask)
     try:
         make_cache_folder(folder)
-        made = Path(export(checkpoint).path) if umask != 0o277 else None
+        path = Path(export(checkpoint).path) if umask != 0o277 else None
     finally:
         os.umask(before)
     assert folder.stat().st_mode & 0o777 == 0o700
-    if made is not None:
-        assert made.stat().st_mode & 0o777 == 0o644
+    if path is not None:
+        assert path.stat().st_mode & 0o777 == 0o644
         assert onnx_encoder.find_export(checkpoint).name == "onnx"
 
 
 @needs_root
-def test_an_export_beside_a_checkpoint_may_be_its_owners_and_nobody_elses(model_copy, onnx_wins, caplog):
+def test_an_export_next_to_a_checkpoint_may_belong_to_its_owner_and_nobody_else(model_copy, onnx_is_faster, caplog):
     checkpoint = load_checkpoint(model_copy)
-    beside = Path(export(checkpoint).path)
-    given_away(model_copy)
-    given_away(beside)
+    path = Path(export(checkpoint).path)
+    change_owner(model_copy)
+    change_owner(path)
     assert onnx_encoder.find_export(checkpoint).name == "onnx"
-    os.chown(beside, 4243, -1)
+    os.chown(path, 4243, -1)
     assert onnx_encoder.find_export(checkpoint) is None
-    assert "m.onnx belongs to another user (uid 4243); PyTorch is used instead" in caplog.text
+    assert "m.onnx belongs to another user (uid 4243); PyTorch encodes instead" in caplog.text
 
 
 @pytest.mark.parametrize("content", [with_checksum(b"model" * 100)[:-1], with_checksum(b"model" * 100)[:100], b"junk"])
-def test_a_damaged_export_in_the_cache_is_made_again(model_copy, monkeypatch, content):
+def test_a_damaged_export_in_the_cache_is_replaced(model_copy, monkeypatch, content):
     checkpoint = load_checkpoint(model_copy)
     path = onnx_encoder.cached_export_path(checkpoint.digest)
     path.parent.mkdir(parents=True)
@@ -329,7 +329,7 @@ def test_a_damaged_export_in_the_cache_is_made_again(model_copy, monkeypatch, co
 
 
 @pytest.mark.parametrize("trouble", ["slower", "a file in the way", "no home"])
-def test_without_a_cache_a_build_goes_on(trouble, model_copy, monkeypatch, tmp_path):
+def test_without_a_cache_a_build_continues(trouble, model_copy, monkeypatch, tmp_path):
     timed(monkeypatch, 1.0, 2.0)
     (tmp_path / "file").touch()
     if trouble == "a file in the way":
@@ -345,40 +345,40 @@ def test_without_a_cache_a_build_goes_on(trouble, model_copy, monkeypatch, tmp_p
 # The command -----------------------------------------------------------------------------------------------------
 
 
-def test_the_command_says_what_it_measured(model_copy, onnx_wins, capsys):
+def test_the_command_prints_its_measurements(model_copy, onnx_is_faster, capsys):
     assert main(["export", str(model_copy), "--json"]) == 0
     out, err = capsys.readouterr()
     document = json.loads(out)
     assert document["path"] == str(model_copy.with_suffix(".onnx"))
     assert (document["torch_ms"], document["onnx_ms"]) == (2.0, 1.0)
     assert document["partial_difference"] < 1e-4
-    assert "1.0 ms by ONNX Runtime, in 2.0 ms by PyTorch (2.00 times)" in err
+    assert "ONNX Runtime encodes a touch in 1.0 ms, PyTorch in 2.0 ms (2.00 times)" in err
     assert model_copy.with_suffix(".onnx").is_file()
 
 
-def test_nothing_is_written_where_onnx_runtime_does_not_win_and_an_older_export_stays(model_copy, monkeypatch, capsys):
+def test_nothing_is_written_if_onnx_runtime_is_not_faster_and_an_older_export_stays(model_copy, monkeypatch, capsys):
     model_copy.with_suffix(".onnx").write_bytes(with_checksum(b"older"))
     timed(monkeypatch, 1.0, 1.0)
     assert main(["export", str(model_copy)]) == 1
-    assert "nothing is exported, as PyTorch is as fast on this machine" in capsys.readouterr().err
+    assert "nothing is exported, because PyTorch is as fast on this machine" in capsys.readouterr().err
     assert model_copy.with_suffix(".onnx").read_bytes() == with_checksum(b"older")
 
 
-def test_nothing_is_written_where_the_numbers_differ(model_copy, onnx_wins, monkeypatch):
+def test_nothing_is_written_if_the_numbers_differ(model_copy, onnx_is_faster, monkeypatch):
     monkeypatch.setattr(exporting, "TOLERANCE", -1.0)
     with pytest.raises(RetrievalError, match="gives other numbers"):
         export(load_checkpoint(model_copy))
     assert sorted(path.suffix for path in model_copy.parent.iterdir()) == [".safetensors"]
 
 
-def test_the_export_goes_where_it_is_asked_for(model_copy, onnx_wins, tmp_path):
+def test_the_export_is_written_to_the_requested_file(model_copy, onnx_is_faster, tmp_path):
     assert export(load_checkpoint(model_copy), tmp_path / "other.onnx").path == str(tmp_path / "other.onnx")
     assert not model_copy.with_suffix(".onnx").exists()
     with pytest.raises(BadInput, match=r"must be named \*\.onnx"):
         export(load_checkpoint(model_copy), tmp_path / "other.bin")
 
 
-def test_what_to_install_is_said(model_copy, monkeypatch):
+def test_the_error_names_the_package_to_install(model_copy, monkeypatch):
     monkeypatch.setattr(exporting, "find_spec", lambda name: None)
     with pytest.raises(BadInput, match=r"export needs onnx; install it with `pip install 'touch-retrieval\[onnx\]'`"):
         export(load_checkpoint(model_copy))
@@ -421,22 +421,22 @@ sys.exit(code)
 """
 
 
-def test_the_group_of_packages_for_queries_is_all_that_a_query_by_onnx_imports(
-    model_copy, index, touch, onnx_wins, tmp_path
+def test_a_query_by_onnx_imports_exactly_the_package_group_for_queries(
+    model_copy, index, touch, onnx_is_faster, tmp_path
 ):
-    """`pip install --group query` and the package without its dependencies are enough; nothing in the group is idle."""
+    """`pip install --group query` and the package without its dependencies suffice; every package is used."""
     export(load_checkpoint(model_copy))
     group = {item.partition(">=")[0] for item in PROJECT["dependency-groups"]["query"]}
-    asked = ["query", "--gelsight", *map(str, touch), "--index", str(index), "--html", str(tmp_path / "q.html")]
-    asked += ["--none-prior", "0"]
-    code = ONLY.format(allowed=group, arguments=asked)
+    arguments = ["query", "--gelsight", *map(str, touch), "--index", str(index), "--html", str(tmp_path / "q.html")]
+    arguments += ["--none-prior", "0"]
+    code = ONLY.format(allowed=group, arguments=arguments)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr
     assert "Which object is in the hand?" in done.stdout
-    assert done.stderr.splitlines()[-1] in ("[]", "['faiss-cpu']"), done.stderr  # an exact search does without faiss
+    assert done.stderr.splitlines()[-1] in ("[]", "['faiss-cpu']"), done.stderr  # an exact search needs no faiss
 
 
-def test_a_querys_words_and_a_wrong_index_import_no_encoder_and_no_pydantic(tmp_path):
+def test_help_and_an_error_about_the_index_import_no_encoder_and_no_pydantic(tmp_path):
     arguments = ["query", "--gelsight", "a.png", "--index", str(tmp_path)]
     code = f"from retrieval.commands.main import main\nmain({arguments!r})"
     done = run_blocked(code, ("torch", "onnxruntime", "onnx", "pydantic"))

@@ -1,4 +1,4 @@
-"""Checkpoints, settings and indexes that somebody wrote on purpose: well formed, and unusable. Each is one sentence."""
+"""Forged checkpoints, settings and indexes: well formed but unusable. Each gives a one-line error."""
 
 import contextlib
 import os
@@ -39,15 +39,15 @@ def saved(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def kept(tmp_path_factory):
-    """As `saved`, for examples that write elsewhere."""
-    path = tmp_path_factory.mktemp("kept") / "m.safetensors"
+def template(tmp_path_factory):
+    """A checkpoint like `saved`, for examples that write elsewhere."""
+    path = tmp_path_factory.mktemp("template") / "m.safetensors"
     save(path)
     return path
 
 
 def with_settings(path, part="matcher", **changes):
-    """Write the checkpoint again with other settings, its checksum made to fit."""
+    """Write the checkpoint again with other settings and a matching checksum."""
     _, header = read_tensors(path)
     config = header["config"]
     rewrite(path, config=config | {part: config[part] | changes})
@@ -56,25 +56,25 @@ def with_settings(path, part="matcher", **changes):
 
 @pytest.mark.parametrize("name", ["hidden", "embedding_dim", "fingers", "candidate_width"])
 @pytest.mark.parametrize("size", [10**9, 2**70])
-def test_weights_are_compared_with_the_settings_before_memory_is_asked_for(saved, name, size):
+def test_weights_are_compared_with_the_settings_before_memory_is_allocated(saved, name, size):
     with_settings(saved, **{name: size})
-    with pytest.raises(CheckpointError, match=r"do not fit its configuration|too large to be counted|fit into 64 bits"):
+    with pytest.raises(CheckpointError, match=r"do not fit its configuration|too large to count|fit into 64 bits"):
         load_checkpoint(saved)
 
 
-def test_no_matcher_of_another_size_is_made(saved, monkeypatch):
-    made = []
+def test_no_matcher_of_another_size_is_allocated(saved, monkeypatch):
+    devices = []
     real = torch.nn.Linear.__init__
 
     def counted(self, inputs, outputs, *arguments, **settings):
         real(self, inputs, outputs, *arguments, **settings)
-        made.append(self.weight.device.type)
+        devices.append(self.weight.device.type)
 
     monkeypatch.setattr(torch.nn.Linear, "__init__", counted)
     with_settings(saved, hidden=4096)
     with pytest.raises(CheckpointError):
         load_checkpoint(saved)
-    assert set(made) == {"meta"}
+    assert set(devices) == {"meta"}
 
 
 @settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -82,9 +82,9 @@ def test_no_matcher_of_another_size_is_made(saved, monkeypatch):
     part=st.sampled_from(["config", "split", "calibration", "provenance", "format", "software", "task"]),
     value=JSON,
 )
-def test_any_part_of_a_header_may_be_forged(kept, part, value):
-    forged = kept.with_name("forged.safetensors")
-    state, header = read_tensors(kept)
+def test_any_part_of_a_header_may_be_forged(template, part, value):
+    forged = template.with_name("forged.safetensors")
+    state, header = read_tensors(template)
     write_tensors(forged, state, header | {part: value})
     for read in (load_checkpoint, read_checkpoint_info, load_gate):
         with contextlib.suppress(BadInput):
@@ -97,9 +97,9 @@ def test_any_part_of_a_header_may_be_forged(kept, part, value):
     key=st.sampled_from(["hidden", "tower", "dropout", "seed", "learning_rate", "touch_px", "background", "init"]),
     value=JSON | st.just(10**400),
 )
-def test_any_setting_in_a_header_may_be_forged(kept, part, key, value):
-    forged = kept.with_name("forged.safetensors")
-    state, header = read_tensors(kept)
+def test_any_setting_in_a_header_may_be_forged(template, part, key, value):
+    forged = template.with_name("forged.safetensors")
+    state, header = read_tensors(template)
     config = {**header["config"], part: {**header["config"][part], key: value}}
     write_tensors(forged, state, header | {"config": config})
     with contextlib.suppress(BadInput):
@@ -135,7 +135,7 @@ def test_forged_tensors_are_refused(saved, tensors):
         {"head.out.weight": None},
     ],
 )
-def test_a_forged_judge_is_refused(saved, tensors):
+def test_a_forged_scorer_is_refused(saved, tensors):
     state, header = read_tensors(saved)
     state = {name: tensor for name, tensor in {**state, **tensors}.items() if tensor is not None}
     write_tensors(saved, state, header)
@@ -143,7 +143,7 @@ def test_a_forged_judge_is_refused(saved, tensors):
         read_scorer(saved)
 
 
-def test_a_checkpoint_that_is_no_file_is_refused_without_being_read(tmp_path):
+def test_a_checkpoint_that_is_not_a_regular_file_is_refused_without_being_read(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "zero").symlink_to("/dev/zero")
     for name in ("pipe", "zero", "."):
@@ -170,11 +170,11 @@ def test_settings_in_a_pipe_are_refused_without_waiting(tmp_path):
         load_config("n" * 10_000)
 
 
-def test_a_training_asks_before_it_would_write_over_another_file(tmp_path):
+def test_a_training_refuses_to_overwrite_a_file_of_another_program(tmp_path):
     (tmp_path / "a.safetensors").write_bytes(b"\x89PNG")
     (tmp_path / "model.md").write_text("# My notes\n")
-    for name, what in (("a.safetensors", "a checkpoint"), ("model.safetensors", "a model card")):
-        with pytest.raises(BadInput, match=f"is not {what} that this program wrote"):
+    for name, kind in (("a.safetensors", "a checkpoint"), ("model.safetensors", "a model card")):
+        with pytest.raises(BadInput, match=f"is not {kind} that this program wrote"):
             require_writable(tmp_path / name)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.safetensors", "model.md"]
 
@@ -198,15 +198,14 @@ ROW = {"id": "mug/1.jpg", "object_id": "mug", "path": "mug/1.jpg", "metadata": {
         {"metadata": []},
     ],
 )
-def test_a_row_of_a_photo_outside_the_catalogue_or_without_its_parts_is_refused(change):
+def test_a_row_with_a_photo_outside_the_catalogue_or_without_a_field_is_refused(change):
     assert listed_photo(ROW).path == "mug/1.jpg"
     with pytest.raises(CorruptIndex):
         listed_photo(ROW | change)
 
 
-def test_an_index_whose_rows_name_no_object_is_of_no_rig(tmp_path):
-    """`serve` looks for the simulated rig's objects before the index is opened to be searched, which says what is
-    wrong."""
+def test_an_index_whose_rows_name_no_object_belongs_to_no_rig(tmp_path):
+    """`serve` checks for the simulated rig's objects before it opens the index for search, which reports the error."""
     from retrieval.serve.rig import simulated_live_rig
 
     vectors = np.eye(2, dtype=np.float32)
@@ -218,15 +217,15 @@ def test_an_index_whose_rows_name_no_object_is_of_no_rig(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "{", '{"seed": 1' + "0" * 5000 + "}", "7"])
-def test_a_hostile_split_is_one_sentence(tmp_path, capsys, text):
+def test_a_hostile_split_gives_a_one_line_error(tmp_path, capsys, text):
     (tmp_path / "split.json").write_text(text)
     assert main(["check", str(tmp_path), "--split", str(tmp_path / "split.json")]) == 2
-    said = capsys.readouterr().err
-    assert "unexpected" not in said
-    assert len(said.splitlines()) == 1
+    message = capsys.readouterr().err
+    assert "unexpected" not in message
+    assert len(message.splitlines()) == 1
 
 
-def test_names_that_no_disk_takes_are_one_sentence(tmp_path, capsys):
+def test_file_names_that_no_disk_accepts_give_a_one_line_error(tmp_path, capsys):
     name = "n" * 10_000
     commands = [
         ["check", name],
@@ -248,6 +247,6 @@ def test_names_that_no_disk_takes_are_one_sentence(tmp_path, capsys):
         ["export", name],
     ]
     for command in commands:
-        code, said = main(command), capsys.readouterr().err.splitlines()
-        assert (code, [line for line in said if "unexpected" in line]) == (2, []), command
-        assert len(said[-1]) < 540, command
+        code, lines = main(command), capsys.readouterr().err.splitlines()
+        assert (code, [line for line in lines if "unexpected" in line]) == (2, []), command
+        assert len(lines[-1]) < 540, command

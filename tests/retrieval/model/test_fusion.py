@@ -1,4 +1,4 @@
-"""The fusion head and its halves, on every backbone, and scoring many photos at once."""
+"""The fusion head and its partial activations on every backbone, and scoring many photos at once."""
 
 import math
 
@@ -15,7 +15,7 @@ from retrieval.model.towers import TOWERS
 
 
 def concatenated_forward(matcher, touches, photos):
-    """The paper's network as it is drawn: one first layer over the concatenated features of all images."""
+    """The paper's network as published: one first layer over the concatenated features of all images."""
     fingers = [matcher.touch_tower(touches[:, finger]) for finger in range(touches.shape[1])]
     features = torch.cat([*fingers, matcher.photo_tower(photos)], dim=1)
     head = matcher.head
@@ -27,7 +27,7 @@ def concatenated_forward(matcher, touches, photos):
 
 @pytest.mark.parametrize("output", ["classes", "pooled"])
 @pytest.mark.parametrize("name", sorted(TOWERS))
-def test_the_logit_from_halves_equals_the_concatenated_forward(name, output):
+def test_the_logit_from_partial_activations_equals_the_concatenated_forward(name, output):
     torch.manual_seed(0)
     matcher = Matcher(MatcherConfig(tower=name, tower_output=output, hidden=64)).eval()
     touches, photos = torch.rand(3, 2, 3, 64, 64), torch.rand(3, 3, 64, 64)
@@ -35,12 +35,12 @@ def test_the_logit_from_halves_equals_the_concatenated_forward(name, output):
         touch = matcher.touch_encoding(matcher.touch_features(touches))
         photo = matcher.photo_encoding(matcher.photo_features(photos))
         ours, naive = matcher.head(touch.partial, photo.partial), concatenated_forward(matcher, touches, photos)
-    # 1e-5 relative to the size of what is summed in the last layer, float32.
+    # 1e-5 relative to the size of the terms of the last layer, float32.
     torch.testing.assert_close(ours, naive, rtol=1e-5, atol=1e-5 * float(naive.abs().max()))
     torch.testing.assert_close(matcher(touches, photos), ours, rtol=1e-4, atol=1e-4 * float(naive.abs().max()))
 
 
-def test_the_cosine_of_the_embeddings_adds_to_the_logit_and_travels_in_the_halves():
+def test_the_cosine_of_the_embeddings_adds_to_the_logit_and_is_part_of_the_partial_activations():
     torch.manual_seed(0)
     config = MatcherConfig(tower="small", tower_output="pooled", hidden=64, embedding_dim=16, cosine=True)
     matcher = Matcher(config).eval()
@@ -48,19 +48,19 @@ def test_the_cosine_of_the_embeddings_adds_to_the_logit_and_travels_in_the_halve
     with torch.inference_mode():
         touch = matcher.touch_encoding(matcher.touch_features(touches))
         photo = matcher.photo_encoding(matcher.photo_features(photos))
-        alone, cosine = concatenated_forward(matcher, touches, photos), (touch.embedding * photo.embedding).sum(1)
-        expected = alone + matcher.cosine_scale * cosine
+        without, cosine = concatenated_forward(matcher, touches, photos), (touch.embedding * photo.embedding).sum(1)
+        expected = without + matcher.cosine_scale * cosine
         assert touch.partial.shape == photo.partial.shape == (3, config.partial_width) == (3, 64 + 16)
         torch.testing.assert_close(matcher(touches, photos), expected, rtol=1e-5, atol=1e-5)
         two = score_partials(matcher.head, touch.partial[:2], photo.partial.numpy())
         by_pair = matcher.head(touch.partial[:2, None], photo.partial[None]).sum(0)
         torch.testing.assert_close(torch.from_numpy(two), by_pair, rtol=1e-5, atol=1e-5)
-        matcher.cosine_scale.fill_(-1.0)  # a match is never what lies apart
+        matcher.cosine_scale.fill_(-1.0)  # the scale never rewards a low cosine
         touch, photo = matcher.touch_encoding(torch.rand(3, 512)), matcher.photo_encoding(torch.rand(3, 256))
         assert not touch.partial[:, 64:].any()
 
 
-def test_a_feature_that_hardly_varies_is_not_scaled_up_where_plain_scaling_follows_its_rounding():
+def test_a_feature_that_hardly_varies_is_not_scaled_up_while_plain_scaling_amplifies_its_rounding():
     torch.manual_seed(0)
     features = torch.stack([torch.randn(400), 100 + 0.01 * torch.randn(400)], dim=1)
     ours, plain = Standardise(2), torch.nn.BatchNorm1d(2, affine=False)
@@ -68,14 +68,14 @@ def test_a_feature_that_hardly_varies_is_not_scaled_up_where_plain_scaling_follo
         for _ in range(200):
             norm(features)
         norm.eval()
-    rounded = features + torch.tensor([0.0, 0.1])  # a thousandth of the mean, as float16 weights give
+    rounded = features + torch.tensor([0.0, 0.1])  # a thousandth of the mean, like float16 weights
     moved = {norm: float((norm(rounded) - norm(features)).abs().max()) for norm in (ours, plain)}
     assert moved[ours] < 0.06
     assert moved[plain] > 5
     torch.testing.assert_close(ours(features)[:, 0], plain(features)[:, 0], rtol=0, atol=0)
 
 
-def test_quiet_features_are_left_quiet_in_training_too():
+def test_a_feature_that_hardly_varies_is_not_scaled_up_in_training_either():
     features = torch.stack([torch.randn(64), 100 + 0.01 * torch.randn(64)], dim=1)
     scaled = Standardise(2)(features).std(0)
     assert 0.9 < scaled[0] < 1.1
@@ -95,7 +95,7 @@ def test_the_paper_configuration_has_the_papers_layers():
     assert towers == [25_557_032, 25_557_032]
 
 
-def test_the_halves_start_as_one_layer_over_the_concatenation_would():
+def test_the_partial_activation_layers_start_like_one_layer_over_the_concatenation():
     torch.manual_seed(0)
     head = FusionHead(2000, 1000, 1024, 0.5)
     bound = 1 / math.sqrt(3000)
@@ -120,8 +120,8 @@ def test_another_number_of_gel_images_is_a_clear_error():
 
 def test_embeddings_have_norm_one_even_for_a_black_image():
     matcher = Matcher(MatcherConfig(tower="small", tower_output="pooled", hidden=8)).eval()
-    code = matcher.photo_encoding(matcher.photo_features(torch.zeros(2, 3, 64, 64)))
-    torch.testing.assert_close(code.embedding.norm(dim=1), torch.ones(2), rtol=0, atol=1e-6)
+    encoding = matcher.photo_encoding(matcher.photo_features(torch.zeros(2, 3, 64, 64)))
+    torch.testing.assert_close(encoding.embedding.norm(dim=1), torch.ones(2), rtol=0, atol=1e-6)
 
 
 def small_head(hidden=32, seed=0):
@@ -130,7 +130,7 @@ def small_head(hidden=32, seed=0):
 
 
 @pytest.mark.parametrize("block", [1, 5, 37, 1000])
-def test_scores_of_many_photos_are_the_logits_of_the_pairs_one_by_one_whatever_the_block(block, monkeypatch):
+def test_scores_of_many_photos_are_the_logits_of_single_pairs_for_any_block_size(block, monkeypatch):
     monkeypatch.setattr(fusion_scorer, "BLOCK", block)
     head, photos = small_head().eval(), np.random.default_rng(0).normal(size=(37, 32)).astype(np.float32)
     touches = torch.randn(3, 32)
@@ -141,24 +141,24 @@ def test_scores_of_many_photos_are_the_logits_of_the_pairs_one_by_one_whatever_t
     np.testing.assert_allclose(score_partials(head, touches, photos), expected, rtol=1e-5, atol=1e-5)
 
 
-def test_scoring_ignores_dropout_and_picks_the_asked_rows():
+def test_scoring_ignores_dropout_and_scores_the_requested_rows():
     head, photos = small_head(), np.random.default_rng(0).normal(size=(9, 32)).astype(np.float32)
     touch, rows = torch.randn(1, 32), np.array([7, 0, 3])
     everything = score_partials(head.train(), touch, photos)
     np.testing.assert_allclose(score_partials(head.eval(), touch, photos, rows), everything[rows], rtol=1e-6)
 
 
-def test_float16_halves_change_a_logit_by_less_than_the_rounding_they_carry():
+def test_float16_partial_activations_change_a_logit_by_less_than_their_rounding():
     head = small_head(hidden=256).eval()
     photos = np.random.default_rng(1).normal(size=(200, 256)).astype(np.float32)
     touch = torch.randn(1, 256)
     exact, stored = score_partials(head, touch, photos), score_partials(head, touch, photos.astype(np.float16))
-    # Float16 keeps 11 bits: a relative error of 2^-11 in each half, averaged down by the sum over 256 of them.
+    # Float16 has 11 bits: a relative error of 2^-11 in each unit, averaged down by the sum over 256 of them.
     assert np.abs(exact - stored).max() < 2**-11 * np.abs(photos).max()
     assert not np.array_equal(exact, stored)
 
 
-def test_a_logit_that_is_not_finite_is_an_error_where_sorting_would_rank_it_first():
+def test_a_logit_that_is_not_finite_is_an_error_although_sorting_would_rank_it_first():
     naive = np.argsort(np.array([0.2, np.nan, 0.9]))[::-1]
     assert naive[0] == 1  # the naive ranking puts the NaN on top
     photos = np.zeros((3, 32), dtype=np.float32)
@@ -168,12 +168,12 @@ def test_a_logit_that_is_not_finite_is_an_error_where_sorting_would_rank_it_firs
 
 
 def test_views_of_a_photo_reach_the_tower_one_by_one_with_channels_last():
-    """Convolutions in training take longer where they lie in memory channel by channel."""
+    """Convolutions in training take longer on memory that is laid out channel by channel."""
     matcher = Matcher(MatcherConfig(tower="small", tower_output="pooled", hidden=8), views=2)
-    strips = torch.rand(3, 16, 32, 3).permute(0, 3, 1, 2)  # as `to_batch` gives them
-    seen = []
-    matcher.photo_tower.register_forward_pre_hook(lambda _, images: seen.extend(images))
+    strips = torch.rand(3, 16, 32, 3).permute(0, 3, 1, 2)  # as from `to_batch`
+    inputs = []
+    matcher.photo_tower.register_forward_pre_hook(lambda _, images: inputs.extend(images))
     matcher.photo_features(strips)
     expected = [strips[photo, :, :, 16 * view : 16 * view + 16] for photo in range(3) for view in range(2)]
-    assert torch.equal(seen[0], torch.stack(expected))
-    assert seen[0].is_contiguous(memory_format=torch.channels_last)
+    assert torch.equal(inputs[0], torch.stack(expected))
+    assert inputs[0].is_contiguous(memory_format=torch.channels_last)

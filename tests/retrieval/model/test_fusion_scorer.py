@@ -1,4 +1,4 @@
-"""Judging stored halves in numpy: exact numbers, equals, and what is refused."""
+"""Scoring stored partial activations in numpy: exact numbers, ties, and refused values."""
 
 import numpy as np
 import pytest
@@ -15,58 +15,58 @@ def random_scorer(hidden, seed=0):
     return FusionScorer(second, bias, out, out_bias)
 
 
-def by_hand(judge, touch, photo):
+def by_hand(scorer, touch, photo):
     """One pair, in plain loops over units."""
     first = [max(float(t) + float(p), 0.0) for t, p in zip(touch, photo, strict=True)]
     second = [
         max(sum(w * x for w, x in zip(row, first, strict=True)) + b, 0.0)
-        for row, b in zip(judge.second, judge.second_bias, strict=True)
+        for row, b in zip(scorer.second, scorer.second_bias, strict=True)
     ]
-    return sum(w * x for w, x in zip(judge.out, second, strict=True)) + judge.out_bias[0]
+    return sum(w * x for w, x in zip(scorer.out, second, strict=True)) + scorer.out_bias[0]
 
 
-def test_a_logit_is_that_of_two_plain_loops_over_the_units():
-    judge, rng = random_scorer(5), np.random.default_rng(1)
+def test_a_logit_equals_that_of_two_plain_loops_over_the_units():
+    scorer, rng = random_scorer(5), np.random.default_rng(1)
     touches, photos = (rng.normal(size=(count, 5)).astype(np.float32) for count in (2, 7))
-    expected = [sum(by_hand(judge, touch, photo) for touch in touches) for photo in photos]
-    np.testing.assert_allclose(judge.logits(touches, photos), expected, rtol=1e-5, atol=1e-5)
+    expected = [sum(by_hand(scorer, touch, photo) for touch in touches) for photo in photos]
+    np.testing.assert_allclose(scorer.logits(touches, photos), expected, rtol=1e-5, atol=1e-5)
 
 
 def test_every_finite_float16_becomes_the_float32_of_the_same_value():
     every = np.arange(65536, dtype=np.uint16).view(np.float16)
     finite = every[np.isfinite(every)]
     assert np.array_equal(as_float32(finite), finite.astype(np.float32))
-    assert np.array_equal(np.signbit(as_float32(finite)), np.signbit(finite))  # -0 among them
+    assert np.array_equal(np.signbit(as_float32(finite)), np.signbit(finite))  # includes -0
     subnormal = np.float16(2.0**-24)
     assert as_float32(np.array([subnormal]))[0] == 2.0**-24
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_float16_that_is_not_finite_stays_so_where_shifting_its_bits_makes_a_number_of_it(bad):
+def test_a_float16_that_is_not_finite_stays_so_although_shifted_bits_would_make_it_finite(bad):
     values = np.array([1.0, bad], dtype=np.float16)
     naive = (values.view(np.int16).astype(np.int32) << 13 & 0x0FFFE000).view(np.float32) * np.float32(2.0**112)
     assert np.isfinite(naive).all()
     np.testing.assert_array_equal(as_float32(values), values.astype(np.float32))
 
 
-def test_halves_that_are_a_view_or_of_another_type_are_taken_as_they_are():
+def test_partial_activations_may_be_a_view_or_of_another_type():
     stored = np.random.default_rng(0).normal(size=(6, 8)).astype(np.float16)
     assert np.array_equal(as_float32(stored[::2, 1:]), stored[::2, 1:].astype(np.float32))
     assert np.array_equal(as_float32(stored.astype(np.float64)), stored.astype(np.float32))
 
 
-def test_judging_changes_neither_the_halves_nor_the_touch():
-    judge, rng = random_scorer(4), np.random.default_rng(2)
+def test_scoring_changes_neither_the_partial_activations_nor_the_touch():
+    scorer, rng = random_scorer(4), np.random.default_rng(2)
     touches, photos = (rng.normal(size=(3, 4)).astype(np.float32) for _ in range(2))
     before = touches.copy(), photos.copy()
-    judge.logits(touches, photos)
+    scorer.logits(touches, photos)
     assert np.array_equal(touches, before[0])
     assert np.array_equal(photos, before[1])
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_half_that_is_not_finite_is_named_by_its_row(bad, dtype):
+def test_a_partial_activation_that_is_not_finite_is_named_by_its_row(bad, dtype):
     photos = np.zeros((9, 4), dtype=dtype)
     photos[7, 2] = bad
     ones = FusionScorer(*(np.ones(shape, np.float32) for shape in ((4, 4), 4, 4, 1)))

@@ -1,4 +1,4 @@
-"""Is it a gel image, and is there a contact? Thresholds by hand, and what a fit on made-up features finds."""
+"""Is it a gel image, and is there a contact? Thresholds by hand, and a fit on synthetic features."""
 
 import math
 
@@ -17,31 +17,35 @@ CHECK = GelCheck(foreign_above=1.0, contact_above=0.5, level_above=4.0, rates={"
 
 
 def readings(*grasps):
-    """Readings (G, 2 fingers, 2) from ((foreign, contact), (foreign, contact)) of each."""
+    """Return readings (G, 2 fingers, 2) from ((foreign, contact), (foreign, contact)) of each grasp."""
     return np.array(grasps, dtype=np.float32)
 
 
-def test_one_finger_in_contact_is_a_contact_and_one_foreign_picture_is_none():
-    felt, no_contact, foreign = (-3, 2), (-3, -2), (5, 2)
-    judged = CHECK.classify(
-        readings((felt, felt), (no_contact, felt), (no_contact, no_contact), (felt, foreign), (foreign, no_contact))
+def test_one_finger_in_contact_is_a_contact_and_one_foreign_picture_is_not_a_gel():
+    contact, no_contact, foreign = (-3, 2), (-3, -2), (5, 2)
+    grasps = (
+        (contact, contact),
+        (no_contact, contact),
+        (no_contact, no_contact),
+        (contact, foreign),
+        (foreign, no_contact),
     )
-    assert judged == [CONTACT, CONTACT, NO_CONTACT, NOT_A_GEL, NOT_A_GEL]
+    assert CHECK.classify(readings(*grasps)) == [CONTACT, CONTACT, NO_CONTACT, NOT_A_GEL, NOT_A_GEL]
 
 
-def test_what_lies_at_a_threshold_is_a_gel_in_contact():
+def test_a_reading_at_a_threshold_is_a_gel_in_contact():
     assert CHECK.classify(readings(((1.0, 0.5), (1.0, 0.5)))) == [CONTACT]
 
 
-def test_a_no_contact_frame_decides_over_what_the_features_say():
-    said_felt, said_untouched = ((-3, 2), (-3, 2)), ((-3, -2), (-3, -2))
+def test_a_no_contact_frame_overrides_the_features():
+    contact, no_contact = ((-3, 2), (-3, 2)), ((-3, -2), (-3, -2))
     levels = np.array([[0.9, 1.1], [0.8, 30.0]], dtype=np.float32)
-    assert CHECK.classify(readings(said_felt, said_untouched), levels) == [NO_CONTACT, CONTACT]
+    assert CHECK.classify(readings(contact, no_contact), levels) == [NO_CONTACT, CONTACT]
 
 
-def test_what_the_recording_could_not_teach_refuses_nothing():
-    blind = GelCheck(None, None, None, {})
-    assert blind.classify(readings(((9, -9), (9, -9)))) == [CONTACT]
+def test_a_check_without_thresholds_refuses_nothing():
+    empty = GelCheck(None, None, None, {})
+    assert empty.classify(readings(((9, -9), (9, -9)))) == [CONTACT]
 
 
 def test_the_level_is_the_largest_difference_of_block_means_in_grey_levels():
@@ -55,13 +59,13 @@ def test_the_level_is_the_largest_difference_of_block_means_in_grey_levels():
     assert contact_level(touch, no_contact[:16]) == pytest.approx(20, abs=1e-3)
 
 
-def test_contact_begins_above_untouched_gels_and_as_far_up_as_it_costs_few_touches():
+def test_the_contact_threshold_is_above_no_contact_gels_and_as_high_as_it_costs_few_touches():
     no_contact, touches = np.arange(201.0), np.arange(500.0, 601.0)
     assert contact_threshold(no_contact, touches) == pytest.approx(502)  # 2 % of the touches lie below
-    assert contact_threshold(no_contact, np.arange(101.0)) == pytest.approx(199)  # .5 % of the untouched lie above
+    assert contact_threshold(no_contact, np.arange(101.0)) == pytest.approx(199)  # exceeded by .5 % of no-contact gels
 
 
-def test_it_is_written_and_read_back():
+def test_a_check_is_written_and_read_back():
     assert GelCheck.from_dict(CHECK.to_dict()) == CHECK
     assert GelCheck.from_dict(GelCheck(None, None, None, {}).to_dict()) == GelCheck(None, None, None, {})
 
@@ -84,7 +88,7 @@ def test_forged_thresholds_are_refused(change):
 
 
 @given(st.recursive(st.none() | st.booleans() | st.floats() | st.text(), lambda inner: st.lists(inner)))
-def test_whatever_stands_in_the_file_is_refused_in_a_sentence(data):
+def test_any_other_content_of_the_file_is_refused_with_one_sentence(data):
     with pytest.raises(BadInput):
         GelCheck.from_dict(data)
 
@@ -92,7 +96,7 @@ def test_whatever_stands_in_the_file_is_refused_in_a_sentence(data):
 # Foreign pictures ------------------------------------------------------------------------------------------
 
 
-def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_again():
+def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_pictures_again():
     photo, gel = np.full((40, 60, 3), 0.4, dtype=np.float32), np.full((30, 40, 3), 0.6, dtype=np.float32)
     drawn = list(draw_foreign(21, 16, [photo], [gel], seed=3))
     assert [name for name, _ in drawn[:7]] == [*SYNTHETIC_KINDS, "photo", "false colours"]
@@ -107,7 +111,7 @@ def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_again():
 
 
 @pytest.mark.parametrize(("count", "px"), [(0, 16), (5, 4)])
-def test_nothing_and_specks_are_not_drawn(count, px):
+def test_an_empty_draw_and_tiny_pictures_are_refused(count, px):
     with pytest.raises(BadInput, match="count must be at least 1 and px at least 8"):
         list(draw_foreign(count, px, [], []))
 
@@ -116,8 +120,10 @@ def test_nothing_and_specks_are_not_drawn(count, px):
 
 
 def pictures(seed, no_contact=60):
-    """Features (8) around three far places: touches, untouched gels, foreign pictures, half of these in false colours
-    and lying among the touches."""
+    """Return features (8) around three distant centres: touches, no-contact gels and foreign pictures.
+
+    Half of the foreign pictures have false colours and are among the touches.
+    """
     rng = np.random.default_rng(seed)
 
     def around(place, *shape):
@@ -129,12 +135,12 @@ def pictures(seed, no_contact=60):
     return GelCheckFeatures(around(places[0], 80, 2), around(places[1], no_contact, 2), foreign, is_plainly_foreign)
 
 
-def test_kinds_that_lie_apart_are_told_apart_on_others_of_their_kind():
+def test_distant_kinds_are_separated_on_other_pictures_of_the_same_kinds():
     head = fit_gel_head(pictures(0))
     check = fit_gel_check(head, pictures(1), levels=([0.5, 0.7, 0.9], [12.0, 30.0]))
     assert check.rates["foreign_rejected"] == 1
     assert check.rates["touches_rejected_as_foreign"] <= 0.02
-    assert check.rates["touches_rejected_as_no_contact"] == 0.025  # 2 of 80, as many as may be lost
+    assert check.rates["touches_rejected_as_no_contact"] == 0.025  # 2 of 80, the accepted loss
     assert check.rates["no_contact_accepted"] == 0
     assert check.level_above == pytest.approx(12.36)  # 2 % of the way from 12 to 30
     with torch.inference_mode():
@@ -143,7 +149,7 @@ def test_kinds_that_lie_apart_are_told_apart_on_others_of_their_kind():
         assert check.classify(head(others.no_contact).numpy()).count(NO_CONTACT) >= 58
 
 
-def test_where_nothing_was_recorded_before_a_contact_every_gel_counts_as_touched():
+def test_without_no_contact_frames_every_gel_is_a_contact():
     head = fit_gel_head(pictures(0, no_contact=0))
     check = fit_gel_check(head, pictures(1, no_contact=0), levels=([], []))
     assert (check.contact_above, check.level_above) == (None, None)
@@ -153,7 +159,7 @@ def test_where_nothing_was_recorded_before_a_contact_every_gel_counts_as_touched
 
 
 def test_a_feature_that_never_varies_gives_no_infinite_weight():
-    lesson = pictures(0)
-    for part in (lesson.touch, lesson.no_contact, lesson.foreign):
+    features = pictures(0)
+    for part in (features.touch, features.no_contact, features.foreign):
         part[..., 7] = 3.0
-    assert bool(torch.isfinite(fit_gel_head(lesson).classifier.weight).all())
+    assert bool(torch.isfinite(fit_gel_head(features).classifier.weight).all())

@@ -19,7 +19,7 @@ def unit(*shape, seed=0):
 
 
 def loss_by_loops(scores, rows, columns):
-    """For each row with a positive and a negative: the mean over positives of -log softmax among the negatives."""
+    """Return the mean over rows, with a positive and a negative, of -log softmax of positives among the negatives."""
     total = []
     for i, row in enumerate(rows):
         negatives = [math.exp(scores[i][j]) for j, column in enumerate(columns) if column != row]
@@ -29,7 +29,7 @@ def loss_by_loops(scores, rows, columns):
     return sum(total) / len(total)
 
 
-def test_the_contrastive_loss_is_what_plain_loops_give():
+def test_the_contrastive_loss_equals_that_of_plain_loops():
     touch, photo = unit(4, 8), unit(6, 8, seed=1)
     touch_objects, photo_objects = torch.tensor([0, 1, 1, 2]), torch.tensor([0, 0, 1, 2, 3, 1])
     scale = torch.tensor(math.log(5.0))
@@ -60,8 +60,8 @@ def test_a_batch_of_one_object_has_no_contrast_and_no_nan():
     assert torch.equal(touch.grad, torch.zeros_like(touch))
 
 
-def test_a_row_of_positives_alone_has_nothing_to_pick_from_and_does_not_thin_the_mean():
-    """Rows: two positives; a positive at 1 beside a negative at 3; two negatives. Only the second one counts."""
+def test_a_row_without_negatives_does_not_count_in_the_mean():
+    """Rows: two positives; a positive at 1 and a negative at 3; two negatives. Only the second one counts."""
     scores = torch.tensor([[5.0, -5.0], [1.0, 3.0], [0.0, 0.0]], requires_grad=True)
     loss = pick_loss(scores, torch.tensor([[True, True], [True, False], [False, False]]))
     loss.backward()
@@ -77,8 +77,8 @@ def test_photos_count_where_no_touch_has_both_a_positive_and_a_negative():
     assert loss.item() == pytest.approx(math.log(1 + math.exp(-1)) / 2, rel=1e-6)
 
 
-def test_the_hardest_pair_at_the_largest_scale_keeps_its_loss_and_gradient():
-    """Positive at cosine -1, negative at +1, scale 100: the loss is 200; log(num / den + tiny) would stick at 88."""
+def test_the_hardest_pair_at_the_largest_scale_has_its_full_loss_and_gradient():
+    """Positive at cosine -1, negative at +1, scale 100: the loss is 200; log(num / den + tiny) would stop at 88."""
     touch = torch.tensor([[1.0, 0.0]], requires_grad=True)
     photo = torch.tensor([[-1.0, 0.0], [1.0, 0.0]])
     objects = torch.tensor([0]), torch.tensor([0, 1])
@@ -91,14 +91,14 @@ def test_the_hardest_pair_at_the_largest_scale_keeps_its_loss_and_gradient():
     assert float(touch.grad.abs().sum()) > 50
 
 
-def test_the_match_loss_is_what_the_formula_says():
+def test_the_match_loss_equals_the_formula():
     logits, labels = torch.tensor([0.0, 2.0, -1.0]), torch.tensor([1.0, 0.0, 1.0])
     expected = (math.log(2) + math.log(1 + math.exp(2)) + math.log(1 + math.exp(1))) / 3
     assert match_loss(logits, labels).item() == pytest.approx(expected, rel=1e-6)
 
 
 def at_angles(*degrees):
-    """Unit vectors of the plane."""
+    """Return unit vectors of the plane."""
     radians = torch.tensor(degrees, dtype=torch.float64) * math.pi / 180
     return torch.stack([radians.cos(), radians.sin()], 1)
 
@@ -112,7 +112,7 @@ def sigmoid_loss_by_loops(cosines, rows, columns, scale, bias):
     return total / len(rows)
 
 
-def test_both_losses_at_known_angles_are_what_two_loops_give():
+def test_both_losses_at_known_angles_equal_those_of_two_loops():
     touch, photo = at_angles(0, 90), at_angles(0, 60, 180)
     cosines = [[1.0, 0.5, -1.0], [0.0, math.sqrt(3) / 2, 0.0]]
     rows, columns = [0, 1], [0, 1, 0]
@@ -126,7 +126,7 @@ def test_both_losses_at_known_angles_are_what_two_loops_give():
     assert got.item() == pytest.approx(expected, rel=1e-6)
 
 
-def test_the_sigmoid_loss_starts_near_what_calling_every_pair_false_costs():
+def test_the_sigmoid_loss_starts_near_the_cost_of_calling_every_pair_false():
     """Scale 10 and bias -10: of orthogonal pairs only the positives cost; with a bias of 0 every pair would."""
     touch, photo, objects = torch.eye(16)[:8], torch.eye(16)[8:], torch.arange(8)
     scale, bias = torch.tensor(SIGMOID_LOG_SCALE_INIT), torch.tensor(SIGMOID_BIAS_INIT)
@@ -134,7 +134,7 @@ def test_the_sigmoid_loss_starts_near_what_calling_every_pair_false_costs():
     assert loss.item() == pytest.approx(10.0, abs=1e-3)
 
 
-def test_a_sigmoid_loss_of_its_own_parameters_is_that_of_the_function_and_its_scale_ends_at_100():
+def test_a_sigmoid_loss_equals_the_function_of_its_parameters_and_its_scale_ends_at_100():
     objects, touch, photo = torch.arange(3), unit(3, 4).float(), unit(3, 4, seed=1).float()
     loss = SigmoidLoss(embedding_dim=4, objects=3)
     batch = EncodedBatch(None, ImageEncoding(touch, touch), ImageEncoding(photo, photo), objects, objects)
@@ -148,8 +148,8 @@ def test_a_sigmoid_loss_of_its_own_parameters_is_that_of_the_function_and_its_sc
     assert loss.log_scale.item() == pytest.approx(LOG_SCALE_MAX)
 
 
-def test_logits_of_ten_thousand_either_way_keep_loss_and_gradient():
-    """Two wrong pairs and two right ones at +-1e4; -log(sigmoid) and exp would be infinite there."""
+def test_logits_of_plus_and_minus_ten_thousand_give_finite_loss_and_gradient():
+    """Two wrong pairs and two correct ones at +-1e4; -log(sigmoid) and exp would be infinite there."""
     touch = torch.tensor([[1.0, 0.0], [-1.0, 0.0]], requires_grad=True)
     photo = torch.tensor([[-1.0, 0.0], [1.0, 0.0]])
     objects, scale = torch.tensor([0, 1]), torch.tensor(math.log(1e4))
@@ -162,8 +162,8 @@ def test_logits_of_ten_thousand_either_way_keep_loss_and_gradient():
         assert loss.item() == pytest.approx(2e4, rel=1e-4)  # both of a touch's pairs, or the gap between them
         assert torch.isfinite(gradient).all()
         assert float(gradient.abs().sum()) > 1e4
-    right = sigmoid_loss(touch, -photo, objects, objects, scale, torch.tensor(0.0))
-    assert right.item() == 0.0
+    correct = sigmoid_loss(touch, -photo, objects, objects, scale, torch.tensor(0.0))
+    assert correct.item() == 0.0
 
 
 @pytest.mark.parametrize("logit", [1e4, -1e4])
@@ -200,14 +200,14 @@ def test_half_precision_embeddings_lose_only_their_own_rounding(dtype):
         exact = loss(touch.to(dtype).double(), photo.to(dtype).double(), *labels, scale)
         assert rounded.dtype == torch.float32
         assert rounded.item() == pytest.approx(exact.item(), rel=1e-5)  # the sums are in float32
-    # What the arithmetic itself would lose at 100 times a cosine, done in half precision:
+    # The loss of the same arithmetic in half precision, at 100 times a cosine:
     naive = (100 * touch.to(dtype) @ photo.to(dtype).T).double() - 100 * touch.to(dtype).double() @ photo.to(
         dtype
     ).T.double()
     assert naive.abs().max() > 0.005
 
 
-def test_the_listwise_loss_of_match_logits_is_that_of_two_loops():
+def test_the_listwise_loss_of_match_logits_equals_that_of_two_loops():
     scores = torch.tensor([[2.0, -1.0, 0.5], [0.0, 1.0, 3.0]])
     touch_objects, photo_objects = torch.tensor([0, 1]), torch.tensor([0, 1, 0])
 
@@ -221,6 +221,6 @@ def test_the_listwise_loss_of_match_logits_is_that_of_two_loops():
 
     table = scores.tolist()
     turned = scores.T.tolist()
-    wanted = (one_way(table, [0, 1], [0, 1, 0]) + one_way(turned, [0, 1, 0], [0, 1])) / 2
-    assert float(listwise_loss(scores, touch_objects, photo_objects)) == pytest.approx(wanted, rel=1e-6)
+    expected = (one_way(table, [0, 1], [0, 1, 0]) + one_way(turned, [0, 1, 0], [0, 1])) / 2
+    assert float(listwise_loss(scores, touch_objects, photo_objects)) == pytest.approx(expected, rel=1e-6)
     assert torch.isfinite(listwise_loss(scores * 1e4, touch_objects, photo_objects))

@@ -1,4 +1,4 @@
-"""The encoder of a long build: the faster one of two that give the same halves."""
+"""The encoder of a long build: the faster one of two with the same partial activations."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def pictures(checkpoint, count=3):
     return list(np.random.default_rng(0).random((count, *shape), dtype=np.float32))
 
 
-def test_both_give_the_same_halves_and_embeddings_of_several_views():
+def test_both_encoders_give_the_same_partial_activations_and_embeddings_of_several_views():
     pytest.importorskip("onnxruntime")
     shipped = load_checkpoint(shipped_model())
     ours, theirs = (make(shipped)(pictures(shipped)) for make in (torch_photo_encoder, onnx_photo_encoder))
@@ -25,40 +25,40 @@ def test_both_give_the_same_halves_and_embeddings_of_several_views():
     assert np.allclose(ours.embedding, theirs.embedding, atol=1e-4)
 
 
-def test_pytorch_encodes_where_the_other_is_missing_slower_or_wrong(model, monkeypatch, caplog):
+def test_pytorch_encodes_if_onnx_runtime_is_missing_slower_or_wrong(model, monkeypatch, caplog):
     checkpoint = load_checkpoint(model)
     images = pictures(checkpoint)
-    right = torch_photo_encoder(checkpoint)(images)
+    expected = torch_photo_encoder(checkpoint)(images)
     monkeypatch.setattr(photo_encoder, "find_spec", lambda name: None)
     assert onnx_photo_encoder(checkpoint) is None
-    assert np.array_equal(fastest_photo_encoder(checkpoint)(images).partial, right.partial)
+    assert np.array_equal(fastest_photo_encoder(checkpoint)(images).partial, expected.partial)
     ours = torch_photo_encoder(checkpoint)
     monkeypatch.setattr(
-        photo_encoder, "onnx_photo_encoder", lambda _: lambda given: PhotoEncodings(ours(given).partial + 1, None)
+        photo_encoder, "onnx_photo_encoder", lambda _: lambda batch: PhotoEncodings(ours(batch).partial + 1, None)
     )
-    assert np.array_equal(fastest_photo_encoder(checkpoint)(images).partial, right.partial)
-    assert "gives other halves" in caplog.text
+    assert np.array_equal(fastest_photo_encoder(checkpoint)(images).partial, expected.partial)
+    assert "gives other partial activations" in caplog.text
     monkeypatch.setattr(
-        photo_encoder, "onnx_photo_encoder", lambda _: lambda given: ours(given)._replace(embedding=None)
+        photo_encoder, "onnx_photo_encoder", lambda _: lambda batch: ours(batch)._replace(embedding=None)
     )
-    for seconds, expected in (((1.0, 2.0), "torch"), ((2.0, 1.0), "onnx")):
+    for seconds, fastest in (((1.0, 2.0), "torch"), ((2.0, 1.0), "onnx")):
         turns = iter(seconds * photo_encoder.ROUNDS)
         monkeypatch.setattr(photo_encoder, "_seconds", lambda encode, images, turns=turns: next(turns))
         chosen = fastest_photo_encoder(checkpoint)
-        assert (chosen(images).embedding is None) == (expected == "onnx")
+        assert (chosen(images).embedding is None) == (fastest == "onnx")
 
 
-def test_a_long_build_by_either_gives_the_same_index(catalogue, model, tmp_path, monkeypatch):
+def test_a_long_build_gives_the_same_index_with_either_encoder(catalogue, model, tmp_path, monkeypatch):
     pytest.importorskip("onnxruntime")
     checkpoint = load_checkpoint(model)
     build_index(catalogue, checkpoint, tmp_path / "torch", quiet=True)
-    asked = []
+    calls = []
     monkeypatch.setattr("retrieval.search.build.embed.MIN_PHOTOS_TO_TUNE", 1)
     monkeypatch.setattr(
-        "retrieval.search.build.embed.fastest_photo_encoder", lambda made: asked.append(1) or onnx_photo_encoder(made)
+        "retrieval.search.build.embed.fastest_photo_encoder", lambda made: calls.append(1) or onnx_photo_encoder(made)
     )
     build_index(catalogue, checkpoint, tmp_path / "onnx", quiet=True)
-    assert asked == [1]  # once a build
+    assert calls == [1]  # once per build
     ours, theirs = (IndexStore(tmp_path / name).open() for name in ("torch", "onnx"))
     assert [row["id"] for row in ours.rows] == [row["id"] for row in theirs.rows]
     partials = [np.asarray(each.arrays["partials"], np.float32) for each in (ours, theirs)]

@@ -1,4 +1,4 @@
-"""The posterior: probabilities by hand, the naive formulas that fail, and planted numbers that the fit finds again."""
+"""The posterior: probabilities by hand, naive formulas that fail, and a fit that recovers planted parameters."""
 
 import math
 
@@ -13,30 +13,30 @@ from retrieval.model.posterior import MAX_GRASPS, SLOPE_BOUNDS, EvidenceMass, Po
 ADDING = Posterior(slope=1.0, offset=0.0, dependence=0.0)
 
 
-def test_logits_of_nothing_leave_the_prior():
-    belief = ADDING.probabilities([0.0, 0.0], none_prior=0.5)
-    assert belief.none == pytest.approx(0.5)
-    assert belief.objects == pytest.approx([0.25, 0.25])
-    assert belief.unscored == 0
+def test_equal_logits_leave_the_prior():
+    found = ADDING.probabilities([0.0, 0.0], none_prior=0.5)
+    assert found.none == pytest.approx(0.5)
+    assert found.objects == pytest.approx([0.25, 0.25])
+    assert found.unscored == 0
 
 
-def test_probabilities_are_those_reckoned_by_hand():
+def test_probabilities_equal_those_calculated_by_hand():
     # Weights: none 1/2; objects 1/4 * 3 and 1/4; together 3/2.
-    belief = ADDING.probabilities([math.log(3), 0.0], none_prior=0.5)
-    assert belief.none == pytest.approx(1 / 3)
-    assert belief.objects == pytest.approx([1 / 2, 1 / 6])
+    found = ADDING.probabilities([math.log(3), 0.0], none_prior=0.5)
+    assert found.none == pytest.approx(1 / 3)
+    assert found.objects == pytest.approx([1 / 2, 1 / 6])
     # A prior of 1/5: 1/5, 4/10 * 3 and 4/10; together 9/5.
-    belief = ADDING.probabilities([math.log(3), 0.0], none_prior=0.2)
-    assert (belief.none, *belief.objects) == pytest.approx((1 / 9, 6 / 9, 2 / 9))
+    found = ADDING.probabilities([math.log(3), 0.0], none_prior=0.2)
+    assert (found.none, *found.objects) == pytest.approx((1 / 9, 6 / 9, 2 / 9))
 
 
-def test_what_was_not_judged_keeps_its_share():
-    # Four objects, two of them judged: 1/8 * 4 and 1/8; the two others like the sample, whose ratios 1 and 3 mean 2.
-    belief = ADDING.probabilities([math.log(4), 0.0], none_prior=0.5, unscored=2, sample=[0.0, math.log(3)])
+def test_unscored_objects_have_the_probability_of_the_sample():
+    # Four objects, two of them scored: 1/8 * 4 and 1/8; the two others like the sample, whose ratios 1 and 3 average 2.
+    found = ADDING.probabilities([math.log(4), 0.0], none_prior=0.5, unscored=2, sample=[0.0, math.log(3)])
     total = 4 / 8 + 4 / 8 + 1 / 8 + 2 * 2 / 8
-    assert belief.none == pytest.approx(0.5 / total)
-    assert belief.unscored == pytest.approx(0.5 / total)
-    assert belief.objects == pytest.approx([0.5 / total, 0.125 / total])
+    assert found.none == pytest.approx(0.5 / total)
+    assert found.unscored == pytest.approx(0.5 / total)
+    assert found.objects == pytest.approx([0.5 / total, 0.125 / total])
 
 
 @given(
@@ -45,93 +45,93 @@ def test_what_was_not_judged_keeps_its_share():
     st.integers(1, 9),
     st.lists(st.floats(-1e6, 1e6), max_size=5),
 )
-def test_all_that_may_be_adds_up_to_one_and_ranks_as_the_logits_do(logits, prior, grasps, sample):
+def test_probabilities_add_up_to_one_and_have_the_order_of_the_logits(logits, prior, grasps, sample):
     posterior = Posterior(slope=0.7, offset=-0.3, dependence=0.6)
-    belief = posterior.probabilities(logits, grasps, none_prior=prior, unscored=7 if sample else 0, sample=sample)
-    assert belief.none + belief.unscored + belief.objects.sum() == pytest.approx(1)
+    found = posterior.probabilities(logits, grasps, none_prior=prior, unscored=7 if sample else 0, sample=sample)
+    assert found.none + found.unscored + found.objects.sum() == pytest.approx(1)
     order = np.argsort(logits)
-    assert (np.diff(belief.objects[order]) >= 0).all()
+    assert (np.diff(found.objects[order]) >= 0).all()
 
 
-def test_large_logits_are_right_where_the_obvious_formula_is_not_a_number():
+def test_large_logits_give_probabilities_where_the_naive_formula_gives_nan():
     logits = np.array([1000.0, 999.0])
     with np.errstate(over="ignore", invalid="ignore"):
         naive = np.exp(logits) / (np.exp(logits).sum() + 1)
     assert np.isnan(naive).all()
-    belief = ADDING.probabilities(logits, none_prior=0.5)
-    assert belief.objects == pytest.approx([1 / (1 + math.exp(-1)), math.exp(-1) / (1 + math.exp(-1))])
+    found = ADDING.probabilities(logits, none_prior=0.5)
+    assert found.objects == pytest.approx([1 / (1 + math.exp(-1)), math.exp(-1) / (1 + math.exp(-1))])
     assert ADDING.probabilities(-logits, none_prior=0.5).none == 1.0
 
 
-def test_the_probability_if_present_is_that_reckoned_by_hand_whatever_the_prior_and_the_offset():
+def test_the_probability_if_present_equals_that_by_hand_for_any_prior_and_offset():
     # Weights 3 and 1, together 4.
     for offset, prior in ((0.0, 0.5), (-3.0, 0.9), (2.0, 0.0)):
-        belief = Posterior(1.0, offset, 0.0).probabilities([math.log(3), 0.0], none_prior=prior)
-        assert belief.objects_if_present == pytest.approx([3 / 4, 1 / 4])
-    # Four objects, two of them judged: weights 4 and 1; the two others weigh 2 each, the mean of the sample.
-    belief = ADDING.probabilities([math.log(4), 0.0], unscored=2, sample=[0.0, math.log(3)])
-    assert belief.objects_if_present == pytest.approx([4 / 9, 1 / 9])
-    # Two grasps: w = 1 / 1.5, so that logits of 1.5 log 3 and 0 weigh 3 and 1.
-    belief = Posterior(1.0, 0.0, 0.5).probabilities([1.5 * math.log(3), 0.0], 2)
-    assert belief.objects_if_present == pytest.approx([3 / 4, 1 / 4])
+        found = Posterior(1.0, offset, 0.0).probabilities([math.log(3), 0.0], none_prior=prior)
+        assert found.objects_if_present == pytest.approx([3 / 4, 1 / 4])
+    # Four objects, two of them scored: weights 4 and 1; the two others weigh 2 each, the mean of the sample.
+    found = ADDING.probabilities([math.log(4), 0.0], unscored=2, sample=[0.0, math.log(3)])
+    assert found.objects_if_present == pytest.approx([4 / 9, 1 / 9])
+    # Two grasps: w = 1 / 1.5, so logits of 1.5 log 3 and 0 weigh 3 and 1.
+    found = Posterior(1.0, 0.0, 0.5).probabilities([1.5 * math.log(3), 0.0], 2)
+    assert found.objects_if_present == pytest.approx([3 / 4, 1 / 4])
 
 
-def test_parts_of_a_catalogue_joined_give_the_probability_if_present_of_the_whole():
+def test_merged_parts_of_a_catalogue_give_the_probability_if_present_of_the_whole():
     # Weights 4, 1 | 3, 8: 16 together. The parts' largest logits differ.
     parts = [ADDING.mass([math.log(4), 0.0]), ADDING.mass([math.log(3), math.log(8)])]
-    belief = ADDING.probabilities_given([math.log(8), math.log(4)], EvidenceMass.merged(parts))
-    assert belief.objects_if_present == pytest.approx([1 / 2, 1 / 4])
+    found = ADDING.probabilities_given([math.log(8), math.log(4)], EvidenceMass.merged(parts))
+    assert found.objects_if_present == pytest.approx([1 / 2, 1 / 4])
 
 
-def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_quotient_is_not_a_number():
-    belief = ADDING.probabilities([-1000.0, -1001.0])
-    assert belief.none == 1.0
+def test_where_none_rounds_to_one_the_probability_if_present_is_exact_and_the_quotient_is_nan():
+    found = ADDING.probabilities([-1000.0, -1001.0])
+    assert found.none == 1.0
     with np.errstate(invalid="ignore"):
-        assert np.isnan(belief.objects / (1 - belief.none)).all()
-    assert belief.objects_if_present == pytest.approx([1 / (1 + math.exp(-1)), 1 / (1 + math.e)])
-    # Short of that, the quotient has lost its digits: 1 - P(none) is a multiple of 1e-16.
-    belief = ADDING.probabilities([-32.0, -33.0])
+        assert np.isnan(found.objects / (1 - found.none)).all()
+    assert found.objects_if_present == pytest.approx([1 / (1 + math.exp(-1)), 1 / (1 + math.e)])
+    # Before that point the quotient has lost its digits: 1 - P(none) is a multiple of 1e-16.
+    found = ADDING.probabilities([-32.0, -33.0])
     exact = 1 / (1 + math.exp(-1))
-    assert belief.objects[0] / (1 - belief.none) != pytest.approx(exact, rel=1e-3)
-    assert belief.objects_if_present[0] == pytest.approx(exact)
+    assert found.objects[0] / (1 - found.none) != pytest.approx(exact, rel=1e-3)
+    assert found.objects_if_present[0] == pytest.approx(exact)
 
 
 @pytest.mark.parametrize(
     ("dependence", "logit", "grasps", "prior", "more"),
     [
-        # Of four objects at even odds w l must exceed log 4 = 1.386. By half dependent, 1 to 5 like grasps of logit 1
-        # together weigh 1, 1.333, 1.5, 1.6 and 1.667.
+        # Of four objects at even odds w l must exceed log 4 = 1.386. At dependence 0.5, 1 to 5 grasps of logit 1 weigh
+        # 1, 1.333, 1.5, 1.6 and 1.667 together.
         (0.5, 1.0, 1, 0.5, 2),
         (0.5, 1.1, 1, 0.5, 1),  # 1.1 * 1.333 = 1.467
         (0.5, 0.85, 1, 0.5, 4),  # 0.85 * 1.6 = 1.36, * 1.667 = 1.417
         (0.5, 0.8, 1, 0.5, None),  # 0.8 * 1.667 = 1.333
         (0.5, 2.0, 2, 0.5, 1),  # a sum of two grasps of logit 1
-        (0.5, 4.1, 5, 0.5, None),  # of more than five nothing is known
+        (0.5, 4.1, 5, 0.5, None),  # no estimate beyond five grasps
         (0.5, -1.0, 1, 0.5, None),
         (0.0, 0.5, 1, 0.5, 2),  # three independent ones: 1.5
         (1.0, 1.3, 1, 0.5, None),  # more of the same
         (0.5, 2.0, 1, 0.8, 2),  # log 4 + log (0.8 / 0.2) = 2.773; 2.667, 3
     ],
 )
-def test_the_further_grasps_to_a_match_are_those_reckoned_by_hand(dependence, logit, grasps, prior, more):
+def test_the_further_grasps_to_a_match_equal_those_calculated_by_hand(dependence, logit, grasps, prior, more):
     assert Posterior(1.0, 0.0, dependence).more_grasps(logit, 4, grasps, prior) == more
 
 
 @given(st.floats(-5, 5), st.floats(-3, 3), st.floats(0, 1), st.integers(1, 4), st.floats(0.05, 0.95))
-def test_after_the_further_grasps_and_no_fewer_the_best_object_is_likelier_than_none(
+def test_after_the_further_grasps_and_no_fewer_the_best_object_is_more_likely_than_none(
     logit, offset, dependence, grasps, prior
 ):
-    """Where these are like those so far."""
+    """The further grasps resemble the previous ones."""
     posterior = Posterior(1.0, offset, dependence)
     totals = range(grasps, MAX_GRASPS + 1)
-    beliefs = [posterior.probabilities([logit * n / grasps, -1e6, -1e6], n, none_prior=prior) for n in totals]
-    gaps = [belief.objects[0] - belief.none for belief in beliefs]
-    assume(gaps[0] <= 0 and min(map(abs, gaps)) > 1e-9)  # else rounding decides
+    answers = [posterior.probabilities([logit * n / grasps, -1e6, -1e6], n, none_prior=prior) for n in totals]
+    gaps = [answer.objects[0] - answer.none for answer in answers]
+    assume(gaps[0] <= 0 and min(map(abs, gaps)) > 1e-9)  # otherwise rounding decides
     matches = [more for more, gap in enumerate(gaps) if gap > 0]
     assert posterior.more_grasps(logit, 3, grasps, prior) == (matches[0] if matches else None)
 
 
-def test_grasps_that_are_alike_weigh_less_than_independent_ones():
+def test_dependent_grasps_weigh_less_than_independent_ones():
     alike, apart = Posterior(2.0, 0.0, dependence=1.0), Posterior(2.0, 0.0, dependence=0.0)
     assert [alike.weight(grasps) for grasps in (1, 2, 4)] == [2.0, 1.0, 0.5]  # the sum of four becomes their mean
     assert [apart.weight(grasps) for grasps in (1, 2, 4)] == [2.0, 2.0, 2.0]
@@ -143,13 +143,13 @@ def test_an_object_with_one_photo_has_its_match_logit():
     assert logits == pytest.approx([1.25, -3.5], abs=1e-12)
 
 
-def test_an_objects_logit_is_the_mean_of_its_photos_likelihoods():
+def test_an_objects_logit_averages_the_likelihoods_of_its_photos():
     posterior = Posterior(0.8, 0.3, 0.5)
     scores, owner, counts = np.array([2.0, -1.0, 0.5, 3.0]), np.array([0, 1, 0, 1]), np.array([2, 3])
     weight = 0.8 / 1.5
     expected = [
         math.log((math.exp(2 * weight) + math.exp(0.5 * weight)) / 2) / weight,
-        math.log((math.exp(-weight) + math.exp(3 * weight) + 0) / 3) / weight,  # its third photo was not judged
+        math.log((math.exp(-weight) + math.exp(3 * weight) + 0) / 3) / weight,  # its third photo was not scored
     ]
     assert posterior.object_logits(scores, owner, counts, grasps=2) == pytest.approx(expected)
     # exp(900) is infinite in float64.
@@ -157,9 +157,10 @@ def test_an_objects_logit_is_the_mean_of_its_photos_likelihoods():
 
 
 def normal_logits(objects, touches, photos, apart, alike, seed=0):
-    """Log likelihood ratios of two normal distributions, d apart in units of their deviation: calibrated as they are.
+    """Return log likelihood ratios of two normal distributions, calibrated as they are.
 
-    alike: the share of the noise of a touch that all touches of its object have in common.
+    apart: distance of the distributions in standard deviations. alike: fraction of the noise of a touch that all
+    touches of its object have in common.
     """
     rng = np.random.default_rng(seed)
     owner, photo_owner = np.repeat(np.arange(objects), touches), np.repeat(np.arange(objects), photos)
@@ -174,16 +175,16 @@ def changed(scored, scale, shift):
     return ScoredTouches(scale * scored.logits + shift, scored.touch_owner, scored.photo_owner, scored.own)
 
 
-def test_the_fit_finds_planted_numbers_again():
+def test_the_fit_recovers_planted_parameters():
     true = normal_logits(300, 1, 1, apart=2.5, alike=0)
     found = fit_posterior(changed(true, 4, 10))  # log ratio = logit / 4 - 10 / 4
     assert found.slope == pytest.approx(1 / 4, rel=0.1)
     for log_ratio in (-1.0, 0.0, 2.0):
         assert found.slope * (4 * log_ratio + 10) + found.offset == pytest.approx(log_ratio, abs=0.3)
-    assert found.dependence == 1.0  # nothing is known of it
+    assert found.dependence == 1.0  # single grasps do not determine it
 
 
-def test_independent_grasps_are_found_to_be_so_and_equal_ones_too():
+def test_the_fit_recognises_independent_grasps_and_equal_ones():
     apart = fit_posterior(normal_logits(100, 2, 1, apart=1.5, alike=0))
     assert apart.dependence < 0.12
     alike = fit_posterior(normal_logits(100, 2, 1, apart=1.5, alike=1))
@@ -192,7 +193,7 @@ def test_independent_grasps_are_found_to_be_so_and_equal_ones_too():
 
 
 @pytest.mark.parametrize(("touches", "unit", "shift"), [(2, 20, 0), (2, 0.05, 0), (1, 20, 1000), (1, 1, -300)])
-def test_the_unit_of_the_logits_makes_no_difference_and_for_one_grasp_neither_does_their_middle(touches, unit, shift):
+def test_the_unit_of_the_logits_does_not_matter_nor_for_one_grasp_their_median(touches, unit, shift):
     scored = normal_logits(60, touches, 1, apart=2, alike=0.3)
     plain, other = fit_posterior(scored), fit_posterior(changed(scored, unit, shift))
     assert other.slope == pytest.approx(plain.slope / unit, rel=1e-2)
@@ -202,7 +203,7 @@ def test_the_unit_of_the_logits_makes_no_difference_and_for_one_grasp_neither_do
         assert ours == pytest.approx(theirs, abs=5e-3)
 
 
-def test_logits_that_never_err_have_a_finite_slope():
+def test_logits_without_errors_have_a_finite_slope():
     owner = np.arange(20)
     scored = ScoredTouches(np.where(np.eye(20, dtype=bool), 5.0, -5.0), owner, owner, np.zeros((20, 20), dtype=bool))
     found = fit_posterior(scored)
@@ -210,7 +211,7 @@ def test_logits_that_never_err_have_a_finite_slope():
     assert 0.5 < found.probabilities([5.0] + [-5.0] * 18).objects[0] < 1
 
 
-def test_logits_that_say_nothing_leave_the_prior():
+def test_logits_without_information_leave_the_prior():
     owner = np.arange(20)
     for noise in (0.0, 1.0):
         scores = noise * np.random.default_rng(0).normal(size=(20, 20))
@@ -218,7 +219,7 @@ def test_logits_that_say_nothing_leave_the_prior():
         assert found.probabilities(scores[0][:10]).none == pytest.approx(0.5, abs=0.12)
 
 
-def test_a_photo_of_the_touchs_own_grasp_is_never_counted():
+def test_a_photo_of_the_touchs_own_grasp_never_counts():
     scored = normal_logits(30, 2, 2, apart=2, alike=0)
     own = np.zeros_like(scored.own)
     own[np.arange(60), np.arange(60)] = True
@@ -229,35 +230,35 @@ def test_a_photo_of_the_touchs_own_grasp_is_never_counted():
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_a_logit_that_is_no_number_is_refused(bad):
+def test_a_logit_that_is_not_finite_is_refused(bad):
     with pytest.raises(NumericalError, match="every logit must be finite"):
         ADDING.probabilities([0.0, bad])
 
 
 @pytest.mark.parametrize("prior", [-0.1, 1.0, math.nan])
-def test_a_prior_that_is_none_is_refused(prior):
+def test_an_invalid_prior_is_refused(prior):
     with pytest.raises(BadInput, match="must be at least 0 and less than 1"):
         ADDING.probabilities([0.0], none_prior=prior)
 
 
-def test_without_a_sample_what_was_not_judged_cannot_be_estimated():
-    with pytest.raises(BadInput, match="a sample where others were not judged"):
+def test_without_a_sample_unscored_objects_are_refused():
+    with pytest.raises(BadInput, match="a sample of the objects that were not scored"):
         ADDING.probabilities([0.0], unscored=3)
 
 
 def test_two_objects_are_too_few_to_fit_on():
     owner = np.array([0, 1])
-    with pytest.raises(BadInput, match="three objects at least"):
+    with pytest.raises(BadInput, match="at least three objects"):
         fit_posterior(ScoredTouches(np.eye(2), owner, owner, np.zeros((2, 2), dtype=bool)))
 
 
-def test_touches_without_another_photo_of_their_object_are_nothing_to_fit_on():
+def test_touches_without_another_photo_of_their_object_are_refused():
     owner = np.arange(3)
-    with pytest.raises(BadInput, match="another photo of theirs; got 3 objects and 0 such touches"):
+    with pytest.raises(BadInput, match="another photo of their object; got 3 objects and 0 such touches"):
         fit_posterior(ScoredTouches(np.eye(3), owner, owner, np.ones((3, 3), dtype=bool)))
 
 
-def test_it_is_written_and_read_back():
+def test_a_posterior_is_written_and_read_back():
     posterior = Posterior(0.9, -0.1, 0.7, tests=321)
     assert Posterior.from_dict(posterior.to_dict()) == posterior
 
@@ -287,6 +288,6 @@ def test_forged_numbers_are_refused(change):
         lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner),
     )
 )
-def test_whatever_stands_in_the_file_is_refused_in_a_sentence(data):
+def test_any_other_content_of_the_file_is_refused_with_one_sentence(data):
     with pytest.raises(BadInput):
         Posterior.from_dict(data)

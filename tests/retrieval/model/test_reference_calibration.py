@@ -1,4 +1,4 @@
-"""What reference touches are worth, by hand."""
+"""Calibration of reference touches, by hand."""
 
 import dataclasses
 import json
@@ -20,7 +20,7 @@ from retrieval.model.reference_calibration import (
 from tests.reference_model import REFERENCE_CALIBRATION
 
 
-def test_one_reference_says_its_cosine_and_a_copy_of_it_nothing_more():
+def test_one_reference_gives_its_cosine_and_a_copy_of_it_changes_nothing():
     cosines = np.float32([[0.3, -0.2], [0.9, 0.1]])
     one = reference_similarity(cosines, np.array([0, 1]))
     np.testing.assert_allclose(one, cosines, atol=1e-7)
@@ -28,8 +28,8 @@ def test_one_reference_says_its_cosine_and_a_copy_of_it_nothing_more():
     np.testing.assert_allclose(copied, cosines, atol=1e-7)
 
 
-def test_several_references_are_averaged_as_likelihoods_are():
-    """By two plain loops, over objects with one, three and two references."""
+def test_several_references_are_averaged_as_likelihoods():
+    """Compare with two plain loops, over objects with one, three and two references."""
     cosines = np.random.default_rng(0).uniform(-1, 1, (4, 6)).astype(np.float32)
     parts = ([0], [1, 2, 3], [4, 5])
     for grasp, row in enumerate(reference_similarity(cosines, np.array([0, 1, 4]))):
@@ -38,13 +38,13 @@ def test_several_references_are_averaged_as_likelihoods_are():
             assert got == pytest.approx(math.log(mean) / SHARPNESS, abs=1e-6)
 
 
-def test_codes_are_the_end_of_halves_at_norm_one():
+def test_embeddings_are_the_end_of_partial_activations_at_norm_one():
     partials = np.float16([[9, 9, 3, 4], [9, 9, 0, -2]])
     np.testing.assert_allclose(touch_embeddings(partials, 2), [[0.6, 0.8], [0, -1]], atol=1e-6)
     assert touch_embeddings(partials, 4).shape == (2, 0)
 
 
-def test_what_they_are_worth_is_stored_and_read_again():
+def test_a_calibration_is_stored_and_read_again():
     assert (
         ReferenceCalibration.from_dict(json.loads(json.dumps(REFERENCE_CALIBRATION.to_dict()))) == REFERENCE_CALIBRATION
     )
@@ -56,13 +56,13 @@ def test_what_they_are_worth_is_stored_and_read_again():
     "change",
     [{"weight": math.inf}, {"weight": -1.0}, {"weight": None}, {"objects": "many"}, {"touch_only": {}}, {"more": 1}],
 )
-def test_what_is_no_worth_is_refused(change):
+def test_an_invalid_calibration_is_refused(change):
     with pytest.raises(BadInput):
         ReferenceCalibration.from_dict(REFERENCE_CALIBRATION.to_dict() | change)
 
 
-def felt(objects=10, touches=4, noise=0.3, photos=True, seed=0):
-    """Codes around a direction of each object, and photos whose logits say a little."""
+def reference_touches(objects=10, touches=4, noise=0.3, photos=True, seed=0):
+    """Return embeddings around a direction of each object, and photos whose logits carry some information."""
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(objects), touches)
     embeddings = rng.normal(size=(objects, 16))[owner] + 4 * noise * rng.normal(size=(len(owner), 16))
@@ -72,37 +72,40 @@ def felt(objects=10, touches=4, noise=0.3, photos=True, seed=0):
     return ReferenceTouches(ScoredTouches(logits, owner, photo_owner, np.zeros(logits.shape, bool)), embeddings)
 
 
-def test_near_touches_weigh_much_and_noise_weighs_little():
-    near, far = fit_reference_calibration(felt(noise=0.1)), fit_reference_calibration(felt(noise=50.0))
+def test_near_touches_get_a_large_weight_and_noise_a_small_one():
+    near, far = (
+        fit_reference_calibration(reference_touches(noise=0.1)),
+        fit_reference_calibration(reference_touches(noise=50.0)),
+    )
     assert near.touch_only.slope > 5 > far.touch_only.slope
     assert near.weight * near.with_photos.slope > 5 * far.weight * far.with_photos.slope
-    assert (near.objects, near.touches) == (10, 20)  # the last half of four touches each
+    assert (near.objects, near.touches) == (10, 20)  # the second half of four touches each
 
 
-def test_without_photos_the_touches_alone_are_fitted():
-    found = fit_reference_calibration(felt(photos=False))
+def test_without_photos_only_the_touches_are_fitted():
+    found = fit_reference_calibration(reference_touches(photos=False))
     assert found.with_photos is None
     assert found.weight is None
     assert found.touch_only.slope > 1
 
 
-def test_too_few_objects_or_touches_or_numbers_teach_nothing():
-    assert fit_reference_calibration(felt(objects=2)) is None
-    assert fit_reference_calibration(felt(touches=1)) is None
-    given = felt()
-    assert fit_reference_calibration(dataclasses.replace(given, embeddings=given.embeddings[:, :0])) is None
+def test_too_few_objects_touches_or_dimensions_give_no_calibration():
+    assert fit_reference_calibration(reference_touches(objects=2)) is None
+    assert fit_reference_calibration(reference_touches(touches=1)) is None
+    touches = reference_touches()
+    assert fit_reference_calibration(dataclasses.replace(touches, embeddings=touches.embeddings[:, :0])) is None
 
 
 @pytest.mark.parametrize("references", [1, 3])
-def test_one_reference_is_believed_no_more_and_three_no_less_than_they_tell(references):
-    """On other objects: how sure the best is said to be, and how often it is right."""
-    worth = fit_reference_calibration(felt(objects=80, touches=8, noise=0.2, photos=False))
-    given = felt(objects=80, touches=8, noise=0.2, photos=False, seed=1)
-    embeddings = given.embeddings.reshape(80, 8, -1)
-    shown, asking = embeddings[:, :references].reshape(80 * references, -1), embeddings[:, 4:].reshape(320, -1)
-    near = reference_similarity(asking @ shown.T, np.arange(80) * references)
-    ratios = np.array([worth.touch_only.log_ratio(row, 1) for row in near])
-    shares = np.exp(ratios - ratios.max(1, keepdims=True))
-    told = (shares.max(1) / shares.sum(1)).mean()
-    right = (ratios.argmax(1) == np.repeat(np.arange(80), 4)).mean()
-    assert told == pytest.approx(right, abs=0.1)
+def test_one_reference_and_three_are_both_calibrated(references):
+    """On other objects, the mean probability of the best object equals its accuracy."""
+    calibration = fit_reference_calibration(reference_touches(objects=80, touches=8, noise=0.2, photos=False))
+    others = reference_touches(objects=80, touches=8, noise=0.2, photos=False, seed=1)
+    embeddings = others.embeddings.reshape(80, 8, -1)
+    shown, queries = embeddings[:, :references].reshape(80 * references, -1), embeddings[:, 4:].reshape(320, -1)
+    near = reference_similarity(queries @ shown.T, np.arange(80) * references)
+    ratios = np.array([calibration.touch_only.log_ratio(row, 1) for row in near])
+    likelihoods = np.exp(ratios - ratios.max(1, keepdims=True))
+    confidence = (likelihoods.max(1) / likelihoods.sum(1)).mean()
+    accuracy = (ratios.argmax(1) == np.repeat(np.arange(80), 4)).mean()
+    assert confidence == pytest.approx(accuracy, abs=0.1)

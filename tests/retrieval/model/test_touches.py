@@ -1,4 +1,4 @@
-"""Gel images however they are given, told apart by how deep the lists are nested."""
+"""Gel images in every form, and grasps by the nesting of lists."""
 
 import io
 import shutil
@@ -15,12 +15,12 @@ from retrieval.model.touches import parse_grasps, read_image
 GREY = np.full((4, 6, 3), 128, dtype=np.uint8)
 
 
-def names(given, fingers=2):
-    return [[image.name for image in grasp] for grasp in parse_grasps(given, fingers)]
+def names(touches, fingers=2):
+    return [[image.name for image in grasp] for grasp in parse_grasps(touches, fingers)]
 
 
-def counts(given, fingers=2):
-    return [len(grasp) for grasp in parse_grasps(given, fingers)]
+def counts(touches, fingers=2):
+    return [len(grasp) for grasp in parse_grasps(touches, fingers)]
 
 
 @pytest.fixture
@@ -39,35 +39,35 @@ def test_a_list_of_images_is_one_grasp_and_a_list_of_lists_are_several():
     assert names([["a.png", "b.png"], ("c.png", "d.png")]) == [["a.png", "b.png"], ["c.png", "d.png"]]
 
 
-def test_for_one_finger_an_image_alone_is_a_grasp():
-    for given in ("a.png", ["a.png"], [["a.png"]]):
-        assert names(given, 1) == [["a.png"]]
+def test_for_one_finger_a_single_image_is_a_grasp():
+    for touches in ("a.png", ["a.png"], [["a.png"]]):
+        assert names(touches, 1) == [["a.png"]]
     assert names([["a.png"], ["b.png"]], 1) == [["a.png"], ["b.png"]]
 
 
-def test_two_images_for_one_finger_are_never_taken_for_two_grasps():
+def test_two_images_for_one_finger_are_never_two_grasps():
     with pytest.raises(BadInput, match=r"takes 1 gel image\(s\) for one touch; got 2: a\.png, b\.png \(one grasp is a"):
         parse_grasps(["a.png", "b.png"], 1)
 
 
-def test_an_array_of_more_axes_is_a_list_of_those_below_it():
+def test_an_array_with_more_axes_is_a_list_of_its_entries():
     assert counts(np.stack([GREY, GREY])) == [2]
     assert counts(np.stack([[GREY, GREY], [GREY, GREY], [GREY, GREY]])) == [2, 2, 2]
     assert counts(GREY, 1) == [1]
 
 
-def test_bytes_are_an_image_and_no_list():
+def test_bytes_are_an_image_and_not_a_list():
     assert names([b"12345", bytearray(b"678")]) == [["grasp 1, finger a (5 bytes)", "grasp 1, finger b (3 bytes)"]]
 
 
-def test_what_is_no_file_is_named_by_its_place():
-    given = [[GREY, "b.png"], [Image.fromarray(GREY), GREY]]
-    assert names(given)[0] == ["grasp 1, finger a (array 4 x 6 x 3 uint8)", "b.png"]
-    assert names(given)[1][0] == "grasp 2, finger a (Pillow image 6 x 4 RGB)"
+def test_an_image_that_is_not_a_file_is_named_by_its_place():
+    touches = [[GREY, "b.png"], [Image.fromarray(GREY), GREY]]
+    assert names(touches)[0] == ["grasp 1, finger a (array 4 x 6 x 3 uint8)", "b.png"]
+    assert names(touches)[1][0] == "grasp 2, finger a (Pillow image 6 x 4 RGB)"
 
 
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("touches", "message"),
     [
         ([], "give at least one touch"),
         ([[]], r"got 0: "),
@@ -75,8 +75,8 @@ def test_what_is_no_file_is_named_by_its_place():
         (["a.png"], r"got 1: a\.png"),
         (["a.png", "b.png", "c.png"], "got 3"),
         ([["a.png", "b.png"], ["c.png"]], r"got 1: c\.png"),
-        (["a.png", ["b.png", "c.png"]], "images and lists of images stand side by side"),
-        ([[["a.png", "b.png"]]], "several objects go to query_many"),
+        (["a.png", ["b.png", "c.png"]], "a list mixes images with lists of images"),
+        ([[["a.png", "b.png"]]], "query several objects with query_many"),
         (None, "got NoneType"),
         ([None, None], "got NoneType"),
         ([[1.0, 2.0]], "got float"),
@@ -85,32 +85,32 @@ def test_what_is_no_file_is_named_by_its_place():
         (np.float32(1), "got float32"),
     ],
 )
-def test_whatever_else_is_refused_in_a_sentence(given, said):
-    with pytest.raises(BadInput, match=said):
-        parse_grasps(given, 2)
+def test_every_other_input_is_refused_with_one_sentence(touches, message):
+    with pytest.raises(BadInput, match=message):
+        parse_grasps(touches, 2)
 
 
 # Reading -----------------------------------------------------------------------------------------------------------
 
 
-def test_a_file_gives_the_same_numbers_however_it_is_given(picture):
+def test_a_file_gives_the_same_numbers_in_every_form(picture):
     data = picture.read_bytes()
     with Image.open(picture) as opened:
-        given = [picture, str(picture), data, bytearray(data), memoryview(data), opened, np.asarray(opened)]
-        read = [read_image(image, "it") for image in given]
+        forms = [picture, str(picture), data, bytearray(data), memoryview(data), opened, np.asarray(opened)]
+        read = [read_image(image, "it") for image in forms]
     assert read[0].shape == (24, 32, 3)
     for other in read[1:]:
         assert np.array_equal(read[0], other)
 
 
 @pytest.mark.parametrize("mode", ["1", "L", "P", "LA", "RGBA", "CMYK"])
-def test_a_pillow_image_is_read_as_its_file_is(mode, picture):
+def test_a_pillow_image_is_read_like_its_file(mode, picture):
     image, buffer = Image.open(picture).convert(mode), io.BytesIO()
     image.save(buffer, "TIFF" if mode == "CMYK" else "PNG")
     assert np.array_equal(read_image(image, "it"), read_image(buffer.getvalue(), "it"))
 
 
-def test_a_pillow_image_is_turned_upright_as_its_file_is(picture):
+def test_a_pillow_image_is_turned_upright_like_its_file(picture):
     image, buffer = Image.open(picture), io.BytesIO()
     exif = image.getexif()
     exif[274] = 6
@@ -120,7 +120,7 @@ def test_a_pillow_image_is_turned_upright_as_its_file_is(picture):
     assert np.array_equal(read_image(opened, "it"), read_image(buffer.getvalue(), "it"))
 
 
-def test_an_array_need_not_lie_in_one_piece():
+def test_an_array_need_not_be_contiguous():
     blue_first = np.random.default_rng(0).integers(0, 256, (8, 10, 3), dtype=np.uint8)
     turned = read_image(blue_first[::2, :, ::-1], "it")
     assert turned.flags.c_contiguous
@@ -128,14 +128,14 @@ def test_an_array_need_not_lie_in_one_piece():
 
 
 @pytest.mark.parametrize(
-    ("array", "said"),
+    ("array", "message"),
     [
-        (GREY / 255, r"must hold uint8 samples in 0\.\.255, got float64; make them of samples in 0\.\.1 by np\.rint"),
+        (GREY / 255, r"must contain uint8 samples in 0\.\.255, got float64; convert samples in 0\.\.1 with np\.rint"),
         (GREY.astype(np.float32), "got float32"),
         (GREY.astype(np.uint16), "got uint16"),
         (GREY > 0, "got bool"),
         (np.array(["a.png", "b.png"]), "got <U5"),
-        (GREY[..., 0], r"must be \(height, width, 3\), red first, got \(4, 6\); repeat a grey image"),
+        (GREY[..., 0], r"must be \(height, width, 3\) in RGB order, got \(4, 6\); repeat a grey image"),
         (GREY[..., :1], r"got \(4, 6, 1\)"),
         (np.concatenate([GREY, GREY[..., :1]], axis=2), r"got \(4, 6, 4\)"),
         (GREY.transpose(2, 0, 1), r"got \(3, 4, 6\).*put channels last"),
@@ -143,8 +143,8 @@ def test_an_array_need_not_lie_in_one_piece():
         (GREY[:, :0], "has no pixels"),
     ],
 )
-def test_an_array_whose_range_or_channels_would_be_guessed_is_refused(array, said):
-    with pytest.raises(ImageError, match=rf"^finger a: .*{said}"):
+def test_an_array_with_unclear_range_or_channels_is_refused(array, message):
+    with pytest.raises(ImageError, match=rf"^finger a: .*{message}"):
         read_image(array, "finger a")
 
 
@@ -167,7 +167,7 @@ def test_a_pillow_image_whose_file_is_closed_is_refused(picture, tmp_path):
         read_image(opened, "it")
 
 
-def test_bytes_that_are_no_picture_are_refused():
+def test_bytes_that_are_not_a_picture_are_refused():
     with pytest.raises(ImageError, match="it: not a PNG"):
         read_image(b"no picture", "it")
     with pytest.raises(ImageError, match="it: the file is empty"):

@@ -1,4 +1,4 @@
-"""Towers of other libraries: tiny models with random weights, made from a configuration alone."""
+"""Towers of other libraries: tiny models with random weights, model_folders from a configuration alone."""
 
 import dataclasses
 import json
@@ -36,20 +36,20 @@ def models():
     import transformers
 
     layers = {"hidden_size": 16, "num_attention_heads": 2, "intermediate_size": 32}
-    seen = {**layers, "num_hidden_layers": 2, "image_size": 32, "patch_size": 16}
+    vision = {**layers, "num_hidden_layers": 2, "image_size": 32, "patch_size": 16}
     words = {"vocab_size": 8, "bos_token_id": 1, "eos_token_id": 2, "pad_token_id": 0}
     return {
         "dino": transformers.Dinov2Config(**layers, num_hidden_layers=4, image_size=56, patch_size=14),
         "convnext": transformers.ConvNextConfig(hidden_sizes=[6, 8, 10, 16], depths=[1, 1, 1, 1]),
         "siglip": transformers.SiglipConfig(
-            text_config={**layers, "num_hidden_layers": 1, **words}, vision_config=seen
+            text_config={**layers, "num_hidden_layers": 1, **words}, vision_config=vision
         ),
     }
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A folder as the Hub has one, by the name of a model."""
+def model_folders(tmp_path_factory):
+    """Folders like those of the Hub, by the name of a model."""
     from transformers import AutoModel
 
     folders = {}
@@ -67,8 +67,8 @@ def tower_of(folder, output="pooled"):
 
 
 @pytest.mark.parametrize(("model", "output"), WIDTHS)
-def test_a_model_of_transformers_is_a_tower_for_images_of_any_size(model, output, made):
-    tower = tower_of(made[model], output)
+def test_a_model_of_transformers_is_a_tower_for_images_of_any_size(model, output, model_folders):
+    tower = tower_of(model_folders[model], output)
     assert (tower.mean.flatten().tolist(), tower.std.flatten().tolist()) == (
         pytest.approx(MEAN),
         pytest.approx(STD),
@@ -80,12 +80,12 @@ def test_a_model_of_transformers_is_a_tower_for_images_of_any_size(model, output
             assert torch.isfinite(features).all()
 
 
-def test_pooled_features_are_what_the_model_itself_pools(made):
+def test_pooled_features_are_those_that_the_model_itself_pools(model_folders):
     from transformers import AutoModel
 
-    tower, images = tower_of(made["dino"]), torch.rand(2, 3, 56, 56)
-    initialise_tower(tower, "imagenet")  # what is published, here in the folder
-    model = AutoModel.from_pretrained(made["dino"]).eval()
+    tower, images = tower_of(model_folders["dino"]), torch.rand(2, 3, 56, 56)
+    initialise_tower(tower, "imagenet")  # the published weights, here from the folder
+    model = AutoModel.from_pretrained(model_folders["dino"]).eval()
     normalised = (images - torch.tensor(MEAN).view(1, 3, 1, 1)) / torch.tensor(STD).view(1, 3, 1, 1)
     with torch.inference_mode():
         torch.testing.assert_close(tower(images), model(normalised).pooler_output)
@@ -93,10 +93,10 @@ def test_pooled_features_are_what_the_model_itself_pools(made):
 
 @pytest.mark.slow
 def test_a_matcher_on_a_model_of_transformers_trains_exports_indexes_and_answers(
-    made, recording, catalogue, touch, tmp_path
+    model_folders, recording, catalogue, touch, tmp_path
 ):
-    """With a ViT and a ConvNeXt side by side; once it is trained their folders are gone."""
-    folders = [shutil.copytree(made[model], tmp_path / model) for model in ("dino", "convnext")]
+    """The model concatenates a ViT and a ConvNeXt. Their folders are deleted after training."""
+    folders = [shutil.copytree(model_folders[model], tmp_path / model) for model in ("dino", "convnext")]
     config = TINY.using(tower="+".join(f"transformers:{folder}" for folder in folders))
     config = dataclasses.replace(config, training=dataclasses.replace(config.training, init="imagenet"))
     trained = train(recording, tmp_path / "m.safetensors", config, quiet=True)
@@ -110,34 +110,34 @@ def test_a_matcher_on_a_model_of_transformers_trains_exports_indexes_and_answers
     (tmp_path / "m.onnx").write_bytes(with_checksum(exporting.touch_encoder_to_onnx(checkpoint)))
     encoder = OnnxEncoder(tmp_path / "m.onnx", checkpoint.digest)
     touches = np.random.default_rng(0).random((3, 2, 32, 32, 3), dtype=np.float32)
-    code, (half, embedding, *_) = encode_touches(checkpoint.matcher, touches), encoder.encode(touches)
+    encoding, (partial, embedding, *_) = encode_touches(checkpoint.matcher, touches), encoder.encode(touches)
     # float32 in another order
-    assert np.abs(half - code.partial.numpy()).max() <= 1e-4 * float(code.partial.abs().max())
-    np.testing.assert_allclose(embedding, code.embedding.numpy(), atol=1e-4)
+    assert np.abs(partial - encoding.partial.numpy()).max() <= 1e-4 * float(encoding.partial.abs().max())
+    np.testing.assert_allclose(embedding, encoding.embedding.numpy(), atol=1e-4)
     build_index(catalogue, checkpoint, tmp_path / "index", quiet=True)
     with Searcher.open(tmp_path / "index") as searcher:
         assert len(searcher.query([touch], none_prior=0.0).results) == 8
 
 
-def test_what_is_not_of_transformers_is_one_clear_error(made, tmp_path):
+def test_a_model_or_output_that_transformers_lacks_is_one_clear_error(model_folders, tmp_path):
     with pytest.raises(ConfigError, match=r"transformers:.*nowhere must be a model of the Hub or in a folder"):
         Config().using(tower=f"transformers:{tmp_path / 'nowhere'}")
     with pytest.raises(ConfigError, match="has no 1000-way layer; set tower_output to pooled or stages"):
-        tower_of(made["dino"], "classes")
+        tower_of(model_folders["dino"], "classes")
     (tmp_path / "nothing").mkdir()
-    tower = tower_of(shutil.copytree(made["dino"], tmp_path / "dino"))
+    tower = tower_of(shutil.copytree(model_folders["dino"], tmp_path / "dino"))
     shutil.rmtree(tmp_path / "dino")
     with pytest.raises(CheckpointError, match="cannot be read"):
         initialise_tower(tower, "imagenet")
 
 
-def test_a_checkpoint_that_names_a_model_and_not_its_architecture_fetches_nothing():
-    with pytest.raises(ConfigError, match="the architecture of transformers:a/b must be known; name it by"):
+def test_a_checkpoint_that_names_a_model_without_its_architecture_downloads_nothing():
+    with pytest.raises(ConfigError, match="the architecture of transformers:a/b is missing; set the tower with"):
         build_tower(MatcherConfig(tower="transformers:a/b").tower)
 
 
 @pytest.mark.parametrize("family", ["timm", "transformers"])
-def test_without_the_package_the_error_says_what_to_install(family, monkeypatch):
+def test_without_the_package_the_error_names_what_to_install(family, monkeypatch):
     monkeypatch.setitem(sys.modules, family, None)
     with pytest.raises(ConfigError, match=rf"a tower of {family} needs the package.*pip install .*{family}"):
         Config().using(tower=f"{family}:something")

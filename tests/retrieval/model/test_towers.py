@@ -14,7 +14,7 @@ from retrieval.model.towers.tower import Tower, stage_statistics
 from retrieval.model.towers.weights import initialise_tower, load_tower_state, read_state
 from tests.data import touch_data
 
-# ResNet-18 and -50 are made of the two kinds of block that there are.
+# ResNet-18 and -50 cover both kinds of block.
 every_tower = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=pytest.mark.slow if name == "resnet34" else ()) for name in sorted(TOWERS)]
 )
@@ -41,7 +41,7 @@ def transformers_mobilenet():
 
 
 def weights_in_order_of_use(model, images):
-    """State of the convolutions, normalisations and linear layers in the order in which a forward pass meets them."""
+    """Return the convolutions, normalisations and linear layers in the order of a forward pass."""
     met, hooks = [], []
     for module in model.modules():
         if isinstance(module, nn.Conv2d | nn.BatchNorm2d | nn.Linear):
@@ -56,14 +56,14 @@ def weights_in_order_of_use(model, images):
 @pytest.mark.parametrize(
     "name", ["resnet18", pytest.param("resnet34", marks=pytest.mark.slow), "resnet50", "mobilenet_v2"]
 )
-def test_a_tower_computes_what_an_independent_implementation_computes_with_the_same_weights(name):
+def test_a_tower_computes_the_same_as_an_independent_implementation_with_the_same_weights(name):
     torch.manual_seed(3)
     other = (transformers_mobilenet() if name == "mobilenet_v2" else transformers_resnet(name)).eval()
     tower = build_tower(name, "classes").eval()
     images = torch.rand(2, 3, 96, 64)
     normalised = (images - tower.mean) / tower.std
     ours, theirs = weights_in_order_of_use(tower, images), weights_in_order_of_use(other, normalised)
-    # Shortcuts may be met before or after the main branch, so layers pair up by kind and shape, in order.
+    # Shortcuts may come before or after the main branch, so layers are paired by kind and shape, in order.
     waiting = list(theirs)
     for layer in ours:
         shapes = {key: value.shape for key, value in layer.state_dict().items()}
@@ -74,7 +74,7 @@ def test_a_tower_computes_what_an_independent_implementation_computes_with_the_s
             and {key: value.shape for key, value in other_layer.state_dict().items()} == shapes
         )
         waiting.remove(partner)
-        for value in partner.parameters():  # no weight is left where a wrong pairing would hide
+        for value in partner.parameters():  # random weights, so that a wrong pairing shows
             nn.init.normal_(value, std=0.05) if value.ndim > 1 else nn.init.uniform_(value, 0.5, 1.5)
         layer.load_state_dict(partner.state_dict())
     assert not waiting
@@ -113,7 +113,7 @@ def test_a_tower_has_the_key_names_of_published_checkpoints(name):
 
 
 @every_tower
-def test_an_image_is_encoded_alike_in_any_batch(name):
+def test_an_image_has_the_same_encoding_in_any_batch(name):
     torch.manual_seed(0)
     tower = build_tower(name).eval()
     images = torch.rand(5, 3, 64, 64)
@@ -135,7 +135,7 @@ def test_an_image_is_encoded_alike_in_any_batch(name):
         (torch.full((1, 3, 64, 64), math.inf), NumericalError, "infinite"),
     ],
 )
-def test_a_tower_refuses_what_is_not_an_image(images, error, words):
+def test_a_tower_refuses_input_that_is_not_an_image(images, error, words):
     with pytest.raises(error, match=words):
         build_tower("small")(images)
 
@@ -156,7 +156,7 @@ def test_weights_come_back_from_a_file(tmp_path):
     assert torch.equal(target.conv1.weight, source.conv1.weight)
 
 
-def test_a_tower_without_optional_weights_takes_those_of_a_file(tmp_path):
+def test_a_tower_loads_a_file_of_its_weights_and_refuses_unknown_ones(tmp_path):
     torch.save(Plain("pooled").state_dict(), tmp_path / "weights.pth")
     target = Plain("pooled")
     initialise_tower(target, str(tmp_path / "weights.pth"))
@@ -176,7 +176,7 @@ class Plain(Tower):
         return self.layer(images.mean((2, 3)))
 
 
-def test_a_class_of_ones_own_is_a_tower_by_its_name():
+def test_a_users_own_class_is_a_tower_by_its_name():
     name = tower_name(Plain)
     assert name == f"{__name__}:Plain"
     assert build_tower(name)(torch.rand(2, 3, 8, 8)).shape == (2, 2)
@@ -195,12 +195,12 @@ def test_weights_of_another_architecture_are_refused_by_name():
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_first_weight_that_is_not_finite_is_refused_and_named(value):
-    """It would be found at the first step, as a learning rate that is too high."""
+def test_an_initial_weight_that_is_not_finite_is_refused_and_named(value):
+    """Otherwise the first training step would fail, as if the learning rate were too high."""
     state = dict(build_tower("resnet18").state_dict())
     state["layer1.0.conv1.weight"] = torch.full_like(state["layer1.0.conv1.weight"], value)
     tower = build_tower("resnet18")
-    with pytest.raises(CheckpointError, match=r"r\.pth holds a NaN or infinite weight in layer1\.0\.conv1\.weight"):
+    with pytest.raises(CheckpointError, match=r"r\.pth contains a NaN or infinite weight in layer1\.0\.conv1\.weight"):
         load_tower_state(tower, state, "r.pth")
     assert all(bool(torch.isfinite(weight).all()) for weight in tower.state_dict().values())
 
@@ -225,7 +225,7 @@ def test_a_pickle_with_code_is_refused_and_not_run(tmp_path, capsys):
     assert "arbitrary" not in capsys.readouterr().out
 
 
-def test_without_network_the_error_says_which_file_to_put_where(tmp_path, monkeypatch):
+def test_without_network_the_error_names_the_file_to_fetch_and_its_place(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "download_url_to_file", _no_network)
     with pytest.raises(CheckpointError, match=re.escape(str(tmp_path / "checkpoints" / "resnet18-f37072fd.pth"))):
@@ -236,7 +236,7 @@ def _no_network(*arguments, **settings):
     raise URLError("no route to host")
 
 
-def test_imagenet_weights_are_taken_from_the_cache(tmp_path, monkeypatch):
+def test_imagenet_weights_are_loaded_from_the_cache(tmp_path, monkeypatch):
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     monkeypatch.setattr(torch.hub, "download_url_to_file", _no_network)
     source = build_tower("resnet18", "classes")
@@ -271,14 +271,14 @@ def test_stages_are_mean_deviation_and_maximum_of_maps_of_any_image(name):
     assert torch.isfinite(features).all()
 
 
-def test_stage_statistics_are_those_of_each_map_side_by_side():
+def test_stage_statistics_are_those_of_each_map_concatenated():
     first = torch.tensor([[[[0.0, 2.0], [4.0, 6.0]]]])  # mean 3, deviation sqrt(5), maximum 6
     second = torch.full((1, 1, 1, 3), 7.0)  # constant
-    wanted = torch.tensor([[3.0, 5**0.5, 6.0, 7.0, 0.0, 7.0]])
-    torch.testing.assert_close(stage_statistics([first, second]), wanted)
+    expected = torch.tensor([[3.0, 5**0.5, 6.0, 7.0, 0.0, 7.0]])
+    torch.testing.assert_close(stage_statistics([first, second]), expected)
 
 
-def test_published_weights_serve_stages_that_do_not_need_their_last_layers(tmp_path):
+def test_published_weights_load_into_stages_without_their_last_layers(tmp_path):
     torch.manual_seed(1)
     source = build_tower("mobilenet_v2", "classes")
     torch.save(source.state_dict(), tmp_path / "weights.pth")
@@ -296,7 +296,7 @@ FIRST = {
 
 @pytest.mark.parametrize("name", sorted(FIRST))
 def test_first_layers_of_a_tower_stay_in_float32_where_others_multiply_in_bfloat16(name):
-    """An image rounded to bfloat16 has lost what tells two gels apart."""
+    """An image rounded to bfloat16 has lost the differences between two gels."""
     tower, types = build_tower(name, "stages"), []
     for place in FIRST[name]:
         tower.get_submodule(place).register_forward_hook(lambda _, __, made: types.append(made.dtype))
@@ -306,7 +306,7 @@ def test_first_layers_of_a_tower_stay_in_float32_where_others_multiply_in_bfloat
 
 
 def test_group_norms_of_the_small_tower_stay_in_float32_where_convolutions_do_not():
-    """PyTorch's own rounds to bfloat16 what the norm gives, and is slow at that."""
+    """PyTorch's own version rounds the result to bfloat16, and is slow."""
     tower = build_tower("small", "pooled")
     norm = next(module for module in tower.modules() if isinstance(module, nn.GroupNorm))
     images = torch.rand(2, norm.num_channels, 8, 8, generator=torch.Generator().manual_seed(0)).bfloat16()
