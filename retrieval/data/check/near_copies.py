@@ -266,7 +266,7 @@ class PictureSet:
     def _min_distances(
         self, queries: NDArray[np.int64], among: NDArray[np.int64], variants: Sequence[Greys]
     ) -> Doubles:
-        """Return the minimum distance (q, n) over variants of each query to each picture; infinity for its own object."""
+        """Return each query's minimum distance (q, n) over variants to each picture; infinity for its own object."""
         similarity = np.full((len(queries), len(among)), -1.0, np.float32)
         for greys in variants:
             np.maximum(similarity, shapes(greys, self.common) @ self._shapes[among].T, out=similarity)
