@@ -27,7 +27,7 @@ class Grasp:
 
     Attributes:
         touches: Gel images, one file per finger, in order a, b.
-        backgrounds: No-contact frames of the same fingers; empty where the recording has none.
+        backgrounds: No-contact frames of the same fingers, if recorded.
     """
 
     grasp_id: str
@@ -273,10 +273,9 @@ _PhotoDraw = tuple[int, Path, float]
 class PairSampler:
     """Sampler of the paper's pairs: each touch with `positives` photos of its object and `negatives` of other objects.
 
-    The sampler is stateless: the batch of a step depends only on the seed and the step, so training can resume at any
-    step. Touches go through the objects in rounds: each object once a round, in a new random order. Within an object,
-    grasps follow random permutations. A negative is a uniformly drawn object, then a uniformly drawn photo of it, from
-    the SAME set of grasps.
+    The sampler is stateless: a batch depends only on the seed and the step, so training can resume at any step. Touches
+    go through the objects in rounds: each object once a round, in a new random order. Within an object, grasps follow
+    random permutations. A negative is a uniformly drawn object of the SAME set, then a uniformly drawn photo of it.
 
     With `share_photos`, the negatives of a training batch are positives of its other objects. The probability of each
     object and photo stays the same, since a batch draws both uniformly. But 6 touches need 24 encoded photos instead of

@@ -4,9 +4,9 @@ Every rank has the whole batch (the sampler is stateless), encodes its rows of t
 features of the other ranks. The gather is differentiable, and batch normalisation in the towers uses the statistics of
 all ranks' images. So the loss, the running statistics and the mean of the ranks' gradients equal those of one process
 up to rounding. With negatives from one rank only, the gradient would differ by half; with batch statistics of one rank
-only, a ResNet-18's gradient differed by 115 %, and its loss differed too. One difference remains: dropout INSIDE a tower
-(the 1000-way output of MobileNetV2), where each rank draws the mask of its own images. `torchrun` starts the ranks;
-without it there is one rank.
+only, a ResNet-18's gradient differed by 115 %, and its loss differed too. One difference remains: dropout INSIDE a
+tower (the 1000-way output of MobileNetV2), where each rank draws the mask of its own images. `torchrun` starts the
+ranks; without it there is one rank.
 
 PyTorch's SyncBatchNorm is not sufficient: it does not run on a CPU, and it counts repeated padding rows as new images.
 """

@@ -163,7 +163,7 @@ class _LowPassPreprocessing(Preprocessing):
 
 
 def photo_margin(image: RgbImage) -> RgbImage:
-    """Return a photo (H, W, 3) with only a frame of an eighth of each side left; the rest is the frame's mean colour."""
+    """Return a photo (H, W, 3) with only its margin (an eighth of each side); the rest is the margin's mean colour."""
     high, wide = (max(1, side // _MARGIN_DIVISOR) for side in image.shape[:2])
     inside = np.zeros(image.shape[:2], dtype=np.bool_)
     inside[high:-high, wide:-wide] = True
