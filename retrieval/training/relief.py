@@ -243,7 +243,7 @@ class ReliefTraining:
         return loss
 
     def _readings(self, images: Tensor) -> tuple[Tensor, ...]:
-        """Predict logits (B, kinds) of each of FAMILIES, then standardised SIZES (B, sizes), from images (B, 3, H, W)."""
+        """Predict logits (B, kinds) of each of FAMILIES, then standardised SIZES (B, 4), of images (B, 3, H, W)."""
         with autocast(self.device, self.config.training.precision):
             features = self.tower(images.to(self.device, memory_format=torch.channels_last))
         outputs: Tensor = self.head(features.float())
