@@ -358,5 +358,5 @@ def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]
     path = PurePosixPath(row["file_name"]).as_posix()
     name = naming.object_of(path)
     if row.get("object_id", name) != name:
-        raise ValueError(f"{path} lies in object {name}, but the line says {row['object_id']}")
+        raise ValueError(f"{path} belongs to object {name}, but the line names {row['object_id']}")
     return path, True, metadata

@@ -219,7 +219,7 @@ def _register_decoder(data: bytes, name: str | Path) -> str | None:
 def _apply_draft_mode(image: Image.Image, min_side: int | None) -> None:
     """Select a smaller decoding size for a JPEG file that is too large or larger than `min_side` requires.
 
-    Memory use then depends on the smaller size. A progressive file that is too large is left alone, since its decoder
+    Memory use then depends on the smaller size. A progressive file that is too large keeps its size, since its decoder
     stores the whole picture.
     """
     width, height = image.size

@@ -77,15 +77,15 @@ class Naming:
 
     @cached_property
     def _pattern(self) -> re.Pattern[str]:
-        parts, seen = [], set()
+        parts, words = [], set()
         for number, part in enumerate(_FIELD.split(self.text)):  # text, word, text, word, ..., text
             if number % 2 == 0:
                 parts.append(re.escape(part))
-            elif part in seen:
+            elif part in words:
                 parts.append(f"(?P={part})")
             else:
                 parts.append(f"(?P<{part}>[^/]+{'' if part == OBJECT else '?'})")
-                seen.add(part)
+                words.add(part)
         return re.compile("".join(parts))
 
 

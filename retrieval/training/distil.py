@@ -37,7 +37,7 @@ SPREAD_WEIGHT = 0.3
 MIN_WEIGHT = 0.5
 """Smallest weight of the first of two blended rows."""
 POOL_SIZE, POOL_RENEWAL_STEPS = 50_000, 100
-"""Blended photos of which the nearest are used, and the number of steps until a new pool is drawn."""
+"""Number of blended photos in the pool, and number of steps until a new pool is drawn."""
 POOL_FRACTION = 0.75
 """Largest fraction of a batch that comes from the pool."""
 WARMUP_DIVISOR = 6

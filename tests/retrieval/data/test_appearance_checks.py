@@ -135,7 +135,7 @@ def test_light_that_changes_from_object_to_object_is_found_on_the_no_contact_fra
     assert "(chance 10%)" in message  # 4 other grasps of the object among 39
 
 
-def test_light_is_found_from_touches_alone_where_it_is_strong(broken):
+def test_strong_light_is_found_from_touches_only(broken):
     lamps(broken, ("touch_a", "touch_b"))
     kinds = {finding.kind for finding in broken.findings()}
     assert "light" in kinds

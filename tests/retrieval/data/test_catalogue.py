@@ -200,7 +200,7 @@ def test_metadata_goes_to_objects_by_the_same_naming(tmp_path):
     )
     found = {item.path: item.metadata for item in list_catalogue(tmp_path, Naming("stem")).photos}
     assert found == {"mug_0.png": {"price": 5}, "mug_1.png": {"price": 5, "colour": "red"}}
-    with pytest.raises(DatasetError, match=r"mug_1\.png lies in object mug_1, but the line says mug"):
+    with pytest.raises(DatasetError, match=r"mug_1\.png belongs to object mug_1, but the line names mug"):
         list_catalogue(tmp_path)
 
 
@@ -223,7 +223,7 @@ BAD_LINES = {
     '{"object_id": "mug", "x": NaN}': "NaN is not a finite number",
     '{"object_id": "mug", "x": -Infinity}': "-Infinity is not a finite number",
     '{"object_id": "mug", "x": 1e999}': "1e999 is not a finite number",
-    '{"file_name": "mug/1.png", "object_id": "cup"}': "lies in object mug, but the line says cup",
+    '{"file_name": "mug/1.png", "object_id": "cup"}': "belongs to object mug, but the line names cup",
     '{"object_id": "first"}': "first has two lines; merge them",
     '{"object_id": ' + "[" * 100_000: "nested deeper than 64 levels",
 }
