@@ -1,1 +1,1 @@
-"""Pictures, catalogues and recordings, as towers and searches want them."""
+"""Pictures, catalogues and recordings, prepared for the towers and the search."""

@@ -1,14 +1,14 @@
-"""A catalogue: a folder of photos to search, with the user's own metadata beside them.
+"""A catalogue: a folder of photos to search, with the user's own metadata.
 
-    catalog/<object_id>/<photo>     the first folder names the object, however deep the photo lies below it
+    catalog/<object_id>/<photo>     the first folder names the object, at any depth of the photo below it
     catalog/<object_id>.<ext>       or one photo per object, named by its file; other rules: retrieval.data.naming
     catalog/<object_id>/touch_*     a gel image: a touch of the object (retrieval.data.catalogue_touches)
-    catalog/metadata.jsonl          optional: one JSON object a line, with `file_name` (a photo's path in the
-                                    catalogue) or `object_id` (all its photos) and any other keys; where both
-                                    give a key, the photo's own wins
+    catalog/metadata.jsonl          optional: one JSON object per line, with `file_name` (a photo's path in the
+                                    catalogue) or `object_id` (all its photos) and any other keys; a photo's
+                                    value of a key takes precedence over its object's
 
-Names that start with a dot are not looked at. A photo's path in the catalogue, forward slashes, is its stable id.
-Listing opens no photo; `read_photo` reads one, and one broken file never stops the rest.
+Names that start with a dot are skipped. A photo's path in the catalogue, with forward slashes, is its stable id.
+Listing opens no photo. `read_photo` reads one photo, and one broken file never stops the rest.
 """
 
 import hashlib
@@ -32,13 +32,19 @@ METADATA_FILE = "metadata.jsonl"
 UNSUPPORTED_EXTENSIONS = frozenset(
     {".arw", ".cr2", ".cr3", ".dng", ".gif", ".jfif", ".jp2", ".jxl", ".nef", ".orf", ".raf", ".rw2", ".svg", ".tga"}
 )
-"""Endings of pictures that are not read: their objects may be left without a photo."""
+"""Extensions of picture formats that are not read. An object with only such files has no photo."""
 _LAYOUT = "put photos in <object_id>/<photo> or <object_id>.<ext>"
 
 
 @dataclass(frozen=True, slots=True)
 class CataloguePhoto:
-    """One photo: its `path` is relative to the catalogue; `metadata` is the user's own."""
+    """One photo of a catalogue.
+
+    Attributes:
+        path: Path relative to the catalogue.
+        object_id: The object that the photo shows.
+        metadata: The user's own keys and values.
+    """
 
     path: str
     object_id: str
@@ -46,10 +52,14 @@ class CataloguePhoto:
 
 
 class PhotoTable(Sequence[CataloguePhoto]):
-    """Photos in columns, each made an object when it is asked for: a hundred thousand objects are looked through by the
-    garbage collector again and again.
+    """Photos stored in columns; indexing makes a `CataloguePhoto`.
 
-    paths (N,); objects (N,): the ids of theirs; metadata: of the photos that have any, by path.
+    The garbage collector would traverse a hundred thousand separate objects again and again.
+
+    Attributes:
+        paths: N paths relative to the catalogue.
+        objects: N object ids.
+        metadata: Metadata by path, for the photos that have any.
     """
 
     def __init__(self, paths: Iterable[str], objects: Iterable[str], metadata: Mapping[str, dict[str, Any]]) -> None:
@@ -57,7 +67,7 @@ class PhotoTable(Sequence[CataloguePhoto]):
 
     @classmethod
     def of(cls, photos: Sequence[CataloguePhoto]) -> Self:
-        """The photos, of which no two have the same path."""
+        """Return a table of photos, whose paths must all differ."""
         metadata = {photo.path: photo.metadata for photo in photos if photo.metadata}
         return cls((photo.path for photo in photos), (photo.object_id for photo in photos), metadata)
 
@@ -79,10 +89,16 @@ class PhotoTable(Sequence[CataloguePhoto]):
 
 @dataclass(frozen=True)
 class Catalogue:
-    """What a folder holds: photos by id, files that are no photos by name, what was left out, remarks.
+    """The photos and touches of a catalogue folder.
 
-    unread: objects of pictures that were left out by their names' endings. touches: of the objects, whether these have
-    photos or not.
+    Attributes:
+        folder: The catalogue folder.
+        photos: Photos, sorted by path.
+        ignored: Names of files that are not pictures.
+        skipped: Pictures that are left out, with reasons.
+        notes: Remarks for the user.
+        unsupported_objects: Objects of pictures that are left out because of their extension.
+        touches: Touches of the objects, with or without photos.
     """
 
     folder: Path
@@ -95,35 +111,42 @@ class Catalogue:
 
     @property
     def where(self) -> str:
-        """The folder, whole, as indexes name it."""
+        """The absolute path of the folder, which indexes store."""
         return str(self.folder.resolve())
 
     def read(self, path: str) -> bytes:
-        """The bytes of a photo's file. Raises ImageError."""
+        """Return the bytes of a photo's file.
+
+        Raises:
+            ImageError: The file cannot be read.
+        """
         return read_bytes(self.folder / path)
 
     @property
     def object_ids(self) -> tuple[str, ...]:
-        """The objects, sorted, each once; some may have no photo that can be read."""
+        """The distinct objects, sorted; some may have no readable photo."""
         return tuple(
             sorted({*self.photos.objects, *(touch.object_id for touch in self.touches), *self.unsupported_objects})
         )
 
 
 def require_separate_folders(catalogue: str | Path, index: str | Path) -> None:
-    """Raise BadInput where an index folder is the folder of a catalogue, or one in it that holds photos.
+    """Check that an index folder contains no photos of the catalogue.
 
-    Another folder in the catalogue may be an index, as `./index` is of the catalogue `.`.
+    A folder of the catalogue without photos may be an index, such as `./index` in the catalogue `.`.
+
+    Raises:
+        BadInput: The index folder is the catalogue folder, or a folder below it that contains photos.
     """
-    root, place = Path(catalogue).resolve(), Path(index).resolve()
-    among = root in place.parents and any(path.suffix.lower() in EXTENSIONS for path in place.rglob("*"))
-    if place == root or among:
+    root, target = Path(catalogue).resolve(), Path(index).resolve()
+    has_photos = root in target.parents and any(path.suffix.lower() in EXTENSIONS for path in target.rglob("*"))
+    if target == root or has_photos:
         raise BadInput(f"the index would be written among the photos in {index}; name another folder with --out")
 
 
 @dataclass(frozen=True)
 class PhotoBytes:
-    """A photo's file as it was read, and the SHA-256 (hex) of those bytes."""
+    """The bytes of a photo's file, and their SHA-256 (hex)."""
 
     photo: CataloguePhoto
     data: bytes = field(repr=False)
@@ -133,17 +156,23 @@ class PhotoBytes:
 def list_catalogue(
     folder: str | Path, naming: Naming | None = None, folder_cache: FolderCache | None = None
 ) -> Catalogue:
-    """List the photos and touches below `folder`, by id. naming: which object each shows; by folder where None. seen:
-    what earlier builds saw there, which takes down what this one sees.
+    """List the photos and touches below `folder`, sorted by path.
 
-    Raises DatasetError: no folder, neither photo nor touch, none that fits the naming, bad metadata.
+    Args:
+        folder: The catalogue folder.
+        naming: Rule that names the object of each photo; by folder where None.
+        folder_cache: Names that earlier builds listed in unchanged folders; this call updates it.
+
+    Raises:
+        DatasetError: The folder does not exist, contains neither photo nor touch, or none that fits the naming; or
+            the metadata are invalid.
     """
     root, naming = Path(folder), naming or Naming()
     if not root.is_dir():
         what = "is a file" if root.exists() else "does not exist"
         raise DatasetError(f"a catalogue must be a folder of photos, but {root} {what}: {_LAYOUT}")
-    found = FolderWalk(Path(os.path.realpath(root)), folder_cache)
-    found.walk(str(root), "")
+    walk = FolderWalk(Path(os.path.realpath(root)), folder_cache)
+    walk.walk(str(root), "")
     path = root / METADATA_FILE
     try:
         lines = read_regular(path)
@@ -151,14 +180,24 @@ def list_catalogue(
         lines = b""
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}") from error
-    return make_catalogue(root, str(root), found.names, found.skipped, naming, lines)
+    return make_catalogue(root, str(root), walk.names, walk.skipped, naming, lines)
 
 
 def make_catalogue(
     folder: Path, where: str, names: list[str], skipped_before: list[SkippedPhoto], naming: Naming, metadata: bytes
 ) -> Catalogue:
-    """The catalogue of files below `where`, by their relative names, and what was left out already. metadata: what
-    METADATA_FILE holds, perhaps nothing. Raises DatasetError as `list_catalogue` does.
+    """Return the catalogue of a list of files.
+
+    Args:
+        folder: The catalogue's folder on this machine.
+        where: Folder or URL that messages name.
+        names: Paths of the files relative to `where`.
+        skipped_before: Files that are already left out.
+        naming: Rule that names the object of each photo.
+        metadata: Content of METADATA_FILE, perhaps empty.
+
+    Raises:
+        DatasetError: As for `list_catalogue`.
     """
     found = _classify_files(names, naming)
     found.skipped[:0] = skipped_before
@@ -166,19 +205,19 @@ def make_catalogue(
         raise _no_photo_error(where, found, naming)
     by_object, by_photo = _read_metadata(f"{where}/{METADATA_FILE}", metadata, naming)
     touches = group_touches(found.gels, naming)
-    strange = sorted(by_photo.keys() - [*found.photos, *(path for path, _ in found.gels)])
-    strange += sorted(by_object.keys() - [*found.objects, *(touch.object_id for touch in touches)])
-    told: _MetadataTable = {}
+    unknown = sorted(by_photo.keys() - [*found.photos, *(path for path, _ in found.gels)])
+    unknown += sorted(by_object.keys() - [*found.objects, *(touch.object_id for touch in touches)])
+    photo_metadata: _MetadataTable = {}
     if by_object or by_photo:
         for path, name in zip(found.photos, found.objects, strict=True):
             if own := {**by_object.get(name, {}), **by_photo.get(path, {})}:
-                told[path] = own
+                photo_metadata[path] = own
     return Catalogue(
         folder,
-        PhotoTable(found.photos, found.objects, told),
+        PhotoTable(found.photos, found.objects, photo_metadata),
         tuple(found.ignored),
         tuple(found.skipped),
-        tuple(f"{METADATA_FILE} speaks of {name}, which is not in the catalogue" for name in strange),
+        tuple(f"{METADATA_FILE} names {name}, which is not in the catalogue" for name in unknown),
         tuple(sorted(found.unsupported_objects)),
         tuple(
             replace(touch, metadata={**by_object.get(touch.object_id, {}), **by_photo.get(touch.paths[0], {})})
@@ -189,9 +228,16 @@ def make_catalogue(
 
 @dataclass
 class _FileGroups:
-    """Files sorted out by their names. photos, and objects: theirs. gels: gel images, each with its object. ignored: no
-    pictures. skipped: pictures that are left out, and why; unfit: those among them that do not fit the naming. unread:
-    objects of pictures of a kind that is not read.
+    """Files of a catalogue, classified by name.
+
+    Attributes:
+        photos: Paths of the photos.
+        objects: The object of each photo.
+        gels: (path, object) of each gel image.
+        ignored: Files that are not pictures.
+        skipped: Pictures that are left out, with reasons.
+        unfit: Paths among `skipped` that do not fit the naming.
+        unsupported_objects: Objects of pictures in unsupported formats.
     """
 
     photos: list[str] = field(default_factory=list)
@@ -204,20 +250,20 @@ class _FileGroups:
 
 
 def _classify_files(names: Iterable[str], naming: Naming) -> _FileGroups:
-    """What each file is by its name and ending, in alphabetical order."""
+    """Classify files by name and extension, in alphabetical order."""
     found = _FileGroups()
     for path in sorted(names):
         dot = path.rfind(".")
-        ending = path[dot:].lower() if dot > path.rfind("/") + 1 else ""
-        if ending not in EXTENSIONS and ending not in UNSUPPORTED_EXTENSIONS:
+        extension = path[dot:].lower() if dot > path.rfind("/") + 1 else ""
+        if extension not in EXTENSIONS and extension not in UNSUPPORTED_EXTENSIONS:
             found.ignored += [path] if path != METADATA_FILE else []
             continue
         name = naming.object_of(path)
-        if ending in UNSUPPORTED_EXTENSIONS:
-            found.skipped.append(SkippedPhoto(path, f"{ending} pictures are not read: save it as PNG or JPEG"))
+        if extension in UNSUPPORTED_EXTENSIONS:
+            found.skipped.append(SkippedPhoto(path, f"{extension} pictures are not read: save it as PNG or JPEG"))
             found.unsupported_objects |= {name} if name else set()
         elif name is None:
-            why = ": a number alone" if naming.text == STEM else ""
+            why = ": the name is only a number" if naming.text == STEM else ""
             found.skipped.append(SkippedPhoto(path, f"does not fit --objects-from {naming.text}{why}"))
             found.unfit.append(path)
         elif touch_name(path, naming) is None:
@@ -229,11 +275,11 @@ def _classify_files(names: Iterable[str], naming: Naming) -> _FileGroups:
 
 
 def _no_photo_error(where: str, found: _FileGroups, naming: Naming) -> DatasetError:
-    """Why there is nothing to search in a catalogue without photos and touches."""
+    """Return the error for a catalogue without photos and touches."""
     if found.unfit:
         return DatasetError(
             f"no photo in {where} fits --objects-from {naming.text}; the first of {len(found.unfit)}: "
-            f"{found.unfit[0]}. Give folder, stem, or a pattern for paths like this one"
+            f"{found.unfit[0]}. Use folder, stem, or a pattern for paths like this one"
         )
     others = f"{len(found.ignored)} other files" + (f" such as {found.ignored[0]}" if found.ignored else "")
     left_out = "".join(f"; {item.path}: {item.reason}" for item in found.skipped[:1])
@@ -242,7 +288,7 @@ def _no_photo_error(where: str, found: _FileGroups, naming: Naming) -> DatasetEr
 
 
 def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | SkippedPhoto:
-    """Read a photo's bytes, once; an unreadable one is a SkippedPhoto."""
+    """Read a photo's bytes; an unreadable photo gives a SkippedPhoto."""
     try:
         data = catalogue.read(photo.path)
     except ImageError as error:
@@ -251,7 +297,15 @@ def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | Skip
 
 
 def decode_photo(file: PhotoBytes, decode: Callable[[bytes, str], RgbImage] = decode_rgb) -> RgbImage | SkippedPhoto:
-    """Decode what `read_photo` gave, to (H, W, 3) float32 in 0..1 where not told how, or say why it is left out."""
+    """Decode a photo that `read_photo` returned.
+
+    Args:
+        file: The photo and its bytes.
+        decode: Function of (bytes, name in messages).
+
+    Returns:
+        The result of `decode`, by default (H, W, 3) float32 in 0..1; a SkippedPhoto where it raises ImageError.
+    """
     try:
         return decode(file.data, file.photo.path)
     except ImageError as error:
@@ -265,7 +319,11 @@ _MetadataTable = dict[str, dict[str, Any]]
 
 
 def _read_metadata(where: str, text: bytes, naming: Naming) -> tuple[_MetadataTable, _MetadataTable]:
-    """The other keys by object_id, and by photo path. Raises DatasetError with the number of a bad line."""
+    """Return the user's keys by object_id, and by photo path.
+
+    Raises:
+        DatasetError: A line is invalid; the message gives its number.
+    """
     by_object: _MetadataTable = {}
     by_photo: _MetadataTable = {}
     for number, line in enumerate(text.split(b"\n"), start=1):
@@ -275,7 +333,7 @@ def _read_metadata(where: str, text: bytes, naming: Naming) -> tuple[_MetadataTa
             name, is_photo, metadata = _parse_line(line, naming)
             table = by_photo if is_photo else by_object
             if name in table:
-                raise ValueError(f"{name} has a line already; join the two")
+                raise ValueError(f"{name} has two lines; merge them")
         except ValueError as error:
             raise DatasetError(f"{where}, line {number}: {error}") from error
         table[name] = metadata
@@ -283,10 +341,10 @@ def _read_metadata(where: str, text: bytes, naming: Naming) -> tuple[_MetadataTa
 
 
 def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]:
-    """Return (photo path or object_id, whether it is a photo, the other keys). Raises ValueError."""
+    """Return (photo path or object_id, whether it is a photo, the other keys)."""
     row = parse_json(line.decode(), finite=True)
     if not isinstance(row, dict):
-        raise ValueError("must hold one JSON object in braces")
+        raise ValueError("must be one JSON object in braces")
     if b"\\u" in line:
         require_utf8(row)
     keys = [key for key in ("file_name", "object_id") if key in row]
@@ -300,5 +358,5 @@ def _parse_line(line: bytes, naming: Naming) -> tuple[str, bool, dict[str, Any]]
     path = PurePosixPath(row["file_name"]).as_posix()
     name = naming.object_of(path)
     if row.get("object_id", name) != name:
-        raise ValueError(f"{path} lies in object {name}, but the line says {row['object_id']}")
+        raise ValueError(f"{path} belongs to object {name}, but the line names {row['object_id']}")
     return path, True, metadata

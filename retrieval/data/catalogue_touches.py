@@ -1,9 +1,9 @@
-"""Touches in a catalogue: gel images beside an object's photos, by their files' names.
+"""Touches in a catalogue: gel images next to an object's photos, recognised by their file names.
 
     catalog/<object_id>/touch_<name>.png                             one touch of a sensor with one finger
     catalog/<object_id>/touch_<name>_a.png, touch_<name>_b.png       one touch of two fingers, in this order
 
-`<name>` tells the touches of an object apart, a number or whatever else; fingers are called a, b, ... as in recordings.
+`<name>` distinguishes the touches of an object, such as a number. Fingers are called a, b, ... as in recordings.
 """
 
 import re
@@ -19,7 +19,13 @@ _TOUCH = re.compile(r"(touch_.*?)(?:_([a-z]))?", re.DOTALL)
 
 @dataclass(frozen=True, slots=True)
 class CatalogueTouch:
-    """One touch: paths of its gel images in the catalogue, a finger after the other; metadata: the user's own."""
+    """One touch of a catalogue.
+
+    Attributes:
+        object_id: The touched object.
+        paths: Paths of the gel images relative to the catalogue, in finger order.
+        metadata: The user's own keys and values.
+    """
 
     object_id: str
     paths: tuple[str, ...]
@@ -27,9 +33,9 @@ class CatalogueTouch:
 
 
 def touch_name(path: str, naming: Naming) -> tuple[str, str] | None:
-    """Of a gel image the name of its touch, folder and all, and its finger, perhaps ""; None for a photo.
+    """Return a gel image's touch name (with its folder) and finger ("" for one finger), or None for a photo.
 
-    In no folder, and where objects are named by the stem of a file, every picture is a photo.
+    A picture outside every folder is a photo, and so is every picture where the file stem names the object.
     """
     if "/touch_" not in path or naming.text == STEM:
         return None
@@ -39,12 +45,13 @@ def touch_name(path: str, naming: Naming) -> tuple[str, str] | None:
 
 
 def group_touches(images: Iterable[tuple[str, str]], naming: Naming) -> tuple[CatalogueTouch, ...]:
-    """Touches of gel images, each with its object; in the order of their names."""
-    found: dict[tuple[str, str], list[tuple[str, str]]] = {}
+    """Group gel images, (path, object) each, into touches, sorted by name."""
+    groups: dict[tuple[str, str], list[tuple[str, str]]] = {}
     for path, object_id in images:
-        named = touch_name(path, naming)
-        assert named is not None
-        found.setdefault((named[0], object_id), []).append((named[1], path))
+        name = touch_name(path, naming)
+        assert name is not None
+        groups.setdefault((name[0], object_id), []).append((name[1], path))
     return tuple(
-        CatalogueTouch(owner, tuple(path for _, path in sorted(own))) for (_, owner), own in sorted(found.items())
+        CatalogueTouch(owner, tuple(path for _, path in sorted(fingers)))
+        for (_, owner), fingers in sorted(groups.items())
     )

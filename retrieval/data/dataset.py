@@ -23,8 +23,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Grasp:
-    """One interaction, ready to be loaded: a photo, the touch (one file per finger, in order a, b), and the
-    no-contact frames of the same fingers where the recording has them (else empty).
+    """The files of one grasp.
+
+    Attributes:
+        touches: Gel images, one file per finger, in order a, b.
+        backgrounds: No-contact frames of the same fingers, if recorded.
     """
 
     grasp_id: str
@@ -36,7 +39,7 @@ class Grasp:
 
 
 AnyRecording = str | Path | Recording
-"""A recording: its folder, or what `robot.read_recording` returns."""
+"""A recording: its folder, or the result of `robot.read_recording`."""
 
 
 def folder_of(recording: AnyRecording) -> Path:
@@ -47,7 +50,7 @@ def folder_of(recording: AnyRecording) -> Path:
 def load_grasps(recording: AnyRecording) -> list[Grasp]:
     """Read the successful grasps of a recording that have a photo and a touch, in the order of collection.
 
-    Raises DatasetError for an unreadable recording, one without such grasps, or one that mixes numbers of fingers.
+    Raises DatasetError if the recording cannot be read, has no such grasps, or mixes numbers of fingers.
 
     >>> [grasp.object_id for grasp in retrieval.load_grasps("recording")]
     ['mug', 'mug', 'tin', 'tin']
@@ -57,21 +60,23 @@ def load_grasps(recording: AnyRecording) -> list[Grasp]:
 
 
 def require_accepted(folder: Path, attempts: Iterable["Attempt"]) -> list[Grasp]:
-    """The accepted grasps of a recording read by `load_all_attempts`. Raises DatasetError as `load_grasps` does."""
+    """Return the accepted grasps of `load_all_attempts(folder)`. Raises DatasetError like `load_grasps`."""
     grasps = [attempt.grasp for attempt in attempts if attempt.accepted]
     if not grasps:
-        raise DatasetError(f"{folder} must hold successful grasps with a photo and a touch; it holds none")
+        raise DatasetError(f"{folder} contains no successful grasp with a photo and a touch")
     finger_count(grasps)
     return grasps
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """One closing of the gripper, whatever came of it.
+    """One closing of the gripper, successful or not.
 
-    outcome: "held", or what went wrong: "missed", "slipped", "no_plan", or "failed" where the recording does not say
-    which; "unknown" where it says nothing. accepted: whether a matcher is trained on it. after: the frames after the
-    lift, one file per finger in order, or empty.
+    Attributes:
+        outcome: "held"; or the failure: "missed", "slipped", "no_plan", or "failed" for an unspecified one; "unknown"
+            where nothing is recorded.
+        accepted: Whether a matcher is trained on it.
+        after: Frames after the lift, one file per finger in order, or empty.
     """
 
     grasp: Grasp
@@ -81,12 +86,12 @@ class Attempt:
 
     @property
     def held(self) -> bool:
-        """Whether the object came up with the gripper."""
+        """Whether the gripper lifted the object."""
         return self.outcome == "held"
 
 
 def load_all_attempts(folder: Path) -> list[Attempt]:
-    """Read every line of a recording, in the order of collection. Raises DatasetError for an unreadable one."""
+    """Read all attempts of a recording, in the order of collection. Raises DatasetError if it cannot be read."""
     try:
         recording = read_recording(folder)
     except RobotError as error:
@@ -118,35 +123,35 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
 def load_attempts(folder: Path) -> list[Attempt]:
     """Read the successful AND the failed grasps of a recording, in the order of collection.
 
-    A grasp counts by its `outcome`, and where that was not recorded by `grasped`; left out are those with neither,
-    and plans that never came to a grasp. Raises DatasetError as `load_grasps` does.
+    The result is `outcome`, or `grasped` without an outcome. Grasps with neither are left out, and so are plans
+    without a grasp. Raises DatasetError like `load_grasps`.
     """
     attempts = [attempt for attempt in load_all_attempts(folder) if attempt.outcome not in ("unknown", "no_plan")]
     if not attempts:
-        raise DatasetError(f"{folder} must say of its grasps whether they succeeded (grasped, outcome); none says so")
+        raise DatasetError(f"no grasp in {folder} has a recorded result; grasped or outcome is required")
     finger_count([attempt.grasp for attempt in attempts])
     return attempts
 
 
 def recording_source(folder: Path) -> str:
-    """What a recording says of where it comes from."""
+    """Return the source that a recording names in its recording.json."""
     return str(read_info(folder)["source"])
 
 
 def finger_count(grasps: Sequence[Grasp]) -> int:
-    """Number of gel images of each touch. Raises DatasetError where grasps differ."""
+    """Return the number of gel images of each touch. Raises DatasetError if it differs between grasps."""
     first = grasps[0]
     for grasp in grasps:
         if len(grasp.touches) != len(first.touches):
             raise DatasetError(
                 f"every touch must have the same number of gel images; {first.grasp_id} has {len(first.touches)}, "
-                f"{grasp.grasp_id} has {len(grasp.touches)}; keep the sensors in recordings of their own"
+                f"{grasp.grasp_id} has {len(grasp.touches)}; use a separate recording for each sensor"
             )
     return len(first.touches)
 
 
 def data_digest(grasps: Iterable[Grasp]) -> str:
-    """SHA-256 over ids and image bytes: two recordings with equal digests train alike."""
+    """Return the SHA-256 (hex) of ids and image bytes; recordings with equal digests give equal trainings."""
     digest = hashlib.sha256()
     for grasp in grasps:
         digest.update(json.dumps([grasp.grasp_id, grasp.object_id, grasp.sequence_id]).encode())
@@ -160,7 +165,7 @@ def data_digest(grasps: Iterable[Grasp]) -> str:
 
 @dataclass(frozen=True)
 class Split:
-    """Which objects train, which choose and calibrate, which are never seen before the end."""
+    """Objects for training, for validation (model selection and calibration), and for the final test only."""
 
     seed: int
     train: tuple[str, ...]
@@ -168,18 +173,18 @@ class Split:
     test: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary, as stored in checkpoints and split files."""
+        """Return a plain dictionary, as stored in checkpoints and split files."""
         return {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(self).items()}
 
     @classmethod
     def from_dict(cls, data: Any) -> "Split":
-        """Inverse of `to_dict`. Raises DatasetError for anything else."""
+        """Return the split of a dictionary made by `to_dict`. Raises DatasetError for anything else."""
         return typed(
             {"seed": 0} | data if isinstance(data, dict) else data, cls, "split", complete=True, error=DatasetError
         )
 
     def select(self, grasps: Iterable[Grasp], part: str) -> list[Grasp]:
-        """Grasps whose object lies in `part` ("train", "validation" or "test")."""
+        """Return the grasps whose object is in `part` ("train", "validation" or "test")."""
         objects = set(getattr(self, part))
         return [grasp for grasp in grasps if grasp.object_id in objects]
 
@@ -187,8 +192,8 @@ class Split:
 def make_split(grasps: Sequence[Grasp], *, validation: float, test: float, seed: int) -> Split:
     """Draw an object-disjoint split; objects that share a sequence stay together.
 
-    validation, test: shares of the objects, each met as closely as whole groups allow; a part that is wanted holds
-    at least the two objects that pairs need. Raises DatasetError where the recording has too few for that.
+    `validation` and `test` are fractions of the objects. Whole groups approximate them; each requested part gets at
+    least two objects, as pairs require. Raises DatasetError if the recording has too few objects.
 
     >>> len(retrieval.make_split(retrieval.load_grasps("lab"), validation=0.2, test=0.25, seed=0).train)
     7
@@ -197,24 +202,22 @@ def make_split(grasps: Sequence[Grasp], *, validation: float, test: float, seed:
     queue = [groups[index] for index in np.random.default_rng(seed).permutation(len(groups))]
     total = sum(len(group) for group in groups)
     chosen = {
-        name: _take(queue, share * total) if share > 0 else ()
-        for name, share in (("test", test), ("validation", validation))
+        name: _take(queue, fraction * total) if fraction > 0 else ()
+        for name, fraction in (("test", test), ("validation", validation))
     }
     train = tuple(sorted(name for group in queue for name in group))
-    wanted = [train] + [chosen[name] for name, share in (("test", test), ("validation", validation)) if share > 0]
-    if min(map(len, wanted)) < 2:
+    parts = [train] + [chosen[name] for name, part in (("test", test), ("validation", validation)) if part > 0]
+    if min(map(len, parts)) < 2:
         raise DatasetError(
-            f"a split into {len(wanted)} parts needs two objects in each, and objects that share a sequence stay "
-            f"together; the recording has {total} objects in {len(groups)} such groups, and the shares part them into "
-            f"{' + '.join(str(len(part)) for part in wanted)}; record more objects, or give a split of your own"
+            f"a split into {len(parts)} parts needs two objects in each, and objects that share a sequence stay "
+            f"together; the recording has {total} objects in {len(groups)} such groups, and the fractions give parts "
+            f"of {' + '.join(str(len(part)) for part in parts)} objects; record more objects, or give your own split"
         )
     return Split(seed=seed, train=train, **chosen)
 
 
 def _take(queue: list[list[str]], target: float) -> tuple[str, ...]:
-    """Take off the queue each group that brings the count closer to the target; the smallest where these hold no two
-    objects.
-    """
+    """Take groups off the queue that bring the count closer to `target`; then the smallest, up to two objects."""
     taken: list[str] = []
     for group in list(queue):
         if abs(len(taken) + len(group) - target) < abs(len(taken) - target):
@@ -228,7 +231,7 @@ def _take(queue: list[list[str]], target: float) -> tuple[str, ...]:
 
 
 def linked_objects(grasps: Iterable[Grasp]) -> list[list[str]]:
-    """Objects joined wherever they share a sequence, which no split may tear apart; groups and members sorted."""
+    """Return groups of objects that share sequences, which a split must not separate; groups and members sorted."""
     group_of: dict[str, set[str]] = {}
     first_of_sequence: dict[str, str] = {}
     for grasp in grasps:
@@ -245,10 +248,14 @@ def linked_objects(grasps: Iterable[Grasp]) -> list[list[str]]:
 
 @dataclass(frozen=True)
 class PairBatch:
-    """Pairs over distinct images: every touch and photo is listed once, however many pairs use it.
+    """P pairs over distinct images: every touch and photo is listed once, for any number of pairs.
 
-    grasps: the grasps whose touches are used; photos: distinct photo files. touch_index, photo_index (P,) point into
-    them; labels (P,) are 1 for the same object. touch_objects (T,), photo_objects (N,) are integer object labels.
+    Attributes:
+        grasps: T grasps whose touches are used.
+        photos: N distinct photo files.
+        touch_index, photo_index: (P,) indices into `grasps` and `photos`.
+        labels: (P,) 1 for the same object, else 0.
+        touch_objects, photo_objects: (T,) and (N,) integer object labels.
     """
 
     grasps: list[Grasp]
@@ -264,19 +271,16 @@ _PhotoDraw = tuple[int, Path, float]
 
 
 class PairSampler:
-    """The paper's pairs: each touch with so many photos of its own object and as many of other objects.
+    """Sampler of the paper's pairs: each touch with `positives` photos of its object and `negatives` of other objects.
 
-    Stateless: the batch of a step depends on the seed and the step alone, so training resumes anywhere. Touches go
-    round the objects, each object once a round in a fresh order, so at any moment every object has been used equally
-    often (to within one); within an object, grasps come in shuffled decks. Negatives draw the object first, then one
-    of its photos, both uniformly, from the SAME set of grasps.
+    The sampler is stateless: a batch depends only on the seed and the step, so training can resume at any step. Touches
+    go through the objects in rounds: each object once a round, in a new random order. Within an object, grasps follow
+    random permutations. A negative is a uniformly drawn object of the SAME set, then a uniformly drawn photo of it.
 
-    share_photos: negatives of a training batch are drawn from the objects of its other touches, and from the photos
-    that stand in it as these objects' positives. Objects and photos are as likely as before, for the objects of a batch
-    are drawn uniformly and the photos of each too; but a batch of 6 touches has 24 photos to encode where it had up to
-    48, and each is looked at as a match and as none, so that what a photo adds to every pair cancels. The variance of
-    the head's gradient over batches is 0.6 of the other's at the start of a training and 1.06 at its end (measured on
-    the shipped checkpoint's features). It pays where a photo costs a pass through a tower in training.
+    With `share_photos`, the negatives of a training batch are positives of its other objects. The probability of each
+    object and photo stays the same, since a batch draws both uniformly. But 6 touches need 24 encoded photos instead of
+    up to 48. The variance of the head's gradient over batches is 0.6 times the other's at the start of training and
+    1.06 times at its end (shipped checkpoint's features). Use it where training encodes photos with a tower.
     """
 
     def __init__(
@@ -288,7 +292,7 @@ class PairSampler:
         negatives: int = 4,
         share_photos: bool = False,
     ) -> None:
-        """Raises DatasetError for fewer than two objects, and where one photo file stands for two objects."""
+        """Group the grasps by object. Raises DatasetError for fewer than two objects, or a photo of two objects."""
         self.seed, self.positives, self.negatives, self.share_photos = seed, positives, negatives, share_photos
         by_object: dict[str, list[Grasp]] = defaultdict(list)
         for grasp in grasps:
@@ -299,25 +303,25 @@ class PairSampler:
         self.grasps = [by_object[name] for name in self.objects]
         self.photos = [sorted({grasp.photo for grasp in part}) for part in self.grasps]
         if len({photo for part in self.photos for photo in part}) != sum(map(len, self.photos)):
-            raise DatasetError("a photo file must belong to one object; two objects share one; run `retrieve check`")
+            raise DatasetError("two objects share a photo file; run `retrieve check`")
 
     def batch(self, step: int, touches: int) -> PairBatch:
-        """The pairs of training step `step` (from 0) with `touches` touches."""
+        """Return the pairs of training step `step` (from 0) with `touches` touches."""
         return self._pairs(
             [self._touch(step * touches + turn) for turn in range(touches)], (1, step), self.share_photos
         )
 
     def evaluation_pairs(self) -> PairBatch:
-        """Every touch of the set with its positive and negative photos: the fixed pairs for evaluation."""
+        """Return fixed pairs for evaluation: every touch of the set with its positive and negative photos."""
         touches = [(index, grasp) for index, part in enumerate(self.grasps) for grasp in part]
         return self._pairs(touches, stream=(2,))
 
     def _touch(self, turn: int) -> tuple[int, Grasp]:
         round_number, place = divmod(turn, len(self.objects))
         index = int(self._rng(3, round_number).permutation(len(self.objects))[place])
-        deck_number, card = divmod(round_number, len(self.grasps[index]))
-        deck = self._rng(4, index, deck_number).permutation(len(self.grasps[index]))
-        return index, self.grasps[index][int(deck[card])]
+        cycle, position = divmod(round_number, len(self.grasps[index]))
+        order = self._rng(4, index, cycle).permutation(len(self.grasps[index]))
+        return index, self.grasps[index][int(order[position])]
 
     def _pairs(self, touches: list[tuple[int, Grasp]], stream: tuple[int, ...], share: bool = False) -> PairBatch:
         rng = self._rng(*stream)
@@ -340,9 +344,9 @@ class PairSampler:
         )
 
     def _draw_photos(self, objects: list[int], rng: np.random.Generator, share: bool) -> Iterator[list[_PhotoDraw]]:
-        """Photos to pair with the touch of each object: (object, photo, label). SharedImage negatives are of the batch's
-        other objects, taken in turn in a random order, with one of the photos that the batch shows of each; where the
-        batch holds no other object they are drawn from all.
+        """Yield the photos to pair with the touch of each object: (object, photo, label).
+
+        With `share`, negatives are the batch's photos of its other objects; without other objects, of all objects.
         """
         if not share:
             for index in objects:
@@ -350,21 +354,21 @@ class PairSampler:
                 yield matches + [(*self._negative(index, rng), 0.0) for _ in range(self.negatives)]
             return
         positives = [self._positives(index, rng) for index in objects]
-        shown: dict[int, list[Path]] = defaultdict(list)
+        photos_of: dict[int, list[Path]] = defaultdict(list)
         for index, drawn in zip(objects, positives, strict=True):
-            shown[index] += drawn
+            photos_of[index] += drawn
         for index, drawn in zip(objects, positives, strict=True):
-            others = sorted(set(shown) - {index})
+            others = sorted(set(photos_of) - {index})
             if others:
                 rounds = [rng.permutation(len(others)) for _ in range(-(-self.negatives // len(others)))]
                 chosen = [others[turn] for turn in np.concatenate(rounds)[: self.negatives]]
-                negatives = [(other, shown[other][int(rng.integers(len(shown[other])))]) for other in chosen]
+                negatives = [(other, photos_of[other][int(rng.integers(len(photos_of[other])))]) for other in chosen]
             else:
                 negatives = [self._negative(index, rng) for _ in range(self.negatives)]
             yield [(index, photo, 1.0) for photo in drawn] + [(*negative, 0.0) for negative in negatives]
 
     def _positives(self, index: int, rng: np.random.Generator) -> list[Path]:
-        """Without replacement where the object has enough photos."""
+        """Draw matching photos, without replacement where the object has enough of them."""
         photos = self.photos[index]
         chosen = rng.choice(len(photos), self.positives, replace=len(photos) < self.positives)
         return [photos[int(row)] for row in chosen]
@@ -379,10 +383,7 @@ class PairSampler:
 
 
 class ImageCache:
-    """Loads preprocessed images once and keeps them while they fit in `limit_bytes`.
-
-    Safe to call from several threads; an image that no longer fits is loaded again each time.
-    """
+    """Thread-safe cache of images that fit in `limit_bytes`; other images are loaded again each time."""
 
     def __init__(self, load: Callable[..., NDArray[Any]], limit_bytes: int = 4 << 30) -> None:
         self._load, self._limit = load, limit_bytes
@@ -390,7 +391,7 @@ class ImageCache:
         self._used = 0
 
     def __call__(self, *paths: Path | None) -> NDArray[Any]:
-        """The image that `load(*paths)` gives."""
+        """Return the image that `load(*paths)` returns."""
         if (image := self._images.get(paths)) is None:
             image = self._load(*paths)
             if self._used + image.nbytes <= self._limit:

@@ -1,4 +1,4 @@
-"""The files of a folder and of those below it, by name; links are followed without going round in a circle."""
+"""List the files of a folder and its subfolders; links are followed without endless loops."""
 
 import os
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from retrieval.errors import DatasetError
 
 @dataclass(frozen=True)
 class SkippedPhoto:
-    """A file or folder that could not be used, and why."""
+    """A file or folder that cannot be used, with the reason."""
 
     path: str
     reason: str
@@ -20,8 +20,14 @@ class SkippedPhoto:
 
 @dataclass
 class FolderWalk:
-    """Files below the folder `root` as relative posix paths, and what was passed over. seen: what earlier builds saw in
-    its folders; followed: where links led.
+    """The walk through a folder and its subfolders.
+
+    Attributes:
+        root: The folder.
+        folder_cache: Names that earlier builds listed in unchanged folders.
+        names: Files found so far, as posix paths relative to `root`.
+        skipped: Files and folders that cannot be used.
+        link_targets: Folders that links have led to.
     """
 
     root: Path
@@ -31,11 +37,15 @@ class FolderWalk:
     link_targets: set[Path] = field(default_factory=set)
 
     def walk(self, folder: str, prefix: str) -> None:
-        """Look through a folder, whose names get this prefix.
+        """Add the files of a folder and its subfolders to `names`, with `prefix` before each name.
 
-        A link to a folder is followed when it leads out of the catalogue, and each target once: no loop can hang.
+        A link to a folder is followed when it leads out of the catalogue. Each target is walked once, so no loop
+        can hang.
+
+        Raises:
+            DatasetError: The folder cannot be listed.
         """
-        status = None if self.folder_cache is None else self.folder_cache.status(folder)  # before what is in it
+        status = None if self.folder_cache is None else self.folder_cache.status(folder)  # read before the entries
         if self.folder_cache is not None and (known := self.folder_cache.names(prefix, status)) is not None:
             self.names += [prefix + name for name in known]
             return
@@ -79,6 +89,6 @@ class FolderWalk:
 
 
 def skipped_non_utf8(path: str) -> SkippedPhoto:
-    """A file whose name cannot be shown."""
-    named = path.encode(errors="surrogateescape").decode(errors="backslashreplace")
-    return SkippedPhoto(named, "the name is not valid UTF-8; rename it")
+    """Return the SkippedPhoto of a file whose name is not valid UTF-8."""
+    printable = path.encode(errors="surrogateescape").decode(errors="backslashreplace")
+    return SkippedPhoto(printable, "the name is not valid UTF-8; rename it")

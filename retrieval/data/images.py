@@ -1,8 +1,8 @@
-"""Pictures: from a file's bytes to float32 RGB in 0..1.
+"""Decode picture files to float32 RGB in 0..1.
 
-Pillow reads and checks every file. It keeps only the high byte of 16-bit colour, so deeper samples are
-decoded a second time with OpenCV after Pillow has loaded the file whole. (OpenCV's imread fills what a
-truncated JPEG lacks with grey and says nothing.) Colour profiles and gamma chunks are not applied.
+Pillow reads and checks every file. Pillow keeps only the high byte of 16-bit colour, so OpenCV decodes such samples a
+second time, after Pillow has loaded the whole file. (OpenCV alone would fill the missing part of a truncated JPEG with
+grey, without an error.) Colour profiles and gamma chunks are not applied.
 """
 
 import io
@@ -29,11 +29,11 @@ _AVIF_BRANDS = frozenset({b"avif", b"avis"})
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
 MAX_PIXELS = 20_000_000
-"""Of a decoded picture, 240 MB in float32. A larger JPEG file is decoded at 1/2, 1/4 or 1/8 of its size."""
+"""Of a decoded picture: 240 MB in float32. A larger JPEG file is decoded at 1/2, 1/4 or 1/8 of its size."""
 MAX_DRAFT_PIXELS = 160_000_000
-"""Pixels of such a file."""
+"""Of a JPEG file that is decoded at a smaller size."""
 MAX_SIDE, MAX_ASPECT = 65_535, 200
-"""Of a picture: pixels of a side, which is what JPEG can say, and of the longer side for each of the shorter."""
+"""Largest side in pixels (the limit of JPEG), and largest ratio of the longer to the shorter side."""
 MAX_BYTES = 512 * 2**20
 
 _FORMATS = ("BMP", "JPEG", "PNG", "TIFF", "WEBP")
@@ -45,9 +45,10 @@ _ORIENTATION, _BITS, _PHOTOMETRIC, _PLANAR, _EXTRA_SAMPLES = 274, 258, 262, 284,
 
 
 class _SuppressedWarnings:
-    """No warnings while any thread is inside. The filters belong to the whole process: `warnings.catch_warnings` in
-    each thread would let them be put back in the wrong order, and a lock around it would decode one picture at a
-    time.
+    """Context manager that suppresses warnings while any thread is inside.
+
+    Warning filters belong to the whole process. With `warnings.catch_warnings` in each thread, threads could restore
+    the filters in the wrong order. A lock around it would decode one picture at a time.
     """
 
     def __init__(self) -> None:
@@ -75,37 +76,56 @@ _DRAFT_SCALES = (8, 4, 2)
 
 
 def read_rgb(path: str | Path) -> RgbImage:
-    """Read the picture at `path` as (H, W, 3) float32 RGB in 0..1, upright. Raises ImageError."""
+    """Read the picture at `path` as (H, W, 3) float32 RGB in 0..1, upright.
+
+    Raises:
+        ImageError: The file cannot be read or decoded.
+    """
     return decode_rgb(read_bytes(path), path)
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Return the bytes of a regular file of at most MAX_BYTES. Raises ImageError."""
+    """Return the bytes of a regular file of at most MAX_BYTES.
+
+    Raises:
+        ImageError: The file cannot be read.
+    """
     try:
         return read_regular(path, MAX_BYTES)
     except FileNotFoundError:
         raise ImageError(path, "no such file") from None
     except IsADirectoryError:
-        raise ImageError(path, "is a folder; give the picture's file") from None
+        raise ImageError(path, "is a folder; name a picture file") from None
     except (OSError, ValueError, MemoryError) as error:
         raise ImageError(path, f"cannot be read: {_reason(error)}") from error
 
 
 def decode_rgb(data: bytes, name: str | Path, min_side: int | None = None) -> RgbImage:
-    """Decode one picture to (H, W, 3) float32 RGB in 0..1; `name` stands for it in messages.
+    """Decode one picture to (H, W, 3) float32 RGB in 0..1.
 
-    least: a JPEG file is decoded at 1/8, 1/4 or 1/2 of its size, by its own cosine transform, where the shorter side
-    keeps so many pixels; a pixel is then nearly the mean of those that it stands for. None: only where it is too large.
+    Grey becomes three equal channels, transparency is composited on white, and the EXIF orientation is applied. Of
+    several pages or frames, the first is decoded.
 
-    Grey becomes three equal channels, transparency is laid on white, the EXIF orientation is applied, and of
-    several pages or frames the first is taken. Raises ImageError for whatever is wrong with the bytes.
+    Args:
+        data: Bytes of the file.
+        name: Name of the picture in messages.
+        min_side: A JPEG file is decoded at 1/8, 1/4 or 1/2 of its size by its cosine transform, as long as the shorter
+            side keeps this many pixels; each pixel is then nearly the mean of its area. None: only a picture that is
+            too large is decoded smaller.
+
+    Raises:
+        ImageError: The bytes are not a picture that can be decoded.
     """
     return to_unit(decode(data, name, min_side))
 
 
 def decode(data: bytes, name: str | Path, min_side: int | None = None) -> Samples:
-    """As `decode_rgb`, but in the 8 bits of the file, (H, W, 3) uint8, where it has no more bits and nothing was laid
-    on white.
+    """Decode like `decode_rgb`, but return (H, W, 3) uint8 for an opaque picture of 8 bits.
+
+    Args:
+        data: Bytes of the file.
+        name: Name of the picture in messages.
+        min_side: As for `decode_rgb`.
     """
     with _open_image(data, name) as image:
         _apply_draft_mode(image, min_side)
@@ -119,7 +139,11 @@ def decode(data: bytes, name: str | Path, min_side: int | None = None) -> Sample
 
 
 def picture_size(data: bytes, name: str | Path) -> tuple[int, int]:
-    """(width, height) of a picture as its file says, and nothing is decoded. Raises ImageError as `decode_rgb` does."""
+    """Return (width, height) from a picture's header, without decoding.
+
+    Raises:
+        ImageError: As for `decode_rgb`.
+    """
     if (size := _webp_size(data)) != (1, 1):
         return size
     with _open_image(data, name) as image:
@@ -129,7 +153,7 @@ def picture_size(data: bytes, name: str | Path) -> tuple[int, int]:
 
 @contextmanager
 def _open_image(data: bytes, name: str | Path) -> Iterator[Image.Image]:
-    """A picture whose header was read; whatever is wrong with it, here and below `with`, is an ImageError."""
+    """Open a picture and read its header; errors here and in the `with` block become ImageError."""
     if not data:
         raise ImageError(name, "the file is empty")
     try:
@@ -152,7 +176,11 @@ def _open_image(data: bytes, name: str | Path) -> Iterator[Image.Image]:
 
 
 def to_float(image: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-    """Scale uint8 or uint16 samples of any shape to float32 in 0..1. Raises BadInput for another type."""
+    """Scale uint8 or uint16 samples of any shape to float32 in 0..1.
+
+    Raises:
+        BadInput: The samples have another type.
+    """
     if image.dtype not in (np.uint8, np.uint16):
         raise BadInput(f"samples must be uint8 or uint16, got {image.dtype}")
     scaled = np.divide(image, np.iinfo(image.dtype).max, dtype=np.float32)
@@ -165,10 +193,10 @@ def _reason(error: BaseException) -> str:
 
 
 def _register_decoder(data: bytes, name: str | Path) -> str | None:
-    """Pillow's name of the decoder for these bytes, "HEIF" or "AVIF", made known to it; None for any other picture.
+    """Register the decoder of HEIF or AVIF bytes with Pillow and return its name; None for any other picture.
 
-    Both files begin with a box of type "ftyp" that lists what its reader must know. Raises ImageError where the
-    decoder is not installed.
+    Both kinds of file begin with a box of type "ftyp" that lists their brands. Raises ImageError where the decoder is
+    not installed.
     """
     if data[4:8] != b"ftyp":
         return None
@@ -179,7 +207,7 @@ def _register_decoder(data: bytes, name: str | Path) -> str | None:
             raise ImageError(name, "an AVIF picture, and this Pillow was built without AVIF: pip install -U pillow")
         return "AVIF"
     if not brands & _HEIC_BRANDS:
-        return None  # a film
+        return None  # a video
     try:
         from pillow_heif import register_heif_opener
     except ImportError:
@@ -189,8 +217,10 @@ def _register_decoder(data: bytes, name: str | Path) -> str | None:
 
 
 def _apply_draft_mode(image: Image.Image, min_side: int | None) -> None:
-    """Have a large JPEG file decoded smaller, which takes the memory of what comes out, and as few pixels as `min_side`
-    asks for. A progressive one keeps its size where nothing is asked: its decoder holds the whole.
+    """Select a smaller decoding size for a JPEG file that is too large or larger than `min_side` requires.
+
+    Memory use then depends on the smaller size. A progressive file that is too large keeps its size, since its decoder
+    stores the whole picture.
     """
     width, height = image.size
     if image.format != "JPEG" or width * height > MAX_DRAFT_PIXELS:
@@ -198,15 +228,26 @@ def _apply_draft_mode(image: Image.Image, min_side: int | None) -> None:
     progressive = bool(image.info.get("progressive"))
     if progressive and width * height > MAX_PIXELS:
         return
-    wanted = next((each for each in _DRAFT_SCALES if min_side is not None and min(width, height) >= each * min_side), 1)
-    enough = next((each for each in (1, 2, 4, 8) if -(-width // each) * -(-height // each) <= MAX_PIXELS), None)
-    if enough and (scale := max(wanted, enough)) > 1:
+    by_side = next(
+        (each for each in _DRAFT_SCALES if min_side is not None and min(width, height) >= each * min_side), 1
+    )
+    by_pixels = next((each for each in (1, 2, 4, 8) if -(-width // each) * -(-height // each) <= MAX_PIXELS), None)
+    if by_pixels and (scale := max(by_side, by_pixels)) > 1:
         image.draft(None, (width // scale, height // scale))
 
 
 def pillow_rgb(image: Image.Image, name: str | Path) -> RgbImage:
-    """An opened Pillow image as `decode_rgb` gives its file, but for samples beyond 8 bits, which Pillow has dropped
-    by then. Raises ImageError.
+    """Decode an opened Pillow image like `decode_rgb`; samples beyond 8 bits are lost, since Pillow drops them.
+
+    Args:
+        image: The opened image.
+        name: Name of the picture in messages.
+
+    Returns:
+        (H, W, 3) float32 RGB in 0..1.
+
+    Raises:
+        ImageError: The image cannot be decoded.
     """
     try:
         check_pixels(image.size, name)
@@ -216,12 +257,20 @@ def pillow_rgb(image: Image.Image, name: str | Path) -> RgbImage:
         return to_unit(_apply_orientation(rgb, _orientation(image)))
     except ImageError:
         raise
-    except Exception as error:  # a file behind it that is damaged, or closed by now
+    except Exception as error:  # its file is damaged or closed
         raise ImageError(name, f"damaged or truncated: {_reason(error)}") from error
 
 
 def check_pixels(size: tuple[int, int], name: str | Path) -> None:
-    """Refuse a size from a header before anything of that size is allocated."""
+    """Check a size from a header before anything of that size is allocated.
+
+    Args:
+        size: (width, height).
+        name: Name of the picture in messages.
+
+    Raises:
+        ImageError: The size is empty, too large or too elongated.
+    """
     width, height = size
     if width < 1 or height < 1:
         raise ImageError(name, f"has no pixels ({width} x {height})")
@@ -230,7 +279,7 @@ def check_pixels(size: tuple[int, int], name: str | Path) -> None:
     if max(size) > min(MAX_SIDE, MAX_ASPECT * min(size)):
         raise ImageError(
             name,
-            f"{width} x {height} pixels; a side may have at most {MAX_SIDE}, and {MAX_ASPECT} for each of the other",
+            f"{width} x {height} pixels; a side may have at most {MAX_SIDE}, and {MAX_ASPECT} times the other side",
         )
 
 
@@ -239,7 +288,10 @@ def _too_large(size: str) -> str:
 
 
 def _webp_size(data: bytes) -> tuple[int, int]:
-    """(width, height) by a WebP header, else (1, 1): Pillow allocates a WebP canvas as it opens the file."""
+    """Return (width, height) from a WebP header, else (1, 1).
+
+    Pillow allocates a WebP canvas when it opens the file, so the size must be checked before that.
+    """
     chunk = data[12:16]
     if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(data) < 30:
         return 1, 1
@@ -267,7 +319,7 @@ def _eight_bit_rgb(image: Image.Image, name: str | Path) -> Samples:
 
 
 def _rgb(image: Image.Image) -> npt.NDArray[np.uint8]:
-    """The samples of an opaque image of 8 bits, taken strip by strip: Pillow copies what it hands over twice."""
+    """Return the samples of an opaque image of 8 bits, copied in strips because Pillow's conversion copies twice."""
     width, height = image.size
     rgb = np.empty((height, width, 3), np.uint8)
     rows = max(1, _STRIP // width)
@@ -278,21 +330,21 @@ def _rgb(image: Image.Image) -> npt.NDArray[np.uint8]:
 
 
 def encode_image(pixels: npt.NDArray[np.uint8], ending: str = ".png") -> bytes:
-    """Return pixels (H, W, 3), red first, as the content of a file, of the kind that `ending` names."""
+    """Return the content of a picture file, of the format that `ending` names, from pixels (H, W, 3), red first."""
     import cv2
 
     return bytes(cv2.imencode(ending, np.ascontiguousarray(pixels[..., ::-1]))[1])
 
 
 def _deep_rgb(image: Image.Image, data: bytes, name: str | Path) -> RgbImage:
-    """Decode 16-bit samples with OpenCV, which gives blue first and neither inverts nor un-premultiplies."""
+    """Decode 16-bit samples with OpenCV, which returns blue first and neither inverts nor un-premultiplies."""
     import cv2
 
     layout = (_tiff_tag(image, _PHOTOMETRIC, (2,)), _tiff_tag(image, _PLANAR, (1,)))
     bits = set(_tiff_tag(image, _BITS, (16,)))
     if image.mode not in _DEEP_MODES or bits != {16} or layout not in (((1,), (1,)), ((2,), (1,))):
         raise ImageError(name, f"this pixel type ({image.mode}, {max(bits)} bits) is not supported; save it as PNG")
-    if image.format == "PNG":  # of which OpenCV allocates what a chunk claims
+    if image.format == "PNG":  # OpenCV allocates the length that a chunk claims
         kind, end = list(png_chunks(data))[-1]
         if kind != b"IEND" or end > len(data):
             raise ImageError(name, "damaged or truncated: a PNG chunk is longer than the file")
@@ -304,7 +356,7 @@ def _deep_rgb(image: Image.Image, data: bytes, name: str | Path) -> RgbImage:
     if image.mode == "RGBA":
         premultiplied = _tiff_tag(image, _EXTRA_SAMPLES, (2,)) == (1,)
         return _on_white(to_float(rgb), to_float(samples[..., 3:]), premultiplied)
-    if "transparency" in image.info:  # a PNG file may name one colour that is see-through
+    if "transparency" in image.info:  # a PNG file may name one transparent colour
         opaque = (rgb != np.asarray(image.info["transparency"])).any(axis=2, keepdims=True)
         return _on_white(to_float(rgb), opaque.astype(np.float32))
     return to_float(rgb)
@@ -318,18 +370,18 @@ def _on_white(rgb: RgbImage, alpha: npt.NDArray[np.float32], premultiplied: bool
 
 
 def _orientation(image: Image.Image) -> int:
-    """EXIF orientation 1..8 that is still to be applied; both decoders turn TIFF files themselves."""
+    """Return the EXIF orientation 1..8 to apply; 1 for TIFF files, since both decoders apply theirs."""
     if image.format == "TIFF":
         return 1
     try:
         value = image.getexif().get(_ORIENTATION, 1)
-    except Exception:  # damaged EXIF is no reason to refuse good pixels
+    except Exception:  # the pixels are still usable
         return 1
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
 def _apply_orientation(image: Samples, orientation: int) -> Samples:
-    """Undo an EXIF orientation: 5..8 swap the axes, then rows (3, 4, 7, 8) and columns (2, 3, 6, 7) turn."""
+    """Undo an EXIF orientation: 5..8 swap the axes, then rows (3, 4, 7, 8) and columns (2, 3, 6, 7) are reversed."""
     if orientation >= 5:
         image = image.swapaxes(0, 1)
     rows = -1 if orientation in (3, 4, 7, 8) else 1

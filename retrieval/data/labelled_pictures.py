@@ -1,9 +1,10 @@
-"""Pictures with what is known of the objects they show, as `retrieve collect --photos-only` and `--touches-only` make
-them, and pairs of them; the format stands in robot.sim.pictures.
+"""Labelled pictures of photo-only and touch-only objects, and pairs of them.
 
-Photographed objects and pressed objects come from worlds of their own, and no object is both; but what two labelled
-objects of one shape and relief, of like pitch, amplitude, aspect and sharpness, feel and look like, teaches a matcher
-what goes with what. One pressed object and one photographed object cost a third and a tenth of a felt one.
+`retrieve collect --photos-only` and `--touches-only` write these pictures; robot.sim.pictures defines the format.
+
+Photo-only and touch-only objects come from separate object sets, so no object has both. Two objects with the same shape
+and relief, and similar pitch, amplitude, aspect and sharpness, still teach a matcher which touch fits which photo. A
+touch-only object costs a third, and a photo-only object a tenth, of the time of a grasped one.
 """
 
 import hashlib
@@ -27,20 +28,25 @@ KINDS = ("photo", "touch")
 FAMILIES = ("relief", "shape")
 SIZES = ("pitch_mm", "amplitude_mm", "aspect", "sharpness")
 MIN_AMPLITUDE_MM = 0.05
-"""An amplitude below this is as none."""
+"""A smaller amplitude counts as this one."""
 SIZE_WEIGHTS = (2.0, 1.0, 1.0, 0.5)
-"""Of the squared differences in `LabelledPicture.size_targets`, each in standard deviations; a pitch is felt and
-seen best."""
+"""Weights of the squared differences in `LabelledPicture.size_targets`, each in standard deviations. The pitch is most
+visible in photos and gel images."""
 SHAPE_MISMATCH_DISTANCE = 3.0
-"""How far apart two objects of different shapes are, in the same unit."""
+"""Distance between two objects of different shapes, in the same unit."""
 
 
 @dataclass(frozen=True)
 class LabelledPicture:
-    """A photo, or one finger's gel image with the untouched gel, and what the object that it shows or feels is.
+    """A photo, or one finger's gel image with its no-contact frame, and the properties of its object.
 
-    finger: whose gel image it is; None for a photo. families: its kind of `FAMILIES`, in their order. sizes: of its
-    relief, `SIZES` in their order; the amplitude of a smooth object is 0.
+    Attributes:
+        file: File of the photo or gel image.
+        finger: Finger of the gel image; None for a photo.
+        before: File of the no-contact frame, if any.
+        object_id: The object.
+        families: Its relief and shape families, in the order of `FAMILIES`.
+        sizes: Sizes of its relief, in the order of `SIZES`; the amplitude of a smooth object is 0.
     """
 
     file: Path
@@ -62,18 +68,22 @@ class LabelledPicture:
 
     @property
     def is_smooth(self) -> bool:
-        """Whether it wears no relief; its pitch, aspect and sharpness then mean nothing."""
+        """Whether the object has no relief; its pitch, aspect and sharpness then have no meaning."""
         return self.sizes[SIZES.index("amplitude_mm")] == 0
 
     @property
     def size_targets(self) -> tuple[float, ...]:
-        """`sizes` as they are learnt and compared: what is a ratio of scales by its logarithm."""
+        """`sizes` for regression and comparison: logarithms of all but the sharpness."""
         pitch, amplitude, aspect, sharpness = self.sizes
         return math.log(pitch), math.log(max(amplitude, MIN_AMPLITUDE_MM)), math.log(aspect), sharpness
 
 
 def load_labelled(folder: Path) -> tuple[str, list[LabelledPicture]]:
-    """The kind of the pictures in `folder`, and the pictures. Raises DatasetError."""
+    """Return the kind of the pictures in `folder` ("photo" or "touch"), and the pictures.
+
+    Raises:
+        DatasetError: The folder contains no valid labelled pictures.
+    """
     try:
         info = read_json(folder / "pictures.json")
         lines = read_regular(folder / "metadata.jsonl").decode().splitlines()
@@ -81,16 +91,17 @@ def load_labelled(folder: Path) -> tuple[str, list[LabelledPicture]]:
         raise DatasetError(f"{folder} must be a folder that `retrieve collect --photos-only` wrote: {error}") from error
     kind = info.get("kind") if isinstance(info, dict) else None
     if kind not in KINDS:
-        raise DatasetError(f"{folder}/pictures.json must say kind photo or touch; got {kind!r}")
+        raise DatasetError(f"{folder}/pictures.json: kind must be photo or touch, got {kind!r}")
     pictures = [_picture(folder, number, line) for number, line in enumerate(lines, start=1)]
     if not pictures:
-        raise DatasetError(f"{folder} holds no picture yet; run the same `retrieve collect` again")
+        raise DatasetError(f"{folder} contains no picture yet; run the same `retrieve collect` again")
     return kind, pictures
 
 
 def labels_digest(pictures: Iterable[LabelledPicture]) -> str:
-    """SHA-256 over the names of the pictures' files and over what is known of the objects, in this order: equal for the
-    same folder read again, wherever it lies. Pictures themselves are not read.
+    """Return the SHA-256 (hex) of the pictures' file names and labels, in this order.
+
+    The digest does not depend on the folder's location. Picture files are not read.
     """
     digest = hashlib.sha256()
     for each in pictures:
@@ -104,74 +115,83 @@ def _picture(folder: Path, number: int, line: str) -> LabelledPicture:
         sizes = tuple(float(row[name]) for name in SIZES)
         before = folder / row["before_file_name"] if "before_file_name" in row else None
         families = tuple(str(row[name]) for name in FAMILIES)
-        found = LabelledPicture(
+        picture = LabelledPicture(
             folder / row["file_name"], row.get("finger"), before, str(row["object_id"]), families, sizes
         )
     except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{folder}/metadata.jsonl, line {number}, is no labelled picture: {error!r}") from error
+        raise DatasetError(f"{folder}/metadata.jsonl, line {number}: not a labelled picture: {error!r}") from error
     pitch, amplitude, aspect, sharpness = sizes
     if not (0 < pitch < math.inf and 0 <= amplitude < math.inf and 1 <= aspect < math.inf and 0 <= sharpness <= 1):
         raise DatasetError(
-            f"{folder}/metadata.jsonl, line {number}: pitch and amplitude must be lengths in mm, aspect from 1, "
+            f"{folder}/metadata.jsonl, line {number}: pitch and amplitude must be lengths in mm, aspect at least 1, "
             f"sharpness within 0..1; got {sizes}"
         )
-    return found
+    return picture
 
 
 # Pairs ---------------------------------------------------------------------------------------------------------------
 
 
 def pair_by_label(photos: Path, touches: Path, fingers: int) -> list[Grasp]:
-    """Grasps made of labelled pictures: each press with the photo of the object most like the pressed one, each photo
-    with the press of the object most like the photographed one.
+    """Make grasps of labelled pictures: pair each touch with the photo of the most similar object, and vice versa.
 
-    photos, touches: folders that `retrieve collect --photos-only` and `--touches-only` wrote. fingers: gel
-    images of one touch; where it is 1, each finger's press is a touch of its own. Like is of the same relief and
-    nearest in sizes, another shape being as far as SHAPE_MISMATCH_DISTANCE; where no object has the relief, a picture is left out.
-    The photographed object names the grasp's object, `like <object_id>`, so that two presses with one photo are of one
-    object. Raises DatasetError for folders of the wrong kind or where nothing pairs.
+    The most similar object has the same relief and the nearest sizes; another shape adds SHAPE_MISMATCH_DISTANCE. A
+    picture is left out where no object on the other side has its relief. The photographed object names the grasp's
+    object, `like <object_id>`, so that two touches with one photo have one object.
+
+    Args:
+        photos: Folder that `retrieve collect --photos-only` wrote.
+        touches: Folder that `retrieve collect --touches-only` wrote.
+        fingers: Number of gel images of one touch; with 1, each finger's image is a touch of its own.
+
+    Returns:
+        The grasps.
+
+    Raises:
+        DatasetError: A folder has the wrong kind, or no pair exists.
     """
     photographed, pressed = _of_kind(photos, "photo"), _of_kind(touches, "touch")
-    of_object: dict[str, list[LabelledPicture]] = defaultdict(list)
+    by_object: dict[str, list[LabelledPicture]] = defaultdict(list)
     for picture in sorted(pressed, key=lambda each: each.finger or ""):
-        of_object[picture.object_id].append(picture)
-    touched = [[one] for one in pressed] if fingers == 1 else of_object.values()
-    whole = [part for part in touched if len(part) == fingers]
-    if not whole:
-        raise DatasetError(f"no object in {touches} was pressed by {fingers} fingers, as the recording's were grasped")
-    grasps = [_grasp(whole[row], photographed[match]) for row, match in _pairs([one[0] for one in whole], photographed)]
+        by_object[picture.object_id].append(picture)
+    groups = [[one] for one in pressed] if fingers == 1 else by_object.values()
+    presses = [group for group in groups if len(group) == fingers]
+    if not presses:
+        raise DatasetError(f"no object in {touches} was pressed by {fingers} fingers, as in the recording's grasps")
+    pairs = _pairs([press[0] for press in presses], photographed)
+    grasps = [_grasp(presses[row], photographed[match]) for row, match in pairs]
     if not grasps:
-        raise DatasetError(f"no object in {touches} has the relief of one in {photos}; collect more")
+        raise DatasetError(f"no object in {touches} has the relief of an object in {photos}; collect more")
     return grasps
 
 
 def _of_kind(folder: Path, kind: str) -> list[LabelledPicture]:
     found, pictures = load_labelled(folder)
     if found != kind:
-        raise DatasetError(f"{folder} must hold labelled pictures of kind {kind}; it holds those of kind {found}")
+        raise DatasetError(f"{folder} must contain labelled pictures of kind {kind}; it contains kind {found}")
     return pictures
 
 
 def _pairs(pressed: list[LabelledPicture], photographed: list[LabelledPicture]) -> list[tuple[int, int]]:
-    """(row of the press, row of the photo), in order."""
+    """Return sorted pairs (row of the touch, row of the photo)."""
     rows_of: dict[str, tuple[list[int], list[int]]] = defaultdict(lambda: ([], []))
     for side, pictures in enumerate((pressed, photographed)):
         for row, picture in enumerate(pictures):
             rows_of[picture.relief][side].append(row)
     shapes = [np.array([each.shape for each in pictures]) for pictures in (pressed, photographed)]
-    felt, seen = _scaled(pressed, photographed), _scaled(photographed, photographed)
+    touch_sizes, photo_sizes = _scaled(pressed, photographed), _scaled(photographed, photographed)
     pairs: set[tuple[int, int]] = set()
     for presses, photos in rows_of.values():
         if presses and photos:
             other = shapes[0][presses][:, None] != shapes[1][photos]
-            apart = np.hypot(cdist(felt[presses], seen[photos]), SHAPE_MISMATCH_DISTANCE * other)
-            pairs |= {(press, photos[match]) for press, match in zip(presses, apart.argmin(1), strict=True)}
-            pairs |= {(presses[match], photo) for photo, match in zip(photos, apart.argmin(0), strict=True)}
+            distances = np.hypot(cdist(touch_sizes[presses], photo_sizes[photos]), SHAPE_MISMATCH_DISTANCE * other)
+            pairs |= {(press, photos[match]) for press, match in zip(presses, distances.argmin(1), strict=True)}
+            pairs |= {(presses[match], photo) for photo, match in zip(photos, distances.argmin(0), strict=True)}
     return sorted(pairs)
 
 
 def _scaled(pictures: list[LabelledPicture], over: list[LabelledPicture]) -> NDArray[np.float64]:
-    """(N, sizes) in weighted standard deviations over `over`; all alike for smooth objects, which have none."""
+    """Return (N, sizes) in weighted standard deviations over `over`; zeros for smooth objects, which have no sizes."""
     deviation = np.array([each.size_targets for each in over]).std(0) + 1e-6
     sizes = np.array([each.size_targets for each in pictures]) / deviation * np.sqrt(SIZE_WEIGHTS)
     sizes[[each.is_smooth for each in pictures]] = 0.0

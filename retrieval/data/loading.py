@@ -1,4 +1,4 @@
-"""The loader: worker threads decode images, some items ahead of the caller that takes them.
+"""The loader: worker threads decode images ahead of the caller.
 
 Threads, not processes: decoding and resizing a picture release the GIL, and a thread's images need no copy from another
 process. docs/training.md has the rates of both; `python -m benchmarks.loader` measures them.
@@ -16,7 +16,7 @@ Result = TypeVar("Result")
 
 
 def worker_count(workers: int | str = "auto") -> int:
-    """Return how many workers decode images: `workers`, or for "auto" one for each core of this rank."""
+    """Return the number of workers that decode images: `workers`, or for "auto" one for each core of this rank."""
     if isinstance(workers, int):
         return workers
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
@@ -24,15 +24,15 @@ def worker_count(workers: int | str = "auto") -> int:
 
 
 def worker_pool(workers: int | str = "auto") -> ThreadPoolExecutor:
-    """Return the threads that decode images; `workers` as in `worker_count`."""
+    """Return a pool of threads that decode images; `workers` as in `worker_count`."""
     return ThreadPoolExecutor(worker_count(workers), thread_name_prefix="decode")
 
 
 def prefetch(futures: Iterable[Future[Result]], depth: int) -> Iterator[Result]:
-    """Yield the results in order while up to `depth` later ones are prepared.
+    """Yield the results in order, while up to `depth` later ones are prepared.
 
     Args:
-        futures: Drawn one at a time, so that drawing one starts its work.
+        futures: Iterable that starts the work of each future when it yields it.
         depth: At least 1.
     """
     waiting: deque[Future[Result]] = deque()
@@ -50,7 +50,7 @@ def map_in_order(pool: Executor, load: Callable[[T], Result], items: Iterable[T]
 
 
 class TimedFunction:
-    """A function that keeps the seconds of each of its calls; safe to call from several threads."""
+    """A function that records the duration of each call in seconds; several threads may call it."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function

@@ -1,14 +1,14 @@
-"""Which object a photo shows, by the photo's path in the catalogue: the rule of `build-index --objects-from`.
+"""Derive the object of a photo from its path in the catalogue: the rule of `build-index --objects-from`.
 
-    folder     the first folder, however deep the photo lies below it; a photo in no folder is named by its file
-    stem       the file's name without its ending and without a number at the end, whatever folder it lies in:
+    folder     the first folder, at any depth of the photo below it; a photo in no folder is named by its file
+    stem       the file's name without extension and without a number at the end, in any folder:
                mug_0.jpg, mug-12.jpg and "mug (3).jpg" show mug
-    PATTERN    a path in which {object} stands for the name, and any other word in braces for what does not matter:
+    PATTERN    a path in which {object} stands for the name, and any other word in braces for an ignored part:
                {split}/{object}/{photo}, or {object}_{view}.jpg
 
-A pattern is held to the photo's whole path without its ending, and where that does not fit, with it. A word in braces
-stands for one character or more, but no "/"; {object} takes as many as it can, the others as few. The same word twice
-stands for the same text.
+A pattern must match the photo's whole path, first without its extension, then with it. A word in braces matches one
+character or more, but no "/"; {object} matches as many as possible, the others as few as possible. The same word twice
+matches the same text.
 """
 
 import re
@@ -30,7 +30,7 @@ NOT_OBJECTS = frozenset(
     | {"object", "objects", "photo", "photos", "pic", "pics", "picture", "pictures", "png", "raw", "rgb"}
     | {"test", "testing", "train", "training", "val", "valid", "validation"}
 )
-"""Names of folders that hold many objects, as data sets have them."""
+"""Names that data sets give to folders of many objects."""
 
 _FIELD = re.compile(r"\{(\w+)\}")
 _NUMBER = re.compile(r"[\s._#-]*\(?\d+\)?$")
@@ -39,7 +39,11 @@ _MAX_EXAMPLES = 3
 
 @dataclass(frozen=True)
 class Naming:
-    """The rule `text`. Raises BadInput for a pattern without {object} or with braces that hold no word."""
+    """The naming rule `text`: folder, stem, or a pattern.
+
+    Raises:
+        BadInput: A pattern has no {object}, has braces without a word, or has two words without text between them.
+    """
 
     text: str = FOLDER
 
@@ -53,15 +57,15 @@ class Naming:
             )
         rest = _FIELD.sub("/", self.text)
         if "{" in rest or "}" in rest or any(not word.isidentifier() for word in words):
-            raise BadInput(f"braces in a pattern must hold one word each, {example}; got {self.text!r}")
+            raise BadInput(f"braces in a pattern must contain one word each, {example}; got {self.text!r}")
         if "}{" in self.text:
             raise BadInput(f"two words of a pattern must have text between them, {example}; got {self.text!r}")
 
     def object_of(self, path: str) -> str | None:
-        """The object of the photo at `path`, forward slashes; None where the path does not fit the rule."""
+        """Return the object of the photo at `path` (forward slashes), or None where the path does not fit the rule."""
         if self.text == FOLDER:
             first, _, rest = path.partition("/")
-            if first not in ("", ".") and rest.strip("./"):  # most paths, without taking them apart
+            if first not in ("", ".") and rest.strip("./"):  # fast way for most paths
                 return first
         name = PurePosixPath(path)
         if self.text == FOLDER:
@@ -73,47 +77,52 @@ class Naming:
 
     @cached_property
     def _pattern(self) -> re.Pattern[str]:
-        parts, seen = [], set()
+        parts, words = [], set()
         for number, part in enumerate(_FIELD.split(self.text)):  # text, word, text, word, ..., text
             if number % 2 == 0:
                 parts.append(re.escape(part))
-            elif part in seen:
+            elif part in words:
                 parts.append(f"(?P={part})")
             else:
                 parts.append(f"(?P<{part}>[^/]+{'' if part == OBJECT else '?'})")
-                seen.add(part)
+                words.add(part)
         return re.compile("".join(parts))
 
 
 def without_number(name: str) -> str:
-    """The name without the number that it ends with, and without what joins the two: "mug" of "mug_12"."""
+    """Return the name without a number at its end, and without the separator: "mug" of "mug_12"."""
     return _NUMBER.sub("", name)
 
 
 def naming_warnings(photos: Mapping[str, int], naming: Naming) -> list[str]:
-    """What looks wrong about objects with these numbers of photos: a sentence each."""
-    names, found = sorted(photos), []
-    if strange := [name for name in names if name.casefold() in NOT_OBJECTS]:
-        found.append(
-            f"{abbreviate_list(strange, _MAX_EXAMPLES)} {'is' if len(strange) == 1 else 'are'} taken for the name of an object, with "
-            f"{sum(photos[name] for name in strange)} photo(s): if the objects' folders lie below it, say "
+    """Return a warning sentence for each suspicious property of the object names.
+
+    Args:
+        photos: Number of photos by object.
+        naming: The rule that gave the names.
+    """
+    names, warnings = sorted(photos), []
+    if generic := [name for name in names if name.casefold() in NOT_OBJECTS]:
+        warnings.append(
+            f"{abbreviate_list(generic, _MAX_EXAMPLES)} {'is' if len(generic) == 1 else 'are'} used as the name of an "
+            f"object, with {sum(photos[name] for name in generic)} photo(s): if the objects' folders are below it, use "
             f"--objects-from '{{split}}/{{object}}/{{photo}}'"
         )
     elif len(names) == 1 and photos[names[0]] > 1:
-        found.append(f"all {photos[names[0]]} photos are taken for photos of one object, {names[0]}")
+        warnings.append(f"all {photos[names[0]]} photos are assigned to one object, {names[0]}")
     stem_of = {name: without_number(name) for name in names}
     stems = Counter(stem_of.values())
-    alike = [name for name, stem in stem_of.items() if stem and stems[stem] > 1]
-    if naming.text != STEM and alike:
+    similar = [name for name, stem in stem_of.items() if stem and stems[stem] > 1]
+    if naming.text != STEM and similar:
         single = all(photos[name] == 1 for name in names)
         what = "every object has one photo, and " if single else ""
-        found.append(
-            f"{what}{len(alike)} of {len(names)} objects have names that differ from another's by a number only: "
-            f"{abbreviate_list(alike, _MAX_EXAMPLES)}; if these show one object, say --objects-from stem, or a pattern"
+        warnings.append(
+            f"{what}the names of {len(similar)} of {len(names)} objects differ from another name only by a number: "
+            f"{abbreviate_list(similar, _MAX_EXAMPLES)}; if these show one object, use --objects-from stem or a pattern"
         )
-    return found
+    return warnings
 
 
 def count_summary(counts: Sequence[int]) -> dict[str, float]:
-    """Least, median and largest number of photos of an object."""
+    """Return the minimum, median and maximum number of photos of an object."""
     return {"min": min(counts), "median": statistics.median(counts), "max": max(counts)}

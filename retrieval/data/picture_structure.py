@@ -1,8 +1,8 @@
-"""Bounds on how a picture's file is built, checked before a decoder sees it.
+"""Bounds on the structure of a picture file, checked before decoding.
 
-A size alone does not bound the work: a JPEG file of 1.5 MB can hold 40,000 scans, each of which goes over all pixels,
-and a PNG file of 19 MB 1.6 million empty chunks, each of which Pillow parses in Python. Every check here takes time in
-proportion to the file, most of it in C.
+The size of a file alone does not bound the work. A JPEG file of 1.5 MB can contain 40,000 scans, and each scan
+processes all pixels. A PNG file of 19 MB can contain 1.6 million empty chunks, and Pillow parses each one in Python.
+Every check here takes time in proportion to the file, most of it in C.
 """
 
 import re
@@ -15,25 +15,33 @@ from retrieval.errors import ImageError
 MAX_SCANS = 50
 """Of a JPEG file. Encoders write 1 to 20."""
 MAX_SEGMENTS = 256
-"""Segments of a JPEG file, and chunks of a PNG file, in front of its pixels; of 64 kB each they hold 16 MB."""
+"""Segments of a JPEG file, and chunks of a PNG file, before its pixels: 16 MB at 64 kB each."""
 MAX_STRAY_BYTES = 1 << 16
-"""Between the segments in front of a JPEG file's pixels, where Pillow reads them one by one."""
+"""Between the segments before a JPEG file's pixels, where Pillow reads them one by one."""
 BYTES_PER_CHUNK = 1024
-"""Of a PNG file, on average at least, beyond the first MAX_SEGMENTS chunks. Encoders write 8 kB or more."""
+"""Smallest mean size of a PNG chunk after the first MAX_SEGMENTS chunks. Encoders write 8 kB or more."""
 MAX_TIFF_TAGS = 1000
 MAX_TIFF_NUMBERS = 500_000
-"""In all tags together, such as the offsets of strips: 20 million pixels in tiles of 16 x 16 make 156,250."""
+"""In all tags together, such as the offsets of strips: 20 million pixels in tiles of 16 x 16 need 156,250."""
 
 _JPEG, _PNG, _SCAN = b"\xff\xd8", b"\x89PNG\r\n\x1a\n", 0xDA
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 _WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xDA)})
 _TIFF_ORDERS = {b"II": "<", b"MM": ">"}
 _TIFF_TEXT, _TIFF_BYTES, _TIFF_EXTENSIONS = 2, frozenset({1, 6, 7}), 340
-"""Types of tags; and the first tag that a decoder does not read as numbers where it holds bytes."""
+"""Types of tags; and the first tag that decoders do not parse as numbers when it contains bytes."""
 
 
 def check_structure(data: bytes, name: str | Path) -> None:
-    """Refuse a file whose structure costs more than its pixels. `name` stands for it in messages. Raises ImageError."""
+    """Check that the structure of a picture file costs no more than its pixels.
+
+    Args:
+        data: Bytes of the file.
+        name: Name of the picture in messages.
+
+    Raises:
+        ImageError: The file has too many scans, segments, chunks or tags.
+    """
     if data.startswith(_JPEG):
         _check_jpeg(data, name)
     elif data.startswith(_PNG):
@@ -43,7 +51,7 @@ def check_structure(data: bytes, name: str | Path) -> None:
 
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
-    """Kind and end of each chunk of a PNG file, up to IEND; a chunk's end may lie behind the file's."""
+    """Yield kind and end of each chunk of a PNG file, up to IEND; a chunk may claim to end after the file."""
     start = len(_PNG)
     while start + 12 <= len(data):
         kind = data[start + 4 : start + 8]
@@ -61,7 +69,7 @@ def _check_jpeg(data: bytes, name: str | Path) -> None:
         if stray > MAX_STRAY_BYTES:
             raise ImageError(name, f"more than {MAX_STRAY_BYTES} stray bytes between its JPEG segments; save it again")
         if found is None:
-            return  # told by the decoder
+            return  # the decoder reports this
         if data[found.end() - 1] == _SCAN:
             break
         start = _after_segment(data, found.end())
@@ -72,7 +80,7 @@ def _check_jpeg(data: bytes, name: str | Path) -> None:
 
 
 def _count_scans(data: bytes, start: int) -> int:
-    """Scans from `start` to the end of the picture; what follows it, such as a film, may hold any bytes."""
+    """Return the number of scans from `start` to the end of the picture; later bytes (such as a video) are ignored."""
     scans = 0
     for _ in range(MAX_SCANS * MAX_SEGMENTS):
         found = _MARKER.search(data, start)
@@ -82,21 +90,21 @@ def _count_scans(data: bytes, start: int) -> int:
         if scans > MAX_SCANS:
             return scans
         start = _after_segment(data, found.end())
-    return MAX_SCANS + 1  # more segments between them than any encoder writes
+    return MAX_SCANS + 1  # no encoder writes so many segments between scans
 
 
 def _after_segment(data: bytes, start: int) -> int:
-    """Where the segment ends whose marker ends at `start`."""
+    """Return the end of the segment whose marker ends at `start`."""
     if data[start - 1] in _WITHOUT_LENGTH:
         return start
     return start + max(int.from_bytes(data[start : start + 2], "big"), 2)
 
 
 def _check_png(data: bytes, name: str | Path) -> None:
-    most, pixels = MAX_SEGMENTS + len(data) // BYTES_PER_CHUNK, False
+    max_chunks, pixels = MAX_SEGMENTS + len(data) // BYTES_PER_CHUNK, False
     for number, (kind, _) in enumerate(png_chunks(data)):
         pixels = pixels or kind == b"IDAT"
-        if number >= (most if pixels else MAX_SEGMENTS):
+        if number >= (max_chunks if pixels else MAX_SEGMENTS):
             where = "" if pixels else " before its pixels"
             raise ImageError(name, f"more than {number} PNG chunks{where}; save it again without metadata")
 
@@ -115,7 +123,7 @@ def _check_tiff(data: bytes, name: str | Path) -> None:
             if kind != _TIFF_TEXT and (tag < _TIFF_EXTENSIONS or kind not in _TIFF_BYTES):
                 numbers += count
     except struct.error:
-        return  # cut off, which the decoder tells
+        return  # truncated; the decoder reports it
     if numbers > MAX_TIFF_NUMBERS:
         raise ImageError(
             name, f"{numbers} numbers in its TIFF tags; at most {MAX_TIFF_NUMBERS} are read: save it in larger strips"

@@ -1,6 +1,6 @@
-"""From a picture to what a tower sees: resized, with the gel's background taken off.
+"""Prepare pictures for the towers: decode, resize, subtract the gel's background.
 
-bytes --decode_rgb--> (H, W, 3) --resize--> (px, px, 3) --subtract_background--> what a tower sees
+bytes --decode_rgb--> (H, W, 3) --resize--> (px, px, 3) --subtract_background--> input of a tower
 """
 
 import hashlib
@@ -20,7 +20,7 @@ from retrieval.data.views import VIEWS, find_object, min_photo_side, min_photo_s
 from retrieval.errors import BadInput, ConfigError, NumericalError
 
 PREPROCESSING_VERSION = 2
-"""Raise when the same file would give other numbers: indexes and checkpoints made before no longer match."""
+"""Increase it when the same file gives different values, so that older indexes and checkpoints do not match."""
 
 _SUBTRACT: dict[str, Callable[[RgbImage, RgbImage], RgbImage]] = {
     "difference": lambda touch, reference: touch - reference,
@@ -28,14 +28,22 @@ _SUBTRACT: dict[str, Callable[[RgbImage, RgbImage], RgbImage]] = {
     "abs": lambda touch, reference: np.abs(touch - reference),
 }
 BACKGROUNDS = ("none", *_SUBTRACT)
-"""What is done with R, the untouched gel: nothing; T - R in -1..1; that plus 0.5, clipped; |T - R|."""
+"""Policies for a touch T and its no-contact frame R: T alone; T - R in -1..1; T - R + 0.5, clipped; |T - R|."""
 
 
 def subtract_background(touch: RgbImage, reference: RgbImage | None, policy: str) -> RgbImage:
-    """Take the untouched gel off a touch, both (H, W, 3) float32 in 0..1, by one of BACKGROUNDS.
+    """Subtract the no-contact frame from a touch.
 
-    "none" returns `touch` itself. In float32: uint8 subtraction wraps, and turns 1 grey level darker into 255
-    brighter. Raises ConfigError for an unknown policy or a missing reference, BadInput for other shapes.
+    The arithmetic is float32: a uint8 subtraction wraps, and turns 1 grey level darker into 255 brighter.
+
+    Args:
+        touch: (H, W, 3) float32 in 0..1.
+        reference: The no-contact frame, of the same shape; may be None for "none".
+        policy: One of BACKGROUNDS; "none" returns `touch` itself.
+
+    Raises:
+        ConfigError: The policy is unknown, or the reference is missing.
+        BadInput: An image has the wrong shape or type.
     """
     _check_policy(policy)
     check_rgb(touch, "touch")
@@ -45,7 +53,7 @@ def subtract_background(touch: RgbImage, reference: RgbImage | None, policy: str
         raise _missing_reference(policy)
     check_rgb(reference, "reference")
     if touch.shape != reference.shape:
-        raise BadInput(f"touch and reference must have one shape, got {touch.shape} and {reference.shape}")
+        raise BadInput(f"touch and reference must have the same shape, got {touch.shape} and {reference.shape}")
     return _SUBTRACT[policy](touch, reference)
 
 
@@ -56,20 +64,24 @@ def _check_policy(policy: object) -> None:
 
 def _missing_reference(policy: str) -> ConfigError:
     return ConfigError(
-        f'background = "{policy}" needs a picture of the untouched gel beside each touch: '
-        'give a reference, or set background = "none"'
+        f'background = "{policy}" needs a no-contact frame for each touch: give a reference, or set background = "none"'
     )
 
 
 Side = Annotated[int, Meta(ge=1, le=4096)]
-"""Of a square, in pixels."""
+"""Side of a square in pixels."""
 
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """How files become what the towers see: sides of the squares in pixels, one of BACKGROUNDS, which views of a
-    photo stand side by side (`retrieval.data.views.VIEWS`), and whether a JPEG photo is decoded no larger than these
-    need (`reduced`).
+    """Settings of the preparation of pictures for the towers.
+
+    Attributes:
+        touch_px: Side of a gel image in pixels.
+        photo_px: Side of each view of a photo in pixels.
+        background: One of BACKGROUNDS.
+        views: Views of a photo, tiled side by side (`retrieval.data.views.VIEWS`).
+        reduced: Whether a JPEG photo is decoded no larger than its views require.
     """
 
     touch_px: Side = 128
@@ -91,21 +103,30 @@ class Preprocessing:
         return asdict(self) | {"views": list(self.views)}
 
     def digest(self) -> str:
-        """Return the SHA-256 (hex) that is equal exactly when the same file gives the same numbers."""
+        """Return the SHA-256 (hex) that is equal exactly when the same file gives the same values."""
         content = {"version": PREPROCESSING_VERSION, **self.to_dict()}
-        if self.views == ("whole",):  # what there was before views
+        if self.views == ("whole",):  # keeps the digest of checkpoints without this setting
             del content["views"]
-        if not self.reduced:  # what there was before
+        if not self.reduced:  # likewise
             del content["reduced"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
     def photo(self, image: RgbImage) -> RgbImage:
-        """(H, W, 3) in 0..1 to (photo_px, views * photo_px, 3). Raises BadInput, NumericalError."""
+        """Return the tiled views (photo_px, views * photo_px, 3) of a photo (H, W, 3) in 0..1.
+
+        Raises:
+            BadInput: The photo has the wrong shape or type.
+            NumericalError: A sample is not finite.
+        """
         check_rgb(image, "photo")
         return tile_views(_finite(image, "photo"), self.views, self.photo_px)
 
     def photo_from_bytes(self, data: bytes, name: str | Path) -> RgbImage:
-        """The bytes of a photo's file as `photo` gives the picture in them. Raises ImageError."""
+        """Return the tiled views of the photo in the bytes of a file, called `name` in messages.
+
+        Raises:
+            ImageError: The bytes cannot be decoded.
+        """
         if not self.reduced:
             return tile_views(decode(data, name), self.views, self.photo_px)
         image = decode(data, name, min_photo_side(self.views, self.photo_px))
@@ -117,10 +138,18 @@ class Preprocessing:
         return tile_views(image, self.views, self.photo_px, box)
 
     def touch(self, image: RgbImage, reference: RgbImage | None = None) -> RgbImage:
-        """(H, W, 3) in 0..1 to (touch_px, touch_px, 3), background off. Raises BadInput, NumericalError.
+        """Return a gel image (H, W, 3) in 0..1 as (touch_px, touch_px, 3), with the background subtracted.
 
-        The background goes after resizing: the two files may have different sizes, the work is less, and for
-        "abs" sensor noise is averaged away while it has both signs instead of adding up to a grey veil.
+        The subtraction follows the resizing: the two files may have different sizes, and the work is less. For "abs",
+        sensor noise averages out while it has both signs, instead of adding a grey veil.
+
+        Args:
+            image: The gel image.
+            reference: Its no-contact frame; may be None for background "none".
+
+        Raises:
+            BadInput: An image has the wrong shape or type.
+            NumericalError: A sample is not finite.
         """
         size = (self.touch_px, self.touch_px)
         if self.background == "none" or reference is None:
@@ -129,13 +158,23 @@ class Preprocessing:
         return _finite(touch, "touch")
 
     def load_photo(self, path: str | Path) -> RgbImage:
-        """Read a photo as (photo_px, views * photo_px, 3) float32. Raises ImageError."""
+        """Read a photo as (photo_px, views * photo_px, 3) float32.
+
+        Raises:
+            ImageError: The file cannot be read or decoded.
+        """
         return self.photo_from_bytes(read_bytes(path), path)
 
     def load_touch(self, path: str | Path, reference: str | Path | None = None) -> RgbImage:
-        """Read one finger's gel image as (touch_px, touch_px, 3) float32; "none" never opens the reference.
+        """Read one finger's gel image as (touch_px, touch_px, 3) float32.
 
-        Raises ImageError, and ConfigError where the policy needs a reference that is not given.
+        Args:
+            path: File of the gel image.
+            reference: File of the no-contact frame; not opened for background "none".
+
+        Raises:
+            ImageError: A file cannot be read or decoded.
+            ConfigError: The background policy requires a reference, and it is missing.
         """
         if self.background == "none":
             return self.touch(read_rgb(path))
@@ -146,5 +185,5 @@ class Preprocessing:
 
 def _finite(image: RgbImage, what: str) -> RgbImage:
     if not np.isfinite(image).all():
-        raise NumericalError(f"the {what} holds a NaN or infinite sample; every sample must lie in 0..1")
+        raise NumericalError(f"the {what} contains a NaN or infinite sample; every sample must be in 0..1")
     return image

@@ -14,16 +14,19 @@ Samples: TypeAlias = npt.NDArray[np.uint8] | RgbImage
 """A picture (H, W, C) of 8 bits, 0..255, or in float32."""
 
 _BAND = 1 << 18
-"""Pixels of an 8-bit picture that are in float32 at once, about."""
+"""Approximate number of pixels of an 8-bit picture that are converted to float32 at once."""
 
 
 def resize(image: RgbImage, size: tuple[int, int]) -> RgbImage:
     """Resize `image` (H, W, 3) float32 to `size` = (height, width) pixels.
 
-    Aspect is not kept and nothing is cropped: the paper tried cropping and found it worse.
-    An axis that shrinks is averaged over the area of each new pixel, an axis that grows is interpolated
-    linearly between pixel centres (the edge repeats). cv2.INTER_AREA drops overlaps below 0.001 pixel. Overlaps are
-    multiples of 1 / new side: below 1000 pixels the mean is exact to 1e-6, from there to 0.001. Raises BadInput.
+    The aspect ratio is not kept, and nothing is cropped: the paper found cropping worse. An axis that shrinks is
+    averaged over the area of each new pixel. An axis that grows is interpolated linearly between pixel centres (the
+    edge repeats). cv2.INTER_AREA drops overlaps below 0.001 pixel, and overlaps are multiples of 1 / new side. So the
+    mean is exact to 1e-6 below 1000 pixels, and to 0.001 from there on.
+
+    Raises:
+        BadInput: The image has the wrong shape or type, or the size is empty.
     """
     check_rgb(image, "image")
     if min(size) < 1:
@@ -32,13 +35,13 @@ def resize(image: RgbImage, size: tuple[int, int]) -> RgbImage:
 
 
 def to_unit(image: Samples) -> RgbImage:
-    """The picture in float32, 0..1."""
+    """Return the picture in float32, 0..1."""
     unit: RgbImage = image if image.dtype == np.float32 else np.divide(image, 255, dtype=np.float32)  # type: ignore[assignment]
     return unit
 
 
 def resize_unchecked(samples: Samples, size: tuple[int, int]) -> RgbImage:
-    """As `resize`, for pictures (H, W, C) of any number of channels, and without its checks."""
+    """Resize like `resize`, without checks, for pictures (H, W, C) of any number of channels."""
     image = samples
     for axis in sorted((0, 1), key=lambda axis: size[axis] / samples.shape[axis]):  # shrink before growing
         if image.shape[axis] != size[axis]:
@@ -47,7 +50,7 @@ def resize_unchecked(samples: Samples, size: tuple[int, int]) -> RgbImage:
 
 
 def _shrink(image: Samples, axis: int, length: int) -> RgbImage:
-    """Shrink one axis, band by band of the other one: few samples are in float32 at once."""
+    """Shrink one axis, in bands of the other axis, so that few samples are in float32 at once."""
     other, bands = 1 - axis, []
     count = min(image.shape[other], -(-image[..., 0].size // _BAND))
     for band in np.array_split(image, count, axis=other):
@@ -58,16 +61,18 @@ def _shrink(image: Samples, axis: int, length: int) -> RgbImage:
 
 
 def _grow(image: Samples, axis: int, length: int) -> RgbImage:
-    """Interpolate one axis. cv2.INTER_LINEAR rounds the places to float32 first: its pixels differ by up to 1e-7, and
-    partial activations, stored as float16, by up to 1e-3 of their value.
+    """Interpolate one axis linearly.
+
+    cv2.INTER_LINEAR rounds positions to float32 first: its pixels differ by up to 1e-7, and partial activations,
+    stored as float16, by up to 1e-3 of their value.
     """
     unit, old = to_unit(image), image.shape[axis]
     position = np.clip((np.arange(length) + 0.5) * (old / length) - 0.5, 0, old - 1)
     left = np.minimum(position.astype(np.int64), max(old - 2, 0))
-    share = (position - left).reshape((-1, 1, 1) if axis == 0 else (-1, 1))
+    weight = (position - left).reshape((-1, 1, 1) if axis == 0 else (-1, 1))
     right = np.minimum(left + 1, old - 1)
-    grown: RgbImage = unit.take(left, axis) * (1 - share).astype(np.float32)
-    grown += unit.take(right, axis) * share.astype(np.float32)
+    grown: RgbImage = unit.take(left, axis) * (1 - weight).astype(np.float32)
+    grown += unit.take(right, axis) * weight.astype(np.float32)
     return grown
 
 

@@ -1,15 +1,14 @@
-"""Photos that lie elsewhere than in a folder of this machine: in an object store, behind HTTP, in Parquet files, in
-WebDataset archives. Whatever `fsspec` opens is read, by its URL.
+"""Catalogues in an object store, behind HTTP, in Parquet files or in WebDataset archives, opened by `fsspec`.
 
-    s3://bucket/catalog                 a folder: `retrieval.data.catalogue` says how, its metadata.jsonl too
-    s3://bucket/photos/*.parquet        a row a photo: `path` (or `file_name`), or `image` with its bytes (plain, or as
-                                        {bytes, path}); `object_id`, or what the rule makes of the path; the rest is the
-                                        user's own metadata
+    s3://bucket/catalog                 a folder, laid out as in `retrieval.data.catalogue`, with its metadata.jsonl
+    s3://bucket/photos/*.parquet        one row per photo: `path` (or `file_name`), or `image` with its bytes (plain, or
+                                        as {bytes, path}); `object_id`, else the naming rule applies to the path; other
+                                        columns are the user's own metadata
     s3://bucket/photos-{000..015}.tar   members `key.jpg`, and `key.json` with metadata and perhaps `object_id`
 
-Listing reads names, and of Parquet all columns but the pictures; the pictures are read one by one when they are
-embedded. What the storage refuses is asked for again; where it goes on, the job ends and can go on later: a photo is
-left out for what it is, never for what the network did.
+Listing reads names, and all Parquet columns but the pictures. The pictures are read one by one when they are embedded.
+Failed requests are retried. If the storage keeps failing, the job ends and can be continued later: a photo is left out
+only because of its content, never because of the network.
 """
 
 import math
@@ -42,31 +41,39 @@ from retrieval.errors import BadInput, DatasetError, ImageError
 _PATHS, _PICTURES = ("path", "file_name"), ("image", "photo", "bytes")
 _RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
 _MAX_CACHED_GROUPS = 4
-"""Row groups of pictures that are held at once."""
+"""Row groups of pictures in memory at once."""
 
 
 class Source(Protocol):
-    """Where photos lie, as it is sent to whoever reads them."""
+    """Location of photos, which can be sent to another process."""
 
     def read(self, path: str) -> bytes:
-        """The bytes of a photo's file. Raises what `fsspec` raises."""
+        """Return the bytes of a photo's file; errors of `fsspec` are raised unchanged."""
 
 
 @dataclass(frozen=True)
 class RemoteCatalogue(Catalogue):
-    """A catalogue of another place than a folder of this machine. url: what it is called."""
+    """A catalogue outside this machine's folders.
+
+    Attributes:
+        source: Location of the photos.
+        url: URL of the catalogue.
+    """
 
     source: Source | None = None
     url: str = ""
 
     @property
     def where(self) -> str:
-        """The URL, by which indexes name the catalogue."""
+        """The URL of the catalogue, which indexes store."""
         return self.url
 
     def read(self, path: str) -> bytes:
-        """The bytes of a photo's file. Raises ImageError for one that is gone or too large, and StorageError where the
-        storage does not answer.
+        """Return the bytes of a photo's file.
+
+        Raises:
+            ImageError: The file is missing, unreadable or too large.
+            RemoteStorageError: The storage does not respond.
         """
         assert self.source is not None
         try:
@@ -81,14 +88,23 @@ class RemoteCatalogue(Catalogue):
 
 
 def is_url_or_archive(where: str | Path) -> bool:
-    """Whether this is read by `list_photos` alone, not as a folder."""
+    """Return whether `where` is a URL, a Parquet file or a tar file, not a folder."""
     return is_url(where) or str(where).endswith((".parquet", ".tar"))
 
 
-def list_photos(where: str | Path, naming: Naming | None = None, seen: FolderCache | None = None) -> Catalogue:
-    """The photos of a folder, or of a URL as the text above says. Raises DatasetError as `list_catalogue` does."""
+def list_photos(where: str | Path, naming: Naming | None = None, folder_cache: FolderCache | None = None) -> Catalogue:
+    """List the photos of a folder, a URL, Parquet files or tar files.
+
+    Args:
+        where: A folder or URL, as described at the top of this module.
+        naming: Rule that names the object of each photo; by folder where None.
+        folder_cache: As for `list_catalogue`; for folders on this machine only.
+
+    Raises:
+        DatasetError: As for `list_catalogue`.
+    """
     if not is_url_or_archive(where):
-        return list_catalogue(Path(where), naming, seen)
+        return list_catalogue(Path(where), naming, folder_cache)
     url, naming = str(where), naming or Naming()
     if url.endswith(".parquet"):
         return _list_parquet_files(url, naming)
@@ -105,7 +121,7 @@ class FolderSource:
     url: str
 
     def read(self, path: str) -> bytes:
-        """As `Source.read`."""
+        """Return the bytes of a photo's file, as `Source.read`."""
         system, root = file_system(self.url)
         data: bytes = system.cat_file(f"{root.rstrip('/')}/{path}" if "://" not in path else path)
         return data
@@ -135,21 +151,21 @@ def _list_folder(url: str, naming: Naming) -> Catalogue:
 def _make_remote_catalogue(
     url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming: Naming, source: Source
 ) -> RemoteCatalogue:
-    """A catalogue of photos, each with its object's name where the file gives one."""
-    found, skipped, seen = list[CataloguePhoto](), list[SkippedPhoto](), set[str]()
+    """Return the catalogue of photos, each with an object id or None; the naming rule applies where it is None."""
+    found, skipped, paths_seen = list[CataloguePhoto](), list[SkippedPhoto](), set[str]()
     for photo, object_id in photos:
         name = object_id or naming.object_of(photo.path)
         if not is_utf8(photo.path):
             skipped.append(skipped_non_utf8(photo.path))
-        elif photo.path in seen:
-            skipped.append(SkippedPhoto(photo.path, "comes twice"))
+        elif photo.path in paths_seen:
+            skipped.append(SkippedPhoto(photo.path, "is listed twice"))
         elif not is_inside(photo.path):
             skipped.append(SkippedPhoto(photo.path, "its name leads out of the catalogue"))
         elif not name:
             skipped.append(SkippedPhoto(photo.path, f"does not fit --objects-from {naming.text}"))
         else:
             found.append(replace(photo, object_id=name))
-        seen.add(photo.path)
+        paths_seen.add(photo.path)
     if not found:
         why = f"; {skipped[0].path}: {skipped[0].reason}" if skipped else ""
         raise DatasetError(f"no photo in the catalogue {url}{why}")
@@ -162,17 +178,22 @@ def _make_remote_catalogue(
 
 @dataclass(frozen=True)
 class ParquetSource:
-    """Pictures in a column. places: of each photo its file, its row group and its row there."""
+    """Pictures in a column of Parquet files.
+
+    Attributes:
+        column: Name of the column.
+        places: (file, row group, row in the group) of each photo, by path.
+    """
 
     column: str
     places: Mapping[str, tuple[str, int, int]]
 
     def read(self, path: str) -> bytes:
-        """As `Source.read`."""
+        """Return the bytes of a photo's file, as `Source.read`."""
         file, group, row = self.places[path]
         data = _row_group(file, group, self.column)[row]
         if not isinstance(data, bytes):
-            raise ValueError("the row holds no picture")
+            raise ValueError("the row contains no picture")
         return data
 
 
@@ -180,7 +201,7 @@ _row_group_lock = threading.Lock()
 
 
 def _row_group(file: str, group: int, column: str) -> list[Any]:
-    with _row_group_lock:  # else each thread reads a group anew
+    with _row_group_lock:  # without the lock each thread would read the group
         return _read_group(file, group, column)
 
 
@@ -201,21 +222,19 @@ def _parquet_file(url: str) -> Any:
 
 
 def _expand_pattern(url: str) -> list[str]:
-    """URLs of the files that a pattern names."""
-    spread = _RANGE.search(url)
-    if spread:
-        low, high = spread.groups()
+    """Return the URLs of the files that match a pattern."""
+    span = _RANGE.search(url)
+    if span:
+        low, high = span.groups()
         numbers = (f"{number:0{len(low)}d}" for number in range(int(low), int(high) + 1))
-        return [
-            one for number in numbers for one in _expand_pattern(url[: spread.start()] + number + url[spread.end() :])
-        ]
+        return [one for number in numbers for one in _expand_pattern(url[: span.start()] + number + url[span.end() :])]
     system, path = file_system(url)
     try:
         found = retry(url, lambda: sorted(system.glob(path)) if "*" in path else [path])
     except PERMANENT_ERRORS as error:
         raise DatasetError(f"{url} cannot be listed: {error}") from error
     if not found:
-        raise DatasetError(f"{url} names no file")
+        raise DatasetError(f"no file matches {url}")
     return [system.unstrip_protocol(one) for one in found]
 
 
@@ -229,12 +248,12 @@ def _list_parquet_files(url: str, naming: Naming) -> Catalogue:
         except PERMANENT_ERRORS as error:
             raise DatasetError(f"{file} is not a readable Parquet file: {error}") from error
         if column not in (None, own):
-            told = [f"{name} has {each or 'names of files'}" for name, each in ((files[0], column), (file, own))]
-            raise DatasetError(f"{url}: pictures must be in one column of all files; {', '.join(told)}")
+            columns = [f"{name} has {each or 'names of files'}" for name, each in ((files[0], column), (file, own))]
+            raise DatasetError(f"{url}: pictures must be in the same column of all files; {', '.join(columns)}")
         column = own
         for photo, object_id, place in listed:
             photos.append((photo, object_id))
-            places.setdefault(photo.path, place)  # of two of one name the first is taken
+            places.setdefault(photo.path, place)  # the first of two photos with one name
     source: Source = ParquetSource(column, places) if column else FolderSource(url.rpartition("/")[0] or ".")
     return _make_remote_catalogue(url, photos, naming, source)
 
@@ -243,8 +262,9 @@ _Row = tuple[CataloguePhoto, str | None, tuple[str, int, int]]
 
 
 def _list_parquet(file: str) -> tuple[str, list[_Row]]:
-    """The column with pictures, "" where rows name their files; and of each row its photo, its object where it names
-    one, and its place: file, row group, row there.
+    """Return the column with pictures ("" where rows name files), and the rows.
+
+    Each row is (photo, object id or None, place), with the place as in `ParquetSource`.
     """
     found = list[_Row]()
     with _parquet_file(file) as table:
@@ -252,12 +272,12 @@ def _list_parquet(file: str) -> tuple[str, list[_Row]]:
         picture = next((name for name in _PICTURES if name in names), "")
         path = next((name for name in _PATHS if name in names), "")
         if not picture and not path:
-            raise ValueError(f"it must have a column of {', '.join((*_PATHS, *_PICTURES))}; has {', '.join(names)}")
-        wanted, stem = [name for name in names if name != picture], PurePosixPath(file).stem
+            raise ValueError(f"it needs one column of {', '.join((*_PATHS, *_PICTURES))}; it has {', '.join(names)}")
+        others, stem = [name for name in names if name != picture], PurePosixPath(file).stem
         count = 0
         for group in range(table.num_row_groups):
             rows = table.metadata.row_group(group).num_rows
-            columns = table.read_row_group(group, columns=wanted).to_pylist() if wanted else [{}] * rows
+            columns = table.read_row_group(group, columns=others).to_pylist() if others else [{}] * rows
             for place, row in enumerate(columns):
                 own = row.pop(path, None) if path else None
                 name = str(own) if own else f"{stem}/{count + place:08d}"
@@ -278,17 +298,21 @@ def _is_plain(value: object) -> bool:
 
 @dataclass(frozen=True)
 class ArchiveSource:
-    """Members of tar files. places: of each photo its archive, and from where to where in it."""
+    """Members of tar files.
+
+    Attributes:
+        places: (archive, start, end) of each photo in bytes, by path.
+    """
 
     places: Mapping[str, tuple[str, int, int]]
 
     def read(self, path: str) -> bytes:
-        """As `Source.read`."""
+        """Return the bytes of a photo's file, as `Source.read`."""
         url, start, end = self.places[path]
         system, name = file_system(url)
         data: bytes = system.cat_file(name, start=start, end=end)
         if len(data) != end - start:
-            raise OSError("the archive was cut short")
+            raise OSError("the archive is truncated")
         return data
 
 
@@ -299,13 +323,13 @@ def _list_archives(url: str, naming: Naming) -> Catalogue:
             members = retry(file, lambda file=file: list(_members(file)))  # type: ignore[misc]
         except PERMANENT_ERRORS as error:
             raise DatasetError(f"{file} is not a readable tar file: {error}") from error
-        stem, about = PurePosixPath(file).stem, dict[str, dict[str, Any]]()
+        stem, metadata = PurePosixPath(file).stem, dict[str, dict[str, Any]]()
         for name, data, _, _ in members:
             if data is not None:
-                about[_sample_key(name)] = _metadata(f"{file}, {name}", data)
+                metadata[_sample_key(name)] = _metadata(f"{file}, {name}", data)
         for name, data, start, end in members:
             if data is None:
-                own = dict(about.get(_sample_key(name), {}))
+                own = dict(metadata.get(_sample_key(name), {}))
                 object_id = own.pop("object_id", None)
                 path = f"{stem}/{name}" if "/" not in name else name
                 photos.append((CataloguePhoto(path, "", own), None if object_id is None else str(object_id)))
@@ -314,7 +338,7 @@ def _list_archives(url: str, naming: Naming) -> Catalogue:
 
 
 def _members(url: str) -> Iterator[tuple[str, bytes | None, int, int]]:
-    """Name, document (None for a picture), start and end of the members that matter."""
+    """Yield (name, document or None for a picture, start, end) of each picture and JSON member."""
     from retrieval.data.images import EXTENSIONS
 
     system, path = file_system(url)
@@ -332,13 +356,16 @@ def _members(url: str) -> Iterator[tuple[str, bytes | None, int, int]]:
 
 
 def _sample_key(name: str) -> str:
-    """What members of one sample share: the name up to the first dot after the folders."""
+    """Return the key of a member's sample: the name up to the first dot after the folders."""
     folder, _, last = name.rpartition("/")
     return f"{folder}/{last.partition('.')[0]}"
 
 
 def _metadata(where: str, data: bytes) -> dict[str, Any]:
-    """The plain keys of a document; none where it is no JSON object. Raises DatasetError for text that is not UTF-8."""
+    """Return the plain values of a JSON object by key; empty for any other document.
+
+    Raises DatasetError for text that is not valid UTF-8.
+    """
     try:
         document = parse_json(data)
     except ValueError:

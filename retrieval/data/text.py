@@ -1,5 +1,7 @@
-"""Text that UTF-8 can hold. JSON may name half of a surrogate pair, `"\\ud83d"`, as a cut-off emoji leaves it: Python
-reads it, and no file, terminal or HTTP answer can show it.
+r"""Check that text can be encoded as UTF-8.
+
+JSON may contain a lone surrogate such as `"\ud83d"`, as from a truncated emoji. Python reads it, but no file, terminal
+or HTTP response can contain it.
 """
 
 import json
@@ -10,7 +12,7 @@ _SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 def is_utf8(document: Any) -> bool:
-    """Whether UTF-8 can hold every text of a JSON document, keys too."""
+    """Return whether every text of a JSON document, keys included, can be encoded as UTF-8."""
     try:
         json.dumps(document, ensure_ascii=False).encode()
     except UnicodeEncodeError:
@@ -19,13 +21,17 @@ def is_utf8(document: Any) -> bool:
 
 
 def require_utf8(document: Any) -> None:
-    """Raise ValueError for a JSON document with text that UTF-8 cannot hold."""
+    """Check that a JSON document can be encoded as UTF-8.
+
+    Raises:
+        ValueError: A text contains a lone surrogate.
+    """
     if not is_utf8(document):
-        raise ValueError("it holds half of a character (a lone surrogate such as \\ud83d); write the whole character")
+        raise ValueError("contains a lone surrogate such as \\ud83d; write the whole character")
 
 
 def replace_surrogates(document: Any) -> Any:
-    """A JSON document, in which U+FFFD stands for what UTF-8 cannot hold."""
+    """Return a JSON document with U+FFFD in place of each lone surrogate."""
     if is_utf8(document):
         return document
     return json.loads(_SURROGATE.sub("\ufffd", json.dumps(document, ensure_ascii=False)))

@@ -1,12 +1,12 @@
-"""What of a photo the matcher sees: the whole, and the object cut out of it.
+"""Views of a photo for the matcher: the whole photo, and crops around the object.
 
-    whole   the photo, its sides made equal
+    whole   the photo, resized to a square
     crop    a square around the object, a little larger than it
     zoom    a square around the object's middle, 7/16 of the photo's shorter side: one scale for all photos of a camera
     grey    the zoom without its colours
 
-In a photo at the towers' resolution the relief that a gel feels is a few pixels wide. `zoom` shows it at the camera's
-own resolution; `grey` because colour says nothing about what can be felt.
+At the towers' resolution, the relief that touches a gel is a few pixels wide in a photo. `zoom` shows it at the
+camera's resolution. `grey` drops the colour, which carries no tactile information.
 """
 
 import math
@@ -23,15 +23,15 @@ from retrieval.data.resize import RgbImage, Samples, resize_unchecked, to_unit
 _CROP_MARGIN = 1.12
 _ZOOM_FRACTION = 7 / 16
 _SIDE = 128
-"""The object is looked for in a photo of so many pixels a side."""
+"""Side in pixels of the resized photo in which the object is searched."""
 _RING = 6
 _GAMMA = 2.2
 _SHADE_TINT = 0.22
-"""By how much light of the sky alone may shift the ground's colour between red and blue."""
+"""Largest shift of the ground's colour between red and blue under sky light alone."""
 _DARKEST_SHADE = -1.6
-"""Logarithm of how dark a shadow makes the ground at most."""
+"""Logarithm of the darkest shadow's lightness relative to the ground."""
 _DIFFERENCE_THRESHOLDS = (4.0, 3.5)
-"""From how many deviations of the ground a colour, and a lightness, is another thing's."""
+"""Deviations of the ground's colour, and lightness, from which a pixel counts as the object's."""
 
 Grey = NDArray[np.float32]
 
@@ -46,15 +46,15 @@ class PixelBox(NamedTuple):
 
 
 def find_object(image: Samples) -> PixelBox:
-    """Where the one object of a photo (H, W, 3) lies that stands before a plain ground; the whole photo if none does.
+    """Return the box of the one object before a plain ground in a photo (H, W, 3), or the whole photo without one.
 
-    The ground is what the photo's border shows: planes of colour and lightness, fitted without what sticks out. An
-    object differs from it in colour, or is lighter, or darker than a shadow: a shadow is the ground with less light
-    and a tint between the lamp's and the sky's. Where depth was recorded it would say better; a catalogue has none.
+    The border of the photo shows the ground: planes of colour and lightness, fitted robustly. An object differs from
+    it in colour, or is lighter, or darker than a shadow. A shadow is the ground with less light and a tint between the
+    lamp's and the sky's. Depth would be more reliable, but a catalogue has none.
     """
     height, width = image.shape[:2]
     linear = np.clip(resize_unchecked(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
-    channels = np.ascontiguousarray(linear.transpose(2, 0, 1))  # a plane after the other: sums in a tenth of the time
+    channels = np.ascontiguousarray(linear.transpose(2, 0, 1))  # channels first: sums take a tenth of the time
     lightness = _channel_sum(channels) / 3
     (red, green, blue, lighter), scatter = _ground_residuals(np.stack([*(channels / lightness), np.log(lightness)]))
     tint = (red - blue) / np.float32(np.sqrt(2))
@@ -71,36 +71,34 @@ def find_object(image: Samples) -> PixelBox:
 
 
 def _channel_sum(channels: NDArray[np.float32]) -> Grey:
-    """The sum of three channels, one added after the other as numpy's own sum over a pixel's numbers does, in a tenth
-    of its time.
-    """
+    """Return the sum of three channels, in the same order as numpy's sum over a pixel, in a tenth of its time."""
     total: Grey = channels[0] + channels[1] + channels[2]
     return total
 
 
 def _ground_residuals(values: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """How much each of n maps of values (n, S, S) lies above a plane through the values of its border, and how much
-    these scatter about that plane (n,).
-    """
+    """Return the residuals (n, S, S) of n maps above a plane fitted to their border, and the border's scatter (n,)."""
     ring, planes, products = _border()
     flat = values.reshape(len(values), -1)
     border, terms = flat[:, ring], planes[:, ring]
     weights, scatter = np.zeros((len(values), 3)), np.zeros(len(values))
-    kept = np.ones(border.shape, bool)
+    inliers = np.ones(border.shape, bool)
     for _ in range(4):
-        chosen = kept.astype(np.float64)
+        chosen = inliers.astype(np.float64)
         normal, right = (chosen @ products).reshape(-1, 3, 3), (chosen * border) @ terms.T
         weights[:] = np.linalg.solve(normal, right[..., None])[..., 0]
-        away = np.abs(border - (weights @ terms).astype(np.float32))
-        scatter = 1.4826 * _medians(away, kept) + 1e-4  # the deviation of a normal distribution
-        kept = away < 3 * scatter[:, None]
+        residuals = np.abs(border - (weights @ terms).astype(np.float32))
+        scatter = 1.4826 * _medians(residuals, inliers) + 1e-4  # standard deviation of a normal distribution
+        inliers = residuals < 3 * scatter[:, None]
     return values - (weights @ planes).astype(np.float32).reshape(values.shape), scatter
 
 
 @lru_cache(maxsize=1)
 def _border() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """The places (R,) of the border's pixels; the planes 1, x and y of all pixels (3, S * S); and of the border's the
-    products of any two (R, 9).
+    """Return the terms of the plane fit.
+
+    Indices (R,) of the border's pixels; the planes 1, x and y of all pixels (3, S * S); and the products (R, 9) of any
+    two planes at the border's pixels.
     """
     inside = np.zeros((_SIDE, _SIDE), bool)
     inside[_RING:-_RING, _RING:-_RING] = True
@@ -111,16 +109,16 @@ def _border() -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float6
     return ring, planes, (terms[:, :, None] * terms[:, None, :]).reshape(-1, 9)
 
 
-def _medians(values: NDArray[np.float32], kept: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """The median (n,) of the kept values of each row of `values` (n, R); each row keeps one at least."""
-    ranked = np.sort(np.where(kept, values, np.float32(np.inf)), axis=1)
-    count, rows = kept.sum(axis=1), np.arange(len(values))
+def _medians(values: NDArray[np.float32], selected: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Return the median (n,) of the selected values of each row (n, R); each row has at least one."""
+    ranked = np.sort(np.where(selected, values, np.float32(np.inf)), axis=1)
+    count, rows = selected.sum(axis=1), np.arange(len(values))
     middle: NDArray[np.float64] = (ranked[rows, (count - 1) // 2].astype(np.float64) + ranked[rows, count // 2]) / 2
     return middle
 
 
 def _largest_region(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
-    """Sides of the box around the largest region near the middle, with those a tenth as large; None for too little."""
+    """Return the box around the largest region near the middle and all regions a tenth as large; None if too small."""
     mask = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
     count, _, about, middles = cv2.connectedComponentsWithStats(mask)
@@ -135,9 +133,7 @@ def _largest_region(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | N
 
 
 def crop_square(image: Samples, box: PixelBox, side: float) -> Samples:
-    """The square of `side` pixels about the middle of a box in the photo; beyond the photo's edge its last pixels go
-    on.
-    """
+    """Return the square of `side` pixels around the middle of a box; pixels beyond the photo's edge repeat the edge."""
     size = max(round(side), 1)
     left, top = (round(middle - size / 2) for middle in ((box.left + box.right) / 2, (box.top + box.bottom) / 2))
     inside = image[max(top, 0) : top + size, max(left, 0) : left + size]
@@ -166,34 +162,49 @@ VIEWS: dict[str, Callable[[Samples, PixelBox], Samples]] = {
     "zoom": _zoom,
     "grey": _grey,
 }
-"""Name of a view -> what cuts it out of a photo (H, W, 3), given the object's box: (h, w, 3), or (h, w, 1) of no
+"""Name of a view -> function of a photo (H, W, 3) and the object's box; returns (h, w, 3), or (h, w, 1) without
 colour."""
 
 
 OVERSAMPLING = 2
-"""Pixels of a reduced photo, along a side, for each that a tower sees."""
+"""Pixels of a reduced photo, along a side, for each pixel of a tower's input."""
 _VIEW_FRACTIONS = {"whole": 1.0, "zoom": _ZOOM_FRACTION, "grey": _ZOOM_FRACTION}
 
 
 def min_photo_side(names: Sequence[str], px: int) -> int:
-    """How many pixels the shorter side of a photo must have so that these views of it hold OVERSAMPLING of its pixels
-    for each of theirs, whatever it shows, and its object can be looked for.
+    """Return the smallest shorter side in pixels of a photo that is sufficient for these views and the object search.
+
+    Each pixel of a view then has OVERSAMPLING pixels of the photo along a side. The view `crop` is not considered,
+    since it depends on the object (`min_photo_side_for_crop`).
     """
-    wanted = [OVERSAMPLING * px / _VIEW_FRACTIONS[name] for name in names if name in _VIEW_FRACTIONS]
-    return math.ceil(max([_SIDE, OVERSAMPLING * px, *wanted]))
+    sides = [OVERSAMPLING * px / _VIEW_FRACTIONS[name] for name in names if name in _VIEW_FRACTIONS]
+    return math.ceil(max([_SIDE, OVERSAMPLING * px, *sides]))
 
 
 def min_photo_side_for_crop(box: PixelBox, short: int, px: int) -> int:
-    """The same for the view that is cut to the object in `box`, of a photo whose shorter side has `short` pixels."""
-    share = _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top, 1) / short
-    return math.ceil(OVERSAMPLING * px / float(share))
+    """Return the smallest shorter side that is sufficient for the view `crop`.
+
+    Args:
+        box: The object's box in a photo of the same picture.
+        short: Shorter side of that photo in pixels.
+        px: Side of the view in pixels.
+    """
+    fraction = _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top, 1) / short
+    return math.ceil(OVERSAMPLING * px / float(fraction))
 
 
 def tile_views(image: Samples, names: Sequence[str], px: int, box: PixelBox | None = None) -> RgbImage:
-    """(px, len(names) * px, 3): the views of a photo (H, W, 3), side by side. box: of its object; None looks for it."""
+    """Return the views of a photo (H, W, 3), side by side: (px, len(names) * px, 3).
+
+    Args:
+        image: The photo.
+        names: Names of the views.
+        px: Side of each view in pixels.
+        box: The object's box; None searches it.
+    """
     if box is None:
         box = PixelBox(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)
-    found = np.empty((px, len(names) * px, 3), np.float32)
-    for place, name in enumerate(names):
-        found[:, place * px : (place + 1) * px] = resize_unchecked(VIEWS[name](image, box), (px, px))
-    return found
+    tiles = np.empty((px, len(names) * px, 3), np.float32)
+    for number, name in enumerate(names):
+        tiles[:, number * px : (number + 1) * px] = resize_unchecked(VIEWS[name](image, box), (px, px))
+    return tiles

@@ -1,1 +1,1 @@
-"""From a recording to a checkpoint."""
+"""Train checkpoints on recordings."""

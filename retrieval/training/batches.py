@@ -1,4 +1,4 @@
-"""From pairs to the features of their distinct images: towers in training, or frozen ones whose features are kept."""
+"""Features of the distinct images of pairs, from towers in training or from frozen towers with cached features."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -25,7 +25,7 @@ from retrieval.training.disk_image_cache import DiskImageCache
 
 @dataclass(frozen=True)
 class LoadedBatch:
-    """A batch with what its features are made from: images, or the features themselves."""
+    """A batch with its images, or with the features themselves."""
 
     batch: PairBatch
     touches: Tensor
@@ -33,7 +33,7 @@ class LoadedBatch:
 
 
 class BatchImages:
-    """Loads the images of batches on worker threads (`retrieval.data.loading`), some batches ahead.
+    """Loader of the images of batches: worker threads (`retrieval.data.loading`), some batches ahead.
 
     No result depends on the settings of the loader (`TrainingConfig.workers`, `prefetch`, `pinned_memory`).
     """
@@ -59,16 +59,20 @@ class BatchImages:
 
     @property
     def decode_rate(self) -> float | None:
-        """Images a second that all workers together can decode; None where every image was kept decoded."""
+        """Images that all workers together can decode each second; None if every image came from the cache."""
         seconds = [second for decoder in self.decoders for second in decoder.seconds]
         return worker_count(self.config.training.workers) * len(seconds) / sum(seconds) if seconds else None
 
     def touch(self, grasp: Grasp) -> list[Image]:
-        """The finger images of a grasp, preprocessed. Raises DatasetError where a no-contact frame is missing."""
+        """Return the preprocessed finger images of a grasp.
+
+        Raises:
+            DatasetError: A no-contact frame is missing.
+        """
         return [self._touch(*files) for files in self._fingers(grasp)]
 
     def _fingers(self, grasp: Grasp) -> list[tuple[Path, ...]]:
-        """What each finger image of a grasp is read from."""
+        """Return the files of each finger image of a grasp."""
         if not self.uses_background:
             return [(path,) for path in grasp.touches]
         if len(grasp.backgrounds) != len(grasp.touches):
@@ -79,15 +83,15 @@ class BatchImages:
         return list(zip(grasp.touches, grasp.backgrounds, strict=True))
 
     def files(self, grasp: Grasp) -> tuple[Path, ...]:
-        """What the finger images of a grasp are read from."""
+        """Return all files of the finger images of a grasp."""
         return grasp.touches + (grasp.backgrounds if self.uses_background else ())
 
     def photo(self, path: Path) -> Image:
-        """A photo, preprocessed."""
+        """Return a preprocessed photo."""
         return self._photo(path)
 
     def cache_decoded(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
-        """Have the images of these grasps decoded into `folder`, and taken from there from now on (`DiskImageCache`)."""
+        """Decode the images of grasps into `folder`, and read them from there afterwards (`DiskImageCache`)."""
         settings = self.config.preprocessing
         by, workers = settings.digest(), self.config.training.workers
         self._touch = touches = DiskImageCache(settings.load_touch, folder, "touch", by, workers)
@@ -97,33 +101,33 @@ class BatchImages:
 
 
 class TrainedFeatures(BatchImages):
-    """Features of towers in training: this rank encodes its share of the images, and gathers the others'."""
+    """Features of towers in training: each rank encodes a part of the images and gathers the other parts."""
 
     def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[LoadedBatch]":
-        """Start loading this rank's share of the batch's images."""
+        """Start loading this rank's part of the batch's images."""
         return self._ahead.submit(self._load, batch)
 
     def _load(self, batch: PairBatch) -> LoadedBatch:
         grasps = [batch.grasps[row] for row in distributed.rank_rows(len(batch.grasps))]
         photos = [batch.photos[row] for row in distributed.rank_rows(len(batch.photos))]
-        felt = [self._workers.submit(self.touch, grasp) for grasp in grasps]
-        seen = [self._workers.submit(self.photo, path) for path in photos]
-        touches = touch_batch([future.result() for future in felt])
+        touch_futures = [self._workers.submit(self.touch, grasp) for grasp in grasps]
+        photo_futures = [self._workers.submit(self.photo, path) for path in photos]
+        touches = touch_batch([future.result() for future in touch_futures])
         return LoadedBatch(
-            batch, self._to_device(touches), self._to_device(to_batch([future.result() for future in seen]))
+            batch, self._to_device(touches), self._to_device(to_batch([future.result() for future in photo_futures]))
         )
 
     def _to_device(self, images: Tensor) -> Tensor:
-        """Images on the device, copied from pinned memory while the device computes."""
+        """Copy images to the device, from pinned memory while the device computes."""
         pinned = self.device.type == "cuda" and self.config.training.pinned_memory
         return (images.pin_memory() if pinned else images).to(self.device, non_blocking=pinned)
 
     def step_context(self) -> AbstractContextManager[None]:
-        """What a step is computed in: towers use every core."""
+        """Return the context of a training step; it changes nothing, since towers use every core."""
         return nullcontext()
 
     def train_features(self, matcher: Matcher, loaded: LoadedBatch) -> tuple[Tensor, Tensor]:
-        """Pass each distinct image through its tower once."""
+        """Return features of the batch's touches and photos; each distinct image passes through its tower once."""
         touches, photos = len(loaded.batch.grasps), len(loaded.batch.photos)
         with autocast(self.device, self.config.training.precision):
             with distributed.counting_rank_rows(touches):
@@ -133,27 +137,31 @@ class TrainedFeatures(BatchImages):
         return distributed.gather_rows(touch, touches), distributed.gather_rows(photo, photos)
 
     def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
-        """Encode the images of the pairs, each once."""
+        """Return features of the pairs' touches and photos, encoded without gradients."""
         touch = touch_features(matcher, map_in_order(self._workers, self.touch, pairs.grasps))
         return touch, photo_features(matcher, map_in_order(self._workers, self.photo, pairs.photos))
 
 
 class FrozenFeatures(BatchImages):
-    """Features of towers that stand still: each image is encoded the first time it is met, and never again.
-
-    known: features by grasp id (of the touch) and by photo file that need no encoding
-    (`retrieval.training.features.features_by_image`).
-    """
+    """Features of frozen towers: each image is encoded once."""
 
     def __init__(self, config: Config, device: torch.device, known: Mapping[str | Path, Tensor]) -> None:
-        super().__init__(config, device, keep_bytes=0)  # an image is read once: its features are kept
+        """Start with known features.
+
+        Args:
+            config: The configuration.
+            device: Device of the features.
+            known: Features by grasp id (of the touch) and by photo file that need no encoding
+                (`retrieval.training.features.features_by_image`).
+        """
+        super().__init__(config, device, keep_bytes=0)  # images are read once, since their features are cached
         self._features: dict[str | Path, Tensor] = dict(known)
 
     def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[LoadedBatch]":
-        """Look up the features of a batch, encoding what is new; done when this returns.
+        """Return the features of a batch, and encode new images before returning.
 
-        Not on the thread ahead: PyTorch gives every thread that calls it a team of workers of its own, and two teams
-        on the same cores spend a hundred times a step's arithmetic waiting for each other.
+        This does not use the prefetch thread. PyTorch starts a separate team of workers for every calling thread, and
+        two teams on the same cores wait for each other a hundred times as long as a step computes.
         """
         done: Future[LoadedBatch] = Future()
         done.set_result(self._cached_features(matcher, batch))
@@ -167,27 +175,27 @@ class FrozenFeatures(BatchImages):
             self._features.update(zip(new, touch_features(matcher, images), strict=True))
         photos = [path for path in batch.photos if path not in self._features]
         if photos:
-            shown = map_in_order(self._workers, self.photo, photos)
-            self._features.update(zip(photos, photo_features(matcher, shown), strict=True))
+            photo_images = map_in_order(self._workers, self.photo, photos)
+            self._features.update(zip(photos, photo_features(matcher, photo_images), strict=True))
         touches = torch.stack([self._features[grasp.grasp_id] for grasp in batch.grasps])
         return LoadedBatch(batch, touches, torch.stack([self._features[path] for path in batch.photos]))
 
     def step_context(self) -> AbstractContextManager[None]:
-        """What a step is computed in: the head's few small products gain nothing from a second core."""
+        """Return the context of a training step: one thread, since the head's small products gain nothing from more."""
         return one_thread()
 
     def train_features(self, matcher: Matcher, loaded: LoadedBatch) -> tuple[Tensor, Tensor]:
-        """The features, as constants of the step."""
+        """Return the features of the batch's touches and photos, as constants of the step."""
         return loaded.touches.clone(), loaded.photos.clone()
 
     def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
-        """The features of all pairs at once."""
+        """Return the features of the pairs' touches and photos."""
         loaded = self.prepare(matcher, pairs).result()
         return loaded.touches, loaded.photos
 
 
 FeatureSource = TrainedFeatures | FrozenFeatures
-"""Where a training run gets the features of a batch from."""
+"""The source of a training run's features."""
 _CHUNK = 64
 
 
@@ -201,9 +209,18 @@ def recorded_features(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Tensor, dict[Path, Tensor]]:
-    """Features of the touches of grasps (G, fingers * F), one grasp at least, and of each of their photo files (F,).
+    """Return features of the touches of grasps (G, fingers * F) and of each of their photo files (F,).
 
-    what: what they are for, in the bar and where it was stopped. Raises JobInterrupted.
+    Args:
+        matcher: The model.
+        source: The source of features.
+        grasps: At least one grasp.
+        what: Purpose of the features, for the progress bar and messages.
+        quiet: No progress on stderr.
+        should_stop: Called between parts.
+
+    Raises:
+        JobInterrupted: `should_stop()` returned True.
     """
     none = np.zeros(0, dtype=np.int64)
     touches: list[Tensor] = []

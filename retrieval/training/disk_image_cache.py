@@ -1,10 +1,10 @@
-"""Images decoded once for all trainings: memory-mapped files in a folder, read in place of the pictures.
+"""Disk cache of decoded images: memory-mapped files in a folder that all trainings can use.
 
-Like features (`retrieval.training.features`), images are kept in parts, `photo-<digest>.npy`; the digest is of the
-files that a part was decoded from and of how they were seen. A part is written whole or not at all, so what was
-interrupted goes on, and where a picture or the preprocessing changed the part is another one. A part holds what was
-decoded, to the bit: eight bits would take a quarter of the disk, and be off by half a grey level wherever a picture was
-resized. Nothing deletes parts that are no longer asked for; the whole folder may be deleted at any time.
+Images are stored in parts, `photo-<digest>.npy`, like features (`retrieval.training.features`). The digest covers the
+picture files of a part and their preprocessing, so a changed picture or setting gives a new part. A part is written
+completely or not at all, so an interrupted job continues. A part contains the exact decoded values: eight bits would
+take a quarter of the disk, but be wrong by half a grey level wherever a picture was resized. Unused parts are never
+deleted; you may delete the whole folder at any time.
 """
 
 import hashlib
@@ -32,16 +32,12 @@ _PART, _FORMAT = 128, 1
 _AHEAD = 16
 
 ImageFiles = tuple[Path | None, ...]
-"""What one image is made from."""
+"""The files of one image."""
 _Part = tuple[Path, list[ImageFiles]]
 
 
 class DiskImageCache:
-    """`load(*files)`, for images that were kept without decoding anything.
-
-    load: gives images of one shape and type. kind: begins the names of the parts. seen_by: what decides what `load`
-    gives beside the files, as a digest. workers: as `retrieval.data.loading.worker_count` takes it.
-    """
+    """A function like `load(*files)` that returns cached images without decoding."""
 
     def __init__(
         self,
@@ -51,6 +47,15 @@ class DiskImageCache:
         preprocessing_digest: str,
         workers: int | str = "auto",
     ) -> None:
+        """Set up an empty cache.
+
+        Args:
+            load: Function that returns images of one shape and type.
+            folder: Folder of the cache.
+            kind: Prefix of the names of the parts.
+            preprocessing_digest: Digest of everything besides the files that determines the result of `load`.
+            workers: As for `retrieval.data.loading.worker_count`.
+        """
         self._load, self._folder, self._kind, self._preprocessing_digest, self._workers = (
             load,
             folder,
@@ -61,14 +66,21 @@ class DiskImageCache:
         self._mapped: dict[ImageFiles, NDArray[Any]] = {}
 
     def __call__(self, *files: Path | None) -> NDArray[Any]:
-        """The image; what was not kept is loaded."""
-        kept = self._mapped.get(files)
-        return self._load(*files) if kept is None else kept
+        """Return the image, from the cache if possible."""
+        cached = self._mapped.get(files)
+        return self._load(*files) if cached is None else cached
 
     def cache_decoded(self, images: Sequence[ImageFiles], *, quiet: bool = False) -> None:
-        """Decode those that the folder does not hold, each rank its share, and map all of them.
+        """Decode the images that are not in the folder, distributed over the ranks, and map all images.
 
-        Raises DatasetError for a picture that cannot be read, BadInput where the disk is too small, OSError.
+        Args:
+            images: The files of each image.
+            quiet: No messages or progress on stderr.
+
+        Raises:
+            DatasetError: A picture cannot be read.
+            BadInput: The disk is too small.
+            OSError: The folder cannot be written.
         """
         parts = [
             (part_path(self._folder, self._kind, [self._preprocessing_digest], part).with_suffix(".npy"), part)
@@ -78,11 +90,11 @@ class DiskImageCache:
         if missing:
             self._require_space(missing, quiet)
         self._decode_parts(missing[distributed.rank() :: distributed.world_size()], quiet)
-        distributed.any_rank(False, default_device())  # all have made theirs
-        self._decode_parts(self._map_existing(missing), quiet)  # what the others wrote to disks of their own
+        distributed.any_rank(False, default_device())  # wait for all ranks
+        self._decode_parts(self._map_existing(missing), quiet)  # parts that other ranks wrote to another disk
 
     def _map_existing(self, parts: Sequence[_Part]) -> list[_Part]:
-        """Those that are not there; the images of the others are taken from them."""
+        """Map the existing parts and return the missing ones."""
         return [part for part in parts if not self._map(*part)]
 
     def _decode_parts(self, parts: Sequence[_Part], quiet: bool) -> None:
@@ -98,7 +110,7 @@ class DiskImageCache:
                 self._map(path, part)
 
     def _write(self, path: Path, part: list[ImageFiles], pool: Executor, bar: Bar) -> None:
-        """Image after image, so that a few are in memory at a time."""
+        """Write a part image by image, so that only a few are in memory at a time."""
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_file(path) as file:
             for number, image in enumerate(map_in_order(pool, lambda files: self._load(*files), part, _AHEAD)):
@@ -110,12 +122,12 @@ class DiskImageCache:
                 bar.advance()
 
     def _map(self, path: Path, part: list[ImageFiles]) -> bool:
-        """Whether the part is there, whole; then its images are taken from it."""
+        """Map a part, and return whether it exists and is complete."""
         try:
             with open_regular(path):
                 images = np.load(path, mmap_mode="r", allow_pickle=False)
             if len(images) != len(part):
-                raise ValueError(f"it holds {len(images)} images, not {len(part)}")
+                raise ValueError(f"it contains {len(images)} images, not {len(part)}")
         except FileNotFoundError:
             return False
         except (OSError, ValueError, EOFError) as error:
@@ -127,17 +139,23 @@ class DiskImageCache:
     def _require_space(self, missing: Sequence[_Part], quiet: bool) -> None:
         count = sum(len(part) for _, part in missing)
         size = count * self._load(*missing[0][1][0]).nbytes
-        said = f"{size / 1e9:.2f} GB for {count} decoded images ({self._kind})"
+        amount = f"{size / 1e9:.2f} GB for {count} decoded images ({self._kind})"
         folder = self._folder.absolute()
-        there = next(each for each in (folder, *folder.parents) if each.is_dir())
-        if size > shutil.disk_usage(there).free:
-            raise BadInput(f"{self._folder} must have room for {said}; give a folder on another disk, or none")
+        existing = next(each for each in (folder, *folder.parents) if each.is_dir())
+        if size > shutil.disk_usage(existing).free:
+            raise BadInput(f"{self._folder} needs {amount}; use a folder on another disk, or no cache")
         if not quiet:
-            say(f"{self._folder} takes {said}")
+            say(f"{self._folder} takes {amount}")
 
 
 def part_path(folder: Path, kind: str, made_by: Sequence[str], part: Sequence[ImageFiles]) -> Path:
-    """Return where a part lies that was made in this very way from these very files; it has no suffix.
+    """Return the path, without suffix, of a part in a cache folder.
+
+    Args:
+        folder: The cache folder.
+        kind: Prefix of the part's name.
+        made_by: Everything besides the files that determines the part's content.
+        part: The files of each image.
 
     Raises:
         DatasetError: A file cannot be read.

@@ -1,11 +1,11 @@
-"""Teaches a candidate_encoder the order in which the classifier puts photos (Hinton, Vinyals, Dean, arXiv:1503.02531).
+"""Distil the fusion head's ranking of photos into a candidate encoder (Hinton, Vinyals, Dean, arXiv:1503.02531).
 
-The classifier judges every pair of a batch of touches and photos; the student's scores learn its softmax over the
-photos. That asks for the top of the order above all, which is what candidates are taken from. Both are drawn afresh
-each step as blends of two recorded ones: halves are affine in features, so that a blend of halves is the half of a
-blend of features, and a few thousand recorded photos stand for the crowd that a large catalogue is. In such a crowd a
-winner stands among others that are nearly as good, and a few thousand photos have few of these: so most of a batch are
-the nearest of a pool of many, by the student as it is so far.
+The head scores every pair of a batch of touches and photos, and the student's scores learn its softmax over the photos.
+This loss weights the top of the ranking, from which candidates are taken. Touches and photos of each step are random
+blends of two recorded ones: partial activations are affine in features, so a blend of partial activations is the
+partial activation of the blended features. So a few thousand recorded photos represent a large catalogue. In a large
+catalogue many photos score nearly as high as the exhaustive top-1, but a few thousand photos contain few of these. So
+most of a batch are the photos of a large pool that are nearest by the current student.
 """
 
 import dataclasses
@@ -30,24 +30,24 @@ from retrieval.training.features import Features
 from retrieval.training.fit import Plan, fit
 
 BATCH_TOUCHES, BATCH_PHOTOS = 32, 2048
-"""In a batch; every touch is judged with every photo."""
+"""In a batch; every touch is scored with every photo."""
 LEARNING_RATE = 2e-3
 SPREAD_WEIGHT = 0.3
-"""Of the squared error of all scores, beside the divergence at the top: it steadies the start."""
+"""Weight of the squared error of all scores, in addition to the divergence; it stabilises the start."""
 MIN_WEIGHT = 0.5
-"""Of the nearer one of two blended ones."""
+"""Smallest weight of the first of two blended rows."""
 POOL_SIZE, POOL_RENEWAL_STEPS = 50_000, 100
-"""Blended photos of which the nearest are taught, and after how many steps they are others."""
+"""Number of blended photos in the pool, and number of steps until a new pool is drawn."""
 POOL_FRACTION = 0.75
-"""Of a batch, at most: the nearest of the pool."""
+"""Largest fraction of a batch that comes from the pool."""
 WARMUP_DIVISOR = 6
-"""The first of so many parts of the steps is without a pool: a student that knows nothing finds nothing."""
+"""The first 1 / WARMUP_DIVISOR of the steps uses no pool, since an untrained student cannot choose from it."""
 CANDIDATE_FRACTION = 0.01
-"""Of the photos that are candidates when a candidate_encoder is measured."""
+"""Fraction of the photos that are candidates when a candidate encoder is evaluated."""
 MAX_GRASPS = 8192
-"""Grasps whose halves are blended."""
+"""Grasps whose partial activations are blended."""
 MAX_QUERIES = 512
-"""At most so many validation touches are kept in a checkpoint."""
+"""Largest number of validation touches stored in a checkpoint."""
 
 
 def distil(
@@ -62,11 +62,25 @@ def distil(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Give `matcher` a candidate_encoder of `width` hidden units and `linear` numbers that are linear in the contrastive
-    embedding (`retrieval.model.config.MatcherConfig`), taught by `matcher.head`; nothing else of it changes.
+    """Train a candidate encoder from `matcher.head` and add it to `matcher`; nothing else of the matcher changes.
 
-    touch_partials, photo_partials (N, half): of training objects. The same seed gives the same candidate_encoder. Raises
-    JobInterrupted once `should_stop()`, NumericalError for a loss that is not finite; the matcher is then as it was.
+    The matcher is unchanged if an error is raised.
+
+    Args:
+        matcher: The matcher.
+        touch_partials: Partial activations (N, P) of touches of training objects.
+        photo_partials: Partial activations (N, P) of photos of training objects.
+        width: Hidden units of the candidate encoder.
+        steps: Number of steps.
+        seed: The same seed gives the same candidate encoder.
+        linear: Number of values that are linear in the contrastive embedding
+            (`retrieval.model.config.MatcherConfig`).
+        quiet: No progress on stderr.
+        should_stop: Called after each step.
+
+    Raises:
+        JobInterrupted: `should_stop()` returned True.
+        NumericalError: The loss is not finite.
     """
     config = dataclasses.replace(matcher.config, candidate_width=width, candidate_linear=linear)
     with torch.random.fork_rng(devices=[]):
@@ -77,25 +91,25 @@ def distil(
     )
     candidate_encoder.initialise_linear(photo_partials, touch_spread, photo_spread)
     generator, head = torch.Generator().manual_seed(seed), matcher.head.eval()
-    crowd = _PhotoSampler(candidate_encoder, photo_partials, photo_spread, generator)
+    sampler = _PhotoSampler(candidate_encoder, photo_partials, photo_spread, generator)
 
     def loss(step: int) -> Tensor:
         touches = blend(touch_partials, BATCH_TOUCHES, generator)
-        read = touch_spread(touches)
-        photos = crowd.photos(step - steps // WARMUP_DIVISOR, read)
-        scores = candidate_encoder.scores(read, photo_spread(photos))
+        standardised = touch_spread(touches)
+        photos = sampler.photos(step - steps // WARMUP_DIVISOR, standardised)
+        scores = candidate_encoder.scores(standardised, photo_spread(photos))
         return distillation_loss(scores, all_logits(head, touches, photos))
 
     optimizer, plan = torch.optim.Adam(candidate_encoder.parameters()), Plan(steps, LEARNING_RATE)
-    with Bar("teach candidate_encoder", steps, "steps", quiet=quiet) as bar:
+    with Bar("distil candidate encoder", steps, "steps", quiet=quiet) as bar:
         if fit(optimizer, plan, range(steps), loss, bar=bar, should_stop=should_stop) < steps:
-            raise JobInterrupted("stopped before the candidate_encoder was taught")
+            raise JobInterrupted("stopped before the candidate encoder was trained")
     candidate_encoder.fold_statistics(touch_spread, photo_spread)
     matcher.config, matcher.candidate_encoder = config, candidate_encoder.eval()
 
 
 class _PhotoSampler:
-    """Photos to teach with: blends drawn for a step, and of a pool of blends those nearest to its touches."""
+    """Sampler of photos for distillation: random blends, and the blends of a pool that are nearest to the touches."""
 
     def __init__(
         self,
@@ -104,13 +118,14 @@ class _PhotoSampler:
         spread: PartialStatistics,
         generator: torch.Generator,
     ) -> None:
-        self._pruner, self._partials, self._spread, self._generator = candidate_encoder, partials, spread, generator
+        self._encoder, self._partials, self._spread, self._generator = candidate_encoder, partials, spread, generator
         self._pool, self._embeddings = Blends.sample(partials, 0, generator), partials[:0]
 
     @torch.no_grad()
     def photos(self, step: int, touches: Tensor) -> Tensor:
-        """Partials (PHOTOS, half) for a step and its touches (T, half), centred and scaled; before step 0 of drawn
-        blends alone.
+        """Return partial activations (BATCH_PHOTOS, P) for a step and its standardised touches (T, P).
+
+        Before step 0, all of them are random blends.
         """
         if step < 0:
             return blend(self._partials, BATCH_PHOTOS, self._generator)
@@ -121,18 +136,20 @@ class _PhotoSampler:
                 self._pool.of(self._partials, rows[start : start + BATCH_PHOTOS])
                 for start in range(0, POOL_SIZE, BATCH_PHOTOS)
             )
-            self._embeddings = torch.cat([self._pruner.photo(self._spread(part)) for part in partials])
+            self._embeddings = torch.cat([self._encoder.photo(self._spread(part)) for part in partials])
         each = max(1, round(POOL_FRACTION * BATCH_PHOTOS / len(touches)))
-        near = (self._pruner.touch(touches) @ self._embeddings.T).topk(each).indices
+        near = (self._encoder.touch(touches) @ self._embeddings.T).topk(each).indices
         near = torch.tensor(sorted(set(near.flatten().tolist())), device=near.device)
         others = blend(self._partials, BATCH_PHOTOS - len(near), self._generator)
         return torch.cat([self._pool.of(self._partials, near), others])
 
 
 def distillation_loss(scores: Tensor, logits: Tensor) -> Tensor:
-    """Divergence of the student's softmax over photos from the head's, and a share of the spread's error.
+    """Return the mean of KL(softmax(logits) || softmax(scores)) over touches, plus a weighted squared error.
 
-    scores, logits (T, N), each free by a constant a row. Mean over touches of KL(softmax(logits) || softmax(scores)).
+    Args:
+        scores: (T, N) scores of the student; a constant added to a row has no effect.
+        logits: (T, N) match logits of the head, likewise.
     """
     divergence = functional.kl_div(
         functional.log_softmax(scores, 1), functional.log_softmax(logits, 1), log_target=True, reduction="batchmean"
@@ -143,49 +160,54 @@ def distillation_loss(scores: Tensor, logits: Tensor) -> Tensor:
 
 
 class Blends(NamedTuple):
-    """Which rows are blended: pairs (2, n) of them, and the share (n, 1) of the first of each."""
+    """Recipes of n blends of two rows.
+
+    Attributes:
+        pairs: (2, n) rows.
+        weight: (n, 1) weight of the first row of each pair.
+    """
 
     pairs: Tensor
     weight: Tensor
 
     @classmethod
     def sample(cls, partials: Tensor, count: int, generator: torch.Generator) -> Self:
-        """`count` blends of rows of `partials` (N, half)."""
+        """Draw `count` blends of rows of `partials` (N, P)."""
         pairs = torch.randint(len(partials), (2, count), generator=generator).to(partials.device)
         weight = MIN_WEIGHT + (1 - MIN_WEIGHT) * torch.rand(count, 1, generator=generator).to(partials.device)
         return cls(pairs, weight)
 
     def of(self, partials: Tensor, rows: Tensor) -> Tensor:
-        """(len(rows), half): those blends, each between two of `partials` and nearer to the first."""
-        nearer, other = self.pairs[:, rows]
-        return torch.lerp(partials[other], partials[nearer], self.weight[rows])
+        """Return the blends number `rows` of `partials`: (len(rows), P)."""
+        first, second = self.pairs[:, rows]
+        return torch.lerp(partials[second], partials[first], self.weight[rows])
 
 
 def blend(partials: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(count, half) blends of `partials` (N, half), drawn for themselves."""
+    """Return `count` random blends (count, P) of `partials` (N, P)."""
     return Blends.sample(partials, count, generator).of(partials, torch.arange(count, device=partials.device))
 
 
 @torch.no_grad()
 def all_logits(head: FusionHead, touch_partials: Tensor, photo_partials: Tensor) -> Tensor:
-    """(T, N) match logits of every touch with every photo, a touch at a time: all at once take T times the memory."""
+    """Return match logits (T, N) of every touch with every photo, one touch at a time to save memory."""
     return torch.stack([head(touch[None], photo_partials) for touch in touch_partials])
 
 
 def agreement_metrics(matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor) -> dict[str, float]:
-    """Metrics of a candidate_encoder: the share of touches whose winner is among the nearest 1 % of the photos."""
+    """Return the fraction of touches whose exhaustive top-1 is among the candidate encoder's nearest 1 % of photos."""
     candidates = max(1, round(CANDIDATE_FRACTION * len(photo_partials)))
     ranks = exhaustive_top1_ranks(matcher, touch_partials, photo_partials)
     return {"candidate_agreement_at_1_percent": float((ranks < candidates).mean())}
 
 
 def exhaustive_top1_ranks(matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor) -> NDArray[np.int64]:
-    """(T,) place from 0, in the candidate_encoder's order, of the photo that the head puts first for each touch."""
+    """Return the rank (T,), from 0, of each touch's exhaustive top-1 photo in the candidate encoder's order."""
     assert matcher.candidate_encoder is not None
     with torch.inference_mode():
-        winners = all_logits(matcher.head, touch_partials, photo_partials).argmax(1)
-        nearness = matcher.candidate_encoder.touch(touch_partials) @ matcher.candidate_encoder.photo(photo_partials).T
-        nearer = nearness > nearness.gather(1, winners[:, None])
+        top1 = all_logits(matcher.head, touch_partials, photo_partials).argmax(1)
+        similarity = matcher.candidate_encoder.touch(touch_partials) @ matcher.candidate_encoder.photo(photo_partials).T
+        nearer = similarity > similarity.gather(1, top1[:, None])
     return nearer.sum(1).cpu().numpy()
 
 
@@ -198,13 +220,25 @@ def recorded_partials(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Tensor, Tensor]:
-    """Partials (N, half) of the touches of grasps and of their photos; of `MAX_GRASPS` grasps, drawn by the seed, if there
-    are more.
+    """Return partial activations (N, P) of the touches of grasps, and of their photos.
+
+    At most `MAX_GRASPS` random grasps are used.
+
+    Args:
+        matcher: The matcher.
+        source: The source of features.
+        grasps: The grasps.
+        seed: Seed of the random choice.
+        quiet: No progress on stderr.
+        should_stop: As for `recorded_features`.
+
+    Raises:
+        JobInterrupted: `should_stop()` returned True.
     """
     order = torch.randperm(len(grasps), generator=torch.Generator().manual_seed(seed))[:MAX_GRASPS]
     sample = [grasps[row] for row in order.tolist()]
     touches, photos = recorded_features(
-        matcher, source, sample, what="candidate_encoder", quiet=quiet, should_stop=should_stop
+        matcher, source, sample, what="candidate encoder", quiet=quiet, should_stop=should_stop
     )
     with torch.inference_mode():
         return matcher.touch_encoding(touches).partial, matcher.photo_encoding(
@@ -214,13 +248,13 @@ def recorded_partials(
 
 @torch.inference_mode()
 def feature_partials(matcher: Matcher, features: Features) -> tuple[Tensor, Tensor]:
-    """Partials (G, half) of the touches and of the photos of features."""
+    """Return partial activations (G, P) of the touches and of the photos of features."""
     touch, photo = torch.from_numpy(features.touch).flatten(1), torch.from_numpy(features.photo)
     return matcher.touch_encoding(touch).partial, matcher.photo_encoding(photo).partial
 
 
 def select_queries(touch_partials: Tensor, seed: int) -> NDArray[np.float16] | None:
-    """Up to QUERIES of touch halves (N, half), drawn by the seed, of those that float16 holds; None for none."""
+    """Return up to MAX_QUERIES random touch partial activations (N, P) that are finite in float16; None without any."""
     partials = touch_partials.cpu().half()
     partials = partials[torch.isfinite(partials).all(1)]
     chosen = torch.randperm(len(partials), generator=torch.Generator().manual_seed(seed))[:MAX_QUERIES]
@@ -236,11 +270,21 @@ def with_candidate_encoder(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Checkpoint:
-    """The checkpoint `made` with the candidate_encoder that `config` asks for, its queries and its own measure among the metrics.
+    """Return the checkpoint `made` with a distilled candidate encoder, queries, and the encoder's metric.
 
-    train, validation: touch halves and photo halves (N, half) of training objects, and of validation objects where
-    there are any; the candidate_encoder is measured by touches of these among the photos of all. The matcher of `made` is taken
-    over. Raises as `distil`.
+    The matcher of `made` is reused and modified.
+
+    Args:
+        made: The checkpoint.
+        config: The configuration, which sets the size of the candidate encoder.
+        train: Partial activations (N, P) of touches and of photos of training objects.
+        validation: The same of validation objects, if any. The metric uses their touches among the photos of all.
+        quiet: No progress on stderr.
+        should_stop: As for `distil`.
+
+    Raises:
+        JobInterrupted: As for `distil`.
+        NumericalError: As for `distil`.
     """
     settings, matcher, metrics = config.training, made.matcher, made.provenance["metrics"]
     width, linear, steps = config.matcher.candidate_width, config.matcher.candidate_linear, settings.distil_steps
@@ -264,9 +308,20 @@ def add_candidate_encoder(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Checkpoint:
-    """The checkpoint `made` with the candidate_encoder that `config` asks for, taught by recorded grasps.
+    """Return the checkpoint `made` with a candidate encoder distilled on recorded grasps.
 
-    `validation` may be empty. Its matcher is taken over, and lies where `source` computes. Raises as `distil`.
+    Args:
+        made: The checkpoint. Its matcher is reused and modified; it must be on the device of `source`.
+        config: The configuration, which sets the size of the candidate encoder.
+        source: The source of features.
+        train: Grasps of training objects.
+        validation: Grasps of validation objects; may be empty.
+        quiet: No progress on stderr.
+        should_stop: As for `distil`.
+
+    Raises:
+        JobInterrupted: As for `distil`.
+        NumericalError: As for `distil`.
     """
     partials = [
         recorded_partials(made.matcher, source, grasps, config.training.seed, quiet=quiet, should_stop=should_stop)

@@ -1,14 +1,14 @@
-"""Data-parallel training: the ranks share the encoding of a batch, and all compute the same loss.
+"""Data-parallel training: each rank encodes a part of a batch, and all ranks compute the same loss.
 
-Every rank knows the whole batch (the sampler is stateless), encodes its share of the distinct images, and gathers the
-features of the others. The gather is differentiable, and batch normalisation in the towers takes its statistics over
-all ranks' images, so the loss, the running statistics and the mean of the ranks' gradients equal those of one process
-to rounding. With negatives from the own rank alone the gradient would differ by half; with batch statistics of the own
-rank alone, a ResNet-18's differed by 115 % and its loss was another. What differs is dropout INSIDE a tower (the
-1000-way output of MobileNetV2): each rank draws the mask of its own images. Started by `torchrun`; without it, one
-rank.
+Every rank has the whole batch (the sampler is stateless), encodes its rows of the distinct images, and gathers the
+features of the other ranks. The gather is differentiable, and batch normalisation in the towers uses the statistics of
+all ranks' images. So the loss, the running statistics and the mean of the ranks' gradients equal those of one process
+up to rounding. With negatives from one rank only, the gradient would differ by half; with batch statistics of one rank
+only, a ResNet-18's gradient differed by 115 %, and its loss differed too. One difference remains: dropout INSIDE a
+tower (the 1000-way output of MobileNetV2), where each rank draws the mask of its own images. `torchrun` starts the
+ranks; without it there is one rank.
 
-PyTorch's SyncBatchNorm would not do: it refuses a CPU, and counts the images that fill up a share as if they were new.
+PyTorch's SyncBatchNorm is not sufficient: it does not run on a CPU, and it counts repeated padding rows as new images.
 """
 
 import os
@@ -24,7 +24,7 @@ from torch.nn import functional
 
 
 def start() -> None:
-    """Join the ranks that `torchrun` started, if it did."""
+    """Join the process group if `torchrun` started this process."""
     if "RANK" not in os.environ or dist.is_initialized():
         return
     if torch.cuda.is_available():
@@ -33,30 +33,38 @@ def start() -> None:
 
 
 def stop() -> None:
-    """Leave the ranks, if joined."""
+    """Leave the process group, if joined."""
     if dist.is_initialized():
         dist.destroy_process_group()
 
 
 def rank() -> int:
-    """Number of this process, 0 where there is one."""
+    """Return the number of this process; 0 without a process group."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
 def world_size() -> int:
-    """Number of processes."""
+    """Return the number of processes."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
 def rank_rows(count: int) -> list[int]:
-    """Rows of a batch of `count` that this rank encodes: equally many on each rank, the last ones repeated."""
+    """Return the rows of a batch of `count` that this rank encodes.
+
+    Every rank gets the same number of rows; the last row of the batch is repeated as padding.
+    """
     size = -(-count // world_size())
     start_row = rank() * size
     return [min(row, count - 1) for row in range(start_row, start_row + size)]
 
 
 def gather_rows(local: Tensor, count: int) -> Tensor:
-    """All ranks' rows (count, d) from this rank's share (`rank_rows(count)`, d), with gradients to the other ranks."""
+    """Gather all ranks' rows (count, d), with gradients to the other ranks.
+
+    Args:
+        local: Values (len(rank_rows(count)), d) of this rank's rows.
+        count: Number of rows in the batch.
+    """
     if world_size() == 1:
         return local
     rows: Tensor = _Gather.apply(local)  # type: ignore[no-untyped-call]
@@ -64,7 +72,7 @@ def gather_rows(local: Tensor, count: int) -> Tensor:
 
 
 class _Gather(torch.autograd.Function):
-    """All ranks' rows; backward, the sum over ranks of the gradients of this rank's own rows."""
+    """Gather of all ranks' rows; backward sums the gradients of this rank's rows over the ranks."""
 
     @staticmethod
     def forward(ctx: Any, local: Tensor) -> Tensor:
@@ -80,7 +88,7 @@ class _Gather(torch.autograd.Function):
 
 
 def any_rank(flag: bool, device: torch.device) -> bool:
-    """Whether `flag` holds on any rank: one answer for all, and nobody gets it before everybody has asked."""
+    """Return whether `flag` is True on any rank; all ranks must call this, and they wait for each other."""
     if world_size() == 1:
         return flag
     count = torch.tensor(float(flag), device=device)
@@ -103,12 +111,12 @@ def average_gradients(model: nn.Module) -> None:
 # Batch normalisation -------------------------------------------------------------------------------------
 
 _counted_fraction: ContextVar[float] = ContextVar("_counted", default=1.0)
-"""Which part of the rows at hand, from the first on, are of the batch; the others fill up a share."""
+"""Fraction of the current rows, from the first on, that belong to the batch; the others are padding."""
 
 
 @contextmanager
 def counting_rank_rows(count: int) -> Iterator[None]:
-    """While this rank passes its share (`rank_rows(count)`) through a tower: what fills it up counts in no statistics."""
+    """Exclude padding rows from batch statistics while this rank encodes `rank_rows(count)`."""
     size = len(rank_rows(count))
     token = _counted_fraction.set(min(max(count - rank() * size, 0), size) / size)
     try:
@@ -118,34 +126,34 @@ def counting_rank_rows(count: int) -> Iterator[None]:
 
 
 def synchronize_batch_norm(tower: nn.Module) -> None:
-    """Make the batch normalisations of a tower take their statistics over the images of all ranks."""
+    """Make the batch normalisation of a tower use the statistics of all ranks' images."""
     if world_size() == 1:
         return
     for module in tower.modules():
         if type(module) is nn.BatchNorm2d:
-            module.__class__ = SharedBatchNorm  # the same weights under the same names; only training differs
+            module.__class__ = SharedBatchNorm  # keeps the weights and their names
 
 
 class SharedBatchNorm(nn.BatchNorm2d):
-    """Batch normalisation (B, C, H, W) whose training statistics are those of all ranks' images; see `counting_rank_rows`."""
+    """Batch normalisation (B, C, H, W) with training statistics of all ranks' images, without padding rows."""
 
     def forward(self, x: Tensor) -> Tensor:
-        """As BatchNorm2d. In training every rank must call it, for the ranks wait for each other."""
+        """Normalise like BatchNorm2d. In training all ranks must call it, since they wait for each other."""
         if not self.training:
             return super().forward(x)
         rows = round(_counted_fraction.get() * len(x))
-        # Half precision would lose the small ones among many; BatchNorm2d too takes its sums in float32 then.
+        # Sums in half precision would lose small values; BatchNorm2d also uses float32 for them.
         wide = x.to(torch.promote_types(x.dtype, torch.float32))
         mean, variance, count = _statistics(wide.detach()[:rows])
         self._update_running_statistics(mean, variance * count / (count - 1))
-        made: Tensor = _Normalise.apply(  # type: ignore[no-untyped-call]
+        normalised: Tensor = _Normalise.apply(  # type: ignore[no-untyped-call]
             wide, self.weight, self.bias, mean, variance, count, rows, self.eps
         )
-        return made.to(x.dtype)
+        return normalised.to(x.dtype)
 
     @torch.no_grad()
     def _update_running_statistics(self, mean: Tensor, variance: Tensor) -> None:
-        """Take the batch into the running statistics."""
+        """Update the running statistics with a batch."""
         assert self.running_mean is not None  # towers keep PyTorch's defaults
         assert self.running_var is not None
         assert self.num_batches_tracked is not None
@@ -156,25 +164,26 @@ class SharedBatchNorm(nn.BatchNorm2d):
 
 
 def _statistics(counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean and variance (C,) and count () of the rows (B, C, H, W) of all ranks; a rank may have none."""
+    """Return mean and variance (C,) and count () over the rows (B, C, H, W) of all ranks; a rank may have none."""
     count = counted.new_full((counted.shape[1],), counted.numel() / counted.shape[1])
     mean, variance = torch.zeros_like(count), torch.zeros_like(count)
-    if len(counted):  # the kernel of BatchNorm2d; `var_mean` takes thirty times as long where channels are last
+    if len(counted):  # the kernel of BatchNorm2d; `var_mean` takes thirty times as long with channels last
         mean, variance = torch.batch_norm_update_stats(counted, None, None, 0.0)
     own = torch.stack([count, mean, variance])
     parts = [torch.empty_like(own) for _ in range(world_size())]
     dist.all_gather(parts, own)
     counts, means, variances = torch.stack(parts, 1)
-    shares = counts / counts.sum(0)
-    whole = (shares * means).sum(0)
-    # Of the differences: the mean square less the squared mean loses all digits where the mean is far from 0.
-    return whole, (shares * (variances + (means - whole).square())).sum(0), counts.sum(0)[0]
+    weights = counts / counts.sum(0)
+    total_mean = (weights * means).sum(0)
+    # Squared differences: the mean square minus the squared mean loses all digits where the mean is far from 0.
+    return total_mean, (weights * (variances + (means - total_mean).square())).sum(0), counts.sum(0)[0]
 
 
 class _Normalise(torch.autograd.Function):
-    """x (B, C, H, W) less `mean` over its standard deviation, by weight and bias, all (C,): statistics of `count`
-    numbers a channel, which are those of the first `rows` rows of every rank. PyTorch's own kernels do it, in a third
-    of the passes over x that plain operations take.
+    """Normalisation of x (B, C, H, W) by mean, variance, weight and bias, all (C,).
+
+    The statistics are those of `count` values in each channel: the first `rows` rows of every rank. PyTorch's kernels
+    need a third of the passes over x that plain operations take.
     """
 
     @staticmethod
@@ -195,20 +204,20 @@ class _Normalise(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        """Rows that only fill up a share are in no loss: their gradient is zero, and stays zero."""
+        """Return the gradients; padding rows are in no loss, so their gradient is zero."""
         x, weight, mean, variance, count = ctx.saved_tensors
-        own, seen = gradient[: ctx.rows], x[: ctx.rows]
+        own, counted = gradient[: ctx.rows], x[: ctx.rows]
         scale, along, total = torch.rsqrt(variance + ctx.eps), torch.zeros_like(mean), torch.zeros_like(mean)
         if len(own):
             _, along, total = torch.ops.aten.native_batch_norm_backward(
-                own, seen, None, None, None, mean, scale, True, ctx.eps, [False, True, True]
+                own, counted, None, None, None, mean, scale, True, ctx.eps, [False, True, True]
             )
         sums = torch.stack([total, along])
         dist.all_reduce(sums)
         shift, slope = sums / count
-        by = (weight * scale)[:, None, None]
-        normal = functional.batch_norm(seen, mean, variance, eps=ctx.eps)
-        moved = torch.zeros_like(gradient)
-        flat = torch.addcmul(-by * shift[:, None, None], normal, -by * slope[:, None, None])
-        torch.addcmul(flat, own, by, out=moved[: ctx.rows])
-        return moved, along, total, None, None, None, None, None
+        factor = (weight * scale)[:, None, None]
+        normal = functional.batch_norm(counted, mean, variance, eps=ctx.eps)
+        x_gradient = torch.zeros_like(gradient)
+        correction = torch.addcmul(-factor * shift[:, None, None], normal, -factor * slope[:, None, None])
+        torch.addcmul(correction, own, factor, out=x_gradient[: ctx.rows])
+        return x_gradient, along, total, None, None, None, None, None

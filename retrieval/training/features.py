@@ -1,4 +1,4 @@
-"""Features of towers that stand still, encoded once and kept on disk: what every method is fitted on and judged by."""
+"""Features of frozen towers, encoded once and cached on disk; all methods are fitted and scored on them."""
 
 import dataclasses
 import hashlib
@@ -35,21 +35,27 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 TOUCH_VARIANTS = ("touch", "low_pass", "no_contact")
-"""What stands for a touch: the gel images; an 8 x 6 blur of each; the frames taken before the contact."""
+"""Inputs of the touch tower: gel images; low-pass gel images (8 x 6); no-contact frames."""
 PHOTO_VARIANTS = ("photo", "margin")
-"""What of a photo is shown: all of it; its margin, where the object mostly is not."""
-_MARGIN_DIVISOR = 8  # the share of a side that it takes
+"""Inputs of the photo tower: whole photos; only the margin, which rarely shows the object."""
+_MARGIN_DIVISOR = 8  # the margin is 1 / _MARGIN_DIVISOR of each side
 _PART = 512
 _BATCH = 32
 
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Tower features of grasps: what every method is fitted on and judged by. One row per grasp.
+    """Tower features of G grasps, one row each.
 
-    grasp_ids, object_ids: of each row. touch (G, fingers, F_touch) and photo (G, F_photo), float32; the photo is the
-    one taken before that grasp. Raises BadInput for arrays of other shapes or types, NumericalError for a feature that
-    is not finite, its grasp named.
+    Attributes:
+        grasp_ids: Id of each grasp.
+        object_ids: Object of each grasp.
+        touch: (G, fingers, F_touch) float32.
+        photo: (G, F_photo) float32, of the photo taken before the grasp.
+
+    Raises:
+        BadInput: An array has the wrong shape or type.
+        NumericalError: A feature is not finite.
     """
 
     grasp_ids: tuple[str, ...]
@@ -78,7 +84,7 @@ class Features:
         return len(self.grasp_ids)
 
     def select(self, rows: NDArray[np.int64]) -> "Features":
-        """The grasps at `rows`, in that order."""
+        """Return the grasps at `rows`, in that order."""
         return Features(
             tuple(self.grasp_ids[row] for row in rows),
             tuple(self.object_ids[row] for row in rows),
@@ -87,12 +93,12 @@ class Features:
         )
 
     def of_objects(self, object_ids: Iterable[str]) -> "Features":
-        """The grasps of these objects."""
-        wanted = set(object_ids)
-        return self.select(np.array([row for row, name in enumerate(self.object_ids) if name in wanted], np.int64))
+        """Return the grasps of these objects."""
+        names = set(object_ids)
+        return self.select(np.array([row for row, name in enumerate(self.object_ids) if name in names], np.int64))
 
     def concatenate(self, others: "Features") -> "Features":
-        """These grasps, then those of `others`."""
+        """Return these grasps, followed by those of `others`."""
         return Features(
             self.grasp_ids + others.grasp_ids,
             self.object_ids + others.object_ids,
@@ -102,7 +108,7 @@ class Features:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 over ids and features: equal exactly when the same is fitted on."""
+        """SHA-256 (hex) of ids and features."""
         ids = json.dumps([self.grasp_ids, self.object_ids, self.touch.shape, self.photo.shape])
         digest = hashlib.sha256(ids.encode())
         for part in (self.touch, self.photo):
@@ -116,7 +122,7 @@ class Features:
 
 
 def features_by_image(grasps: Iterable[Grasp], features: Features, device: torch.device) -> dict[str | Path, Tensor]:
-    """Features of grasps by grasp id (of the touch, finger after finger) and by photo file, on `device`."""
+    """Return features on `device`: of touches (fingers concatenated) by grasp id, and of photos by file."""
     touch, photo = (torch.from_numpy(part).flatten(1).to(device) for part in (features.touch, features.photo))
     row_of = {grasp_id: row for row, grasp_id in enumerate(features.grasp_ids)}
     known: dict[str | Path, Tensor] = {}
@@ -127,10 +133,10 @@ def features_by_image(grasps: Iterable[Grasp], features: Features, device: torch
 
 
 def low_pass(image: RgbImage) -> RgbImage:
-    """An image (H, W, 3) of which nothing is left but an 8 x 6 blur of its colours, at its old size.
+    """Return an image (H, W, 3) reduced to 8 x 6 pixels and enlarged to its old size.
 
-    Gaussian blur of a tenth of the width, then 8 x 6 pixels: lamps and gel drift of the capture stay, and coarse
-    shape; whatever a method still finds in it is no sense of touch.
+    A Gaussian blur of a tenth of the width precedes the reduction. Lamps, gel drift and coarse shape remain, so a
+    method's score on such images does not come from fine tactile detail.
     """
     height, width = image.shape[:2]
     down, across = _low_pass_matrix(height, 6, width / 10), _low_pass_matrix(width, 8, width / 10)
@@ -140,8 +146,9 @@ def low_pass(image: RgbImage) -> RgbImage:
 
 @lru_cache(maxsize=16)
 def _low_pass_matrix(old: int, new: int, sigma: float) -> NDArray[np.float32]:
-    """(new, old): one axis of a Gaussian blur and of the resizing after it, as one matrix: to blur whole pictures this
-    widely takes longer than a tower does.
+    """Return a matrix (new, old) that blurs and resizes one axis.
+
+    Blurring whole pictures this widely would take longer than a tower.
     """
     import cv2
 
@@ -156,7 +163,7 @@ class _LowPassPreprocessing(Preprocessing):
 
 
 def photo_margin(image: RgbImage) -> RgbImage:
-    """A photo (H, W, 3) of which nothing is left but a frame of an eighth of each side, around its mean colour."""
+    """Return a photo (H, W, 3) with only its margin (an eighth of each side); the rest is the margin's mean colour."""
     high, wide = (max(1, side // _MARGIN_DIVISOR) for side in image.shape[:2])
     inside = np.zeros(image.shape[:2], dtype=np.bool_)
     inside[high:-high, wide:-wide] = True
@@ -179,21 +186,31 @@ def encode_recording(
     photo_features_from: Features | None = None,
     quiet: bool = False,
 ) -> Features:
-    """Features of all grasps by the towers of `matcher`, which stand still; each photo file is encoded once.
+    """Return features of grasps by the frozen towers of `matcher`; each photo file is encoded once.
 
-    cache: folder where they are kept in parts of 512, each under a digest of tower, preprocessing, variant and image
-    files: a run that was stopped goes on, a second one reads. None keeps nothing. variant: one of `TOUCH_VARIANTS`; shown:
-    one of `PHOTO_VARIANTS`. photo_features_from: features of these grasps and perhaps more, whose photos need no encoding again. Raises
-    BadInput for another variant, DatasetError where a no-contact frame is needed and missing.
+    Args:
+        grasps: The grasps.
+        matcher: The matcher.
+        config: The configuration, for preprocessing and workers.
+        cache: Folder of cached parts of 512 images; a later or resumed run reads them. A part's name is a digest of
+            tower, preprocessing, variant and image files. None stores nothing.
+        touch_variant: One of `TOUCH_VARIANTS`.
+        photo_variant: One of `PHOTO_VARIANTS`.
+        photo_features_from: Features of at least these grasps; their photo features are used without encoding.
+        quiet: No progress on stderr.
+
+    Raises:
+        BadInput: A variant is unknown, or two variants are combined.
+        DatasetError: A required no-contact frame is missing.
     """
-    felt = [_grasp_for_variant(grasp, touch_variant) for grasp in grasps]
+    touched = [_grasp_for_variant(grasp, touch_variant) for grasp in grasps]
     device = default_device()
     matcher = deepcopy(matcher).to(device).eval()
     settings = _config_for_variants(config, touch_variant, photo_variant)
     with BatchImages(settings, device, keep_bytes=0) as images:
         touch_made_by = (touch_variant, _tower_digest(matcher.touch_tower), settings.preprocessing.digest())
         workers, encode = config.training.workers, partial(touch_features, matcher)
-        touch = _FeatureCache(cache, touch_made_by, images.touch, encode, images.files, workers, quiet).rows(felt)
+        touch = _FeatureCache(cache, touch_made_by, images.touch, encode, images.files, workers, quiet).rows(touched)
         if photo_features_from is None:
             photo_made_by = (photo_variant, _tower_digest(matcher.photo_tower), settings.preprocessing.digest())
             encode = partial(photo_features, matcher)
@@ -213,32 +230,32 @@ def encode_recording(
 
 def _config_for_variants(config: Config, touch_variant: str, photo_variant: str) -> Config:
     for what, one, known in (
-        ("what stands for a touch", touch_variant, TOUCH_VARIANTS),
-        ("what of a photo is shown", photo_variant, PHOTO_VARIANTS),
+        ("touch_variant", touch_variant, TOUCH_VARIANTS),
+        ("photo_variant", photo_variant, PHOTO_VARIANTS),
     ):
         if one not in known:
             raise BadInput(f"{what} must be one of {', '.join(known)}; got {one!r}")
     if touch_variant == "low_pass" and photo_variant == "margin":
-        raise BadInput("a blurred touch and the margin of a photo are two controls; ask for one of them")
-    as_shown = (
+        raise BadInput("low_pass touches and margin photos are two separate controls; use one at a time")
+    kind = (
         _LowPassPreprocessing
         if touch_variant == "low_pass"
         else _MarginPreprocessing
         if photo_variant == "margin"
         else None
     )
-    if as_shown is None:
+    if kind is None:
         return config
-    return dataclasses.replace(config, preprocessing=as_shown(**config.preprocessing.to_dict()))
+    return dataclasses.replace(config, preprocessing=kind(**config.preprocessing.to_dict()))
 
 
 def _grasp_for_variant(grasp: Grasp, touch_variant: str) -> Grasp:
-    """The grasp with the files in place of its touch that are to be encoded as one."""
+    """Return the grasp with its touch replaced by the files of the variant."""
     if touch_variant != "no_contact":
         return grasp
     if len(grasp.backgrounds) != len(grasp.touches):
         raise DatasetError(
-            f"a frame before the contact is needed for each finger; {grasp.grasp_id} has {len(grasp.backgrounds)} for "
+            f"each finger needs a no-contact frame; {grasp.grasp_id} has {len(grasp.backgrounds)} for "
             f"{len(grasp.touches)}; record them, or leave this control out"
         )
     return dataclasses.replace(grasp, touches=grasp.backgrounds)
@@ -250,10 +267,16 @@ def _tower_digest(tower: nn.Module) -> str:
 
 @dataclass(frozen=True)
 class _FeatureCache(Generic[T]):
-    """Features of images, part by part: read where a part is kept, else encoded and kept.
+    """Features of images in parts: read from the cache, or encoded and stored.
 
-    made_by: variant, tower and preprocessing. load gives the image (or images) of an item, encode the features (B, F)
-    of a list of these, files what an item is read from.
+    Attributes:
+        cache: The cache folder, or None.
+        made_by: Variant, tower and preprocessing.
+        load: Returns the image (or images) of an item.
+        encode: Returns features (B, F) of a list of images.
+        files: Returns the files of an item.
+        workers: As for `retrieval.data.loading.worker_count`.
+        quiet: No progress on stderr.
     """
 
     cache: Path | None
@@ -265,20 +288,20 @@ class _FeatureCache(Generic[T]):
     quiet: bool
 
     def rows(self, items: Sequence[T]) -> NDArray[np.float32]:
-        """The features (len(items), F) of items, in their order."""
-        photo_variant = self.made_by[0]
-        unit = "photos" if photo_variant in PHOTO_VARIANTS else "grasps"
+        """Return the features (len(items), F) of items, in their order."""
+        variant = self.made_by[0]
+        unit = "photos" if variant in PHOTO_VARIANTS else "grasps"
         with (
-            Bar(f"encode {photo_variant}", len(items), unit, quiet=self.quiet) as bar,
+            Bar(f"encode {variant}", len(items), unit, quiet=self.quiet) as bar,
             worker_pool(self.workers) as pool,
         ):
             return np.concatenate([self._part(part, pool, bar) for part in batches(items, _PART)])
 
     def _part(self, items: list[T], pool: Executor, bar: Bar) -> NDArray[np.float32]:
         path = self._path(items)
-        if path and (kept := _read_cached(path)) is not None and len(kept) == len(items):
+        if path and (cached := _read_cached(path)) is not None and len(cached) == len(items):
             bar.advance(len(items))
-            return kept.numpy()
+            return cached.numpy()
         encoded = []
         for batch in batches(map_in_order(pool, self.load, items, _BATCH), _BATCH):
             encoded.append(self.encode(batch).cpu())
@@ -289,7 +312,7 @@ class _FeatureCache(Generic[T]):
         return features.numpy()
 
     def _path(self, items: list[T]) -> Path | None:
-        """Where the features of these very images, made in this very way, are kept."""
+        """Return the cache file of the features of these items, or None without a cache."""
         if self.cache is None:
             return None
         files = [self.files(item) for item in items]
@@ -297,7 +320,7 @@ class _FeatureCache(Generic[T]):
 
 
 def _read_cached(path: Path) -> Tensor | None:
-    """Features that are kept; None where there are none, or the file is damaged."""
+    """Return cached features, or None where there are none or the file is damaged."""
     if not path.is_file():
         return None
     try:

@@ -1,4 +1,4 @@
-"""The training loop: everything that is learned by steps down a gradient is learned in it."""
+"""The training loop of everything that is trained by gradient descent."""
 
 import math
 from collections.abc import Callable, Iterable
@@ -18,11 +18,13 @@ Batch = TypeVar("Batch")
 
 @dataclass(frozen=True)
 class Plan:
-    """How long to train, and how fast.
+    """Length and speed of a training.
 
-    steps: how many steps the optimiser takes. learning_rate: of the first step; then it follows `schedule`
-    (`retrieval.model.config.SCHEDULES`). validate_every: the module is validated after so many steps, and after the
-    last.
+    Attributes:
+        steps: Number of optimiser steps.
+        learning_rate: Learning rate of the first step.
+        schedule: Name of the learning rate's schedule (`retrieval.model.config.SCHEDULES`).
+        validate_every: Number of steps between validations; the last step is always followed by one.
     """
 
     steps: int
@@ -46,12 +48,27 @@ def fit(
     validate: Callable[[int], None] = lambda done: None,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> int:
-    """Minimise the `loss` of batches, one a step; returns how many steps are done, fewer than planned once `should_stop()`.
+    """Minimise the loss of batches, one batch a step.
 
-    done: steps of an earlier run that this one goes on from; `batches` are those after them. Each step is taken within
-    `step_context()`; before_step: called with the gradients in place; after_step: with the number of steps done; note: what
-    the bar says behind the loss; validate: with the number of steps done, also when it is stopped. Raises
-    NumericalError for a loss that is not finite, before anything has changed by it.
+    Args:
+        optimizer: The optimiser.
+        plan: Length and speed of the training.
+        batches: The remaining batches.
+        loss: Returns the loss of a batch.
+        bar: Progress bar.
+        done: Number of steps that an earlier run completed.
+        step_context: Context of each step.
+        before_step: Called when the gradients are computed.
+        after_step: Called with the number of completed steps.
+        note: Text after the loss in the progress bar.
+        validate: Called with the number of completed steps, also on an early stop.
+        should_stop: Called after each step.
+
+    Returns:
+        The number of completed steps: fewer than planned if `should_stop()` returned True.
+
+    Raises:
+        NumericalError: The loss is not finite; no parameter has changed in this step.
     """
     for batch in batches:
         for group in optimizer.param_groups:
@@ -62,8 +79,8 @@ def fit(
             value = current.item()
             if not math.isfinite(value):
                 raise NumericalError(
-                    f"the loss must stay finite; {bar.title}, step {done}, gave {value}; lower learning_rate, or where "
-                    "there is none to set, report it"
+                    f"the loss must stay finite; {bar.title}, step {done}, gave {value}; lower learning_rate, or "
+                    "report this if there is no such setting"
                 )
             current.backward()  # type: ignore[no-untyped-call]
             before_step()
@@ -81,7 +98,12 @@ def fit(
 
 @dataclass(frozen=True)
 class BestStep:
-    """The step after which a module was worth most on validation objects, and what it was worth."""
+    """The step with the highest score on validation objects.
+
+    Attributes:
+        step: Number of completed steps.
+        value: The score.
+    """
 
     step: int
     value: float
@@ -97,31 +119,44 @@ def fit_best(
     weight_decay: float = 0.0,
     after_step: Callable[[int], None] = lambda done: None,
 ) -> BestStep:
-    """`fit` by AdamW, leaving `module` in evaluation mode as it was when `score()` was highest.
+    """Train `module` by `fit` with AdamW, and restore the weights of its best step.
 
-    loss: of the step with this number. Only matrices decay: a bias or a temperature has no reason to be small.
+    Weight decay applies to matrices only, since a bias or a temperature has no reason to be small. The module ends in
+    evaluation mode.
+
+    Args:
+        module: The module.
+        plan: Length and speed of the training.
+        loss: Returns the loss of the step with this number.
+        score: Returns the validation score; higher is better.
+        bar: Progress bar.
+        weight_decay: Weight decay of matrices.
+        after_step: Called with the number of completed steps.
+
+    Returns:
+        The best step.
     """
     groups: list[dict[str, Any]] = [{"params": [], "weight_decay": 0.0}, {"params": [], "weight_decay": weight_decay}]
     for parameter in module.parameters():
         groups[parameter.ndim > 1]["params"].append(parameter)
-    best, kept = BestStep(0, -math.inf), dict[str, Tensor]()
+    best, best_weights = BestStep(0, -math.inf), dict[str, Tensor]()
 
     def validate(done: int) -> None:
-        nonlocal best, kept
+        nonlocal best, best_weights
         module.eval()
         with torch.inference_mode():
             value = score()
         module.train()
         if value > best.value:
             best = BestStep(done, value)
-            kept = {name: tensor.clone() for name, tensor in module.state_dict().items()}
+            best_weights = {name: tensor.clone() for name, tensor in module.state_dict().items()}
 
     def note() -> str:
-        return f"  validation AUC {best.value:.3f}" if kept else ""
+        return f"  validation AUC {best.value:.3f}" if best_weights else ""
 
     optimizer, steps = torch.optim.AdamW(groups), range(plan.steps)
     module.train()
     fit(optimizer, plan, steps, loss, bar=bar, after_step=after_step, note=note, validate=validate)
-    module.load_state_dict(kept)
+    module.load_state_dict(best_weights)
     module.eval()
     return best

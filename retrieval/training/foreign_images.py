@@ -1,6 +1,6 @@
-"""Pictures that are no gel images: what a check of touches is taught to refuse.
+"""Foreign pictures (not gel images), for training the check of touches.
 
-Drawn ones (plain, noise, clouds, ramps, stripes), pieces of photos, and gel images in colours that no gel has.
+Synthetic pictures (plain, noise, clouds, ramps, stripes), pieces of photos, and gel images in false colours.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -17,10 +17,17 @@ _Draw = Callable[[np.random.Generator, int], np.ndarray]
 def draw_foreign(
     count: int, px: int, photos: Sequence[RgbImage], gels: Sequence[RgbImage], seed: int = 0
 ) -> Iterator[tuple[str, RgbImage]]:
-    """`count` pictures (px, px, 3) float32 in 0..1 with the names of their kinds, which take turns.
+    """Yield `count` foreign pictures (px, px, 3) float32 in 0..1, each with the name of its kind; kinds alternate.
 
-    photos: pictures (H, W, 3) of which pieces are shown; gels: gel images that are shown in false colours; where there
-    are none, neither kind is drawn. The same seed draws the same.
+    Args:
+        count: Number of pictures.
+        px: Side in pixels.
+        photos: Photos (H, W, 3) to cut pieces from; may be empty.
+        gels: Gel images (H, W, 3) to recolour; may be empty.
+        seed: The same seed gives the same pictures.
+
+    Raises:
+        BadInput: `count` is below 1, or `px` below 8.
     """
     if count < 1 or px < 8:
         raise BadInput(f"count must be at least 1 and px at least 8; got {count} and {px}")
@@ -37,13 +44,13 @@ def draw_foreign(
 
 
 def _plain(rng: np.random.Generator, px: int) -> np.ndarray:
-    """One colour, a third of them black or white, with the noise of a camera or without."""
+    """Draw a plain picture (black, white or coloured), with or without camera noise."""
     colour = [np.zeros(3), np.ones(3), rng.random(3)][min(int(rng.integers(4)), 2)]
     return np.asarray(colour + rng.normal(0, rng.choice([0.0, 0.002, 0.01, 0.02]), (px, px, 3)))
 
 
 def _noise(rng: np.random.Generator, px: int) -> np.ndarray:
-    """Independent squares of 1 to 16 pixels, coloured or grey."""
+    """Draw independent squares of 1 to 16 pixels, coloured or grey."""
     side = -(-px // 2 ** int(rng.integers(5)))
     squares = rng.normal(0.5, rng.uniform(0.02, 0.5), (side, side, int(rng.choice([1, 3]))))
     return _resized(np.broadcast_to(squares, (side, side, 3)), px, cv2.INTER_NEAREST)
@@ -67,9 +74,9 @@ def _stripes(rng: np.random.Generator, px: int) -> np.ndarray:
     rows, columns = np.mgrid[:px, :px] / px
     angle, waves = rng.uniform(0, np.pi), rng.uniform(4, 50)
     wave = np.sin(2 * np.pi * waves * (rows * np.sin(angle) + columns * np.cos(angle)))
-    share = (np.sign(wave) if rng.random() < 0.5 else wave)[..., None] / 2 + 0.5
+    weight = (np.sign(wave) if rng.random() < 0.5 else wave)[..., None] / 2 + 0.5
     one, other = rng.random((2, 3))
-    return np.asarray(one + (other - one) * share)
+    return np.asarray(one + (other - one) * weight)
 
 
 SYNTHETIC_KINDS: dict[str, _Draw] = {
@@ -82,14 +89,14 @@ SYNTHETIC_KINDS: dict[str, _Draw] = {
 
 
 def _piece(photo: RgbImage, rng: np.random.Generator, px: int) -> np.ndarray:
-    """A square of a third of the photo or more, lighter or darker."""
+    """Cut a square of at least 0.3 of the photo's shorter side, and make it lighter or darker."""
     side = max(1, int(min(photo.shape[:2]) * rng.uniform(0.3, 1)))
     top, left = (int(rng.integers(length - side + 1)) for length in photo.shape[:2])
     return rng.uniform(0.5, 1.4) * _resized(photo[top : top + side, left : left + side], px, cv2.INTER_AREA)
 
 
 def _false_colours(gel: RgbImage, rng: np.random.Generator, px: int) -> np.ndarray:
-    """Channels exchanged, grey, negative, tinted or mixed: other lamps than the sensor's."""
+    """Return a gel image with exchanged, grey, negative, tinted or mixed channels, as if under other lamps."""
     picture = _resized(gel, px, cv2.INTER_AREA)
     other_orders = ((0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0))
     change = int(rng.integers(5))

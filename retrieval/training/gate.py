@@ -1,7 +1,7 @@
-"""The gate between a rig and its recording: gel images of a grasp in, whether it succeeded out.
+"""The grasp-success gate between a rig and its recording: it classifies the gel images of a grasp.
 
-As in the authors' collection code, one network serves every finger and sees the change since the gel was untouched;
-a grasp succeeded when ANY finger says so with probability 1/2 or more. The network is smaller.
+As in the authors' collection code, one network serves all fingers, and its input is the difference from the no-contact
+frame. A grasp succeeds if ANY finger's probability is at least 1/2. This network is smaller than theirs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,12 @@ MOMENTS = ("after", "during")
 
 @dataclass(frozen=True)
 class GateSettings:
-    """What a gate looks at. touch_px: side of the square it reads; frame: one of MOMENTS, compared with before."""
+    """Input of a gate.
+
+    Attributes:
+        touch_px: Side of the image in pixels.
+        frame: The frame that is compared with the no-contact frame, one of MOMENTS.
+    """
 
     touch_px: int = 64
     frame: str = "after"
@@ -34,19 +39,20 @@ class GateSettings:
     def __post_init__(self) -> None:
         self.preprocessing()
         if self.frame not in MOMENTS:
-            raise ConfigError(f"the frame that a gate judges must be one of {', '.join(MOMENTS)}; got {self.frame!r}")
+            raise ConfigError(f"the frame of a gate must be one of {', '.join(MOMENTS)}; got {self.frame!r}")
 
     def preprocessing(self) -> Preprocessing:
-        """From two frames to their difference (touch_px, touch_px, 3) in -1..1, in float32."""
+        """Return the preprocessing that makes float32 differences (touch_px, touch_px, 3) in -1..1."""
         return Preprocessing(touch_px=self.touch_px, background="difference")
 
 
 class GraspNet(nn.Module):
-    """Differences (B, fingers, 3, px, px) in -1..1 to one logit for each finger (B, fingers), by shared weights.
+    """Network with shared weights: differences (B, fingers, 3, px, px) in -1..1 to logits (B, fingers).
 
-    Nothing normalises a single image: how strong the change is tells contact from noise. Strength counts by its
-    logarithm, or a firm touch would be a thousand times as sure as a light one. A change of the whole
-    picture is a lamp and no contact, so edges are repeated: padding with zeros would draw a frame round it.
+    Single images are not normalised, since the strength of the change distinguishes contact from noise. The logits
+    depend on the logarithm of the strength; otherwise a firm touch would have a thousand times the logit of a light
+    one. A change of the whole picture comes from a lamp, not from contact. So edges are repeated: zero padding would
+    draw a frame around the picture.
     """
 
     scale: Tensor
@@ -58,7 +64,7 @@ class GraspNet(nn.Module):
         self.last = nn.Linear(64, 1)
 
     def forward(self, differences: Tensor) -> Tensor:
-        """The logits (B, fingers) that a grasp succeeded; the class says of what."""
+        """Return the logits (B, fingers) of a successful grasp."""
         maps = self.layers(differences.flatten(0, 1) / self.scale).flatten(2)
         logits: Tensor = self.last(torch.cat([maps.mean(2), maps.amax(2)], dim=1).log1p())
         return logits.view(differences.shape[:2])
@@ -71,35 +77,46 @@ def _convolution(inputs: int, outputs: int, kernel: int) -> list[nn.Module]:
 
 
 class FingerFrames(Protocol):
-    """One finger's pictures, (H, W, 3) uint8 RGB; None where the rig does not take them. `robot.grasping.gates` makes
-    them.
-    """
+    """One finger's frames, (H, W, 3) uint8 RGB, from `robot.grasping.gates`; None where the rig does not take them."""
 
     @property
-    def before(self) -> NDArray[np.uint8] | None: ...
+    def before(self) -> NDArray[np.uint8] | None:
+        """The no-contact frame."""
+
     @property
-    def during(self) -> NDArray[np.uint8]: ...
+    def during(self) -> NDArray[np.uint8]:
+        """The frame during the grasp."""
+
     @property
-    def after(self) -> NDArray[np.uint8] | None: ...
+    def after(self) -> NDArray[np.uint8] | None:
+        """The frame after the lift."""
 
 
 class GraspSuccessGate:
-    """Judges grasps, as a function of {finger: frames}. It is independent of the number of fingers."""
+    """Classifier of grasps, a function of {finger: frames} for any number of fingers."""
 
     def __init__(self, net: GraspNet, settings: GateSettings) -> None:
         self.net, self.settings = net.eval(), settings
         self._preprocessing = settings.preprocessing()
 
     def __call__(self, fingers: Mapping[str, FingerFrames]) -> bool:
-        """Whether the grasp succeeded: whether any finger's probability is 1/2 or more. Raises BadInput."""
+        """Return whether the grasp succeeded: whether any finger's probability is at least 1/2.
+
+        Raises:
+            BadInput: As for `logits`.
+        """
         return max(self.logits(fingers).values()) >= 0
 
     def probabilities(self, fingers: Mapping[str, FingerFrames]) -> dict[str, float]:
-        """Each finger's probability of success, at even odds before looking."""
+        """Return each finger's probability of success, for a prior probability of 1/2."""
         return {finger: float(torch.tensor(logit).double().sigmoid()) for finger, logit in self.logits(fingers).items()}
 
     def logits(self, fingers: Mapping[str, FingerFrames]) -> dict[str, float]:
-        """Each finger's log-odds of success. Raises BadInput for no fingers, a missing frame, or what is no picture."""
+        """Return each finger's log-odds of success.
+
+        Raises:
+            BadInput: There are no fingers, a frame is missing, or a frame is not a picture.
+        """
         if not fingers:
             raise BadInput("a grasp must have the frames of at least one finger; got none")
         names = sorted(fingers)
@@ -107,8 +124,10 @@ class GraspSuccessGate:
 
     @torch.inference_mode()
     def score(self, differences: Sequence[Sequence[NDArray[np.float32]]]) -> list[list[float]]:
-        """Logits of grasps, each a sequence of its fingers' differences. Raises NumericalError for a NaN or infinite
-        one: it is not above 0, and the grasp would count as failed.
+        """Return the logits of grasps, each given by its fingers' differences.
+
+        Raises:
+            NumericalError: A logit is not finite. A NaN is not above 0, so the grasp would count as failed.
         """
         with one_thread():
             logits = self.net(touch_batch(differences))
@@ -119,26 +138,30 @@ class GraspSuccessGate:
                 f"every logit of a gate must be finite; finger {finger} of grasp {grasp} has "
                 f"{logits[grasp, finger].item()}; train the gate again"
             )
-        found: list[list[float]] = logits.tolist()
-        return found
+        values: list[list[float]] = logits.tolist()
+        return values
 
     def _difference(self, finger: str, frames: FingerFrames) -> NDArray[np.float32]:
-        judged, before = getattr(frames, self.settings.frame), frames.before
-        if judged is None or before is None:
+        frame, before = getattr(frames, self.settings.frame), frames.before
+        if frame is None or before is None:
             missing = "before" if before is None else self.settings.frame
             raise BadInput(
                 f"this gate compares the frames before and {self.settings.frame}; finger {finger} has none {missing}"
             )
-        return self._preprocessing.touch(to_float(judged), to_float(before))
+        return self._preprocessing.touch(to_float(frame), to_float(before))
 
 
 def load_gate(path: Path) -> GraspSuccessGate:
-    """Read a gate that `train_gate` wrote. Raises CheckpointError with what is wrong and what to do."""
+    """Read a gate that `train_gate` wrote.
+
+    Raises:
+        CheckpointError: The file is not a usable gate.
+    """
     state, header = read_tensors(path)
     if header.get("task") != TASK:
         raise CheckpointError(
-            f"{path} is no grasp-success gate but another checkpoint, such as a matcher; "
-            f"`retrieve train --task {TASK}` makes gates"
+            f"{path} is not a grasp-success gate but another checkpoint, such as a matcher; "
+            f"train a gate with `retrieve train --task {TASK}`"
         )
     net = GraspNet()
     try:

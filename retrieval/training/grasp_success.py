@@ -1,18 +1,18 @@
-"""Training the gate (`retrieval.training.gate`): did a grasp succeed, judged from its gel images?
+"""Train the grasp-success gate (`retrieval.training.gate`), which classifies a grasp from its gel images.
 
-Like the authors' classifier it sees one finger at a time and is asked of both; what differs, and why:
+Like the authors' classifier, it processes one finger at a time and combines the fingers. The differences and reasons:
 
-* It judges the frame AFTER the lift where the recording has it, as the authors' collection code does, else the frame
-  during the grasp. What slips is gone after the lift, but pressed the gel like any other before: on 569 grasps of the
-  simulated rig the later frame told all, on three splits, while the frame during the grasp (0.60 to 0.71 right) let
-  half of the slips pass and threw away a fifth of what was held, of some objects three quarters.
-  `GateSettings(frame="during")` judges T itself, for rigs that do not lift.
-* The loss is taken on the highest logit of the fingers, since that alone decides. With the grasp's label on each
-  finger, a finger that hangs in the air beside a good grasp would teach that an empty gel is a success; and of two
-  answers that were each fitted to be right alone, the higher one accepts more than either.
-* Batches hold as many held as failed grasps, so probability 1/2 is at even odds whatever the rig's luck.
+* It uses the frame AFTER the lift where the recording has it, like the authors' collection code, else the frame during
+  the grasp. An object that slips is absent after the lift, but it presses the gel like any other during the grasp. On
+  569 grasps of the simulated rig, the later frame classified all grasps correctly on three splits. The frame during the
+  grasp (accuracy 0.60 to 0.71) accepted half of the slips and rejected a fifth of the held grasps, three quarters for
+  some objects. `GateSettings(frame="during")` uses the touch itself, for rigs that do not lift.
+* The loss uses the highest logit of the fingers, which alone decides. With the grasp's label on each finger, a finger
+  without contact in a good grasp would teach that an empty gel is a success. And the maximum of two outputs that were
+  fitted separately accepts more grasps than either.
+* Batches contain equal numbers of held and failed grasps, so probability 1/2 means even odds at any success rate.
 
-A gate chooses the touches that a matcher later trains on, so it makes them easier: log what it rejects.
+A gate selects the touches that a matcher later trains on, so it makes them easier: log the grasps that it rejects.
 """
 
 import dataclasses
@@ -42,19 +42,30 @@ from retrieval.training.gate import TASK, GateSettings, GraspNet, GraspSuccessGa
 from retrieval.training.gate import load_gate as load_gate
 
 BATCH = 32
-LEARNING_RATE = 3e-3  # and halved after each quarter of the steps, as by the authors
-VALIDATION = 0.25  # share of the objects, as by the authors
-BRIGHTNESS, CONTRAST = 20 / 255, 0.1  # the lamps may change by so much between two frames
+LEARNING_RATE = 3e-3  # halved after each quarter of the steps, as the authors do
+VALIDATION = 0.25  # fraction of the objects, as the authors use
+BRIGHTNESS, CONTRAST = 20 / 255, 0.1  # largest change of the lamps between two frames
 _GREY_LEVEL = 1 / 255
 
 
 @dataclass(frozen=True)
 class GateReport:
-    """How a gate did on objects that it was not trained on.
+    """Accuracy of a gate on validation objects.
 
-    The last step is kept and no threshold chosen, so these objects were used for nothing else. interval: 95 % for the
-    accuracy, widened for grasps of one object being alike. chance: accuracy of always giving the commoner answer.
-    accepted: (accepted, all) by outcome. least: the object whose held grasps are accepted least often, and how often.
+    The gate is the one of the last step, with a fixed threshold, so the validation objects have no other use.
+
+    Attributes:
+        path: File of the gate.
+        frame: The frame that it uses, one of `retrieval.training.gate.MOMENTS`.
+        train_grasps: Number of training grasps.
+        train_held: Number of held grasps among them.
+        validation_grasps: Number of validation grasps.
+        validation_objects: Number of validation objects.
+        accuracy: Fraction of validation grasps classified correctly.
+        interval: 95 % interval of the accuracy; grasps of one object count as dependent.
+        chance: Accuracy of always predicting the more frequent class.
+        accepted: (accepted, all) grasps by outcome.
+        lowest_acceptance: The object with the lowest acceptance of held grasps, and that fraction.
     """
 
     path: str
@@ -70,28 +81,29 @@ class GateReport:
     lowest_acceptance: tuple[str, float] | None
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON."""
+        """Return a plain dictionary for JSON."""
         return dataclasses.asdict(self)
 
     def lines(self) -> Iterator[str]:
-        """The report for people."""
+        """Yield the lines of the report for people."""
         yield (
-            f"{self.path}: judges the frame {self.frame} the grasp; trained on {self.train_grasps} grasps, "
+            f"{self.path}: uses the frame {self.frame} the grasp; trained on {self.train_grasps} grasps, "
             f"{self.train_held} of them held"
         )
         yield (
             f"accuracy {self.accuracy:.3f} (95 %: {self.interval[0]:.3f} to {self.interval[1]:.3f}) on "
-            f"{self.validation_grasps} grasps of {self.validation_objects} other objects; always giving the commoner "
-            f"answer: {self.chance:.3f}"
+            f"{self.validation_grasps} grasps of {self.validation_objects} other objects; always predicting the more "
+            f"frequent class: {self.chance:.3f}"
         )
         if self.validation_objects < FEW_OBJECTS:
             yield (
-                f"so few objects ({self.validation_objects}) cannot show how much objects differ: the interval is too "
-                "narrow, and holds the truth less often than in 95 % of cases (2 objects: 79 %, 3: 86 %, 4: 89 %)"
+                f"with so few objects ({self.validation_objects}) the interval is too narrow: it contains the true "
+                "value in fewer than 95 % of cases (2 objects: 79 %, 3: 86 %, 4: 89 %)"
             )
         yield "accepted: " + ", ".join(f"{part} of {whole} {name}" for name, (part, whole) in self.accepted.items())
         if self.lowest_acceptance:
-            yield f"held grasps are accepted least often of {self.lowest_acceptance[0]}: {self.lowest_acceptance[1]:.0%}"
+            name, fraction = self.lowest_acceptance
+            yield f"lowest acceptance of held grasps: {fraction:.0%} ({name})"
 
 
 def train_gate(
@@ -105,10 +117,24 @@ def train_gate(
 ) -> GateReport:
     """Train a gate on the successful and failed grasps of a recording and write it to `out`.
 
-    settings: by default the frame after the lift is judged, or where grasps lack it, the one during the grasp. A
-    quarter of the objects judge the gate. It takes half a minute, and 15 ms for each grasp; the same seed gives the
-    same gate. Raises DatasetError for a recording without both kinds of grasps or without the frames to compare,
-    CheckpointError where `out` cannot be written.
+    A quarter of the objects are for validation. Training takes half a minute, plus 15 ms for each grasp.
+
+    Args:
+        recording: Folder of the recording.
+        out: File of the gate (.safetensors).
+        iterations: Number of steps.
+        seed: The same seed gives the same gate.
+        settings: By default, the gate uses the frame after the lift, or the frame during the grasp if any grasp lacks
+            the former.
+        quiet: No progress on stderr.
+
+    Returns:
+        The accuracy on validation objects.
+
+    Raises:
+        DatasetError: The recording lacks successful grasps, failed grasps, or required frames.
+        ConfigError: `iterations` or `seed` is out of range.
+        CheckpointError: `out` cannot be written.
     """
     if iterations < 1:
         raise ConfigError(f"iterations must be at least 1; got {iterations}")
@@ -118,7 +144,7 @@ def train_gate(
     attempts = load_attempts(recording)
     settings = settings or GateSettings(frame="after" if all(attempt.after for attempt in attempts) else "during")
     _require_frames(attempts, settings.frame)
-    _require_both_outcomes(attempts, f"{recording} must hold")
+    _require_both_outcomes(attempts, f"{recording} must contain")
     split = make_split([attempt.grasp for attempt in attempts], validation=VALIDATION, test=0, seed=seed)
     train, validation = (
         [attempt for attempt in attempts if attempt.grasp.object_id in objects]
@@ -128,8 +154,8 @@ def train_gate(
     with worker_pool() as pool, one_thread():
         differences = _DifferenceLoader(settings, pool)
         gate = GraspSuccessGate(_train_net(train, differences, iterations, seed, quiet), settings)
-        with Bar("judge", len(validation), "grasps", quiet=quiet) as bar:
-            logits: list[float] = []  # the highest of each grasp
+        with Bar("validate", len(validation), "grasps", quiet=quiet) as bar:
+            logits: list[float] = []  # each grasp's highest logit
             for part in batches(validation, BATCH):
                 logits += [max(fingers) for fingers in gate.score(differences(part))]
                 bar.advance(len(part))
@@ -140,8 +166,8 @@ def train_gate(
 
 def _require_frames(attempts: Sequence[Attempt], frame: str) -> None:
     for attempt in attempts:
-        grasp, judged = attempt.grasp, attempt.after if frame == "after" else attempt.grasp.touches
-        for moment, files in (("before", grasp.backgrounds), (frame, judged)):
+        grasp, frames = attempt.grasp, attempt.after if frame == "after" else attempt.grasp.touches
+        for moment, files in (("before", grasp.backgrounds), (frame, frames)):
             if len(files) != len(grasp.touches):
                 raise DatasetError(
                     f"a gate compares the frames before and {frame} of each finger; {grasp.grasp_id} has "
@@ -149,17 +175,17 @@ def _require_frames(attempts: Sequence[Attempt], frame: str) -> None:
                 )
 
 
-def _require_both_outcomes(attempts: Sequence[Attempt], who: str) -> None:
+def _require_both_outcomes(attempts: Sequence[Attempt], subject: str) -> None:
     held = sum(attempt.held for attempt in attempts)
     if held in (0, len(attempts)):
         raise DatasetError(
-            f"{who} both successful and failed grasps; got {held} successful of {len(attempts)}; "
-            "collect without a gate, so that failures are recorded too"
+            f"{subject} both successful and failed grasps; got {held} successful of {len(attempts)}; "
+            "collect without a gate to record failures too"
         )
 
 
 class _DifferenceLoader:
-    """The differences of grasps, decoded by a pool of workers and kept in memory."""
+    """Loader of the differences of grasps: a pool of workers decodes them, and a cache stores them in memory."""
 
     def __init__(self, settings: GateSettings, pool: Executor) -> None:
         self._frame, self._pool = settings.frame, pool
@@ -167,12 +193,12 @@ class _DifferenceLoader:
 
     def __call__(self, attempts: Sequence[Attempt]) -> list[list[NDArray[np.float32]]]:
         distinct = {attempt.grasp.grasp_id: attempt for attempt in attempts}  # no two threads read one file
-        read = dict(zip(distinct, self._pool.map(self._of, distinct.values()), strict=True))
-        return [read[attempt.grasp.grasp_id] for attempt in attempts]
+        differences = dict(zip(distinct, self._pool.map(self._of, distinct.values()), strict=True))
+        return [differences[attempt.grasp.grasp_id] for attempt in attempts]
 
     def _of(self, attempt: Attempt) -> list[NDArray[np.float32]]:
-        judged = attempt.after if self._frame == "after" else attempt.grasp.touches
-        return [self._load(*pair) for pair in zip(judged, attempt.grasp.backgrounds, strict=True)]
+        frames = attempt.after if self._frame == "after" else attempt.grasp.touches
+        return [self._load(*pair) for pair in zip(frames, attempt.grasp.backgrounds, strict=True)]
 
 
 def _train_net(
@@ -201,12 +227,12 @@ def _train_net(
 
 
 def gate_loss(logits: Tensor, held: Tensor) -> Tensor:
-    """Cross-entropy of the highest logit of each grasp. logits (B, fingers); held (B,) of 0 and 1."""
+    """Return the cross-entropy of each grasp's highest logit, from logits (B, fingers) and labels (B,) 0 or 1."""
     return match_loss(logits.amax(1), held)
 
 
 def draw_batch(attempts: Sequence[Attempt], step: int, seed: int) -> tuple[list[Attempt], np.random.Generator]:
-    """As many held as failed grasps, drawn by seed and step alone; and the generator, for what else is random."""
+    """Draw equal numbers of held and failed grasps, from seed and step only; also return the random generator."""
     rng = np.random.default_rng([seed, step])
     drawn: list[Attempt] = []
     for held in (True, False):
@@ -216,7 +242,7 @@ def draw_batch(attempts: Sequence[Attempt], step: int, seed: int) -> tuple[list[
 
 
 def augment(images: Tensor, rng: np.random.Generator) -> Tensor:
-    """Differences (B, fingers, 3, px, px) flipped either way, and as if the lamps had changed: each finger its own.
+    """Flip differences (B, fingers, 3, px, px) and change their light, randomly for each finger.
 
     A lamp that is brighter by b in the later frame adds b to the difference; contrast c multiplies it by c.
     """
@@ -236,18 +262,18 @@ def _report(
 ) -> GateReport:
     accepted = logits >= 0
     held = np.array([attempt.held for attempt in validation])
-    right = _group_flags([attempt.grasp.object_id for attempt in validation], accepted == held)
-    good = _group_flags([attempt.grasp.object_id for attempt in validation if attempt.held], accepted[held])
-    lowest_acceptance = min(((sum(part) / len(part), name) for name, part in good.items()), default=None)
+    correct = _group_flags([attempt.grasp.object_id for attempt in validation], accepted == held)
+    held_accepted = _group_flags([attempt.grasp.object_id for attempt in validation if attempt.held], accepted[held])
+    lowest_acceptance = min(((sum(part) / len(part), name) for name, part in held_accepted.items()), default=None)
     return GateReport(
         path=str(out),
         frame=frame,
         train_grasps=len(train),
         train_held=sum(attempt.held for attempt in train),
         validation_grasps=len(validation),
-        validation_objects=len(right),
+        validation_objects=len(correct),
         accuracy=float((accepted == held).mean()),
-        interval=grouped_interval(list(right.values())),
+        interval=grouped_interval(list(correct.values())),
         chance=float(max(held.mean(), 1 - held.mean())),
         accepted={
             name: (sum(part), len(part))

@@ -1,8 +1,8 @@
-"""Teaching one tower what relief looks like, from labelled pictures alone: no touch needs its photo.
+"""Pretrain one tower on relief and shape labels, from labelled pictures without touch-photo pairs.
 
-A photographed object costs a tenth of a felt one, and what a matcher lacks on the photo's side is objects. The tower
-learns which relief and shape an object has, how wide, high, drawn out and sharp its relief is; its weights then begin a
-matcher's (`init_photo`, `init_touch`), whose head is trained on felt objects as before.
+A photo-only object costs a tenth of the time of a grasped one, and a matcher's photo tower mostly lacks objects. The
+tower learns the relief and shape families of an object, and the pitch, amplitude, aspect and sharpness of its relief. A
+matcher starts from its weights (`init_photo`, `init_touch`), and its head is trained on touched objects.
 """
 
 import dataclasses
@@ -38,21 +38,26 @@ from retrieval.training.state import load_state, require_no_unfinished_state, sa
 BATCH, ITERATIONS, LEARNING_RATE = 32, 1500, 4e-4
 WEIGHT_DECAY, SMOOTHING, DROPOUT = 0.03, 0.05, 0.2
 HEAD_RATE_FACTOR = 5.0
-"""The head, which begins at zero, learns so many times faster than the tower."""
+"""Ratio of the head's learning rate to the tower's, since the head starts at zero."""
 VALIDATION, MAX_VALIDATION_OBJECTS = 0.05, 400
 SAVE_EVERY = 200
 BACKGROUNDS = ("none", "difference+0.5")
-"""Policies under which touches are seen, in turns: the weights serve matchers of both."""
+"""Background policies of training touches, drawn at random, so that the weights serve matchers of both policies."""
 VISIBLE_FRACTION = 0.8
-"""Share of a photo's side that a step sees; a gel is seen whole."""
+"""Fraction of a photo's side that a training step uses; a gel image is used whole."""
 
 
 @dataclass(frozen=True)
 class ReliefReport:
-    """How well objects that were held out are told.
+    """Accuracy of a pretrained tower on held-out objects.
 
-    families: of `FAMILIES`, the share named right and what chance would name. sizes: of `SIZES`, the correlation of the
-    reading with the truth (of pitch, amplitude and aspect their logarithms).
+    Attributes:
+        kind: "photo" or "touch".
+        pictures: Number of all pictures.
+        objects: Number of all objects.
+        steps: Number of training steps.
+        families: Accuracy and chance accuracy for each of `FAMILIES`.
+        sizes: Correlation of predicted and true value for each of `SIZES` (logarithms except for the sharpness).
     """
 
     kind: str
@@ -63,11 +68,11 @@ class ReliefReport:
     sizes: dict[str, float]
 
     def lines(self) -> list[str]:
-        """The report as lines for people."""
+        """Return the report as lines for people."""
         return [
             f"{self.kind}: {self.steps} steps on {self.pictures} pictures of {self.objects} objects",
-            "objects held out: "
-            + ", ".join(f"{name} {share:.3f} (chance {chance:.3f})" for name, (share, chance) in self.families.items()),
+            "held-out objects: "
+            + ", ".join(f"{name} {value:.3f} (chance {chance:.3f})" for name, (value, chance) in self.families.items()),
             "correlations: "
             + ", ".join(f"{name.removesuffix('_mm')} {value:.2f}" for name, value in self.sizes.items()),
         ]
@@ -85,15 +90,29 @@ def train_relief(
 ) -> ReliefReport:
     """Train a tower of `config` on the pictures in `folder` and write its weights to `out` (.safetensors).
 
-    Photos are seen as the view "grey" or "zoom" shows them, touches with and without their background, whichever of
-    both the matcher wants (`config.preprocessing`, by which the report judges); the first weights are
-    `config.training.init`. resume: go on from the state beside `out`. cache: folder where decoded images are kept
-    (`retrieval.training.disk_image_cache`). Ctrl-C keeps a state and raises JobInterrupted.
-    Raises DatasetError, ConfigError, CheckpointError.
+    Photos are used as in the views "zoom" and "grey", touches with and without background subtraction. The report uses
+    `config.preprocessing`. The initial weights are `config.training.init`. Ctrl-C saves a state.
+
+    Args:
+        folder: Folder that `retrieve collect --photos-only` or `--touches-only` wrote.
+        out: File of the weights.
+        config: The configuration.
+        iterations: Number of steps.
+        resume: Continue from the state next to `out`.
+        cache: Folder of decoded images (`retrieval.training.disk_image_cache`).
+        quiet: No progress on stderr.
+
+    Returns:
+        The accuracy on held-out objects.
+
+    Raises:
+        DatasetError, ConfigError, CheckpointError: The data or settings cannot be trained with.
+        JobInterrupted: After Ctrl-C.
     """
     if config.preprocessing.background == "difference":
         raise ConfigError(
-            'pictures are learned from in 8 bits, which hold no darker than black; set background = "difference+0.5"'
+            "this training uses 8-bit pictures, which cannot store negative differences; "
+            'set background = "difference+0.5"'
         )
     if iterations < 1:
         raise ConfigError(f"iterations must be at least 1; got {iterations}")
@@ -109,7 +128,7 @@ def train_relief(
     with interruption() as stop, Bar("train relief", iterations, "steps", done=training.step, quiet=quiet) as bar:
         training.run(out, bar, stop.is_set)
     if training.step < iterations:
-        raise JobInterrupted(f"stopped at step {training.step} of {iterations}; --resume goes on from here")
+        raise JobInterrupted(f"stopped at step {training.step} of {iterations}; --resume continues from here")
     report = training.report()
     about = {"tower": config.matcher.tower, "tower_output": config.matcher.tower_output}
     write_tensors(out, training.tower.state_dict(), about | dataclasses.asdict(report))
@@ -118,20 +137,20 @@ def train_relief(
 
 
 class ReliefTraining:
-    """A tower, the head that reads relief off its features, and the pictures they learn from."""
+    """A tower, a head that predicts the labels from its features, and their training pictures."""
 
     def __init__(self, kind: str, pictures: Sequence[LabelledPicture], config: Config, iterations: int) -> None:
         self.kind, self.config, self.iterations, self.step = kind, config, iterations, 0
         self.device, seed = default_device(), config.training.seed
         objects = sorted({picture.object_id for picture in pictures})
-        held_out = max(1, min(round(VALIDATION * len(objects)), MAX_VALIDATION_OBJECTS))
+        count = max(1, min(round(VALIDATION * len(objects)), MAX_VALIDATION_OBJECTS))
         self.labels = labels_digest(pictures)
-        chosen = set(np.random.default_rng([seed, 1]).permutation(objects)[:held_out].tolist())
-        self.pictures = [picture for picture in pictures if picture.object_id not in chosen]
-        self.validation = [picture for picture in pictures if picture.object_id in chosen]
-        self.families = [sorted({each.families[place] for each in self.pictures}) for place in range(len(FAMILIES))]
+        held_out = set(np.random.default_rng([seed, 1]).permutation(objects)[:count].tolist())
+        self.pictures = [picture for picture in pictures if picture.object_id not in held_out]
+        self.validation = [picture for picture in pictures if picture.object_id in held_out]
+        self.families = [sorted({each.families[index] for each in self.pictures}) for index in range(len(FAMILIES))]
         if len(self.families[0]) < 2:
-            raise DatasetError(f"relief can be learned from two families and more; got {', '.join(self.families[0])}")
+            raise DatasetError(f"training needs at least two relief families, got {', '.join(self.families[0])}")
         sizes = np.array([each.size_targets for each in self.pictures if not each.is_smooth])
         self.mean, self.deviation = sizes.mean(0), sizes.std(0) + 1e-6
         torch.manual_seed(seed)
@@ -151,19 +170,17 @@ class ReliefTraining:
         self._workers = worker_pool(config.training.workers)
 
     def _load(self, file: Path, before: Path | None) -> NDArray[np.uint8]:
-        """(forms, H, W, 3) of a picture as the matcher sees it; a touch also as a matcher of another policy for the
-        background would.
-        """
+        """Return the variants (V, H, W, 3) of a picture: the matcher's, and for touches those of other policies."""
         settings = self.config.preprocessing
         if self.kind == "photo":
-            forms = [Preprocessing(photo_px=settings.photo_px, views=("zoom",)).load_photo(file)]
+            variants = [Preprocessing(photo_px=settings.photo_px, views=("zoom",)).load_photo(file)]
         else:
             policies = dict.fromkeys((settings.background, *BACKGROUNDS))
-            forms = [replace(settings, background=policy).load_touch(file, before) for policy in policies]
-        return np.rint(255 * np.stack(forms)).astype(np.uint8)
+            variants = [replace(settings, background=policy).load_touch(file, before) for policy in policies]
+        return np.rint(255 * np.stack(variants)).astype(np.uint8)
 
     def cache_decoded(self, folder: Path, *, quiet: bool = False) -> None:
-        """Have all pictures decoded into `folder`, and taken from there from now on (`DiskImageCache`)."""
+        """Decode all pictures into `folder`, and read them from there afterwards (`DiskImageCache`)."""
         preprocessing_digest = replace(self.config.preprocessing, views=("zoom",)).digest()
         self._variants = DiskImageCache(
             self._load, folder, f"relief-{self.kind}", preprocessing_digest, self.config.training.workers
@@ -172,15 +189,15 @@ class ReliefTraining:
         self._variants.cache_decoded([(picture.file, picture.before) for picture in everything], quiet=quiet)
 
     def _images(self, pictures: Sequence[LabelledPicture], rng: np.random.Generator | None = None) -> Tensor:
-        """(B, 3, H, W) of pictures in 8 bits. rng: draws how each touch is seen."""
-        seen = [
-            to_float(forms[rng.integers(len(forms)) if rng else 0])
-            for forms in self._workers.map(lambda picture: self._variants(picture.file, picture.before), pictures)
+        """Return pictures as a batch (B, 3, H, W); `rng` draws the variant of each, the first one without it."""
+        images = [
+            to_float(variants[rng.integers(len(variants)) if rng else 0])
+            for variants in self._workers.map(lambda picture: self._variants(picture.file, picture.before), pictures)
         ]
-        return to_batch(seen)
+        return to_batch(images)
 
     def run(self, out: Path, bar: Bar, should_stop: Callable[[], bool]) -> None:
-        """Train from the current step to the last, saving the state of `out` now and then."""
+        """Train from the current step to the last, and save the state of `out` every SAVE_EVERY steps."""
         plan = Plan(self.iterations, LEARNING_RATE, "cosine", SAVE_EVERY)
         with ThreadPoolExecutor(1) as batches:
             steps = range(self.step, self.iterations)
@@ -214,23 +231,23 @@ class ReliefTraining:
         self.tower.train()
         for module in self.tower.modules():
             if isinstance(module, nn.BatchNorm2d):
-                module.eval()  # the published statistics hold; a batch of 32 is too few for new ones
+                module.eval()  # keep the pretrained statistics, since a batch of 32 is too small for new ones
         self.head.train()
         torch.manual_seed(self.config.training.seed * 1_000_003 + self.step)  # the dropout mask
         *families, sizes = self._readings(images)
-        worn = torch.tensor([not each.is_smooth for each in pictures], device=self.device)
-        loss = ((sizes - self._targets(pictures)).square().mean(1) * worn).mean()
-        for place, (names, readings) in enumerate(zip(self.families, families, strict=True)):
-            named = torch.tensor([names.index(each.families[place]) for each in pictures], device=self.device)
-            loss = loss + functional.cross_entropy(readings, named, label_smoothing=SMOOTHING)
+        has_relief = torch.tensor([not each.is_smooth for each in pictures], device=self.device)
+        loss = ((sizes - self._targets(pictures)).square().mean(1) * has_relief).mean()
+        for index, (names, logits) in enumerate(zip(self.families, families, strict=True)):
+            labels = torch.tensor([names.index(each.families[index]) for each in pictures], device=self.device)
+            loss = loss + functional.cross_entropy(logits, labels, label_smoothing=SMOOTHING)
         return loss
 
     def _readings(self, images: Tensor) -> tuple[Tensor, ...]:
-        """Of images (B, 3, H, W): logits (B, kinds) for each of FAMILIES, then standardised SIZES (B, sizes)."""
+        """Predict logits (B, kinds) of each of FAMILIES, then standardised SIZES (B, 4), of images (B, 3, H, W)."""
         with autocast(self.device, self.config.training.precision):
             features = self.tower(images.to(self.device, memory_format=torch.channels_last))
-        readings: Tensor = self.head(features.float())
-        return torch.split(readings, [*map(len, self.families), len(SIZES)], dim=1)
+        outputs: Tensor = self.head(features.float())
+        return torch.split(outputs, [*map(len, self.families), len(SIZES)], dim=1)
 
     def _targets(self, pictures: Sequence[LabelledPicture]) -> Tensor:
         sizes = (np.array([each.size_targets for each in pictures]) - self.mean) / self.deviation
@@ -238,47 +255,52 @@ class ReliefTraining:
 
     @torch.inference_mode()
     def report(self) -> ReliefReport:
-        """FusionScorer the objects that were held out; a touch by each of its fingers."""
+        """Evaluate the tower on the held-out objects; each finger of a touch counts separately."""
         self.tower.eval()
         self.head.eval()
         parts = [self.validation[start : start + BATCH] for start in range(0, len(self.validation), BATCH)]
-        read = [self._readings(centre_crop(self._images(part), self.kind)) for part in parts]
-        *families, sizes = (torch.cat(part).cpu().numpy() for part in zip(*read, strict=True))
-        told = {}
-        for place, (name, known, readings) in enumerate(zip(FAMILIES, self.families, families, strict=True)):
-            named = np.array(known)[readings.argmax(1)]
-            right = named == np.array([each.families[place] for each in self.validation])
-            told[name] = float(right.mean()), 1 / len(known)
-        worn = np.array([not each.is_smooth for each in self.validation])
-        wanted = self._targets(self.validation).cpu().numpy()
+        outputs = [self._readings(centre_crop(self._images(part), self.kind)) for part in parts]
+        *families, sizes = (torch.cat(part).cpu().numpy() for part in zip(*outputs, strict=True))
+        accuracies = {}
+        for index, (name, known, logits) in enumerate(zip(FAMILIES, self.families, families, strict=True)):
+            predicted = np.array(known)[logits.argmax(1)]
+            correct = predicted == np.array([each.families[index] for each in self.validation])
+            accuracies[name] = float(correct.mean()), 1 / len(known)
+        has_relief = np.array([not each.is_smooth for each in self.validation])
+        targets = self._targets(self.validation).cpu().numpy()
         everything = [*self.pictures, *self.validation]
         return ReliefReport(
             kind=self.kind,
             pictures=len(everything),
             objects=len({each.object_id for each in everything}),
             steps=self.step,
-            families=told,
-            sizes={name: _correlation(sizes[worn, at], wanted[worn, at]) for at, name in enumerate(SIZES)},
+            families=accuracies,
+            sizes={name: _correlation(sizes[has_relief, at], targets[has_relief, at]) for at, name in enumerate(SIZES)},
         )
 
     def _identity(self) -> dict[str, Any]:
-        """What must be the same for a training to be resumed."""
+        """Return the settings that must not change between a training and its resumption."""
         return {"config": self.config.to_dict(), "iterations": self.iterations, "pictures": self.labels}
 
     def _save(self, out: Path) -> None:
         save_state(out, self.modules, self.optimizer, {"step": self.step, **self._identity()})
 
     def resume(self, out: Path) -> None:
-        """Continue from the state of `out`. Raises CheckpointError where there is none, or one of another training."""
+        """Continue from the state of `out`.
+
+        Raises:
+            CheckpointError: There is no state, or it belongs to another training.
+        """
         self.step = load_state(out, self.modules, self.optimizer, self._identity())["step"]
 
 
 def augment(images: Tensor, kind: str, rng: np.random.Generator) -> Tensor:
-    """Other pictures of the same relief, from images (B, 3, H, W): turned by up to .1 rad, 8 % nearer or further,
-    shifted, flipped, in other light, with noise; photos also drawn towards grey, for colour says nothing of relief.
+    """Return augmented images (B, 3, H, W) with the same relief.
 
-    A gel's colours come from its lamps: they keep their places, so a gel is flipped only top to bottom, where it is
-    the same press with the finger turned, and its channels are scaled alike.
+    Images are turned by up to .1 rad, scaled by up to 8 %, shifted, flipped, relit, and get noise. Photos are also
+    desaturated, since colour carries no information on relief. A gel's colours come from its lamps, which keep their
+    places. So a gel image is only flipped top to bottom (the same press with a turned finger), and its channels are
+    scaled equally.
     """
     count = len(images)
 
@@ -287,40 +309,40 @@ def augment(images: Tensor, kind: str, rng: np.random.Generator) -> Tensor:
 
     turn, size = draw(-0.1, 0.1), draw(0.92, 1.08)
     flip = torch.from_numpy(np.where(rng.random(count) < 0.5, -1.0, 1.0).astype(np.float32))
-    shown = VISIBLE_FRACTION if kind == "photo" else 1.0
+    visible = VISIBLE_FRACTION if kind == "photo" else 1.0
     across, down = (flip, torch.ones(count)) if kind == "photo" else (torch.ones(count), flip)
-    cosine, sine = torch.cos(turn) * size * shown, torch.sin(turn) * size * shown
+    cosine, sine = torch.cos(turn) * size * visible, torch.sin(turn) * size * visible
     shift = draw(-0.1, 0.1, 2) if kind == "photo" else draw(-0.05, 0.05, 2)
     maps = torch.stack([across * cosine, -down * sine, shift[:, 0], across * sine, down * cosine, shift[:, 1]], 1)
-    seen = _sample_grid(images, maps.view(count, 2, 3), shown)
+    result = _sample_grid(images, maps.view(count, 2, 3), visible)
     if kind == "photo":
-        grey, towards = seen.mean(1, keepdim=True), draw(0.0, 1.0, 1, 1, 1)
-        seen = torch.lerp(seen, grey.expand_as(seen), (towards + 0.5).clamp(max=1.0) * (towards > 0.25))
-        middle = seen.mean((1, 2, 3), keepdim=True)
-        seen = (seen - middle) * draw(0.7, 1.3, 1, 1, 1) + middle + draw(-0.15, 0.15, 1, 1, 1)
+        grey, towards = result.mean(1, keepdim=True), draw(0.0, 1.0, 1, 1, 1)
+        result = torch.lerp(result, grey.expand_as(result), (towards + 0.5).clamp(max=1.0) * (towards > 0.25))
+        middle = result.mean((1, 2, 3), keepdim=True)
+        result = (result - middle) * draw(0.7, 1.3, 1, 1, 1) + middle + draw(-0.15, 0.15, 1, 1, 1)
     else:
-        seen = (seen - 0.5) * draw(0.7, 1.4, 1, 1, 1) + 0.5
-    noise = torch.from_numpy(rng.standard_normal(seen.shape, dtype=np.float32))
-    return (seen + 0.01 * noise).clamp(0.0, 1.0)
+        result = (result - 0.5) * draw(0.7, 1.4, 1, 1, 1) + 0.5
+    noise = torch.from_numpy(rng.standard_normal(result.shape, dtype=np.float32))
+    return (result + 0.01 * noise).clamp(0.0, 1.0)
 
 
 def centre_crop(images: Tensor, kind: str) -> Tensor:
-    """What of images is seen where nothing is drawn: the middle of a photo, in grey; a whole gel."""
+    """Return images for evaluation: the middle of a photo in grey, or a whole gel image."""
     if kind == "touch":
         return images
     same = torch.tensor([[VISIBLE_FRACTION, 0.0, 0.0], [0.0, VISIBLE_FRACTION, 0.0]]).expand(len(images), 2, 3)
-    seen = _sample_grid(images, same, VISIBLE_FRACTION)
-    return seen.mean(1, keepdim=True).expand_as(seen)
+    middle = _sample_grid(images, same, VISIBLE_FRACTION)
+    return middle.mean(1, keepdim=True).expand_as(middle)
 
 
-def _sample_grid(images: Tensor, maps: Tensor, shown: float) -> Tensor:
-    side = [max(round(shown * length), 1) for length in images.shape[2:]]
+def _sample_grid(images: Tensor, maps: Tensor, visible: float) -> Tensor:
+    side = [max(round(visible * length), 1) for length in images.shape[2:]]
     grid = functional.affine_grid(maps, [len(images), 3, *side], align_corners=False)
     return functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)
 
 
-def _correlation(readings: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:
-    """Pearson's correlation; 0 where one side does not vary."""
-    if len(readings) < 2 or readings.std() == 0 or wanted.std() == 0:
+def _correlation(predictions: NDArray[np.float32], targets: NDArray[np.float32]) -> float:
+    """Return Pearson's correlation, or 0 where one side does not vary."""
+    if len(predictions) < 2 or predictions.std() == 0 or targets.std() == 0:
         return 0.0
-    return float(np.corrcoef(readings, wanted)[0, 1])
+    return float(np.corrcoef(predictions, targets)[0, 1])

@@ -1,4 +1,4 @@
-"""The state of an unfinished training, next to its output: weights, optimiser, step, and what must not change."""
+"""The state of an unfinished training, next to its output: weights, optimiser, step, and fixed settings."""
 
 import hashlib
 import inspect
@@ -34,10 +34,15 @@ def state_path(out: Path) -> Path:
 
 
 def require_no_unfinished_state(out: Path) -> None:
-    """Raise CheckpointError where an unfinished training of `out` would be lost."""
+    """Check that a new training of `out` overwrites no unfinished one.
+
+    Raises:
+        CheckpointError: The state of an unfinished training exists.
+    """
     if state_path(out).exists():
         raise CheckpointError(
-            f"an unfinished training is at {state_path(out)}; go on with --resume, or delete the file to start afresh"
+            f"an unfinished training is at {state_path(out)}; continue it with --resume, or delete the file to start "
+            "a new one"
         )
 
 
@@ -56,7 +61,7 @@ def save_state(
         modules: Everything with parameters.
         optimizer: The optimiser of these parameters.
         header: The step, and the settings that `load_state` compares; JSON types.
-        left_out: How the names of weights begin that are stored elsewhere.
+        excluded: Prefixes of the names of weights that are stored elsewhere.
     """
     tensors = {
         f"{_MODEL}{name}": tensor for name, tensor in modules.state_dict().items() if not name.startswith(excluded)
@@ -75,14 +80,14 @@ def load_state(
     *,
     excluded: Callable[[], Mapping[str, Tensor]] = dict,
 ) -> dict[str, Any]:
-    """Load what `save_state` wrote into `modules` and `optimizer`.
+    """Load the state that `save_state` wrote into `modules` and `optimizer`.
 
     Args:
         out: The output of the training.
         modules: As in `save_state`.
         optimizer: As in `save_state`.
-        identity: Settings that the header must hold unchanged.
-        left_out: Gives the weights that the file does not hold, by name.
+        identity: Settings that the header must contain unchanged.
+        excluded: Returns the weights that the file does not contain, by name.
 
     Returns:
         The header.
@@ -95,15 +100,15 @@ def load_state(
     for name, value in json.loads(json.dumps(identity)).items():
         if header.get(name) != value:
             raise CheckpointError(
-                f"{path} is of another training, with another {name.replace('_', ' ')}; resume with the same data and "
-                "configuration, or delete the file to start afresh"
+                f"{path} belongs to a training with another {name.replace('_', ' ')}; resume with the same data and "
+                "configuration, or delete the file to start a new training"
             )
     weights = {name.removeprefix(_MODEL): tensor for name, tensor in tensors.items() if name.startswith(_MODEL)}
     load_weights(modules, weights | dict(excluded()))
     for name, parameter in modules.named_parameters():
         prefix = f"{_OPTIMIZER}{name}."
         stored = {key.removeprefix(prefix): tensor for key, tensor in tensors.items() if key.startswith(prefix)}
-        if stored:  # the count of steps stays on the CPU, as PyTorch itself keeps it
+        if stored:  # PyTorch keeps the step count on the CPU
             optimizer.state[parameter] = {
                 quantity: tensor if quantity == "step" else tensor.to(parameter.device)
                 for quantity, tensor in stored.items()
@@ -112,9 +117,9 @@ def load_state(
 
 
 def code_digest(*classes: type) -> dict[str, str]:
-    """Return {"code": SHA-256} of the source of classes that are not this project's; {} where all are ours.
+    """Return {"code": SHA-256} of the source of classes outside this project, or {} without any.
 
-    An edited loss or method is then fitted again. The source is that of the module, or of a class in a notebook.
+    So an edited loss or method is fitted again. The source is that of the module, or of the class for a notebook.
     """
     sources = []
     for each in classes:
@@ -122,22 +127,22 @@ def code_digest(*classes: type) -> dict[str, str]:
             module = sys.modules[each.__module__]
             try:
                 sources.append(inspect.getsource(module if getattr(module, "__file__", None) else each))
-            except (OSError, TypeError):  # typed into an interpreter, which keeps no source
+            except (OSError, TypeError):  # typed into an interpreter, without source
                 sources.append(each.__qualname__)
     return {"code": hashlib.sha256("\n".join(sources).encode()).hexdigest()} if sources else {}
 
 
 def unfinished_path(done: Path) -> Path:
-    """Return where a checkpoint lies until its training is finished: in another folder, so that `done` is whole."""
+    """Return the path of a checkpoint during its training, in another folder, so that `done` is always complete."""
     return done.parent / "unfinished" / done.name
 
 
 def finish_training(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
-    """Train to the end and return the checkpoint, once: a finished training is read, an unfinished one resumed.
+    """Train to the end and return the checkpoint; read a finished training, and resume an unfinished one.
 
     Args:
         trainer: A training whose `out` is `unfinished_path(done)`.
-        done: Where the finished checkpoint lies afterwards. One of another training is replaced.
+        done: Path of the finished checkpoint. A checkpoint of another training is replaced.
         quiet: No progress on stderr.
 
     Raises:
@@ -145,9 +150,9 @@ def finish_training(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
     """
     mine = (trainer.config, trainer.split, trainer.data_digest, trainer.code.get("code"))
     if done.is_file():
-        kept = load_checkpoint(done)
-        if (kept.config, kept.split, *map(kept.provenance.get, ("data_digest", "code"))) == mine:
-            return kept
+        stored = load_checkpoint(done)
+        if (stored.config, stored.split, *map(stored.provenance.get, ("data_digest", "code"))) == mine:
+            return stored
     if state_path(trainer.out).is_file():
         try:
             trainer.resume()

@@ -19,12 +19,15 @@ class WeightedLosses(nn.Module):
     """The losses of a training whose weight is above 0, with their own parameters."""
 
     def __init__(self, weights: Mapping[str, float], matcher: Matcher, objects: int) -> None:
-        """Make them. Raises ConfigError for a name that no loss has.
+        """Create the losses with a weight above 0.
 
         Args:
-            weights: Name of a loss to its weight.
+            weights: Weight of each loss by name.
             matcher: The model that they train.
-            objects: How many objects are trained on.
+            objects: Number of training objects.
+
+        Raises:
+            ConfigError: No loss has a name.
         """
         super().__init__()
         self.weights = {name: weight for name, weight in weights.items() if weight > 0}
@@ -36,7 +39,7 @@ class WeightedLosses(nn.Module):
         return [weight * term(batch) for weight, term in zip(self.weights.values(), self.terms, strict=True)]
 
     def clamp(self) -> None:
-        """Hold their parameters within range."""
+        """Clamp the losses' parameters to their ranges."""
         for term in self.terms:
             if isinstance(term, Loss):
                 term.clamp()
@@ -49,7 +52,7 @@ def batch_loss(
     touch_features: Tensor,
     photo_features: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Loss (scalar) and match logits (P,) of a batch from the features of its distinct touches and photos."""
+    """Return loss (scalar) and match logits (P,) of a batch, from features of its distinct touches and photos."""
     arrays = batch.touch_index, batch.photo_index, batch.labels, batch.touch_objects, batch.photo_objects
     touch_index, photo_index, labels, *objects = (torch.from_numpy(array).to(touch_features.device) for array in arrays)
     touch, photo = matcher.touch_encoding(touch_features), matcher.photo_encoding(photo_features)
@@ -61,7 +64,7 @@ def batch_loss(
 
 
 def shuffle_fingers(touch_features: Tensor, fingers: int) -> Tensor:
-    """Each touch's features (B, fingers * F) with its fingers in a random order, by PyTorch's seed on the CPU."""
+    """Return each touch's features (B, fingers * F) with randomly permuted fingers, by PyTorch's seed on the CPU."""
     each = touch_features.view(len(touch_features), fingers, -1)
     order = torch.rand(len(each), fingers).argsort(dim=1).to(each.device)
     return torch.take_along_dim(each, order[..., None], dim=1).flatten(1)
@@ -69,7 +72,7 @@ def shuffle_fingers(touch_features: Tensor, fingers: int) -> Tensor:
 
 @torch.inference_mode()
 def pair_logits(matcher: Matcher, pairs: PairBatch, source: FeatureSource) -> NDArray[np.float32]:
-    """Match logits (P,) of pairs, in evaluation mode, each image encoded once."""
+    """Return match logits (P,) of pairs in evaluation mode; each image is encoded once."""
     matcher.eval()
     touch_features, photo_features = source.eval_features(matcher, pairs)
     with source.step_context():

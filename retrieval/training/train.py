@@ -1,7 +1,7 @@
-"""Training a matcher: the step, validation, checkpoints, interruption and resumption.
+"""Train a matcher: steps, validation, checkpoints, interruption and resumption.
 
-Every step depends on the seed, the step number and the state alone, so a run that was stopped and resumed on the same
-machine ends bit for bit where an unbroken run ends.
+Every step depends only on the seed, the step number and the state. So a run that is stopped and resumed on the same
+machine gives the same bits as an uninterrupted run.
 """
 
 import dataclasses
@@ -70,14 +70,14 @@ def train(
     cache: Path | None = None,
     quiet: bool = False,
 ) -> Checkpoint:
-    """Train on a recording and write the best checkpoint by validation objects to `out`.
+    """Train on a recording and write the checkpoint with the best validation score to `out`.
 
-    Ctrl-C ends after the current step with a usable checkpoint; a second one stops at once.
+    Ctrl-C ends after the current step with a usable checkpoint; a second Ctrl-C stops immediately.
 
     Args:
-        recording: A folder, or what `robot.read_recording` returns. It decides the number of fingers.
+        recording: A folder, or the result of `robot.read_recording`. It decides the number of fingers.
         out: The checkpoint (.safetensors).
-        config: As an object (`Config.using` takes towers and losses of your own) or as `load_config` takes it.
+        config: An object (`Config.using` accepts your own towers and losses), or an argument of `load_config`.
         split: Objects of each part; drawn from the configuration where None.
         resume: Continue from the state next to `out`.
         cache: Folder of decoded images (`retrieval.training.disk_image_cache`), for towers that are trained.
@@ -98,7 +98,7 @@ def train(
     recording, (config, _) = folder_of(recording), named_config(config)
     if cache and config.training.freeze_towers:
         raise ConfigError(
-            "images are kept for towers that are trained; frozen ones look at each once: leave out the cache"
+            "a cache of decoded images is only for trained towers; frozen towers read each image once: omit the cache"
         )
     require_writable(out)
     distributed.start()
@@ -134,7 +134,7 @@ class Trainer:
         source: str,
         known: Features | None = None,
     ) -> None:
-        """known: features of all these grasps, for frozen towers; then they are the data, and no image is read."""
+        """Prepare a run; `known` are features of all grasps for frozen towers, in place of their images."""
         settings = config.training
         self.config, self.split, self.out, self.source = config, split, out, source
         pairs = labelled_pairs(config)
@@ -150,7 +150,7 @@ class Trainer:
         towers = (module for module in self.matcher.modules() if isinstance(module, Tower))
         self.code = code_digest(*map(type, (*self.losses.terms, *towers)))
         trained = [parameter for parameter in self.modules.parameters() if parameter.requires_grad]
-        # On a CPU PyTorch's default goes over every tensor eight times; fused goes once. CUDA's default is fast.
+        # On a CPU PyTorch's default passes over every tensor eight times, and fused once. CUDA's default is fast.
         self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
@@ -165,7 +165,7 @@ class Trainer:
 
     def _sampler(self, chosen: list[Grasp]) -> PairSampler:
         settings = self.config.training
-        # Features that are kept cost nothing to draw from all objects.
+        # With cached features, drawing from all objects costs nothing.
         shared = not settings.freeze_towers if settings.negatives == "auto" else settings.negatives == "batch"
         return PairSampler(
             chosen,
@@ -200,18 +200,18 @@ class Trainer:
                 after_step=self._after_step,
                 note=self._note,
                 validate=lambda _: self._validate_and_save(),
-                # All ranks stop after the same step: one that went on would wait for the others for ever.
+                # All ranks must stop after the same step, or the remaining ranks would wait forever.
                 should_stop=lambda: distributed.any_rank(stop.is_set(), self.device),
             )
         if not quiet and not settings.freeze_towers:
             say(self._rates())
         if self.step < plan.steps:
             raise JobInterrupted(
-                f"stopped at step {self.step} of {plan.steps}; {self.out} is usable, --resume goes on from here"
+                f"stopped at step {self.step} of {plan.steps}; {self.out} is usable, --resume continues from here"
             )
 
     def _rates(self) -> str:
-        """Say how fast the loader decodes and the towers compute: the slower one decides how long a step takes."""
+        """Return a sentence on the speed of the loader and of the towers; the slower one limits the training."""
         towers = f"the towers take {self._image_count / self._compute_s:.0f} images/s"
         if (rate := self.features.decode_rate) is None:
             return f"loader: no image was decoded; {towers}"
@@ -223,7 +223,7 @@ class Trainer:
         return self.features.prepare(self.matcher, batch)
 
     def loss(self, loaded: LoadedBatch) -> Tensor:
-        """The loss of a prepared batch."""
+        """Return the loss of a prepared batch."""
         settings, batch = self.config.training, loaded.batch
         self._image_count += loaded.touches.shape[:2].numel() + len(loaded.photos)
         self._step_start_s = time.perf_counter()
@@ -236,7 +236,7 @@ class Trainer:
         return loss
 
     def _after_step(self, done: int) -> None:
-        # Fused steps do not count as changes by themselves, and what is made from the weights would seem to be fresh.
+        # Fused steps do not increment the versions of weights, and values cached from weights would seem up to date.
         increment_version(list(self.matcher.parameters()))
         self.matcher.clamp_scale()
         self.losses.clamp()
@@ -249,7 +249,7 @@ class Trainer:
         return f"  accuracy {pair_accuracy(logits.cpu().numpy(), labels):.2f}{best}"
 
     def _finish(self, stop: threading.Event, quiet: bool) -> None:
-        """Complete the best checkpoint, on the first rank; after Ctrl-C all ranks leave."""
+        """Complete the best checkpoint on the first rank; after Ctrl-C all ranks stop."""
         should_stop = False
         if not distributed.rank():
             try:
@@ -257,13 +257,13 @@ class Trainer:
                 state_path(self.out).unlink(missing_ok=True)
             except JobInterrupted:
                 should_stop = True
-        if distributed.any_rank(should_stop, self.device):  # and no rank leaves before the files are there
+        if distributed.any_rank(should_stop, self.device):  # all ranks wait here until the files are written
             raise JobInterrupted(
                 f"stopped before the checkpoint was complete; {self.out} ranks photos, --resume adds the rest"
             )
 
     def _complete(self, stop: threading.Event, quiet: bool) -> None:
-        """Add to the best checkpoint what is fitted when all is learned: the candidate_encoder, the posterior, the gel check."""
+        """Add the parts that are fitted after training: candidate encoder, posterior and gel check."""
         train = [grasp for part in self.sampler.grasps for grasp in part]
         held_out = self.validation.grasps if self.validation else []
         made = load_checkpoint(self.out)
@@ -284,10 +284,10 @@ class Trainer:
             if better:
                 self._save_best(metrics)
             self._save_state()
-        distributed.any_rank(False, self.device)  # no rank reads or leaves before the files are there
+        distributed.any_rank(False, self.device)  # all ranks wait here until the files are written
 
     def validate(self) -> dict[str, float]:
-        """FusionScorer the fixed validation pairs; nothing where the split has no validation objects."""
+        """Return the metrics of the fixed validation pairs; empty without validation objects."""
         if self.validation is None:
             return {}
         logits, labels = pair_logits(self.matcher, self.validation, self.features), self.validation.labels
@@ -315,7 +315,7 @@ class Trainer:
         )
 
     def _identity(self) -> dict[str, Any]:
-        """What must be the same for a run to be resumed."""
+        """Return the settings that must not change between a run and its resumption."""
         return {
             "config": self.config.to_dict(),
             "split": self.split.to_dict(),
@@ -329,7 +329,7 @@ class Trainer:
         save_state(self.out, self.modules, self.optimizer, header, excluded=excluded)
 
     def resume(self) -> None:
-        """Continue from the state next to `out`. Raises CheckpointError where it belongs to another run."""
+        """Continue from the state next to `out`. Raises CheckpointError if it belongs to another run."""
         header = load_state(self.out, self.modules, self.optimizer, self._identity(), excluded=self._frozen_weights)
         self.step, self.best = header["step"], -math.inf if header["best"] is None else header["best"]
 
@@ -340,33 +340,32 @@ class Trainer:
         return {name: tensor for name, tensor in named.items() if frozen and name.startswith(FROZEN)}
 
     def _load_own_checkpoint(self) -> Checkpoint:
-        """The best checkpoint so far is part of the state. It may be newer than the rest of it (a crash between the
-        two writes): the steps since then are repeated to the same end.
+        """Return the best checkpoint so far, which is part of the state.
+
+        After a crash between the two writes it is newer than the state; repeating the steps gives the same result.
         """
-        kept = load_checkpoint(self.out)
-        mine = (kept.split, kept.provenance.get("data_digest")) == (self.split, self.data_digest)
-        if not mine or kept.config not in (
-            self.config_without_encoder,
-            self.config,
-        ):  # before and after its candidate_encoder is taught
+        stored = load_checkpoint(self.out)
+        mine = (stored.split, stored.provenance.get("data_digest")) == (self.split, self.data_digest)
+        # The configuration changes when the candidate encoder is added.
+        if not mine or stored.config not in (self.config_without_encoder, self.config):
             raise CheckpointError(
-                f"{self.out} is not of the training to resume; put its checkpoint back or start afresh"
+                f"{self.out} does not belong to the training to resume; restore its checkpoint or start a new training"
             )
-        return kept
+        return stored
 
 
 FROZEN = ("matcher.touch_tower.", "matcher.photo_tower.")
-"""How the names of the weights of frozen towers begin."""
+"""Prefixes of the names of the frozen towers' weights."""
 
 
 def labelled_pairs(config: Config) -> list[Grasp]:
-    """What the configured folders of labelled pictures add to the training objects; nothing without them."""
+    """Return the grasps of the configured folders of labelled pictures; empty without such folders."""
     photos, touches = config.training.photos, config.training.touches
     return pair_by_label(Path(photos), Path(touches), config.matcher.fingers) if photos else []
 
 
 def build_matcher(config: Config) -> Matcher:
-    """A matcher with the configured first weights in both towers."""
+    """Return a matcher with the configured initial weights in both towers."""
     settings, matcher = config.training, Matcher(config.matcher, len(config.preprocessing.views))
     for tower, init, side in (
         (matcher.touch_tower, settings.init_touch, "touch_tower"),
@@ -386,10 +385,9 @@ def _shipped_tower(fingers: int, side: str) -> dict[str, Tensor]:
 
 
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
-    """Put the matcher into training mode. What is frozen stays in evaluation mode, so that its running statistics stand
-    still.
+    """Put the matcher into training mode; frozen parts stay in evaluation mode, so their running statistics are fixed.
 
-    Frozen towers are never switched, not even for a moment: another thread may be encoding with them.
+    Frozen towers are not switched even briefly, since another thread may encode with them.
     """
     towers = (matcher.touch_tower, matcher.photo_tower)
     for part in matcher.children():

@@ -1,8 +1,8 @@
-"""What a checkpoint needs beyond its ranking, fitted when its training is over: a posterior, and a check of touches.
+"""Fit the parts of a checkpoint that verdicts need, after training: a posterior, and a check of touches.
 
 The posterior (`retrieval.model.posterior`) is fitted on touches and photos of validation objects. The check
-(`retrieval.model.fusion_scorer`) reads the touch tower's features: its linear layer is fitted on touches and untouched gels
-of training objects and on foreign pictures, its thresholds on those of validation objects.
+(`retrieval.model.fusion_scorer`) uses the touch tower's features. Its linear layer is fitted on touches and no-contact
+frames of training objects and on foreign pictures, its thresholds on those of validation objects.
 """
 
 import dataclasses
@@ -29,19 +29,19 @@ from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.foreign_images import draw_foreign
 
 MAX_GRASPS = 400
-"""Grasps, at most, that each part of the split gives."""
+"""Largest number of grasps from each part of the split."""
 MIN_GRASPS = 40
-"""Validation grasps that a check of touches needs: the thresholds of fewer would refuse too many others."""
+"""Validation grasps that a check of touches needs; thresholds of fewer grasps would reject too many touches."""
 FOREIGN_COUNT = 700
-"""Foreign pictures to learn from; others, half as many, are judged."""
+"""Foreign pictures for fitting; half as many others are for validation."""
 FALSE_ALARM_RATE = 0.005
-"""Share of validation gels that may be called foreign, and of untouched ones that may be called touches."""
+"""Fraction of validation gel images that may be classified as foreign, and of no-contact frames as touches."""
 MARGIN = 1.0
-"""Log-odds beyond that, for both: gels that were not recorded differ a little."""
+"""Margin in log-odds added to both thresholds, since other gels differ a little."""
 LOW_CONTACT_RATE = 0.02
-"""Share of validation touches that may be called untouched: those that hardly press the gel say hardly anything."""
+"""Fraction of validation touches that may be classified as no contact; low-contact touches carry little information."""
 PENALTY = 0.02
-"""Of the squared weights of the check's linear layer, for features of unit variance; less for more pictures."""
+"""Penalty on the squared weights of the check's linear layer, for features of unit variance; less for more pictures."""
 _MAX_PIECES = 100
 
 StopRequested = Callable[[], bool]
@@ -58,78 +58,101 @@ def with_verdicts(
     quiet: bool = False,
     should_stop: StopRequested = lambda: False,
 ) -> Checkpoint:
-    """The checkpoint with a posterior and a check of touches, as far as validation grasps can teach them.
+    """Return the checkpoint `made` with a posterior and a check of touches, if there are enough validation grasps.
 
-    A posterior needs three validation objects and another photo of a touch's object, a check of touches needs
-    `MIN_GRASPS` validation grasps. foreign: pictures to learn from that are no gels. The matcher of `made` is taken
-    over. Raises JobInterrupted.
+    A posterior needs three validation objects and a second photo of some touch's object. A check of touches needs
+    `MIN_GRASPS` validation grasps.
+
+    Args:
+        made: The checkpoint. Its matcher is reused and modified.
+        source: The source of features.
+        train: Grasps of training objects.
+        validation: Grasps of validation objects.
+        foreign: Number of foreign pictures for fitting.
+        quiet: No progress on stderr.
+        should_stop: As for `recorded_features`.
+
+    Raises:
+        JobInterrupted: `should_stop()` returned True.
     """
     seed, matcher = made.config.training.seed, made.matcher
-    learned, scored = _sample_grasps(train, seed), _sample_grasps(validation, seed)
-    if not learned or not scored:
+    train, validation = _sample_grasps(train, seed), _sample_grasps(validation, seed)
+    if not train or not validation:
         return made
-    touches, photos = recorded_features(matcher, source, scored, what="posterior", quiet=quiet, should_stop=should_stop)
-    asked = posterior_touches(matcher, scored, touches, photos)
+    touches, photos = recorded_features(
+        matcher, source, validation, what="posterior", quiet=quiet, should_stop=should_stop
+    )
+    queries = posterior_touches(matcher, validation, touches, photos)
     made = dataclasses.replace(
         made,
-        posterior=None if asked is None else fit_posterior(asked.scored, seed=seed),
-        references=None if asked is None else fit_reference_calibration(asked, seed=seed),
+        posterior=None if queries is None else fit_posterior(queries.scored, seed=seed),
+        references=None if queries is None else fit_reference_calibration(queries, seed=seed),
     )
-    if len(scored) < MIN_GRASPS:
+    if len(validation) < MIN_GRASPS:
         return made
-    others, _ = recorded_features(
-        matcher, source, learned, what="check of touches", quiet=quiet, should_stop=should_stop
+    train_touches, _ = recorded_features(
+        matcher, source, train, what="check of touches", quiet=quiet, should_stop=should_stop
     )
     preprocessing = made.config.preprocessing
-    fitting = GelCheckFeatures.of(matcher, preprocessing, learned, others, foreign, seed)
-    test = GelCheckFeatures.of(matcher, preprocessing, scored, touches, foreign // 2, seed + 1)
+    fitting = GelCheckFeatures.of(matcher, preprocessing, train, train_touches, foreign, seed)
+    test = GelCheckFeatures.of(matcher, preprocessing, validation, touches, foreign // 2, seed + 1)
     matcher.gel_head = fit_gel_head(fitting, PENALTY * FOREIGN_COUNT / foreign)
-    check = fit_gel_check(matcher.gel_head, test, contact_levels(scored))
+    check = fit_gel_check(matcher.gel_head, test, contact_levels(validation))
     return dataclasses.replace(made, gel_check=check)
 
 
 def _sample_grasps(grasps: Sequence[Grasp], seed: int) -> list[Grasp]:
-    """Grasps of objects drawn by the seed, all of each while there is room."""
+    """Return at most MAX_GRASPS grasps, object by object in random order."""
     by_object: dict[str, list[Grasp]] = {}
     for grasp in grasps:
         by_object.setdefault(grasp.object_id, []).append(grasp)
     names = sorted(by_object)
     order = np.random.default_rng([seed, 5]).permutation(len(names))
-    return [grasp for place in order for grasp in by_object[names[place]]][:MAX_GRASPS]
+    return [grasp for index in order for grasp in by_object[names[index]]][:MAX_GRASPS]
 
 
-# Which object was it? --------------------------------------------------------------------------------------
+# The posterior ---------------------------------------------------------------------------------------------
 
 
 def posterior_touches(
     matcher: Matcher, grasps: Sequence[Grasp], touches: Tensor, photos: dict[Path, Tensor]
 ) -> ReferenceTouches | None:
-    """What a posterior is fitted on: touches (G, fingers * F) of grasps and their photos; None where these are too
-    few.
+    """Return the data that a posterior is fitted on, or None where there are too few objects or photos.
+
+    Args:
+        matcher: The matcher.
+        grasps: G grasps.
+        touches: Touch features (G, fingers * F).
+        photos: Features of each photo by file.
     """
     objects = sorted({grasp.object_id for grasp in grasps})
-    shows = {grasp.photo: grasp.object_id for grasp in grasps}
+    object_of = {grasp.photo: grasp.object_id for grasp in grasps}
     own = np.array([[grasp.photo == photo for photo in photos] for grasp in grasps])
     touch_owner = np.array([objects.index(grasp.object_id) for grasp in grasps])
-    photo_owner = np.array([objects.index(shows[photo]) for photo in photos])
+    photo_owner = np.array([objects.index(object_of[photo]) for photo in photos])
     if len(objects) < 3 or not ((touch_owner[:, None] == photo_owner) & ~own).any():
         return None
     with torch.inference_mode():
         touch_partials = matcher.touch_encoding(touches).partial.cpu().numpy()
         photo_partials = matcher.photo_encoding(torch.stack(list(photos.values()))).partial.cpu().numpy()
-    classify = scorer_of(matcher.head)
-    logits = np.stack([classify.logits(partial[None], photo_partials) for partial in touch_partials])
+    scorer = scorer_of(matcher.head)
+    logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
     embeddings = touch_embeddings(touch_partials, matcher.config.hidden)
     return ReferenceTouches(ScoredTouches(logits, touch_owner, photo_owner, own), embeddings)
 
 
-# What does a gel image show? -------------------------------------------------------------------------------
+# The check of touches --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class GelCheckFeatures:
-    """Features of the touch tower, on the CPU: touch (G, fingers, F); untouched (U, fingers, F), U = 0 where nothing
-    was recorded before a contact; foreign (N, F), and which of these are no gel in false colours (N,).
+    """Features of the touch tower, on the CPU.
+
+    Attributes:
+        touch: (G, fingers, F) of touches.
+        no_contact: (U, fingers, F) of no-contact frames; U = 0 where none are recorded.
+        foreign: (N, F) of foreign pictures.
+        is_plainly_foreign: (N,) False for gel images in false colours.
     """
 
     touch: Tensor
@@ -141,28 +164,39 @@ class GelCheckFeatures:
     def of(
         cls, matcher: Matcher, settings: Preprocessing, grasps: Sequence[Grasp], touches: Tensor, count: int, seed: int
     ) -> "GelCheckFeatures":
-        """Pictures of recorded grasps, whose touch features are known, and `count` foreign ones."""
+        """Encode no-contact frames of grasps and `count` foreign pictures.
+
+        Args:
+            matcher: The matcher.
+            settings: Preprocessing of the pictures.
+            grasps: G grasps.
+            touches: Their touch features (G, fingers * F).
+            count: Number of foreign pictures.
+            seed: Seed of the foreign pictures.
+        """
         fingers = matcher.config.fingers
         frames = list(_no_contact_images(settings, grasps, fingers))
-        some = [
+        sample = [
             grasps[row] for row in np.linspace(0, len(grasps) - 1, min(_MAX_PIECES, len(grasps))).round().astype(int)
         ]
-        photos = [settings.load_photo(grasp.photo) for grasp in some]
-        gels = [settings.load_touch(grasp.touches[0], *grasp.backgrounds[:1]) for grasp in some]
+        photos = [settings.load_photo(grasp.photo) for grasp in sample]
+        gels = [settings.load_touch(grasp.touches[0], *grasp.backgrounds[:1]) for grasp in sample]
         names, drawn = zip(*draw_foreign(count, settings.touch_px, photos, gels, seed), strict=True)
         shape = (-1, fingers, touches.shape[1] // fingers)
         return cls(
             touches.cpu().reshape(shape),
             touch_features(matcher, frames).cpu().reshape(shape) if frames else torch.zeros(0, *shape[1:]),
-            # A tower sees one finger at a time; as many pictures as there are fingers stand for a touch.
+            # A touch needs one picture per finger, so each foreign picture is repeated.
             touch_features(matcher, [[picture] * fingers for picture in drawn]).cpu().reshape(shape)[:, 0],
             np.array([name != "false colours" for name in names]),
         )
 
 
 def _no_contact_images(settings: Preprocessing, grasps: Sequence[Grasp], fingers: int) -> Iterator[list[Image]]:
-    """Untouched gels as the tower sees them. Where it sees a difference from a no-contact frame, that frame is the one
-    of the grasp before: a frame less itself holds no noise.
+    """Yield preprocessed no-contact frames.
+
+    With background subtraction, the reference is the no-contact frame of the previous grasp, since a frame minus
+    itself has no noise.
     """
     if settings.background == "none":
         for grasp in grasps:
@@ -174,37 +208,37 @@ def _no_contact_images(settings: Preprocessing, grasps: Sequence[Grasp], fingers
 
 
 def _consecutive_frames(grasps: Iterable[Grasp]) -> Iterator[tuple[tuple[Path, ...], tuple[Path, ...]]]:
-    """No-contact frames of two grasps of one object, one after the other: of the same gels."""
+    """Yield the no-contact frames of two consecutive grasps of one object, which show the same gels."""
     for first, second in pairwise(grasps):
         if first.object_id == second.object_id and first.backgrounds and second.backgrounds:
             yield first.backgrounds, second.backgrounds
 
 
 def fit_gel_head(fitting: GelCheckFeatures, penalty: float = PENALTY) -> GelHead:
-    """Softmax regression on standardised features, kinds alike whatever their numbers, with a penalty on the weights.
+    """Fit a softmax regression on standardised features, with equal weight for each class and an L2 penalty.
 
-    Without untouched gels, that kind is never read.
+    Without no-contact frames, the head never predicts that class.
     """
     from scipy.optimize import minimize
 
     kinds = [part.reshape(-1, part.shape[-1]).double().numpy() for part in (fitting.touch, fitting.no_contact)]
     kinds.append(fitting.foreign.double().numpy())
-    x, which = np.concatenate(kinds), np.repeat(np.arange(len(GEL_CLASSES)), [len(part) for part in kinds])
+    x, labels = np.concatenate(kinds), np.repeat(np.arange(len(GEL_CLASSES)), [len(part) for part in kinds])
     centre, spread = x.mean(0), x.std(0)
-    spread = np.maximum(spread, MIN_RELATIVE_DEVIATION * np.abs(centre))  # as features are standardised for the matcher
+    spread = np.maximum(spread, MIN_RELATIVE_DEVIATION * np.abs(centre))  # the same standardisation as in the matcher
     spread = np.where(spread > 1e-6, spread, 1.0)
     x = (x - centre) / spread
     present = np.array([len(part) > 0 for part in kinds])
-    weights = np.array([1 / len(part) if len(part) else 0.0 for part in kinds])[which] / present.sum()
-    targets, absent = np.eye(len(GEL_CLASSES))[which], np.where(present, 0.0, -1e4)
+    weights = np.array([1 / len(part) if len(part) else 0.0 for part in kinds])[labels] / present.sum()
+    targets, absent = np.eye(len(GEL_CLASSES))[labels], np.where(present, 0.0, -1e4)
 
     def loss(flat: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
         matrix = flat.reshape(-1, len(GEL_CLASSES))
         logits = x @ matrix[:-1] + matrix[-1] + absent
         logs = logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)
-        slack = weights[:, None] * (np.exp(logs) - targets)
+        residuals = weights[:, None] * (np.exp(logs) - targets)
         value = -float(weights @ (logs * targets).sum(1)) + penalty / 2 * float((matrix[:-1] ** 2).sum())
-        return value, np.vstack([x.T @ slack + penalty * matrix[:-1], slack.sum(0)]).ravel()
+        return value, np.vstack([x.T @ residuals + penalty * matrix[:-1], residuals.sum(0)]).ravel()
 
     found = minimize(loss, np.zeros((x.shape[1] + 1) * len(GEL_CLASSES)), jac=True, method="L-BFGS-B")
     matrix = found.x.reshape(-1, len(GEL_CLASSES))
@@ -216,8 +250,10 @@ def fit_gel_head(fitting: GelCheckFeatures, penalty: float = PENALTY) -> GelHead
 
 
 def contact_levels(grasps: Sequence[Grasp]) -> tuple[list[float], list[float]]:
-    """Grey levels, the larger of the fingers', by which untouched gels differ from their own frame of another grasp,
-    and touches from the frame before them; empty where nothing was recorded before a contact.
+    """Return the contact levels, in grey levels, of no-contact frames and of touches; empty without such frames.
+
+    A no-contact frame is compared with the one of the previous grasp, a touch with its own no-contact frame. The
+    finger with the largest level counts.
     """
     no_contact = [_largest_level(second, first) for first, second in _consecutive_frames(grasps)]
     touched = [_largest_level(grasp.touches, grasp.backgrounds) for grasp in grasps if grasp.backgrounds]
@@ -231,7 +267,13 @@ def _largest_level(images: Sequence[Path], frames: Sequence[Path]) -> float:
 
 @torch.inference_mode()
 def fit_gel_check(head: GelHead, test: GelCheckFeatures, levels: tuple[Sequence[float], Sequence[float]]) -> GelCheck:
-    """Thresholds by validation pictures, of which a grasp counts by the finger that says most; and what they refuse."""
+    """Return the check with thresholds from validation pictures, and the fractions that it rejects.
+
+    Args:
+        head: The linear layer.
+        test: Features of validation pictures. The finger with the highest logit counts.
+        levels: Result of `contact_levels`.
+    """
     touch, no_contact = head(test.touch).numpy(), head(test.no_contact).numpy()  # (G, fingers, 2)
     foreign: Readings = head(test.foreign[:, None]).numpy()
     gels = np.concatenate([touch, no_contact])[..., 0].max(1)
@@ -254,7 +296,11 @@ def fit_gel_check(head: GelHead, test: GelCheckFeatures, levels: tuple[Sequence[
 
 
 def contact_threshold(no_contact: ArrayLike, touch: ArrayLike) -> float:
-    """Above all but `FALSE_ALARM_RATE` of the untouched readings, as far up as loses no more than `LOW_CONTACT_RATE` of the touches."""
+    """Return the threshold between values of no-contact frames and of touches.
+
+    At most `FALSE_ALARM_RATE` of the no-contact values lie above it. It is higher if at most `LOW_CONTACT_RATE` of the
+    touches lie below it.
+    """
     low, high = np.asarray(no_contact, dtype=np.float64), np.asarray(touch, dtype=np.float64)
     return float(max(np.quantile(low, 1 - FALSE_ALARM_RATE), np.quantile(high, LOW_CONTACT_RATE)))
 

@@ -1,1 +1,1 @@
-"""Lint of a recording: broken files, near copies, swapped folders, leakage."""
+"""Checks of a recording: broken files, near copies, swapped folders, leakage."""

@@ -1,8 +1,8 @@
-"""Doubts about a recording by what its pictures look like; each yields findings on the grasps it is given.
+"""Checks of a recording by the appearance of its pictures; each yields findings on its grasps.
 
-A minority is judged against the rest. What cannot be told is a note: no look at the pictures tells two fingers apart
-whose gels are alike, before from during where nothing was touched, and two objects whose photos were exchanged
-throughout.
+Each check compares a minority with the majority of the recording. A note reports the cases that cannot be decided.
+Pictures alone do not distinguish two fingers with similar gels, the no-contact frame from the touch where nothing was
+touched, or two objects whose photos were all exchanged.
 """
 
 from collections import Counter
@@ -27,18 +27,20 @@ from retrieval.data.check.near_copies import PictureSet, Thumbnail, is_copy
 from retrieval.data.dataset import Grasp
 
 COMPARED_COPIES = "compared-copies"
-"""The finding that says in how many pictures near copies were looked for."""
+"""Kind of the finding that reports how many pictures were compared for near copies."""
 _MIN_GRASPS = 4
 _MAX_BY_LIGHT, _MAX_BY_TOUCH = 0.35, 0.6
-"""How far from chance to always may light alone name the object: by frames without contact, and by the mean colour of
-touches, which names it a little by what was felt (0.2 to 0.35 of the way on simulated recordings)."""
+"""Accepted accuracy of identifying the object from light alone, as a fraction of the way from chance to 1: from
+no-contact frames, and from the mean colour of touches. The mean colour depends a little on the touched object (0.2 to
+0.35 of the way on simulated recordings)."""
 
 
-def swapped(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Gel images share one look (the gel's tint and lamps); photos of different objects do not.
+def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
+    """Find photos and touches that look exchanged.
 
-    So small pictures of touches lie close to their median and those of photos lie far from it. A grasp whose photo lies
-    closer than its touch is suspect; when the photos of the whole recording are the tighter cloud, everything is.
+    Gel images look alike (the gel's tint and lamps); photos of different objects do not. So small pictures of touches
+    lie close to their median, and photos lie far from it. A grasp is suspect if its photo lies closer than its touch.
+    The whole recording is suspect if its photos are more alike than its touches.
     """
     if len(grasps) < 3:
         return
@@ -55,37 +57,37 @@ def swapped(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]
             tuple(grasp.grasp_id for grasp in grasps),
         )
         return
-    look = np.median(touches, axis=0)
-    closer = distance(photos, look) < distance(touches, look) / 2
+    centre = np.median(touches, axis=0)
+    closer = distance(photos, centre) < distance(touches, centre) / 2
     names = [grasp.grasp_id for grasp, suspect in zip(grasps, closer, strict=True) if suspect]
     whole = {one.sequence_id for one in grasps} - {one.sequence_id for one in grasps if one.grasp_id not in set(names)}
     where = f", throughout the sequence(s) {abbreviate_list(sorted(filter(None, whole)))}," if whole - {None} else ""
     yield from findings_for("error", "swapped", f"touch and photo look swapped{where}", names, grasps)
 
 
-def fingers(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Frames of two fingers, before and during the grasp, that look exchanged."""
-    both = [grasp for grasp in grasps if len(grasp.backgrounds) == len(grasp.touches)]
-    for moment, those in (("touch", grasps), ("untouched gel", both)):
-        if len(those) < _MIN_GRASPS:
+def check_fingers(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
+    """Find frames of two fingers, of touches and without contact, that look exchanged."""
+    with_frames = [grasp for grasp in grasps if len(grasp.backgrounds) == len(grasp.touches)]
+    for moment, selected in (("touch", grasps), ("no-contact frame", with_frames)):
+        if len(selected) < _MIN_GRASPS:
             continue
-        fingers = range(min(len(grasp.touches) for grasp in those))
-        frames = [_small(records, [_of(grasp, moment)[finger] for grasp in those]) for finger in fingers]
+        fingers = range(min(len(grasp.touches) for grasp in selected))
+        frames = [_small(records, [_of(grasp, moment)[finger] for grasp in selected]) for finger in fingers]
         for a, b in combinations(fingers, 2):
             which = f"{ascii_lowercase[a]} and {ascii_lowercase[b]}"
             found = swapped_fingers(frames[a], frames[b])
             if found is None:
-                text = f"fingers {which} look too much alike to find swapped ones ({moment})"
+                text = f"fingers {which} look too similar to find swapped ones ({moment})"
                 yield Finding("note", "unchecked-fingers", text)
                 continue
-            names = [those[row].grasp_id for row in found]
+            names = [selected[row].grasp_id for row in found]
             yield from findings_for(
-                "error", "swapped-fingers", f"fingers {which} look swapped ({moment})", names, those
+                "error", "swapped-fingers", f"fingers {which} look swapped ({moment})", names, selected
             )
 
 
-def moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Touches and frames of the untouched gel that look exchanged."""
+def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
+    """Find touches and no-contact frames that look exchanged."""
     both = [grasp for grasp in grasps if grasp.backgrounds and len(grasp.backgrounds) == len(grasp.touches)]
     if len(both) < _MIN_GRASPS:
         return
@@ -97,33 +99,33 @@ def moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]
             yield Finding(
                 "error",
                 "swapped-moments",
-                f"touches of finger {ascii_lowercase[finger]} look swapped throughout with the untouched gel (its "
-                "frames are the less alike); exchange the columns",
+                f"touches of finger {ascii_lowercase[finger]} look swapped throughout with the no-contact frames "
+                "(the latter are the less alike); exchange the columns",
                 tuple(grasp.grasp_id for grasp in both),
             )
             return
         suspects |= {both[row].grasp_id for row in found.swapped}
         if 2 * found.low_contact > len(both):
             text = (
-                f"{found.low_contact} of {len(both)} touches of finger {ascii_lowercase[finger]} hardly differ from the "
-                "untouched gel: whether these two are swapped cannot be told"
+                f"{found.low_contact} of {len(both)} touches of finger {ascii_lowercase[finger]} hardly differ from "
+                "the no-contact frame: swaps of the two cannot be found"
             )
             yield Finding("note", "unchecked-moments", text)
     names = [grasp.grasp_id for grasp in both if grasp.grasp_id in suspects]
-    yield from findings_for("error", "swapped-moments", "touch and untouched gel look swapped", names, both)
+    yield from findings_for("error", "swapped-moments", "touch and no-contact frame look swapped", names, both)
 
 
-def light(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Lamps or gels that changed from object to object, so that light names the object."""
+def check_light(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
+    """Find lamps or gels that changed from object to object, so that light identifies the object."""
     objects = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)[1] if grasps else np.zeros(0, int)
     repeated = Counter(objects.tolist())
     if len(repeated) < 2 or max(repeated.values()) < 2:
         yield Finding(
-            "note", "unchecked-light", "light that names the object cannot be looked for: no object came twice"
+            "note", "unchecked-light", "light that identifies the object cannot be checked: no object has two grasps"
         )
         return
     has_before = all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps)
-    # A frame that serves many grasps says once what the light was like.
+    # A no-contact frame that serves many grasps shows the light of one moment only.
     has_before = has_before and len({records[one.backgrounds[0]].digest for one in grasps}) > len(grasps) / 2
     fingers = range(min(len(grasp.touches) for grasp in grasps))
     for moment, allowed in (("before", _MAX_BY_LIGHT), ("touch", _MAX_BY_TOUCH)):
@@ -131,27 +133,27 @@ def light(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
             yield Finding(
                 "note",
                 "unchecked-light",
-                "without a frame of the untouched gel of its own for every grasp, light that names the object is found "
-                "only where it is strong",
+                "without a separate no-contact frame for every grasp, only a strong effect of light on the object's "
+                "identity is found",
             )
             continue
         frames = [_small(records, [_of(grasp, moment)[finger] for grasp in grasps]) for finger in fingers]
         values = np.stack(frames, axis=1)
         found = nearest_grasp_accuracy(values if moment == "before" else values.mean(axis=(2, 3)), objects)
         if found.exceeds_chance(allowed):
-            what = "the untouched gel" if moment == "before" else "the mean colour of the touch"
+            what = "the no-contact frame" if moment == "before" else "the mean colour of the touch"
             yield Finding(
                 "warning",
                 "light",
-                f"{what} alone names the object in {found.accuracy:.0%} of {found.grasps} grasps (chance "
+                f"{what} alone identifies the object in {found.accuracy:.0%} of {found.grasps} grasps (chance "
                 f"{found.chance:.0%}): light or gel changed from object to object, and a model can learn that instead "
-                "of touch; mix the objects while recording, and compare with `retrieve evaluate`'s controls",
+                "of touch; mix the objects while recording, and compare with the controls of `retrieve evaluate`",
             )
             return
 
 
 def check_exchanged_photos(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Photos of two objects that look exchanged."""
+    """Find photos of two objects that look exchanged."""
     photos = np.array([records[grasp.photo].photo for grasp in grasps], dtype=np.float32)
     names, objects = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)
     if len(names) < 2:
@@ -163,15 +165,16 @@ def check_exchanged_photos(grasps: Sequence[Grasp], records: ImageRecords) -> It
         yield Finding(
             "warning",
             "exchanged-photos",
-            f"the photos of {len(found.pairs)} pair(s) of grasps look exchanged between two objects: {abbreviate_list(where)}",
+            f"the photos of {len(found.pairs)} pair(s) of grasps look exchanged between two objects: "
+            f"{abbreviate_list(where)}",
             tuple(grasps[row].grasp_id for row in rows),
         )
     if found.distinguishable_pairs < found.all:
         yield Finding(
             "note",
             "unchecked-photos",
-            f"photos exchanged between two objects can be noticed for {found.distinguishable_pairs} of {found.all} pairs of "
-            "objects; the others look too much alike, or have fewer than 4 photos",
+            f"photos exchanged between two objects can be found for {found.distinguishable_pairs} of {found.all} "
+            "pairs of objects; the others look too similar, or have fewer than 4 photos",
         )
 
 
@@ -179,7 +182,7 @@ def check_exchanged_photos(grasps: Sequence[Grasp], records: ImageRecords) -> It
 
 
 def check_own_photo(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Touches that are their own photo, encoded or sized in another way."""
+    """Find touches that are their own photo, with another encoding or size."""
     names = [
         grasp.grasp_id
         for grasp in grasps
@@ -188,41 +191,40 @@ def check_own_photo(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[
     yield from findings_for("error", "same-modality", "a touch shows its own photo", names, grasps)
 
 
-def copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: Sequence[Grasp]) -> Iterator[Finding]:
-    """Near copies of pictures of another object, and in how many of those of all accepted grasps they were looked for.
+def check_near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: Sequence[Grasp]) -> Iterator[Finding]:
+    """Find near copies of pictures of another object, and count the pictures that were compared.
 
-    Of touches a warning only: smooth things pressed in the same way look so without being copies. (68 pairs of 4,991
-    touches of VT60, boxes, mugs and bowls; none of those looked at was a copy.)
+    A near copy of a touch is only a warning: smooth objects that are pressed in the same way look alike. (68 pairs
+    among 4,991 touches of boxes, mugs and bowls in VT60; no inspected pair was a copy.)
     """
     counts, low_contact, left_out = [], 0, 0
     for kind, every in _by_kind(accepted).items():
-        one_each = [(grasp, path) for path, grasp in _by_kind(grasps).get(kind, {}).items()]
-        pictures = PictureSet(
-            [_thumbnail(records, path) for _, path in one_each], [one.object_id for one, _ in one_each]
-        )
-        rows = np.arange(len(one_each))
+        items = [(grasp, path) for path, grasp in _by_kind(grasps).get(kind, {}).items()]
+        pictures = PictureSet([_thumbnail(records, path) for _, path in items], [one.object_id for one, _ in items])
+        rows = np.arange(len(items))
         found = pictures.nearest(rows, rows)
         pairs: dict[tuple[int, ...], str] = {}
         for row in np.flatnonzero(found.copy).tolist():
-            (grasp, path), (other, near) = one_each[row], one_each[found.row[row]]
+            (grasp, path), (other, near) = items[row], items[found.row[row]]
             if records[path].digest != records[near].digest:
                 pairs[tuple(sorted((row, int(found.row[row]))))] = f"{grasp.grasp_id} and {other.grasp_id}"
         if pairs:
             text = f"{len(pairs)} pair(s) of images ({kind}) of two objects are near copies of each other"
-            severity, or_else = ("error", "") if kind == "photo" else ("warning", ", or of things that feel alike")
+            severity, or_else = ("error", "") if kind == "photo" else ("warning", ", or the objects feel alike")
             yield Finding(severity, "near-copy", f"{text}{or_else}: {abbreviate_list(list(pairs.values()))}")
         counts.append(f"{found.checked.sum()} of {len(every)} images ({kind})")
         low_contact += int((~found.checked).sum())
-        left_out += len(every) - len(one_each)
-    why = [f"{low_contact} show too little to tell a copy by (a light contact, or a look that many share)"] * bool(
-        low_contact
-    )
-    why += [f"{left_out} are of grasps that are named above"] * bool(left_out)
-    yield Finding("note", COMPARED_COPIES, f"near copies were looked for in {'; '.join([', '.join(counts), *why])}")
+        left_out += len(every) - len(items)
+    reasons = []
+    if low_contact:
+        reasons.append(f"{low_contact} show too little to recognise a copy (a light contact, or too many similar ones)")
+    if left_out:
+        reasons.append(f"{left_out} belong to grasps that are named above")
+    yield Finding("note", COMPARED_COPIES, f"near copies were searched in {'; '.join([', '.join(counts), *reasons])}")
 
 
 def _by_kind(grasps: Sequence[Grasp]) -> dict[str, dict[Path, Grasp]]:
-    """Photos, and touches of each finger: a grasp of each file, which several may share."""
+    """Return one grasp for each file of the photos, and of the touches of each finger."""
     kinds = {"photo": {grasp.photo: grasp for grasp in grasps}}
     for finger in range(min((len(grasp.touches) for grasp in grasps), default=0)):
         kinds[f"touch {ascii_lowercase[finger]}"] = {grasp.touches[finger]: grasp for grasp in grasps}
@@ -241,6 +243,6 @@ def _small(records: ImageRecords, paths: Sequence[Path]) -> SmallImages:
 
 
 def _thumbnail(records: ImageRecords, path: Path) -> Thumbnail:
-    found = records[path].thumbnail
-    assert found is not None  # made of every photo and touch of the accepted grasps
-    return found
+    result = records[path].thumbnail
+    assert result is not None  # every photo and touch of the accepted grasps has one
+    return result

@@ -1,8 +1,8 @@
-"""What pictures of a recording look like together: fingers, moments, light and photos that do not fit the others.
+"""Statistics of a recording's pictures: fingers, moments, light and photos that do not fit the others.
 
-Every judgement is made against the recording itself: a minority is suspect, and where looks do not tell two things
-apart (gels that are alike, touches without contact, objects of one colour) nothing is said, but how much could not be
-checked. Arrays hold small pictures (n, h, w, 3) of one kind, 0..1.
+The reference is always the recording itself: a minority is suspect. Some cases cannot be distinguished (similar gels,
+touches without contact, objects of one colour); these are only counted. Arrays contain small pictures (n, h, w, 3) of
+one kind, 0..1.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 SmallImages = NDArray[np.float32]
 Rows = NDArray[np.int64]
 
-_MIN_FINGER_DIFFERENCE = 0.3  # how near to nothing, of its median, the difference of two fingers may come
+_MIN_FINGER_DIFFERENCE = 0.3  # smallest difference of two fingers, relative to its median
 _NOISE_TIMES = 5.0
 _MIN_NOISE = 0.25 / 255
 _NEARER = 0.5  # logarithm: 40 % nearer
@@ -26,10 +26,10 @@ _BINS = 16
 
 
 def swapped_fingers(a: SmallImages, b: SmallImages) -> Rows | None:
-    """Grasps whose frames of fingers a and b look exchanged; None where the gels are too much alike to tell.
+    """Return the grasps whose frames of fingers a and b look exchanged, or None where the gels are too similar.
 
-    The difference of the two gels is the same in every grasp but for contact and its sign. Its direction is that of the
-    largest sum of squares, and the sign that of most grasps.
+    Without contact, the difference of the two gels is the same in every grasp; an exchange changes its sign. The
+    direction of the difference is the one with the largest sum of squares. Its normal sign is that of most grasps.
     """
     differences = (a - b).reshape(len(a), -1)
     along = differences @ np.linalg.svd(differences, full_matrices=False)[2][0]
@@ -45,10 +45,12 @@ def swapped_fingers(a: SmallImages, b: SmallImages) -> Rows | None:
 
 @dataclass(frozen=True)
 class MomentSwaps:
-    """What the moments at which frames were taken look like.
+    """Exchanges of no-contact frames and touches.
 
-    swapped: grasps whose frames before and during the contact look exchanged. throughout: whether all do. faint: how
-    many touches differ too little from the untouched gel to tell.
+    Attributes:
+        swapped: Rows of the grasps whose two frames look exchanged.
+        all_swapped: Whether the frames of all grasps look exchanged.
+        low_contact: Number of touches that differ too little from the no-contact frame for this check.
     """
 
     swapped: Rows
@@ -57,21 +59,22 @@ class MomentSwaps:
 
 
 def swapped_moments(before: SmallImages, during: SmallImages) -> MomentSwaps:
-    """Frames of the untouched gel are all alike, touches are not: what lies far from the median of the frames before
-    belongs among the touches.
+    """Return the grasps whose no-contact frame and touch look exchanged.
+
+    No-contact frames are all alike, touches are not. So a frame far from the median no-contact frame is a touch.
     """
     spread = [float(np.median(distance(frames, np.median(frames, axis=0)))) for frames in (before, during)]
     if spread[0] > max(2 * spread[1], _NOISE_TIMES * _MIN_NOISE):
         return MomentSwaps(np.zeros(0, np.int64), True, 0)
-    untouched, touched = (distance(frames, np.median(before, axis=0)) for frames in (before, during))
-    noise = max(float(np.quantile(untouched, 0.25)), _MIN_NOISE)
+    no_contact, touched = (distance(frames, np.median(before, axis=0)) for frames in (before, during))
+    noise = max(float(np.quantile(no_contact, 0.25)), _MIN_NOISE)
     far = _NOISE_TIMES * noise
-    swapped = np.flatnonzero((untouched > far) & (touched < untouched / 2))
-    return MomentSwaps(swapped, False, int(((untouched <= far) & (touched <= far)).sum()))
+    swapped = np.flatnonzero((no_contact > far) & (touched < no_contact / 2))
+    return MomentSwaps(swapped, False, int(((no_contact <= far) & (touched <= far)).sum()))
 
 
 def distance(images: SmallImages, centre: SmallImages) -> NDArray[np.float64]:
-    """Root mean square (n,) of how far each image is from `centre` (h, w, 3)."""
+    """Return the root mean square difference (n,) of each image from `centre` (h, w, 3)."""
     return np.asarray(np.sqrt(np.mean((images - centre) ** 2, axis=(1, 2, 3), dtype=np.float64)))
 
 
@@ -80,35 +83,41 @@ def distance(images: SmallImages, centre: SmallImages) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class NearestGraspAccuracy:
-    """How often the nearest other grasp is one of the same object, how often by chance, and of how many grasps."""
+    """Accuracy of identifying a grasp's object by the nearest other grasp.
+
+    Attributes:
+        accuracy: Fraction of grasps whose nearest other grasp has the same object.
+        chance: Expected fraction by chance.
+        grasps: Number of grasps.
+    """
 
     accuracy: float
     chance: float
     grasps: int
 
     def exceeds_chance(self, part: float) -> bool:
-        """Whether it goes more than `part` of the way from chance to always, and more than chance would by itself."""
-        scatter = np.sqrt(self.chance * (1 - self.chance) / max(self.grasps, 1))
-        least = max(part * (1 - self.chance), 5 * scatter)
-        return bool(self.grasps > 0 and self.accuracy > self.chance + least)
+        """Return whether accuracy is more than `part` of the way from chance to 1, and significantly above chance."""
+        deviation = np.sqrt(self.chance * (1 - self.chance) / max(self.grasps, 1))
+        threshold = max(part * (1 - self.chance), 5 * deviation)
+        return bool(self.grasps > 0 and self.accuracy > self.chance + threshold)
 
 
 def nearest_grasp_accuracy(values: NDArray[np.floating], objects: NDArray[np.int64]) -> NearestGraspAccuracy:
-    """Whether values (n, k) of grasps name their objects (n,), by the nearest other grasp."""
+    """Return how well values (n, k) of grasps identify their objects (n,), by the nearest other grasp."""
     flat = values.reshape(len(values), -1).astype(np.float64)
     flat = flat - flat.mean(axis=0)
     squares = (flat**2).sum(axis=1)
-    right = []
+    correct = []
     for row in range(len(flat)):
-        far = squares - 2 * (flat @ flat[row])
-        far[row] = np.inf
-        right.append(objects[far.argmin()] == objects[row])
+        distances = squares - 2 * (flat @ flat[row])
+        distances[row] = np.inf
+        correct.append(objects[distances.argmin()] == objects[row])
     others = np.bincount(objects)[objects] - 1
-    some = others > 0
-    if not some.any():
+    has_others = others > 0
+    if not has_others.any():
         return NearestGraspAccuracy(0.0, 0.0, 0)
-    chance = others[some].mean() / (len(objects) - 1)
-    return NearestGraspAccuracy(float(np.mean(np.array(right)[some])), float(chance), int(some.sum()))
+    chance = others[has_others].mean() / (len(objects) - 1)
+    return NearestGraspAccuracy(float(np.mean(np.array(correct)[has_others])), float(chance), int(has_others.sum()))
 
 
 # Photos ------------------------------------------------------------------------------------------------------
@@ -118,8 +127,10 @@ def nearest_grasp_accuracy(values: NDArray[np.floating], objects: NDArray[np.int
 class PhotoExchanges:
     """Photos that look exchanged between objects.
 
-    pairs: grasps (row, row) of two objects whose photos look exchanged. distinguishable_pairs: of how many pairs of objects
-    (`all`) the photos look different enough for that to be noticed.
+    Attributes:
+        pairs: Rows (row, row) of two grasps of two objects whose photos look exchanged.
+        distinguishable_pairs: Number of pairs of objects whose photos differ enough for this check.
+        all: Number of all pairs of objects.
     """
 
     pairs: list[tuple[int, int]]
@@ -128,51 +139,59 @@ class PhotoExchanges:
 
 
 def exchanged_photos(photos: SmallImages, objects: NDArray[np.int64]) -> PhotoExchanges:
-    """Two grasps of two objects, each photo nearer in colour to the other object's photos than to its own object's,
-    where every other photo of both objects is nearer to its own.
+    """Return the pairs of photos that look exchanged between two objects.
 
-    Objects with fewer than four photos are passed over. Colour is the chromaticity of what stands out from the median
-    photo. Measured on five simulated recordings of 12 and 40 objects, every photo under another light: none is called
-    exchanged that is not, and of single exchanges 5, 20, 35, 65 and 70 % are found. Fixed light tells more.
+    Both photos are nearer in colour to the other object's photos than to their own object's photos, and every other
+    photo of both objects is nearer to its own object. Objects with fewer than four photos are skipped. Colour is the
+    chromaticity of the pixels that differ from the median photo.
+
+    Measured on five simulated recordings of 12 and 40 objects, with a different light for every photo: no false
+    alarms; 5, 20, 35, 65 and 70 % of single exchanges are found. More are found under fixed light.
+
+    Args:
+        photos: (n, h, w, 3), 0..1.
+        objects: (n,) object numbers.
     """
     counts = np.bincount(objects)
     names = np.flatnonzero(counts >= 4)
     members = [np.flatnonzero(objects == name) for name in names]
     colours = _colours(photos)
-    far = np.stack([_to_object(colours, own) for own in members], axis=1) if members else np.zeros((len(photos), 0))
+    distances = np.zeros((len(photos), 0))
+    if members:
+        distances = np.stack([_to_object(colours, own) for own in members], axis=1)
     worst, second, which = (np.zeros((len(names), len(names))) for _ in range(3))
     for at, own in enumerate(members):
-        nearer = np.log(far[own, at][:, None] / far[own])
+        nearer = np.log(distances[own, at][:, None] / distances[own])
         order = np.argsort(nearer, axis=0, kind="stable")
         second[at] = np.take_along_axis(nearer, order[-2:-1], 0)[0]
         worst[at], which[at] = np.take_along_axis(nearer, order[-1:], 0)[0], own[order[-1]]
-    apart = np.triu((second < 0) & (second.T < 0), 1)
-    pairs = np.argwhere(apart & (worst > _NEARER) & (worst.T > _NEARER))
+    distinguishable = np.triu((second < 0) & (second.T < 0), 1)
+    pairs = np.argwhere(distinguishable & (worst > _NEARER) & (worst.T > _NEARER))
     return PhotoExchanges(
         [(int(which[one, other]), int(which[other, one])) for one, other in pairs],
-        int(apart.sum()),
+        int(distinguishable.sum()),
         len(np.unique(objects)) * (len(np.unique(objects)) - 1) // 2,
     )
 
 
 def _to_object(colours: NDArray[np.float64], own: Rows) -> NDArray[np.float64]:
-    """Median distance (n,) of every photo to an object's photos, without the one that is farthest, or itself."""
+    """Return the median distance (n,) of every photo to an object's photos, without the farthest one or itself."""
     squares = 2 - 2 * colours @ colours[own].T
-    far = np.sqrt(np.maximum(squares, 1e-9))
-    far[own, np.arange(len(own))] = np.inf
-    return np.asarray(np.median(np.sort(far, axis=1)[:, :-1], axis=1))
+    distances = np.sqrt(np.maximum(squares, 1e-9))
+    distances[own, np.arange(len(own))] = np.inf
+    return np.asarray(np.median(np.sort(distances, axis=1)[:, :-1], axis=1))
 
 
 def _colours(photos: SmallImages) -> NDArray[np.float64]:
-    """Unit vectors (n, 256): square roots of the share of the foreground's pixels in each bin of chromaticity."""
-    usual = 255 * np.median(photos, axis=0)
-    found = []
+    """Return unit vectors (n, 256): square roots of the foreground's histogram of chromaticity."""
+    median = 255 * np.median(photos, axis=0)
+    vectors = []
     for photo in 255 * photos:
-        light = np.median(photo / np.maximum(usual, 1))
-        pixels = photo[np.abs(photo - light * usual).max(axis=2) > _FOREGROUND]
+        light = np.median(photo / np.maximum(median, 1))
+        pixels = photo[np.abs(photo - light * median).max(axis=2) > _FOREGROUND]
         pixels = pixels if len(pixels) > 20 else photo.reshape(-1, 3)
-        accuracy = pixels[:, :2] / (pixels.sum(axis=1, keepdims=True) + 1)
-        counts = np.histogram2d(accuracy[:, 0], accuracy[:, 1], bins=_BINS, range=((0.1, 0.7), (0.1, 0.7)))[0]
+        chromaticity = pixels[:, :2] / (pixels.sum(axis=1, keepdims=True) + 1)
+        counts = np.histogram2d(chromaticity[:, 0], chromaticity[:, 1], bins=_BINS, range=((0.1, 0.7), (0.1, 0.7)))[0]
         counts = cv2.GaussianBlur(counts, (3, 3), 0).ravel() + 1e-9
-        found.append(np.sqrt(counts / counts.sum()))
-    return np.array(found)
+        vectors.append(np.sqrt(counts / counts.sum()))
+    return np.array(vectors)

@@ -1,4 +1,4 @@
-"""What a check of a recording says, and what it keeps of every picture."""
+"""The findings of a recording check, and the data that it stores for each picture."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,8 +14,13 @@ from retrieval.data.dataset import Grasp
 
 @dataclass(frozen=True)
 class Finding:
-    """One remark. severity: "error" (do not train on this), "warning" or "note" (what could not be checked). kind:
-    short name for programs. grasps: those it is about, where it is about single ones.
+    """One finding.
+
+    Attributes:
+        severity: "error" (do not train on this), "warning", or "note" (something could not be checked).
+        kind: Short name for programs.
+        message: Sentence for the user.
+        grasps: Ids of the grasps concerned, where the finding concerns single grasps.
     """
 
     severity: str
@@ -26,8 +31,15 @@ class Finding:
 
 @dataclass(frozen=True, eq=False)
 class ImageRecord:
-    """What is kept of one picture, or why it cannot be read: the digest of its bytes, whether it is of one colour, a
-    small picture (6, 8, 3), of photos a larger one too, and of accepted photos and touches what copies are found by.
+    """The data stored for one picture.
+
+    Attributes:
+        digest: SHA-256 (hex) of the file's bytes.
+        is_flat: Whether the picture has one colour only.
+        small: The picture at (6, 8, 3).
+        photo: The picture at (64, 64, 3), for photos only.
+        thumbnail: Data for finding near copies, for accepted photos and touches only.
+        error: Why the picture cannot be read; empty if it can.
     """
 
     digest: str = ""
@@ -44,7 +56,7 @@ ImageRecords = dict[Path, ImageRecord]
 def findings_for(
     severity: str, kind: str, what: str, names: Sequence[str], grasps: Sequence[Grasp]
 ) -> Iterator[Finding]:
-    """A remark on those of the grasps that are named, if any."""
+    """Yield one finding about the grasps called `names`, if there are any."""
     if names:
         where = f"in {len(names)} of {len(grasps)} grasps: {abbreviate_list(names)}"
         yield Finding(severity, kind, f"{what} {where}", tuple(names))

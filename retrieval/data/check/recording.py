@@ -1,7 +1,7 @@
-"""Lint of a recording: what would spoil a training, or make its result too good to be true.
+"""Check a recording for problems that spoil training or make its results too good.
 
-An ERROR is certain, or so far from the rest of the recording that nothing else explains it: do not train. A WARNING is
-a judgement by looks, or a lack: see for yourself. A NOTE says what could not be checked.
+An ERROR is certain, or so far from the rest of the recording that nothing else explains it: do not train. A WARNING
+concerns appearance, or something missing: inspect the recording. A NOTE reports what could not be checked.
 """
 
 from collections import Counter, defaultdict
@@ -24,16 +24,25 @@ from retrieval.errors import DatasetError, ImageError
 
 _SMALL, _PHOTO = (6, 8), (64, 64)
 _FLAT = 3.5 / 255
-"""What JPEG makes of one colour stays within it."""
+"""Range of the samples of a single colour after JPEG compression, at most."""
 
 _Check = Callable[[Sequence[Grasp], ImageRecords], Iterable[Finding]]
 
 
 def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
-    """Check every photo and gel image of a recording, those of rejected grasps too, and the split where one is given.
+    """Check every photo and gel image of a recording, including rejected grasps, and optionally the split.
 
-    Depth pictures are not opened: nothing is trained on them. A grasp that one check names is left out of the later
-    ones. Raises DatasetError where the recording cannot be read at all, or holds no accepted grasp.
+    Depth pictures are not opened, since no training uses them. Each check skips the grasps that earlier findings name.
+
+    Args:
+        folder: Folder of the recording.
+        split: The split to check, if any.
+
+    Returns:
+        The findings, notes last.
+
+    Raises:
+        DatasetError: The recording cannot be read, or contains no accepted grasp.
 
     >>> from pathlib import Path
     >>> {finding.severity for finding in retrieval.check_recording(Path("lab"))} <= {"note", "warning", "error"}
@@ -51,45 +60,46 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     counts = Counter(grasp.object_id for grasp in accepted)
     if single := sorted(name for name, count in counts.items() if count == 1):
         text = (
-            f"{len(single)} of {len(counts)} object(s) have one grasp, so photo and touch of a pair always come from "
-            f"the same moment: {abbreviate_list(single)}"
+            f"{len(single)} of {len(counts)} object(s) have only one grasp, so photo and touch of a pair always come "
+            f"from the same moment: {abbreviate_list(single)}"
         )
         findings.append(Finding("warning", "one-grasp", text))
     findings += _duplicates(folder, grasps, records)
-    whole = [one.grasp for one in attempts if all(not records[path].error for path in _pictures(one))]
+    readable = [one.grasp for one in attempts if all(not records[path].error for path in _pictures(one))]
     trained_on = {grasp.grasp_id for grasp in accepted}
     of_all: tuple[_Check, ...] = (
         _same_images,
         known_problems.check_dead_frames,
-        appearance_checks.swapped,
-        appearance_checks.fingers,
-        appearance_checks.moments,
+        appearance_checks.check_swapped_modalities,
+        appearance_checks.check_fingers,
+        appearance_checks.check_moments,
     )
     of_accepted: tuple[_Check, ...] = (
-        *(
-            known_problems.check_frozen_frames,
-            known_problems.check_shared_backgrounds,
-            known_problems.check_repeated_touches,
-        ),
-        *(appearance_checks.check_own_photo, appearance_checks.light, appearance_checks.check_exchanged_photos),
+        known_problems.check_frozen_frames,
+        known_problems.check_shared_backgrounds,
+        known_problems.check_repeated_touches,
+        appearance_checks.check_own_photo,
+        appearance_checks.check_light,
+        appearance_checks.check_exchanged_photos,
     )
 
     def unnamed() -> list[Grasp]:
-        known = {name for finding in findings for name in finding.grasps}
-        return [grasp for grasp in whole if grasp.grasp_id not in known]
+        named = {name for finding in findings for name in finding.grasps}
+        return [grasp for grasp in readable if grasp.grasp_id not in named]
 
     for check in of_all + of_accepted:
         findings += check([one for one in unnamed() if check in of_all or one.grasp_id in trained_on], records)
-    findings += appearance_checks.copies([one for one in unnamed() if one.grasp_id in trained_on], records, accepted)
+    remaining = [one for one in unnamed() if one.grasp_id in trained_on]
+    findings += appearance_checks.check_near_copies(remaining, records, accepted)
     if split:
         findings += check_split(accepted, split)
-        looked_at = [grasp for grasp in whole if grasp.grasp_id in trained_on]
-        findings += known_problems.check_sequences_in_training(looked_at, split, records)
+        readable_accepted = [grasp for grasp in readable if grasp.grasp_id in trained_on]
+        findings += known_problems.check_sequences_in_training(readable_accepted, split, records)
     return sorted(findings, key=lambda finding: finding.severity == "note")
 
 
 def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
-    """Objects and sequences that stand on two sides of a split, and objects on none."""
+    """Yield findings about objects and sequences in two parts of a split, and objects in none."""
     parts = {"train": split.train, "validation": split.validation, "test": split.test}
     part_of: dict[str, set[str]] = defaultdict(set)
     for part, objects in parts.items():
@@ -115,10 +125,15 @@ def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
 
 
 def require_fit(split: Split, grasps: Sequence[Grasp]) -> None:
-    """Raise DatasetError for a split that leaks, or whose parts have too few objects in the recording for pairs."""
+    """Check that a split fits a recording.
+
+    Raises:
+        DatasetError: Parts of the split share an object or a sequence, or a part has fewer than two objects in the
+            recording.
+    """
     for finding in check_split(grasps, split):
         if finding.severity == "error":
-            raise DatasetError(f"{finding.message}; every object and sequence must stand in one part of the split")
+            raise DatasetError(f"{finding.message}; every object and sequence must be in one part of the split")
     for part in ("train", "validation"):
         count = len({grasp.object_id for grasp in split.select(grasps, part)})
         if count < 2 and (part == "train" or split.validation):
@@ -140,7 +155,7 @@ def _read_pictures(attempts: Sequence[Attempt]) -> ImageRecords:
     photos = {attempt.grasp.photo for attempt in attempts}
     copied = {path for one in attempts if one.accepted for path in (one.grasp.photo, *one.grasp.touches)}
 
-    def look(path: Path) -> ImageRecord:
+    def read(path: Path) -> ImageRecord:
         try:
             data = read_bytes(path)
             image = decode_rgb(data, path)
@@ -156,27 +171,27 @@ def _read_pictures(attempts: Sequence[Attempt]) -> ImageRecords:
 
     records: ImageRecords = {}
     with ThreadPoolExecutor(2) as pool, Bar("check", len(files), "images") as bar:
-        for path, found in zip(files, pool.map(look, files), strict=True):
-            records[path] = found
+        for path, record in zip(files, pool.map(read, files), strict=True):
+            records[path] = record
             bar.advance()
     return records
 
 
 def _duplicates(folder: Path, grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """The same bytes under two objects."""
-    holders: dict[str, dict[str, Path]] = defaultdict(dict)
+    """Find files of two objects with the same bytes."""
+    users: dict[str, dict[str, Path]] = defaultdict(dict)
     for grasp in grasps:
         for path in (grasp.photo, *grasp.touches):
             if records[path].digest:
-                holders[records[path].digest].setdefault(grasp.object_id, path)
-    for objects in holders.values():
+                users[records[path].digest].setdefault(grasp.object_id, path)
+    for objects in users.values():
         if len(objects) > 1:
             where = [f"{name} ({path.relative_to(folder)})" for name, path in sorted(objects.items())]
             yield Finding("error", "duplicate", f"{len(objects)} objects share one image: {abbreviate_list(where)}")
 
 
 def _same_images(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """The same bytes for the photo and a touch, or for two fingers, of one grasp."""
+    """Find grasps with the same bytes for the photo and a touch, or for two fingers."""
     kinds = {"same-modality": ("error", "photo and touch are"), "same-fingers": ("warning", "two fingers have")}
     names: dict[str, list[str]] = {kind: [] for kind in kinds}
     for grasp in grasps:

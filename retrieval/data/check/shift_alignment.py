@@ -1,14 +1,14 @@
-"""Near copies that were moved: the correlation of two pictures at the best of many shifts.
+"""Shifted near copies: the correlation of two pictures at the best of many shifts.
 
-`retrieval.data.check.near_copies` compares pictures as they lie, by 16 x 16 grey levels, and loses a copy that was moved by
-a few pixels. Here pictures have 128 x 128 grey levels, and the inner part of one is compared with the other at every
+`retrieval.data.check.near_copies` compares 16 x 16 grey levels without shifts, and misses a copy that was moved by a
+few pixels. Here pictures have 128 x 128 grey levels, and the inner part of one is compared with the other at every
 shift of up to a sixteenth of the side. At each shift a constant and the best multiple of the median picture of their
-kind are taken off, which all of them share. The distance is 1 less the greatest correlation of what remains.
+kind are subtracted. The distance is 1 minus the largest correlation of the residuals.
 
-Measured with objects that differ: the nearest of 7,000 pairs lay at .145 (photos) and .136 (touches) on the simulated
-rig, at .066 (photos) and .015 (touches: smooth things, pressed alike) on VT60; a picture moved by 6 pixels and encoded
-again as JPEG 90 lies at .002 (photos) and .05 (touches) from its original, at most. No threshold serves all, so a copy
-must be four times as near as the third nearest other object.
+Measured with different objects: the nearest of 7,000 pairs lay at .145 (photos) and .136 (touches) on the simulated
+rig, at .066 (photos) and .015 (touches: smooth objects, pressed alike) on VT60. A picture that was moved by 6 pixels
+and saved again as JPEG 90 lies at most .002 (photos) and .05 (touches) from its original. No threshold fits all cases,
+so a copy must be four times as near as the third nearest other object.
 """
 
 from collections.abc import Sequence
@@ -24,23 +24,23 @@ SIDE = PX - 2 * MAX_SHIFT_PX
 MIN_LIMIT, MAX_DISTANCE = 0.02, 0.1
 RELATIVE_LIMIT = 0.25
 _MAX_MEDIAN_PICTURES = 500
-"""Pictures at most, evenly chosen, of which the median is taken."""
+"""Largest number of pictures, evenly spaced, for the median picture."""
 _HALF_PIXEL_KERNELS = ((1, 2), (2, 1), (2, 2))
 _ONES = np.full((SIDE, SIDE), 1 / SIDE, np.float32)
 
 Doubles = NDArray[np.float64]
 FineGreys = NDArray[np.float16]
-"""(PX, PX): grey levels of 255, each within .06."""
+"""(PX, PX): grey levels 0..255, each within .06."""
 
 
 def fine_grey_levels(picture: NDArray[np.uint8] | RgbImage) -> FineGreys:
-    """Return the grey levels (PX, PX) of a picture (H, W, 3), in the unit of its own."""
+    """Return the grey levels (PX, PX) of a picture (H, W, 3), in the picture's unit."""
     grey = picture.mean(axis=2, dtype=np.float32)
     return np.asarray(cv2.resize(grey, (PX, PX), interpolation=cv2.INTER_AREA).astype(np.float16))
 
 
 class AlignedSet:
-    """Pictures of one kind, (n, PX, PX), to be compared at every shift."""
+    """Pictures of one kind, (n, PX, PX), for comparison at every shift."""
 
     def __init__(self, pictures: Sequence[FineGreys]) -> None:
         self._pictures = pictures
@@ -53,23 +53,25 @@ class AlignedSet:
         return self._distances_to(self._pictures[row].astype(np.float32), others)
 
     def half_pixel_distance(self, row: int) -> float:
-        """Return the distance of a picture to itself moved by half a pixel along either side or both, the farthest.
+        """Return the largest distance of a picture to itself moved by half a pixel along one axis or both.
 
-        A moved copy lies no farther, unless it was changed otherwise too.
+        A shifted copy without other changes lies no farther.
         """
         picture = self._pictures[row].astype(np.float32)
         return max(float(self._distances_to(cv2.blur(picture, size), [row])[0]) for size in _HALF_PIXEL_KERNELS)
 
     def _distances_to(self, picture: NDArray[np.float32], others: Sequence[int]) -> Doubles:
-        """At each shift, the correlation of what remains of a part of `picture` with what remains of the inner part of
-        the other: the latter is orthogonal to what is taken off, so it is multiplied with the picture as it is.
+        """Return the distances of `picture` to the others (n,).
+
+        At each shift, correlate the residual of a part of `picture` with the residual of the other's inner part. The
+        latter is orthogonal to the subtracted basis, so it is multiplied with the unchanged picture.
         """
-        picture = picture - picture.mean()  # so that float32 holds its squares
+        picture = picture - picture.mean()  # keeps the squares exact in float32
         squares = cv2.matchTemplate(picture**2, np.ones_like(_ONES), cv2.TM_CCORR).astype(np.float64)
-        taken = sum(cv2.matchTemplate(picture, one, cv2.TM_CCORR).astype(np.float64) ** 2 for one in self._basis())
-        length = np.sqrt(np.maximum(squares - taken, 1.0))  # one grey level in all: what is fainter has no shape
-        found = [(cv2.matchTemplate(picture, self._residual(other), cv2.TM_CCORR) / length).max() for other in others]
-        return 1.0 - np.array(found, dtype=np.float64)
+        removed = sum(cv2.matchTemplate(picture, one, cv2.TM_CCORR).astype(np.float64) ** 2 for one in self._basis())
+        length = np.sqrt(np.maximum(squares - removed, 1.0))  # a residual below one grey level in total has no shape
+        best = [(cv2.matchTemplate(picture, self._residual(other), cv2.TM_CCORR) / length).max() for other in others]
+        return 1.0 - np.array(best, dtype=np.float64)
 
     def _basis(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         return _ONES, self._common

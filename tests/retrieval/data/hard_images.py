@@ -1,4 +1,4 @@
-"""Pictures whose whole numbers wrap, whose samples are skipped, or where one of them is NaN."""
+"""Hard cases of pictures: integers that wrap, samples that are skipped, a NaN."""
 
 from collections.abc import Iterator
 
@@ -13,7 +13,7 @@ _BACKGROUND, _RESIZE = "background", "resize"
 
 
 def hard_cases() -> Iterator[HardCase]:
-    """Cases of the pictures."""
+    """Yield the hard cases of pictures."""
     yield _background_wraps()
     yield _sixteen_bits()
     yield _checkers()
@@ -21,39 +21,39 @@ def hard_cases() -> Iterator[HardCase]:
 
 
 def _background_wraps() -> HardCase:
-    """One grey level darker than the untouched gel: -1/255."""
+    """One grey level darker than the no-contact frame: -1/255."""
     touch, gel = np.full((1, 1, 3), 100, np.uint8), np.full((1, 1, 3), 101, np.uint8)
     naive = float(to_float(touch - gel)[0, 0, 0])
     ours = float(subtract_background(to_float(touch), to_float(gel), "difference")[0, 0, 0])
     near = [abs(value + 1 / 255) < 1e-6 for value in (naive, ours)]
-    wanted, named = f"{-1 / 255:.5f}", f"uint8 wraps to {naive:.5f}"
-    return HardCase(_BACKGROUND, "one grey level darker", wanted, named, f"{ours:.5f}", near[1], near[0])
+    expected, naive_text = f"{-1 / 255:.5f}", f"uint8 wraps to {naive:.5f}"
+    return HardCase(_BACKGROUND, "one grey level darker", expected, naive_text, f"{ours:.5f}", near[1], near[0])
 
 
 def _sixteen_bits() -> HardCase:
-    """Nearly white of a 16-bit camera."""
+    """A nearly white pixel of a 16-bit camera."""
     samples = np.full((1, 1, 3), 65_280, np.uint16)
     naive, ours = float(samples.astype(np.uint8)[0, 0, 0] / 255), float(to_float(samples)[0, 0, 0])
-    must = 65_280 / 65_535
-    near = [abs(value - must) < 1e-6 for value in (naive, ours)]
-    return HardCase("samples", "65280 of 16 bits", f"{must:.4f}", f"{naive:.4f}", f"{ours:.4f}", near[1], near[0])
+    true = 65_280 / 65_535
+    near = [abs(value - true) < 1e-6 for value in (naive, ours)]
+    return HardCase("samples", "65280 of 16 bits", f"{true:.4f}", f"{naive:.4f}", f"{ours:.4f}", near[1], near[0])
 
 
 def _checkers() -> HardCase:
-    """Fine texture 8 times too fine for the new size must become its mean, not one of its pixels."""
+    """A texture 8 times too fine for the new size; it must become its mean, not one of its pixels."""
     import cv2
 
     y, x = (np.indices((512, 512)) + 2) // 4
     fine = np.repeat(((x + y) % 2).astype(np.float32)[..., None], 3, axis=2)
-    found = cv2.resize(fine, (64, 64), interpolation=cv2.INTER_LINEAR), resize(fine, (64, 64))
-    spread = [float(np.abs(image - 0.5).max()) for image in found]
-    naive, ours = (f"off by {value:.2g}" for value in spread)
-    wanted = "0.5 everywhere"
-    return HardCase(_RESIZE, "checkers of 4 px, 512 px to 64", wanted, naive, ours, spread[1] < 1e-6, spread[0] < 1e-6)
+    results = cv2.resize(fine, (64, 64), interpolation=cv2.INTER_LINEAR), resize(fine, (64, 64))
+    error = [float(np.abs(image - 0.5).max()) for image in results]
+    naive, ours = (f"off by {value:.2g}" for value in error)
+    expected = "0.5 everywhere"
+    return HardCase(_RESIZE, "checkers of 4 px, 512 px to 64", expected, naive, ours, error[1] < 1e-6, error[0] < 1e-6)
 
 
 def _nan_picture() -> HardCase:
-    """One sample of a touch is NaN; a mean over the picture, as in every tower, makes all of its features NaN."""
+    """One sample of a touch is NaN; a tower's mean over the picture makes all features NaN."""
     touch = np.full((8, 8, 3), 0.5, np.float32)
     touch[3, 4, 0] = np.nan
     naive = float(touch.mean())

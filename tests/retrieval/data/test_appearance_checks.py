@@ -1,4 +1,4 @@
-"""What a check says by looks: each fault planted in a recording is found by name, and nothing in a clean one."""
+"""Checks of a recording by appearance: each planted fault is found, and a clean recording has no findings."""
 
 import re
 
@@ -20,19 +20,19 @@ GRASPS = 5
 
 
 @pytest.fixture(scope="module")
-def felt(tmp_path_factory):
-    """8 objects, 5 grasps each with the untouched gels, and one miss each."""
-    folder = tmp_path_factory.mktemp("felt") / "recording"
+def clean(tmp_path_factory):
+    """8 objects, 5 grasps each with no-contact frames, and one miss each."""
+    folder = tmp_path_factory.mktemp("clean") / "recording"
     return synthetic.write_recording(folder, synthetic.make_objects(8), GRASPS, misses=1)
 
 
 @pytest.fixture
-def broken(felt, tmp_path):
-    return Broken(felt, tmp_path / "r")
+def broken(clean, tmp_path):
+    return Broken(clean, tmp_path / "r")
 
 
 def exchange(*columns):
-    """A change of a line: files of the columns, in pairs, exchanged."""
+    """Return a change of a line that exchanges the files of pairs of columns."""
 
     def change(row):
         for first, second in zip(columns[::2], columns[1::2], strict=True):
@@ -50,15 +50,15 @@ def edit(path, change):
 # Clean -----------------------------------------------------------------------------------------------------
 
 
-def test_a_clean_recording_has_no_remark_but_says_what_could_not_be_checked(felt):
-    assert remarks(felt) == []
-    kinds = {finding.kind for finding in check_recording(felt)}
+def test_a_clean_recording_has_only_notes_on_what_could_not_be_checked(clean):
+    assert remarks(clean) == []
+    kinds = {finding.kind for finding in check_recording(clean)}
     assert kinds <= {"unchecked-photos", "compared-copies"}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 5])
-def test_a_clean_simulated_recording_is_called_clean(tmp_path, seed):
+def test_a_clean_simulated_recording_has_no_finding(tmp_path, seed):
     from retrieval.commands.main import main
 
     options = ["--objects", "5", "--grasps", "4", "--seed", str(seed), "--out", str(tmp_path / "r")]
@@ -81,13 +81,13 @@ def test_a_broken_picture_of_a_rejected_grasp_is_named(broken):
 @pytest.mark.parametrize("numbers", [[7], [0, 1, 13, 20, 33], list(range(0, 48, 3))])
 def test_grasps_whose_fingers_are_swapped_are_named(broken, numbers):
     broken.change(numbers, exchange("touch_a", "touch_b", "touch_a_before", "touch_b_before"))
-    touch, untouched = broken.findings()
-    for finding in (touch, untouched):
+    touch, no_contact = broken.findings()
+    for finding in (touch, no_contact):
         assert (finding.severity, finding.kind, finding.grasps) == ("error", "swapped-fingers", broken.names(numbers))
     assert touch.message.startswith(f"fingers a and b look swapped (touch) in {len(numbers)} of 48 grasps: ")
 
 
-def test_fingers_of_one_look_cannot_be_checked_and_none_is_called_swapped():
+def test_similar_fingers_cannot_be_checked_and_are_not_reported_as_swapped():
     frames = np.random.default_rng(0).normal(0.5, 0.02, (2, 40, 6, 8, 3)).astype(np.float32)
     assert swapped_fingers(*frames) is None
     assert swapped_fingers(frames[0], frames[0]) is None
@@ -95,7 +95,7 @@ def test_fingers_of_one_look_cannot_be_checked_and_none_is_called_swapped():
 
 
 @pytest.mark.parametrize("numbers", [[2], [0, 1, 14, 20, 33]])
-def test_grasps_whose_touch_stands_for_the_no_contact_frame_are_named(broken, numbers):
+def test_grasps_with_touch_and_no_contact_frame_exchanged_are_named(broken, numbers):
     broken.change(numbers, exchange("touch_a", "touch_a_before", "touch_b", "touch_b_before"))
     (finding,) = broken.findings()
     assert (finding.severity, finding.kind, finding.grasps) == ("error", "swapped-moments", broken.names(numbers))
@@ -108,7 +108,7 @@ def test_touches_and_no_contact_frames_swapped_throughout_are_found(broken):
     assert "throughout" in finding.message
 
 
-def test_touches_of_nothing_leave_the_moments_open():
+def test_touches_without_contact_leave_swapped_moments_undecided():
     gel = np.full((20, 6, 8, 3), 0.5, np.float32)
     noise = np.random.default_rng(0).normal(0, 0.001, (2, 20, 6, 8, 3)).astype(np.float32)
     found = swapped_moments(gel + noise[0], gel + noise[1])
@@ -119,7 +119,7 @@ def test_touches_of_nothing_leave_the_moments_open():
 
 
 def lamps(broken, columns):
-    """Another brightness for each object, up to 8 % more or less."""
+    """Change the brightness of each object's pictures by up to 8 %."""
     objects = sorted({row["object_id"] for row in broken.rows})
     for number, row in enumerate(broken.rows):
         gain = 0.92 + 0.16 * objects.index(row["object_id"]) / (len(objects) - 1)
@@ -131,29 +131,29 @@ def test_light_that_changes_from_object_to_object_is_found_on_the_no_contact_fra
     lamps(broken, ("touch_a", "touch_b", "touch_a_before", "touch_b_before"))
     severity, kind, message = one(broken.findings())
     assert (severity, kind) == ("warning", "light")
-    assert "the untouched gel alone names the object in" in message
+    assert "the no-contact frame alone identifies the object in" in message
     assert "(chance 10%)" in message  # 4 other grasps of the object among 39
 
 
-def test_light_of_the_touches_alone_is_found_where_it_is_strong(broken):
+def test_strong_light_is_found_from_touches_only(broken):
     lamps(broken, ("touch_a", "touch_b"))
     kinds = {finding.kind for finding in broken.findings()}
     assert "light" in kinds
 
 
-def test_what_names_the_object_no_better_than_chance_is_no_betrayal():
+def test_accuracy_at_chance_level_is_no_finding():
     objects = np.repeat(np.arange(10), 6)
     rng = np.random.default_rng(0)
     assert not nearest_grasp_accuracy(rng.normal(size=(60, 18)), objects).exceeds_chance(0.25)
-    told = nearest_grasp_accuracy(objects[:, None] + rng.normal(0, 0.05, (60, 18)), objects)
-    assert told.accuracy == 1.0
-    assert told.chance == pytest.approx(5 / 59)
-    assert told.exceeds_chance(0.25)
+    result = nearest_grasp_accuracy(objects[:, None] + rng.normal(0, 0.05, (60, 18)), objects)
+    assert result.accuracy == 1.0
+    assert result.chance == pytest.approx(5 / 59)
+    assert result.exceeds_chance(0.25)
     assert not nearest_grasp_accuracy(rng.normal(size=(10, 3)), np.arange(10)).exceeds_chance(0.25)
 
 
 def plain_photos(seed=0):
-    """Five photos each of a red, a green and a blue patch on a grey table, everything under a light of its own."""
+    """Return five photos each of a red, a green and a blue patch on a grey table, each under a different light."""
     rng = np.random.default_rng(seed)
     photos, objects = [], np.repeat(np.arange(3), 5)
     for name in objects:
@@ -163,7 +163,7 @@ def plain_photos(seed=0):
     return np.array(photos, dtype=np.float32), objects
 
 
-def test_photos_exchanged_between_two_objects_are_named_with_each_other():
+def test_photos_exchanged_between_two_objects_are_reported_as_a_pair():
     photos, objects = plain_photos()
     assert exchanged_photos(photos, objects).pairs == []
     assert exchanged_photos(photos, objects).distinguishable_pairs == 3
@@ -179,7 +179,7 @@ def test_photos_of_objects_of_one_colour_cannot_be_checked():
 
 
 def test_a_check_names_the_grasps_whose_photos_are_exchanged(broken):
-    """Three objects with plain photos; the third photo of the first for the fourth of the second."""
+    """Three objects with plain photos; two photos of the first and second object are exchanged."""
     broken.rows = broken.rows[: 3 * (GRASPS + 1)]
     files = [broken.file(number, "photo") for number, row in enumerate(broken.rows) if row["grasped"]]
     photos = plain_photos()[0]
@@ -221,7 +221,7 @@ GENTLE = ("gain 1.1", "mirrored", "upside down")
 
 
 def found_in(how):
-    """The drawn touches show fine relief alone, which the harder changes wipe out; of these the notes tell."""
+    """Return the kinds of pictures with found copies; stronger changes erase the fine relief of the drawn touches."""
     return {"photo", "touch a", "touch b"} if how in GENTLE else {"photo"}
 
 
@@ -243,8 +243,8 @@ def test_near_copies_of_another_object_are_named(broken, how):
 
 
 @pytest.mark.parametrize("by", [(6, 6), (-6, 5), (0, 6)])
-def test_a_photo_that_was_moved_by_several_pixels_is_a_near_copy(broken, by):
-    """Photos of 120 x 160: a sixteenth of the side is 7 pixels."""
+def test_a_photo_moved_by_several_pixels_is_a_near_copy(broken, by):
+    """Photos have 120 x 160 pixels: a sixteenth of the side is 7 pixels."""
     image = cv2.imread(str(broken.file(3, "photo")))
     padded = np.pad(image, ((8, 8), (8, 8), (0, 0)), "edge")
     height, width = image.shape[:2]
@@ -255,8 +255,8 @@ def test_a_photo_that_was_moved_by_several_pixels_is_a_near_copy(broken, by):
     assert set(found.message.split(": ")[1].split(" and ")) == set(broken.names((3, 20)))
 
 
-def test_a_check_ends_by_saying_in_how_many_pictures_copies_were_looked_for_and_why_not_in_the_others(broken, capsys):
-    """Touches that hardly differ from the untouched gel, each with noise of its own; two files are broken."""
+def test_the_last_note_counts_the_pictures_compared_for_copies_and_explains_the_others(broken, capsys):
+    """Touches hardly differ from the no-contact frame, each with its own noise; two files are broken."""
     from retrieval.commands.main import main
 
     rng = np.random.default_rng(0)
@@ -271,6 +271,6 @@ def test_a_check_ends_by_saying_in_how_many_pictures_copies_were_looked_for_and_
     main(["check", str(broken.folder)])
     last = capsys.readouterr().err.splitlines()[-2]
     assert last.startswith(f"{broken.folder}: ")
-    assert re.search(rf"looked for in \d+ of {total} images \(photo\), 0 of {total} images \(touch a\)", last)
-    assert "show too little to tell a copy by (a light contact, or a look that many share)" in last
-    assert "6 are of grasps that are named above" in last
+    assert re.search(rf"searched in \d+ of {total} images \(photo\), 0 of {total} images \(touch a\)", last)
+    assert "show too little to recognise a copy (a light contact, or too many similar ones)" in last
+    assert "6 belong to grasps that are named above" in last

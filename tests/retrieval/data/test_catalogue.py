@@ -30,7 +30,7 @@ def fill(folder, *paths, content=None):
     return folder
 
 
-def say(folder, *rows):
+def write_metadata(folder, *rows):
     lines = [row if isinstance(row, str) else json.dumps(row) for row in rows]
     (folder / "metadata.jsonl").write_text("\n".join(lines) + "\n", "utf-8")
     return folder
@@ -43,7 +43,7 @@ def found(folder):
 # Listing ---------------------------------------------------------------------------------------------------
 
 
-def test_the_first_folder_or_the_file_names_the_object(tmp_path):
+def test_the_first_folder_or_the_file_name_names_the_object(tmp_path):
     fill(tmp_path, "mug/2.jpg", "mug/1.png", "cup.webp", "red ball/side/deep/x.PNG", "v1.2.tif")
     assert found(tmp_path) == {
         "cup.webp": "cup",
@@ -54,7 +54,7 @@ def test_the_first_folder_or_the_file_names_the_object(tmp_path):
     }
 
 
-def test_photos_are_sorted_by_their_id_which_is_their_path_wherever_the_catalogue_lies(tmp_path, monkeypatch):
+def test_photos_are_sorted_by_id_which_is_their_path_in_the_catalogue(tmp_path, monkeypatch):
     fill(tmp_path / "one", "b/1.png", "a/2.png", "a/10.png", "a.png")
     assert list(found(tmp_path / "one")) == ["a.png", "a/10.png", "a/2.png", "b/1.png"]
     (tmp_path / "one").rename(tmp_path / "two")
@@ -71,12 +71,12 @@ def test_the_case_of_an_extension_does_not_matter(tmp_path, name):
 
 def test_other_files_are_listed_as_ignored_and_dotfiles_not_at_all(tmp_path):
     fill(tmp_path, "mug/1.png", "mug/notes.txt", "readme", ".DS_Store", "mug/.hidden.png", ".git/x.png")
-    catalogue = list_catalogue(say(tmp_path, {"object_id": "mug"}))
+    catalogue = list_catalogue(write_metadata(tmp_path, {"object_id": "mug"}))
     assert [item.path for item in catalogue.photos] == ["mug/1.png"]
     assert catalogue.ignored == ("mug/notes.txt", "readme")
 
 
-def test_no_folder_a_file_and_an_empty_folder_are_told_apart(tmp_path):
+def test_a_missing_folder_a_file_and_an_empty_folder_give_different_errors(tmp_path):
     fill(tmp_path, "file.png")
     with pytest.raises(DatasetError, match=r"does not exist: put photos in <object_id>/<photo>"):
         list_catalogue(tmp_path / "none")
@@ -89,7 +89,7 @@ def test_no_folder_a_file_and_an_empty_folder_are_told_apart(tmp_path):
         list_catalogue(fill(tmp_path / "wrong", "a.gif", "b.txt"))
 
 
-def test_a_folder_that_may_not_be_listed_is_an_error_for_its_objects_would_be_missing(tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_listed_is_an_error(tmp_path, monkeypatch):
     def refuse(path):
         raise PermissionError(13, "Permission denied")
 
@@ -98,7 +98,7 @@ def test_a_folder_that_may_not_be_listed_is_an_error_for_its_objects_would_be_mi
         list_catalogue(fill(tmp_path, "mug/1.png"))
 
 
-def test_a_naming_names_objects_and_leaves_out_what_does_not_fit(tmp_path):
+def test_a_naming_names_objects_and_skips_photos_that_do_not_fit(tmp_path):
     fill(tmp_path, "train/mug/0.png", "train/mug/1.png", "test/cup/0.png", "cover.png", "train/notes.txt")
     catalogue = list_catalogue(tmp_path, Naming("{split}/{object}/{photo}"))
     assert {item.path: item.object_id for item in catalogue.photos} == {
@@ -115,7 +115,7 @@ def test_a_naming_that_no_photo_fits_is_an_error_with_an_example(tmp_path):
         list_catalogue(fill(tmp_path, "mug/0.png", "cup/0.png"), Naming("stem"))
 
 
-def test_an_object_of_pictures_that_are_not_read_is_an_object_without_a_photo(tmp_path):
+def test_an_object_with_only_unsupported_pictures_is_an_object_without_a_photo(tmp_path):
     catalogue = list_catalogue(fill(tmp_path, "mug/1.png", "cup/1.gif", "cup/2.DNG", "docs/readme.txt"))
     assert catalogue.object_ids == ("cup", "mug")
     assert [item.path for item in catalogue.photos] == ["mug/1.png"]
@@ -125,7 +125,7 @@ def test_an_object_of_pictures_that_are_not_read_is_an_object_without_a_photo(tm
     }
 
 
-def test_links_to_folders_outside_are_followed_once_and_those_that_loop_do_not_hang(tmp_path):
+def test_links_to_outside_folders_are_followed_once_and_loops_do_not_hang(tmp_path):
     root, outside = fill(tmp_path / "c", "mug/1.png", "cup/1.png"), fill(tmp_path / "o", "1.png")
     (root / "mug" / "up").symlink_to(root)
     (root / "mug" / "across").symlink_to(root / "cup")
@@ -143,7 +143,7 @@ def test_links_to_folders_outside_are_followed_once_and_those_that_loop_do_not_h
     assert catalogue.ignored == ("self",)
 
 
-def test_a_name_that_is_not_utf8_is_left_out_and_told(tmp_path):
+def test_a_name_that_is_not_utf8_is_skipped_and_reported(tmp_path):
     fill(tmp_path, "mug/1.png", "mug/größe.png")
     try:
         (tmp_path / "mug" / os.fsdecode(b"\xff.png")).write_bytes(photo())
@@ -164,9 +164,9 @@ def test_listing_opens_no_photo(tmp_path, monkeypatch):
 # Metadata --------------------------------------------------------------------------------------------------
 
 
-def test_a_photo_has_the_metadata_of_its_object_and_its_own_wins(tmp_path):
+def test_a_photos_own_metadata_takes_precedence_over_its_objects(tmp_path):
     fill(tmp_path, "mug/1.png", "mug/2.png", "cup.png")
-    say(
+    write_metadata(
         tmp_path,
         {"object_id": "mug", "price": 5, "colour": "red"},
         "",
@@ -182,32 +182,34 @@ def test_a_photo_has_the_metadata_of_its_object_and_its_own_wins(tmp_path):
     assert catalogue.notes == ()
 
 
-def test_photos_in_columns_are_the_photos_that_they_were():
+def test_a_photo_table_returns_the_photos_it_was_made_of():
     photos = [
         CataloguePhoto("a/1.png", "a"),
         CataloguePhoto("a/2.png", "a", {"price": 5}),
         CataloguePhoto("b.png", "b"),
     ]
-    held = PhotoTable.of(photos)
-    assert (list(held), len(held), held[-1], list(held[1:])) == (photos, 3, photos[2], photos[1:])
-    assert (held.paths, held.objects) == (("a/1.png", "a/2.png", "b.png"), ("a", "a", "b"))
+    table = PhotoTable.of(photos)
+    assert (list(table), len(table), table[-1], list(table[1:])) == (photos, 3, photos[2], photos[1:])
+    assert (table.paths, table.objects) == (("a/1.png", "a/2.png", "b.png"), ("a", "a", "b"))
 
 
 def test_metadata_goes_to_objects_by_the_same_naming(tmp_path):
     fill(tmp_path, "mug_0.png", "mug_1.png")
-    say(tmp_path, {"object_id": "mug", "price": 5}, {"file_name": "mug_1.png", "object_id": "mug", "colour": "red"})
+    write_metadata(
+        tmp_path, {"object_id": "mug", "price": 5}, {"file_name": "mug_1.png", "object_id": "mug", "colour": "red"}
+    )
     found = {item.path: item.metadata for item in list_catalogue(tmp_path, Naming("stem")).photos}
     assert found == {"mug_0.png": {"price": 5}, "mug_1.png": {"price": 5, "colour": "red"}}
-    with pytest.raises(DatasetError, match=r"mug_1\.png lies in object mug_1, but the line says mug"):
+    with pytest.raises(DatasetError, match=r"mug_1\.png belongs to object mug_1, but the line names mug"):
         list_catalogue(tmp_path)
 
 
-def test_metadata_of_what_is_not_there_is_a_note_and_no_error(tmp_path):
-    say(fill(tmp_path, "mug/1.png"), {"file_name": "mug/9.png"}, {"object_id": "cup"})
+def test_metadata_of_a_missing_photo_or_object_is_a_note_and_no_error(tmp_path):
+    write_metadata(fill(tmp_path, "mug/1.png"), {"file_name": "mug/9.png"}, {"object_id": "cup"})
     notes = list_catalogue(tmp_path).notes
     assert notes == (
-        "metadata.jsonl speaks of mug/9.png, which is not in the catalogue",
-        "metadata.jsonl speaks of cup, which is not in the catalogue",
+        "metadata.jsonl names mug/9.png, which is not in the catalogue",
+        "metadata.jsonl names cup, which is not in the catalogue",
     )
 
 
@@ -221,15 +223,15 @@ BAD_LINES = {
     '{"object_id": "mug", "x": NaN}': "NaN is not a finite number",
     '{"object_id": "mug", "x": -Infinity}': "-Infinity is not a finite number",
     '{"object_id": "mug", "x": 1e999}': "1e999 is not a finite number",
-    '{"file_name": "mug/1.png", "object_id": "cup"}': "lies in object mug, but the line says cup",
-    '{"object_id": "first"}': "first has a line already; join the two",
+    '{"file_name": "mug/1.png", "object_id": "cup"}': "belongs to object mug, but the line names cup",
+    '{"object_id": "first"}': "first has two lines; merge them",
     '{"object_id": ' + "[" * 100_000: "nested deeper than 64 levels",
 }
 
 
 @pytest.mark.parametrize("line", BAD_LINES, ids=BAD_LINES.values())
 def test_a_bad_metadata_line_is_named_by_its_number(tmp_path, line):
-    say(fill(tmp_path, "mug/1.png"), {"object_id": "first"}, line)
+    write_metadata(fill(tmp_path, "mug/1.png"), {"object_id": "first"}, line)
     with pytest.raises(DatasetError, match=r"metadata\.jsonl, line 2: .*" + BAD_LINES[line]) as caught:
         list_catalogue(tmp_path)
     assert caught.value.exit_code == 2

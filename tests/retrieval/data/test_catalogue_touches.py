@@ -1,4 +1,4 @@
-"""Which files of a catalogue are touches, of which object, with which finger first."""
+"""Touches in a catalogue: their files, objects and finger order."""
 
 import pytest
 from hypothesis import given
@@ -16,7 +16,7 @@ def listed(tmp_path, *names, metadata=b"", naming=FOLDER):
     return make_catalogue(tmp_path, "catalog", list(names), [], naming, metadata)
 
 
-def test_gel_images_beside_photos_are_touches_and_no_photos(tmp_path):
+def test_gel_images_next_to_photos_are_touches_and_not_photos(tmp_path):
     found = listed(
         tmp_path, "mug/1.jpg", "mug/touch_0_b.png", "mug/touch_0_a.png", "mug/touch_1_a.png", "tin/touch.jpg"
     )
@@ -33,17 +33,17 @@ def test_gel_images_beside_photos_are_touches_and_no_photos(tmp_path):
         ("mug/touch_7.png", ("mug/touch_7", "")),
         ("mug/touch_7_b.png", ("mug/touch_7", "b")),
         ("mug/second/touch_rim_left_a.jpg", ("mug/second/touch_rim_left", "a")),
-        ("mug/touch_a.png", ("mug/touch_a", "")),  # the name is what tells touches apart, so it is not left empty
-        ("touch_7.png", None),  # an object of that name, by its only photo
+        ("mug/touch_a.png", ("mug/touch_a", "")),  # the name of a touch is never empty
+        ("touch_7.png", None),  # the only photo of an object of that name
         ("mug/touched.png", None),
         ("touch_1/view.png", None),
     ],
 )
-def test_the_file_says_touch_and_finger(path, name):
+def test_the_file_name_gives_touch_and_finger(path, name):
     assert touch_name(path, FOLDER) == name
 
 
-def test_where_files_name_the_objects_every_picture_is_a_photo(tmp_path):
+def test_every_picture_is_a_photo_if_file_stems_name_the_objects(tmp_path):
     found = listed(tmp_path, "all/touch_1.png", naming=Naming("stem"))
     assert [photo.object_id for photo in found.photos] == ["touch"]
     assert found.touches == ()
@@ -54,19 +54,19 @@ def test_a_pattern_names_the_object_of_a_touch(tmp_path):
     assert [touch.object_id for touch in found.touches] == ["mug"]
 
 
-def test_objects_may_have_touches_alone_and_carry_their_metadata(tmp_path):
+def test_objects_may_have_only_touches_and_these_have_metadata(tmp_path):
     found = listed(tmp_path, "mug/touch_1.png", metadata=b'{"object_id": "mug", "shelf": 3}\n')
     assert (len(found.photos), found.object_ids, found.notes) == (0, ("mug",), ())
     assert found.touches[0].metadata == {"shelf": 3}
 
 
-def test_a_folder_with_neither_is_refused(tmp_path):
+def test_a_folder_without_photos_and_touches_is_refused(tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     with pytest.raises(DatasetError, match="no photo"):
         list_catalogue(tmp_path)
 
 
 @given(st.lists(st.from_regex(r"[a-c]{1,2}/(touch_[0-9_a-c]{0,4})\.png", fullmatch=True), unique=True, max_size=20))
-def test_every_gel_image_stands_in_exactly_one_touch(paths):
+def test_every_gel_image_belongs_to_exactly_one_touch(paths):
     images = [(path, path.split("/")[0]) for path in paths]
     assert sorted(path for touch in group_touches(images, FOLDER) for path in touch.paths) == sorted(paths)

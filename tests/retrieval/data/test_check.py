@@ -1,4 +1,4 @@
-"""The lint of a recording: each remark on a recording broken in that way, and none on a clean one."""
+"""Checks of a recording: each fault gives its finding, and a clean recording gives none."""
 
 import json
 import shutil
@@ -12,12 +12,12 @@ from tests import synthetic
 
 
 def remarks(folder, split=None):
-    """What is found, without the notes on what could not be checked."""
+    """Return the findings without notes."""
     return [finding for finding in check_recording(folder, split) if finding.severity != "note"]
 
 
 class Broken:
-    """A copy of a recording, to be broken."""
+    """A copy of a recording that a test breaks."""
 
     def __init__(self, recording, folder):
         self.folder = folder
@@ -42,7 +42,7 @@ class Broken:
         return self.folder / self.rows[number][f"{column}_file_name"]
 
     def names(self, numbers):
-        """The grasps of these lines."""
+        """Return the grasp ids of these lines."""
         return tuple(self.rows[number]["grasp_id"] for number in numbers)
 
     def findings(self, split=None):
@@ -51,7 +51,7 @@ class Broken:
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory):
-    """8 objects, 3 grasps each, a photo and two touches: 72 pictures."""
+    """8 objects, 3 grasps each, with a photo and two gel images: 72 pictures."""
     folder = tmp_path_factory.mktemp("clean") / "recording"
     return synthetic.write_recording(folder, synthetic.make_objects(8), 3, before=False)
 
@@ -77,18 +77,18 @@ def good_split(folder):
 # Clean -----------------------------------------------------------------------------------------------------
 
 
-def test_a_clean_recording_and_a_drawn_split_give_no_remark(recording):
+def test_a_clean_recording_and_a_drawn_split_have_no_finding(recording):
     assert remarks(recording, good_split(recording)) == []
 
 
 @pytest.mark.parametrize(("seed", "fingers"), [(1, "a"), (2, "ab")])
-def test_other_clean_recordings_give_no_remark(tmp_path, seed, fingers):
+def test_other_clean_recordings_have_no_finding(tmp_path, seed, fingers):
     objects = synthetic.make_objects(6, seed=seed)
     folder = synthetic.write_recording(tmp_path / "r", objects, 2, seed=seed, fingers=fingers, before=False, misses=1)
     assert remarks(folder) == []
 
 
-def test_what_is_no_recording_is_an_error(tmp_path):
+def test_a_folder_that_is_not_a_recording_is_an_error(tmp_path):
     with pytest.raises(DatasetError, match=r"recording\.json"):
         check_recording(tmp_path)
 
@@ -97,7 +97,7 @@ def test_progress_goes_to_stderr(recording, capsys):
     check_recording(recording)
     out, err = capsys.readouterr()
     assert out == ""
-    assert "check: 180/180 images" in err  # 12 objects, 3 grasps, a photo and two touches before and during each
+    assert "check: 180/180 images" in err  # 12 objects, 3 grasps; a photo, two touches, two no-contact frames
 
 
 # Files -----------------------------------------------------------------------------------------------------
@@ -117,25 +117,25 @@ def test_a_missing_no_contact_frame_is_named(recording, tmp_path):
     assert one(broken.findings()) == ("error", "broken", f"images/{path.name}: no such file")
 
 
-@pytest.mark.parametrize("share", [0.0, 0.9])
+@pytest.mark.parametrize("fraction", [0.0, 0.9])
 @pytest.mark.parametrize("column", ["photo", "touch_b"])
-def test_a_truncated_picture_is_named(broken, column, share):
+def test_a_truncated_picture_is_named(broken, column, fraction):
     path = broken.file(7, column)
     data = path.read_bytes()
-    path.write_bytes(data[: int(share * len(data))])
+    path.write_bytes(data[: int(fraction * len(data))])
     severity, kind, message = one(broken.findings())
     assert (severity, kind) == ("error", "broken")
     assert message.startswith(f"images/{path.name}: ")
 
 
-def test_every_broken_file_has_its_remark_and_the_others_are_still_checked(broken):
+def test_every_broken_file_has_a_finding_and_other_files_are_still_checked(broken):
     for number in (0, 5, 9):
         broken.file(number, "touch_a").write_bytes(b"no picture")
     broken.file(12, "photo").write_bytes(broken.file(20, "photo").read_bytes())
     assert [finding.kind for finding in broken.findings()] == ["broken"] * 3 + ["duplicate"]
 
 
-def test_a_recording_without_one_readable_picture_is_survived(broken):
+def test_a_recording_without_any_readable_picture_gives_findings(broken):
     for path in (broken.folder / "images").iterdir():
         path.write_bytes(b"")
     findings = broken.findings()
@@ -148,7 +148,7 @@ def test_a_recording_without_one_readable_picture_is_survived(broken):
 
 @pytest.mark.parametrize("column", ["photo", "touch_a"])
 def test_the_same_picture_under_two_objects_names_both(broken, column):
-    """Once as a copy of the file; with a photo the pair would be positive and negative at once."""
+    """The second file is a copy of the first; a shared photo would be positive and negative at once."""
     one_file, other = broken.file(1, column), broken.file(10, column)
     other.write_bytes(one_file.read_bytes())
     severity, kind, message = one(broken.findings())
@@ -180,19 +180,19 @@ def test_two_fingers_with_the_same_picture_are_a_warning(broken):
 
 
 @pytest.mark.parametrize("column", ["touch_a_file_name", "touch_b_file_name"])
-def test_a_photo_that_is_also_the_touch_is_an_error_though_nothing_looks_swapped(broken, column):
+def test_a_photo_that_is_also_the_touch_is_an_error_although_nothing_looks_swapped(broken, column):
     broken.change(range(24), lambda row: row.update({column: row["photo_file_name"]}))
     severity, kind, message = one(broken.findings())
     assert (severity, kind) == ("error", "same-modality")
     assert message.startswith("photo and touch are the same image in 24 of 24 grasps: ")
 
 
-def test_objects_with_one_grasp_are_a_warning_that_names_the_first_five(tmp_path):
+def test_objects_with_one_grasp_give_a_warning_that_names_the_first_five(tmp_path):
     folder = synthetic.write_recording(tmp_path / "r", synthetic.make_objects(7), 1, before=False)
     names = sorted(obj.object_id for obj in synthetic.make_objects(7))
     severity, kind, message = one(remarks(folder))
     assert (severity, kind) == ("warning", "one-grasp")
-    assert message.startswith("7 of 7 object(s) have one grasp, ")
+    assert message.startswith("7 of 7 object(s) have only one grasp, ")
     assert message.endswith(f": {', '.join(names[:5])} and 2 more")
 
 
@@ -201,7 +201,7 @@ def test_one_object_with_one_grasp_is_named(broken):
     broken.rows = [rows[0], *rows[3:]]
     severity, kind, message = one(broken.findings())
     assert (severity, kind) == ("warning", "one-grasp")
-    assert message.startswith("1 of 8 object(s) have one grasp")
+    assert message.startswith("1 of 8 object(s) have only one grasp")
     assert message.endswith(f": {rows[0]['object_id']}")
 
 
@@ -226,7 +226,7 @@ def test_the_grasps_with_photo_and_touch_swapped_are_named(broken, numbers):
     assert message.endswith("and 2 more" if len(numbers) == 7 else names[-1])
 
 
-def test_two_grasps_are_too_few_to_tell_a_swap_from(tmp_path):
+def test_two_grasps_are_too_few_to_find_a_swap(tmp_path):
     folder = synthetic.write_recording(tmp_path / "r", synthetic.make_objects(1), 2, before=False)
     broken = Broken(folder, tmp_path / "copy")
     broken.change([0], swap_photo_and_touch)
@@ -240,7 +240,7 @@ def with_test(split, *names):
     return Split(split.seed, split.train, split.validation, (*split.test, *names))
 
 
-def test_an_object_on_two_sides_is_an_error_and_so_are_its_sequences(clean):
+def test_an_object_in_two_parts_is_an_error_and_so_are_its_sequences(clean):
     split = good_split(clean)
     first, second = split.train[:2]
     objects, sequences = remarks(clean, with_test(split, second, first))
@@ -250,23 +250,23 @@ def test_an_object_on_two_sides_is_an_error_and_so_are_its_sequences(clean):
     assert (sequences.severity, sequences.kind) == ("error", "split-sequences")
 
 
-def test_an_object_on_two_sides_without_sequences_is_one_error(broken):
+def test_an_object_in_two_parts_without_sequences_is_one_error(broken):
     broken.change(range(24), lambda row: row.pop("sequence_id"))
     split = good_split(broken.folder)
     assert one(broken.findings(with_test(split, split.validation[0])))[:2] == ("error", "split-objects")
 
 
 def test_a_sequence_cut_in_two_is_an_error(broken):
-    """Two objects filmed in one take: a split drawn before that was known parts them."""
+    """Two objects are in one video, and an earlier split separates them."""
     split = good_split(broken.folder)
     take = {split.train[0], split.test[0]}
     numbers = [number for number, row in enumerate(broken.rows) if row["object_id"] in take]
     broken.change(numbers, lambda row: row.update(sequence_id="one take"))
-    cut, share = broken.findings(split)
+    cut, leak = broken.findings(split)
     assert (cut.severity, cut.kind) == ("error", "split-sequences")
     assert cut.message.startswith("the split cuts 1 sequence(s) in two")
     assert cut.message.endswith(": one take")
-    assert (share.severity, share.kind) == ("error", "sequences-in-training")
+    assert (leak.severity, leak.kind) == ("error", "sequences-in-training")
     assert broken.findings(good_split(broken.folder)) == []
 
 
@@ -283,7 +283,7 @@ def test_an_object_of_the_split_that_was_not_recorded_is_a_warning(clean):
     assert found == ("warning", "split-unknown", "the split names 1 object(s) not recorded: ghost")
 
 
-def test_a_split_is_checked_without_a_look_at_the_pictures(broken):
+def test_a_split_is_checked_without_reading_pictures(broken):
     shutil.rmtree(broken.folder / "images")
     grasps = load_grasps(broken.folder)
     split = make_split(grasps, validation=0.25, test=0.2, seed=0)

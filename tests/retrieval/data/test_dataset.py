@@ -1,4 +1,4 @@
-"""Grasps of a recording, splits that share no object, and the pair sampler."""
+"""Grasps of a recording, object-disjoint splits, and the pair sampler."""
 
 import dataclasses
 import json
@@ -41,7 +41,7 @@ def grasps_of(*counts):
 
 
 def pairs(batch):
-    """(row of the touch, its object, the photo, the photo's object, label), one for each pair."""
+    """Return (row of the touch, its object, the photo, the photo's object, label) of each pair."""
     return [
         (int(t), batch.grasps[t].object_id, batch.photos[p], str(batch.photos[p]).rsplit("-", 1)[0], float(label))
         for t, p, label in zip(batch.touch_index, batch.photo_index, batch.labels, strict=True)
@@ -49,7 +49,7 @@ def pairs(batch):
 
 
 def contents(batch):
-    """Everything in a batch as plain values, to compare two of them."""
+    """Return a batch as plain values, for comparisons."""
     return {
         key: value.tolist() if isinstance(value, np.ndarray) else value
         for key, value in dataclasses.asdict(batch).items()
@@ -70,7 +70,7 @@ def small_recording(tmp_path_factory):
     return synthetic.write_recording(folder, synthetic.make_objects(2), 2, misses=1)
 
 
-def test_grasps_come_in_the_order_of_collection_with_their_files_in_the_order_of_the_fingers(small_recording):
+def test_grasps_are_in_collection_order_and_their_files_in_finger_order(small_recording):
     rows = [json.loads(line) for line in (small_recording / "metadata.jsonl").read_text().splitlines()]
     rows = [row for row in rows if row["grasped"]]
     grasps = load_grasps(small_recording)
@@ -83,31 +83,31 @@ def test_grasps_come_in_the_order_of_collection_with_their_files_in_the_order_of
         assert item.backgrounds == tuple(small_recording / row[f"touch_{finger}_before_file_name"] for finger in "ab")
 
 
-def test_a_recording_is_given_by_its_folder_or_as_it_was_read(small_recording):
+def test_a_recording_is_accepted_as_a_folder_or_as_a_read_recording(small_recording):
     by_folder = load_grasps(small_recording)
     assert by_folder == load_grasps(str(small_recording)) == load_grasps(read_recording(small_recording))
 
 
-def test_grasps_that_closed_on_nothing_are_left_out(small_recording):
+def test_grasps_that_missed_are_left_out(small_recording):
     assert Counter(item.object_id for item in load_grasps(small_recording)) == {"ribs-0000": 2, "bumps-0001": 2}
 
 
-def test_the_source_of_a_recording_is_what_its_writer_said(small_recording):
+def test_the_source_of_a_recording_is_the_one_its_writer_stored(small_recording):
     assert recording_source(small_recording) == "drawn test pictures, not a simulation of contact"
 
 
-def test_a_recording_with_misses_alone_is_an_error(tmp_path):
+def test_a_recording_with_misses_only_is_an_error(tmp_path):
     folder = synthetic.write_recording(tmp_path / "r", synthetic.make_objects(1), 0, misses=2)
-    with pytest.raises(DatasetError, match=r"r must hold successful grasps with a photo and a touch; it holds none"):
+    with pytest.raises(DatasetError, match=r"r contains no successful grasp with a photo and a touch"):
         load_grasps(folder)
 
 
-def test_what_the_recording_says_is_wrong_comes_as_our_own_error(tmp_path):
+def test_an_error_of_the_recording_reader_becomes_a_dataset_error(tmp_path):
     with pytest.raises(DatasetError, match=r"recording\.json"):
         load_grasps(tmp_path)
 
 
-def test_a_line_that_a_crash_left_is_dropped_and_said(small_recording, tmp_path, caplog):
+def test_a_line_cut_off_by_a_crash_is_dropped_with_a_warning(small_recording, tmp_path, caplog):
     shutil.copytree(small_recording, tmp_path / "r")
     with (tmp_path / "r" / "metadata.jsonl").open("a") as file:
         file.write('{"grasp_id": "0')
@@ -116,14 +116,14 @@ def test_a_line_that_a_crash_left_is_dropped_and_said(small_recording, tmp_path,
     assert "half-written" in caplog.text
 
 
-def test_touches_with_another_number_of_fingers_are_refused_by_name():
+def test_touches_with_different_numbers_of_fingers_are_refused_by_name():
     assert finger_count([grasp("mug", fingers="a")]) == 1
     assert finger_count([grasp("mug"), grasp("cup")]) == 2
-    with pytest.raises(DatasetError, match=r"mug-0 has 2, cup-0 has 1; keep the sensors in recordings of their own"):
+    with pytest.raises(DatasetError, match=r"mug-0 has 2, cup-0 has 1; use a separate recording for each sensor"):
         finger_count([grasp("mug"), grasp("cup", fingers="a")])
 
 
-def test_the_data_digest_follows_bytes_and_ids_and_not_the_place(small_recording, tmp_path):
+def test_the_data_digest_depends_on_bytes_and_ids_and_not_on_the_folder(small_recording, tmp_path):
     shutil.copytree(small_recording, tmp_path / "r")
     grasps = load_grasps(tmp_path / "r")
     before = data_digest(grasps)
@@ -131,14 +131,14 @@ def test_the_data_digest_follows_bytes_and_ids_and_not_the_place(small_recording
     assert before != data_digest(grasps[::-1])
     assert before != data_digest([dataclasses.replace(grasps[0], object_id="other"), *grasps[1:]])
     for path in (grasps[0].photo, grasps[1].touches[1], grasps[2].backgrounds[0]):
-        kept = path.read_bytes()
-        path.write_bytes(kept[:-1] + bytes([kept[-1] ^ 1]))
+        data = path.read_bytes()
+        path.write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
         assert data_digest(grasps) != before
-        path.write_bytes(kept)
+        path.write_bytes(data)
     assert data_digest(grasps) == before
 
 
-def test_the_data_digest_names_a_file_that_is_not_there(small_recording, tmp_path):
+def test_the_data_digest_names_a_missing_file(small_recording, tmp_path):
     shutil.copytree(small_recording, tmp_path / "r")
     grasps = load_grasps(tmp_path / "r")
     grasps[1].touches[0].unlink()
@@ -165,16 +165,16 @@ def test_every_object_is_in_exactly_one_part_of_at_least_two(counts, seed):
 
 @settings(max_examples=50)
 @given(count=st.integers(6, 120), seed=seeds, validation=st.floats(0, 0.35), test=st.floats(0, 0.35))
-def test_shares_are_met_to_half_an_object_or_the_least_of_two(count, seed, validation, test):
+def test_fractions_are_met_to_half_an_object_with_a_minimum_of_two(count, seed, validation, test):
     split = make_split(grasps_of(*[1] * count), validation=validation, test=test, seed=seed)
-    for share, part in ((validation, split.validation), (test, split.test)):
-        if share * count < 2:
-            assert len(part) == (2 if share else 0)
+    for fraction, part in ((validation, split.validation), (test, split.test)):
+        if fraction * count < 2:
+            assert len(part) == (2 if fraction else 0)
         else:
-            assert abs(len(part) - share * count) <= 0.5
+            assert abs(len(part) - fraction * count) <= 0.5
 
 
-def test_the_papers_shares_of_98_objects_are_18_and_10():
+def test_the_papers_fractions_of_98_objects_are_18_and_10():
     split = make_split(grasps_of(*[1] * 98), validation=0.1, test=0.184, seed=0)
     assert [len(part) for part in parts_of(split).values()] == [70, 10, 18]
 
@@ -204,8 +204,8 @@ def test_objects_that_share_a_sequence_however_indirectly_stay_together(links, s
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_a_large_group_is_left_to_training_where_small_ones_meet_the_share(seed):
-    """The naive draw takes whichever group comes first, here often ten objects for a share of four."""
+def test_a_large_group_stays_in_training_if_small_ones_meet_the_fraction(seed):
+    """A naive draw takes the first group, here often ten objects for a target of four."""
     grasps = [*(grasp(f"linked-{i}", 0, "day one") for i in range(10)), *grasps_of(*[1] * 10)]
     split = make_split(grasps, validation=0.1, test=0.2, seed=seed)
     assert (len(split.train), len(split.validation), len(split.test)) == (14, 2, 4)
@@ -220,7 +220,7 @@ def test_a_split_depends_on_its_seed_and_not_on_the_order_of_grasps():
 
 
 @pytest.mark.parametrize(("validation", "test", "parts"), [(0.0, 0.0, 1), (0.2, 0.0, 2), (0.0, 0.2, 2), (0.2, 0.2, 3)])
-def test_a_part_with_no_share_is_empty_and_too_few_objects_are_counted_in_the_error(validation, test, parts):
+def test_a_part_with_fraction_zero_is_empty_and_the_error_counts_too_few_objects(validation, test, parts):
     split = make_split(grasps_of(*[1] * 2 * parts), validation=validation, test=test, seed=0)
     assert (split.validation == ()) == (validation == 0)
     assert (split.test == ()) == (test == 0)
@@ -229,9 +229,9 @@ def test_a_part_with_no_share_is_empty_and_too_few_objects_are_counted_in_the_er
         make_split(grasps_of(*[1] * few), validation=validation, test=test, seed=0)
 
 
-def test_shares_and_sequences_that_leave_too_few_to_train_on_are_told_in_objects():
+def test_fractions_and_sequences_that_leave_too_few_training_objects_are_an_error_with_counts():
     with pytest.raises(
-        DatasetError, match=r"has 7 objects in 7 such groups, and the shares part them into 1 \+ 3 \+ 3"
+        DatasetError, match=r"has 7 objects in 7 such groups, and the fractions give parts of 1 \+ 3 \+ 3 objects"
     ):
         make_split(grasps_of(*[1] * 7), validation=0.4, test=0.4, seed=0)
     one_take = [grasp(f"object-{i}", 0, "one long take") for i in range(9)]
@@ -239,7 +239,7 @@ def test_shares_and_sequences_that_leave_too_few_to_train_on_are_told_in_objects
         make_split(one_take, validation=0.2, test=0.2, seed=0)
 
 
-def test_a_split_survives_json_and_selects_its_grasps():
+def test_a_split_can_be_stored_as_json_and_selects_its_grasps():
     grasps = grasps_of(*[2] * 8)
     split = make_split(grasps, validation=0.25, test=0.25, seed=4)
     assert Split.from_dict(json.loads(json.dumps(split.to_dict()))) == split
@@ -264,7 +264,7 @@ def test_a_split_survives_json_and_selects_its_grasps():
     ],
     ids=repr,
 )
-def test_what_is_no_split_is_refused_with_what_it_must_hold(data):
+def test_data_that_is_not_a_split_is_refused_with_the_required_keys(data):
     with pytest.raises(DatasetError, match=r"split(\.\S+)? must (be a|hold seed, train, validation, test;)"):
         Split.from_dict(data)
 
@@ -281,7 +281,7 @@ def test_what_is_no_split_is_refused_with_what_it_must_hold(data):
     share=st.booleans(),
     numbers=st.just((4, 4)) | st.tuples(st.integers(1, 5), st.integers(1, 5)),
 )
-def test_every_touch_has_as_many_photos_of_its_object_and_of_others_as_asked(
+def test_every_touch_has_the_requested_numbers_of_matching_and_other_photos(
     counts, seed, step, touches, share, numbers
 ):
     grasps, (positives, negatives) = grasps_of(*counts), numbers
@@ -297,7 +297,7 @@ def test_every_touch_has_as_many_photos_of_its_object_and_of_others_as_asked(
 
 @settings(max_examples=50)
 @given(counts=counts, seed=seeds, touches=st.integers(1, 9), share=st.booleans())
-def test_every_photo_is_listed_once_with_its_object_and_every_listed_one_is_used(counts, seed, touches, share):
+def test_every_photo_is_listed_once_with_its_object_and_every_listed_photo_is_used(counts, seed, touches, share):
     batch = PairSampler(grasps_of(*counts), seed=seed, share_photos=share).batch(0, touches)
     assert len(batch.photos) == len(set(batch.photos)) == len(batch.photo_objects)
     assert set(batch.photo_index.tolist()) == set(range(len(batch.photos)))
@@ -330,7 +330,7 @@ def test_within_an_object_every_grasp_comes_once_before_any_comes_again(counts, 
 
 @settings(max_examples=50)
 @given(seed=seeds, steps=st.permutations(range(5)))
-def test_a_batch_depends_on_seed_and_step_and_not_on_what_was_asked_before(seed, steps):
+def test_a_batch_depends_on_seed_and_step_and_not_on_earlier_calls(seed, steps):
     grasps = grasps_of(3, 1, 4, 2)
     sampler = PairSampler(grasps, seed=seed)
     in_order = [contents(PairSampler(grasps, seed=seed).batch(step, 4)) for step in range(5)]
@@ -366,19 +366,19 @@ def test_a_photo_shared_by_grasps_of_one_object_counts_as_one():
     assert Counter(str(photo).rsplit("-", 1)[0] for photo in batch.photos) == {"mug": 1, "object-00": 2}
 
 
-def test_negatives_draw_the_object_first_so_that_one_with_many_photos_is_not_met_more_often():
-    """The naive draw over all other photos would meet the object of 60 in 60 / 61 of the pairs."""
+def test_negatives_draw_the_object_first_so_an_object_with_many_photos_is_not_more_frequent():
+    """A naive draw over all other photos would use the object with 60 photos in 60 / 61 of the pairs."""
     sampler = PairSampler(grasps_of(1, 1, 60), seed=0, positives=1, negatives=500)
     batch = sampler.batch(0, 3)
     row = batch.touch_objects.tolist().index(0)
     negatives = [batch.photo_objects[p] for t, p in zip(batch.touch_index, batch.photo_index, strict=True) if t == row]
-    met = Counter(map(int, negatives[1:]))
-    # 500 fair draws: the deviation is 11, and six of them are allowed.
-    assert abs(met[1] - 250) < 67
-    assert met[1] + met[2] == 500
+    drawn = Counter(map(int, negatives[1:]))
+    # The deviation of 500 fair draws is 11; allow six deviations.
+    assert abs(drawn[1] - 250) < 67
+    assert drawn[1] + drawn[2] == 500
 
 
-def test_shared_photos_are_half_as_many_and_each_is_some_touchs_positive():
+def test_shared_photos_are_half_as_many_and_each_is_a_positive_of_some_touch():
     grasps = grasps_of(*[9] * 12)
     for step in range(2):  # these two batches are one round of the objects
         shared = PairSampler(grasps, seed=0, share_photos=True).batch(step, 6)
@@ -390,34 +390,34 @@ def test_shared_photos_are_half_as_many_and_each_is_some_touchs_positive():
             assert len({owner for row, _, _, owner, label in rows if row == touch and not label}) == 4
 
 
-def test_shared_negatives_meet_every_other_object_and_every_photo_of_it_alike():
-    """As those drawn from all: a touch's negatives are any other object's photos with the same chance."""
+def test_shared_negatives_use_every_other_object_and_each_of_its_photos_equally():
+    """A touch's negatives are the photos of any other object with the same probability, shared or not."""
     grasps = grasps_of(*[4] * 5, 8)
-    met: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
-    for share, seen in met.items():
+    drawn: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
+    for share, photos in drawn.items():
         sampler = PairSampler(grasps, seed=1, share_photos=share, positives=3, negatives=2)
         for step in range(2000):
             batch = sampler.batch(step, 3)
             for touch, photo, label in zip(batch.touch_index, batch.photo_index, batch.labels, strict=True):
                 if not label and batch.touch_objects[touch] == 0:
-                    seen[str(batch.photos[photo])] += 1
-    total = sum(met[True].values())
-    assert total == sum(met[False].values()) == 2000
-    for seen in met.values():
-        for name, count in seen.items():
-            share = total / 5 / (8 if name.startswith("object-05") else 4)
-            assert abs(count - share) < 6 * share**0.5, name  # six deviations of a fair draw
-        assert len(seen) == 4 * 4 + 8
+                    photos[str(batch.photos[photo])] += 1
+    total = sum(drawn[True].values())
+    assert total == sum(drawn[False].values()) == 2000
+    for photos in drawn.values():
+        for name, count in photos.items():
+            expected = total / 5 / (8 if name.startswith("object-05") else 4)
+            assert abs(count - expected) < 6 * expected**0.5, name  # six deviations of a fair draw
+        assert len(photos) == 4 * 4 + 8
 
 
-def test_a_batch_of_one_object_finds_its_negatives_outside():
+def test_a_batch_of_one_object_draws_its_negatives_from_other_objects():
     batch = PairSampler(grasps_of(3, 3, 3), seed=0, share_photos=True).batch(0, 1)
     assert batch.labels.tolist() == [1, 1, 1, 1, 0, 0, 0, 0]
     assert all((batch.photo_objects[batch.photo_index] == batch.touch_objects[0]) == (batch.labels == 1))
 
 
-def test_the_pairs_for_evaluation_hold_every_touch_once_are_never_shared_and_are_the_same_each_time():
-    """SharedImage or not, as every checkpoint so far was chosen on these."""
+def test_the_evaluation_pairs_contain_every_touch_once_and_are_never_shared_and_always_the_same():
+    """They do not depend on share_photos, since existing checkpoints were selected on them."""
     grasps = grasps_of(3, 1, 5)
     sampler = PairSampler(grasps, seed=0)
     batch = sampler.evaluation_pairs()
@@ -429,20 +429,20 @@ def test_the_pairs_for_evaluation_hold_every_touch_once_are_never_shared_and_are
 
 
 @pytest.mark.parametrize("grasps", [[], grasps_of(5)], ids=["none", "one object"])
-def test_fewer_than_two_objects_make_no_pairs(grasps):
+def test_fewer_than_two_objects_give_no_pairs(grasps):
     with pytest.raises(DatasetError, match=rf"at least 2 objects in each part of the split; got {min(len(grasps), 1)}"):
         PairSampler(grasps, seed=0)
 
 
-def test_one_photo_of_two_objects_would_be_its_own_negative_and_is_refused():
-    with pytest.raises(DatasetError, match="a photo file must belong to one object"):
+def test_a_photo_of_two_objects_would_be_its_own_negative_and_is_refused():
+    with pytest.raises(DatasetError, match="two objects share a photo file"):
         PairSampler([grasp("mug", photo="same.jpg"), grasp("cup", photo="same.jpg")], seed=0)
 
 
 # Cache -----------------------------------------------------------------------------------------------------
 
 
-def test_an_image_is_loaded_once_while_the_cache_has_room_and_again_when_it_has_not():
+def test_an_image_is_loaded_once_while_it_fits_in_the_cache_and_otherwise_each_time():
     calls = []
 
     def load(*paths):

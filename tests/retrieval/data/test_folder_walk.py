@@ -1,4 +1,4 @@
-"""Folders that look as they did are not listed again; what is put in, taken out or renamed is found all the same."""
+"""Unchanged folders are not listed again; added, removed and renamed files are still found."""
 
 import os
 import random
@@ -17,8 +17,8 @@ HOUR_NS = 3600 * 10**9
 
 
 @pytest.fixture
-def settled(monkeypatch):
-    """No folder has changed for long, and all lie on a disk."""
+def old_folders(monkeypatch):
+    """No folder has changed for an hour, and all are on a disk."""
     now = time.time_ns
     monkeypatch.setattr(stat_cache.time, "time_ns", lambda: now() + HOUR_NS)
     monkeypatch.setattr(stat_cache.os, "major", lambda device: 8)
@@ -27,21 +27,21 @@ def settled(monkeypatch):
 
 @pytest.fixture
 def listed(monkeypatch):
-    """Names of the folders that walks listed, in order."""
+    """Names of the folders that walks list, in order."""
     folders, scandir = [], os.scandir
 
-    def noted(folder):
+    def record(folder):
         if sys._getframe(1).f_globals is vars(folder_walk):
             folders.append(os.path.basename(folder))
         return scandir(folder)
 
-    monkeypatch.setattr(folder_walk.os, "scandir", noted)
+    monkeypatch.setattr(folder_walk.os, "scandir", record)
     return folders
 
 
 @pytest.fixture
 def shelf(tmp_path):
-    """Three objects, one with photos in a folder of a folder."""
+    """Three objects, one with photos in subfolders."""
     for name in ("cup/1.jpg", "cup/2.jpg", "mug/1.jpg", "pan/side/1.jpg", "pan/top/1.jpg"):
         path = tmp_path / "catalogue" / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -57,8 +57,8 @@ def walked(folder, folder_cache=None):
 
 
 def again(folder, known=True):
-    """What a listing finds that knows of the ones before; it must be what is there."""
-    time.sleep(0.02)  # more than a tick of the clock that folders' times are taken from
+    """Return the files of a listing with the cache of earlier ones; they must equal those of a listing without."""
+    time.sleep(0.02)  # more than a tick of the clock of folder times
     folder_cache = FolderCache(folder.parent / "index", known)
     found = walked(folder, folder_cache)
     folder_cache.write()
@@ -66,10 +66,10 @@ def again(folder, known=True):
     return found[0]
 
 
-@pytest.mark.usefixtures("settled")
-def test_only_folders_of_folders_and_those_that_changed_are_listed_again(shelf, listed):
+@pytest.mark.usefixtures("old_folders")
+def test_only_folders_with_subfolders_and_changed_folders_are_listed_again(shelf, listed):
     assert len(again(shelf)) == 5
-    for change, must in (
+    for change, expected in (
         (lambda: None, ["catalogue", "pan"]),
         (lambda: (shelf / "cup" / "3.jpg").write_text("new"), ["catalogue", "cup", "pan"]),
         (lambda: (shelf / "mug" / "1.jpg").unlink(), ["catalogue", "mug", "pan"]),
@@ -81,12 +81,12 @@ def test_only_folders_of_folders_and_those_that_changed_are_listed_again(shelf, 
         change()
         listed.clear()
         again(shelf)
-        first = listed[: listed.index("catalogue", 1)]  # then it is listed whole, to compare
-        assert set(must) | {"catalogue", "pan"} == set(first) - ({"lid"} if "lid" not in must else set())
+        first = listed[: listed.index("catalogue", 1)]  # the second, complete listing is for the comparison
+        assert set(expected) | {"catalogue", "pan"} == set(first) - ({"lid"} if "lid" not in expected else set())
 
 
-@pytest.mark.usefixtures("settled")
-def test_all_is_listed_where_notes_are_not_to_be_believed_and_noted_anew(shelf, listed):
+@pytest.mark.usefixtures("old_folders")
+def test_every_folder_is_listed_if_the_cache_is_not_trusted_and_the_cache_is_rewritten(shelf, listed):
     again(shelf)
     listed.clear()
     again(shelf, known=False)
@@ -96,8 +96,8 @@ def test_all_is_listed_where_notes_are_not_to_be_believed_and_noted_anew(shelf, 
     assert listed[:3] == ["catalogue", "pan", "catalogue"]
 
 
-@pytest.mark.usefixtures("settled")
-def test_links_and_names_that_are_no_utf8_are_looked_at_every_time(shelf, tmp_path):
+@pytest.mark.usefixtures("old_folders")
+def test_folders_with_links_or_names_that_are_not_utf8_are_listed_every_time(shelf, tmp_path):
     target = tmp_path / "elsewhere"
     target.write_text("a file")
     (shelf / "cup" / "link").symlink_to(target)
@@ -105,7 +105,7 @@ def test_links_and_names_that_are_no_utf8_are_looked_at_every_time(shelf, tmp_pa
     target.unlink()
     target.mkdir()
     (target / "9.jpg").write_text("a photo")
-    assert "cup/link/9.jpg" in again(shelf)  # though nothing changed in the folder of the link
+    assert "cup/link/9.jpg" in again(shelf)  # although the folder of the link did not change
     try:
         os.mkdir(os.fsencode(shelf) + b"/odd")
         os.close(os.open(os.fsencode(shelf) + b"/odd/\xff.jpg", os.O_CREAT))
@@ -116,9 +116,9 @@ def test_links_and_names_that_are_no_utf8_are_looked_at_every_time(shelf, tmp_pa
     assert walked(shelf, FolderCache(tmp_path / "index"))[1] == ["odd/\\xff.jpg"]
 
 
-@pytest.mark.usefixtures("settled")
+@pytest.mark.usefixtures("old_folders")
 @pytest.mark.parametrize("seed", range(6))
-def test_whatever_changes_a_listing_is_one_from_nothing(shelf, seed):
+def test_a_cached_listing_equals_a_full_listing_after_any_change(shelf, seed):
     draw = random.Random(seed)
     for _ in range(8):
         for _ in range(draw.randrange(3)):
@@ -140,7 +140,7 @@ def test_whatever_changes_a_listing_is_one_from_nothing(shelf, seed):
         again(shelf)
 
 
-def test_a_folder_that_changed_just_now_or_lies_on_no_disk_is_not_noted(shelf, monkeypatch):
+def test_a_folder_that_changed_recently_or_is_not_on_a_disk_is_not_cached(shelf, monkeypatch):
     folder_cache = FolderCache(shelf.parent / "index")
     walked(shelf, folder_cache)
     folder_cache.write()
@@ -152,8 +152,8 @@ def test_a_folder_that_changed_just_now_or_lies_on_no_disk_is_not_noted(shelf, m
     assert not (shelf.parent / "index" / FOLDERS).exists()
 
 
-@pytest.mark.usefixtures("settled")
-def test_a_build_finds_what_was_put_into_a_folder_and_what_is_gone(catalogue_copy, checkpoint, tmp_path, listed):
+@pytest.mark.usefixtures("old_folders")
+def test_a_build_finds_photos_that_were_added_to_or_removed_from_a_folder(catalogue_copy, checkpoint, tmp_path, listed):
     build_index(catalogue_copy, checkpoint, tmp_path / "index", quiet=True)
     assert (tmp_path / "index" / FOLDERS).is_file()
     first, second = sorted(path for path in catalogue_copy.iterdir() if path.is_dir())[:2]

@@ -1,4 +1,4 @@
-"""HEIC and AVIF pictures: read like any other, or refused with what to install."""
+"""HEIC and AVIF pictures: read like any other, or refused with an installation hint."""
 
 import sys
 
@@ -29,15 +29,15 @@ def test_colours_are_those_of_the_pixels(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_transparency_is_laid_on_white(kind):
+def test_transparency_is_composited_on_white(kind):
     rgb = decode_rgb(saved(Image.new("RGBA", (16, 16), (255, 0, 0, 51)), kind, quality=100), "x")
     np.testing.assert_allclose(rgb, np.broadcast_to([1, 0.8, 0.8], (16, 16, 3)), atol=0.02)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_picture_is_upright_as_the_same_jpeg_is(kind, orientation):
-    """A HEIC file turns its pixels itself and an AVIF file says how: applied twice or never, corners change places."""
+def test_a_picture_is_upright_like_the_same_jpeg(kind, orientation):
+    """A HEIC decoder rotates the pixels itself, an AVIF file has a tag; a second or no rotation would move corners."""
     quarters = np.kron(np.array([[40, 100], [160, 220]], np.uint8), np.ones((16, 24), np.uint8))
     image = Image.fromarray(quarters).convert("RGB")
     ours, jpeg = (decode_rgb(saved(image, one, exif=exif(orientation), quality=95), one) for one in (kind, "JPEG"))
@@ -46,7 +46,7 @@ def test_a_picture_is_upright_as_the_same_jpeg_is(kind, orientation):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_colour_profile_is_not_applied_as_in_a_jpeg(kind):
+def test_a_colour_profile_is_ignored_like_in_a_jpeg(kind):
     from PIL import ImageCms
 
     profile = ImageCms.ImageCmsProfile(ImageCms.createProfile("LAB")).tobytes()
@@ -63,27 +63,27 @@ def test_a_file_cut_at_any_length_is_refused(kind):
             decode_rgb(data[:length], "x")
 
 
-def test_a_heic_picture_without_its_package_names_the_extra(monkeypatch):
+def test_a_heic_picture_without_its_package_gives_an_error_that_names_the_extra(monkeypatch):
     data = saved(Image.new("RGB", (16, 16)), "HEIF")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     with pytest.raises(ImageError, match=r"photo\.heic: a HEIC picture.*pip install 'touch-retrieval\[heif\]'"):
         decode_rgb(data, "photo.heic")
 
 
-def test_an_avif_picture_where_pillow_was_built_without_says_so(monkeypatch):
+def test_an_avif_picture_and_pillow_without_avif_give_an_error_that_says_so(monkeypatch):
     data = saved(Image.new("RGB", (16, 16)), "AVIF")
     monkeypatch.setattr(features, "check", lambda name: False)
     with pytest.raises(ImageError, match=r"this Pillow was built without AVIF"):
         decode_rgb(data, "photo.avif")
 
 
-def test_a_film_is_no_picture():
-    film = b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom" + bytes(100)
+def test_a_video_is_not_a_picture():
+    video = b"\0\0\0\x18ftypmp42\0\0\0\0mp42isom" + bytes(100)
     with pytest.raises(ImageError, match="not a PNG, JPEG"):
-        decode_rgb(film, "x")
+        decode_rgb(video, "x")
 
 
-def test_a_header_that_asks_for_too_many_pixels_is_refused_before_they_are_decoded(monkeypatch):
+def test_a_header_with_too_many_pixels_is_refused_before_decoding(monkeypatch):
     data = {kind: saved(Image.new("RGB", (64, 64)), kind) for kind in KINDS}
     monkeypatch.setattr(images, "MAX_PIXELS", 64 * 64 - 1)
     for kind in KINDS:

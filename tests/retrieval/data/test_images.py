@@ -1,4 +1,4 @@
-"""Reading pictures, and refusing what is none. Resizing is in test_retrieval_images_resize.py."""
+"""Reading pictures, and refusing other files. Resizing is in test_images_resize.py."""
 
 import contextlib
 import io
@@ -124,7 +124,7 @@ def sample_files():
         ("WEBP", {"lossless": True}),
     ],
 )
-def test_a_lossless_file_gives_back_its_pixels(tmp_path, kind, options):
+def test_a_lossless_file_returns_its_pixels(tmp_path, kind, options):
     pixels = noise(5, 4)
     path = tmp_path / "picture"
     path.write_bytes(saved(Image.fromarray(pixels), kind, **options))
@@ -165,7 +165,7 @@ def test_every_eight_bit_kind_becomes_rgb_on_white(name):
     np.testing.assert_allclose(rgb, np.reshape(expected, (1, 1, 3)), atol=1e-7)
 
 
-def test_a_transparent_palette_entry_is_white_and_the_others_keep_their_colour():
+def test_a_transparent_palette_entry_becomes_white_and_others_keep_their_colour():
     image = Image.new("P", (2, 1))
     image.putpalette([255, 0, 0, 0, 0, 255])
     image.putpixel((1, 0), 1)
@@ -174,7 +174,7 @@ def test_a_transparent_palette_entry_is_white_and_the_others_keep_their_colour()
 
 
 @pytest.mark.parametrize("kind", [".png", ".tiff"])
-def test_sixteen_bit_colour_keeps_its_low_byte_which_pillow_alone_drops(kind):
+def test_sixteen_bit_colour_keeps_the_low_byte_that_pillow_drops(kind):
     pixels = np.array([[[256, 257, 65535], [1, 0, 511]]], np.uint16)
     data = cv2.imencode(kind, np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes()
     np.testing.assert_array_equal(decode_rgb(data, "x"), pixels.astype(np.float32) / 65535)
@@ -182,7 +182,7 @@ def test_sixteen_bit_colour_keeps_its_low_byte_which_pillow_alone_drops(kind):
     np.testing.assert_array_equal(naive[0, 0, :2], [1, 1])
 
 
-def test_sixteen_bit_grey_is_scaled_and_not_clipped_as_pillow_alone_does():
+def test_sixteen_bit_grey_is_scaled_and_not_clipped_like_in_pillow():
     pixels = np.array([[0, 256, 32768, 65535]], np.uint16)
     for data in (png(0, 16, pixels), tiff(pixels[..., None])):
         np.testing.assert_array_equal(decode_rgb(data, "x")[0, :, 1], pixels[0].astype(np.float32) / 65535)
@@ -200,8 +200,8 @@ SIXTEEN_BIT = {
         [[1, 1, 1], [0.8, 0.8, 0.8]],
     ),
     "premultiplied": (tiff(np.array([[[13107, 0, 0, 13107]]], np.uint16), extra_samples=1), [[1, 0.8, 0.8]]),
-    "a fourth sample that is no alpha": (tiff(np.array([[[65535, 0, 0, 0]]], np.uint16), extra_samples=0), [[1, 0, 0]]),
-    "a grey key of which all bits must agree": (keyed(0, [[2000, 2001]], [2000]), [[1] * 3, [2001 / 65535] * 3]),
+    "fourth sample without alpha": (tiff(np.array([[[65535, 0, 0, 0]]], np.uint16), extra_samples=0), [[1, 0, 0]]),
+    "a grey key that matches in all bits": (keyed(0, [[2000, 2001]], [2000]), [[1] * 3, [2001 / 65535] * 3]),
     "a colour key": (
         keyed(2, [[[7, 8, 9], [7, 8, 10]]], [7, 8, 9]),
         [[1] * 3, [7 / 65535, 8 / 65535, 10 / 65535]],
@@ -246,7 +246,7 @@ def test_the_exif_orientation_is_applied_once(orientation, kind):
     np.testing.assert_allclose(decode_rgb(data, "x")[..., 0], np.array(UPRIGHT[orientation]) * scale, atol=1e-6)
 
 
-def test_a_jpeg_that_says_it_lies_on_its_side_stands_up():
+def test_a_jpeg_with_a_rotated_orientation_is_turned_upright():
     left_white = Image.new("L", (32, 16))
     left_white.paste(255, (0, 0, 16, 16))
     rgb = decode_rgb(saved(left_white, "JPEG", exif=exif(6)), "x")
@@ -255,12 +255,12 @@ def test_a_jpeg_that_says_it_lies_on_its_side_stands_up():
 
 
 @pytest.mark.parametrize("orientation", [0, 9, 60000])
-def test_an_orientation_that_does_not_exist_is_none(orientation):
+def test_an_invalid_orientation_is_ignored(orientation):
     data = saved(Image.fromarray(noise(2, 3)), "PNG", exif=exif(orientation))
     assert decode_rgb(data, "x").shape == (2, 3, 3)
 
 
-def test_damaged_exif_does_not_cost_the_picture():
+def test_damaged_exif_does_not_make_a_picture_unreadable():
     data = png(0, 8, [[255]], chunk(b"eXIf", b"II*\0\xff\xff\xff\xff broken"))
     np.testing.assert_array_equal(decode_rgb(data, "x"), np.ones((1, 1, 3)))
 
@@ -268,7 +268,7 @@ def test_damaged_exif_does_not_cost_the_picture():
 # Refusing --------------------------------------------------------------------------------------------------
 
 
-def test_a_missing_file_a_folder_and_a_pipe_are_named_with_the_reason(tmp_path):
+def test_a_missing_file_a_folder_and_a_pipe_give_errors_with_the_reason(tmp_path):
     os.mkfifo(tmp_path / "pipe.png")
     for name, reason in (("none.png", "no such file"), (".", "folder"), ("pipe.png", "not a regular file")):
         with pytest.raises(ImageError, match=reason) as caught:
@@ -277,7 +277,7 @@ def test_a_missing_file_a_folder_and_a_pipe_are_named_with_the_reason(tmp_path):
         assert caught.value.exit_code == 2
 
 
-def test_a_file_that_may_not_be_read_and_one_that_is_too_long_are_named_with_the_reason(tmp_path, monkeypatch):
+def test_an_unreadable_file_and_a_too_long_file_give_errors_with_the_reason(tmp_path, monkeypatch):
     with pytest.raises(ImageError, match="cannot be read"):
         read_rgb("a\0.png")
     (tmp_path / "a.png").write_bytes(b"12345")
@@ -311,14 +311,14 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_usable_picture_is_refused_with_the_reason(name):
+def test_unusable_pictures_are_refused_with_the_reason(name):
     data, reason = REFUSED[name]
     with pytest.raises(ImageError, match=reason) as caught:
         decode_rgb(data, "shot.png")
     assert str(caught.value).startswith("shot.png: ")
 
 
-def test_a_bomb_is_refused_by_its_header_before_it_is_decoded(monkeypatch):
+def test_a_bomb_is_refused_by_its_header_before_decoding(monkeypatch):
     def decoded(self):
         raise AssertionError("decoded")
 
@@ -332,9 +332,9 @@ def jpeg_of(height, width, **options):
     return saved(Image.fromarray(np.broadcast_to(ramp[:, None], (height, width, 3))), "JPEG", **options)
 
 
-@pytest.mark.parametrize(("most", "size"), [(120_000, (300, 400)), (119_999, (150, 200)), (5_000, (38, 50))])
-def test_a_large_jpeg_is_decoded_smaller(monkeypatch, most, size):
-    monkeypatch.setattr(images, "MAX_PIXELS", most)
+@pytest.mark.parametrize(("max_pixels", "size"), [(120_000, (300, 400)), (119_999, (150, 200)), (5_000, (38, 50))])
+def test_a_large_jpeg_is_decoded_smaller(monkeypatch, max_pixels, size):
+    monkeypatch.setattr(images, "MAX_PIXELS", max_pixels)
     image = decode_rgb(jpeg_of(300, 400), "x")
     assert image.shape == (*size, 3)
     assert np.abs(image - np.linspace(0, 1, size[1])[:, None]).max() < 0.02
@@ -367,7 +367,7 @@ def webp_headers(width, height):
     yield b"VP8 " + struct.pack("<I", 10) + bytes(3) + b"\x9d\x01\x2a" + struct.pack("<HH", width, height)
 
 
-def test_a_webp_bomb_is_refused_before_pillow_opens_it_for_opening_allocates(monkeypatch):
+def test_a_webp_bomb_is_refused_before_pillow_opens_it_since_opening_allocates(monkeypatch):
     def opened(*_, **__):
         raise AssertionError("opened")
 
@@ -391,11 +391,11 @@ def test_a_picture_of_the_largest_size_is_read(monkeypatch):
         decode_rgb(saved(Image.new("L", (7, 1)), "PNG"), "x")
 
 
-def test_a_png_chunk_that_claims_gigabytes_does_not_reach_opencv_which_would_allocate_them(monkeypatch):
+def test_a_png_chunk_that_claims_gigabytes_does_not_reach_opencv_since_it_would_allocate_them(monkeypatch):
     data = sample_files()["png 16-bit"]
-    place = data.index(b"IDAT") - 4
-    bomb = data[:place] + b"\x7f" + data[place + 1 :]
-    Image.open(io.BytesIO(bomb)).load()  # Pillow takes it
+    start = data.index(b"IDAT") - 4
+    bomb = data[:start] + b"\x7f" + data[start + 1 :]
+    Image.open(io.BytesIO(bomb)).load()  # Pillow accepts it
     monkeypatch.setattr(cv2, "imdecode", None)
     with pytest.raises(ImageError, match="a PNG chunk is longer than the file"):
         decode_rgb(bomb, "x")
@@ -410,7 +410,7 @@ def test_running_out_of_memory_is_an_image_error(monkeypatch):
         decode_rgb(sample_files()["png"], "x")
 
 
-def test_a_truncated_jpeg_is_refused_which_the_imread_of_opencv_fills_with_grey(tmp_path):
+def test_a_truncated_jpeg_is_refused_although_opencv_fills_it_with_grey(tmp_path):
     data = saved(Image.fromarray(noise(40, 48)), "JPEG")
     path = tmp_path / "half.jpg"
     path.write_bytes(data[: len(data) // 2])
@@ -422,7 +422,7 @@ def test_a_truncated_jpeg_is_refused_which_the_imread_of_opencv_fills_with_grey(
 
 
 @pytest.mark.parametrize("name", sample_files())
-def test_a_file_cut_at_any_length_is_refused_or_gives_the_whole_picture(name):
+def test_a_file_truncated_at_any_length_is_refused_or_gives_the_whole_picture(name):
     data = sample_files()[name]
     whole = decode_rgb(data, name)
     for length in {*range(0, len(data), max(len(data) // 60, 1)), *range(max(len(data) - 30, 0), len(data))}:
@@ -435,7 +435,7 @@ def test_a_file_cut_at_any_length_is_refused_or_gives_the_whole_picture(name):
 
 def check_only_image_errors(data):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(images, "MAX_PIXELS", 1_000_000)  # 50 times faster where a header asks for the most
+        patch.setattr(images, "MAX_PIXELS", 1_000_000)  # 50 times faster for headers with the largest size
         try:
             rgb = decode_rgb(data, "fuzz")
         except ImageError:
@@ -479,16 +479,16 @@ def test_extreme_values_in_the_header_are_an_image_error_or_a_picture(name, plac
     check_only_image_errors(data[:place] + value + data[place + 2 :])
 
 
-def test_threads_that_decode_together_agree_and_leave_the_warning_filters_alone():
-    before, data, found = list(warnings.filters), sample_files()["tiff lzw"], []
-    threads = [threading.Thread(target=lambda: found.append(decode_rgb(data, "x"))) for _ in range(8)]
+def test_threads_that_decode_at_once_agree_and_keep_the_warning_filters():
+    before, data, results = list(warnings.filters), sample_files()["tiff lzw"], []
+    threads = [threading.Thread(target=lambda: results.append(decode_rgb(data, "x"))) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
     assert warnings.filters == before
-    assert len(found) == 8
-    assert all(np.array_equal(first, second) for first, second in pairwise(found))
+    assert len(results) == 8
+    assert all(np.array_equal(first, second) for first, second in pairwise(results))
 
 
 def test_to_float_scales_by_the_type_and_refuses_others():

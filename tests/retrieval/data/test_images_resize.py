@@ -1,4 +1,4 @@
-"""Resizing, background and the settings of both. Expected values by hand or by two plain loops."""
+"""Resizing, background subtraction and their settings. Expected values come from hand or from two plain loops."""
 
 import hashlib
 
@@ -21,7 +21,7 @@ ATOL = 2e-6  # float32 sums over at most a few dozen samples of 0..1
 
 
 def area_by_loops(line, new):
-    """Mean of `line` over each of `new` equal parts, by two plain loops over fractions of samples."""
+    """Return the mean of `line` over each of `new` equal parts, by two plain loops over fractions of samples."""
     scale = len(line) / new
     out = []
     for target in range(new):
@@ -66,7 +66,7 @@ def test_an_axis_that_grows_is_interpolated_between_pixel_centres(old, new, axis
     np.testing.assert_allclose(out[..., 1].ravel(), linear_by_loops(line, new), atol=ATOL)
 
 
-def test_resizing_values_worked_out_by_hand():
+def test_resizing_gives_values_computed_by_hand():
     np.testing.assert_allclose(resize(line_image([0, 0.3, 0.9], 1), (1, 2))[0, :, 0], [0.1, 0.7], atol=ATOL)
     np.testing.assert_allclose(resize(line_image([0, 1], 1), (1, 4))[0, :, 0], [0, 0.25, 0.75, 1], atol=ATOL)
 
@@ -119,7 +119,7 @@ def test_a_picture_resized_in_bands_is_the_same_to_the_bit(shape, monkeypatch):
         (np.zeros((4, 4, 3), np.float32), (0, 2)),
     ],
 )
-def test_what_cannot_be_resized_is_refused(image, size):
+def test_arrays_that_cannot_be_resized_are_refused(image, size):
     with pytest.raises(BadInput, match=r"must be (H x W x 3 float32|at least 1 x 1)"):
         resize(image, size)
 
@@ -131,7 +131,7 @@ def grey(level):
     return to_float(np.full((4, 4, 3), level, np.uint8))
 
 
-def test_every_policy_by_hand():
+def test_every_policy_gives_values_computed_by_hand():
     touch, reference = grey(51), grey(204)
     expected = {"none": 0.2, "difference": -0.6, "difference+0.5": 0.0, "abs": 0.6}
     assert set(expected) == set(BACKGROUNDS)
@@ -142,19 +142,19 @@ def test_every_policy_by_hand():
 
 
 @pytest.mark.parametrize("policy", [policy for policy in BACKGROUNDS if policy != "none"])
-def test_a_missing_reference_says_what_to_give(policy, tmp_path):
+def test_a_missing_reference_is_an_error_that_says_what_to_do(policy, tmp_path):
     with pytest.raises(ConfigError, match='give a reference, or set background = "none"'):
         subtract_background(grey(1), None, policy)
-    with pytest.raises(ConfigError, match="untouched gel"):
+    with pytest.raises(ConfigError, match="no-contact frame"):
         Preprocessing(background=policy).touch(grey(1))
-    with pytest.raises(ConfigError, match="untouched gel"):  # before the file is looked for
+    with pytest.raises(ConfigError, match="no-contact frame"):  # before any file is read
         Preprocessing(background=policy).load_touch(tmp_path / "none.png")
 
 
-def test_unknown_policies_and_other_shapes_are_refused():
+def test_unknown_policies_and_different_shapes_are_refused():
     with pytest.raises(ConfigError, match=r"background must be one of none, difference, difference\+0\.5, abs"):
         subtract_background(grey(1), None, "minus")
-    with pytest.raises(BadInput, match="one shape"):
+    with pytest.raises(BadInput, match="the same shape"):
         subtract_background(grey(1), np.zeros((2, 4, 3), np.float32), "abs")
     with pytest.raises(BadInput, match="uint8"):
         subtract_background(np.zeros((2, 2, 3), np.uint8), None, "none")
@@ -179,7 +179,7 @@ def test_no_reference_is_resized_under_policy_none(monkeypatch):
 # Preprocessing ---------------------------------------------------------------------------------------------
 
 
-def test_photo_and_touch_have_the_sizes_of_the_paper_and_are_not_cropped(tmp_path):
+def test_photo_and_touch_have_the_papers_sizes_and_are_not_cropped(tmp_path):
     wide = np.zeros((240, 320, 3), np.uint8)
     wide[:, 300:] = 255  # a centre crop to a square would lose it
     (tmp_path / "w.png").write_bytes(saved(Image.fromarray(wide), "PNG"))
@@ -190,13 +190,13 @@ def test_photo_and_touch_have_the_sizes_of_the_paper_and_are_not_cropped(tmp_pat
     np.testing.assert_allclose(touch.mean(), 20 / 320, atol=1e-5)
 
 
-def test_the_reference_may_have_another_size_for_it_is_taken_off_after_resizing():
+def test_the_reference_may_have_another_size_since_it_is_subtracted_after_resizing():
     settings_ = Preprocessing(touch_px=2, background="difference")
     reference = to_float(np.full((8, 10, 3), 51, np.uint8))
     np.testing.assert_allclose(settings_.touch(grey(102), reference), 0.2, atol=1e-6)
 
 
-def test_noise_is_averaged_away_before_its_sign_is_dropped():
+def test_noise_averages_out_before_its_sign_is_dropped():
     sign = np.where(np.indices((4, 4)).sum(axis=0) % 2, 1, -1)[..., None]
     noisy = (0.5 + 0.1 * sign * np.ones((4, 4, 3))).astype(np.float32)
     flat = np.full((4, 4, 3), 0.5, np.float32)
@@ -205,12 +205,12 @@ def test_noise_is_averaged_away_before_its_sign_is_dropped():
     np.testing.assert_allclose(naive, 0.1, atol=1e-6)
 
 
-def test_a_nan_does_not_pass():
+def test_a_nan_is_refused():
     broken = np.full((4, 4, 3), 0.5, np.float32)
     broken[1, 1, 1] = np.nan
-    with pytest.raises(NumericalError, match="photo holds a NaN"):
+    with pytest.raises(NumericalError, match="photo contains a NaN"):
         Preprocessing(photo_px=2).photo(broken)
-    with pytest.raises(NumericalError, match="touch holds a NaN"):
+    with pytest.raises(NumericalError, match="touch contains a NaN"):
         Preprocessing(touch_px=4).touch(broken)
 
 
@@ -230,7 +230,7 @@ def test_a_setting_out_of_range_is_refused_by_name(change):
         Preprocessing(**change)
 
 
-def test_the_digest_is_of_the_settings_and_the_version():
+def test_the_digest_depends_on_the_settings_and_the_version():
     text = '{"background": "none", "photo_px": 256, "touch_px": 128, "version": 2}'
     assert Preprocessing().digest() == hashlib.sha256(text.encode()).hexdigest()
     others = {
@@ -241,7 +241,7 @@ def test_the_digest_is_of_the_settings_and_the_version():
     assert len(others | {Preprocessing().digest()}) == 4
 
 
-def test_another_version_is_another_digest(monkeypatch):
+def test_another_version_gives_another_digest(monkeypatch):
     before = Preprocessing().digest()
     monkeypatch.setattr(preprocessing, "PREPROCESSING_VERSION", 1)
     assert Preprocessing().digest() != before

@@ -1,4 +1,4 @@
-"""Troubles of published data sets, each planted in a recording: a check finds it by name, and none in a clean one."""
+"""Known problems of published data sets: each planted problem is found, and a clean recording has no findings."""
 
 import shutil
 
@@ -15,7 +15,7 @@ from tests.retrieval.data.test_check import Broken, one, remarks, swap_photo_and
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory):
-    """8 objects, 3 grasps each with the untouched gels."""
+    """8 objects, 3 grasps each with no-contact frames."""
     folder = tmp_path_factory.mktemp("clean") / "recording"
     return synthetic.write_recording(folder, synthetic.make_objects(8), 3)
 
@@ -29,7 +29,7 @@ def broken(clean, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("column", "what"), [("photo", "the photo"), ("touch_b", "a touch"), ("touch_a_before", "an untouched gel")]
+    ("column", "what"), [("photo", "the photo"), ("touch_b", "a touch"), ("touch_a_before", "a no-contact frame")]
 )
 @pytest.mark.parametrize("level", [0, 128])
 def test_dead_frames_are_named(broken, column, what, level):
@@ -37,10 +37,10 @@ def test_dead_frames_are_named(broken, column, what, level):
         cv2.imwrite(str(broken.file(number, column)), np.full((120, 160, 3), level, np.uint8))
     (finding,) = [finding for finding in broken.findings() if finding.kind == "dead-frame"]
     assert (finding.severity, finding.grasps) == ("error", broken.names((4, 17)))
-    assert finding.message.startswith(f"{what} is of one colour alone, a dead frame, in 2 of 24 grasps: ")
+    assert finding.message.startswith(f"{what} has a single colour (a dead frame) in 2 of 24 grasps: ")
 
 
-def test_a_dead_frame_with_what_jpeg_adds_is_dead_and_a_dark_one_with_noise_is_not(broken):
+def test_a_dead_frame_with_jpeg_noise_is_dead_and_a_dark_frame_with_noise_is_not(broken):
     dark = np.random.default_rng(0).integers(0, 12, (120, 160, 3), dtype=np.uint8)
     cv2.imwrite(str(broken.file(2, "photo")), dark)
     assert [finding for finding in broken.findings() if finding.kind == "dead-frame"] == []
@@ -49,14 +49,14 @@ def test_a_dead_frame_with_what_jpeg_adds_is_dead_and_a_dark_one_with_noise_is_n
     assert finding.grasps == broken.names((2,))
 
 
-def test_a_frozen_sensor_whose_touch_is_the_frame_before_is_named(broken):
+def test_a_frozen_sensor_whose_touch_equals_the_no_contact_frame_is_named(broken):
     broken.file(5, "touch_b").write_bytes(broken.file(5, "touch_b_before").read_bytes())
     severity, kind, message = one(broken.findings())
     assert (severity, kind) == ("error", "frozen-frame")
-    assert message == f"touch and untouched gel are the same image in 1 of 24 grasps: {broken.names((5,))[0]}"
+    assert message == f"touch and no-contact frame are the same image in 1 of 24 grasps: {broken.names((5,))[0]}"
 
 
-def test_a_touch_repeated_within_an_object_is_a_warning_and_a_shared_photo_is_none(broken):
+def test_a_touch_repeated_within_an_object_is_a_warning_and_a_shared_photo_is_not(broken):
     assert broken.rows[3]["object_id"] == broken.rows[5]["object_id"]
     broken.file(5, "touch_a").write_bytes(broken.file(3, "touch_a").read_bytes())
     broken.file(4, "photo").write_bytes(broken.file(3, "photo").read_bytes())
@@ -69,7 +69,7 @@ def test_a_touch_repeated_within_an_object_is_a_warning_and_a_shared_photo_is_no
 
 
 def use_background_of(broken, first):
-    """Every grasp gets the untouched gels of the grasp that `first` (row -> number of a row) names."""
+    """Give every grasp the no-contact frames of another grasp: `first` maps row numbers to row numbers."""
     rows = broken.rows
     for number, row in enumerate(rows):
         for finger in "ab":
@@ -78,48 +78,50 @@ def use_background_of(broken, first):
                 shutil.copyfile(source, broken.folder / row[f"touch_{finger}_before_file_name"])
 
 
-def test_one_background_for_many_objects_is_a_warning_with_its_counts(broken):
+def test_one_background_for_many_objects_is_a_warning_with_counts(broken):
     use_background_of(broken, lambda number: 0)
     severity, kind, message = one(broken.findings())
     assert (severity, kind) == ("warning", "one-background")
-    assert message.startswith("2 frame(s) of the untouched gel serve 24 of 24 grasps, of 8 objects: ")
+    assert message.startswith("2 no-contact frame(s) serve 24 of 24 grasps, of 8 objects: ")
 
 
-def test_a_background_for_each_object_is_no_trouble_and_does_not_pass_for_light_that_names_it(broken):
+def test_one_background_for_each_object_is_no_problem_and_not_reported_as_light(broken):
     use_background_of(broken, lambda number: number - number % 3)
     assert broken.findings() == []
-    assert any("of its own for every grasp" in finding.message for finding in check_recording(broken.folder))
+    assert any("separate no-contact frame" in finding.message for finding in check_recording(broken.folder))
 
 
 # Swapped folders ---------------------------------------------------------------------------------------------
 
 
-def test_a_sequence_whose_folders_are_swapped_is_named_as_a_whole(broken):
-    """As in TVL's first upload: `vision` and `tactile` exchanged below one timestamp."""
+def test_a_sequence_with_swapped_folders_is_named(broken):
+    """TVL's first upload had this problem: `vision` and `tactile` exchanged below one timestamp."""
     broken.change([6, 7, 8, 20], swap_photo_and_touch)
     severity, kind, message = one(broken.findings())
     assert (severity, kind) == ("error", "swapped")
-    whole, other = broken.rows[6]["sequence_id"], broken.rows[20]["sequence_id"]
-    assert message.startswith(f"touch and photo look swapped, throughout the sequence(s) {whole}, in 4 of 24 grasps: ")
+    swapped, other = broken.rows[6]["sequence_id"], broken.rows[20]["sequence_id"]
+    assert message.startswith(
+        f"touch and photo look swapped, throughout the sequence(s) {swapped}, in 4 of 24 grasps: "
+    )
     assert other not in message.split(" in 4 of")[0]
 
 
 # Test sequences in training ----------------------------------------------------------------------------------
 
 
-def film(folder, sequences, frames=6, sequence_ids=True, halves=True):
-    """Frames of videos: one press each, which slides by a pixel a frame under the sensor's noise.
+def write_videos(folder, sequences, frames=6, sequence_ids=True, mixed=True):
+    """Write frames of videos: one press each, which moves by a pixel a frame, with sensor noise.
 
-    halves: every other frame of a video stands under another object, as rows drawn without regard to videos do.
+    With `mixed`, every second frame of a video belongs to another object, as in splits that ignore videos.
     """
     rng = np.random.default_rng(0)
-    with RecordingWriter(folder, {"source": "films", "sensor": "drawn gel"}) as writer:
+    with RecordingWriter(folder, {"source": "videos", "sensor": "drawn gel"}) as writer:
         for sequence, drawn in enumerate(synthetic.make_objects(sequences)):
             press = synthetic.draw_touch(drawn, 0, fingers="a")["a"]
             for frame in range(frames):
                 noise = rng.normal(0, 2, press.shape)
                 touch = np.clip(np.roll(press, frame, axis=1) + noise, 0, 255).astype(np.uint8)
-                part = "odd" if halves and frame % 2 else "even"
+                part = "odd" if mixed and frame % 2 else "even"
                 writer.append(
                     f"{sequence:02d}-{frame}",
                     f"{sequence:02d}-{part}",
@@ -129,42 +131,42 @@ def film(folder, sequences, frames=6, sequence_ids=True, halves=True):
     return folder
 
 
-def torn(folder):
-    """The even frames train, the odd ones test."""
+def split_within_videos(folder):
+    """Return a split with the even frames in training and the odd ones in the test."""
     objects = sorted({grasp.object_id for grasp in load_grasps(folder)})
     even, odd = ([name for name in objects if name.endswith(part)] for part in ("even", "odd"))
     return Split(0, tuple(even), (), tuple(odd))
 
 
-def about_sequences(folder, split):
+def sequence_findings(folder, split):
     return [finding for finding in remarks(folder, split) if finding.kind == "sequences-in-training"]
 
 
-def test_test_sequences_in_training_are_an_error_with_the_share_that_raw_pixels_name(tmp_path):
-    folder = film(tmp_path / "r", 10)
-    (finding,) = about_sequences(folder, torn(folder))
+def test_test_sequences_in_training_are_an_error_with_the_accuracy_of_raw_pixels(tmp_path):
+    folder = write_videos(tmp_path / "r", 10)
+    (finding,) = sequence_findings(folder, split_within_videos(folder))
     assert finding.severity == "error"
     assert finding.message.startswith(
-        "30 of 30 test grasps are of sequences that are trained on, and for 100% of them the nearest training touch by "
-        "raw pixels names the sequence (chance 10%)"
+        "30 of 30 test grasps are of sequences that are also in training, and for 100% of them the nearest training "
+        "touch by raw pixels is of the same sequence (chance 10%)"
     )
 
 
-def test_neighbouring_frames_without_sequence_ids_are_a_warning_with_both_shares(tmp_path):
-    folder = film(tmp_path / "r", 10, sequence_ids=False)
-    (finding,) = about_sequences(folder, torn(folder))
+def test_neighbouring_frames_without_sequence_ids_are_a_warning_with_both_fractions(tmp_path):
+    folder = write_videos(tmp_path / "r", 10, sequence_ids=False)
+    (finding,) = sequence_findings(folder, split_within_videos(folder))
     assert finding.severity == "warning"
     assert int(finding.message.split("%")[0]) > 90
     assert "(0% of the training touches have one)" in finding.message
 
 
 @pytest.mark.parametrize("sequence_ids", [True, False])
-def test_a_split_that_keeps_the_videos_whole_has_no_such_remark(tmp_path, sequence_ids):
-    folder = film(tmp_path / "r", 10, sequence_ids=sequence_ids, halves=False)
+def test_a_split_that_keeps_videos_together_has_no_such_finding(tmp_path, sequence_ids):
+    folder = write_videos(tmp_path / "r", 10, sequence_ids=sequence_ids, mixed=False)
     split = make_split(load_grasps(folder), validation=0.2, test=0.3, seed=0)
-    assert about_sequences(folder, split) == []
+    assert sequence_findings(folder, split) == []
 
 
-def test_touches_of_one_object_that_differ_like_those_of_two_say_nothing(clean):
+def test_touches_of_one_object_that_differ_like_touches_of_two_give_no_finding(clean):
     split = make_split(load_grasps(clean), validation=0.25, test=0.25, seed=0)
-    assert about_sequences(clean, split) == []
+    assert sequence_findings(clean, split) == []

@@ -1,4 +1,4 @@
-"""Which object a photo shows, by its path: `build-index --objects-from`, and what looks wrong about the answer."""
+"""Objects derived from photo paths (`build-index --objects-from`), and warnings about suspicious names."""
 
 import pytest
 from hypothesis import given
@@ -49,34 +49,34 @@ BY_RULE = {
 
 
 @pytest.mark.parametrize("rule", BY_RULE)
-def test_a_rule_names_the_object_of_a_path_or_says_that_it_does_not_fit(rule):
+def test_a_rule_gives_the_object_of_a_path_or_none_where_it_does_not_fit(rule):
     assert {path: Naming(rule).object_of(path) for path in BY_RULE[rule]} == BY_RULE[rule]
 
 
 @pytest.mark.parametrize(
-    ("rule", "said"),
+    ("rule", "message"),
     {
         "": "must be named from folder, stem, or a pattern with {object}",
         "stems": "got 'stems'",
         "{split}/{photo}": "pattern with {object}",
         "object/photo": "pattern with {object}",
         "{Object}": "pattern with {object}",
-        "{object}/{}": "braces in a pattern must hold one word each",
-        "{object}/{a b}": "braces in a pattern must hold one word each",
-        "{object}/{1}": "braces in a pattern must hold one word each",
-        "{object}}": "braces in a pattern must hold one word each",
+        "{object}/{}": "braces in a pattern must contain one word each",
+        "{object}/{a b}": "braces in a pattern must contain one word each",
+        "{object}/{1}": "braces in a pattern must contain one word each",
+        "{object}}": "braces in a pattern must contain one word each",
         "{object}{view}": "must have text between them",
     }.items(),
 )
-def test_a_rule_that_is_none_is_refused_with_what_it_must_be(rule, said):
+def test_an_invalid_rule_is_refused_with_the_valid_forms(rule, message):
     with pytest.raises(BadInput) as raised:
         Naming(rule)
-    assert said in str(raised.value)
+    assert message in str(raised.value)
     assert "{split}/{object}/{photo}" in str(raised.value)
 
 
 @given(rule=st.text("{}object/_.a(", max_size=20), path=st.text("object/_.a1(", min_size=1, max_size=20))
-def test_any_text_is_a_rule_or_refused_and_an_object_is_a_part_of_the_path(rule, path):
+def test_any_text_is_a_rule_or_refused_and_an_object_is_part_of_the_path(rule, path):
     try:
         naming = Naming(rule)
     except BadInput:
@@ -85,41 +85,40 @@ def test_any_text_is_a_rule_or_refused_and_an_object_is_a_part_of_the_path(rule,
     assert name is None or (name and name in path and "/" not in name)
 
 
-# Doubts ----------------------------------------------------------------------------------------------------
+# Warnings --------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["train", "Test", "VAL", "images", "photos", "data"])
-def test_a_folder_called_train_is_warned_of(name):
-    (said,) = naming_warnings({name: 40, "mug": 3}, Naming())
-    assert said.startswith(f"{name} is taken for the name of an object, with 40 photo(s)")
-    assert "--objects-from '{split}/{object}/{photo}'" in said
+def test_a_folder_called_train_gives_a_warning(name):
+    (warning,) = naming_warnings({name: 40, "mug": 3}, Naming())
+    assert warning.startswith(f"{name} is used as the name of an object, with 40 photo(s)")
+    assert "--objects-from '{split}/{object}/{photo}'" in warning
 
 
-def test_names_that_differ_by_a_number_only_are_warned_of_the_harder_where_each_has_one_photo():
-    (said,) = naming_warnings({"mug_0": 1, "mug_1": 1, "cup (1)": 1, "cup (2)": 1, "ball": 1}, Naming())
-    assert said.startswith(
-        "every object has one photo, and 4 of 5 objects have names that differ from another's by a number only: "
+def test_names_that_differ_only_by_a_number_give_a_warning_that_mentions_single_photos():
+    (warning,) = naming_warnings({"mug_0": 1, "mug_1": 1, "cup (1)": 1, "cup (2)": 1, "ball": 1}, Naming())
+    assert warning.startswith(
+        "every object has one photo, and the names of 4 of 5 objects differ from another name only by a number: "
         "cup (1), cup (2), mug_0 and 1 more"
     )
-    (said,) = naming_warnings({"mug_0": 3, "mug_1": 1, "ball": 1}, Naming())
-    assert said.startswith("2 of 3 objects have names that differ")
-    (said,) = naming_warnings({"mug": 1, "mug (2)": 1}, Naming())
-    assert "2 of 2" in said
+    (warning,) = naming_warnings({"mug_0": 3, "mug_1": 1, "ball": 1}, Naming())
+    assert warning.startswith("the names of 2 of 3 objects differ")
+    (warning,) = naming_warnings({"mug": 1, "mug (2)": 1}, Naming())
+    assert "2 of 2" in warning
 
 
-def test_one_object_for_many_photos_is_warned_of():
-    assert naming_warnings({"set": 12}, Naming()) == ["all 12 photos are taken for photos of one object, set"]
+def test_one_object_for_many_photos_gives_a_warning():
+    assert naming_warnings({"set": 12}, Naming()) == ["all 12 photos are assigned to one object, set"]
     assert naming_warnings({"mug": 1}, Naming()) == []
 
 
-def test_what_looks_right_is_not_doubted():
+def test_plausible_names_give_no_warning():
     assert naming_warnings({"mug": 3, "cup": 3, "trainer": 1}, Naming()) == []
-    assert naming_warnings({"1": 3, "2": 3}, Naming()) == []  # a number is a name as good as any
+    assert naming_warnings({"1": 3, "2": 3}, Naming()) == []  # a number is a valid name
     assert naming_warnings({"slab-knurl-20000-00010": 3, "cone-ribs-20000-00015": 3}, Naming()) == []
-    assert (
-        naming_warnings({"mug_1": 2, "mug_2": 2}, Naming("stem")) == []
-    )  # the numbers of mug_1_5.jpg are gone already
+    # The rule stem has already removed the last number of mug_1_5.jpg.
+    assert naming_warnings({"mug_1": 2, "mug_2": 2}, Naming("stem")) == []
 
 
-def test_numbers_of_photos_are_told_by_least_median_and_most():
+def test_the_count_summary_has_minimum_median_and_maximum():
     assert count_summary([4, 1, 1, 2]) == {"min": 1, "median": 1.5, "max": 4}

@@ -1,4 +1,4 @@
-"""Near copies by shape: distances by hand, and where grey levels and hashes of the whole picture fail."""
+"""Near copies by shape: distances computed by plain loops, and distorted copies."""
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from retrieval.data.check.near_copies import (
 
 
 def scene(seed, size=(120, 160)):
-    """A gel of one tint, dark at its edges, with a soft dent of its own."""
+    """Return a gel of one tint, dark at its edges, with a soft random dent."""
     y, x = np.mgrid[-1 : 1 : size[0] * 1j, -1 : 1 : size[1] * 1j]
     dent = cv2.resize(np.random.default_rng(seed).normal(size=(5, 6)), size[::-1], interpolation=cv2.INTER_CUBIC)
     gel = 140 - 30 * (x * x + y * y) + 12 * dent
@@ -28,7 +28,7 @@ def pictures(images):
     return PictureSet([thumbnail(b"", image) for image in images], [f"object {row}" for row in range(len(images))])
 
 
-def test_a_shape_forgets_a_constant_and_any_multiple_of_the_common_picture():
+def test_a_shape_ignores_a_constant_and_any_multiple_of_the_common_picture():
     rng = np.random.default_rng(0)
     grey, common = rng.normal(size=(2, PX**2)).astype(np.float32)
     plain = shapes(grey[None], common)
@@ -46,7 +46,7 @@ def test_a_flip_of_the_thumbnail_is_the_thumbnail_of_the_flip():
         )
 
 
-def test_the_nearest_picture_of_another_object_is_that_of_plain_loops():
+def test_the_nearest_picture_of_another_object_equals_that_of_plain_loops():
     images = [scene(seed) for seed in range(7)]
     all_of_them = pictures(images)
     unit = [shapes(one[None], all_of_them.common)[0] for one in all_of_them.greys]
@@ -62,7 +62,7 @@ def test_the_nearest_picture_of_another_object_is_that_of_plain_loops():
 
 
 @pytest.mark.parametrize("change", [as_jpeg, brighter, shifted, lambda gel: np.ascontiguousarray(gel[::-1])])
-def test_a_changed_copy_is_nearer_than_its_limit_and_no_other_picture_is(change):
+def test_a_distorted_copy_is_within_its_limit_and_no_other_picture_is(change):
     images = [scene(seed) for seed in range(9)]
     copy = change(np.rint(255 * images[2]).astype(np.uint8)).astype(np.float32) / 255
     found = pictures([*images, copy]).nearest(np.arange(10), np.arange(10))
@@ -71,7 +71,7 @@ def test_a_changed_copy_is_nearer_than_its_limit_and_no_other_picture_is(change)
     assert found.checked.all()
 
 
-def test_without_pictures_there_is_nothing_to_find():
+def test_without_pictures_nothing_is_found():
     nothing = np.zeros(0, dtype=np.int64)
     assert len(pictures([]).nearest(nothing, nothing).row) == 0
     found = pictures([scene(0)]).nearest(np.array([0]), nothing)

@@ -1,4 +1,4 @@
-"""Files whose structure costs more than their pixels: refused soon, with one line, before any decoder sees them."""
+"""Files whose structure costs more than their pixels are refused quickly, with one line, before decoding."""
 
 import io
 import time
@@ -42,34 +42,34 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_file_that_costs_more_than_its_pixels_is_refused_in_one_line_before_it_is_decoded(name):
-    make, said = HOSTILE[name]
+def test_a_file_that_costs_more_than_its_pixels_is_refused_with_one_line_before_decoding(name):
+    make, message = HOSTILE[name]
     data = make()
     for read in (decode, picture_size) if name not in ("thin", "flat") else (decode,):
-        begun = time.process_time()
-        with pytest.raises(ImageError, match=said) as error:
+        start = time.process_time()
+        with pytest.raises(ImageError, match=message) as error:
             read(data, "x.png")
-        assert time.process_time() - begun < 0.5
+        assert time.process_time() - start < 0.5
         assert "\n" not in str(error.value)
 
 
-def test_a_film_behind_a_photo_and_a_thumbnail_before_it_are_no_scans_of_it():
+def test_a_video_after_a_photo_and_a_thumbnail_before_it_do_not_count_as_scans():
     thumbnail, photo = io.BytesIO(), io.BytesIO()
     Image.new("RGB", (8, 8)).save(thumbnail, "JPEG")
     Image.new("RGB", (16, 8), "red").save(photo, "JPEG", progressive=True, exif=b"Exif\0\0" + thumbnail.getvalue())
-    film = b"\xff\xda" * 1000
-    assert decode(photo.getvalue() + film, "x").shape == (8, 16, 3)
+    video = b"\xff\xda" * 1000
+    assert decode(photo.getvalue() + video, "x").shape == (8, 16, 3)
 
 
 @pytest.mark.parametrize("scans", [1, 10, MAX_SCANS])
-def test_a_progressive_jpeg_of_as_many_scans_as_encoders_write_is_read(scans):
+def test_a_progressive_jpeg_with_a_usual_number_of_scans_is_read(scans):
     assert decode(jpeg_of_scans(64, scans), "x").shape == (64, 64, 3)
 
 
-def test_scans_that_hide_behind_other_segments_are_counted():
+def test_scans_hidden_behind_other_segments_are_counted():
     data = jpeg_of_scans(64, 60)
     scan = data.rindex(b"\xff\xda")
-    hidden = data[:scan] + b"\xff\xfe\0\4\xff\xd9" + data[scan:]  # a comment that holds the picture's end
+    hidden = data[:scan] + b"\xff\xfe\0\4\xff\xd9" + data[scan:]  # a comment that contains an end-of-image marker
     with pytest.raises(ImageError, match="more than 50 JPEG scans"):
         decode(hidden, "x")
     first = data.index(b"\xff\xda") + 2
@@ -78,7 +78,7 @@ def test_scans_that_hide_behind_other_segments_are_counted():
         decode(many, "x")
 
 
-def test_what_is_just_within_the_bounds_is_read():
+def test_files_just_within_the_bounds_are_read():
     assert decode(jpeg_of_segments(MAX_SEGMENTS - 20), "x").shape == (8, 8, 3)
     stray = jpeg_of_segments(1).replace(b"\xff\xfe\0\2", b"\xff\xfe\0\2" + bytes(MAX_STRAY_BYTES), 1)
     assert decode(stray, "x").shape == (8, 8, 3)
@@ -88,7 +88,7 @@ def test_what_is_just_within_the_bounds_is_read():
     assert decode(png_of_zeros(20_000, 100), "x").shape == (100, 20_000, 3)
 
 
-def test_a_large_picture_is_taken_in_strips_and_is_the_same(monkeypatch):
+def test_a_large_picture_is_copied_in_strips_without_a_difference(monkeypatch):
     samples = np.random.default_rng(0).integers(0, 256, (40, 30, 3), np.uint8)
     for mode in ("RGB", "L", "CMYK", "P"):
         picture, file = Image.fromarray(samples).convert(mode), io.BytesIO()

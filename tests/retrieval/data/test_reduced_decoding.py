@@ -1,4 +1,4 @@
-"""Large JPEG photos decoded no larger than the views of them need: by how much, how far they move, and what stays."""
+"""Large JPEG photos are decoded no larger than their views require: sizes, errors, and unchanged cases."""
 
 import dataclasses
 import io
@@ -17,7 +17,7 @@ from retrieval.search.embeddings import _preprocess
 
 
 def jpeg(height, width, **options):
-    """A smooth picture, whose pixels say where they are."""
+    """Return a smooth JPEG picture whose pixel values encode their positions."""
     down, across = np.mgrid[:height, :width]
     samples = np.stack([255 * down / height, 255 * across / width, np.full(down.shape, 90.0)], axis=2)
     buffer = io.BytesIO()
@@ -27,15 +27,15 @@ def jpeg(height, width, **options):
 
 @pytest.fixture
 def decoded(monkeypatch):
-    """Sizes of what was decoded."""
+    """Sizes of the decoded pictures."""
     sizes = []
 
-    def noted(*given):
-        image = decode(*given)
+    def record(*arguments):
+        image = decode(*arguments)
         sizes.append(image.shape[:2])
         return image
 
-    monkeypatch.setattr(preprocessing, "decode", noted)
+    monkeypatch.setattr(preprocessing, "decode", record)
     return sizes
 
 
@@ -51,12 +51,12 @@ def decoded(monkeypatch):
     ],
 )
 @pytest.mark.parametrize("progressive", [False, True])
-def test_a_jpeg_is_as_small_as_its_shorter_side_may_be(min_side, shape, progressive):
+def test_a_jpeg_is_decoded_as_small_as_its_shorter_side_may_be(min_side, shape, progressive):
     data = jpeg(1200, 1600, progressive=progressive)
     assert decode_rgb(data, "x", min_side).shape[:2] == shape
 
 
-def test_other_formats_and_a_turned_photo_keep_what_they_are():
+def test_other_formats_are_not_reduced_and_a_rotated_photo_is_turned_upright():
     buffer = io.BytesIO()
     Image.new("RGB", (400, 300)).save(buffer, "PNG")
     assert decode_rgb(buffer.getvalue(), "x", 10).shape == (300, 400, 3)
@@ -65,7 +65,7 @@ def test_other_formats_and_a_turned_photo_keep_what_they_are():
     assert decode_rgb(jpeg(1200, 1600, exif=content.tobytes()), "x", 300).shape == (400, 300, 3)
 
 
-def test_a_reduced_pixel_is_nearly_the_mean_of_those_it_stands_for():
+def test_a_reduced_pixel_is_nearly_the_mean_of_its_area():
     data = jpeg(800, 800)
     whole, half = decode_rgb(data, "x"), decode_rgb(data, "x", 400)
     means = whole.reshape(400, 2, 400, 2, 3).mean(axis=(1, 3))
@@ -73,26 +73,26 @@ def test_a_reduced_pixel_is_nearly_the_mean_of_those_it_stands_for():
 
 
 @pytest.mark.parametrize(("views", "side"), [(("whole",), 128), (("zoom",), 256), (("whole", "grey"), 256)])
-def test_views_are_cut_from_as_many_pixels_as_they_show_twice_over(views, side, decoded):
-    """Of 1,024 pixels; a tower sees 32: 64 of the whole (and 128 to look for the object), 64 in 7/16 of the side."""
+def test_views_are_cut_from_twice_as_many_pixels_as_they_have(views, side, decoded):
+    """A tower has 32 pixels: 64 of the whole photo (and 128 for the object search), or 64 in 7/16 of the side."""
     Preprocessing(photo_px=32, views=views, reduced=True).photo_from_bytes(jpeg(1024, 1024), "x")
     assert decoded == [(side, side)]
 
 
-def with_object(side, share):
-    """A photo of a blue square before a plain ground, so large a share of its side."""
+def with_object(side, fraction):
+    """Return a JPEG photo of a blue square on a plain ground; `fraction` is the square's side relative to the photo."""
     samples = np.full((side, side, 3), 190, np.uint8)
-    low, high = round(side * (0.5 - share / 2)), round(side * (0.5 + share / 2))
+    low, high = round(side * (0.5 - fraction / 2)), round(side * (0.5 + fraction / 2))
     samples[low:high, low:high] = (20, 30, 200)
     buffer = io.BytesIO()
     Image.fromarray(samples).save(buffer, "JPEG", quality=95)
     return buffer.getvalue()
 
 
-def test_a_small_object_is_cut_out_of_a_photo_decoded_again_and_a_large_one_of_the_first(decoded):
+def test_a_small_object_needs_a_second_larger_decoding_and_a_large_one_does_not(decoded):
     settings = Preprocessing(photo_px=64, views=("crop",), reduced=True)
     settings.photo_from_bytes(with_object(1024, 0.6), "x")
-    assert decoded == [(128, 128), (256, 256)]  # 1.12 * 0.6 of 128 are 86 pixels, and 128 are wanted
+    assert decoded == [(128, 128), (256, 256)]  # 1.12 * 0.6 of 128 are 86 pixels, and 128 are required
     decoded.clear()
     settings.photo_from_bytes(with_object(1024, 0.96), "x")
     assert decoded == [(128, 128)]
@@ -100,12 +100,12 @@ def test_a_small_object_is_cut_out_of_a_photo_decoded_again_and_a_large_one_of_t
     settings.photo_from_bytes(with_object(1024, 0.12), "x")
     assert decoded == [(128, 128), (1024, 1024)]
     decoded.clear()
-    settings.photo_from_bytes(with_object(200, 0.12), "x")  # the file holds no more
+    settings.photo_from_bytes(with_object(200, 0.12), "x")  # the file has no more pixels
     assert decoded == [(200, 200)]
 
 
 @pytest.mark.parametrize("views", [("whole",), ("crop", "grey")])
-def test_what_is_seen_moves_by_a_few_grey_levels_at_most(views):
+def test_views_change_by_a_few_grey_levels_at_most(views):
     data = with_object(1600, 0.4)
     plain, reduced = (
         Preprocessing(photo_px=64, views=views, reduced=one).photo_from_bytes(data, "x") for one in (False, True)
@@ -113,30 +113,30 @@ def test_what_is_seen_moves_by_a_few_grey_levels_at_most(views):
     assert 0 < np.abs(plain - reduced).mean() < 2 / 255
 
 
-def test_a_model_from_before_decodes_as_before_and_its_digest_is_the_same(decoded):
+def test_an_older_model_decodes_whole_photos_and_keeps_its_digest(decoded):
     settings = Preprocessing(photo_px=32)
     settings.photo_from_bytes(jpeg(1024, 1024), "x")
     assert decoded == [(1024, 1024)]
     tables = Config().to_dict()
     del tables["preprocessing"]["reduced"]
     assert Config.from_dict(tables) == Config()
-    # Of a checkpoint made before there was a choice.
+    # The digest of a checkpoint made before this setting existed.
     assert Preprocessing().digest() == "cf5550cd981a488f563364adb341e62a44c70d1b1b351b39ae77e9a3a8004f6b"
     assert dataclasses.replace(settings, reduced=True).digest() != settings.digest()
 
 
-def test_files_and_bytes_are_seen_alike_and_pictures_in_memory_whole(tmp_path):
+def test_files_and_bytes_give_equal_views_and_decoded_pictures_are_not_reduced(tmp_path):
     settings, data = Preprocessing(photo_px=32, reduced=True), jpeg(1024, 768)
     path = tmp_path / "a.jpg"
     path.write_bytes(data)
-    seen = [_preprocess(photo, "x", settings) for photo in (path, str(path), data, memoryview(data))]
-    for one in (settings.load_photo(path), *seen):
+    prepared = [_preprocess(photo, "x", settings) for photo in (path, str(path), data, memoryview(data))]
+    for one in (settings.load_photo(path), *prepared):
         np.testing.assert_array_equal(one, settings.photo_from_bytes(data, "x"))
     picture = Image.open(io.BytesIO(data))
     np.testing.assert_array_equal(_preprocess(picture, "x", settings), settings.photo(decode_rgb(data, "x")))
 
 
 @pytest.mark.parametrize("length", [0, 30, 700])
-def test_a_truncated_photo_is_refused_reduced_too(length):
+def test_a_truncated_photo_is_refused_with_reduced_decoding_too(length):
     with pytest.raises(ImageError):
         Preprocessing(photo_px=32, reduced=True).photo_from_bytes(jpeg(1024, 1024)[:length], Path("x.jpg"))

@@ -1,4 +1,4 @@
-"""Photos that lie elsewhere: listed, read and embedded as those of a folder are, whatever the storage does."""
+"""Remote photos are listed, read and embedded like those of a folder, even if the storage fails temporarily."""
 
 import io
 import json
@@ -45,14 +45,14 @@ def write_tar(path, members):
 
 
 def contents(catalogue):
-    """{path: (object, metadata, bytes)} of every photo."""
+    """Return {path: (object, metadata, bytes)} of every photo."""
     read = [read_photo(catalogue, photo) for photo in catalogue.photos]
     return {item.photo.path: (item.photo.object_id, item.photo.metadata, item.data) for item in read}
 
 
 @pytest.fixture
 def memory():
-    """An empty object store in this process: its file system."""
+    """The file system of an empty object store in this process."""
     system = fsspec.filesystem("memory")
     system.store.clear()
     yield system
@@ -65,7 +65,7 @@ def put(system, folder, below="/bucket/catalog"):
             system.pipe_file(f"{below}/{path.relative_to(folder)}", path.read_bytes())
 
 
-def test_a_folder_of_an_object_store_is_a_folder(catalogue, memory):
+def test_a_folder_of_an_object_store_is_listed_like_a_local_folder(catalogue, memory):
     put(memory, catalogue)
     memory.pipe_file("/bucket/catalog/.hidden/1.jpg", b"")
     memory.pipe_file("/bucket/catalog/readme.txt", b"")
@@ -81,7 +81,7 @@ def test_a_folder_of_an_object_store_is_a_folder(catalogue, memory):
     assert (listed.ignored, listed.where) == (("readme.txt",), "memory://bucket/catalog")
 
 
-def test_parquet_holds_pictures_or_their_names(catalogue, tmp_path):
+def test_parquet_contains_pictures_or_their_names(catalogue, tmp_path):
     photos = contents(list_catalogue(catalogue))
     own = {path: of for path, (of, _, _) in photos.items()}
     write_parquet(
@@ -94,18 +94,18 @@ def test_parquet_holds_pictures_or_their_names(catalogue, tmp_path):
             "weight": [float("nan")] * len(own),
         },
     )
-    held = contents(list_photos(str(tmp_path / "a.parquet")))
-    assert {path: (of, data) for path, (of, _, data) in held.items()} == {
+    listed = contents(list_photos(str(tmp_path / "a.parquet")))
+    assert {path: (of, data) for path, (of, _, data) in listed.items()} == {
         path: (of, data) for path, (of, _, data) in photos.items()
     }
-    assert [metadata for _, metadata, _ in held.values()] == [{"price": number} for number in range(len(own))]
+    assert [metadata for _, metadata, _ in listed.values()] == [{"price": number} for number in range(len(own))]
     write_parquet(catalogue.parent / "names.parquet", {"file_name": [f"{catalogue.name}/{path}" for path in photos]})
     named = contents(list_photos(str(catalogue.parent / "names.parquet"), Naming("{root}/{object}/{photo}")))
     assert [data for _, _, data in named.values()] == [data for _, _, data in photos.values()]
     assert [of for of, _, _ in named.values()] == list(own.values())
 
 
-def test_a_parquet_file_that_is_refused_half_way_is_listed_once(catalogue, tmp_path, monkeypatch):
+def test_a_parquet_file_that_fails_half_way_is_listed_once(catalogue, tmp_path, monkeypatch):
     photos = contents(list_catalogue(catalogue))
     write_parquet(tmp_path / "a.parquet", {"path": list(photos), "image": [data for _, _, data in photos.values()]})
     real, refusals = sources._parquet_file, [OSError("the storage is busy")]
@@ -137,40 +137,40 @@ def test_a_parquet_file_that_is_refused_half_way_is_listed_once(catalogue, tmp_p
     }
 
 
-def test_of_two_rows_of_one_name_the_first_is_taken_whole(catalogue, tmp_path):
+def test_of_two_rows_with_one_name_the_whole_first_row_is_used(catalogue, tmp_path):
     first, second = [data for _, _, data in contents(list_catalogue(catalogue)).values()][:2]
     rows = {"path": ["mug/1.jpg"] * 2, "image": [first, second], "object_id": ["mug", "tin"]}
     write_parquet(tmp_path / "a.parquet", rows)
     listed = list_photos(str(tmp_path / "a.parquet"))
     assert contents(listed) == {"mug/1.jpg": ("mug", {}, first)}
-    assert [item.reason for item in listed.skipped] == ["comes twice"]
+    assert [item.reason for item in listed.skipped] == ["is listed twice"]
 
 
 def test_pictures_without_a_name_are_named_by_their_row(catalogue, tmp_path):
     data = [item for _, _, item in contents(list_catalogue(catalogue)).values()][:5]
     for part, rows in (("one", data[:3]), ("two", data[3:])):
         write_parquet(tmp_path / f"{part}.parquet", {"image": rows, "object_id": ["mug"] * len(rows)})
-    held = contents(list_photos(f"{tmp_path}/*.parquet"))
-    assert list(held) == [f"one/{row:08d}" for row in range(3)] + [f"two/{row:08d}" for row in range(2)]
-    assert [item for _, _, item in held.values()] == data
+    listed = contents(list_photos(f"{tmp_path}/*.parquet"))
+    assert list(listed) == [f"one/{row:08d}" for row in range(3)] + [f"two/{row:08d}" for row in range(2)]
+    assert [item for _, _, item in listed.values()] == data
 
 
-def test_archives_of_webdataset_hold_pictures_and_what_is_said_of_them(catalogue, tmp_path):
+def test_webdataset_archives_contain_pictures_and_their_metadata(catalogue, tmp_path):
     photos = contents(list_catalogue(catalogue))
     for number, part in enumerate(np.array_split(np.array(list(photos)), 2)):
         members = []
-        for place, path in enumerate(part):
-            members.append((f"{place:04d}.jpg", photos[path][2]))
-            members.append((f"{place:04d}.json", json.dumps({"object_id": photos[path][0], "from": path}).encode()))
+        for row, path in enumerate(part):
+            members.append((f"{row:04d}.jpg", photos[path][2]))
+            members.append((f"{row:04d}.json", json.dumps({"object_id": photos[path][0], "from": path}).encode()))
         write_tar(tmp_path / f"p-{number:03d}.tar", members)
-    held = contents(list_photos(f"{tmp_path}/p-{{000..001}}.tar"))
-    assert len(held) == len(photos)
-    for path, (of, metadata, data) in held.items():
+    listed = contents(list_photos(f"{tmp_path}/p-{{000..001}}.tar"))
+    assert len(listed) == len(photos)
+    for path, (of, metadata, data) in listed.items():
         assert path.startswith(("p-000/", "p-001/"))
         assert (of, data) == (photos[metadata["from"]][0], photos[metadata["from"]][2])
 
 
-def test_names_that_lead_out_of_an_archive_and_twins_are_left_out_and_named(catalogue, tmp_path):
+def test_names_that_lead_out_of_an_archive_and_duplicates_are_skipped_and_named(catalogue, tmp_path):
     data = next(catalogue.rglob("*.jpg")).read_bytes()
     write_tar(
         tmp_path / "a.tar",
@@ -181,34 +181,35 @@ def test_names_that_lead_out_of_an_archive_and_twins_are_left_out_and_named(cata
     assert {item.path: item.reason for item in listed.skipped} == {
         "../up.jpg": "its name leads out of the catalogue",
         "/root/1.jpg": "its name leads out of the catalogue",
-        "mug/1.jpg": "comes twice",
+        "mug/1.jpg": "is listed twice",
     }
 
 
-def test_parquet_files_whose_pictures_are_in_columns_of_their_own_are_refused(tmp_path):
-    """Those of the first were looked for in the column of the last."""
+def test_parquet_files_with_pictures_in_different_columns_are_refused(tmp_path):
+    """Otherwise the first file's pictures would be read from the last file's column."""
     write_parquet(tmp_path / "a.parquet", {"image": [b"1"], "object_id": ["mug"]})
-    for other, said in ({"photo": [b"2"]}, "photo"), ({"path": ["mug/1.jpg"]}, "names of files"):
+    for other, column in ({"photo": [b"2"]}, "photo"), ({"path": ["mug/1.jpg"]}, "names of files"):
         write_parquet(tmp_path / "b.parquet", other)
-        with pytest.raises(DatasetError, match=rf"in one column of all files; .*a\.parquet has image, .*{said}"):
+        message = rf"in the same column of all files; .*a\.parquet has image, .*{column}"
+        with pytest.raises(DatasetError, match=message):
             list_photos(f"{tmp_path}/*.parquet")
 
 
 @pytest.mark.parametrize("ending", ["parquet", "tar"])
 @pytest.mark.parametrize("content", [b"", b"no such format" * 100, b"PAR1" * 10])
-def test_files_that_are_none_are_refused_in_a_sentence(ending, content, tmp_path):
+def test_invalid_files_are_refused_in_one_sentence(ending, content, tmp_path):
     path = tmp_path / f"a.{ending}"
     path.write_bytes(content)
     with pytest.raises(DatasetError, match=r"is not a readable|no photo in the catalogue"):
         list_photos(str(path))
 
 
-def test_a_url_that_nothing_opens_is_refused():
+def test_a_url_without_a_file_system_is_refused():
     with pytest.raises(BadInput, match="nosuch://bucket cannot be opened"):
         list_photos("nosuch://bucket")
 
 
-def test_a_place_without_a_photo_is_refused(memory):
+def test_a_url_without_a_photo_is_refused(memory):
     memory.pipe_file("/bucket/readme.txt", b"")
     with pytest.raises(DatasetError, match=r"no photo \(.*\) in the catalogue memory://bucket, only 1 other files"):
         list_photos("memory://bucket")
@@ -218,21 +219,21 @@ def test_a_place_without_a_photo_is_refused(memory):
 
 
 @pytest.fixture
-def refused(monkeypatch, memory):
-    """The storage refuses every so many-th reading: {"every": n, "times": how often in a row}."""
-    how, calls, plain = {"every": 20, "times": 1}, [], type(memory).cat_file
+def failures(monkeypatch, memory):
+    """Settings of a failing storage: of each `every` readings, the first `times` fail."""
+    settings, calls, plain = {"every": 20, "times": 1}, [], type(memory).cat_file
 
     def cat_file(self, path, start=None, end=None, **kwargs):
         calls.append(path)
-        if (len(calls) - 1) % how["every"] < how["times"]:
+        if (len(calls) - 1) % settings["every"] < settings["times"]:
             raise OSError("503 Slow Down")
         return plain(self, path, start, end, **kwargs)
 
     monkeypatch.setattr(type(memory), "cat_file", cat_file)
-    return how
+    return settings
 
 
-def test_a_storage_that_refuses_one_request_of_twenty_loses_nothing(catalogue, model, memory, refused, tmp_path, index):
+def test_a_storage_that_fails_one_request_in_twenty_loses_nothing(catalogue, model, memory, failures, tmp_path, index):
     put(memory, catalogue)
     report = build_index("memory://bucket/catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
     assert (report.photos, report.skipped) == (24, [])
@@ -241,31 +242,31 @@ def test_a_storage_that_refuses_one_request_of_twenty_loses_nothing(catalogue, m
         np.testing.assert_array_equal(ours.generation.arrays["partials"], theirs.generation.arrays["partials"])
 
 
-def test_a_storage_that_goes_on_refusing_ends_the_build_which_goes_on_later(
-    catalogue, model, memory, refused, tmp_path, embedded
+def test_a_storage_that_keeps_failing_ends_the_build_and_a_later_build_succeeds(
+    catalogue, model, memory, failures, tmp_path, embedded
 ):
     put(memory, catalogue)
-    refused.update(every=40, times=21)
+    failures.update(every=40, times=21)
     listed = list_photos("memory://bucket/catalog")
     assert len(listed.photos) == 24
-    with pytest.raises(RemoteStorageError, match=r"the storage refused 6 times \(OSError: 503 Slow Down\)"):
+    with pytest.raises(RemoteStorageError, match=r"the storage failed 6 times \(OSError: 503 Slow Down\)"):
         read_photo(listed, listed.photos[0])
     checkpoint = load_checkpoint(model)
-    refused.update(every=10**9, times=0)
+    failures.update(every=10**9, times=0)
     build_sharded("memory://bucket/catalog", checkpoint, tmp_path / "c", 2, quiet=True)
     assert sum(embedded) == 24
 
 
-def test_a_photo_that_is_gone_or_broken_is_left_out_and_named(catalogue, model, memory, tmp_path):
+def test_a_photo_that_is_missing_or_broken_is_skipped_and_named(catalogue, model, memory, tmp_path):
     put(memory, catalogue)
     listed = list_photos("memory://bucket/catalog")
     memory.rm_file(f"/bucket/catalog/{listed.photos[0].path}")
     assert read_photo(listed, listed.photos[0]) == SkippedPhoto(listed.photos[0].path, "no such file")
     assert isinstance(read_photo(listed, listed.photos[1]), PhotoBytes)
-    torn = listed.photos[1].path
-    memory.pipe_file(f"/bucket/catalog/{torn}", memory.cat_file(f"/bucket/catalog/{torn}")[:100])
+    truncated = listed.photos[1].path
+    memory.pipe_file(f"/bucket/catalog/{truncated}", memory.cat_file(f"/bucket/catalog/{truncated}")[:100])
     report = build_sharded("memory://bucket/catalog", load_checkpoint(model), tmp_path / "c", 2, quiet=True)
-    assert ([item.path for item in report.skipped], report.photos) == ([torn], 22)
+    assert ([item.path for item in report.skipped], report.photos) == ([truncated], 22)
     assert report.embedded == 22
 
 
@@ -274,7 +275,7 @@ def test_a_photo_that_is_gone_or_broken_is_left_out_and_named(catalogue, model, 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::DeprecationWarning")
-def test_a_catalogue_on_s3_is_built_as_one_on_the_disk(s3_server, catalogue, model, index, tmp_path):
+def test_a_catalogue_on_s3_is_built_like_one_on_disk(s3_server, catalogue, model, index, tmp_path):
     s3.put(catalogue, "photos/catalog")
     report = build_index("s3://photos/catalog", load_checkpoint(model), tmp_path / "index", quiet=True)
     assert (report.photos, report.skipped) == (24, [])

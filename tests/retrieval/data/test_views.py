@@ -1,4 +1,4 @@
-"""Where the object of a photo lies, and what is cut out of the photo around it."""
+"""The object's box in a photo, and the views that are cut out around it."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ GROUND = (0.55, 0.5, 0.45)
 
 
 def photo(*, size=(256, 256), colour=(0.2, 0.4, 0.8), box=(100, 60, 150, 200), shadow=(), noise=0.01, slope=0.0):
-    """A box of one colour on a ground with a little noise; a shadow keeps a third of the light and is bluer."""
+    """Return a photo of a plain box on a ground with a little noise; a shadow is darker and bluer than the ground."""
     rng = np.random.default_rng(0)
     image = np.ones((*size, 3)) * GROUND
     image *= 1 + slope * np.linspace(-1, 1, size[1])[None, :, None]
@@ -32,12 +32,12 @@ def photo(*, size=(256, 256), colour=(0.2, 0.4, 0.8), box=(100, 60, 150, 200), s
     return np.clip(image + rng.normal(0, noise, image.shape), 0, 1).astype(np.float32)
 
 
-def near(found, box, px=6):
-    return np.abs(np.subtract(found, box)).max() <= px
+def near(found, expected, px=6):
+    return np.abs(np.subtract(found, expected)).max() <= px
 
 
 @pytest.mark.parametrize("colour", [(0.2, 0.4, 0.8), (0.95, 0.95, 0.9), (0.05, 0.05, 0.06), (0.7, 0.3, 0.3)])
-def test_the_object_is_what_differs_from_the_ground(colour):
+def test_the_object_differs_from_the_ground(colour):
     assert near(find_object(photo(colour=colour)), (100, 60, 150, 200))
 
 
@@ -45,7 +45,7 @@ def test_a_shadow_is_not_the_object():
     assert near(find_object(photo(shadow=[(150, 150, 240, 200)])), (100, 60, 150, 200))
 
 
-def test_light_that_falls_off_is_not_an_object():
+def test_uneven_light_is_not_an_object():
     assert near(find_object(photo(slope=0.3)), (100, 60, 150, 200))
 
 
@@ -54,13 +54,13 @@ def test_the_box_is_in_the_photos_own_pixels():
     assert near(found, (400, 100, 550, 500), px=16)
 
 
-def test_white_paper_with_a_thing_on_it_needs_no_noise():
+def test_an_object_on_white_paper_is_found_without_noise():
     image = np.ones((200, 200, 3), np.float32)
     image[50:150, 80:120] = 0.4
     assert near(find_object(image), (80, 50, 120, 150))
 
 
-def test_a_photo_without_an_object_is_looked_at_whole():
+def test_a_photo_without_an_object_is_used_whole():
     assert find_object(photo(box=(0, 0, 0, 0))) == (0, 0, 256, 256)
     assert find_object(np.zeros((40, 30, 3), np.float32)) == (0, 0, 30, 40)
 
@@ -78,43 +78,43 @@ def test_any_photo_has_a_box_inside_it(image):
 
 
 def fitted(values, ring=6):
-    """As the docstring of `_off_the_ground` has it, map by map: what lies above the plane, and its scatter."""
+    """Return residuals and scatter of one map, computed as the docstring of `_ground_residuals` describes."""
     side = len(values)
     border = np.ones((side, side), bool)
     border[ring:-ring, ring:-ring] = False
     y, x = np.mgrid[:side, :side] / side - 0.5
-    plane, kept = np.stack([np.ones_like(x), x, y], axis=2), border
+    plane, inliers = np.stack([np.ones_like(x), x, y], axis=2), border
     for _ in range(4):
-        off = values - plane @ np.linalg.lstsq(plane[kept], values[kept], rcond=None)[0]
-        scatter = 1.4826 * np.median(np.abs(off[kept])) + 1e-4
-        kept = border & (np.abs(off) < 3 * scatter)
-    return off, scatter
+        residuals = values - plane @ np.linalg.lstsq(plane[inliers], values[inliers], rcond=None)[0]
+        scatter = 1.4826 * np.median(np.abs(residuals[inliers])) + 1e-4
+        inliers = border & (np.abs(residuals) < 3 * scatter)
+    return residuals, scatter
 
 
-def test_the_ground_is_the_plane_of_least_squares_through_what_of_the_border_scatters_alike():
+def test_the_ground_is_the_least_squares_plane_through_the_inliers_of_the_border():
     rng = np.random.default_rng(0)
     slope = np.linspace(0, 0.2, 128)[None, :, None] * [1, -1, 0.5, 0]
     maps = (1 + slope + rng.normal(0, [0.01, 0.02, 0.03, 0.0], (128, 128, 4))).astype(np.float32).transpose(2, 0, 1)
-    maps[:, 100:, 40:90] += 0.7  # a thing that lies across the border
-    off, scatter = views._ground_residuals(maps)
-    for one, found, by in zip(maps, off, scatter, strict=True):
-        expected, spread = fitted(one.astype(np.float64))
+    maps[:, 100:, 40:90] += 0.7  # an object that touches the border
+    residuals, scatters = views._ground_residuals(maps)
+    for one, found, scatter in zip(maps, residuals, scatters, strict=True):
+        expected, expected_scatter = fitted(one.astype(np.float64))
         np.testing.assert_allclose(found, expected, atol=1e-6)
-        assert by == pytest.approx(spread, rel=1e-4)
-    assert np.abs(off[0, 60:90]).max() < 0.06
-    assert np.abs(off[0, 110:, 50:80]).min() > 0.6
+        assert scatter == pytest.approx(expected_scatter, rel=1e-4)
+    assert np.abs(residuals[0, 60:90]).max() < 0.06
+    assert np.abs(residuals[0, 110:, 50:80]).min() > 0.6
 
 
 @pytest.mark.parametrize("side", [1, 2, 3, 6, 7, 30])
 @pytest.mark.parametrize("middle", [(0, 0), (19, 0), (0, 9), (19, 9), (8, 4)])
-def test_a_square_is_cut_out_pixel_by_pixel_wherever_it_lies(side, middle):
+def test_a_square_is_cut_out_exactly_at_any_position(side, middle):
     image = np.random.default_rng(0).random((10, 20, 3)).astype(np.float32)
     found = crop_square(image, PixelBox(*middle, middle[0] + 1, middle[1] + 1), side)
     left, top = (round(each + 0.5 - side / 2) for each in middle)
     for row in range(side):
         for column in range(side):
-            there = image[min(max(top + row, 0), 9), min(max(left + column, 0), 19)]
-            np.testing.assert_array_equal(found[row, column], there)
+            expected = image[min(max(top + row, 0), 9), min(max(left + column, 0), 19)]
+            np.testing.assert_array_equal(found[row, column], expected)
 
 
 def test_the_grey_view_is_the_zoom_without_its_colours_to_the_bit():
@@ -124,24 +124,24 @@ def test_the_grey_view_is_the_zoom_without_its_colours_to_the_bit():
     np.testing.assert_array_equal(tile_views(image, ("grey",), 48, PixelBox(90, 80, 140, 150)), expected)
 
 
-def test_a_square_goes_on_with_the_edges_pixels():
+def test_a_square_beyond_the_edge_repeats_the_edge_pixels():
     image = np.arange(12, dtype=np.float32).reshape(3, 4, 1).repeat(3, 2)
     found = crop_square(image, PixelBox(0, 0, 1, 1), 3)[..., 0]
     np.testing.assert_array_equal(found, [[0, 0, 1], [0, 0, 1], [4, 4, 5]])
 
 
-def test_views_stand_side_by_side():
+def test_views_are_tiled_side_by_side():
     image = photo()
-    seen = tile_views(image, ("whole", "crop", "zoom", "grey"), 64)
-    assert seen.shape == (64, 256, 3)
-    np.testing.assert_array_equal(seen[:, :64], Preprocessing(photo_px=64).photo(image))
-    crop, zoom, grey = seen[:, 64:128], seen[:, 128:192], seen[:, 192:]
-    blue = [float((view[..., 2] > 0.65).mean()) for view in (seen[:, :64], crop, zoom)]
+    tiles = tile_views(image, ("whole", "crop", "zoom", "grey"), 64)
+    assert tiles.shape == (64, 256, 3)
+    np.testing.assert_array_equal(tiles[:, :64], Preprocessing(photo_px=64).photo(image))
+    crop, zoom, grey = tiles[:, 64:128], tiles[:, 128:192], tiles[:, 192:]
+    blue = [float((view[..., 2] > 0.65).mean()) for view in (tiles[:, :64], crop, zoom)]
     assert blue[2] > blue[1] > blue[0]  # windows of 112, 157 and 256 pixels
     np.testing.assert_allclose(grey, zoom.mean(axis=2, keepdims=True).repeat(3, 2), atol=1e-6)
 
 
-def test_the_zoom_has_one_scale_whatever_the_objects_size():
+def test_the_zoom_has_one_scale_for_all_object_sizes():
     def stripes(box):
         image = photo(box=box)
         left, top, right, bottom = box
@@ -156,18 +156,18 @@ def test_the_zoom_has_one_scale_whatever_the_objects_size():
 
 
 @pytest.mark.parametrize("names", [(), ("whole", "whole"), ("macro",)])
-def test_views_are_known_and_differ(names):
+def test_unknown_and_repeated_views_are_refused(names):
     with pytest.raises(ConfigError, match="views must be some of whole, crop, zoom, grey"):
         Preprocessing(views=names)
 
 
-def test_what_was_made_before_views_still_matches():
+def test_the_digest_of_the_whole_view_equals_that_of_older_settings():
     assert Preprocessing().digest() == Preprocessing(views=("whole",)).digest()
     assert Preprocessing().digest() != Preprocessing(views=("zoom",)).digest()
     assert Preprocessing(views=("crop", "zoom")).digest() != Preprocessing(views=("zoom", "crop")).digest()
 
 
-def test_views_come_back_from_a_file():
+def test_views_can_be_read_from_a_file():
     made = Config(preprocessing=Preprocessing(views=("zoom", "grey")))
     table = made.to_dict()
     table["preprocessing"]["views"] = list(table["preprocessing"]["views"])
@@ -186,7 +186,7 @@ def test_a_photos_features_are_those_of_its_views_side_by_side():
     assert matcher.head.photo_partial.in_features == found.shape[1]
 
 
-def test_a_sheet_shows_what_the_model_sees_of_a_catalogue(tmp_path, model, catalogue, capsys):
+def test_a_sheet_shows_the_views_of_a_catalogue(tmp_path, model, catalogue, capsys):
     words = ["build-index", str(catalogue), "--model", str(model), "--out", str(tmp_path / "index")]
     assert main([*words, "--preview"]) == 0
     sheet = tmp_path / "index-views.png"

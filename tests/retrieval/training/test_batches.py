@@ -1,4 +1,4 @@
-"""Batches of pairs over distinct images: what sharing them leaves as it was."""
+"""Batches of pairs over distinct images: shared images give the same gradients."""
 
 import dataclasses
 import threading
@@ -25,14 +25,14 @@ PAPER = dataclasses.replace(
 
 @pytest.fixture
 def loaded(recording):
-    """Three touches with two photos of their objects and two of others', the photos shared, and their images."""
+    """A loaded batch of three touches, each with two matching and two other photos, with shared photos."""
     sampler = PairSampler(load_grasps(recording), seed=0, positives=2, negatives=2, share_photos=True)
     with TrainedFeatures(PAPER, torch.device("cpu")) as source:
         return source.prepare(None, sampler.batch(0, 3)).result()
 
 
 def new_matcher():
-    """In training mode but for the batch normalisation, which keeps to its running statistics."""
+    """Return a matcher in training mode, with fixed running statistics in batch normalisation."""
     torch.manual_seed(0)
     matcher = Matcher(dataclasses.replace(PAPER.matcher, standardise=False))
     set_training_mode(matcher, PAPER.training)
@@ -46,18 +46,18 @@ def gradients(matcher, backward):
 
 
 def difference(one, other):
-    """Largest difference of two gradients, as a share of each tensor's largest entry."""
+    """Return the largest difference of two gradients, relative to each tensor's largest entry."""
     return max(float((one[name] - other[name]).abs().max() / one[name].abs().max().clamp(min=1e-12)) for name in one)
 
 
 def shared_images(matcher, loaded):
-    """What a training step does: each distinct image through its tower once."""
+    """Compute gradients like a training step: each distinct image passes through its tower once."""
     touch, photo = matcher.touch_features(loaded.touches), matcher.photo_features(loaded.photos)
     batch_loss(matcher, WeightedLosses(PAPER.training.weights, matcher, 9), loaded.batch, touch, photo)[0].backward()
 
 
 def pair_by_pair(matcher, loaded):
-    """The plain way: one touch and one photo at a time, the gradients added up."""
+    """Sum the gradients of one touch and one photo at a time."""
     batch = loaded.batch
     for touch, photo, label in zip(batch.touch_index, batch.photo_index, batch.labels, strict=True):
         logit = matcher(loaded.touches[touch][None], loaded.photos[photo][None])
@@ -65,7 +65,7 @@ def pair_by_pair(matcher, loaded):
 
 
 def test_shared_images_give_the_gradients_of_one_pair_at_a_time(loaded):
-    """With running statistics: in training batch normalisation makes a photo's features depend on its batch."""
+    """Running statistics are fixed, since batch statistics would make a photo's features depend on its batch."""
     matcher = new_matcher()
     one, other = (gradients(matcher, lambda way=way: way(matcher, loaded)) for way in (shared_images, pair_by_pair))
     assert one.keys() == other.keys()
@@ -73,22 +73,22 @@ def test_shared_images_give_the_gradients_of_one_pair_at_a_time(loaded):
     assert max(float(grad.abs().max()) for grad in one.values()) > 1e-4
 
 
-def test_a_batch_is_loaded_on_another_thread_while_its_caller_goes_on(recording):
-    """A step that loaded its own images would wait for each of them."""
+def test_a_batch_is_loaded_on_another_thread_while_its_caller_continues(recording):
+    """A step that loads its own images would wait for each of them."""
     batch = PairSampler(load_grasps(recording), seed=0).batch(0, 2)
-    go_on, threads = threading.Event(), set()
+    proceed, threads = threading.Event(), set()
     with TrainedFeatures(PAPER, torch.device("cpu")) as source:
         load = source._photo
 
         def waiting(path):
             threads.add(threading.current_thread())
-            assert go_on.wait(10)
+            assert proceed.wait(10)
             return load(path)
 
         source._photo = waiting
         upcoming = source.prepare(None, batch)
         assert not upcoming.done()
-        go_on.set()
+        proceed.set()
         assert len(upcoming.result().photos) == len(batch.photos)
     assert threading.main_thread() not in threads
 

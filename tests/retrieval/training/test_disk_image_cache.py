@@ -1,4 +1,4 @@
-"""Images decoded once and kept: to the bit what decoding gives, and what changed or broke is decoded again."""
+"""The disk image cache: its images equal decoded ones bit for bit, and changed or damaged ones are decoded again."""
 
 import dataclasses
 import shutil
@@ -34,14 +34,14 @@ def _small_parts(monkeypatch):
 
 @pytest.fixture
 def photos(recording, tmp_path):
-    """Twelve photos of a recording, to change: a tuple of files for each."""
+    """Twelve photos in a copy of a recording: a tuple of files for each."""
     folder = shutil.copytree(recording, tmp_path / "copy")
     return [(grasp.photo,) for grasp in load_grasps(folder)[:12]]
 
 
 @pytest.fixture
 def decoded(monkeypatch):
-    """The photo files that were decoded, in order."""
+    """The photo files that are decoded, in order."""
     files, load = [], Preprocessing.load_photo
 
     def counting(self, path):
@@ -52,8 +52,8 @@ def decoded(monkeypatch):
     return files
 
 
-def cache_decoded(folder, photos, seen=TINY.preprocessing):
-    images = DiskImageCache(seen.load_photo, folder, "photo", seen.digest())
+def cache_decoded(folder, photos, preprocessing=TINY.preprocessing):
+    images = DiskImageCache(preprocessing.load_photo, folder, "photo", preprocessing.digest())
     images.cache_decoded(photos, quiet=True)
     return images
 
@@ -67,23 +67,23 @@ def batch_of(recording, config, folder=None):
 
 
 @pytest.mark.parametrize("background", ["none", "difference"])
-def test_a_batch_of_kept_images_is_that_of_decoded_ones_to_the_bit(recording, tmp_path, background):
-    seen = dataclasses.replace(TINY.preprocessing, background=background)
-    config = dataclasses.replace(TINY, preprocessing=seen)
-    plain, ours = batch_of(recording, config), batch_of(recording, config, tmp_path / "kept")
+def test_a_batch_of_cached_images_equals_one_of_decoded_images_bit_for_bit(recording, tmp_path, background):
+    preprocessing = dataclasses.replace(TINY.preprocessing, background=background)
+    config = dataclasses.replace(TINY, preprocessing=preprocessing)
+    plain, ours = batch_of(recording, config), batch_of(recording, config, tmp_path / "cache")
     assert torch.equal(plain.touches, ours.touches)
     assert torch.equal(plain.photos, ours.photos)
     assert plain.photos.stride() == ours.photos.stride()
-    rounded = torch.round(plain.photos * 255) / 255  # what eight bits would have kept
+    rounded = torch.round(plain.photos * 255) / 255  # eight bits would store these values
     assert 0 < (rounded - plain.photos).abs().max() <= 0.5001 / 255
 
 
 @pytest.mark.slow
-def test_a_training_on_kept_images_ends_bit_for_bit_where_another_ends(recording, tmp_path, decoded):
+def test_a_training_on_cached_images_gives_the_same_bits(recording, tmp_path, decoded):
     train(recording, tmp_path / "plain.safetensors", TINY, quiet=True)
-    train(recording, tmp_path / "first.safetensors", TINY, cache=tmp_path / "kept", quiet=True)
+    train(recording, tmp_path / "first.safetensors", TINY, cache=tmp_path / "cache", quiet=True)
     decoded.clear()
-    train(recording, tmp_path / "second.safetensors", TINY, cache=tmp_path / "kept", quiet=True)
+    train(recording, tmp_path / "second.safetensors", TINY, cache=tmp_path / "cache", quiet=True)
     assert not decoded
     plain, first, second = (read_tensors(tmp_path / f"{name}.safetensors")[0] for name in ("plain", "first", "second"))
     assert plain.keys() == first.keys() == second.keys()
@@ -92,35 +92,35 @@ def test_a_training_on_kept_images_ends_bit_for_bit_where_another_ends(recording
         assert torch.equal(tensor, second[name]), name
 
 
-def test_relief_is_learned_from_kept_pictures_as_from_others(quick, tmp_path, monkeypatch):  # noqa: F811
+def test_pretraining_on_cached_pictures_gives_the_same_weights(quick, tmp_path, monkeypatch):  # noqa: F811
     folder = write_pictures(tmp_path / "pictures", "touch")
     relief.train_relief(folder, tmp_path / "plain.safetensors", RELIEF, iterations=3, quiet=True)
     for _ in range(2):
-        out = tmp_path / "kept.safetensors"
-        relief.train_relief(folder, out, RELIEF, iterations=3, cache=tmp_path / "kept", quiet=True)
+        out = tmp_path / "cached.safetensors"
+        relief.train_relief(folder, out, RELIEF, iterations=3, cache=tmp_path / "cache", quiet=True)
         plain, ours = read_tensors(tmp_path / "plain.safetensors")[0], read_tensors(out)[0]
         assert all(torch.equal(plain[name], ours[name]) for name in plain)
         monkeypatch.setattr(Preprocessing, "load_touch", lambda *_: pytest.fail("decoded again"))
 
 
-def test_of_a_changed_recording_the_changed_part_alone_is_decoded_again(photos, tmp_path, decoded):
-    cache_decoded(tmp_path / "kept", photos)
+def test_only_the_changed_part_of_a_recording_is_decoded_again(photos, tmp_path, decoded):
+    cache_decoded(tmp_path / "cache", photos)
     (changed,), (other,) = photos[6], photos[11]
     changed.write_bytes(other.read_bytes())
     decoded.clear()
-    images = cache_decoded(tmp_path / "kept", photos)
+    images = cache_decoded(tmp_path / "cache", photos)
     assert set(decoded) == {path for (path,) in photos[5:10]}
     np.testing.assert_array_equal(images(changed), LOAD(other))
 
 
-def test_another_preprocessing_is_another_image(photos, tmp_path):
-    cache_decoded(tmp_path / "kept", photos)
+def test_another_preprocessing_gives_another_image(photos, tmp_path):
+    cache_decoded(tmp_path / "cache", photos)
     wider = dataclasses.replace(TINY.preprocessing, photo_px=64)
-    assert cache_decoded(tmp_path / "kept", photos, wider)(*photos[0]).shape == (64, 64, 3)
+    assert cache_decoded(tmp_path / "cache", photos, wider)(*photos[0]).shape == (64, 64, 3)
 
 
-def test_what_was_interrupted_goes_on_with_whole_parts(photos, tmp_path, monkeypatch, decoded):
-    folder, count = tmp_path / "kept", []
+def test_an_interrupted_job_continues_with_complete_parts(photos, tmp_path, monkeypatch, decoded):
+    folder, count = tmp_path / "cache", []
 
     def failing(path):
         count.append(path)
@@ -140,8 +140,8 @@ def test_what_was_interrupted_goes_on_with_whole_parts(photos, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("harm", ["cut", "empty", "of others", "pickled", "folder"])
-def test_a_damaged_part_is_decoded_again_and_said(photos, tmp_path, caplog, harm):
-    folder = tmp_path / "kept"
+def test_a_damaged_part_is_decoded_again_with_a_warning(photos, tmp_path, caplog, harm):
+    folder = tmp_path / "cache"
     cache_decoded(folder, photos)
     part = min(folder.iterdir())
     data = part.read_bytes()
@@ -166,82 +166,82 @@ def test_a_damaged_part_is_decoded_again_and_said(photos, tmp_path, caplog, harm
         np.testing.assert_array_equal(images(path), LOAD(path))
 
 
-def test_an_image_that_was_not_kept_is_loaded(photos, tmp_path):
-    images = cache_decoded(tmp_path / "kept", photos[:3])
+def test_an_image_that_is_not_cached_is_loaded(photos, tmp_path):
+    images = cache_decoded(tmp_path / "cache", photos[:3])
     np.testing.assert_array_equal(images(*photos[7]), LOAD(*photos[7]))
 
 
 def test_few_images_are_in_memory_while_a_part_is_written(photos, tmp_path, monkeypatch):
-    alive, most = [], []
+    alive, counts = [], []
     monkeypatch.setattr(disk_image_cache, "_AHEAD", 2)
 
-    class Noted(np.ndarray):
+    class Tracked(np.ndarray):
         def __del__(self):
             alive.pop()
 
     def load(path):
         alive.append(path)
-        most.append(len(alive))
-        return LOAD(path).view(Noted)
+        counts.append(len(alive))
+        return LOAD(path).view(Tracked)
 
-    DiskImageCache(load, tmp_path / "kept", "photo", "noted").cache_decoded(photos, quiet=True)
-    assert max(most) <= 4
+    DiskImageCache(load, tmp_path / "cache", "photo", "tracked").cache_decoded(photos, quiet=True)
+    assert max(counts) <= 4
 
 
-def test_a_disk_without_room_is_refused_before_anything_is_written(photos, tmp_path, monkeypatch):
+def test_a_disk_without_space_is_refused_before_anything_is_written(photos, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(10**12, 10**12, 331_775))
-    with pytest.raises(BadInput, match=r"must have room for 0.00 GB for 12 decoded images"):  # of 27,648 bytes each
-        cache_decoded(tmp_path / "kept", photos)
-    assert not (tmp_path / "kept").exists()
+    with pytest.raises(BadInput, match=r"needs 0.00 GB for 12 decoded images"):  # of 27,648 bytes each
+        cache_decoded(tmp_path / "cache", photos)
+    assert not (tmp_path / "cache").exists()
     monkeypatch.setattr(shutil, "disk_usage", lambda folder: shutil._ntuple_diskusage(10**12, 10**12, 331_776))
-    cache_decoded(tmp_path / "kept", photos)
+    cache_decoded(tmp_path / "cache", photos)
 
 
-def test_the_size_is_said_before_and_nothing_where_all_is_there(photos, tmp_path, capsys):
-    for said in (True, False):
-        DiskImageCache(LOAD, tmp_path / "kept", "photo", "").cache_decoded(photos)
-        assert ("kept takes 0.00 GB for 12 decoded images (photo)" in capsys.readouterr().err) == said
+def test_the_size_is_printed_only_if_something_must_be_decoded(photos, tmp_path, capsys):
+    for expected in (True, False):
+        DiskImageCache(LOAD, tmp_path / "cache", "photo", "").cache_decoded(photos)
+        assert ("cache takes 0.00 GB for 12 decoded images (photo)" in capsys.readouterr().err) == expected
 
 
-def test_a_missing_picture_is_an_error_in_a_sentence(photos, tmp_path):
+def test_a_missing_picture_is_an_error_in_one_sentence(photos, tmp_path):
     photos[4][0].unlink()
     with pytest.raises(DatasetError, match=r"cannot be read .*run `retrieve check`"):
-        cache_decoded(tmp_path / "kept", photos)
+        cache_decoded(tmp_path / "cache", photos)
 
 
-def test_ranks_share_the_decoding(photos, tmp_path, monkeypatch, decoded):
-    """The first one finds what the second made meanwhile."""
-    folder, counts = tmp_path / "kept", []
+def test_ranks_distribute_the_decoding(photos, tmp_path, monkeypatch, decoded):
+    """The first rank finds the part that the second one wrote."""
+    folder, counts = tmp_path / "cache", []
     monkeypatch.setattr(distributed, "world_size", lambda: 2)
 
     def second_rank(*_):
         counts.append(len(decoded))
-        with monkeypatch.context() as there:
-            there.setattr(distributed, "rank", lambda: 1)
-            there.setattr(distributed, "any_rank", lambda *_: False)
+        with monkeypatch.context() as second:
+            second.setattr(distributed, "rank", lambda: 1)
+            second.setattr(distributed, "any_rank", lambda *_: False)
             cache_decoded(folder, photos)
         counts.append(len(decoded))
         return False
 
     monkeypatch.setattr(distributed, "any_rank", second_rank)
     cache_decoded(folder, photos)
-    asked_for_size = 1
-    assert counts == [asked_for_size + 7, 2 * asked_for_size + 12]  # parts of 5 and 2, then the one of 5
+    for_size = 1  # each rank decodes one image to compute the size
+    assert counts == [for_size + 7, 2 * for_size + 12]  # parts of 5 and 2, then the part of 5
     assert len(decoded) == counts[1]
 
 
-def test_frozen_towers_and_gates_take_no_cache(recording, tmp_path, capsys):
-    with pytest.raises(ConfigError, match="look at each once"):
-        train(recording, tmp_path / "m.safetensors", with_training(TINY, freeze_towers=True), cache=tmp_path / "kept")
-    words = ["train", str(recording), "--out", str(tmp_path / "gate.safetensors"), "--cache", str(tmp_path / "kept")]
+def test_frozen_towers_and_gates_accept_no_cache(recording, tmp_path, capsys):
+    with pytest.raises(ConfigError, match="read each image once"):
+        train(recording, tmp_path / "m.safetensors", with_training(TINY, freeze_towers=True), cache=tmp_path / "cache")
+    words = ["train", str(recording), "--out", str(tmp_path / "gate.safetensors"), "--cache", str(tmp_path / "cache")]
     assert main([*words, "--task", "grasp-success"]) == 2
     assert "--cache is of matchers" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_two_ranks_keep_images_for_each_other(recording, settings, tmp_path):  # noqa: F811
+def test_two_ranks_cache_images_for_each_other(recording, settings, tmp_path):  # noqa: F811
     words = command(recording, tmp_path / "m.safetensors", settings(), 2)
-    done = subprocess.run([*words, "--cache", str(tmp_path / "kept")], env=ENVIRONMENT, capture_output=True, text=True)
+    done = subprocess.run([*words, "--cache", str(tmp_path / "cache")], env=ENVIRONMENT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    kinds = [path.name.split("-")[0] for path in (tmp_path / "kept").iterdir()]
+    kinds = [path.name.split("-")[0] for path in (tmp_path / "cache").iterdir()]
     assert (kinds.count("photo"), kinds.count("touch")) == (1, 1)

@@ -1,4 +1,4 @@
-"""Teaching the candidate_encoder: its loss, its data, that it finds the classifier's winner, and that nothing else changes."""
+"""Distillation of the candidate encoder: its loss, its data, its agreement with exhaustive search, and invariants."""
 
 import dataclasses
 import itertools
@@ -26,7 +26,7 @@ WITHOUT_CANDIDATE_ENCODER = MatcherConfig(tower="small", fingers=1, hidden=HIDDE
 
 @pytest.fixture
 def matcher():
-    """Its head says how far apart touch and photo are: minus the sum of |t - v|, each as relu(t - v) + relu(v - t)."""
+    """A matcher whose head returns minus the sum of |t - v|, each as relu(t - v) + relu(v - t)."""
     torch.manual_seed(3)
     matcher = Matcher(WITHOUT_CANDIDATE_ENCODER).eval()
     with torch.no_grad():
@@ -45,10 +45,10 @@ def _small_batches(monkeypatch):
 
 
 def drawn(count, seed, sign):
-    """Partials that vary in two directions, as a tower's vary in few: of touches with sign 1, of photos with -1."""
+    """Return partial activations that vary in two directions, of touches (sign 1) or photos (sign -1)."""
     directions = torch.randn(2, HIDDEN // 2, generator=torch.Generator().manual_seed(4))
-    seen = torch.randn(count, 2, generator=torch.Generator().manual_seed(seed)) @ directions
-    return sign * torch.cat([seen, -seen], dim=1)
+    values = torch.randn(count, 2, generator=torch.Generator().manual_seed(seed)) @ directions
+    return sign * torch.cat([values, -values], dim=1)
 
 
 @pytest.fixture
@@ -56,8 +56,8 @@ def partials():
     return drawn(60, 5, sign=1), drawn(400, 6, sign=-1)
 
 
-def taught(matcher, partials, steps=5, seed=0, **given):
-    distil.distil(matcher, *partials, width=32, steps=steps, seed=seed, quiet=True, **given)
+def distilled(matcher, partials, steps=5, seed=0, **options):
+    distil.distil(matcher, *partials, width=32, steps=steps, seed=seed, quiet=True, **options)
     return {name: tensor.clone() for name, tensor in matcher.candidate_encoder.state_dict().items()}
 
 
@@ -68,35 +68,35 @@ def same(left, right):
 # The loss --------------------------------------------------------------------------------------------------
 
 
-def test_the_loss_is_nothing_for_scores_that_are_the_logits_up_to_a_constant_of_each_touch():
+def test_the_loss_is_zero_for_scores_that_equal_the_logits_up_to_a_constant_per_touch():
     logits = torch.tensor([[3.0, -1.0, 0.5], [200.0, -200.0, 0.0]])
     loss = distil.distillation_loss(logits + torch.tensor([[7.0], [-20.0]]), logits)
     torch.testing.assert_close(loss, torch.tensor(0.0), rtol=0, atol=1e-5)
 
 
-def test_the_loss_is_the_divergence_and_a_share_of_the_error_by_hand():
+def test_the_loss_is_the_divergence_plus_the_weighted_error():
     scores, logits = np.array([[0.0, 1.0], [2.0, 2.0]]), np.array([[1.0, 0.0], [3.0, 5.0]])
-    chances = [np.exp(row) / np.exp(row).sum() for row in logits]
-    other = [np.exp(row) / np.exp(row).sum() for row in scores]
-    divergence = np.mean([(p * np.log(p / q)).sum() for p, q in zip(chances, other, strict=True)])
+    targets = [np.exp(row) / np.exp(row).sum() for row in logits]
+    student = [np.exp(row) / np.exp(row).sum() for row in scores]
+    divergence = np.mean([(p * np.log(p / q)).sum() for p, q in zip(targets, student, strict=True)])
     centred = [row - row.mean() for row in scores], [row - row.mean() for row in logits]
     error = np.mean((np.array(centred[0]) - np.array(centred[1])) ** 2) / logits.var(ddof=1)
     loss = distil.distillation_loss(torch.tensor(scores), torch.tensor(logits))
     assert loss.item() == pytest.approx(divergence + distil.SPREAD_WEIGHT * error)
 
 
-def test_logits_that_lie_far_apart_have_a_finite_loss_where_probabilities_have_none():
+def test_the_loss_is_finite_for_distant_logits_although_probabilities_give_nan():
     scores, logits = torch.tensor([[-300.0, 300.0]]), torch.tensor([[300.0, -300.0]])
-    chances = logits.softmax(1)
-    assert (chances * (chances / scores.softmax(1)).log()).sum().isnan()
+    targets = logits.softmax(1)
+    assert (targets * (targets / scores.softmax(1)).log()).sum().isnan()
     assert distil.distillation_loss(scores, logits).item() > 600
 
 
-def test_a_loss_that_is_not_finite_is_told_and_the_matcher_stays_as_it_was(matcher, partials):
+def test_a_loss_that_is_not_finite_is_an_error_and_the_matcher_is_unchanged(matcher, partials):
     with torch.no_grad():
         matcher.head.out.bias.fill_(torch.inf)
     with pytest.raises(NumericalError, match="loss must stay finite"):
-        taught(matcher, partials)
+        distilled(matcher, partials)
     assert matcher.candidate_encoder is None
     assert matcher.config == WITHOUT_CANDIDATE_ENCODER
 
@@ -134,67 +134,66 @@ def test_every_touch_is_scored_with_every_photo(matcher, partials):
         torch.testing.assert_close(table[row, column], one[0], rtol=1e-5, atol=1e-6)
 
 
-def test_what_is_distilled_after_the_start_lies_nearer_to_the_touches_than_what_is_drawn(matcher, partials):
-    taught(matcher, partials)
-    crowd = distil._PhotoSampler(
+def test_photos_of_the_pool_are_nearer_to_the_touches_than_random_blends(matcher, partials):
+    distilled(matcher, partials)
+    sampler = distil._PhotoSampler(
         matcher.candidate_encoder, partials[1], lambda rows: rows, torch.Generator().manual_seed(2)
     )
-    drawn_alone = crowd.photos(-1, partials[0][:16])
-    best_params = crowd.photos(0, partials[0][:16])
-    assert drawn_alone.shape == best_params.shape == (256, HIDDEN)
+    random_only = sampler.photos(-1, partials[0][:16])
+    with_pool = sampler.photos(0, partials[0][:16])
+    assert random_only.shape == with_pool.shape == (256, HIDDEN)
     touches = matcher.candidate_encoder.touch(partials[0][:16])
-    best = [
+    similarity = [
         (touches @ matcher.candidate_encoder.photo(photos).T).topk(12).values.mean().item()
-        for photos in (drawn_alone, best_params)
+        for photos in (random_only, with_pool)
     ]
-    assert best[1] > best[0]
-    pool = crowd._pool.of(partials[1], torch.arange(distil.POOL_SIZE))
+    assert similarity[1] > similarity[0]
+    pool = sampler._pool.of(partials[1], torch.arange(distil.POOL_SIZE))
     nearest = (touches @ matcher.candidate_encoder.photo(pool).T).topk(12).values
-    assert best[1] >= nearest.mean().item() - 1e-6  # those of the pool are all there
-    crowd.photos(1, partials[0][:16])
-    assert torch.equal(crowd._pool.of(partials[1], torch.arange(distil.POOL_SIZE)), pool)
-    crowd.photos(distil.POOL_RENEWAL_STEPS, partials[0][:16])
-    assert not torch.equal(crowd._pool.of(partials[1], torch.arange(distil.POOL_SIZE)), pool)
+    assert similarity[1] >= nearest.mean().item() - 1e-6  # the pool's nearest photos are all included
+    sampler.photos(1, partials[0][:16])
+    assert torch.equal(sampler._pool.of(partials[1], torch.arange(distil.POOL_SIZE)), pool)
+    sampler.photos(distil.POOL_RENEWAL_STEPS, partials[0][:16])
+    assert not torch.equal(sampler._pool.of(partials[1], torch.arange(distil.POOL_SIZE)), pool)
 
 
-# What is taught --------------------------------------------------------------------------------------------
+# The distilled encoder -------------------------------------------------------------------------------------
 
 
-def test_the_exhaustive_top1_is_found_among_few_where_an_untrained_candidate_encoder_misses_it(matcher, partials):
-    """On touches that were not taught, among 400 photos."""
+def test_the_exhaustive_top1_is_among_few_candidates_only_after_training(matcher, partials):
+    """The touches are not in the training data; there are 400 photos."""
     unseen = drawn(100, 8, sign=1)
-    taught(matcher, partials, steps=1)
+    distilled(matcher, partials, steps=1)
     before = distil.exhaustive_top1_ranks(matcher, unseen, partials[1])
-    taught(matcher, partials, steps=60)
+    distilled(matcher, partials, steps=60)
     after = distil.exhaustive_top1_ranks(matcher, unseen, partials[1])
     assert (before < 40).mean() < 0.3
     assert (after < 40).mean() > 0.8
 
 
 def test_the_rank_of_the_exhaustive_top1_counts_the_photos_nearer_than_it(matcher, partials):
-    taught(matcher, partials)
+    distilled(matcher, partials)
     touches, photos = partials[0][:10], partials[1]
     ranks = distil.exhaustive_top1_ranks(matcher, touches, photos)
     for touch, rank in zip(touches, ranks, strict=True):
         logits = [matcher.head(touch[None], photo[None]).item() for photo in photos]
-        nearness = (matcher.candidate_encoder.touch(touch[None]) @ matcher.candidate_encoder.photo(photos).T)[
-            0
-        ].tolist()
-        assert rank == sum(near > nearness[int(np.argmax(logits))] for near in nearness)
+        encoder = matcher.candidate_encoder
+        similarity = (encoder.touch(touch[None]) @ encoder.photo(photos).T)[0].tolist()
+        assert rank == sum(one > similarity[int(np.argmax(logits))] for one in similarity)
 
 
-def test_the_seed_decides_and_neither_the_candidate_encoder_before_nor_other_random_numbers_do(matcher, partials):
-    first = taught(matcher, partials)
+def test_the_result_depends_on_the_seed_and_not_on_an_earlier_encoder_or_other_random_numbers(matcher, partials):
+    first = distilled(matcher, partials)
     torch.manual_seed(99)
     state = torch.get_rng_state()
-    assert same(taught(matcher, partials), first)
+    assert same(distilled(matcher, partials), first)
     assert torch.equal(torch.get_rng_state(), state)
-    assert not same(taught(matcher, partials, seed=1), first)
+    assert not same(distilled(matcher, partials, seed=1), first)
 
 
 def test_nothing_but_the_candidate_encoder_changes(matcher, partials):
     before = {name: tensor.clone() for name, tensor in matcher.state_dict().items()}
-    taught(matcher, partials)
+    distilled(matcher, partials)
     after = matcher.state_dict()
     assert same(before, after)
     assert {name.split(".")[0] for name in after.keys() - before.keys()} == {"candidate_encoder"}
@@ -204,10 +203,10 @@ def test_nothing_but_the_candidate_encoder_changes(matcher, partials):
     )
 
 
-def test_with_a_cosine_in_the_logit_linear_numbers_find_exhaustive_top1s_deeper_in_the_order_than_a_network_alone(
+def test_with_a_cosine_in_the_logit_linear_values_rank_the_exhaustive_top1_higher_than_a_network_alone(
     partials,
 ):
-    """A logit that is the cosine alone, of embeddings that vary in two directions."""
+    """The logit is only the cosine of embeddings that vary in two directions."""
     torch.manual_seed(3)
     config = dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, cosine=True)
     matcher = Matcher(config).eval()
@@ -217,18 +216,18 @@ def test_with_a_cosine_in_the_logit_linear_numbers_find_exhaustive_top1s_deeper_
         torch.cat([part, sign * 2 * torch.nn.functional.normalize(part[:, :8])], dim=1)
         for part, sign in zip(partials, (1, -1), strict=True)
     )
-    found = []
+    ranks = []
     for linear in (0, 2):
         distil.distil(matcher, touches, photos, width=32, linear=linear, steps=3, seed=0, quiet=True)
         assert matcher.config == dataclasses.replace(config, candidate_width=32, candidate_linear=linear)
-        found.append(distil.exhaustive_top1_ranks(matcher, touches, photos).mean())
-    assert found[1] < found[0] / 2
+        ranks.append(distil.exhaustive_top1_ranks(matcher, touches, photos).mean())
+    assert ranks[1] < ranks[0] / 2
 
 
-def test_a_stop_leaves_the_matcher_as_it_was(matcher, partials):
-    asked = iter([False, False, True])
+def test_a_stop_leaves_the_matcher_unchanged(matcher, partials):
+    stops = iter([False, False, True])
     with pytest.raises(JobInterrupted):
-        taught(matcher, partials, should_stop=lambda: next(asked))
+        distilled(matcher, partials, should_stop=lambda: next(stops))
     assert matcher.candidate_encoder is None
 
 
@@ -249,19 +248,21 @@ def checkpoint(matcher, tmp_path):
     )
 
 
-def wanted(steps=20):
+def config_with_encoder(steps=20):
     return Config(
         dataclasses.replace(WITHOUT_CANDIDATE_ENCODER, candidate_width=32), TrainingConfig(distil_steps=steps)
     )
 
 
-def test_a_checkpoint_gets_a_candidate_encoder_queries_and_the_candidate_encoders_own_measure(checkpoint, partials):
+def test_a_checkpoint_gets_a_candidate_encoder_queries_and_a_metric(checkpoint, partials):
     held_out = drawn(30, 8, sign=1), drawn(50, 9, sign=-1)
     assert not checkpoint.config.has_embeddings
     path = checkpoint.path
-    store_checkpoint(distil.with_candidate_encoder(checkpoint, wanted(), partials, held_out, quiet=True), path)
+    store_checkpoint(
+        distil.with_candidate_encoder(checkpoint, config_with_encoder(), partials, held_out, quiet=True), path
+    )
     made = load_checkpoint(path)
-    assert made.config == wanted()
+    assert made.config == config_with_encoder()
     assert made.config.has_embeddings
     np.testing.assert_array_equal(made.queries, held_out[0].half().numpy())
     ranks = distil.exhaustive_top1_ranks(
@@ -269,16 +270,16 @@ def test_a_checkpoint_gets_a_candidate_encoder_queries_and_the_candidate_encoder
     )
     metrics = made.provenance["metrics"]
     assert metrics == {"validation_auc": 0.75, "candidate_agreement_at_1_percent": (ranks < 4).mean()}
-    assert "candidate_encoder finds winner in nearest percent" in path.with_suffix(".md").read_text()
+    assert "candidate agreement at 1 percent" in path.with_suffix(".md").read_text()
 
 
-def test_without_validation_objects_there_are_neither_queries_nor_a_measure(checkpoint, partials):
-    made = distil.with_candidate_encoder(checkpoint, wanted(2), partials, quiet=True)
+def test_without_validation_objects_there_are_neither_queries_nor_a_metric(checkpoint, partials):
+    made = distil.with_candidate_encoder(checkpoint, config_with_encoder(2), partials, quiet=True)
     assert made.queries is None
     assert made.provenance["metrics"] == {"validation_auc": 0.75}
 
 
-def test_queries_are_as_many_as_are_kept_and_only_what_float16_holds():
+def test_queries_are_limited_in_number_and_finite_in_float16():
     partials = torch.arange(1200.0)[:, None] * torch.ones(1, 2)
     partials[7, 1] = 70_000.0
     queries = distil.select_queries(partials, seed=0)
@@ -291,10 +292,10 @@ def test_queries_are_as_many_as_are_kept_and_only_what_float16_holds():
     assert distil.select_queries(partials[7:8], seed=0) is None
 
 
-def test_a_checkpoint_from_before_candidate_encoders_had_linear_numbers_opens_and_searches_as_it_did(
-    checkpoint, partials
-):
-    store_checkpoint(distil.with_candidate_encoder(checkpoint, wanted(2), partials, quiet=True), checkpoint.path)
+def test_an_older_checkpoint_without_linear_values_opens_and_searches_as_before(checkpoint, partials):
+    store_checkpoint(
+        distil.with_candidate_encoder(checkpoint, config_with_encoder(2), partials, quiet=True), checkpoint.path
+    )
     state, header = read_tensors(checkpoint.path)
     del header["config"]["matcher"]["candidate_linear"]
     before = checkpoint.matcher.candidate_encoder.photo(partials[1])
@@ -304,7 +305,7 @@ def test_a_checkpoint_from_before_candidate_encoders_had_linear_numbers_opens_an
     assert torch.equal(opened.matcher.candidate_encoder.photo(partials[1]), before)
 
 
-def test_an_older_checkpoint_without_a_word_of_candidate_encoders_searches_by_its_contrastive_embeddings():
+def test_an_older_checkpoint_without_a_candidate_encoder_searches_by_contrastive_embeddings():
     tables = TINY.to_dict()
     del tables["matcher"]["candidate_width"], tables["training"]["distil_steps"]
     config = Config.from_dict(tables)
@@ -315,7 +316,7 @@ def test_an_older_checkpoint_without_a_word_of_candidate_encoders_searches_by_it
 # In the harness --------------------------------------------------------------------------------------------
 
 
-def test_with_a_candidate_encoder_the_best_of_a_few_candidates_is_late_fusions_best_photo(recording, tmp_path):
+def test_with_a_candidate_encoder_the_best_candidate_is_late_fusions_best_photo(recording, tmp_path):
     training = dataclasses.replace(TINY.training, freeze_towers=True, distil_steps=60, iterations=30)
     config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, candidate_width=32), training=training)
     grasps = load_grasps(recording)

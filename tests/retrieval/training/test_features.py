@@ -1,4 +1,4 @@
-"""Features of frozen towers: what they are, that they are encoded once, and what stands for a touch in a control."""
+"""Features of frozen towers: their values, the cache, and the variants of controls."""
 
 import dataclasses
 
@@ -35,7 +35,7 @@ def matcher():
 
 @pytest.fixture
 def counted(monkeypatch):
-    """How many images have gone through the towers."""
+    """Numbers of images that pass through the towers."""
     counts = {"touch_features": 0, "photo_features": 0}
     for name in counts:
         real = getattr(__import__("retrieval.training.features", fromlist=[name]), name)
@@ -49,7 +49,7 @@ def counted(monkeypatch):
     return counts
 
 
-def test_a_row_holds_what_the_towers_say_of_that_grasp_alone(grasps, matcher):
+def test_a_row_contains_the_tower_features_of_its_grasp(grasps, matcher):
     features = encode_recording(grasps, matcher, TINY, None, quiet=True)
     assert features.grasp_ids == tuple(grasp.grasp_id for grasp in grasps)
     assert features.object_ids == tuple(grasp.object_id for grasp in grasps)
@@ -59,10 +59,10 @@ def test_a_row_holds_what_the_towers_say_of_that_grasp_alone(grasps, matcher):
             fingers = np.stack([load.load_touch(path) for path in grasps[row].touches])
             photo = load.load_photo(grasps[row].photo)[None]
             touch = matcher.touch_tower(torch.from_numpy(fingers).permute(0, 3, 1, 2))
-            seen = matcher.photo_tower(torch.from_numpy(photo).permute(0, 3, 1, 2))
+            encoded_photo = matcher.photo_tower(torch.from_numpy(photo).permute(0, 3, 1, 2))
             # float32, summed in another order in a batch of another size
             np.testing.assert_allclose(features.touch[row], touch, rtol=1e-4, atol=1e-5)
-            np.testing.assert_allclose(features.photo[row], seen[0], rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(features.photo[row], encoded_photo[0], rtol=1e-4, atol=1e-5)
 
 
 def test_a_second_run_reads_and_encodes_nothing(grasps, matcher, tmp_path, counted):
@@ -73,14 +73,14 @@ def test_a_second_run_reads_and_encodes_nothing(grasps, matcher, tmp_path, count
     assert again.digest == first.digest
 
 
-def test_a_run_that_was_stopped_keeps_its_finished_parts(grasps, matcher, tmp_path, counted, monkeypatch):
+def test_an_interrupted_run_keeps_its_finished_parts(grasps, matcher, tmp_path, counted, monkeypatch):
     whole = encode_recording(grasps, matcher, TINY, None, quiet=True)
     monkeypatch.setattr("retrieval.training.features._PART", 4)
     with monkeypatch.context() as during:
         during.setattr("retrieval.data.preprocessing.Preprocessing.load_photo", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
-    assert len(list(tmp_path.iterdir())) == 3  # of 4, 4 and 1 touches; no photo was finished
+    assert len(list(tmp_path.iterdir())) == 3  # 4, 4 and 1 touches; no part of photos was finished
     counted.update(touch_features=0, photo_features=0)
     resumed = encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
     assert counted == {"touch_features": 0, "photo_features": 9}
@@ -88,7 +88,7 @@ def test_a_run_that_was_stopped_keeps_its_finished_parts(grasps, matcher, tmp_pa
     np.testing.assert_allclose(resumed.photo, whole.photo, rtol=1e-4, atol=1e-5)
 
 
-def test_a_damaged_part_is_encoded_again_and_said(grasps, matcher, tmp_path, counted, caplog):
+def test_a_damaged_part_is_encoded_again_with_a_warning(grasps, matcher, tmp_path, counted, caplog):
     first = encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
     touches = next(tmp_path.glob("touch-*"))
     data = bytearray(touches.read_bytes())
@@ -100,7 +100,7 @@ def test_a_damaged_part_is_encoded_again_and_said(grasps, matcher, tmp_path, cou
     assert "encoded again" in caplog.text
 
 
-def test_other_weights_preprocessing_or_images_are_never_taken_for_these(grasps, matcher, tmp_path, counted):
+def test_other_weights_preprocessing_or_images_use_other_cache_parts(grasps, matcher, tmp_path, counted):
     encode_recording(grasps, matcher, TINY, tmp_path, quiet=True)
     torch.manual_seed(1)
     smaller = dataclasses.replace(TINY, preprocessing=dataclasses.replace(TINY.preprocessing, touch_px=40))
@@ -112,7 +112,7 @@ def test_other_weights_preprocessing_or_images_are_never_taken_for_these(grasps,
         assert counted["photo_features"] == 9 * count
 
 
-def test_a_photo_file_that_grasps_share_is_encoded_once(grasps, matcher, counted):
+def test_a_photo_file_shared_by_grasps_is_encoded_once(grasps, matcher, counted):
     shared = [dataclasses.replace(grasp, photo=grasps[0].photo) for grasp in grasps[:3]]
     features = encode_recording(shared, matcher, TINY, None, quiet=True)
     assert counted["photo_features"] == 1
@@ -120,7 +120,7 @@ def test_a_photo_file_that_grasps_share_is_encoded_once(grasps, matcher, counted
     np.testing.assert_array_equal(features.photo[0], features.photo[2])
 
 
-def test_what_stands_for_a_touch_changes_the_touch_alone(grasps, matcher, tmp_path, counted):
+def test_a_touch_variant_changes_only_the_touch(grasps, matcher, tmp_path, counted):
     made = {
         touch_variant: encode_recording(grasps, matcher, TINY, tmp_path, touch_variant=touch_variant, quiet=True)
         for touch_variant in ("touch", "low_pass", "no_contact")
@@ -133,39 +133,39 @@ def test_what_stands_for_a_touch_changes_the_touch_alone(grasps, matcher, tmp_pa
     for touch_variant in ("low_pass", "no_contact"):
         np.testing.assert_array_equal(made[touch_variant].photo, made["touch"].photo)
         assert np.abs(made[touch_variant].touch - made["touch"].touch).max() > 0.01
-    photo_variant = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in grasps]
-    before = encode_recording(photo_variant, matcher, TINY, None, quiet=True)
-    np.testing.assert_array_equal(made["no_contact"].touch, before.touch)
+    frames = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in grasps]
+    expected = encode_recording(frames, matcher, TINY, None, quiet=True)
+    np.testing.assert_array_equal(made["no_contact"].touch, expected.touch)
 
 
-def test_frames_from_before_the_contact_must_be_there_to_be_shown(grasps, matcher):
+def test_no_contact_frames_are_required_by_their_variant(grasps, matcher):
     lacking = [dataclasses.replace(grasp, backgrounds=()) for grasp in grasps]
-    with pytest.raises(DatasetError, match="before the contact"):
+    with pytest.raises(DatasetError, match="needs a no-contact frame"):
         encode_recording(lacking, matcher, TINY, None, touch_variant="no_contact", quiet=True)
-    with pytest.raises(BadInput, match="touch, blurred, before; got 'after'"):
+    with pytest.raises(BadInput, match="touch, low_pass, no_contact; got 'after'"):
         encode_recording(grasps, matcher, TINY, None, touch_variant="after", quiet=True)
 
 
-def test_a_blur_keeps_colour_and_size_and_nothing_fine():
+def test_low_pass_keeps_colour_and_size_and_removes_fine_detail():
     image = np.full((60, 80, 3), 0.25, dtype=np.float32)
     image[::2] += 0.5  # stripes a pixel wide, mean 0.5
     plain = low_pass(image)
     assert plain.shape == image.shape
     np.testing.assert_allclose(plain, 0.5, atol=0.02)
-    halves = np.zeros((60, 80, 3), dtype=np.float32)
-    halves[:, 40:] = 1  # what is coarse stays
-    assert low_pass(halves)[:, :10].max() < 0.1
-    assert low_pass(halves)[:, -10:].min() > 0.9
+    edge = np.zeros((60, 80, 3), dtype=np.float32)
+    edge[:, 40:] = 1  # coarse structure remains
+    assert low_pass(edge)[:, :10].max() < 0.1
+    assert low_pass(edge)[:, -10:].min() > 0.9
 
 
 @pytest.mark.parametrize("size", [(240, 320), (32, 48), (7, 9), (1, 3)])
-def test_a_blur_is_that_of_the_whole_picture_made_small_and_large_again(size):
+def test_low_pass_equals_a_gaussian_blur_reduced_and_enlarged_again(size):
     image = np.random.default_rng(0).random((*size, 3), dtype=np.float32)
     smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), size[1] / 10), dtype=np.float32)
     np.testing.assert_allclose(low_pass(image), resize(resize(smooth, (6, 8)), size), atol=2e-6)  # float32 sums
 
 
-def test_of_a_photo_its_margin_stays_and_nothing_inside():
+def test_the_margin_of_a_photo_remains_and_the_inside_is_removed():
     image = np.zeros((80, 160, 3), dtype=np.float32)
     image[:10], image[-10:], image[:, :20], image[:, -20:] = 1, 1, 1, 1
     image[40, 80] = 0.5
@@ -177,7 +177,7 @@ def test_of_a_photo_its_margin_stays_and_nothing_inside():
     assert photo_margin(noise[:1, :1]).shape == (1, 1, 3)
 
 
-def test_the_margin_of_photos_is_encoded_beside_whole_photos(grasps, matcher, tmp_path):
+def test_the_margin_variant_is_cached_separately_from_whole_photos(grasps, matcher, tmp_path):
     whole, framed = (
         encode_recording(grasps, matcher, TINY, tmp_path, photo_variant=photo_variant, quiet=True)
         for photo_variant in PHOTO_VARIANTS
@@ -186,7 +186,7 @@ def test_the_margin_of_photos_is_encoded_beside_whole_photos(grasps, matcher, tm
     assert np.abs(whole.photo - framed.photo).max() > 0.01
     with pytest.raises(BadInput, match="photo, margin; got 'inside'"):
         encode_recording(grasps, matcher, TINY, None, photo_variant="inside", quiet=True)
-    with pytest.raises(BadInput, match="two controls"):
+    with pytest.raises(BadInput, match="two separate controls"):
         encode_recording(grasps, matcher, TINY, None, touch_variant="low_pass", photo_variant="margin", quiet=True)
 
 
@@ -199,7 +199,7 @@ def test_objects_are_numbered_by_their_sorted_names():
     assert some_features().owner.tolist() == [2, 1, 2, 0]
 
 
-def test_selected_rows_are_those_asked_for_in_that_order():
+def test_selected_rows_are_in_the_requested_order():
     part = some_features().select(np.array([3, 0]))
     assert (part.grasp_ids, part.object_ids) == (("d", "a"), ("box", "mug"))
     assert part.touch[:, 0, 0].tolist() == [18, 0]
@@ -207,7 +207,7 @@ def test_selected_rows_are_those_asked_for_in_that_order():
     assert some_features().of_objects(["mug", "spoon"]).grasp_ids == ("a", "c")
 
 
-def test_equal_features_have_equal_digests_and_others_have_not():
+def test_equal_features_have_equal_digests_and_different_ones_do_not():
     one = some_features()
     assert one.digest == some_features().digest
     renamed = dataclasses.replace(one, object_ids=("mug", "can", "mug", "can"))
@@ -230,15 +230,15 @@ def test_features_of_another_shape_or_type_are_refused(touch, photo):
 
 @pytest.mark.parametrize("part", ["touch", "photo"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_feature_that_is_not_finite_is_refused_and_its_grasp_named(part, value):
+def test_a_feature_that_is_not_finite_is_an_error_that_names_its_grasp(part, value):
     features = some_features()
-    spoilt = {"touch": features.touch.copy(), "photo": features.photo.copy()}
-    spoilt[part][1, ..., 0] = value
+    invalid = {"touch": features.touch.copy(), "photo": features.photo.copy()}
+    invalid[part][1, ..., 0] = value
     with pytest.raises(NumericalError, match=f"{part} features must be finite; grasp {features.grasp_ids[1]} has"):
-        Features(features.grasp_ids, features.object_ids, **spoilt)
+        Features(features.grasp_ids, features.object_ids, **invalid)
 
 
-def test_features_are_found_by_grasp_and_by_photo_file(grasps, matcher):
+def test_features_are_returned_by_grasp_and_by_photo_file(grasps, matcher):
     features = encode_recording(grasps, matcher, TINY, None, quiet=True)
     known = features_by_image(grasps[2:4], features, torch.device("cpu"))
     assert set(known) == {grasp.grasp_id for grasp in grasps[2:4]} | {grasp.photo for grasp in grasps[2:4]}

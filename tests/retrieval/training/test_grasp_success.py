@@ -1,4 +1,4 @@
-"""The grasp-success gate: what it learns from, how it decides, and what it refuses."""
+"""The grasp-success gate: its training data, its decisions, and invalid inputs."""
 
 import json
 import pickle
@@ -22,12 +22,12 @@ OBJECTS = tuple("abcdefgh")
 DURING, AFTER = (GateSettings(touch_px=24, frame=frame) for frame in ("during", "after"))
 ENOUGH = 150  # steps
 OUTCOMES = ("held", "held", "missed", "slipped")
-LEAN = np.linspace(100, 150, 32).astype(np.uint8)[None, :, None].repeat(24, 0).repeat(3, 2)  # an untouched gel
+LEAN = np.linspace(100, 150, 32).astype(np.uint8)[None, :, None].repeat(24, 0).repeat(3, 2)  # a gel without contact
 
 
 @dataclass(frozen=True)
 class Frames:
-    """One finger's pictures, as a rig hands them over."""
+    """One finger's frames, as a rig returns them."""
 
     before: np.ndarray | None
     during: np.ndarray | None
@@ -35,7 +35,7 @@ class Frames:
 
 
 def gel(rng, touched):
-    """(24, 32, 3) uint8: the untouched gel with noise, and where it is touched, a disc lit from one side."""
+    """Return (24, 32, 3) uint8: the gel with noise and, if touched, a disc lit from one side."""
     picture = LEAN + rng.normal(0, 1.5, LEAN.shape)
     if touched:
         y, x = np.mgrid[:24, :32]
@@ -45,13 +45,13 @@ def gel(rng, touched):
 
 
 def fingers(seed, during="ab", after="ab"):
-    """Frames of one grasp; `during` and `after` name the fingers that are touched then."""
+    """Return the frames of one grasp; `during` and `after` name the fingers with contact in these frames."""
     rng = np.random.default_rng(seed)
     return {name: Frames(gel(rng, False), gel(rng, name in during), gel(rng, name in after)) for name in ("a", "b")}
 
 
 def write(folder, outcomes=OUTCOMES, objects=OBJECTS, columns=("during", "before", "after"), **fields):
-    """For each object a grasp of each outcome: one that slipped looks held until the lift, one missed never does."""
+    """Write a grasp of each outcome for each object: a slip looks held until the lift, a miss never does."""
     suffix = {"during": "", "before": "_before", "after": "_after"}
     with RecordingWriter(folder, {"source": "test", "sensor": "drawn"}) as writer:
         for number, name in enumerate(objects):
@@ -63,9 +63,9 @@ def write(folder, outcomes=OUTCOMES, objects=OBJECTS, columns=("during", "before
                     for finger, frames in shots.items()
                     for column in columns
                 }
-                given = {"outcome": outcome, "grasped": outcome == "held"} | fields
-                given = {key: value for key, value in given.items() if value is not None}
-                writer.append(f"{name}-{turn}", name, {"photo": LEAN, **images}, **given)
+                values = {"outcome": outcome, "grasped": outcome == "held"} | fields
+                values = {key: value for key, value in values.items() if value is not None}
+                writer.append(f"{name}-{turn}", name, {"photo": LEAN, **images}, **values)
     return Path(folder)
 
 
@@ -101,12 +101,12 @@ def test_failed_grasps_are_read_for_the_gate_and_left_out_for_the_matcher(attemp
     assert len(load_grasps(attempts)) == 2 * len(OBJECTS)
 
 
-def test_what_the_gripper_felt_counts_and_not_what_another_gate_decided(tmp_path):
+def test_the_outcome_counts_and_not_the_decision_of_another_gate(tmp_path):
     folder = write(tmp_path / "r", ("held", "slipped"), grasped=True)
     assert [item.held for item in load_attempts(folder)] == [True, False] * len(OBJECTS)
 
 
-def test_without_outcomes_a_grasp_counts_by_grasped(tmp_path):
+def test_without_outcomes_the_field_grasped_counts(tmp_path):
     with RecordingWriter(tmp_path / "r", {"source": "test", "sensor": "drawn"}) as writer:
         for number, grasped in enumerate((True, False, None)):
             fields = {} if grasped is None else {"grasped": grasped}
@@ -118,16 +118,16 @@ def test_without_outcomes_a_grasp_counts_by_grasped(tmp_path):
     ]
 
 
-def test_a_recording_that_does_not_say_what_succeeded_is_refused(tmp_path):
+def test_a_recording_without_grasp_results_is_refused(tmp_path):
     folder = write(tmp_path / "r", ("held",), outcome=None, grasped=None)
-    with pytest.raises(DatasetError, match="must say of its grasps whether they succeeded"):
+    with pytest.raises(DatasetError, match=r"no grasp in .* has a recorded result"):
         load_attempts(folder)
 
 
 # Training --------------------------------------------------------------------------------------------------
 
 
-def test_misses_are_told_from_held_grasps_of_objects_never_seen(trained):
+def test_misses_and_held_grasps_of_new_objects_are_distinguished(trained):
     _, report = trained
     assert (report.train_grasps, report.train_held, report.validation_grasps, report.validation_objects) == (
         24,
@@ -141,8 +141,8 @@ def test_misses_are_told_from_held_grasps_of_objects_never_seen(trained):
     assert report.lowest_acceptance[1] == 1.0
 
 
-def test_the_frame_after_the_lift_shows_a_slip_that_the_frame_during_it_cannot(attempts, tmp_path):
-    """In these pictures a grasp that slips looks exactly like one that holds, until the lift."""
+def test_the_frame_after_the_lift_shows_a_slip_that_the_frame_during_the_grasp_does_not(attempts, tmp_path):
+    """In these pictures a grasp that slips looks exactly like a held one until the lift."""
     after = train_gate(attempts, tmp_path / "a.safetensors", settings=AFTER, iterations=ENOUGH, quiet=True)
     during = train_gate(attempts, tmp_path / "d.safetensors", settings=DURING, iterations=ENOUGH, quiet=True)
     assert after.accepted == {"held": (4, 4), "missed": (0, 2), "slipped": (0, 2)}
@@ -150,7 +150,7 @@ def test_the_frame_after_the_lift_shows_a_slip_that_the_frame_during_it_cannot(a
     assert after.accuracy > during.accuracy
 
 
-def test_the_frame_after_the_lift_is_scored_where_there_is_one(attempts, tmp_path):
+def test_the_frame_after_the_lift_is_used_if_there_is_one(attempts, tmp_path):
     def frame(folder):
         return train_gate(folder, tmp_path / "g.safetensors", iterations=1, quiet=True).frame
 
@@ -159,15 +159,15 @@ def test_the_frame_after_the_lift_is_scored_where_there_is_one(attempts, tmp_pat
     assert load_gate(tmp_path / "g.safetensors").settings == GateSettings(frame="during")
 
 
-def test_the_report_says_how_good_chance_is_and_what_was_accepted(trained):
+def test_the_report_contains_the_chance_accuracy_and_the_accepted_grasps(trained):
     text = "\n".join(trained[1].lines())
     assert "accuracy 1.000 (95 %: 0.631 to 1.000) on 8 grasps of 2 other objects" in text
-    assert "so few objects (2) cannot show how much objects differ: the interval is too narrow" in text
-    assert "always giving the commoner answer: 0.500" in text
+    assert "with so few objects (2) the interval is too narrow" in text
+    assert "always predicting the more frequent class: 0.500" in text
     assert "accepted: 4 of 4 held, 0 of 4 missed" in text
 
 
-def test_the_file_says_what_made_it(trained, misses):
+def test_the_file_contains_its_provenance(trained, misses):
     out, report = trained
     header = read_tensors(out)[1]
     assert header["task"] == "grasp-success"
@@ -180,7 +180,7 @@ def test_the_file_says_what_made_it(trained, misses):
     assert str(misses) not in json.dumps(header)
 
 
-def test_the_same_seed_gives_the_same_file_and_touches_no_one_elses_random_numbers(misses, tmp_path):
+def test_the_same_seed_gives_the_same_file_and_the_global_random_state_is_unchanged(misses, tmp_path):
     files = [tmp_path / f"{name}.safetensors" for name in "xyz"]
     torch.manual_seed(5)
     expected = torch.rand(3)
@@ -192,7 +192,7 @@ def test_the_same_seed_gives_the_same_file_and_touches_no_one_elses_random_numbe
     assert files[0].read_bytes() != files[2].read_bytes()
 
 
-def test_only_the_frames_that_are_scored_are_read_and_each_once(attempts, tmp_path, monkeypatch):
+def test_only_the_required_frames_are_read_and_each_once(attempts, tmp_path, monkeypatch):
     read = []
     load = Preprocessing.load_touch
     monkeypatch.setattr(Preprocessing, "load_touch", lambda self, *paths: read.append(paths) or load(self, *paths))
@@ -202,7 +202,7 @@ def test_only_the_frames_that_are_scored_are_read_and_each_once(attempts, tmp_pa
     assert not [name for name in names if name.endswith("_after")]
 
 
-def test_batches_hold_both_kinds_in_equal_number_and_depend_on_seed_and_step_alone(attempts):
+def test_batches_contain_equal_numbers_of_both_kinds_and_depend_only_on_seed_and_step(attempts):
     few = load_attempts(attempts)[:8]
     for step in range(5):
         batch, rng = draw_batch(few, step, seed=3)
@@ -214,7 +214,7 @@ def test_batches_hold_both_kinds_in_equal_number_and_depend_on_seed_and_step_alo
     assert draw_batch(few, 0, seed=3)[0] != draw_batch(few, 0, seed=4)[0]
 
 
-def test_the_loss_is_on_the_finger_that_decides_and_an_idle_finger_learns_nothing_from_a_good_grasp():
+def test_the_loss_uses_the_deciding_finger_and_an_idle_finger_gets_no_gradient():
     logits = torch.tensor([[3.0, -2.0], [1.0, -4.0]], requires_grad=True)
     held = torch.tensor([1.0, 0.0])
     loss = gate_loss(logits, held)
@@ -224,16 +224,16 @@ def test_the_loss_is_on_the_finger_that_decides_and_an_idle_finger_learns_nothin
     assert logits.grad[:, 1].tolist() == [0, 0]
     naive = logits.detach().clone().requires_grad_()
     binary_cross_entropy_with_logits(naive, held[:, None].expand(2, 2)).backward()
-    assert naive.grad[0, 1] < 0  # the grasp's label on every finger: an empty gel is pushed towards success
+    assert naive.grad[0, 1] < 0  # with the grasp's label on every finger, an empty gel is trained towards success
 
 
-def test_the_loss_stays_finite_where_probabilities_do_not():
+def test_the_loss_is_finite_although_probabilities_are_not():
     logits = torch.tensor([[200.0, 300.0]])
     assert gate_loss(logits, torch.tensor([0.0])).item() == pytest.approx(300.0)
     assert torch.log(1 - torch.sigmoid(logits.amax(1))).isinf().all()  # the naive formula
 
 
-def test_augmentation_flips_and_changes_the_lamps_of_each_finger_on_its_own():
+def test_augmentation_flips_and_relights_each_finger_independently():
     images = torch.zeros(64, 2, 3, 8, 8)
     images[..., 0, 0] = 0.5  # one corner
     changed = augment(images, np.random.default_rng(0))
@@ -247,7 +247,7 @@ def test_augmentation_flips_and_changes_the_lamps_of_each_finger_on_its_own():
     contrast = (corners.amax(-1) - brightness) / 0.5
     assert 0.9 - 1e-6 <= contrast.min() < 0.92
     assert 1.08 < contrast.max() <= 1.1 + 1e-6
-    assert torch.equal(brightness[..., 0], brightness[..., 2])  # a lamp changes all colours alike
+    assert torch.equal(brightness[..., 0], brightness[..., 2])  # a lamp changes all colours equally
 
 
 def test_a_loss_that_is_not_finite_stops_the_training_and_writes_nothing(misses, tmp_path, monkeypatch):
@@ -261,27 +261,30 @@ def test_a_loss_that_is_not_finite_stops_the_training_and_writes_nothing(misses,
 
 
 REFUSED = {
-    "held grasps alone": (
+    "held grasps only": (
         {"outcomes": ("held",)},
-        r"must hold both successful and failed grasps; got 8 successful of 8",
+        r"must contain both successful and failed grasps; got 8 successful of 8",
     ),
-    "failed ones alone": ({"outcomes": ("missed",)}, r"must hold both successful and failed grasps; got 0 successful"),
+    "failed grasps only": (
+        {"outcomes": ("missed",)},
+        r"must contain both successful and failed grasps; got 0 successful",
+    ),
     "no frame before": ({"columns": ("during",)}, r"a-0 has 0 before for 2 finger\(s\)"),
     "no frame after": ({"columns": ("during", "before")}, r"a-0 has 0 after for 2 finger\(s\)"),
     "too few objects": ({"objects": OBJECTS[:3]}, "needs two objects in each"),
 }
 
 
-@pytest.mark.parametrize("why", REFUSED)
-def test_a_recording_that_teaches_no_gate_is_refused(tmp_path, why):
-    given, said = REFUSED[why]
-    settings = AFTER if "after" in why else DURING
-    with pytest.raises(DatasetError, match=said):
-        train_gate(write(tmp_path / "r", **given), tmp_path / "g.safetensors", settings=settings, quiet=True)
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_recording_that_cannot_train_a_gate_is_refused(tmp_path, case):
+    options, message = REFUSED[case]
+    settings = AFTER if "after" in case else DURING
+    with pytest.raises(DatasetError, match=message):
+        train_gate(write(tmp_path / "r", **options), tmp_path / "g.safetensors", settings=settings, quiet=True)
 
 
-def test_training_objects_of_one_kind_alone_are_refused(tmp_path):
-    """Seed 0 gives the objects c and e, here the only ones with a miss, to validation."""
+def test_training_objects_with_only_one_outcome_are_refused(tmp_path):
+    """Seed 0 assigns the objects c and e, the only ones with misses, to validation."""
     folder = write(tmp_path / "r", ("held",), objects="abdfgh")
     write(folder, ("missed",), objects="ce")
     with pytest.raises(DatasetError, match=r"training objects of seed 0 must have both .*got 6 successful of 6"):
@@ -297,14 +300,16 @@ def test_settings_out_of_range_are_refused(misses, tmp_path):
         GateSettings(touch_px=0)
 
 
-def test_a_place_that_cannot_be_written_is_told_before_the_first_step(misses, tmp_path, monkeypatch):
+def test_an_output_that_cannot_be_written_is_an_error_before_the_first_step(misses, tmp_path, monkeypatch):
     monkeypatch.setattr("retrieval.training.grasp_success._train_net", lambda *_: pytest.fail("trained"))
     with pytest.raises(CheckpointError, match="is a folder"):
         train_gate(misses, tmp_path, quiet=True)
 
 
-def test_a_matcher_is_no_gate_and_a_gate_no_matcher(model, trained):
-    with pytest.raises(CheckpointError, match=r"no grasp-success gate but .* a matcher; `retrieve train --task"):
+def test_a_matcher_is_not_a_gate_and_a_gate_is_not_a_matcher(model, trained):
+    with pytest.raises(
+        CheckpointError, match=r"not a grasp-success gate but .* a matcher; train a gate with `retrieve train --task"
+    ):
         load_gate(model)
     with pytest.raises(
         CheckpointError, match="is a grasp-success classifier, not a matcher; `retrieve collect --gate`"
@@ -312,7 +317,7 @@ def test_a_matcher_is_no_gate_and_a_gate_no_matcher(model, trained):
         load_checkpoint(trained[0])
 
 
-def test_a_damaged_gate_and_one_of_another_make_are_refused(trained, tmp_path):
+def test_a_damaged_gate_and_a_gate_with_other_settings_are_refused(trained, tmp_path):
     data = trained[0].read_bytes()
     (tmp_path / "bent.safetensors").write_bytes(data[:-3] + bytes([data[-3] ^ 1]) + data[-2:])
     with pytest.raises(CheckpointError, match="damaged"):
@@ -330,25 +335,25 @@ def test_a_damaged_gate_and_one_of_another_make_are_refused(trained, tmp_path):
 # Use -------------------------------------------------------------------------------------------------------
 
 
-def test_a_grasp_is_accepted_when_any_finger_is_touched(trained):
+def test_a_grasp_is_accepted_if_any_finger_has_contact(trained):
     gate = load_gate(trained[0])
     for touched, accepted in {"ab": True, "a": True, "b": True, "": False}.items():
         frames = fingers(77, during=touched, after="")
         assert gate(frames) is accepted
-        chances = gate.probabilities(frames)
-        assert {finger for finger, chance in chances.items() if chance >= 0.5} == set(touched)
-        assert all(0 < chance < 1 for chance in chances.values())
+        probabilities = gate.probabilities(frames)
+        assert {finger for finger, value in probabilities.items() if value >= 0.5} == set(touched)
+        assert all(0 < value < 1 for value in probabilities.values())
 
 
 @pytest.mark.parametrize(("logits", "accepted"), [((0.0, -9.0), True), ((-1e-30, -9.0), False), ((-9.0, 1e-30), True)])
-def test_the_bound_is_a_probability_of_exactly_one_half(monkeypatch, logits, accepted):
+def test_the_threshold_is_a_probability_of_exactly_one_half(monkeypatch, logits, accepted):
     gate = GraspSuccessGate(GraspNet(), DURING)
     monkeypatch.setattr(GraspSuccessGate, "score", lambda *_: [list(logits)])
     assert gate(fingers(0)) is accepted
 
 
-def test_a_logit_that_is_not_finite_is_no_failed_grasp():
-    """Finite weights can overflow; NaN >= 0 is false, and every grasp would be thrown away without a word."""
+def test_a_logit_that_is_not_finite_is_an_error_and_not_a_failed_grasp():
+    """Finite weights can overflow; NaN >= 0 is False, so every grasp would be rejected silently."""
     net = GraspNet()
     torch.nn.init.constant_(net.last.weight, 3e38)
     torch.nn.init.constant_(net.layers[0].bias, 3e38)
@@ -356,8 +361,8 @@ def test_a_logit_that_is_not_finite_is_no_failed_grasp():
         GraspSuccessGate(net, DURING)(fingers(0))
 
 
-def test_a_change_of_one_grey_level_stays_one_and_never_wraps(trained):
-    """In uint8, one level darker is 255 brighter."""
+def test_a_change_of_one_grey_level_does_not_wrap(trained):
+    """In uint8 arithmetic, one level darker becomes 255 brighter."""
     gate, darker = load_gate(trained[0]), Frames(LEAN, LEAN - np.uint8(1))
     naive = darker.during - darker.before
     assert naive.min() == 255
@@ -366,13 +371,13 @@ def test_a_change_of_one_grey_level_stays_one_and_never_wraps(trained):
 
 
 @pytest.mark.parametrize("level", [0, 255])
-def test_black_white_and_unchanged_pictures_give_finite_answers(trained, level):
+def test_black_white_and_unchanged_pictures_give_finite_logits(trained, level):
     flat = np.full((24, 32, 3), level, np.uint8)
-    answers = load_gate(trained[0]).logits({"a": Frames(flat, flat), "b": Frames(flat, 255 - flat)})
-    assert all(np.isfinite(value) for value in answers.values())
+    logits = load_gate(trained[0]).logits({"a": Frames(flat, flat), "b": Frames(flat, 255 - flat)})
+    assert all(np.isfinite(value) for value in logits.values())
 
 
-def test_a_finger_is_scored_alike_alone_beside_others_and_at_another_size(trained):
+def test_a_fingers_logit_does_not_depend_on_other_fingers_or_the_image_size(trained):
     gate, frames = load_gate(trained[0]), fingers(78, during="a")
     both = gate.logits(frames)
     large = Frames(*(picture.repeat(4, 0).repeat(4, 1) for picture in (frames["a"].before, frames["a"].during)))
@@ -381,15 +386,15 @@ def test_a_finger_is_scored_alike_alone_beside_others_and_at_another_size(traine
     assert gate({"a": large})
 
 
-def test_a_brighter_lamp_draws_no_frame_round_the_picture():
-    """Padding with zeros would: a change of the whole picture would have an edge."""
+def test_a_brighter_lamp_gives_no_frame_around_the_picture():
+    """With zero padding, a change of the whole picture would have an edge."""
     layers = GraspNet().layers
     for layer, even in ((layers[0], True), (torch.nn.Conv2d(3, 16, 5, stride=2, padding=2), False)):
         maps = layer(torch.full((1, 3, 64, 64), 0.08)).flatten(2)
         assert bool((maps.amax(2) - maps.amin(2)).max() < 1e-5) is even
 
 
-def test_a_gate_asks_for_the_frames_that_it_was_trained_on(misses, trained, tmp_path):
+def test_a_gate_requires_the_frames_that_it_was_trained_on(misses, trained, tmp_path):
     train_gate(misses, tmp_path / "after.safetensors", settings=AFTER, iterations=ENOUGH, quiet=True)
     after, during = load_gate(tmp_path / "after.safetensors"), load_gate(trained[0])
     slipped = fingers(79, during="ab", after="")

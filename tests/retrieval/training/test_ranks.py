@@ -1,9 +1,9 @@
-"""Training on several ranks, as `torchrun` starts them: the figures of one process, and what a lost rank costs.
+"""Training on several ranks, started by `torchrun`: the same results as one process, and recovery from a lost rank.
 
-Their gradients and statistics are compared in tests/retrieval/training/test_train.py. Weights drift apart from the
-second step on as those of two single processes do whose first weights differ in the eighth digit: Adam's first steps
-are as long where a gradient is next to nothing as where it is large. So figures are compared where the towers stand
-still, and in double precision where they are trained.
+tests/retrieval/training/test_train.py compares gradients and statistics. From the second step on, the weights of two
+ranks and of one process drift apart, like those of two processes whose initial weights differ in the eighth digit:
+Adam's first steps have the same length for small and large gradients. So results are compared with frozen towers, and
+in double precision with trained towers.
 """
 
 import os
@@ -32,11 +32,11 @@ def command(recording, out, config, ranks=2, program="retrieval"):
 
 @pytest.fixture
 def settings(tmp_path):
-    """Writes the settings of a training with these lines instead of its own."""
+    """Function that writes the settings of a training with changed values and returns the file."""
 
-    def written(**instead):
+    def write(**changes):
         text = TINY_TOML
-        for name, value in instead.items():
+        for name, value in changes.items():
             line = f"{name} = {value}"
             text, found = re.subn(rf"^{name} = .*$", line, text, flags=re.MULTILINE)
             text = text if found else text.replace("[training]", f"[training]\n{line}")
@@ -44,19 +44,19 @@ def settings(tmp_path):
         path.write_text(text)
         return path
 
-    return written
+    return write
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("program", "instead"),
+    ("program", "changes"),
     [
         ("retrieval", {"freeze_towers": "true", "validate_every": 20}),
         ("benchmarks.models.in_double", {"iterations": 40, "validate_every": 40}),
     ],
 )
-def test_two_ranks_reach_the_figures_of_one_process(program, instead, recording, settings, tmp_path):
-    config, made = settings(**instead), []
+def test_two_ranks_give_the_results_of_one_process(program, changes, recording, settings, tmp_path):
+    config, made = settings(**changes), []
     for ranks in (1, 2):
         out = tmp_path / f"{ranks}.safetensors"
         done = subprocess.run(
@@ -75,14 +75,14 @@ def test_two_ranks_reach_the_figures_of_one_process(program, instead, recording,
 
 @pytest.mark.slow
 @pytest.mark.parametrize("victim", [0, -1])
-def test_a_rank_that_is_killed_ends_the_job_and_resume_goes_on(victim, recording, settings, tmp_path):
+def test_a_killed_rank_ends_the_job_and_resume_continues_it(victim, recording, settings, tmp_path):
     out, config = tmp_path / "m.safetensors", settings(iterations=100_000, validate_every=5)
     with run_process(command(recording, out, config), env=ENVIRONMENT) as process:
         wait_until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
         ranks = sorted(ray_processes.processes_named(r".*-m retrieval train|.*-u -m retrieval", process.pid))
         assert len(ranks) == 2
         os.kill(ranks[victim], signal.SIGKILL)
-        process.communicate(timeout=240)  # a rank that waited for the other one would wait for half an hour
+        process.communicate(timeout=240)  # a rank that waits for the other one would wait half an hour
     assert process.returncode != 0
     assert not set(ranks) & set(ray_processes.parents())
     state = state_path(out).stat().st_mtime_ns
@@ -90,5 +90,5 @@ def test_a_rank_that_is_killed_ends_the_job_and_resume_goes_on(victim, recording
         wait_until(lambda: state_path(out).stat().st_mtime_ns != state or process.poll() is not None, limit_s=240)
         assert process.poll() is None, process.stderr.read()
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=240)
-    assert "--resume goes on from here" in said
+        _, output = process.communicate(timeout=240)
+    assert "--resume continues from here" in output

@@ -1,4 +1,4 @@
-"""A tower learns relief from labelled pictures; its weights begin a matcher's."""
+"""Pretraining of a tower on labelled pictures, and its weights in a matcher."""
 
 import dataclasses
 import json
@@ -26,7 +26,7 @@ CONFIG = Config(
 
 
 def write_pictures(folder, kind="photo", objects=24):
-    """Stripes or squares, of pitches 8 to 16 pixels, on every object's picture."""
+    """Write a picture of stripes or squares for each object, with pitches of 8 to 16 pixels."""
     (folder / "images").mkdir(parents=True)
     (folder / "pictures.json").write_text(json.dumps({"schema_version": 1, "kind": kind, "seed": 0}))
     rng, lines = np.random.default_rng(0), []
@@ -56,50 +56,50 @@ def quick(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["photo", "touch"])
-def test_families_are_told_apart_on_objects_that_were_held_out(quick, tmp_path, kind):
+def test_families_are_recognised_on_held_out_objects(quick, tmp_path, kind):
     folder = write_pictures(tmp_path / "pictures", kind, objects=40)
     report = train_relief(folder, tmp_path / "tower.safetensors", CONFIG, iterations=60, quiet=True)
     assert (report.kind, report.objects, report.steps) == (kind, 40, 60)
     assert report.families["relief"][0] >= 0.9
     assert [chance for _, chance in report.families.values()] == [0.5, 0.5]
-    assert report.sizes["sharpness"] == 0.0  # nothing varies
+    assert report.sizes["sharpness"] == 0.0  # it does not vary
 
 
-def test_a_touch_is_seen_with_its_background_and_without_and_scored_as_the_matcher_sees_it(tmp_path):
+def test_training_uses_touches_with_and_without_background_and_evaluation_the_matchers_policy(tmp_path):
     kind, pictures = load_labelled(write_pictures(tmp_path / "pictures", "touch"))
     for policy in ("difference+0.5", "none"):
         settings = dataclasses.replace(CONFIG.preprocessing, background=policy)
         training = relief.ReliefTraining(kind, pictures, dataclasses.replace(CONFIG, preprocessing=settings), 1)
-        judged = training._images(pictures[:1])
-        wanted = settings.load_touch(pictures[0].file, pictures[0].before)
-        assert np.abs(judged[0].permute(1, 2, 0).numpy() - wanted).max() < 1 / 255
-        seen = training._images(pictures[:1] * 40, np.random.default_rng(0))
-        same = [torch.equal(one, judged[0]) for one in seen]
+        evaluated = training._images(pictures[:1])
+        expected = settings.load_touch(pictures[0].file, pictures[0].before)
+        assert np.abs(evaluated[0].permute(1, 2, 0).numpy() - expected).max() < 1 / 255
+        images = training._images(pictures[:1] * 40, np.random.default_rng(0))
+        same = [torch.equal(one, evaluated[0]) for one in images]
         assert 10 < sum(same) < 30
-        assert len({float(one.mean()) for one in seen}) == 2
+        assert len({float(one.mean()) for one in images}) == 2
 
 
 @pytest.mark.parametrize("side", ["photo", "touch"])
-def test_the_weights_begin_the_tower_of_their_side_alone(quick, tmp_path, side):
+def test_the_weights_initialise_only_the_tower_of_their_side(quick, tmp_path, side):
     folder, out = write_pictures(tmp_path / "pictures", side), tmp_path / "tower.safetensors"
     train_relief(folder, out, CONFIG, iterations=3, quiet=True)
     training = dataclasses.replace(CONFIG.training, **{f"init_{side}": str(out)})
     made = build_matcher(dataclasses.replace(CONFIG, training=training))
-    taught = read_tensors(out)[0]
+    pretrained = read_tensors(out)[0]
     towers = {"photo": made.photo_tower.state_dict(), "touch": made.touch_tower.state_dict()}
     other = towers.pop("touch" if side == "photo" else "photo")
     for name, tensor in towers[side].items():
-        torch.testing.assert_close(tensor, taught[name], rtol=0, atol=0)
-    assert any(not torch.equal(other[name], taught[name]) for name in taught)
+        torch.testing.assert_close(tensor, pretrained[name], rtol=0, atol=0)
+    assert any(not torch.equal(other[name], pretrained[name]) for name in pretrained)
 
 
-def test_a_training_that_was_stopped_ends_as_one_that_was_not(quick, tmp_path, monkeypatch):
+def test_an_interrupted_training_ends_like_an_uninterrupted_one(quick, tmp_path, monkeypatch):
     folder = write_pictures(tmp_path / "pictures")
     train_relief(folder, tmp_path / "whole.safetensors", CONFIG, iterations=8, quiet=True)
     monkeypatch.setattr(relief, "SAVE_EVERY", 3)
     steps, loss = [], relief.ReliefTraining._loss
 
-    def breaks_off(self, batch):
+    def fail_at_step_6(self, batch):
         steps.append(self.step)
         if len(steps) == 6:
             raise RuntimeError("the power failed")
@@ -107,17 +107,19 @@ def test_a_training_that_was_stopped_ends_as_one_that_was_not(quick, tmp_path, m
 
     out = tmp_path / "parts.safetensors"
     with monkeypatch.context() as failing:
-        failing.setattr(relief.ReliefTraining, "_loss", breaks_off)
+        failing.setattr(relief.ReliefTraining, "_loss", fail_at_step_6)
         with pytest.raises(RuntimeError, match="the power failed"):
             train_relief(folder, out, CONFIG, iterations=8, quiet=True)
     with pytest.raises(CheckpointError, match="--resume"):
         train_relief(folder, out, CONFIG, iterations=8, quiet=True)
-    with pytest.raises(CheckpointError, match="another training"):
+    with pytest.raises(CheckpointError, match="belongs to a training with another"):
         train_relief(folder, out, CONFIG, iterations=9, resume=True, quiet=True)
     others = write_pictures(tmp_path / "others")
     labels = (others / "metadata.jsonl").read_text()
-    (others / "metadata.jsonl").write_text(labels.replace('"sharpness": 0.3', '"sharpness": 0.9'))  # as many of them
-    with pytest.raises(CheckpointError, match="another training"):
+    (others / "metadata.jsonl").write_text(
+        labels.replace('"sharpness": 0.3', '"sharpness": 0.9')
+    )  # the same number of labels
+    with pytest.raises(CheckpointError, match="belongs to a training with another"):
         train_relief(others, out, CONFIG, iterations=8, resume=True, quiet=True)
     train_relief(folder, out, CONFIG, iterations=8, resume=True, quiet=True)
     whole, parts = (read_tensors(tmp_path / f"{name}.safetensors")[0] for name in ("whole", "parts"))
@@ -126,61 +128,61 @@ def test_a_training_that_was_stopped_ends_as_one_that_was_not(quick, tmp_path, m
     assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == ["parts.safetensors", "whole.safetensors"]
 
 
-def test_a_gel_keeps_its_left_and_right_and_its_lamps():
+def test_augmentation_keeps_a_gels_left_and_right_and_its_lamps():
     gel = torch.zeros(64, 3, 20, 20)
     gel[:, 0, :, :10] = 0.8
     gel[:, 2, :, 10:] = 0.8
-    seen = augment(gel, "touch", np.random.default_rng(0))
-    assert (seen[:, 0, :, :5].mean((1, 2)) > seen[:, 0, :, 15:].mean((1, 2))).all()
-    assert (seen[:, 2, :, 15:].mean((1, 2)) > seen[:, 2, :, :5].mean((1, 2))).all()
+    images = augment(gel, "touch", np.random.default_rng(0))
+    assert (images[:, 0, :, :5].mean((1, 2)) > images[:, 0, :, 15:].mean((1, 2))).all()
+    assert (images[:, 2, :, 15:].mean((1, 2)) > images[:, 2, :, :5].mean((1, 2))).all()
 
 
-def test_a_photo_that_is_scored_is_its_grey_middle():
+def test_photos_are_evaluated_by_their_grey_middle():
     photo = torch.rand(2, 3, 20, 20)
-    seen = centre_crop(photo, "photo")
-    assert seen.shape == (2, 3, 16, 16)
-    torch.testing.assert_close(seen[:, 1], photo[:, :, 2:18, 2:18].mean(1), atol=1e-5, rtol=0)
+    middle = centre_crop(photo, "photo")
+    assert middle.shape == (2, 3, 16, 16)
+    torch.testing.assert_close(middle[:, 1], photo[:, :, 2:18, 2:18].mean(1), atol=1e-5, rtol=0)
     assert centre_crop(photo, "touch") is photo
 
 
 @pytest.mark.parametrize(
-    ("file", "content", "said"),
+    ("file", "content", "message"),
     [
         ("pictures.json", "{", "retrieve collect --photos-only"),
-        ("pictures.json", '{"kind": "film"}', "kind photo or touch"),
+        ("pictures.json", '{"kind": "film"}', "kind must be photo or touch"),
         ("metadata.jsonl", "", "no picture yet"),
-        ("metadata.jsonl", '{"object_id": "a"}\n', "line 1, is no labelled picture"),
+        ("metadata.jsonl", '{"object_id": "a"}\n', "line 1: not a labelled picture"),
         (
             "metadata.jsonl",
             '{"file_name": "a.png", "object_id": "a", "relief": "ribs", "shape": "box", "pitch_mm": 2, '
             '"amplitude_mm": 1, "aspect": 0.5, "sharpness": 0}\n',
-            "aspect from 1",
+            "aspect at least 1",
         ),
-        ("metadata.jsonl", "[]\n", "line 1, is no labelled picture"),
+        ("metadata.jsonl", "[]\n", "line 1: not a labelled picture"),
     ],
 )
-def test_what_is_no_folder_of_pictures_is_said(tmp_path, file, content, said):
+def test_an_invalid_folder_of_labelled_pictures_is_refused(tmp_path, file, content, message):
     folder = write_pictures(tmp_path / "pictures", objects=2)
     (folder / file).write_text(content)
-    with pytest.raises(DatasetError, match=said):
+    with pytest.raises(DatasetError, match=message):
         load_labelled(folder)
 
 
-def test_differences_below_zero_are_refused_for_eight_bits_would_turn_them_bright(tmp_path):
+def test_negative_differences_are_refused_since_eight_bits_would_turn_them_bright(tmp_path):
     signed = dataclasses.replace(CONFIG.preprocessing, background="difference")
     with pytest.raises(ConfigError, match=r"difference\+0.5"):
         train_relief(tmp_path, tmp_path / "tower.safetensors", dataclasses.replace(CONFIG, preprocessing=signed))
 
 
-def test_one_family_alone_teaches_nothing(quick, tmp_path):
+def test_a_single_family_is_refused(quick, tmp_path):
     folder = write_pictures(tmp_path / "pictures", objects=4)
     lines = (folder / "metadata.jsonl").read_text().replace("squares", "stripes")
     (folder / "metadata.jsonl").write_text(lines)
-    with pytest.raises(DatasetError, match="two families"):
+    with pytest.raises(DatasetError, match="at least two relief families"):
         train_relief(folder, tmp_path / "tower.safetensors", CONFIG, iterations=2, quiet=True)
 
 
-def test_the_command_line_collects_pictures_and_learns_from_them(quick, tmp_path, capsys):
+def test_the_command_line_collects_pictures_and_trains_on_them(quick, tmp_path, capsys):
     small = tmp_path / "small.toml"
     small.write_text(
         '[matcher]\ntower = "small"\ntower_output = "pooled"\n[training]\ninit = "random"\n'
@@ -197,7 +199,7 @@ def test_the_command_line_collects_pictures_and_learns_from_them(quick, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["collect", "--photos-only", "--touches-only", "--out", "x"], "go alone"),
         (["collect", "--photos-only", "--preview", "--out", "x"], "go alone"),
@@ -210,8 +212,8 @@ def test_the_command_line_collects_pictures_and_learns_from_them(quick, tmp_path
         (["train", "x", "--task", "relief", "--out", "y.safetensors"], "--photos-only"),
     ],
 )
-def test_words_that_do_not_go_together_are_wrong_use(tmp_path, monkeypatch, capsys, words, said):
+def test_incompatible_options_are_refused(tmp_path, monkeypatch, capsys, words, message):
     monkeypatch.chdir(tmp_path)
     assert main(words) in (1, 2)
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
     assert not any(tmp_path.iterdir())

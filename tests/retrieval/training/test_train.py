@@ -1,4 +1,4 @@
-"""Training: shared images, resumption bit for bit, interruption, frozen towers, and ranks that equal one process."""
+"""Training: shared images, bit-exact resumption, interruption, frozen towers, and several ranks."""
 
 import dataclasses
 import os
@@ -45,10 +45,10 @@ def same_weights(left, right):
     return all(torch.equal(left[name], right[name]) for name in left)
 
 
-def test_each_distinct_image_goes_through_its_tower_once(recording, tmp_path, monkeypatch):
+def test_each_distinct_image_passes_through_its_tower_once(recording, tmp_path, monkeypatch):
     trainer = trainer_for(recording, tmp_path / "m.safetensors")
     batch = trainer.sampler.batch(0, 4)
-    assert len(batch.labels) == 16  # pairs, of 4 touches and no more than 16 photos
+    assert len(batch.labels) == 16  # pairs of 4 touches and at most 16 photos
     counts = {"touch": 0, "photo": 0}
     for name, tower in (("touch", trainer.matcher.touch_tower), ("photo", trainer.matcher.photo_tower)):
         tower.register_forward_hook(
@@ -59,14 +59,14 @@ def test_each_distinct_image_goes_through_its_tower_once(recording, tmp_path, mo
     assert counts == {"touch": 2 * 4, "photo": len(set(batch.photos))}
 
 
-def test_labelled_pairs_train_and_never_validate(recording, tmp_path):
+def test_labelled_pairs_are_for_training_only(recording, tmp_path):
     config = with_training(TINY, **label_recording(recording, tmp_path))
-    trainer, alone = (trainer_for(recording, tmp_path / "m.safetensors", each) for each in (config, TINY))
-    assert len(trainer.sampler.objects) == len(alone.sampler.objects) + 12
-    assert {name for name in trainer.sampler.objects if not name.startswith("like ")} == set(alone.sampler.objects)
-    assert trainer.validation.grasps == alone.validation.grasps
-    assert trainer.data_digest != alone.data_digest
-    assert trainer.split == alone.split
+    trainer, plain = (trainer_for(recording, tmp_path / "m.safetensors", each) for each in (config, TINY))
+    assert len(trainer.sampler.objects) == len(plain.sampler.objects) + 12
+    assert {name for name in trainer.sampler.objects if not name.startswith("like ")} == set(plain.sampler.objects)
+    assert trainer.validation.grasps == plain.validation.grasps
+    assert trainer.data_digest != plain.data_digest
+    assert trainer.split == plain.split
 
 
 def test_labelled_photos_without_touches_are_refused():
@@ -74,8 +74,8 @@ def test_labelled_photos_without_touches_are_refused():
         with_training(TINY, photos="photos")
 
 
-def test_the_loss_of_a_batch_is_the_mean_over_its_pairs_run_one_by_one(recording):
-    """Without the contrastive term and dropout: exactly the paper's loss."""
+def test_the_loss_of_a_batch_is_the_mean_over_its_single_pairs(recording):
+    """Without the contrastive term and dropout, the loss is exactly the paper's."""
     config = with_training(TINY, weights={}, precision="float32")
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, standardise=False, dropout=0.0))
     torch.manual_seed(0)
@@ -100,7 +100,7 @@ def test_the_loss_of_a_batch_is_the_mean_over_its_pairs_run_one_by_one(recording
     torch.testing.assert_close(loss, match_loss(one_by_one, torch.from_numpy(batch.labels)), rtol=1e-5, atol=1e-6)
 
 
-def test_each_loss_of_the_table_is_added_with_its_weight(recording):
+def test_each_loss_is_added_with_its_weight(recording):
     config = with_training(TINY, weights={"contrastive": 0.3, "listwise": 0.7}, precision="float32")
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, dropout=0.0))
     torch.manual_seed(0)
@@ -119,7 +119,7 @@ def test_each_loss_of_the_table_is_added_with_its_weight(recording):
 
 
 class Proxies(Loss):
-    """A loss whose parameters are matrices, drawn at random."""
+    """A loss with a random matrix as its parameter."""
 
     def __init__(self, embedding_dim, objects):
         super().__init__(embedding_dim, objects)
@@ -132,7 +132,7 @@ class Proxies(Loss):
 OWN = TINY.using(losses={"sigmoid": 0.5, Proxies: 0.5})
 
 
-def test_the_parameters_of_a_loss_are_trained_with_the_model_and_stay_out_of_its_checkpoint(recording, tmp_path):
+def test_the_parameters_of_a_loss_are_trained_and_not_stored_in_the_checkpoint(recording, tmp_path):
     trainer = trainer_for(recording, tmp_path / "m.safetensors", OWN)
     assert list(trainer.losses.weights) == ["sigmoid", f"{__name__}:Proxies"]
     first = {name: tensor.clone() for name, tensor in trainer.losses.state_dict().items()}
@@ -158,13 +158,13 @@ def test_a_loss_with_parameters_resumes_bit_for_bit(recording, tmp_path):
     assert same_weights(whole.matcher.state_dict(), resumed.matcher.state_dict())
 
 
-def test_a_loss_that_nobody_has_is_refused_before_an_image_is_read(recording, tmp_path):
+def test_an_unknown_loss_is_refused_before_an_image_is_read(recording, tmp_path):
     config = with_training(TINY, weights={"triplet": 1.0})
     with pytest.raises(ConfigError, match="loss must be one of contrastive, listwise, sigmoid; got 'triplet'"):
         train(recording, tmp_path / "m.safetensors", config, quiet=True)
 
 
-def test_a_contrastive_weight_of_zero_leaves_the_projections_untouched(recording, tmp_path):
+def test_a_contrastive_weight_of_zero_leaves_the_projections_unchanged(recording, tmp_path):
     out = tmp_path / "m.safetensors"
     train(recording, out, with_training(TINY, weights={}), quiet=True)
     torch.manual_seed(TINY.training.seed)
@@ -175,7 +175,7 @@ def test_a_contrastive_weight_of_zero_leaves_the_projections_untouched(recording
     assert not torch.equal(first["head.second.weight"], last["head.second.weight"])
 
 
-def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_ends(recording, tmp_path):
+def test_a_resumed_training_gives_the_bits_of_an_uninterrupted_one(recording, tmp_path):
     whole, parts = trainer_for(recording, tmp_path / "a.safetensors"), tmp_path / "b.safetensors"
     whole.run(quiet=True)
     broken = trainer_for(recording, parts)
@@ -191,34 +191,34 @@ def test_a_resumed_training_ends_bit_for_bit_where_an_unbroken_one_ends(recordin
     assert not state_path(parts).exists()
 
 
-PRUNED = dataclasses.replace(
+WITH_ENCODER = dataclasses.replace(
     with_training(TINY, distil_steps=4), matcher=dataclasses.replace(TINY.matcher, candidate_width=8)
 )
-TINY_UNPRUNED = dataclasses.replace(PRUNED, matcher=TINY.matcher)
+WITHOUT_ENCODER = dataclasses.replace(WITH_ENCODER, matcher=TINY.matcher)
 
 
-def test_a_candidate_encoder_is_distilled_after_the_last_step_and_queries_are_kept(recording, tmp_path):
-    trainer = trainer_for(recording, tmp_path / "m.safetensors", PRUNED)
+def test_a_candidate_encoder_is_distilled_after_the_last_step_and_queries_are_stored(recording, tmp_path):
+    trainer = trainer_for(recording, tmp_path / "m.safetensors", WITH_ENCODER)
     with pytest.raises(RuntimeError, match="power cut"):
         stop_after(trainer, 4)
     underway = load_checkpoint(trainer.out)
-    assert underway.config == TINY_UNPRUNED
+    assert underway.config == WITHOUT_ENCODER
     assert underway.queries is None
-    trainer = trainer_for(recording, trainer.out, PRUNED)
+    trainer = trainer_for(recording, trainer.out, WITH_ENCODER)
     trainer.run(quiet=True)
     made = load_checkpoint(trainer.out)
-    assert made.config == PRUNED
+    assert made.config == WITH_ENCODER
     assert made.matcher.candidate_encoder is not None
-    assert made.queries.shape == (len(trainer.validation.grasps), PRUNED.matcher.partial_width)
+    assert made.queries.shape == (len(trainer.validation.grasps), WITH_ENCODER.matcher.partial_width)
     assert not state_path(trainer.out).exists()
 
 
-def test_a_candidate_encoder_changes_nothing_else_that_training_makes(recording, tmp_path):
-    for name, config in (("a", PRUNED), ("b", TINY)):
+def test_a_candidate_encoder_changes_no_other_weights(recording, tmp_path):
+    for name, config in (("a", WITH_ENCODER), ("b", TINY)):
         trainer_for(recording, tmp_path / f"{name}.safetensors", config).run(quiet=True)
-    with_one, without = (load_checkpoint(tmp_path / f"{name}.safetensors").matcher.state_dict() for name in "ab")
-    assert same_weights(without, with_one)
-    assert {name.split(".")[0] for name in with_one.keys() - without.keys()} == {"candidate_encoder"}
+    distilled, plain = (load_checkpoint(tmp_path / f"{name}.safetensors").matcher.state_dict() for name in "ab")
+    assert same_weights(plain, distilled)
+    assert {name.split(".")[0] for name in distilled.keys() - plain.keys()} == {"candidate_encoder"}
 
 
 def power_cut(*_, **__):
@@ -235,30 +235,27 @@ def power_cut_before_deleting(path):
 
 
 @pytest.mark.parametrize(
-    "where", ["while the candidate_encoder is taught", "before the state is deleted", "at the posterior"]
+    "where", ["while the candidate encoder is trained", "before the state is deleted", "at the posterior"]
 )
 def test_a_power_cut_after_the_last_step_changes_no_bit(where, recording, tmp_path, monkeypatch):
-    """Before the complete checkpoint is written, and after that, while the state of the training still lies there."""
-    trainer_for(recording, tmp_path / "a.safetensors", PRUNED).run(quiet=True)
-    broken = trainer_for(recording, tmp_path / "b.safetensors", PRUNED)
+    """The cut comes before the complete checkpoint is written, or after that, while the state still exists."""
+    trainer_for(recording, tmp_path / "a.safetensors", WITH_ENCODER).run(quiet=True)
+    broken = trainer_for(recording, tmp_path / "b.safetensors", WITH_ENCODER)
     with monkeypatch.context() as cut:
         if where == "before the state is deleted":
             cut.setattr(Path, "unlink", power_cut_before_deleting(state_path(broken.out)))
         else:
-            step = (
-                "distil.distillation_loss"
-                if where == "while the candidate_encoder is taught"
-                else "train.with_verdicts"
-            )
+            in_distillation = where == "while the candidate encoder is trained"
+            step = "distil.distillation_loss" if in_distillation else "train.with_verdicts"
             cut.setattr(f"retrieval.training.{step}", power_cut)
         with pytest.raises(RuntimeError, match="power cut"):
             broken.run(quiet=True)
     assert (load_checkpoint(broken.out).matcher.candidate_encoder is not None) == (
         where == "before the state is deleted"
     )
-    resumed = trainer_for(recording, broken.out, PRUNED)
+    resumed = trainer_for(recording, broken.out, WITH_ENCODER)
     resumed.resume()
-    assert resumed.step == PRUNED.training.iterations
+    assert resumed.step == WITH_ENCODER.training.iterations
     resumed.run(quiet=True)
     assert (tmp_path / "a.safetensors").read_bytes() == broken.out.read_bytes()
     assert not state_path(broken.out).exists()
@@ -269,36 +266,36 @@ def test_ctrl_c_after_the_last_step_leaves_a_usable_checkpoint_that_resuming_com
     step, recording, tmp_path, monkeypatch
 ):
     whole, broken = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
-    train(recording, whole, PRUNED, quiet=True)
+    train(recording, whole, WITH_ENCODER, quiet=True)
     module, name = step.split(".")
     function = getattr(import_module(f"retrieval.training.{module}"), name)
-    said = r"before the checkpoint was complete; .* ranks photos, --resume adds the rest"
+    message = r"before the checkpoint was complete; .* ranks photos, --resume adds the rest"
     with monkeypatch.context() as interrupting:
         interrupting.setattr(f"retrieval.training.{step}", interrupted_before(function))
-        with pytest.raises(JobInterrupted, match=said):
-            train(recording, broken, PRUNED, quiet=True)
+        with pytest.raises(JobInterrupted, match=message):
+            train(recording, broken, WITH_ENCODER, quiet=True)
     left = load_checkpoint(broken)
-    assert (left.config, left.posterior) == (TINY_UNPRUNED, None)
+    assert (left.config, left.posterior) == (WITHOUT_ENCODER, None)
     assert state_path(broken).exists()
-    made = train(recording, broken, PRUNED, resume=True, quiet=True)
-    assert made.config == PRUNED
+    made = train(recording, broken, WITH_ENCODER, resume=True, quiet=True)
+    assert made.config == WITH_ENCODER
     assert made.posterior is not None
     assert whole.read_bytes() == broken.read_bytes()
     assert not state_path(broken).exists()
 
 
 def interrupted_before(function):
-    """The same function, which is called with a Ctrl-C under way."""
+    """Return a function that sends Ctrl-C and then calls `function`."""
 
-    def interrupted(*given, **named):
+    def interrupted(*arguments, **keywords):
         os.kill(os.getpid(), signal.SIGINT)
-        return function(*given, **named)
+        return function(*arguments, **keywords)
 
     return interrupted
 
 
 def stop_after(trainer, steps):
-    """Run, and fail like a power cut in the step after `steps`, once the state of that step is on disk."""
+    """Run and fail like a power cut in the step after `steps`, when the state of that step is on disk."""
     loss = trainer.loss
 
     def failing(loaded):
@@ -323,12 +320,12 @@ def test_an_unfinished_training_is_neither_overwritten_nor_resumed_by_another(re
         train(recording, out, TINY, resume=True, quiet=True)
 
 
-def test_there_is_nothing_to_resume_without_a_state(recording, tmp_path):
+def test_resuming_without_a_state_is_an_error(recording, tmp_path):
     with pytest.raises(CheckpointError, match="there is no"):
         train(recording, tmp_path / "m.safetensors", TINY, resume=True, quiet=True)
 
 
-def test_ctrl_c_leaves_a_usable_checkpoint_and_a_state_to_go_on_from(recording, tmp_path):
+def test_ctrl_c_leaves_a_usable_checkpoint_and_a_state_to_resume(recording, tmp_path):
     trainer = trainer_for(
         recording, tmp_path / "m.safetensors", with_training(TINY, iterations=1000, validate_every=900)
     )
@@ -347,19 +344,19 @@ def test_ctrl_c_leaves_a_usable_checkpoint_and_a_state_to_go_on_from(recording, 
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_frozen_towers_are_run_once_for_each_image_and_do_not_change(recording, tmp_path):
+def test_frozen_towers_encode_each_image_once_and_do_not_change(recording, tmp_path):
     config = with_training(TINY, freeze_towers=True)
-    # ResNet-18 has batch statistics, which would move if a tower were ever in training mode.
+    # ResNet-18 has batch statistics, which would change if a tower were ever in training mode.
     config = dataclasses.replace(config, matcher=dataclasses.replace(config.matcher, tower="resnet18"))
     trainer = trainer_for(recording, tmp_path / "m.safetensors", config)
     before = {name: value.clone() for name, value in trainer.matcher.photo_tower.state_dict().items()}
-    seen = []
-    trainer.matcher.photo_tower.register_forward_hook(lambda _, images, __: seen.append(len(images[0])))
+    counts = []
+    trainer.matcher.photo_tower.register_forward_hook(lambda _, images, __: counts.append(len(images[0])))
     trainer.run(quiet=True)
     assert isinstance(trainer.features, FrozenFeatures)
     assert same_weights(before, trainer.matcher.photo_tower.state_dict())
     known = {photo for part in trainer.sampler.photos for photo in part} | set(trainer.validation.photos)
-    assert sum(seen) <= len(known)
+    assert sum(counts) <= len(known)
 
 
 def test_frozen_batch_norm_keeps_its_running_statistics(recording):
@@ -374,7 +371,7 @@ def test_frozen_batch_norm_keeps_its_running_statistics(recording):
     assert not torch.equal(before, matcher.photo_tower.bn1.running_mean)
 
 
-def test_training_takes_the_number_of_fingers_from_the_recording(model):
+def test_training_reads_the_number_of_fingers_from_the_recording(model):
     assert load_checkpoint(model).config.matcher.fingers == 2
 
 
@@ -393,7 +390,7 @@ def test_bfloat16_is_refused_where_it_would_be_emulated(recording, tmp_path, mon
         train(recording, tmp_path / "m.safetensors", with_training(TINY, precision="bfloat16"), quiet=True)
 
 
-def test_a_training_that_diverges_says_so_and_writes_nothing(recording, tmp_path):
+def test_a_diverging_training_is_an_error_and_writes_nothing(recording, tmp_path):
     from retrieval.errors import NumericalError
 
     trainer = trainer_for(recording, tmp_path / "m.safetensors")
@@ -420,18 +417,18 @@ from tests.retrieval.training.test_train import with_training
 torch.set_num_threads(1)
 distributed.start()
 torch.manual_seed(0)
-# Where hardware multiplies bfloat16, towers in training would round differently in batches of another size.
+# With bfloat16 hardware, towers in training would round differently in batches of another size.
 config = with_training(TINY, precision="float32")
 matcher = build_matcher(config)
 set_training_mode(matcher, config.training)
 with TrainedFeatures(config, torch.device("cpu")) as source:
     loaded = source.prepare(matcher, PairSampler(load_grasps(Path(sys.argv[1])), seed=0).batch(0, 5)).result()
     torch.manual_seed(1)
-    if sys.argv[3] == "local":  # the naive way: every rank's loss over its own share of the images
-        rows = torch.tensor(distributed.share(len(loaded.batch.photos)))
+    if sys.argv[3] == "local":  # the naive way: every rank's loss uses its own images only
+        rows = torch.tensor(distributed.rank_rows(len(loaded.batch.photos)))
         touch = matcher.touch_encoding(matcher.touch_features(loaded.touches)).embedding
         photo = matcher.photo_encoding(matcher.photo_features(loaded.photos)).embedding
-        touches = torch.tensor(distributed.share(len(loaded.batch.grasps)))
+        touches = torch.tensor(distributed.rank_rows(len(loaded.batch.grasps)))
         touch_objects, photo_objects = (
             torch.from_numpy(labels) for labels in (loaded.batch.touch_objects, loaded.batch.photo_objects)
         )
@@ -455,7 +452,7 @@ distributed.stop()
 
 
 def gradients(recording, tmp_path, ranks, loss):
-    """Gradients of one batch, reckoned by so many ranks."""
+    """Return the gradients of one batch, computed by `ranks` ranks."""
     script, out = tmp_path / "gradients.py", tmp_path / f"{loss}{ranks}.pt"
     script.write_text(GRADIENTS)
     run_ranks(script, ranks, recording, out, loss)
@@ -463,7 +460,7 @@ def gradients(recording, tmp_path, ranks, loss):
 
 
 def difference(ours, reference):
-    """Largest difference of a gradient, relative to the largest gradient."""
+    """Return the largest difference of a gradient, relative to the largest gradient."""
     scale = max(float(value.abs().max()) for value in reference.values())
     return max(float((ours[name] - reference[name]).abs().max()) for name in reference) / scale
 
@@ -475,7 +472,7 @@ def test_two_ranks_have_the_gradient_of_one_process(recording, tmp_path):
 
 
 @pytest.mark.slow
-def test_negatives_of_the_own_rank_alone_would_give_another_gradient(recording, tmp_path):
+def test_negatives_of_one_rank_alone_would_give_another_gradient(recording, tmp_path):
     reference = gradients(recording, tmp_path, 1, "contrast")
     assert difference(gradients(recording, tmp_path, 2, "contrast"), reference) < 1e-5
     assert difference(gradients(recording, tmp_path, 2, "local"), reference) > 0.1
@@ -485,12 +482,12 @@ def test_negatives_of_the_own_rank_alone_would_give_another_gradient(recording, 
     ("negatives", "frozen", "shared"),
     [("auto", False, True), ("auto", True, False), ("dataset", False, False), ("batch", True, True)],
 )
-def test_negatives_come_from_the_batch_or_the_whole_set_as_set(recording, tmp_path, negatives, frozen, shared):
+def test_negatives_come_from_the_batch_or_the_whole_set_as_configured(recording, tmp_path, negatives, frozen, shared):
     config = with_training(TINY, negatives=negatives, freeze_towers=frozen)
     assert trainer_for(recording, tmp_path / "m.safetensors", config).sampler.share_photos is shared
 
 
-def test_without_validation_objects_the_last_step_is_kept_uncalibrated(recording, tmp_path):
+def test_without_validation_objects_the_checkpoint_is_the_last_step_without_a_posterior(recording, tmp_path):
     config = with_training(TINY, validation_fraction=0.0, iterations=4, validate_every=3)
     made = train(recording, tmp_path / "m.safetensors", config, quiet=True)
     assert made.split.validation == ()
@@ -516,8 +513,8 @@ else:
     encode, images = tower.double(), 30 + torch.randn(4, 3, 8, 8).double()
 if sys.argv[2] == "all":
     distributed.synchronize_batch_norm(tower)
-with distributed.encoding(len(images)):
-    local = encode(images[distributed.share(len(images))])
+with distributed.counting_rank_rows(len(images)):
+    local = encode(images[distributed.rank_rows(len(images))])
 rows = distributed.gather_rows(local.flatten(1), len(images))
 loss = (rows * torch.randn(rows.shape).double()).sum() + rows.square().square().mean()
 loss.backward()
@@ -530,7 +527,7 @@ distributed.stop()
 
 
 def run_ranks(script, ranks, *arguments):
-    """Run a script on so many ranks."""
+    """Run a script on `ranks` ranks."""
     torchrun = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(ranks)] if ranks > 1 else []
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3]), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *torchrun, str(script), *map(str, arguments)]
@@ -539,25 +536,27 @@ def run_ranks(script, ranks, *arguments):
 
 
 def of_one_batch(tmp_path, tower, ranks, statistics="all"):
-    """Of every rank: loss, gradients and running statistics of a tower after one batch, in double precision, so that
-    no ReLU falls the other way by rounding."""
+    """Return each rank's loss, gradients and running statistics of a tower after one batch.
+
+    The computation is in double precision, so that rounding does not change the sign of a ReLU's input.
+    """
     script, out = tmp_path / "statistics.py", tmp_path / f"{ranks}{statistics}"
     script.write_text(BATCH_STATISTICS)
     run_ranks(script, ranks, tower, statistics, out)
     return [torch.load(f"{out}.{rank}", weights_only=True) for rank in range(ranks)]
 
 
-def test_batch_statistics_are_those_of_all_ranks_images_each_counted_once(tmp_path):
-    """Four images on three ranks: the last share holds nothing new, the fourth image again and again."""
+def test_batch_statistics_count_each_image_of_all_ranks_once(tmp_path):
+    """With four images on three ranks, the last rank has only repetitions of the fourth image."""
     (one,) = of_one_batch(tmp_path, "tiny", 1)
     three, *others = of_one_batch(tmp_path, "tiny", 3)
     assert difference(three, one) < 1e-12
-    for other in others:  # the ranks stay one model, to the bit
+    for other in others:  # all ranks have the same bits
         assert all(torch.equal(other[name], three[name]) for name in three)
 
 
 @pytest.mark.slow
-def test_two_ranks_of_a_resnet_are_one_process(tmp_path):
+def test_two_ranks_of_a_resnet_give_the_results_of_one_process(tmp_path):
     (one,) = of_one_batch(tmp_path, "resnet18", 1)
     assert difference(of_one_batch(tmp_path, "resnet18", 2)[0], one) < 1e-9
     naive = of_one_batch(tmp_path, "resnet18", 2, statistics="own")[0]
@@ -589,7 +588,7 @@ photo_px = 32
 
 @pytest.mark.slow
 def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_path):
-    """A rank that left before the files are written, or that stopped at another step, would take the other down."""
+    """A rank that left before the files are written, or stopped at another step, would make the other fail."""
     out, config = tmp_path / "m.safetensors", tmp_path / "tiny.toml"
     config.write_text(TINY_TOML.replace("iterations = 40", "iterations = 100000"))
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
@@ -598,11 +597,11 @@ def test_two_ranks_train_from_the_command_line_and_stop_together(recording, tmp_
     with run_process(command, env=environment) as process:
         wait_until(lambda: state_path(out).exists() or process.poll() is not None, limit_s=240)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=240)
-    assert "--resume goes on from here" in said
+        _, output = process.communicate(timeout=240)
+    assert "--resume continues from here" in output
     stopped = read_tensors(state_path(out))[1]["step"]
     assert stopped > 0
-    # A fresh and short one: nothing is there for a rank to read before the other has written it.
+    # In a new, short training, no rank finds files before the other has written them.
     config.write_text(TINY_TOML.replace("iterations = 40", "iterations = 2"))
     state_path(out).unlink()
     out.unlink()
@@ -627,18 +626,18 @@ def test_a_split_that_leaks_or_lacks_objects_is_refused(recording, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["folder", "model.md", "file/model.safetensors"])
-def test_a_checkpoint_that_could_not_be_written_is_told_before_the_first_step(recording, tmp_path, monkeypatch, name):
+def test_a_checkpoint_that_cannot_be_written_is_an_error_before_the_first_step(recording, tmp_path, monkeypatch, name):
     (tmp_path / "folder").mkdir()
     (tmp_path / "file").touch()
     monkeypatch.setattr(Trainer, "loss", lambda *_: pytest.fail("trained"))
-    refused = r"is a folder; name the file|must be named \*.safetensors|cannot be written"
-    with pytest.raises(CheckpointError, match=refused):
+    message = r"is a folder; name the file|must be named \*.safetensors|cannot be written"
+    with pytest.raises(CheckpointError, match=message):
         train(recording, tmp_path / name, TINY, quiet=True)
 
 
 @pytest.mark.slow
-def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_path):
-    """SIGKILL by the system, through the command line."""
+def test_a_killed_training_resumes_from_its_last_state(recording, tmp_path):
+    """The system sends SIGKILL to a training on the command line."""
     out = tmp_path / "m.safetensors"
     config = tmp_path / "tiny.toml"
     config.write_text(TINY_TOML.replace("validate_every = 30", "validate_every = 5"))
@@ -651,7 +650,7 @@ def test_a_training_killed_outright_goes_on_from_its_last_state(recording, tmp_p
     assert load_checkpoint(out).provenance["step"] > 0
 
 
-def test_fingers_are_shuffled_within_a_touch_and_by_the_seed():
+def test_fingers_are_shuffled_within_a_touch_by_the_seed():
     features = torch.arange(24.0).view(4, 6)  # four touches of two fingers with three features
     torch.manual_seed(3)
     shuffled = shuffle_fingers(features, fingers=2)
@@ -660,6 +659,6 @@ def test_fingers_are_shuffled_within_a_touch_and_by_the_seed():
     swapped = features.view(4, 2, 3).flip(1).flatten(1)
     same, other = (shuffled == features).all(1), (shuffled == swapped).all(1)
     assert (same ^ other).all()
-    seen = torch.cat([shuffle_fingers(features, fingers=2) for _ in range(50)])
-    assert 60 < int((seen == swapped.repeat(50, 1)).all(1).sum()) < 140
+    repeated = torch.cat([shuffle_fingers(features, fingers=2) for _ in range(50)])
+    assert 60 < int((repeated == swapped.repeat(50, 1)).all(1).sum()) < 140
     assert torch.equal(shuffle_fingers(features, fingers=1), features)
