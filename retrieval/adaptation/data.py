@@ -105,26 +105,26 @@ def config_for(start: Checkpoint, fingers: int, tower: str | type[Tower] | None,
         tower: The published tower.
         seed: Seed of the configuration.
     """
-    preset, known = load_config(PRESET), start.config.matcher
+    preset, source = load_config(PRESET), start.config.matcher
     published = [] if tower is None else [tower_name(tower)]
     matcher = dataclasses.replace(
         preset.matcher,
-        tower=TOWER_SEPARATOR.join([known.tower, *published]),
-        tower_output=known.tower_output,
+        tower=TOWER_SEPARATOR.join([source.tower, *published]),
+        tower_output=source.tower_output,
         fingers=fingers,
-        architectures={**known.architectures, **(architectures_of(published[0]) if published else {})},
+        architectures={**source.architectures, **(architectures_of(published[0]) if published else {})},
     )
     training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="", seed=seed)
     return dataclasses.replace(preset, matcher=matcher, training=training)
 
 
-def load_start_weights(tower: Tower, known: Tower, init: str) -> None:
+def load_start_weights(tower: Tower, start: Tower, init: str) -> None:
     """Load the weights of the start model and, into the last part of a combined tower, the published ones."""
     if init == NO_TOWER:
-        tower.load_state_dict(known.state_dict())
+        tower.load_state_dict(start.state_dict())
         return
     assert isinstance(tower, ConcatenatedTowers)
     *parts, published = tower.parts
-    for part, source in zip(parts, known.parts if isinstance(known, ConcatenatedTowers) else [known], strict=True):
+    for part, source in zip(parts, start.parts if isinstance(start, ConcatenatedTowers) else [start], strict=True):
         part.load_state_dict(source.state_dict())
     initialise_tower(published, init)  # type: ignore[arg-type]

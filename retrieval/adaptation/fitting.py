@@ -94,28 +94,30 @@ def install_codes(matcher: Matcher, projections: CcaProjections, scale: float, o
     matcher.cosine_scale.fill_(scale)
 
 
-def calibrate_fit(made: Checkpoint, data: AdaptationData, estimate: Estimate | None, *, quiet: bool) -> Checkpoint:
+def calibrate_fit(
+    checkpoint: Checkpoint, data: AdaptationData, estimate: Estimate | None, *, quiet: bool
+) -> Checkpoint:
     """Add the gel check and the posterior to a fitted checkpoint.
 
     The posterior is fitted on held-out objects, because the codes are overfitted to their own objects.
 
     Args:
-        made: The fitted checkpoint.
+        checkpoint: The fitted checkpoint.
         data: The own grasps and their features.
         estimate: Contains the held-out touches; without it the checkpoint has no posterior.
         quiet: No progress on stderr.
     """
-    made = _with_gel_check(made, data.grasps, data.features, quiet)
+    checkpoint = _with_gel_check(checkpoint, data.grasps, data.features, quiet)
     if estimate is None:
-        return dataclasses.replace(made, posterior=None, references=None)
+        return dataclasses.replace(checkpoint, posterior=None, references=None)
     # Touches of held-out objects (half of each kind at a time), with the match logits of the matcher.
-    assert made.matcher.cosine_scale is not None
-    scale, offset = made.matcher.cosine_scale.item(), made.matcher.head.out.bias.item()
+    assert checkpoint.matcher.cosine_scale is not None
+    scale, offset = checkpoint.matcher.cosine_scale.item(), checkpoint.matcher.head.out.bias.item()
     left_out = [
         ReferenceTouches(dataclasses.replace(part.scored, logits=scale * part.scored.logits + offset), part.embeddings)
         for part in estimate.choice.held_out_touches
     ]
-    return _with_posterior(made, left_out)
+    return _with_posterior(checkpoint, left_out)
 
 
 def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estimate, *, quiet: bool) -> Checkpoint:
@@ -127,27 +129,27 @@ def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estima
         estimate: The estimate with the unadapted baseline.
         quiet: No progress on stderr.
     """
-    made = _with_gel_check(start, data.grasps, estimate.baseline.features, quiet)
+    checkpoint = _with_gel_check(start, data.grasps, estimate.baseline.features, quiet)
     folds = [sorted(set(fold.left_out.object_ids)) for fold in estimate.folds]
     about = {"source": data.source, "data_digest": data_digest(data.grasps)}
     provenance = start.provenance | {"adapted_to": about, "metrics": estimate.to_dict()}
     return _with_posterior(
-        dataclasses.replace(made, provenance=provenance),
+        dataclasses.replace(checkpoint, provenance=provenance),
         estimate.baseline.reference_touches(folds, MAX_CALIBRATION_TOUCHES),
     )
 
 
-def _with_posterior(made: Checkpoint, left_out: list[ReferenceTouches]) -> Checkpoint:
+def _with_posterior(checkpoint: Checkpoint, left_out: list[ReferenceTouches]) -> Checkpoint:
     """Return the checkpoint with posterior and reference calibration, fitted on touches of held-out objects."""
     posterior = fit_posterior(*(part.scored for part in left_out))
-    return dataclasses.replace(made, posterior=posterior, references=fit_reference_calibration(*left_out))
+    return dataclasses.replace(checkpoint, posterior=posterior, references=fit_reference_calibration(*left_out))
 
 
-def _with_gel_check(made: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:
+def _with_gel_check(checkpoint: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:
     """Return the checkpoint with a gel check: fitted on half of the objects, with thresholds from the others."""
     device = default_device()
     names = sorted({grasp.object_id for grasp in grasps})
     groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
-    made.matcher.to(device)
-    with FrozenFeatures(made.config, device, features_by_image(grasps, features, device)) as source:
-        return with_verdicts(made, source, *groups, quiet=quiet)
+    checkpoint.matcher.to(device)
+    with FrozenFeatures(checkpoint.config, device, features_by_image(grasps, features, device)) as source:
+        return with_verdicts(checkpoint, source, *groups, quiet=quiet)

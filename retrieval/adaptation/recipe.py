@@ -103,10 +103,10 @@ def adapt(
     )
     estimate = estimate_accuracy(data, start, cache=cache, seed=seed, quiet=quiet)
     if estimate and estimate.is_baseline_better:
-        made = calibrate_baseline(start, data, estimate, quiet=quiet)
+        checkpoint = calibrate_baseline(start, data, estimate, quiet=quiet)
     else:
-        made = calibrate_fit(fit_matcher(data, estimate, out), data, estimate, quiet=quiet)
-    store_checkpoint(made, out)
+        checkpoint = calibrate_fit(fit_matcher(data, estimate, out), data, estimate, quiet=quiet)
+    store_checkpoint(checkpoint, out)
     page = None
     if report and estimate:
         page = write_curve(report, learning_curve(data, start, cache=cache, seed=seed, quiet=quiet))

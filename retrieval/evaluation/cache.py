@@ -81,5 +81,5 @@ def resumable(folder: Path) -> Iterator[None]:
         yield
     except JobInterrupted as error:
         raise JobInterrupted(
-            f"Stopped. Finished parts are stored in {folder}; run the same command again to resume."
+            f"Stopped. Finished parts are stored in {folder}; run the same command to continue."
         ) from error

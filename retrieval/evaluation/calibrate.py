@@ -171,13 +171,13 @@ def draw_pairs(table: ScoreTable, seed: int) -> tuple[NDArray[np.float64], NDArr
     Returns:
         Scores (P,) and labels (P,), 1 for a true pair.
     """
-    kept = table.with_targets
+    targets = table.with_targets
     rng = np.random.default_rng([seed, 1])
-    keys = np.where(kept.relevant & ~kept.own, rng.random(kept.own.shape), np.inf)
+    keys = np.where(targets.relevant & ~targets.own, rng.random(targets.own.shape), np.inf)
     true = np.argsort(keys, axis=1)[:, :_PAIRS_OF_A_ROW]
     is_drawn = np.isfinite(np.take_along_axis(keys, true, 1))
-    false = _other_photos(kept, true.shape[1], rng)
-    scores = [np.take_along_axis(kept.scores, columns, 1)[is_drawn] for columns in (true, false)]
+    false = _other_photos(targets, true.shape[1], rng)
+    scores = [np.take_along_axis(targets.scores, columns, 1)[is_drawn] for columns in (true, false)]
     labels = np.repeat([1, 0], is_drawn.sum())
     return np.concatenate(scores).astype(np.float64), labels
 
@@ -210,13 +210,15 @@ def draw_k_way_tests(
     Raises:
         BadInput: The table has fewer than two objects.
     """
-    kept = table.with_targets
-    scores = object_scores(kept, choice.photos, _TESTS_OF_A_ROW, seed, posterior.object_logits if posterior else None)
-    count = min(choice.k, len(kept.objects))
+    targets = table.with_targets
+    scores = object_scores(
+        targets, choice.photos, _TESTS_OF_A_ROW, seed, posterior.object_logits if posterior else None
+    )
+    count = min(choice.k, len(targets.objects))
     if count < 2:
-        raise BadInput(f"A K-way test needs at least 2 objects, got {len(kept.objects)}.")
+        raise BadInput(f"A K-way test needs at least 2 objects, got {len(targets.objects)}.")
     # The true object gets the smallest key, so it always comes first.
-    true = kept.touch_owner[:, None] == kept.objects
+    true = targets.touch_owner[:, None] == targets.objects
     keys = np.random.default_rng([seed, 2]).random(scores.shape) - true
     return np.take_along_axis(scores, np.argsort(keys, axis=2)[..., :count], 2).reshape(-1, count)
 

@@ -77,10 +77,10 @@ def thin_grasps(grasps: Sequence[Grasp], max_grasps: int) -> list[Grasp]:
     rows_of: dict[str, list[int]] = defaultdict(list)
     for row, grasp in enumerate(grasps):
         rows_of[grasp.object_id].append(row)
-    kept: set[int] = set()
+    selected: set[int] = set()
     for rows in rows_of.values():
-        kept |= {rows[place] for place in np.linspace(0, len(rows) - 1, min(max_grasps, len(rows))).astype(int)}
-    return [grasps[row] for row in sorted(kept)]
+        selected |= {rows[place] for place in np.linspace(0, len(rows) - 1, min(max_grasps, len(rows))).astype(int)}
+    return [grasps[row] for row in sorted(selected)]
 
 
 def score_control(description: str, method: str, experiment: Experiment, seed: int, *, draws: int) -> dict[str, Any]:

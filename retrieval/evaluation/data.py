@@ -116,8 +116,8 @@ def _split(
     if requested is not None:
         require_fit(requested, grasps)
         return requested, "given"
-    known = checkpoint.split if checkpoint else None
-    trained = {*known.train, *known.validation} if known else set()
+    own = checkpoint.split if checkpoint else None
+    trained = {*own.train, *own.validation} if own else set()
     recorded = {grasp.object_id for grasp in grasps}
     if checkpoint and checkpoint.split and trained and trained <= recorded:
         test = checkpoint.split.test or tuple(sorted(recorded - trained))

@@ -106,7 +106,7 @@ def evaluate(
         data = prepare(folder_of(recording), out, config, model=model, split=split, quiet=quiet)
         experiment, controls = _experiments(data, out, cache or out / "features", seed, quiet)
         jobs = {name: experiment.seeds_of(name, seed_list) for name in dict.fromkeys(names)}
-        predictions = {name: [experiment.run(name, one) for one in some] for name, some in jobs.items()}
+        predictions = {name: [experiment.run(name, each) for each in seeds_used] for name, seeds_used in jobs.items()}
         groups = [
             ("controls", CONTROLS, CONTROL_METHOD, controls),
             ("ceilings", CEILINGS, CEILING_METHOD, ceiling_experiments(experiment)),

@@ -295,7 +295,7 @@ class _ProtocolRun:
     def _aggregation(self, folds: Mapping[int, Sequence[Split]]) -> Aggregation:
         if not self.protocol.choices:
             return Aggregation(DRAWS, self.seeds[0])
-        splits = [split for some in folds.values() for split in some]
+        splits = [split for of_seed in folds.values() for split in of_seed]
         test = sum(len(split.test) for split in splits)
         return Aggregation(DRAWS, self.seeds[0], test / sum(len(split.train + split.validation) for split in splits))
 

@@ -335,10 +335,10 @@ def touch_to_touch_entry(
 
 def _towers(rows: Sequence[BenchmarkRow]) -> Iterator[tuple[str, TowerEncoder]]:
     """Yield the name and the towers of the rows, each towers once."""
-    known: list[TowerEncoder] = []
+    distinct: list[TowerEncoder] = []
     for row in rows:
-        if not any(row.towers is one for one in known):
-            known.append(row.towers)
+        if not any(row.towers is one for one in distinct):
+            distinct.append(row.towers)
             yield (row.name if row.towers.checkpoint else FROZEN), row.towers
 
 

@@ -85,7 +85,7 @@ def _choices(facts: RecordingFacts, seed: int) -> list[Split]:
     fewest = min(map(len, classes.values()))
     if fewest < 3:
         raise DatasetError(
-            f"Each class needs at fewest 3 instances, 2 for test and the others for training, but a class has {fewest}."
+            f"Each class needs at least 3 instances, 2 for test and the others for training, but a class has {fewest}."
         )
     tests = [[names[turn] for names in classes.values() for turn in pair] for pair in combinations(range(fewest), 2)]
     for _ in range(DRAWN_CHOICES):

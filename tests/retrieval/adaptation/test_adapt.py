@@ -298,7 +298,7 @@ def test_initial_weights_are_for_all_towers_or_for_each(published):
     assert torch.equal(
         two.parts[0].features[0][0].weight, torch.load(published, weights_only=True)["features.0.0.weight"]
     )
-    with pytest.raises(CheckpointError, match="2 towers side by side take first weights for each"):
+    with pytest.raises(CheckpointError, match="2 concatenated towers need initial weights each"):
         initialise_tower(two, "random+random+random")
 
 
@@ -350,5 +350,5 @@ def test_a_report_that_cannot_be_written_is_reported_as_missing(recording, model
     assert main([*line, "--init", "none", "--split", str(split), "--report", str(tmp_path / "curve")]) == 0
     output = capsys.readouterr().err
     assert "at least 6 objects, got 4" in output
-    assert f"{tmp_path / 'curve'} is not written" in output
+    assert f"{tmp_path / 'curve'} was not written" in output
     assert not (tmp_path / "curve").exists()

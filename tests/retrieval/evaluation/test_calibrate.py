@@ -238,7 +238,7 @@ def test_two_objects_give_a_pair_calibration_but_no_posterior():
     assert list(fitted.pairs) == [1]
     assert fitted.posteriors == {}
     assert set(reliability(fitted, {1: planted(objects=2)}, [KWayTest(2)])) == {"pairs"}
-    with pytest.raises(BadInput, match="three objects at least"):
+    with pytest.raises(BadInput, match="at least three objects"):
         posterior_questions(planted(objects=2))
 
 

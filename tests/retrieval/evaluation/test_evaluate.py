@@ -277,7 +277,7 @@ def test_ctrl_c_during_training_prints_how_to_resume(run, tmp_path, monkeypatch)
         return loss(self, loaded)
 
     monkeypatch.setattr(Trainer, "loss", interrupted)
-    with pytest.raises(JobInterrupted, match="run the same command again to resume"):
+    with pytest.raises(JobInterrupted, match="run the same command to continue"):
         run(tmp_path / "out", methods=("late_fusion",))
 
 
@@ -431,6 +431,6 @@ def test_the_command_writes_a_report_and_one_json_document(grasped, tmp_path, ca
 def test_the_command_refuses_conflicting_options(grasped, tmp_path, capsys):
     command = ["evaluate", str(grasped), "--out", str(tmp_path / "r"), "--model", "m.safetensors"]
     assert main([*command, "--preset", "paper"]) == 2
-    assert "give --model, or --preset and --init" in capsys.readouterr().err
+    assert "give either --model or --preset and --init" in capsys.readouterr().err
     assert main([*command[:-2], "--methods", "oracle"]) == 2
     assert main(command) == 2

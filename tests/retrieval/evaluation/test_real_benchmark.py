@@ -144,7 +144,7 @@ def test_choices_report_each_fold_with_confidences_and_contact(tmp_path, monkeyp
     assert sum(one["count"] for one in row["reliability"]["gallery"]) == 4 * 4 * 18 * 4  # drawn four times each
     assert set(row["best_params"][0][0]) >= {"ridge", "photo_ridge", "directions", "power", "posterior"}
     text = re.sub(r"\\", "", (tmp_path / "out" / "report.md").read_text())
-    for words in ("over choices", "strongest quarter", "mean stated", "the order of capture", "4 choice(s) each"):
+    for words in ("over choices", "strongest quartile", "mean confidence", "the order of capture", "4 choice(s) each"):
         assert words in text
 
 
@@ -179,7 +179,7 @@ def test_a_stopped_run_resumes(data, out, tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(Method, "fit", stopping)
     assert benchmark(data, again, "--protocols", ",".join(PROTOCOL_NAMES)) == 1
-    assert "goes on with it" in capsys.readouterr().err
+    assert "run the same command to continue" in capsys.readouterr().err
     assert benchmark(data, again, "--protocols", ",".join(PROTOCOL_NAMES)) == 0
     assert len(fitted) == 3
     assert (again / "results.json").read_bytes() == (out / "results.json").read_bytes()
@@ -209,7 +209,7 @@ def test_a_missing_data_set_prints_the_import_command(data, tmp_path, capsys):
     message = capsys.readouterr().err
     assert f"retrieve benchmark real {data} --out {tmp_path / 'out'} --protocols objectfolder" in message
     assert f"retrieve import rct RCT --out {data / 'rct'} --option touch=... photo=... && " in message
-    assert "must hold data of a protocol" in message
+    assert "must contain data of at least one protocol" in message
 
 
 @pytest.mark.slow
@@ -242,7 +242,7 @@ def test_a_checkpoint_is_a_row_and_one_finger_is_used_for_both_of_its_fingers(da
     row = json.loads((tmp_path / "results.json").read_text())["protocols"]["billets-places"]["rows"]["mine"]
     assert row["model"]
     assert row["verdict"]
-    assert "mine (as it is)" in (tmp_path / "report.md").read_text()
+    assert "mine (unadapted)" in (tmp_path / "report.md").read_text()
 
 
 @pytest.mark.slow

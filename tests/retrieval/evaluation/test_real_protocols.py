@@ -353,7 +353,7 @@ def test_an_interval_over_choices_is_the_corrected_resampled_t_interval():
     assert (difference["min"], difference["max"]) == (pytest.approx(0.1), pytest.approx(0.3))
     # t = .2 / sqrt(.01333) = 1.7321; of 2 degrees of freedom both tails beyond it have 1 - t / sqrt(t^2 + 2)
     assert difference["p"] == pytest.approx(1 - 1.7320508 / np.sqrt(5))
-    with pytest.raises(BadInput, match="needs two choices at least; got 1"):
+    with pytest.raises(BadInput, match="needs at least two splits; got 1"):
         summarise_splits(of_choices(0.5, 0.6, 0.7)[:1], ratio=1.0)
 
 

@@ -237,7 +237,7 @@ def test_rejection_works_at_any_score_scale(scale):
 
 def test_two_objects_are_too_few():
     table = planted(objects=2)
-    with pytest.raises(BadInput, match="three objects at least"):
+    with pytest.raises(BadInput, match="at least three objects"):
         reject(Posterior(), table)
 
 
