@@ -226,7 +226,7 @@ def test_an_imported_recording_replaces_the_data_sets_own_folder(out, tmp_path):
         (["--protocols", "ycb"], "protocol must be one of"),
         (["--methods", "mine"], "method must be one of"),
         (["--model", "alone"], "NAME=FILE"),
-        (["--seeds", "0"], "0 is not from 1"),
+        (["--seeds", "0"], "must be from 1 to 1000000000, got 0"),
     ],
 )
 def test_wrong_use_is_one_line(data, tmp_path, options, message, capsys):
