@@ -50,8 +50,8 @@ def test_a_skipped_row_has_a_reason_and_no_plot(tmp_path):
 
 def test_the_performance_page_has_the_number_of_approximations():
     text = (Path(__file__).parents[3] / "docs" / "performance.md").read_text()
-    assert f"{len(APPROXIMATIONS)} approximations of a search" in " ".join(text.split())
-    assert f"{len(KERNELS)} approximations of our kernels" in " ".join(text.split())
+    assert f" {len(APPROXIMATIONS)} approximations of a search" in " ".join(text.split())
+    assert f" {len(KERNELS)} approximations of our kernels" in " ".join(text.split())
 
 
 def test_labels_of_near_points_are_above_and_below():
