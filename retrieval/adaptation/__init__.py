@@ -1,1 +1,1 @@
-"""Fitting a matcher to a new sensor and a few own objects, and saying what came of it."""
+"""Adaptation of a matcher to a new sensor and a few own objects, with an accuracy estimate."""

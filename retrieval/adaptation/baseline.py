@@ -1,4 +1,4 @@
-"""The model that one starts from, as it is: on a sensor like its own, no fit to a few objects knows as much."""
+"""The unadapted start model as a baseline: on a similar sensor it is better than a fit to a few objects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,51 +20,60 @@ from retrieval.training.features import Features, encode_recording
 
 @dataclass(frozen=True, eq=False)
 class UnadaptedBaseline:
-    """A model that nothing is fitted to, and what its towers make of own grasps in its own preprocessing."""
+    """A start model without any fit, and the features of own grasps in its own preprocessing.
+
+    Attributes:
+        start: The model.
+        features: Tower features of the grasps.
+    """
 
     start: Checkpoint
     features: Features
 
     @classmethod
     def of(cls, start: Checkpoint, grasps: list[Grasp], cache: Path | None, quiet: bool) -> "UnadaptedBaseline":
-        """A touch of fewer fingers than the model takes is given to each of them."""
+        """Encode the grasps; if the model has more fingers than a grasp, the touches are repeated."""
         config = replace(start.config.matcher, fingers=len(grasps[0].touches))
-        seen = Matcher(config, start.matcher.views).eval()
-        seen.touch_tower, seen.photo_tower = start.matcher.touch_tower, start.matcher.photo_tower
-        found = encode_recording(grasps, seen, replace(start.config, matcher=config), cache, quiet=quiet)
+        encoder = Matcher(config, start.matcher.views).eval()
+        encoder.touch_tower, encoder.photo_tower = start.matcher.touch_tower, start.matcher.photo_tower
+        found = encode_recording(grasps, encoder, replace(start.config, matcher=config), cache, quiet=quiet)
         fingers = np.arange(start.config.matcher.fingers) % config.fingers
         return cls(start, replace(found, touch=np.ascontiguousarray(found.touch[:, fingers])))
 
     @one_thread()
-    def logits(self, asked: Features) -> NDArray[np.float32]:
-        """(n, n) of the touch of every grasp with the photo of every one."""
-        matcher, reference_touches = self.start.matcher, self._partials(asked)
+    def logits(self, features: Features) -> NDArray[np.float32]:
+        """Return match logits (n, n) of the touch of every grasp with the photo of every grasp."""
+        matcher, touches = self.start.matcher, self._partials(features)
         with torch.inference_mode():
-            photos = matcher.photo_encoding(torch.from_numpy(asked.photo)).partial.numpy()
-        return np.stack([score_partials(matcher.head, partial[None], photos) for partial in reference_touches])
+            photos = matcher.photo_encoding(torch.from_numpy(features.photo)).partial.numpy()
+        return np.stack([score_partials(matcher.head, touch[None], photos) for touch in touches])
 
     @torch.inference_mode()
-    def _partials(self, asked: Features) -> torch.Tensor:
-        return self.start.matcher.touch_encoding(torch.from_numpy(asked.touch).flatten(1)).partial
+    def _partials(self, features: Features) -> torch.Tensor:
+        return self.start.matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1)).partial
 
     def fold_accuracies(self, folds: Sequence[Sequence[str]]) -> list[FoldAccuracy]:
-        """How it tells the objects of each fold apart."""
-        return [score_accuracy(self.logits(asked), asked) for asked in map(self.features.of_objects, folds)]
+        """Return the accuracy of the model among the objects of each fold."""
+        return [score_accuracy(self.logits(features), features) for features in map(self.features.of_objects, folds)]
 
-    def reference_touches(self, folds: Sequence[Sequence[str]], most: int) -> list[ReferenceTouches]:
-        """What its posterior can be fitted on, and what references are worth: of each object at most so many
-        touches.
+    def reference_touches(self, folds: Sequence[Sequence[str]], max_touches: int) -> list[ReferenceTouches]:
+        """Return the touches of each fold that calibrate the posterior and the reference touches.
+
+        Args:
+            folds: Objects of each fold.
+            max_touches: Maximum number of touches of one object.
         """
         parts = []
-        for asked in map(self.features.of_objects, folds):
-            some = asked.select(first_rows(asked, most))
-            none = np.eye(len(some), dtype=np.bool_)
-            projections = touch_embeddings(self._partials(some).numpy(), self.start.config.matcher.hidden)
-            parts.append(ReferenceTouches(ScoredTouches(self.logits(some), some.owner, some.owner, none), projections))
+        for fold in map(self.features.of_objects, folds):
+            features = fold.select(first_rows(fold, max_touches))
+            own = np.eye(len(features), dtype=np.bool_)
+            projections = touch_embeddings(self._partials(features).numpy(), self.start.config.matcher.hidden)
+            scored = ScoredTouches(self.logits(features), features.owner, features.owner, own)
+            parts.append(ReferenceTouches(scored, projections))
         return parts
 
 
-def first_rows(features: Features, most: int) -> NDArray[np.int64]:
-    """Rows of the first grasps of each object."""
+def first_rows(features: Features, max_grasps: int) -> NDArray[np.int64]:
+    """Return the rows of the first grasps of each object, at most `max_grasps`."""
     owner = features.owner
-    return np.concatenate([np.flatnonzero(owner == name)[:most] for name in range(owner.max() + 1)])
+    return np.concatenate([np.flatnonzero(owner == name)[:max_grasps] for name in range(owner.max() + 1)])

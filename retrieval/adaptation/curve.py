@@ -1,4 +1,4 @@
-"""How many touches of how many own objects does it take? Fits on fewer of them, judged on objects left out."""
+"""Learning curve: accuracy on held-out objects of fits to fewer own objects and fewer touches."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -25,11 +25,11 @@ from retrieval.training.features import Features
 from retrieval.version import __version__
 
 OBJECTS, TOUCHES = (5, 10, 20, 1000), (5, 20, 100)
-"""What is tried: so many own objects, of which all outside the fold at most, and so many touches of each."""
+"""Numbers of own objects, at most all outside the fold, and of touches of each object to fit."""
 SETTINGS = CcaSettings()
-"""Of every fit on the curve: few objects leave none to choose by."""
-ADAPTED, START_TOWERS, PUBLISHED_TOWERS = "adapted", "towers of the model alone", "published towers alone"
-LOW_PASS, UNADAPTED = "adapted, touches blurred", "the model as it is"
+"""Settings of every fit on the curve: few objects leave none for validation."""
+ADAPTED, START_TOWERS, PUBLISHED_TOWERS = "adapted", "only the towers of the model", "only the published towers"
+LOW_PASS, UNADAPTED = "adapted, low-pass touches", "the unadapted model"
 COLOURS = ("#9ecae1", "#56b4e9", "#0072b2", "#08306b")
 
 
@@ -38,8 +38,15 @@ Interval = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class CurvePoint:
-    """One place on the curve: a fit on so many touches of each of so many objects, and its first guesses and pair
-    accuracy on those left out, each with the ends of its interval by object.
+    """One point of the curve: a fit and its accuracy on held-out objects.
+
+    Attributes:
+        label: The kind of fit.
+        objects: Number of fitted objects.
+        touches: Number of touches of each object.
+        top1: Top-1 accuracy and the ends of its interval by object.
+        pair_accuracy: Pair accuracy and the ends of its interval by object.
+        chance: Chance level of the top-1 accuracy.
     """
 
     label: str
@@ -51,12 +58,12 @@ class CurvePoint:
 
     @classmethod
     def of(cls, label: str, objects: int, touches: int, top1: Measure, pair_accuracy: Measure) -> "CurvePoint":
-        """A place on the curve, from measures over the objects left out."""
+        """Return the point of these measures on held-out objects."""
         return cls(label, objects, touches, interval_of(top1), interval_of(pair_accuracy), float(top1.chance[0]))
 
 
 def interval_of(measure: Measure) -> Interval:
-    """A value, and the ends of its interval."""
+    """Return the value of a measure and the ends of its interval."""
     found = summarise([measure])
     return found["value"][0], found["low"][0], found["high"][0]
 
@@ -65,28 +72,39 @@ def interval_of(measure: Measure) -> Interval:
 def learning_curve(
     data: AdaptationData, start: Checkpoint, *, cache: Path | None = None, seed: int = 0, quiet: bool = False
 ) -> list[CurvePoint]:
-    """Fits on fewer touches of fewer objects; beside them, with all that a fit here takes: the towers of each side
-    alone, the blurred control, and the model that one started from, as it is.
+    """Fit to fewer touches of fewer objects and measure the accuracy on held-out objects.
 
-    cache: where the features of that last one are kept. Raises BadInput for fewer than six objects.
+    For comparison the curve includes the unadapted model and, with all objects and touches, the low-pass control and
+    fits to each of the combined towers alone.
+
+    Args:
+        data: The own grasps and their features.
+        start: The start model.
+        cache: Folder of the features of the unadapted model.
+        seed: Seed of folds and drawn touches.
+        quiet: No progress on stderr.
+
+    Raises:
+        BadInput: There are fewer than six objects.
     """
     folds = draw_folds(data.grasps, seed)
     features, blocks = data.features, data.blocks
-    most = min(len(set(features.object_ids)) - len(fold) for fold in folds)
-    held = int(np.bincount(features.owner).min())
+    max_objects = min(len(set(features.object_ids)) - len(fold) for fold in folds)
+    max_touches = int(np.bincount(features.owner).min())
     objects, touches = (
-        sorted({min(count, end) for count in counts}) for counts, end in ((OBJECTS, most), (TOUCHES, held))
+        sorted({min(count, end) for count in counts})
+        for counts, end in ((OBJECTS, max_objects), (TOUCHES, max_touches))
     )
-    tried = [(ADAPTED, features, blocks, count, each) for count in objects for each in touches]
-    tried.append((LOW_PASS, data.low_pass, blocks, objects[-1], touches[-1]))
+    fits = [(ADAPTED, features, blocks, count, each) for count in objects for each in touches]
+    fits.append((LOW_PASS, data.low_pass, blocks, objects[-1], touches[-1]))
     if isinstance(data.matcher.touch_tower, ConcatenatedTowers):
         for place, name in enumerate((START_TOWERS, PUBLISHED_TOWERS)):
-            tried.append((name, *one_tower(data, place), objects[-1], touches[-1]))
+            fits.append((name, *one_tower(data, place), objects[-1], touches[-1]))
     baseline = UnadaptedBaseline.of(start, data.grasps, cache, quiet).fold_accuracies(folds)
     points = [CurvePoint.of(UNADAPTED, 0, 0, measure(baseline, "top1"), measure(baseline, "pair_accuracy"))]
-    with Bar("learning curve", len(tried), "fits", quiet=quiet) as bar:
-        for label, shown, widths, count, each in tried:
-            points.append(_point(label, shown, widths, folds, count, each, seed))
+    with Bar("learning curve", len(fits), "fits", quiet=quiet) as bar:
+        for label, inputs, widths, count, each in fits:
+            points.append(_point(label, inputs, widths, folds, count, each, seed))
             bar.advance()
     return points
 
@@ -100,9 +118,7 @@ def _point(
     touches: int,
     seed: int,
 ) -> CurvePoint:
-    """A place on the curve: for every fold a fit on objects and touches drawn from those outside it, judged on the
-    fold.
-    """
+    """Return a point of the curve: for each fold a fit to random outside objects and touches, scored on the fold."""
     rng = np.random.default_rng([seed, objects, touches])
     everyone = {name for fold in folds for name in fold}
     number_of = {name: number for number, name in enumerate(sorted(set(features.object_ids)))}
@@ -110,30 +126,35 @@ def _point(
     for fold in folds:
         chosen = rng.permutation(sorted(everyone.difference(fold)))[:objects]
         rows = [rng.permutation(np.flatnonzero(features.owner == number_of[name]))[:touches] for name in chosen]
-        learned = features.select(np.sort(np.concatenate(rows)))
-        touch = learned.touch.reshape(len(learned), -1)
-        projections = dict(fit_projections(touch, learned.photo, learned.owner, blocks, [SETTINGS]))[SETTINGS]
+        drawn = features.select(np.sort(np.concatenate(rows)))
+        touch = drawn.touch.reshape(len(drawn), -1)
+        projections = dict(fit_projections(touch, drawn.photo, drawn.owner, blocks, [SETTINGS]))[SETTINGS]
         parts.append(fold_accuracy(Fold(features.of_objects(fold), projections, SETTINGS)))
     return CurvePoint.of(label, objects, touches, measure(parts, "top1"), measure(parts, "pair_accuracy"))
 
 
 def one_tower(data: AdaptationData, place: int) -> tuple[Features, TowerWidths]:
-    """What one of the towers that stand side by side makes of the grasps alone."""
+    """Return the features of one of the combined towers, and their widths.
+
+    Args:
+        data: The own grasps and their features.
+        place: Place of the tower among the combined ones.
+    """
 
     def part(x: NDArray[np.float32], widths: Sequence[int], images: int) -> NDArray[np.float32]:
-        its = np.split(x.reshape(len(x), images, -1), np.cumsum(widths)[:-1], axis=2)[place]
-        return np.ascontiguousarray(its)
+        blocks = np.split(x.reshape(len(x), images, -1), np.cumsum(widths)[:-1], axis=2)
+        return np.ascontiguousarray(blocks[place])
 
     matcher, features = data.matcher, data.features
-    felt, seen = feature_counts_of(matcher.touch_tower), feature_counts_of(matcher.photo_tower)
+    touch_widths, photo_widths = feature_counts_of(matcher.touch_tower), feature_counts_of(matcher.photo_tower)
     fingers = matcher.config.fingers
-    touch, photo = part(features.touch, felt, fingers), part(features.photo, seen, matcher.views)
-    alone = replace(features, touch=touch, photo=photo.reshape(len(photo), -1))
-    return alone, ([felt[place]] * fingers, [seen[place]] * matcher.views)
+    touch, photo = part(features.touch, touch_widths, fingers), part(features.photo, photo_widths, matcher.views)
+    single = replace(features, touch=touch, photo=photo.reshape(len(photo), -1))
+    return single, ([touch_widths[place]] * fingers, [photo_widths[place]] * matcher.views)
 
 
 def write_curve(folder: Path, points: Sequence[CurvePoint]) -> Path:
-    """curve.json, curve.png and curve.md in `folder`; returns the last."""
+    """Write curve.json, curve.png and curve.md to `folder`; return the path of curve.md."""
     folder.mkdir(parents=True, exist_ok=True)
     document = {"software": __version__, "points": [asdict(point) for point in points]}
     write_atomically(folder / "curve.json", f"{json.dumps(document, indent=1)}\n".encode())
@@ -144,10 +165,10 @@ def write_curve(folder: Path, points: Sequence[CurvePoint]) -> Path:
 
 
 def _text(points: Sequence[CurvePoint]) -> Iterator[str]:
-    yield from (GENERATOR_COMMENT, "# How many touches of how many own objects?", "")
-    yield "First guess and pair accuracy of one touch on objects that were left out of the fit; intervals by object,"
-    yield f"chance {points[0].chance:.3f} and .500.\n"
-    yield "| what | objects | touches of each | first guess | pair accuracy |\n|---|---|---|---|---|"
+    yield from (GENERATOR_COMMENT, "# Accuracy by number of own objects and touches", "")
+    yield "Top-1 accuracy and pair accuracy of one touch on objects that were left out of the fit. Intervals resample"
+    yield f"objects; chance is {points[0].chance:.3f} and 0.500.\n"
+    yield "| fit | objects | touches of each | top-1 accuracy | pair accuracy |\n|---|---|---|---|---|"
     for point in points:
         yield (
             f"| {point.label} | {point.objects} | {point.touches} | {{:.3f}} [{{:.3f}}, {{:.3f}}] ".format(*point.top1)
@@ -181,6 +202,6 @@ def _figure(points: Sequence[CurvePoint]) -> Figure:
     panel.set_xticks(ticks, [str(tick) for tick in ticks])
     panel.minorticks_off()
     panel.set_xlabel("touches of each own object")
-    percent_axis(panel, "first guess right, objects left out (%)")
+    percent_axis(panel, "top-1 accuracy, held-out objects (%)")
     panel.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     return figure

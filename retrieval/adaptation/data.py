@@ -1,4 +1,4 @@
-"""What is fitted on: own grasps as towers see them that stand still, those of the start beside published ones."""
+"""Inputs of a fit: own grasps, encoded by the frozen towers of the start model and a published tower."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -20,16 +20,23 @@ from retrieval.training.features import Features, encode_recording
 
 PRESET = "adapt"
 PUBLISHED_TOWER = "mobilenet_v2"
-"""The tower whose published weights stand beside those of the start."""
+"""Published tower that is combined with the towers of the start model by default."""
 NO_TOWER = "none"
-"""In place of first weights: no tower beside those of the start."""
+"""Value of `init` for no published tower."""
 
 
 @dataclass(frozen=True, eq=False)
 class AdaptationData:
-    """Own grasps, the towers side by side, and what these make of them; blurred: of an 8 x 6 blur of each touch.
+    """Own grasps, the combined towers, and the features.
 
-    kind_of: the class of each object, where the recording names it.
+    Attributes:
+        grasps: The grasps.
+        config: Configuration of the fitted matcher.
+        matcher: Matcher with the combined towers.
+        features: Tower features of the grasps.
+        low_pass: The same with low-pass (8 x 6) touches.
+        kind_of: The class of each object, if the recording has it.
+        source: Source of the recording.
     """
 
     grasps: list[Grasp]
@@ -42,7 +49,7 @@ class AdaptationData:
 
     @property
     def blocks(self) -> TowerWidths:
-        """How wide the towers' features are that stand side by side, of a touch and of a photo."""
+        """Feature widths of the combined towers, for a touch and for a photo."""
         touch, photo = feature_counts_of(self.matcher.touch_tower), feature_counts_of(self.matcher.photo_tower)
         return touch * self.config.matcher.fingers, photo * self.matcher.views
 
@@ -58,45 +65,66 @@ def load_adaptation_data(
     seed: int,
     quiet: bool,
 ) -> AdaptationData:
-    """The recording as the towers of the start, and those beside them, see it."""
+    """Read a recording and encode it with the towers of the start model and a published tower.
+
+    Args:
+        recording: Folder of the recording.
+        start: The start model.
+        tower: The published tower.
+        init: Weights of that tower, or "none" for no such tower.
+        split: Its test objects are left out.
+        cache: Folder of encoded features.
+        seed: Seed of the configuration.
+        quiet: No progress on stderr.
+
+    Raises:
+        BadInput: Fewer than two objects are left.
+    """
     grasps = load_grasps(recording)
     if split is not None:
         grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
     if len({grasp.object_id for grasp in grasps}) < 2:
-        raise BadInput("a matcher is fitted to two own objects at least; record more")
+        raise BadInput("A fit needs at least 2 own objects. Record more.")
     config = config_for(start, finger_count(grasps), None if init == NO_TOWER else tower, seed=seed)
     matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
     load_start_weights(matcher.touch_tower, start.matcher.touch_tower, init)
     load_start_weights(matcher.photo_tower, start.matcher.photo_tower, init)
-    shown = partial(encode_recording, grasps, matcher, config, cache, quiet=quiet)
-    features = shown()
-    low_pass = shown(touch_variant="low_pass", photo_features_from=features)
+    encode = partial(encode_recording, grasps, matcher, config, cache, quiet=quiet)
+    features = encode()
+    low_pass = encode(touch_variant="low_pass", photo_features_from=features)
     facts = read_recording_facts(recording)
     return AdaptationData(grasps, config, matcher, features, low_pass, facts.kind_of, facts.source)
 
 
 def config_for(start: Checkpoint, fingers: int, tower: str | type[Tower] | None, *, seed: int) -> Config:
-    """The preset, for towers of the start and, next to them, a published `tower`."""
-    preset, known = load_config(PRESET), start.config.matcher
-    beside = [] if tower is None else [tower_name(tower)]
+    """Return the preset for the towers of the start model and, if not None, a published tower.
+
+    Args:
+        start: The start model.
+        fingers: Fingers of a touch.
+        tower: The published tower.
+        seed: Seed of the configuration.
+    """
+    preset, source = load_config(PRESET), start.config.matcher
+    published = [] if tower is None else [tower_name(tower)]
     matcher = dataclasses.replace(
         preset.matcher,
-        tower=TOWER_SEPARATOR.join([known.tower, *beside]),
-        tower_output=known.tower_output,
+        tower=TOWER_SEPARATOR.join([source.tower, *published]),
+        tower_output=source.tower_output,
         fingers=fingers,
-        architectures={**known.architectures, **(architectures_of(beside[0]) if beside else {})},
+        architectures={**source.architectures, **(architectures_of(published[0]) if published else {})},
     )
     training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="", seed=seed)
     return dataclasses.replace(preset, matcher=matcher, training=training)
 
 
-def load_start_weights(tower: Tower, known: Tower, init: str) -> None:
-    """Give a tower the weights of the start and, to the part beside it, the published ones."""
+def load_start_weights(tower: Tower, start: Tower, init: str) -> None:
+    """Load the weights of the start model and, into the last part of a combined tower, the published ones."""
     if init == NO_TOWER:
-        tower.load_state_dict(known.state_dict())
+        tower.load_state_dict(start.state_dict())
         return
     assert isinstance(tower, ConcatenatedTowers)
-    *parts, beside = tower.parts
-    for part, its in zip(parts, known.parts if isinstance(known, ConcatenatedTowers) else [known], strict=True):
-        part.load_state_dict(its.state_dict())
-    initialise_tower(beside, init)  # type: ignore[arg-type]
+    *parts, published = tower.parts
+    for part, source in zip(parts, start.parts if isinstance(start, ConcatenatedTowers) else [start], strict=True):
+        part.load_state_dict(source.state_dict())
+    initialise_tower(published, init)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""What a fit is worth: first guesses on own objects that were left out of it, beside the same of blurred touches."""
+"""Accuracy estimate of a fit: top-1 and pair accuracy on held-out objects, compared with low-pass touches."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,12 +18,18 @@ from retrieval.model.encode import one_thread
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What the fit is worth on objects left out; the same of blurred touches is the control.
+    """Accuracy on held-out objects, of the fit, of the low-pass control and of the unadapted baseline.
 
-    choice: the fit to all objects, whose settings were chosen by holding out half of each kind. folds: the fits behind
-    the estimate, each with settings chosen in the same way among the objects that taught it. first, below: first
-    guesses among a fold's objects, and pairs.
-    known: the model that one starts from, with nothing fitted; known_first, known_below: what it is worth.
+    Attributes:
+        choice: The fit to all objects; its settings were selected by holding out half of each kind.
+        folds: The fits of the estimate; each selects its settings in the same way among its own fitted objects.
+        baseline: The unadapted start model.
+        top1: Top-1 accuracy of the fit among the objects of a fold.
+        pair_accuracy: Pair accuracy of the fit.
+        low_pass_top1: Top-1 accuracy of the control.
+        low_pass_pair_accuracy: Pair accuracy of the control.
+        baseline_top1: Top-1 accuracy of the baseline.
+        baseline_pair_accuracy: Pair accuracy of the baseline.
     """
 
     choice: CcaSelection
@@ -38,42 +44,47 @@ class Estimate:
 
     @property
     def is_baseline_better(self) -> bool:
-        """Whether the model as it is tells these objects apart better than the fit does. One for another number of
-        fingers cannot be kept.
+        """Whether the unadapted model has at least the pair accuracy of the fit.
+
+        A model for another number of fingers cannot be used and is never better.
         """
-        fingers = self.baseline.start.config.matcher.fingers == self.folds[0].left_out.touch.shape[1]
-        return fingers and mean(self.baseline_pair_accuracy) >= mean(self.pair_accuracy)
+        same_fingers = self.baseline.start.config.matcher.fingers == self.folds[0].left_out.touch.shape[1]
+        return same_fingers and mean(self.baseline_pair_accuracy) >= mean(self.pair_accuracy)
 
     def lines(self) -> list[str]:
-        """The estimate as lines for people."""
+        """Return the estimate as lines of text."""
         found = [
-            ("first guess", self.top1, self.low_pass_top1),
+            ("top-1 accuracy", self.top1, self.low_pass_top1),
             ("pair accuracy", self.pair_accuracy, self.low_pass_pair_accuracy),
         ]
-        lines = [f"objects left out once each, one touch, {self.top1.gallery}:"]
+        lines = [f"each object held out once, one touch, {self.top1.gallery}:"]
         for name, touched, control in found:
             mine, other, gain = summarise([touched]), summarise([control]), compare([touched], [control])
             lines.append(
-                f"  {name} {interval(mine)}; blurred touch {interval(other)}; chance {mine['chance'][0]:.3f}; "
+                f"  {name} {interval(mine)}; low-pass touch {interval(other)}; chance {mine['chance'][0]:.3f}; "
                 f"difference {gain['difference']:+.3f} [{gain['low']:+.3f}, {gain['high']:+.3f}]"
             )
         lines.append("  " + self.verdict)
         baseline = [interval(summarise([each])) for each in (self.baseline_top1, self.baseline_pair_accuracy)]
-        lines.append(f"the model as it is: first guess {baseline[0]}, pair accuracy {baseline[1]}")
+        lines.append(f"unadapted model: top-1 accuracy {baseline[0]}, pair accuracy {baseline[1]}")
         if self.is_baseline_better:
-            lines.append("  it is kept: a fit to these objects knows less; its probabilities are fitted to them")
+            lines.append(
+                "  The unadapted model is used: it is more accurate than the fit. Its probabilities are fitted."
+            )
         return lines
 
     @property
     def verdict(self) -> str:
-        """Whether the touch itself was felt, in words."""
+        """Whether the fit uses the touch itself, in words."""
         gain = compare([self.top1], [self.low_pass_top1])
         if gain["low"] > 0:
-            return "the touch tells more than its blur does: what was learnt is more than light and coarse shape"
-        return "the touch tells no more than its blur does: this is not shown to be touch; record more objects"
+            return "The touch beats its low-pass control: the fit uses more than light and coarse shape."
+        return (
+            "The touch does not beat its low-pass control, so the result is not shown to be touch. Record more objects."
+        )
 
     def to_dict(self) -> dict[str, float]:
-        """The numbers that a checkpoint keeps as its metrics."""
+        """Return the metrics that the checkpoint stores."""
         return {
             "held_out_top1": mean(self.top1),
             "held_out_top1_low_pass": mean(self.low_pass_top1),
@@ -86,12 +97,12 @@ class Estimate:
 
 
 def mean(measure: Measure) -> float:
-    """The mean of a measure over objects, which count alike."""
+    """Return the mean of a measure over objects, with equal weights."""
     return float(measure.by_object()[1].mean())
 
 
 def interval(summary: dict[str, Any]) -> str:
-    """A value with its interval."""
+    """Format a value with its interval."""
     return f"{summary['value'][0]:.3f} [{summary['low'][0]:.3f}, {summary['high'][0]:.3f}]"
 
 
@@ -99,16 +110,27 @@ def interval(summary: dict[str, Any]) -> str:
 def estimate_accuracy(
     data: AdaptationData, start: Checkpoint, *, cache: Path | None, seed: int, quiet: bool
 ) -> Estimate | None:
-    """The estimate from objects left out; None where there are too few of them."""
+    """Estimate the accuracy on held-out objects.
+
+    Args:
+        data: The own grasps and their features.
+        start: The start model.
+        cache: Folder of the features of the unadapted model.
+        seed: Seed of the folds.
+        quiet: No output on stderr.
+
+    Returns:
+        The estimate; None if there are too few objects.
+    """
     try:
         drawn = draw_folds(data.grasps, seed)
     except BadInput as error:
         if not quiet:
-            say(f"nothing is known of how good this is: {error}")
+            say(f"no accuracy estimate: {error}")
         return None
     folds, low_pass = (
         list(fit_folds(features, drawn, data, seed=seed, label=label, quiet=quiet))
-        for features, label in ((data.features, "touches"), (data.low_pass, "blurred touches"))
+        for features, label in ((data.features, "touches"), (data.low_pass, "low-pass touches"))
     )
     choice = choose_settings(data.features, data, seed)
     fold_accuracies, control = list(map(fold_accuracy, folds)), list(map(fold_accuracy, low_pass))

@@ -1,4 +1,4 @@
-"""The checkpoint: codes fitted on all own objects become a matcher's projections, folds say what its logits mean."""
+"""Write a fit into a checkpoint: projections from all own objects, calibration from held-out objects."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -24,14 +24,20 @@ from retrieval.training.verdicts import with_verdicts
 
 @one_thread()
 def fit_matcher(data: AdaptationData, estimate: Estimate | None, out: Path) -> Checkpoint:
-    """The checkpoint of codes fitted on all own objects; without an estimate by the widest ridges."""
+    """Fit codes to all own objects and return them as a checkpoint.
+
+    Args:
+        data: The own grasps and their features.
+        estimate: Contains the selected settings; without it the largest ridge is used.
+        out: Path of the checkpoint.
+    """
     features, config, matcher = data.features, data.config, data.matcher
     if estimate:
         projections = estimate.choice.projections
         scale, offset = _log_odds(part.scored for part in estimate.choice.held_out_touches)
     else:
-        touch, most = features.touch.reshape(len(features), -1), max(GRID)
-        projections = dict(fit_projections(touch, features.photo, features.owner, data.blocks, [most]))[most]
+        touch, largest = features.touch.reshape(len(features), -1), max(GRID)
+        projections = dict(fit_projections(touch, features.photo, features.owner, data.blocks, [largest]))[largest]
         scale, offset = 1.0, 0.0
     install_codes(matcher, projections, scale, offset)
     objects = tuple(sorted(set(features.object_ids)))
@@ -52,14 +58,14 @@ def fit_matcher(data: AdaptationData, estimate: Estimate | None, out: Path) -> C
 
 
 def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
-    """Scale and offset that make of a cosine the log-odds of a match, with as many pairs that match as do not."""
+    """Return scale and offset from cosine to log-odds of a match, with equally many true and false pairs."""
     cosines, labels = [], []
     for part in parts:
         same = part.touch_owner[:, None] == part.photo_owner
         rng = np.random.default_rng(0)
-        pairs = [rng.permutation(np.flatnonzero(some.ravel())) for some in (same & ~part.own, ~same)]
+        pairs = [rng.permutation(np.flatnonzero(mask.ravel())) for mask in (same & ~part.own, ~same)]
         count = min(len(pairs[0]), len(pairs[1]), 20_000)
-        cosines += [part.logits.ravel()[some[:count]] for some in pairs]
+        cosines += [part.logits.ravel()[drawn[:count]] for drawn in pairs]
         labels += [np.ones(count), np.zeros(count)]
     found = fit_calibration(np.concatenate(cosines), np.concatenate(labels))
     return found.slope, found.intercept
@@ -67,9 +73,16 @@ def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
 
 @torch.no_grad()
 def install_codes(matcher: Matcher, projections: CcaProjections, scale: float, offset: float) -> None:
-    """Make the matcher judge by `scale * cosine + offset` of the codes; its layers of the head add nothing."""
+    """Make the match logit `scale * cosine + offset` of the codes; the layers of the head contribute 0.
+
+    Args:
+        matcher: The matcher to change.
+        projections: Maps from features to codes.
+        scale: Scale of the cosine.
+        offset: Offset of the logit.
+    """
     for layer, found in ((matcher.touch_projection, projections.touch), (matcher.photo_projection, projections.photo)):
-        used = found.weight.shape[1]  # codes may be shorter than the layer: the rest stays 0, which no cosine sees
+        used = found.weight.shape[1]  # shorter codes leave zeros, which do not change the cosine
         layer.weight.zero_()
         layer.bias.zero_()
         layer.weight[:used] = torch.from_numpy(found.weight.T.astype(np.float32))
@@ -81,49 +94,62 @@ def install_codes(matcher: Matcher, projections: CcaProjections, scale: float, o
     matcher.cosine_scale.fill_(scale)
 
 
-def calibrate_fit(made: Checkpoint, data: AdaptationData, estimate: Estimate | None, *, quiet: bool) -> Checkpoint:
-    """The fitted checkpoint with a check of touches, and with the posterior of the folds: what a match is worth is told
-    by objects left out, as codes know those that they were fitted on too well. Without an estimate it has no
-    posterior.
+def calibrate_fit(
+    checkpoint: Checkpoint, data: AdaptationData, estimate: Estimate | None, *, quiet: bool
+) -> Checkpoint:
+    """Add the gel check and the posterior to a fitted checkpoint.
+
+    The posterior is fitted on held-out objects, because the codes are overfitted to their own objects.
+
+    Args:
+        checkpoint: The fitted checkpoint.
+        data: The own grasps and their features.
+        estimate: Contains the held-out touches; without it the checkpoint has no posterior.
+        quiet: No progress on stderr.
     """
-    made = _with_gel_check(made, data.grasps, data.features, quiet)
+    checkpoint = _with_gel_check(checkpoint, data.grasps, data.features, quiet)
     if estimate is None:
-        return dataclasses.replace(made, posterior=None, references=None)
-    # Touches of objects that were held out, half of each kind together, with the match logits of the matcher.
-    assert made.matcher.cosine_scale is not None
-    scale, offset = made.matcher.cosine_scale.item(), made.matcher.head.out.bias.item()
+        return dataclasses.replace(checkpoint, posterior=None, references=None)
+    # Touches of held-out objects (half of each kind at a time), with the match logits of the matcher.
+    assert checkpoint.matcher.cosine_scale is not None
+    scale, offset = checkpoint.matcher.cosine_scale.item(), checkpoint.matcher.head.out.bias.item()
     left_out = [
         ReferenceTouches(dataclasses.replace(part.scored, logits=scale * part.scored.logits + offset), part.embeddings)
         for part in estimate.choice.held_out_touches
     ]
-    return _with_posterior(made, left_out)
+    return _with_posterior(checkpoint, left_out)
 
 
 def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estimate, *, quiet: bool) -> Checkpoint:
-    """The model that one started from, with a check of touches and a posterior fitted to own objects."""
-    made = _with_gel_check(start, data.grasps, estimate.baseline.features, quiet)
+    """Return the start model with a gel check and a posterior fitted to own objects.
+
+    Args:
+        start: The start model.
+        data: The own grasps and their features.
+        estimate: The estimate with the unadapted baseline.
+        quiet: No progress on stderr.
+    """
+    checkpoint = _with_gel_check(start, data.grasps, estimate.baseline.features, quiet)
     folds = [sorted(set(fold.left_out.object_ids)) for fold in estimate.folds]
     about = {"source": data.source, "data_digest": data_digest(data.grasps)}
     provenance = start.provenance | {"adapted_to": about, "metrics": estimate.to_dict()}
     return _with_posterior(
-        dataclasses.replace(made, provenance=provenance),
+        dataclasses.replace(checkpoint, provenance=provenance),
         estimate.baseline.reference_touches(folds, MAX_CALIBRATION_TOUCHES),
     )
 
 
-def _with_posterior(made: Checkpoint, left_out: list[ReferenceTouches]) -> Checkpoint:
-    """The checkpoint with a posterior and the worth of reference touches, both fitted on touches of objects left
-    out.
-    """
+def _with_posterior(checkpoint: Checkpoint, left_out: list[ReferenceTouches]) -> Checkpoint:
+    """Return the checkpoint with posterior and reference calibration, fitted on touches of held-out objects."""
     posterior = fit_posterior(*(part.scored for part in left_out))
-    return dataclasses.replace(made, posterior=posterior, references=fit_reference_calibration(*left_out))
+    return dataclasses.replace(checkpoint, posterior=posterior, references=fit_reference_calibration(*left_out))
 
 
-def _with_gel_check(made: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:
-    """The checkpoint with a check of touches: fitted on one half of the objects, thresholds from the other half."""
+def _with_gel_check(checkpoint: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:
+    """Return the checkpoint with a gel check: fitted on half of the objects, with thresholds from the others."""
     device = default_device()
     names = sorted({grasp.object_id for grasp in grasps})
-    partials = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
-    made.matcher.to(device)
-    with FrozenFeatures(made.config, device, features_by_image(grasps, features, device)) as source:
-        return with_verdicts(made, source, *partials, quiet=quiet)
+    groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
+    checkpoint.matcher.to(device)
+    with FrozenFeatures(checkpoint.config, device, features_by_image(grasps, features, device)) as source:
+        return with_verdicts(checkpoint, source, *groups, quiet=quiet)

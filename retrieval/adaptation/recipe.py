@@ -1,8 +1,8 @@
-"""A checkpoint for a new sensor and own objects, from a few of them.
+"""Adapt a model to a new sensor and own objects.
 
-Towers are frozen: those of the checkpoint that one starts from, which learnt on the simulated rig what relief looks
-like, next to a published one, which knows pictures. What is fitted is linear (`retrieval.methods.cca_towers`), and
-every number that is told of it comes from objects that were left out of the fit.
+The towers are frozen: those of the start model, pretrained on relief in simulation, combined with a published tower,
+pretrained on photos. The fit is linear (`retrieval.methods.cca_towers`). Every reported number comes from objects that
+were left out of the fit.
 """
 
 from dataclasses import dataclass
@@ -23,17 +23,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Adaptation:
-    """What `adapt` made: the checkpoint, and what it is worth on objects left out of the fit.
+    """Result of `adapt`: the checkpoint and its accuracy on held-out objects.
 
-    material: the grasps that it was fitted to, and what the towers make of them. estimate: None for fewer than six
-    objects; the checkpoint then states no probabilities. report: the page of the learning curve, where one was asked
-    for and could be drawn.
+    Attributes:
+        checkpoint: The written checkpoint.
+        data: The fitted grasps and their features.
+        estimate: The accuracy estimate; None for fewer than six objects, whose checkpoint has no probabilities.
+        report: Page of the learning curve, if it was requested and there is an estimate.
 
     >>> from pathlib import Path
     >>> made = retrieval.adapt("lab", Path("own.safetensors"), "model.safetensors", init="none", quiet=True)
     >>> made.checkpoint.path.name, made.report
     ('own.safetensors', None)
-    >>> 0 <= made.estimate.to_dict()["left_out_top1"] <= 1
+    >>> 0 <= made.estimate.to_dict()["held_out_top1"] <= 1
     True
     """
 
@@ -43,7 +45,7 @@ class Adaptation:
     report: Path | None
 
     def lines(self) -> list[str]:
-        """Return what people are told."""
+        """Return the result as lines of text."""
         lines = self.estimate.lines() if self.estimate else []
         if self.report:
             lines.append(f"learning curve: {self.report}")
@@ -67,24 +69,25 @@ def adapt(
 ) -> Adaptation:
     """Fit a model to a recording of another sensor and own objects, and write the checkpoint `out`.
 
-    Where the model as it is tells objects that were left out apart better than the fit does, it is kept, and only its
+    If the unadapted model is more accurate on held-out objects than the fit, it is written instead, and only its
     probabilities are fitted.
 
     Args:
-        recording: A folder, or what `robot.read_recording` returns.
+        recording: A folder, or the object that `robot.read_recording` returns.
         out: The checkpoint (.safetensors).
-        start: The model that one starts from; the shipped one of as many fingers where None.
-        tower: The published tower next to those of the model: a name, "module:Class", or a class.
+        start: The start model; None takes the shipped one for the same number of fingers.
+        tower: The published tower to combine with those of the model: a name, "module:Class", or a class.
         init: Weights of that tower: "imagenet", a file, or "none" for no such tower.
         split: Its test objects are left out of everything.
-        report: Folder of the learning curve: how many touches of how many objects it takes.
-        cache: Folder of kept features, so that a stopped run goes on.
-        seed: Of the folds.
+        report: Folder of the learning curve, the accuracy by number of objects and touches.
+        cache: Folder of encoded features, so that a stopped run resumes.
+        seed: Seed of the folds.
         quiet: No progress on stderr.
 
     Raises:
-        DatasetError, BadInput: There is too little to fit to.
-        CheckpointError: `start` cannot be read, or `out` not written.
+        DatasetError: The recording cannot be read.
+        BadInput: The recording has too few objects.
+        CheckpointError: `start` cannot be read, or `out` cannot be written.
 
     >>> from pathlib import Path
     >>> made = retrieval.adapt("lab", Path("mine.safetensors"), "model.safetensors", init="none", quiet=True)
@@ -100,10 +103,10 @@ def adapt(
     )
     estimate = estimate_accuracy(data, start, cache=cache, seed=seed, quiet=quiet)
     if estimate and estimate.is_baseline_better:
-        made = calibrate_baseline(start, data, estimate, quiet=quiet)
+        checkpoint = calibrate_baseline(start, data, estimate, quiet=quiet)
     else:
-        made = calibrate_fit(fit_matcher(data, estimate, out), data, estimate, quiet=quiet)
-    store_checkpoint(made, out)
+        checkpoint = calibrate_fit(fit_matcher(data, estimate, out), data, estimate, quiet=quiet)
+    store_checkpoint(checkpoint, out)
     page = None
     if report and estimate:
         page = write_curve(report, learning_curve(data, start, cache=cache, seed=seed, quiet=quiet))

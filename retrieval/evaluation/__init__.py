@@ -1,4 +1,4 @@
-"""How good a ranking is, with intervals and the level of chance."""
+"""Ranking metrics with confidence intervals and chance levels."""
 
-SCHEMA_VERSION = 2
-"""Of results.json."""
+SCHEMA_VERSION = 3
+"""Schema version of results.json."""

@@ -1,7 +1,7 @@
-"""Leakage audit of a split: what the parts share, and near copies of test frames among those fitted or chosen on.
+"""Leakage audit of a split: content that two parts share, and near copies of test frames in the other parts.
 
-Byte-identical files are found by their digests, what was encoded again, lit otherwise, moved or flipped by shape: see
-`retrieval.data.check.near_copies`, which also says of how many test frames a copy could have been told.
+Digests find byte-identical files. Shapes find frames that were re-encoded, lit differently, moved or flipped.
+`retrieval.data.check.near_copies` compares the shapes and marks the test frames that have enough detail for the check.
 """
 
 from collections import defaultdict
@@ -21,14 +21,14 @@ from retrieval.data.dataset import Grasp, Split, finger_count
 from retrieval.data.loading import worker_pool
 
 QUANTILES = (0.0, 0.01, 0.05, 0.25, 0.5)
-UNIT = "1 less the correlation of shapes (0: a copy; about 1: unlike pictures)"
+UNIT = "1 minus the correlation of shapes (0: a copy; about 1: unrelated images)"
 _PARTS = ("train", "validation", "test")
 _MAX_EXAMPLES = 5
 
 
 @dataclass(frozen=True, eq=False)
 class _Frames:
-    """One kind of frame ("photo", "touch a", ...) of all grasps, in their order."""
+    """One kind of frame ("photo", "touch a", ...) of all grasps, in the order of the grasps."""
 
     kind: str
     digests: list[str]
@@ -36,16 +36,28 @@ class _Frames:
 
 
 def audit(grasps: Sequence[Grasp], split: Split, *, quiet: bool = False) -> dict[str, Any]:
-    """Compare the parts of `split`; grasps of objects outside it are left out. Reads every photo and touch once.
+    """Compare the parts of a split. Read every photo and touch once.
 
-    Returns JSON types:
-    objects, grasps: counts by part; shared: sentences on objects and sequences that stand in two parts;
-    identical: {"count": files of equal bytes in two parts, "examples": lists of "part: grasp_id kind"};
-    frames: by kind {"test", "seen": counts, "to_seen", "within_object": distances at `quantiles`, or null where
-    there is nothing to compare, "checked": test frames of which a copy could be told, "near_copies": those of them that have
-    one, "nearest": the nearest pairs of checked frames, one of each test object}, where seen means of training and
-    validation objects; quantiles, unit; clean: whether nothing was found, verdict.
-    Raises ImageError for an image that cannot be read.
+    Args:
+        grasps: All grasps of the recording; those of objects outside the split are ignored.
+        split: The objects of each part.
+        quiet: No progress on stderr.
+
+    Returns:
+        JSON types.
+
+        * objects, grasps: counts by part.
+        * shared: sentences about objects and sequences that are in two parts.
+        * identical: {"count": files with equal bytes in two parts, "examples": lists of "part: grasp_id kind"}.
+        * frames: by kind {"test", "train_validation": counts, "to_train_validation", "within_object": distances at
+          `quantiles`, null where there is no pair to compare, "checked": test frames with enough detail to recognise a
+          copy, "near_copies": checked frames that have one, "nearest": the nearest pairs of checked frames, one for
+          each test object}. "train_validation" means training and validation objects together.
+        * quantiles, unit: what the distances mean.
+        * clean: whether the audit found no leakage; verdict: the result as a sentence.
+
+    Raises:
+        ImageError: An image cannot be read.
     """
     part_of = {name: part for part in _PARTS for name in getattr(split, part)}
     grasps = [grasp for grasp in grasps if grasp.object_id in part_of]
@@ -53,9 +65,9 @@ def audit(grasps: Sequence[Grasp], split: Split, *, quiet: bool = False) -> dict
     kinds = list(_read_frames(grasps, quiet))
     result: dict[str, Any] = {
         **_counts(grasps, parts),
-        "shared": [found.message for found in check_split(grasps, split) if found.severity == "error"],
+        "shared": [problem.message for problem in check_split(grasps, split) if problem.severity == "error"],
         "identical": _identical(grasps, parts, kinds),
-        "frames": {frames.kind: _nearness(frames, grasps, parts) for frames in kinds},
+        "frames": {frames.kind: _frame_distances(frames, grasps, parts) for frames in kinds},
         "quantiles": list(QUANTILES),
         "unit": UNIT,
     }
@@ -76,7 +88,7 @@ def _counts(grasps: Sequence[Grasp], parts: NDArray[np.str_]) -> dict[str, Any]:
 
 
 def _read_frames(grasps: Sequence[Grasp], quiet: bool) -> Iterable[_Frames]:
-    """Photos, then the touches of each finger."""
+    """Yield the photos, then the touches of each finger."""
     files: dict[str, list[Path]] = {"photo": [grasp.photo for grasp in grasps]}
     for finger in range(finger_count(grasps) if grasps else 0):
         files[f"touch {ascii_lowercase[finger]}"] = [grasp.touches[finger] for grasp in grasps]
@@ -86,16 +98,17 @@ def _read_frames(grasps: Sequence[Grasp], quiet: bool) -> Iterable[_Frames]:
         Bar("audit", sum(map(len, map(set, files.values()))), "images", quiet=quiet) as bar,
     ):
         for kind, paths in files.items():
-            seen: dict[Path, Thumbnail] = {}
-            for path, found in zip(dict.fromkeys(paths), pool.map(load_thumbnail, dict.fromkeys(paths)), strict=True):
-                seen[path] = found
+            thumbnails: dict[Path, Thumbnail] = {}
+            unique = list(dict.fromkeys(paths))
+            for path, thumbnail in zip(unique, pool.map(load_thumbnail, unique), strict=True):
+                thumbnails[path] = thumbnail
                 bar.advance()
-            frames = [seen[path] for path in paths]
+            frames = [thumbnails[path] for path in paths]
             yield _Frames(kind, [frame.digest for frame in frames], PictureSet(frames, objects))
 
 
 def _identical(grasps: Sequence[Grasp], parts: NDArray[np.str_], kinds: Iterable[_Frames]) -> dict[str, Any]:
-    """Files of equal bytes in more than one part, photos and touches of all fingers together."""
+    """Return the files with equal bytes in more than one part, photos and touches of all fingers together."""
     places: dict[str, dict[str, str]] = defaultdict(dict)
     for frames in kinds:
         for digest, grasp, part in zip(frames.digests, grasps, parts, strict=True):
@@ -104,17 +117,17 @@ def _identical(grasps: Sequence[Grasp], parts: NDArray[np.str_], kinds: Iterable
     return {"count": len(across), "examples": sorted(across)[:_MAX_EXAMPLES]}
 
 
-# Nearness --------------------------------------------------------------------------------------------
+# Distances -------------------------------------------------------------------------------------------
 
 
-def _nearness(frames: _Frames, grasps: Sequence[Grasp], parts: NDArray[np.str_]) -> dict[str, Any]:
-    test, seen = np.flatnonzero(parts == "test"), np.flatnonzero(parts != "test")
-    found = frames.pictures.nearest(test, seen)
+def _frame_distances(frames: _Frames, grasps: Sequence[Grasp], parts: NDArray[np.str_]) -> dict[str, Any]:
+    test, others = np.flatnonzero(parts == "test"), np.flatnonzero(parts != "test")
+    found = frames.pictures.nearest(test, others)
     owners = [grasps[row].object_id for row in test.tolist()]
     checked = [int(at) for at in np.argsort(found.distance, kind="stable") if found.checked[at]]
     return {
         "test": len(test),
-        "train_validation": len(seen),
+        "train_validation": len(others),
         "to_train_validation": _quantiles(found.distance),
         "within_object": _quantiles(frames.pictures.within_object_distances(test)),
         "checked": int(found.checked.sum()),
@@ -131,7 +144,7 @@ def _nearness(frames: _Frames, grasps: Sequence[Grasp], parts: NDArray[np.str_])
 
 
 def _first_of_each(order: Sequence[int], owners: Sequence[str]) -> list[int]:
-    """The first places of an order, one of each owner: the frames of one object mostly have one neighbour."""
+    """Return the first place of each owner in an order: the frames of one object mostly share one neighbour."""
     first: dict[str, int] = {}
     for at in order:
         first.setdefault(owners[at], int(at))
@@ -144,26 +157,27 @@ def _quantiles(distances: NDArray[np.float64]) -> list[float] | None:
 
 
 def _verdict(result: dict[str, Any]) -> dict[str, Any]:
-    found = list(result["shared"])
+    problems = list(result["shared"])
     if count := result["identical"]["count"]:
-        found.append(f"{count} file(s) stand byte for byte in two parts")
+        problems.append(f"{count} file(s) are byte-identical in two parts")
     for kind, frames in result["frames"].items():
         if frames["near_copies"]:
-            found.append(
-                f"{frames['near_copies']} of {frames['test']} test frames ({kind}) are near copies of a frame of a training "
-                "or validation object"
+            problems.append(
+                f"{frames['near_copies']} of {frames['test']} test frames ({kind}) are near copies of a frame of a "
+                "training or validation object"
             )
-    start = f"Leakage is possible: {'; '.join(found)}" if found else "No object, sequence or file stands in two parts"
-    return {"clean": not found, "verdict": f"{start}; {_describe_checked(result['frames'])}."}
+    clean = "No object, sequence or file is in two parts"
+    start = f"Leakage is possible: {'; '.join(problems)}" if problems else clean
+    return {"clean": not problems, "verdict": f"{start}; {_describe_checked(result['frames'])}."}
 
 
 def _describe_checked(kinds: dict[str, Any]) -> str:
-    """How many test frames could be checked for near copies."""
+    """Describe how many test frames were checked for near copies."""
     compared = {kind: frames for kind, frames in kinds.items() if frames["to_train_validation"]}
     if not compared:
-        return "there are no frames of both sides to compare"
-    shares = [f"{frames['checked']} of {frames['test']} ({kind})" for kind, frames in compared.items()]
-    copies = "" if any(frames["near_copies"] for frames in compared.values()) else "; none has one"
+        return "near copies were not checked, as one side has no frames"
+    counts = [f"{frames['checked']} of {frames['test']} ({kind})" for kind, frames in compared.items()]
+    copies = "" if any(frames["near_copies"] for frames in compared.values()) else "; none was found"
     rest = any(frames["checked"] < frames["test"] for frames in compared.values())
-    why = ", and the others show too little to tell a copy by" if rest else ""
-    return f"near copies could be looked for of these test frames: {', '.join(shares)}{copies}{why}"
+    reason = "; the other test frames have too little detail to recognise a copy" if rest else ""
+    return f"checked for near copies: {', '.join(counts)} test frames{copies}{reason}"

@@ -1,4 +1,4 @@
-"""What evaluations keep on disk: a file holds the digest of what made it, and one of other settings is made again."""
+"""Cache files of evaluations: each contains a digest of its inputs and is made again when the inputs change."""
 
 import hashlib
 import json
@@ -15,7 +15,7 @@ from retrieval.model.checkpoint import read_tensors, write_tensors
 
 T = TypeVar("T")
 CacheKey = Mapping[str, Any]
-"""Everything that decides what a file holds, in JSON types."""
+"""All inputs that determine the content of a file, in JSON types."""
 
 
 def _digest(cache_key: CacheKey) -> str:
@@ -23,12 +23,19 @@ def _digest(cache_key: CacheKey) -> str:
 
 
 def write_cached(path: Path, cache_key: CacheKey, tensors: dict[str, Tensor], about: CacheKey) -> None:
-    """Keep tensors, with what is said about them in JSON types."""
+    """Write tensors and a header to a cache file.
+
+    Args:
+        path: The file.
+        cache_key: All inputs that determine the tensors.
+        tensors: Tensors by name.
+        about: Further header entries, JSON types.
+    """
     write_tensors(path, tensors, {"cache_key": _digest(cache_key), **about})
 
 
 def read_cached(path: Path, cache_key: CacheKey) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
-    """Return what `write_cached` wrote; None where it is missing, damaged, or made by something else."""
+    """Return tensors and header of a cache file; None if it is missing, damaged, or has another key."""
     if not path.is_file():
         return None
     try:
@@ -39,12 +46,12 @@ def read_cached(path: Path, cache_key: CacheKey) -> tuple[dict[str, Tensor], dic
 
 
 def cached_document(path: Path, cache_key: CacheKey, make: Callable[[], T]) -> T:
-    """Return `make()`, a JSON document, or what it returned in an earlier run of the same `cache_key`."""
+    """Return the JSON document `make()`, or the stored one of an earlier run with the same key."""
     key = _digest(cache_key)
     try:
-        kept = read_json(path)
-        if kept["cache_key"] == key:
-            document: T = kept["document"]
+        stored = read_json(path)
+        if stored["cache_key"] == key:
+            document: T = stored["document"]
             return document
     except (OSError, ValueError, KeyError, TypeError):  # missing or damaged
         pass
@@ -55,17 +62,24 @@ def cached_document(path: Path, cache_key: CacheKey, make: Callable[[], T]) -> T
 
 
 def write_document(path: Path, document: Mapping[str, Any]) -> None:
-    """Write JSON whole or not at all; equal documents are equal to the byte."""
+    """Write a JSON file atomically. Equal documents give equal bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, f"{json.dumps(document, sort_keys=True, indent=1, allow_nan=False)}\n".encode())
 
 
 @contextmanager
 def resumable(folder: Path) -> Iterator[None]:
-    """Say after Ctrl-C that the work goes on from `folder`. Raises JobInterrupted."""
+    """Add to the message after Ctrl-C that the same command resumes from `folder`.
+
+    Args:
+        folder: The folder of the finished parts.
+
+    Raises:
+        JobInterrupted: After Ctrl-C.
+    """
     try:
         yield
     except JobInterrupted as error:
         raise JobInterrupted(
-            f"stopped; what was made is kept in {folder}, and the same command goes on with it"
+            f"Stopped. Finished parts are stored in {folder}; run the same command to continue."
         ) from error

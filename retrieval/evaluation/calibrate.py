@@ -1,9 +1,9 @@
-"""Probabilities of pairs, of objects and of none: fitted on validation objects, judged on test objects.
+"""Calibration of pair and object probabilities: fitted on validation objects, evaluated on test objects.
 
-Ranking needs none of this. A pair of a touch and a photo has calibrated log-odds, `slope * score + intercept`; which
-object it is, and whether it is any, has the posterior that queries have (`retrieval.model.posterior`). Both are fitted
-for each number of grasps on its own: a method scores a set of grasps in its own way, so a set counts as one grasp whose
-score is the set's.
+Ranking does not need calibration. A pair of a touch and a photo has calibrated log-odds, `slope * score + intercept`.
+The posterior over objects and "none of these" is that of queries (`retrieval.model.posterior`). Both are fitted
+separately for each number of grasps, because each method combines the scores of several grasps in its own way: a set
+counts as one grasp with the score of the set.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,13 +25,19 @@ from retrieval.model.posterior import (
 )
 
 MIN_THRESHOLD_OBJECTS = 10
-"""Validation objects that a threshold of pairs is fitted on."""
+"""Minimum number of validation objects for fitting a pair threshold."""
 _PAIRS_OF_A_ROW = 8  # of each kind
 _TESTS_OF_A_ROW = 4
 
 
 class KWayTest(NamedTuple):
-    """A K-way test: the true object among k candidates, after so many grasps, each shown by so many photos."""
+    """A K-way test: rank the true object among k candidates.
+
+    Attributes:
+        k: Number of candidates.
+        grasps: Grasps of the query.
+        photos: Photos of each candidate.
+    """
 
     k: int
     grasps: int = 1
@@ -39,22 +45,24 @@ class KWayTest(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As in results.json: "k5", "k5_g5"."""
+        """Name in results.json: "k5", "k5_g5"."""
         return f"k{self.k}" + (f"_g{self.grasps}" if self.grasps > 1 else "")
 
 
 @dataclass(frozen=True)
 class Calibrations:
-    """What validation objects say of a method's scores, by the number of grasps that a row of its tables is.
+    """Calibrations of one method, by the number of grasps of a table row.
 
-    pairs: log-odds of a touch with a photo; posteriors: which object it is, or none.
+    Attributes:
+        pairs: Log-odds that a touch and a photo match.
+        posteriors: Posterior over the objects and "none of these".
     """
 
     pairs: dict[int, Calibration]
     posteriors: dict[int, Posterior]
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON types: {"pairs": {"1": {...}}, "posteriors": {"1": {...}}}."""
+        """Return JSON types: {"pairs": {"1": {...}}, "posteriors": {"1": {...}}}."""
         return {
             kind: {str(grasps): one.to_dict() for grasps, one in fitted.items()}
             for kind, fitted in (("pairs", self.pairs), ("posteriors", self.posteriors))
@@ -62,27 +70,35 @@ class Calibrations:
 
 
 def calibrate(validation: Mapping[int, ScoreTable], *, seed: int = 0) -> Calibrations:
-    """Fit on validation objects; `validation` holds a table for each number of grasps.
+    """Fit the calibrations on validation objects.
 
-    Of fewer than three objects there are no posteriors (`has_enough_objects`).
+    Args:
+        validation: A score table for each number of grasps.
+        seed: Seed of the drawn pairs and trials.
+
+    Returns:
+        The calibrations; without posteriors for fewer than three objects (`has_enough_objects`).
     """
     pairs = {grasps: calibrate_pairs(table, seed=seed) for grasps, table in validation.items()}
-    asked_of = {
+    trials_of = {
         grasps: posterior_questions(table, seed) for grasps, table in validation.items() if has_enough_objects(table)
     }
-    return Calibrations(pairs, {grasps: fit_posterior_to_trials([one]) for grasps, one in asked_of.items()})
+    return Calibrations(pairs, {grasps: fit_posterior_to_trials([one]) for grasps, one in trials_of.items()})
 
 
 def calibrate_pairs(validation: ScoreTable, *, seed: int = 0) -> Calibration:
-    """Log-odds of a row of the table with a photo, fitted on drawn pairs."""
+    """Fit the log-odds of a row with a photo on drawn pairs."""
     return fit_calibration(*draw_pairs(validation, seed))
 
 
 @dataclass(frozen=True)
 class PairRule:
-    """Which pairs are called matches, where that comes from, or why there is no such rule.
+    """Rule that classifies a pair as match or no match.
 
-    source: "the checkpoint" or "validation objects"; empty where there is none.
+    Attributes:
+        rule: The calibration or the threshold; None if there is none.
+        source: "the checkpoint" or "validation objects"; empty without a rule.
+        reason: Why there is no rule.
     """
 
     rule: Calibration | Threshold | None
@@ -90,64 +106,87 @@ class PairRule:
     reason: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """The "pair_threshold" of results.json: {"at", "from", "why_not"}; at: the score above which a pair matches."""
+        """Return "pair_threshold" of results.json: {"at": score above which a pair matches, "from", "reason"}."""
         at = -self.rule.intercept / self.rule.slope if isinstance(self.rule, Calibration) else None
         at = self.rule.at if isinstance(self.rule, Threshold) else at
         return {"at": at, "from": self.source or None, "reason": self.reason or None}
 
 
-def pair_rule(chosen: Mapping[str, Any], validation: ScoreTable, *, seed: int = 0) -> PairRule:
-    """The threshold that a checkpoint brings with it (`chosen["pair_threshold"]`), else one fitted on validation
-    objects, of which `MIN_THRESHOLD_OBJECTS` are needed: between fewer a threshold falls anywhere.
+def pair_rule(best_params: Mapping[str, Any], validation: ScoreTable, *, seed: int = 0) -> PairRule:
+    """Return the pair threshold of a checkpoint, else one that is fitted on validation objects.
+
+    Args:
+        best_params: Parameters of the method; "pair_threshold" is the checkpoint's own threshold.
+        validation: Scores of validation objects. Fewer than `MIN_THRESHOLD_OBJECTS` objects give no rule, because a
+            threshold between so few objects is arbitrary.
+        seed: Seed of the drawn pairs.
     """
-    if (own := chosen.get("pair_threshold")) is not None:
+    if (own := best_params.get("pair_threshold")) is not None:
         return PairRule(Threshold(own), "the checkpoint")
     if (count := len(validation.with_targets.objects)) < MIN_THRESHOLD_OBJECTS:
         return PairRule(
             None,
-            reason=f"pair accuracy needs a threshold: a checkpoint's own, or one fitted on {MIN_THRESHOLD_OBJECTS} "
-            f"validation objects; there are {count}",
+            reason="pair accuracy needs a threshold of the checkpoint, or one fitted on at least "
+            f"{MIN_THRESHOLD_OBJECTS} validation objects; the split has {count}",
         )
     return PairRule(calibrate_pairs(validation, seed=seed), "validation objects")
 
 
 def has_enough_objects(table: ScoreTable) -> bool:
-    """Whether "which object, or none" can be asked: of two catalogues of two objects, with the true one and without."""
+    """Return whether the table has enough objects for trials with and without the true object.
+
+    Each trial needs a gallery of two objects, so three objects are the minimum.
+    """
     return len(table.objects) >= MIN_OBJECTS
 
 
 def posterior_questions(table: ScoreTable, seed: int = 0) -> IdentificationTrials:
-    """ "Which object, or none?" for every row that has a photo to find; a row counts as one grasp.
+    """Return an identification trial for every row that has a target photo; a row counts as one grasp.
 
-    Objects stand in the order of `table.objects`, rows in that of `table.with_targets`. Raises BadInput for fewer than
-    three objects.
+    Args:
+        table: The scores.
+        seed: Seed of the drawn photos.
+
+    Returns:
+        The trials: objects in the order of `table.objects`, rows in the order of `table.with_targets`.
+
+    Raises:
+        BadInput: The table has fewer than three objects.
     """
-    kept = table.with_targets
-    judged = ScoredTouches(kept.scores, kept.touch_owner, kept.photo_owner, kept.own)
-    return IdentificationTrials.of(judged, np.arange(len(kept.touch_owner))[:, None], seed)
+    targets = table.with_targets
+    scored = ScoredTouches(targets.scores, targets.touch_owner, targets.photo_owner, targets.own)
+    return IdentificationTrials.of(scored, np.arange(len(targets.touch_owner))[:, None], seed)
 
 
 def draw_pairs(table: ScoreTable, seed: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Scores and labels (P,): up to 8 photos of each row's object (never its own), as many of other objects.
+    """Draw pairs for calibration: up to 8 true photos of each row, and as many false ones.
 
-    The object of a false pair is drawn uniformly, then its photo, so that both kinds are even in every row.
+    The photo of the row's own grasp is never drawn. For a false pair first the object is drawn uniformly, then its
+    photo. Every row has as many true as false pairs.
+
+    Args:
+        table: The scores.
+        seed: Seed of the draw.
+
+    Returns:
+        Scores (P,) and labels (P,), 1 for a true pair.
     """
-    kept = table.with_targets
+    targets = table.with_targets
     rng = np.random.default_rng([seed, 1])
-    keys = np.where(kept.relevant & ~kept.own, rng.random(kept.own.shape), np.inf)
+    keys = np.where(targets.relevant & ~targets.own, rng.random(targets.own.shape), np.inf)
     true = np.argsort(keys, axis=1)[:, :_PAIRS_OF_A_ROW]
-    shown = np.isfinite(np.take_along_axis(keys, true, 1))
-    false = _other_photos(kept, true.shape[1], rng)
-    scores = [np.take_along_axis(kept.scores, columns, 1)[shown] for columns in (true, false)]
-    labels = np.repeat([1, 0], shown.sum())
+    is_drawn = np.isfinite(np.take_along_axis(keys, true, 1))
+    false = _other_photos(targets, true.shape[1], rng)
+    scores = [np.take_along_axis(targets.scores, columns, 1)[is_drawn] for columns in (true, false)]
+    labels = np.repeat([1, 0], is_drawn.sum())
     return np.concatenate(scores).astype(np.float64), labels
 
 
 def _other_photos(table: ScoreTable, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """(T, count) columns of other objects, drawn with replacement."""
+    """Return columns (T, count) of other objects, drawn with replacement."""
     objects, counts = np.unique(table.photo_owner, return_counts=True)
     if len(objects) < 2:
-        raise BadInput(f"pairs need {table.column_words} of two objects at least; got {len(objects)}")
+        raise BadInput(f"Pairs need {table.column_words} of at least 2 objects, got {len(objects)}.")
     order, start = np.argsort(table.photo_owner, kind="stable"), np.cumsum(counts) - counts
     other = rng.integers(len(objects) - 1, size=(len(table.touch_owner), count))
     other += other >= np.searchsorted(objects, table.touch_owner)[:, None]
@@ -157,18 +196,29 @@ def _other_photos(table: ScoreTable, count: int, rng: np.random.Generator) -> ND
 def draw_k_way_tests(
     table: ScoreTable, choice: KWayTest, seed: int, posterior: Posterior | None = None
 ) -> NDArray[np.float64]:
-    """Scores (Q, k) of candidates, the true one first; rivals drawn uniformly, 4 tests a row.
+    """Draw K-way tests, 4 for each row; rivals are drawn uniformly.
 
-    posterior: what makes one logit of a candidate's photos, in place of their mean. Raises BadInput for fewer than
-    two objects; with fewer than k there are as many candidates as objects.
+    Args:
+        table: The scores.
+        choice: The kind of test.
+        seed: Seed of the draw.
+        posterior: Combines the scores of a candidate's photos into one logit; None takes their mean.
+
+    Returns:
+        Scores (Q, k) of the candidates, the true one first. With fewer than k objects all of them are candidates.
+
+    Raises:
+        BadInput: The table has fewer than two objects.
     """
-    kept = table.with_targets
-    scores = object_scores(kept, choice.photos, _TESTS_OF_A_ROW, seed, posterior.object_logits if posterior else None)
-    count = min(choice.k, len(kept.objects))
+    targets = table.with_targets
+    scores = object_scores(
+        targets, choice.photos, _TESTS_OF_A_ROW, seed, posterior.object_logits if posterior else None
+    )
+    count = min(choice.k, len(targets.objects))
     if count < 2:
-        raise BadInput(f"a choice needs two objects at least; got {len(kept.objects)}")
+        raise BadInput(f"A K-way test needs at least 2 objects, got {len(targets.objects)}.")
     # The true object gets the smallest key, so it always comes first.
-    true = kept.touch_owner[:, None] == kept.objects
+    true = targets.touch_owner[:, None] == targets.objects
     keys = np.random.default_rng([seed, 2]).random(scores.shape) - true
     return np.take_along_axis(scores, np.argsort(keys, axis=2)[..., :count], 2).reshape(-1, count)
 
@@ -176,11 +226,18 @@ def draw_k_way_tests(
 def reliability(
     calibrations: Calibrations, test: Mapping[int, ScoreTable], choices: Sequence[KWayTest], *, seed: int = 0
 ) -> dict[str, Any]:
-    """How often what was said came true, on test objects: {"pairs": ..., "k5": ..., "k5_g5": ...}.
+    """Return the reliability bins of calibrated probabilities on test objects.
 
-    "pairs" (even odds, one grasp): probability and truth of pairs. A choice: the posterior's probability of the first
-    guess where one candidate is known to be true (a prior of none of 0), and whether it was right (equals share it).
-    A choice without a posterior, or among more candidates than there are test objects, is left out.
+    Args:
+        calibrations: The fitted calibrations.
+        test: Scores of test objects, by number of grasps.
+        choices: K-way tests. One without a posterior, or with more candidates than test objects, is left out.
+        seed: Seed of the drawn pairs and tests.
+
+    Returns:
+        {"pairs": bins, "k5": bins, "k5_g5": bins, ...}. "pairs": match probabilities of single touches at even prior
+        odds. A K-way test: probability of the top-1 candidate when one candidate is true (prior of none: 0) against
+        its accuracy; tied candidates split the credit.
     """
     scores, labels = draw_pairs(test[1], seed)
     found = {"pairs": reliability_bins(calibrations.pairs[1].probability(scores), labels)}
@@ -193,9 +250,15 @@ def reliability(
 
 
 def top1_confidences(logits: NDArray[np.float64], posterior: Posterior) -> NDArray[np.float64]:
-    """(Q, 2): the stated probability of the first guess among candidates of which one is true, and whether it is right
-    (equals share it); logits (Q, k), the true candidate first.
+    """Return the probability of the top-1 candidate and whether it is right, when one candidate is true.
+
+    Args:
+        logits: (Q, k), the true candidate first.
+        posterior: The posterior of the logits.
+
+    Returns:
+        (Q, 2): probability; 1 if right, 0 if wrong, 1/n for n tied candidates that include the true one.
     """
     tied = logits == logits.max(1, keepdims=True)
-    said = [posterior.probabilities(row, none_prior=0).objects.max() for row in logits]
-    return np.column_stack([said, tied[:, 0] / tied.sum(1)])
+    confidences = [posterior.probabilities(row, none_prior=0).objects.max() for row in logits]
+    return np.column_stack([confidences, tied[:, 0] / tied.sum(1)])

@@ -1,4 +1,4 @@
-"""What an evaluation works on: the recording's grasps, who trains and who tests, and towers that stand still."""
+"""Inputs of an evaluation: the grasps of the recording, its split, and frozen towers."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -18,11 +18,20 @@ from retrieval.training.train import Trainer, labelled_pairs
 
 @dataclass(frozen=True, eq=False)
 class EvaluationData:
-    """The recording, its split, and a matcher whose towers make the features.
+    """The recording, its split, and a matcher whose towers compute the features.
 
-    pairs: labelled ones, which train beside the split's training objects. split_from: in words. checkpoint: the whole
-    model where there is one, which late fusion then is; None where towers are frozen and only heads are to be fitted.
-    config: what these heads are fitted with.
+    Attributes:
+        name: Name of the recording's folder.
+        source: Source of the recording.
+        digest: Digest of the grasps.
+        grasps: All grasps.
+        pairs: Labelled pairs that train in addition to the training objects of the split.
+        split: Training, validation and test objects.
+        split_from: Origin of the split, in words.
+        config: Configuration of the heads that are fitted.
+        matcher: Matcher with the towers.
+        checkpoint: The whole model, which late fusion then uses as it is; None if only heads are fitted on frozen
+            towers.
     """
 
     name: str
@@ -40,10 +49,23 @@ class EvaluationData:
 def prepare(
     recording: Path, out: Path, config: Config, *, model: Path | None, split: Split | None, quiet: bool
 ) -> EvaluationData:
-    """Read a recording and make towers for it: those of `model`, the frozen ones of `config`, or, where `config`
-    trains its towers, those of a training into `out`/model.safetensors.
+    """Read a recording and prepare its towers.
 
-    With a model, all of its configuration counts but the number of iterations. Raises DatasetError, CheckpointError.
+    The towers are those of `model`; without a model, the frozen towers of `config`. If `config` trains its towers, a
+    model is trained and written to `out`/model.safetensors.
+
+    Args:
+        recording: Folder of the recording.
+        out: Folder of the results.
+        config: Configuration. With a model, the model's own configuration replaces it, except for the number of
+            iterations and the paths of labelled pairs.
+        model: A checkpoint.
+        split: The split; None takes the model's own, or draws one.
+        quiet: No progress on stderr.
+
+    Raises:
+        DatasetError: The recording cannot be read, or does not fit the split.
+        CheckpointError: The model cannot be read.
     """
     grasps = load_grasps(recording)
     digest = data_digest(grasps)
@@ -73,7 +95,7 @@ def prepare(
 
 
 def _of_model(checkpoint: Checkpoint, config: Config) -> Config:
-    """The configuration of heads on a model's towers; these are there already, wherever their first weights lay."""
+    """Return the configuration of heads on a model's towers; its initial weights are not needed again."""
     training = dataclasses.replace(
         checkpoint.config.training,
         init="random",
@@ -88,23 +110,23 @@ def _of_model(checkpoint: Checkpoint, config: Config) -> Config:
 
 
 def _split(
-    grasps: Sequence[Grasp], config: Config, checkpoint: Checkpoint | None, given: Split | None
+    grasps: Sequence[Grasp], config: Config, checkpoint: Checkpoint | None, requested: Split | None
 ) -> tuple[Split, str]:
-    """The split given, else the model's own, else a new one; and which, in words."""
-    if given is not None:
-        require_fit(given, grasps)
-        return given, "given"
-    known = checkpoint.split if checkpoint else None
-    seen = {*known.train, *known.validation} if known else set()
+    """Return the requested split, else the model's own, else a new one; and its origin in words."""
+    if requested is not None:
+        require_fit(requested, grasps)
+        return requested, "given"
+    own = checkpoint.split if checkpoint else None
+    trained = {*own.train, *own.validation} if own else set()
     recorded = {grasp.object_id for grasp in grasps}
-    if checkpoint and checkpoint.split and seen and seen <= recorded:
-        test = checkpoint.split.test or tuple(sorted(recorded - seen))
+    if checkpoint and checkpoint.split and trained and trained <= recorded:
+        test = checkpoint.split.test or tuple(sorted(recorded - trained))
         return dataclasses.replace(checkpoint.split, test=test), "the model's own"
-    if shared := seen & recorded:
+    if shared := trained & recorded:
         raise DatasetError(
-            f"the recording must hold all objects that the model was trained with, or none; it holds {len(shared)} of "
-            f"{len(seen)}, such as {min(shared)}; give a split with --split"
+            f"The recording must contain all training objects of the model or none of them, but contains {len(shared)} "
+            f"of {len(trained)}, such as {min(shared)}. Give a split with --split."
         )
     settings = config.training
     drawn = make_split(grasps, validation=settings.validation_fraction, test=settings.test_fraction, seed=settings.seed)
-    return drawn, "drawn; the model has seen none of its objects" if checkpoint else "drawn"
+    return drawn, "drawn; the model was trained on none of its objects" if checkpoint else "drawn"

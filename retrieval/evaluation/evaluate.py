@@ -1,4 +1,4 @@
-"""One evaluation from recording to results.json: encode, fit, predict, score. What is done is not done again."""
+"""Run an evaluation from recording to results.json: encode, fit, predict, score. Finished steps are not repeated."""
 
 import os
 import time
@@ -41,10 +41,10 @@ from retrieval.training.features import encode_recording
 from retrieval.version import __version__
 
 BySeed = Mapping[str, Sequence[Predictions]]
-"""Predictions of each training seed, by method."""
+"""Predictions by method, one for each training seed."""
 DRAWS = 10_000
 COMPARED_MEASURES = ("pair_accuracy", "topn_k5")
-"""Measures by which the first method is compared with each of the others."""
+"""Measures of the comparisons between the first method and each other one."""
 
 
 def evaluate(
@@ -60,22 +60,22 @@ def evaluate(
     cache: Path | None = None,
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Compare methods on objects that they never saw; write results.json and timings.json.
+    """Compare methods on unseen objects; write results.json and timings.json.
 
-    Files under `out` that the same settings made are read, so that a stopped run goes on. Equal settings give equal
-    results to the byte.
+    A stopped run resumes: files under `out` from the same settings are reused. Equal settings give byte-identical
+    results.
 
     Args:
-        recording: A folder, or what `robot.read_recording` returns.
+        recording: A folder, or the object that `robot.read_recording` returns.
         out: Folder of the results.
-        config: Towers, heads and split, as an object (`Config.using` takes towers and losses of your own) or as
-            `load_config` takes it. Its seed is the seed of everything drawn.
-        preset: What the report calls the configuration; its name where None.
-        methods: Names, or classes of your own, which the report calls by their names.
-        model: A checkpoint to evaluate instead of one fitted here.
-        seeds: Trainings of each method, from the seed of `config` on.
-        split: Objects of each part; drawn where None.
-        cache: Folder of kept features; `out`/features where None.
+        config: Towers, heads and split: a `Config` (`Config.using` accepts your own towers and losses), or an argument
+            of `load_config`. Its seed is the seed of every random draw.
+        preset: Name of the configuration in the report; None takes its own name.
+        methods: Names, or your own classes, which the report lists by class name.
+        model: A checkpoint to evaluate instead of one that is fitted here.
+        seeds: Number of trainings of each method; the first seed is that of `config`.
+        split: Objects of each part; None takes the model's own split, or draws one.
+        cache: Folder of encoded features; None takes `out`/features.
         quiet: No progress on stderr.
 
     Returns:
@@ -97,40 +97,41 @@ def evaluate(
     """
     names = [METHODS.name_of(method) for method in methods]
     if not names or seeds < 1:
-        raise BadInput(f"give one method and one seed at least; got {len(names)} and {seeds}")
-    config, called = named_config(config, preset)
+        raise BadInput(f"An evaluation needs at least 1 method and 1 seed, got {len(names)} and {seeds}.")
+    config, preset_name = named_config(config, preset)
     out.mkdir(parents=True, exist_ok=True)
     seed = config.training.seed
-    wanted = list(range(seed, seed + seeds))
+    seed_list = list(range(seed, seed + seeds))
     with resumable(out):
         data = prepare(folder_of(recording), out, config, model=model, split=split, quiet=quiet)
         experiment, controls = _experiments(data, out, cache or out / "features", seed, quiet)
-        jobs = {name: experiment.seeds_of(name, wanted) for name in dict.fromkeys(names)}
-        predictions = {name: [experiment.run(name, one) for one in some] for name, some in jobs.items()}
-        sides = [
+        jobs = {name: experiment.seeds_of(name, seed_list) for name in dict.fromkeys(names)}
+        predictions = {name: [experiment.run(name, each) for each in seeds_used] for name, seeds_used in jobs.items()}
+        groups = [
             ("controls", CONTROLS, CONTROL_METHOD, controls),
             ("ceilings", CEILINGS, CEILING_METHOD, ceiling_experiments(experiment)),
         ]
-        beside = {
-            side: {
-                name: score_control(words[name], method, one, seed, draws=DRAWS) for name, one in experiments.items()
+        controls_and_ceilings = {
+            group: {
+                name: score_control(descriptions[name], method, one, seed, draws=DRAWS)
+                for name, one in experiments.items()
             }
-            for side, words, method, experiments in sides
+            for group, descriptions, method, experiments in groups
         }
-    asked = experiment.queries
-    tested = [data.grasps[row] for row in asked.touches[asked.of_part(asked.touch_owner, "test")]]
+    queries = experiment.queries
+    tested = [data.grasps[row] for row in queries.touches[queries.of_part(queries.touch_owner, "test")]]
     results = {
-        **_about(data, experiment, called, wanted),
+        **_about(data, experiment, preset_name, seed_list),
         "audit": cached_document(
             out / "audit.json",
             {"recording": data.digest, "split": data.split.to_dict(), "distance": UNIT},
-            lambda: audit(data.grasps, data.split, quiet=quiet),  # it reads every image
+            lambda: audit(data.grasps, data.split, quiet=quiet),  # reads every image
         ),
         **_score_methods(experiment, predictions, seed, quiet),
         "low_contact": score_low_contact(
-            find_low_contact_touches(tested, quiet=quiet), asked, predictions, draws=DRAWS, seed=seed
+            find_low_contact_touches(tested, quiet=quiet), queries, predictions, draws=DRAWS, seed=seed
         ),
-        **beside,
+        **controls_and_ceilings,
     }
     write_document(out / "results.json", results)
     write_document(out / "timings.json", _timings(data, predictions))
@@ -140,14 +141,14 @@ def evaluate(
 def _experiments(
     data: EvaluationData, out: Path, cache: Path, seed: int, quiet: bool
 ) -> tuple[Experiment, dict[str, Experiment]]:
-    """The experiment of the evaluation, and those of the controls."""
-    shown = partial(encode_recording, matcher=data.matcher, config=data.config, cache=cache, quiet=quiet)
+    """Return the experiment of the evaluation, and those of the controls."""
+    encode = partial(encode_recording, matcher=data.matcher, config=data.config, cache=cache, quiet=quiet)
     experiment = Experiment(
         folder=out,
         config=data.config,
         split=data.split,
-        features=shown(data.grasps),
-        pairs=shown(data.pairs) if data.pairs else None,
+        features=encode(data.grasps),
+        pairs=encode(data.pairs) if data.pairs else None,
         queries=draw_queries(data.grasps, data.split, seed),
         checkpoint=data.checkpoint,
         shuffled=False,
@@ -187,7 +188,7 @@ def _about(data: EvaluationData, experiment: Experiment, preset: str, seeds: lis
 
 
 def _score_methods(experiment: Experiment, predictions: BySeed, seed: int, quiet: bool) -> dict[str, Any]:
-    """ "methods" and "comparisons" of results.json."""
+    """Return "methods" and "comparisons" of results.json."""
     entries: dict[str, Any] = {}
     measures: dict[str, list[Measures]] = {}
     with Bar("score", len(predictions), "methods", quiet=quiet) as bar:
@@ -222,7 +223,7 @@ def _timings(data: EvaluationData, predictions: BySeed) -> dict[str, Any]:
 
 
 def _method_times(by_seed: Sequence[Mapping[str, float]]) -> dict[str, float | None]:
-    """Times of a method, medians over the seeds; no time of fitting for a method that came fitted."""
+    """Return the median times of a method over the seeds; a checkpoint has no time of fitting."""
     seconds = {key: float(np.median([one[key] for one in by_seed])) for key in by_seed[0]}
     return {
         "fit_s": seconds["fit"] or None,
@@ -235,7 +236,7 @@ def _method_times(by_seed: Sequence[Mapping[str, float]]) -> dict[str, float | N
 
 @one_thread()
 def _tower_times(data: EvaluationData, count: int = 4, repeats: int = 3) -> dict[str, Any]:
-    """Median time of the towers, on one thread, for one touch and for one photo; their files are read before."""
+    """Return the median times of the towers for one touch and one photo, on one thread, without reading files."""
     grasps = data.grasps[:count]
     with BatchImages(data.config, torch.device("cpu"), keep_bytes=0) as images:
         touches, photos = [images.touch(grasp) for grasp in grasps], [images.photo(grasp.photo) for grasp in grasps]

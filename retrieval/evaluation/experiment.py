@@ -1,4 +1,4 @@
-"""Fitting and predicting: every method and seed writes a file of predictions, unless it lies there already."""
+"""Fit and predict: write one file of predictions for each method and seed, unless it exists."""
 
 import time
 from collections.abc import Mapping
@@ -26,12 +26,21 @@ from retrieval.version import __version__
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """What methods are fitted on and asked, and the folder where fits and predictions lie.
+    """Data, settings and queries on which methods are fitted and scored.
 
-    pairs: labelled pairs that train beside the split's training objects. checkpoint: a whole model, which late fusion
-    and what shares its weights then are; None: they are fitted. shuffled: touches are permuted among the objects of
-    each part before fitting, so that nothing can be learned. fit_on_validation, kind_of: as in `MethodSettings`. role: what it is
-    beside the evaluation itself, such as "control: blurred", for people who watch.
+    Attributes:
+        folder: Folder of fits and predictions.
+        config: Configuration of the heads.
+        split: Training, validation and test objects.
+        features: Tower features of all grasps.
+        pairs: Features of labelled pairs that train in addition to the training objects.
+        queries: Touches and photos to score.
+        checkpoint: A whole model, which late fusion and methods with its weights then use; None fits them.
+        shuffled: Whether touches are permuted among the objects of each part before fitting, as a control.
+        quiet: No progress on stderr.
+        fit_on_validation: As in `MethodSettings`.
+        kind_of: As in `MethodSettings`.
+        role: Label for progress lines, such as "control: low_pass"; empty for the evaluation itself.
     """
 
     folder: Path
@@ -48,16 +57,16 @@ class Experiment:
     role: str = ""
 
     def seeds_of(self, name: str, seeds: list[int]) -> list[int]:
-        """The seeds that make a difference to a method."""
+        """Return the seeds that change the result of a method."""
         method = METHODS.load(name)
-        comes_fitted = self.checkpoint is not None and issubclass(method, LateFusion)
-        return seeds[:1] if comes_fitted or not method.is_seeded else seeds
+        is_fitted = self.checkpoint is not None and issubclass(method, LateFusion)
+        return seeds[:1] if is_fitted or not method.is_seeded else seeds
 
     def run(self, name: str, seed: int) -> Predictions:
-        """Return the predictions of a method: those in the folder, else it is fitted and they are written there."""
+        """Return the stored predictions of a method, or fit it and store them."""
         path, cache_key = self.folder / "predictions" / f"{name}-{seed}.safetensors", self.cache_key(name, seed)
-        if (kept := read_predictions(path, cache_key)) is not None:
-            return kept
+        if (stored := read_predictions(path, cache_key)) is not None:
+            return stored
         if not self.quiet:
             say(f"evaluate: {name}, seed {seed}" + (f" ({self.role})" if self.role else ""))
         method, fit_s = self._fit(name, seed)
@@ -66,7 +75,7 @@ class Experiment:
         return predictions
 
     def cache_key(self, name: str, seed: int) -> dict[str, Any]:
-        """Return everything that decides the predictions of a method, in JSON types."""
+        """Return all inputs that determine the predictions of a method, in JSON types."""
         losses = [LOSSES.load(loss) for loss, weight in self.config.training.weights.items() if weight > 0]
         return {
             "method": name,
@@ -84,7 +93,7 @@ class Experiment:
         }
 
     def _fit(self, name: str, seed: int) -> tuple[Method, float]:
-        config = self.config.without_candidate_encoder() if self.shuffled else self.config  # there is no order to learn
+        config = self.config.without_candidate_encoder() if self.shuffled else self.config  # no ranking to learn
         settings = MethodSettings(config, seed, self.folder / "fits", self.quiet, self.fit_on_validation, self.kind_of)
         method = METHODS.load(name)(settings)
         if self.checkpoint is not None and isinstance(method, LateFusion):
@@ -95,12 +104,12 @@ class Experiment:
         if self.shuffled:
             train, validation = _permute_touches(train, seed), _permute_touches(validation, seed)
         start = time.perf_counter()
-        with one_thread():  # heads are small, and times are then those of one core
+        with one_thread():  # heads are small; times refer to one core
             method.fit(train, validation)
         return method, time.perf_counter() - start
 
 
 def _permute_touches(features: Features, seed: int) -> Features:
-    """Every touch with a grasp drawn at random; photos stay where they are."""
+    """Return the features with touches randomly assigned to grasps."""
     order = np.random.default_rng([seed, 13]).permutation(len(features))
     return Features(features.grasp_ids, features.object_ids, features.touch[order], features.photo)

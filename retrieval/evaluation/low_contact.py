@@ -1,4 +1,4 @@
-"""Touches that hardly press the gel, judged apart: what was not felt cannot be found."""
+"""Separate measures of low-contact touches, which hardly press the gel."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,13 +20,16 @@ from retrieval.metrics.measure import Measure
 from retrieval.metrics.registry import MethodScoreTables, compute
 
 LOW_CONTACT_FRACTION = 0.05
-"""Share of the touches that is judged apart."""
+"""Fraction of the touches with the smallest gel change that counts as low-contact."""
 
 
 @dataclass(frozen=True, eq=False)
 class LowContactTouches:
-    """The faintest touches of a part of the split. change: grey levels, of the strongest of these; rows (Q,): of the
-    part's touches, which these are.
+    """The low-contact touches of one part of the split.
+
+    Attributes:
+        gel_change: Largest gel change among these touches, grey levels.
+        rows: (Q,) whether each touch of the part is one of them.
     """
 
     gel_change: float
@@ -34,11 +37,16 @@ class LowContactTouches:
 
 
 def find_low_contact_touches(grasps: Sequence[Grasp], *, quiet: bool = True) -> LowContactTouches | None:
-    """The faintest of these touches, by `gel_change`; None where one lacks the frames from before its contact."""
+    """Return the touches with the smallest `gel_change`; None if a grasp lacks no-contact frames.
+
+    Args:
+        grasps: The grasps of one part.
+        quiet: No progress on stderr.
+    """
     if any(len(grasp.backgrounds) != len(grasp.touches) for grasp in grasps):
         return None
     changes = []
-    with Bar("compare with untouched", len(grasps), "grasps", quiet=quiet) as bar:
+    with Bar("compare with no-contact frames", len(grasps), "grasps", quiet=quiet) as bar:
         for grasp in grasps:
             changes.append(gel_change(grasp))
             bar.advance()
@@ -47,9 +55,13 @@ def find_low_contact_touches(grasps: Sequence[Grasp], *, quiet: bool = True) -> 
 
 
 def gel_change(grasp: Grasp) -> float:
-    """Mean difference of a gel image from that before the contact, grey levels; of the finger that felt more.
+    """Return the mean absolute difference between gel image and no-contact frame, grey levels.
 
-    Raises DatasetError where the two differ in size.
+    Args:
+        grasp: A grasp with no-contact frames; of two fingers the larger change counts.
+
+    Raises:
+        DatasetError: The two images differ in size.
     """
     return max(map(_finger_change, grasp.touches, grasp.backgrounds))
 
@@ -58,7 +70,7 @@ def _finger_change(touch: Path, before: Path) -> float:
     pressed, no_contact = read_rgb(touch), read_rgb(before)
     if pressed.shape != no_contact.shape:
         raise DatasetError(
-            f"{touch} and the frame before it must be of one size; got {pressed.shape} and {no_contact.shape}"
+            f"{touch} and its no-contact frame must have the same size, got {pressed.shape} and {no_contact.shape}."
         )
     return float(255 * np.abs(pressed - no_contact).mean())
 
@@ -71,7 +83,15 @@ def score_low_contact(
     draws: int,
     seed: int,
 ) -> dict[str, Any] | None:
-    """ "faint" of results.json: measures of the faintest touches and of the others, by method."""
+    """Return "low_contact" of results.json: measures of low-contact and other touches, by method.
+
+    Args:
+        low_contact: The low-contact test touches; None gives None.
+        queries: The queries of the evaluation.
+        predictions: Predictions of each training seed, by method.
+        draws: Resamples of an interval.
+        seed: Seed of the resamples.
+    """
     if low_contact is None:
         return None
     parts = {"low_contact": low_contact.rows, "others": ~low_contact.rows}
@@ -85,12 +105,11 @@ def score_low_contact(
     return {"change": low_contact.gel_change, "touches": int(low_contact.rows.sum()), "methods": methods}
 
 
-def _measures(judged: MethodScores, rows: NDArray[np.bool_]) -> dict[str, Measure]:
-    """The measures of some test touches (`rows`) with all test photos."""
-    table = judged.touches("test", "test")
+def _measures(method_scores: MethodScores, rows: NDArray[np.bool_]) -> dict[str, Measure]:
+    """Return the measures of some test touches (`rows`) with all test photos."""
+    table = method_scores.touches("test", "test")
     part = table.select(rows, np.arange(len(table.photo_owner)))
-    return (
-        compute(MethodScoreTables(part, part, {}, judged.pair_rule.rule, judged.seed), CONTROL_MEASURES)
-        if part.has_target.any()
-        else {}
-    )
+    if not part.has_target.any():
+        return {}
+    tables = MethodScoreTables(part, part, {}, method_scores.pair_rule.rule, method_scores.seed)
+    return compute(tables, CONTROL_MEASURES)

@@ -1,4 +1,4 @@
-"""What all methods are asked alike: the touches, the sets of grasps and the photos, drawn once."""
+"""Queries of an evaluation: touches, sets of grasps and photos, drawn once for all methods."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ from retrieval.metrics.registry import PHOTOS_PER_CANDIDATE, SET_SIZES
 
 PARTS = ("train", "validation", "test")
 MAX_GRASPS = {"train": 8, "validation": 12}
-"""ShardResult grasps of an object; of a test object all are judged."""
+"""Maximum number of scored grasps of one object, by part; test objects have no limit."""
 SETS_OF_AN_OBJECT = 20
 
 Rows = NDArray[np.int64]
@@ -23,12 +23,17 @@ Rows = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Queries:
-    """Touches (Q) and photos (P) that are judged, and sets of these touches.
+    """Touches (Q) and photos (P) to score, and sets of these touches.
 
-    touches (Q,), photos (P,): rows of the features; every photo FILE stands once, however many grasps share it.
-    own_photo (Q,): column of the photo taken before that grasp. touch_owner (Q,), photo_owner (P,): number in
-    `objects`, the names of all objects of the split, sorted. part_of: the part of each object. sets: by number of
-    grasps, (S, G) places in `touches`, each of one object.
+    Attributes:
+        touches: (Q,) rows of the features.
+        photos: (P,) rows of the features; a photo file that several grasps share is listed once.
+        own_photo: (Q,) column of the photo that was taken before the grasp.
+        touch_owner: (Q,) object numbers.
+        photo_owner: (P,) object numbers.
+        objects: Names of all objects of the split, sorted; object numbers are places in it.
+        part_of: The part of each object.
+        sets: By number of grasps, (S, G) places in `touches`; a set has one object.
     """
 
     touches: Rows
@@ -41,12 +46,12 @@ class Queries:
     sets: dict[int, Rows]
 
     def of_part(self, owner: Rows, part: str) -> Rows:
-        """Places of the items, with these owners, whose object is in `part`."""
+        """Return the places of the items whose owner is in `part`."""
         return np.flatnonzero(np.array(self.part_of, dtype=str)[owner] == part)
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256: equal exactly when the same is asked."""
+        """Return a SHA-256 digest of the queries."""
         digest = hashlib.sha256(repr((self.objects, self.part_of, sorted(self.sets))).encode())
         arrays = [self.touches, self.photos, self.own_photo, self.touch_owner, self.photo_owner]
         for array in [*arrays, *(self.sets[size] for size in sorted(self.sets))]:
@@ -57,12 +62,20 @@ class Queries:
 def draw_queries(
     grasps: Sequence[Grasp], split: Split, seed: int, max_grasps: Mapping[str, int] = MAX_GRASPS
 ) -> Queries:
-    """FusionScorer all grasps of test objects and some of the others, drawn by `seed`; most: grasps of an object, by part.
+    """Draw the queries: all grasps of test objects and some of the others.
 
-    Sets of each of `SET_SIZES` are drawn for test and validation objects, without replacement within a set, where
-    they leave the object `PHOTOS_PER_CANDIDATE` photos of other grasps. Shown by fewer than its rivals are, the true object
-    would come first more often than 1 in K by chance: the mean of fewer scores lies further out. Raises DatasetError
-    where the objects of a part are fewer than two.
+    Sets of each size in `SET_SIZES` are drawn for test and validation objects, without replacement within a set, if
+    `PHOTOS_PER_CANDIDATE` photos of other grasps remain. With fewer photos than its rivals the true object would rank
+    first more often than 1 in K by chance, because a mean of fewer scores varies more.
+
+    Args:
+        grasps: All grasps of the recording.
+        split: The objects of each part.
+        seed: Seed of the draw.
+        max_grasps: Maximum number of grasps of one object, by part; a part without an entry has no limit.
+
+    Raises:
+        DatasetError: A part has fewer than two objects.
     """
     part_of = {name: part for part in PARTS for name in getattr(split, part)}
     objects = tuple(sorted({grasp.object_id for grasp in grasps} & set(part_of)))
@@ -70,18 +83,18 @@ def draw_queries(
     for part in PARTS:
         if (count := parts.count(part)) < 2:
             raise DatasetError(
-                f"an evaluation needs two {part} objects at least; the recording has {count} of the split's: record "
-                "more objects, or give a split of your own"
+                f"An evaluation needs at least 2 {part} objects, but the recording has {count} of the split's. Record "
+                "more objects, or give your own split."
             )
     rng = np.random.default_rng([seed, 11])
-    judged = [_draw_touches(grasps, name, max_grasps.get(part_of[name]), rng) for name in objects]
-    touches = np.concatenate(judged)
-    owner = np.repeat(np.arange(len(objects)), [len(rows) for rows in judged])
+    drawn_rows = [_draw_touches(grasps, name, max_grasps.get(part_of[name]), rng) for name in objects]
+    touches = np.concatenate(drawn_rows)
+    owner = np.repeat(np.arange(len(objects)), [len(rows) for rows in drawn_rows])
     column: dict[Path, int] = {}
     own_photo = np.array([column.setdefault(grasps[row].photo, len(column)) for row in touches])
     first = np.unique(own_photo, return_index=True)[1]
-    asked = [np.flatnonzero(owner == place) for place, part in enumerate(parts) if part != "train"]
-    sets = {size: _draw_sets(asked, size, rng) for size in SET_SIZES}
+    touches_of = [np.flatnonzero(owner == place) for place, part in enumerate(parts) if part != "train"]
+    sets = {size: _draw_sets(touches_of, size, rng) for size in SET_SIZES}
     return Queries(
         touches=touches,
         photos=touches[first],
@@ -102,7 +115,7 @@ def _draw_touches(grasps: Sequence[Grasp], name: str, max_grasps: int | None, rn
 
 
 def _draw_sets(touches_of: Sequence[Rows], size: int, rng: np.random.Generator) -> Rows:
-    """(S, size): sets of the touches of each object that has enough."""
+    """Return sets (S, size) of the touches of each object that has enough."""
     enough = [places for places in touches_of if len(places) >= size + PHOTOS_PER_CANDIDATE]
     drawn = [rng.choice(places, size, replace=False) for places in enough for _ in range(SETS_OF_AN_OBJECT)]
     return np.array(drawn, dtype=np.int64).reshape(-1, size)

@@ -1,7 +1,7 @@
 """Error against run time of every approximation of a search, measured with one model on one recording.
 
-A new approximation is one function from a `Sample` to a `ApproximationResult`, one row of `APPROXIMATIONS`, one test parameter. The
-kernels' own, which need no recording of the user's, stand in `benchmarks/frontier/` of the repository.
+A new approximation is one function from a `Sample` to an `ApproximationResult`, one row of `APPROXIMATIONS` and one
+test parameter. Approximations of kernels, which need no recording, are in `benchmarks/frontier/` of the repository.
 """
 
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ APPROXIMATIONS = {
     "image_size": "retrieval.frontier.pixels:image_size",
     "grasps": "retrieval.frontier.grasps:grasps",
 }
-"""Name -> the function that measures it, imported when it is used."""
+"""Name -> measuring function, imported on first use."""
 
 
 def load_approximation(

@@ -1,4 +1,4 @@
-"""How many photos the full classifier judges: the share of winners that the candidates leave out, and what it costs."""
+"""Number of reranked candidates: miss rate of the exhaustive top-1 against the time of a query."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -17,19 +17,19 @@ from retrieval.search.build.measuring import EXHAUSTIVE_LIMIT, SHORT_LADDER, can
 from retrieval.search.build.operating import TARGET
 
 TOLERANCE = 100 * (1 - TARGET)
-"""Percent of winners that `build-index` lets candidates miss unless it is told otherwise."""
+"""Default tolerance of `build-index`: percent of exhaustive top-1 photos that the candidates may miss."""
 
 
 def candidates(sample: Sample) -> ApproximationResult:
-    """Candidates k by every embedding the model has, exact search, then the rerank of what was found."""
+    """Measure numbers of candidates k: exact search by each embedding of the model, then reranking."""
     if not sample.queries.keys() - {"partial"}:
         return ApproximationResult(
-            "Candidates", "", skipped="this model has no trained embeddings and judges every photo"
+            "Candidates", "", skipped="this model has no trained embeddings and reranks every photo"
         )
     return ApproximationResult(
         "Candidates",
-        "The full classifier judges only the k photos nearest in embedding. The reference judges all of them. A winner "
-        "is the photo that the reference ranks first.",
+        "The full classifier reranks only the k photos nearest in embedding. The reference reranks every photo. The "
+        "exhaustive top-1 is the photo that the reference ranks first.",
         (_missed_top1_panel(sample), _lost_top1_panel(sample)),
     )
 
@@ -46,7 +46,7 @@ def _missed_top1_panel(sample: Sample) -> Panel:
     points.append(miss_rate_point("no candidates", "all", sample.exhaustive_top1 < 0, default == count))
     works.append(partial(sample.logits, sample.queries["partial"][0], photos.partials))
     points = list(time_points(points, works, sample.scale.repeats))
-    return _panel(f"missed winners, {count:,} blended photos", points, len(sample.exhaustive_top1))
+    return _panel(f"missed exhaustive top-1, {count:,} blended photos", points, len(sample.exhaustive_top1))
 
 
 def _panel(title: str, points: Sequence[Tradeoff], queries: int) -> Panel:
@@ -54,7 +54,7 @@ def _panel(title: str, points: Sequence[Tradeoff], queries: int) -> Panel:
         title=title,
         time="search and rerank of one query, one thread",
         unit="% of queries",
-        reference="every photo judged",
+        reference="every photo reranked",
         tolerance=round(TOLERANCE, 6),
         points=tuple(points),
         resolution=100 / queries,
@@ -62,21 +62,22 @@ def _panel(title: str, points: Sequence[Tradeoff], queries: int) -> Panel:
 
 
 def _query_work(
-    sample: Sample, index: VectorIndex, asked: Mapping[str, Array], name: str, partials: NDArray[Any], k: int
+    sample: Sample, index: VectorIndex, queries: Mapping[str, Array], name: str, partials: NDArray[Any], k: int
 ) -> Callable[[], object]:
-    """Search and rerank of one touch after the other."""
-    touches = cycle(zip(asked["partial"], asked[name], strict=True))
+    """Return a function that searches and reranks one touch after the other."""
+    touches = cycle(zip(queries["partial"], queries[name], strict=True))
 
-    def ask() -> Array:
-        partial_activation, query = next(touches)
-        return sample.logits(partial_activation, partials, np.sort(index.search(query[None], k)[1][0]))
+    def work() -> Array:
+        touch_partial, query = next(touches)
+        return sample.logits(touch_partial, partials, np.sort(index.search(query[None], k)[1][0]))
 
-    return ask
+    return work
 
 
 def default_k(sample: Sample) -> int:
-    """What `build-index` would write into the index of the blended catalogue, these touches asked: the first of its
-    steps whose candidates hold enough winners.
+    """Return the number of candidates that `build-index` would select for the blended catalogue and these touches.
+
+    It is the first step of `build-index` whose candidates contain enough exhaustive top-1 photos.
     """
     photos = sample.catalogue
     used = next(name for name in photos.embeddings if is_used(sample, name))
@@ -85,49 +86,49 @@ def default_k(sample: Sample) -> int:
 
 
 def is_used(sample: Sample, name: str) -> bool:
-    """Whether search takes its candidates by this embedding."""
+    """Return whether search uses this embedding for its candidates."""
     return name == (
         "candidate encoder" if sample.checkpoint.matcher.candidate_encoder is not None else "contrastive embedding"
     )
 
 
 def ranks(queries: Array, embeddings: Array, exhaustive_top1: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(Q,) how many photos lie nearer to each query than its winner does."""
+    """Return how many photos (Q,) are nearer to each query than its exhaustive top-1."""
     found = []
-    for query, winner in zip(queries, exhaustive_top1, strict=True):
-        nearness = embeddings @ query
-        found.append(int(np.count_nonzero(nearness > nearness[winner])))
+    for query, best in zip(queries, exhaustive_top1, strict=True):
+        similarity = embeddings @ query
+        found.append(int(np.count_nonzero(similarity > similarity[best])))
     return np.array(found)
 
 
-# First guesses -------------------------------------------------------------------------------------------
+# Top-1 answers -------------------------------------------------------------------------------------------
 
 
 def _lost_top1_panel(sample: Sample) -> Panel:
-    """First guesses lost to fewer candidates; on real photos only, as a blend is of no object."""
+    """Measure correct top-1 answers that fewer candidates lose; on real photos, as a blend has no object."""
     rows = sample.touch_rows[: sample.scale.queries]
-    asked, partials, count = sample.touch_encodings(rows), sample.real_photo_codes["partial"], len(sample.photo_rows)
+    queries, partials, count = sample.touch_encodings(rows), sample.real_photo_codes["partial"], len(sample.photo_rows)
     points, works = list[Tradeoff](), list[Callable[[], object]]()
-    table = np.array([sample.logits(partial_activation, partials) for partial_activation in asked["partial"]])
+    table = np.array([sample.logits(touch_partial, partials) for touch_partial in queries["partial"]])
     whole = _wrong(sample, table, rows)
-    for name in (name for name in asked if name != "partial"):
+    for name in (name for name in queries if name != "partial"):
         index = load_kind("flat").build(sample.real_photo_codes[name], threads=1)
         for k in (k for k in (1, 2, 5, *SHORT_LADDER[::-1], *candidate_steps(count)) if k < count):
-            judged = _candidate_logits(table, index.search(asked[name], k)[1])
-            points.append(miss_rate_point(name, f"k = {k:,}", _wrong(sample, judged, rows) & ~whole))
-            works.append(_query_work(sample, index, asked, name, partials, k))
+            logits = _candidate_logits(table, index.search(queries[name], k)[1])
+            points.append(miss_rate_point(name, f"k = {k:,}", _wrong(sample, logits, rows) & ~whole))
+            works.append(_query_work(sample, index, queries, name, partials, k))
     points.append(miss_rate_point("no candidates", "all", rows < 0, count <= EXHAUSTIVE_LIMIT))
-    works.append(partial(sample.logits, asked["partial"][0], partials))
+    works.append(partial(sample.logits, queries["partial"][0], partials))
     points = list(time_points(points, works, sample.scale.repeats))
     objects = len(np.unique(sample.owner))
-    return _panel(f"right first guesses lost, {count} photos of {objects} unseen objects", points, len(rows))
+    return _panel(f"lost correct top-1 answers, {count} photos of {objects} unseen objects", points, len(rows))
 
 
 def _candidate_logits(table: Array, slots: NDArray[np.int64]) -> Array:
-    """Logits (Q, N) of the candidates (Q, k), all others last."""
-    judged = np.full(table.shape, -np.inf, dtype=np.float32)
-    np.put_along_axis(judged, slots, np.take_along_axis(table, slots, 1), 1)
-    return judged
+    """Return logits (Q, N) of the candidates (Q, k); -inf for the others."""
+    logits = np.full(table.shape, -np.inf, dtype=np.float32)
+    np.put_along_axis(logits, slots, np.take_along_axis(table, slots, 1), 1)
+    return logits
 
 
 def _wrong(sample: Sample, table: Array, rows: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""How long work takes, and on which machine."""
+"""Run times, and the machine on which they are measured."""
 
 import dataclasses
 import os
@@ -18,9 +18,15 @@ MIN_SECONDS = 0.005
 def time_points(
     points: Sequence[Tradeoff], works: Sequence[Callable[[], object]], repeats: int
 ) -> tuple[Tradeoff, ...]:
-    """The points, each with the median seconds of its work: all take turns, so that a busy moment slows all of them.
+    """Return the points, each with the median seconds of its work.
 
-    Every work is run once before, which is not counted; short work is timed several runs together. All on one thread.
+    All works take turns, so that a busy moment slows all of them. Each runs once for warm-up. Short works are timed
+    over several runs together. Everything runs on one thread.
+
+    Args:
+        points: The points.
+        works: The work of each point.
+        repeats: Number of timed rounds.
     """
     with _one_thread():
         calls = [max(1, int(MIN_SECONDS / max(_seconds(work, 1), 1e-9))) for work in works]
@@ -33,7 +39,7 @@ def time_points(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """PyTorch; and numpy, by threadpoolctl, which scikit-learn brings along."""
+    """Limit PyTorch and numpy to one thread; threadpoolctl comes with scikit-learn."""
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped, unused-ignore]
 
     with one_thread(), threadpool_limits(1):
@@ -48,12 +54,12 @@ def _seconds(work: Callable[[], object], calls: int) -> float:
 
 
 def machine() -> dict[str, str | int | None]:
-    """Processor and cores: times of another machine are other times."""
+    """Return processor, cores and system, because times depend on the machine."""
     return {"processor": _processor(), "cores": os.cpu_count(), "system": platform.system()}
 
 
 def _processor() -> str:
-    """The name in /proc/cpuinfo where there is one: platform.processor() is often empty."""
+    """Return the name in /proc/cpuinfo if there is one: platform.processor() is often empty."""
     try:
         lines = Path("/proc/cpuinfo").read_text("utf-8").splitlines()
     except OSError:

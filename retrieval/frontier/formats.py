@@ -1,4 +1,4 @@
-"""Number formats: of the towers' arithmetic, and of the halves that an index keeps."""
+"""Number formats of the towers' arithmetic, and of the partial activations in an index."""
 
 import copy
 import dataclasses
@@ -25,23 +25,23 @@ from retrieval.model.fusion import Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder, with_checksum
 
 LOGIT_TOLERANCE = 0.05
-"""Largest error of a match logit that nobody will see: the probability moves by a percent at most."""
+"""Largest negligible error of a match logit: the probability changes by about one percentage point at most."""
 FLIP_TOLERANCE = 1.0
 MAX_TOUCHES = 20
-"""EncodedTouches in every format of the towers: bfloat16 is emulated, slowly, where the processor has none."""
+"""Number of touches that each tower format encodes: emulated bfloat16 is slow on processors without it."""
 _BATCH = 16
 
 # Towers ----------------------------------------------------------------------------------------------------
 
 
 def towers(sample: Sample) -> ApproximationResult:
-    """Formats of the touch tower: errors of match logits against float64, and the time of one touch."""
-    asked = sample.touch_rows[: 2 if sample.scale.quick else min(MAX_TOUCHES, sample.scale.touches)]
+    """Measure formats of the touch tower: errors of match logits against float64, and the time of one touch."""
+    rows = sample.touch_rows[: 2 if sample.scale.quick else min(MAX_TOUCHES, sample.scale.touches)]
     settings = sample.checkpoint.config.preprocessing
-    images = [load_touch(settings, sample.grasps[row]) for row in asked]
+    images = [load_touch(settings, sample.grasps[row]) for row in rows]
     photos = sample.real_photo_codes["partial"]
     whole = copy.deepcopy(sample.checkpoint.matcher).double()
-    exact = _logits(sample, np.concatenate([_halves(whole, part) for part in batches(images, _BATCH)]), photos)
+    exact = _logits(sample, np.concatenate([_touch_partials(whole, part) for part in batches(images, _BATCH)]), photos)
     errors, flips, works = list[Tradeoff](), list[Tradeoff](), list[Callable[[], object]]()
     for name, encode, is_default in encoders(sample.checkpoint):
         logits = _logits(sample, np.concatenate([encode(part) for part in batches(images, _BATCH)]), photos)
@@ -50,8 +50,8 @@ def towers(sample: Sample) -> ApproximationResult:
         works.append(partial(encode, images[:1]))
     return ApproximationResult(
         "Number format of the towers",
-        f"{len(images)} touches, each with {len(photos)} photos, whose halves stay as they are. A query encodes with "
-        "ONNX Runtime instead where `retrieve export` has put its file beside the model.",
+        f"{len(images)} touches, each with {len(photos)} photos, whose partial activations do not change. A query "
+        "encodes with ONNX Runtime instead if the file of `retrieve export` is next to the model.",
         _panels(
             sample, errors, flips, works, len(images), ("the touch tower in float64", "encoding one touch, one thread")
         ),
@@ -66,7 +66,7 @@ def _panels(
     queries: int,
     words: tuple[str, str],
 ) -> tuple[Panel, Panel]:
-    """words: the reference, and what takes the time."""
+    """Return the panels of logit errors and of changed top-1; `words` are the reference and the timed work."""
     reference, time = words
     of_errors = time_points(errors, works, sample.scale.repeats)
     of_flips = tuple(
@@ -82,7 +82,7 @@ def _panels(
             of_errors,
             smallest_error(errors),
         ),
-        Panel("another photo first", time, "% of touches", reference, FLIP_TOLERANCE, of_flips, 100 / queries),
+        Panel("changed top-1 photo", time, "% of touches", reference, FLIP_TOLERANCE, of_flips, 100 / queries),
     )
 
 
@@ -90,11 +90,14 @@ Encode = Callable[[list[Any]], Array]
 
 
 def encoders(checkpoint: Checkpoint) -> Iterator[tuple[str, Encode, bool]]:
-    """(name, touches to halves, whether a query encodes so); ONNX Runtime only where it is installed."""
+    """Yield (name, function from touches to partial activations, whether queries use it) of each tower format.
+
+    ONNX Runtime is included if it is installed.
+    """
     matcher = checkpoint.matcher
     fast = for_inference(matcher)
-    yield "float32, as trained", partial(_halves, matcher), False
-    yield "float32, folded", partial(_halves, fast), True
+    yield "float32, as trained", partial(_touch_partials, matcher), False
+    yield "float32, folded", partial(_touch_partials, fast), True
     emulated = "" if has_fast_bfloat16(torch.device("cpu")) else " (emulated here)"
     yield f"bfloat16, folded{emulated}", partial(_bfloat16, fast), False
     if all(find_spec(name) for name in ("onnx", "onnxruntime")):
@@ -102,7 +105,7 @@ def encoders(checkpoint: Checkpoint) -> Iterator[tuple[str, Encode, bool]]:
 
 
 def _onnx(checkpoint: Checkpoint) -> Encode:
-    """What `retrieve export` writes, on one thread."""
+    """Return the encoder that `retrieve export` writes, on one thread."""
     with TemporaryDirectory() as folder:
         path = Path(folder, "model.onnx")
         path.write_bytes(with_checksum(touch_encoder_to_onnx(checkpoint)))
@@ -111,45 +114,52 @@ def _onnx(checkpoint: Checkpoint) -> Encode:
 
 
 @torch.inference_mode()
-def _halves(matcher: Matcher, images: list[Any]) -> Array:
-    """Partials (B, half) of touches, the arithmetic in the type of the matcher's weights."""
+def _touch_partials(matcher: Matcher, images: list[Any]) -> Array:
+    """Return partial activations (B, partial_width) of touches, computed in the dtype of the matcher's weights."""
     features: Tensor = matcher.touch_tower(touch_batch(images).flatten(0, 1))
     return matcher.touch_encoding(features.reshape(len(images), -1)).partial.float().numpy()
 
 
 @torch.inference_mode()
 def _bfloat16(matcher: Matcher, images: list[Any]) -> Array:
-    """The tower in bfloat16, what comes after it in float32."""
+    """Run the tower in bfloat16 and the following layers in float32."""
     with torch.autocast("cpu", torch.bfloat16):
         features: Tensor = matcher.touch_tower(touch_batch(images).flatten(0, 1))
     return matcher.touch_encoding(features.float().reshape(len(images), -1)).partial.numpy()
 
 
 def _logits(sample: Sample, partials: Array, photos: NDArray[Any]) -> Array:
-    return np.array([sample.logits(partial_activation, photos) for partial_activation in partials])
+    return np.array([sample.logits(touch_partial, photos) for touch_partial in partials])
 
 
-# Partials ----------------------------------------------------------------------------------------------------
+# Partial activations --------------------------------------------------------------------------------------
 
 
 def partials(sample: Sample) -> ApproximationResult:
-    """Formats of stored halves: errors of match logits against float32, and the time to judge a thousand photos."""
-    asked = sample.touch_encodings(sample.touch_rows[: sample.scale.touches])["partial"]
+    """Measure formats of stored partial activations: logit errors against float32, and the time of 1,000 photos."""
+    queries = sample.touch_encodings(sample.touch_rows[: sample.scale.touches])["partial"]
     whole = sample.real_photo_codes["partial"]
-    exact = _logits(sample, asked, whole)
+    exact = _logits(sample, queries, whole)
     many = np.tile(whole, (1 + 1000 // len(whole), 1))[:1000]
     errors, flips, works = list[Tradeoff](), list[Tradeoff](), list[Callable[[], object]]()
     for name, store, read, is_default in FORMATS:
-        logits = _logits(sample, asked, read(store(whole)))
+        logits = _logits(sample, queries, read(store(whole)))
         setting = f"{sum(part.nbytes for part in store(many)) // len(many)} bytes a photo"
         errors.append(Tradeoff(name, setting, float(np.abs(logits - exact).max()), is_default=is_default))
         flips.append(miss_rate_point(name, setting, logits.argmax(1) != exact.argmax(1), is_default))
-        works.append(partial(lambda read, kept: sample.logits(asked[0], read(kept)), read, store(many)))
+        works.append(partial(lambda read, stored: sample.logits(queries[0], read(stored)), read, store(many)))
     return ApproximationResult(
-        "Number format of stored halves",
-        f"{len(asked)} touches, each with {len(whole)} photos. All are computed with in float32, so a small one "
-        "saves memory and no time: an index keeps float16, half the bytes of float32, as long as no answer changes.",
-        _panels(sample, errors, flips, works, len(asked), ("halves in float32", "judging 1,000 photos, one thread")),
+        "Number format of stored partial activations",
+        f"{len(queries)} touches, each with {len(whole)} photos. Arithmetic is in float32 for every format, so a "
+        "smaller one saves memory but no time. An index stores float16: half the bytes, and no answer changes.",
+        _panels(
+            sample,
+            errors,
+            flips,
+            works,
+            len(queries),
+            ("partial activations in float32", "scoring 1,000 photos, one thread"),
+        ),
     )
 
 
@@ -161,14 +171,14 @@ def _as_float(kind: type[np.floating[Any]]) -> Callable[[Array], StoredArrays]:
 
 
 def _as_int8(whole: Array) -> StoredArrays:
-    """Whole numbers of -127..127 and a scale for each photo."""
+    """Return integers in -127..127 and a scale for each photo."""
     scale = np.abs(whole).max(1, keepdims=True) / 127
     return np.rint(whole / np.where(scale > 0, scale, 1)).astype(np.int8), scale.astype(np.float32)
 
 
 FORMATS: tuple[tuple[str, Callable[[Array], StoredArrays], Callable[[StoredArrays], NDArray[Any]], bool], ...] = (
-    ("float32", _as_float(np.float32), lambda kept: kept[0], False),
-    ("float16", _as_float(np.float16), lambda kept: kept[0], True),
-    ("int8, a scale for each photo", _as_int8, lambda kept: kept[0] * kept[1], False),
+    ("float32", _as_float(np.float32), lambda stored: stored[0], False),
+    ("float16", _as_float(np.float16), lambda stored: stored[0], True),
+    ("int8, a scale for each photo", _as_int8, lambda stored: stored[0] * stored[1], False),
 )
-"""(name, how halves are stored, how they are read again, whether an index keeps them so)."""
+"""(name, function that stores partial activations, function that reads them, whether an index uses it)."""

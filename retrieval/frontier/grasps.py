@@ -1,4 +1,4 @@
-"""How often the object is grasped before the answer: wrong first guesses against the time of the query."""
+"""Number of grasps of the object in a query: top-1 error against the time of the query."""
 
 from functools import partial
 
@@ -16,14 +16,12 @@ COUNTS = (1, 2, 3, 4, 5, 8)
 
 
 def grasps(sample: Sample) -> ApproximationResult:
-    """Logits of several grasps add."""
+    """Measure queries of several grasps, whose logits are added."""
     owner = sample.owner[sample.touch_rows]
-    most = int(np.unique(owner, return_counts=True)[1].min())
+    max_count = int(np.unique(owner, return_counts=True)[1].min())
     codes = sample.touch_encodings(sample.touch_rows)["partial"]
-    table = np.array(
-        [sample.logits(partial_activation, sample.real_photo_codes["partial"]) for partial_activation in codes]
-    )
-    counts = [count for count in COUNTS if count <= most]
+    table = np.array([sample.logits(touch_partial, sample.real_photo_codes["partial"]) for touch_partial in codes])
+    counts = [count for count in COUNTS if count <= max_count]
     points = [
         miss_rate_point(
             "",
@@ -35,8 +33,8 @@ def grasps(sample: Sample) -> ApproximationResult:
     ]
     points = list(time_points(points, [partial(_query, sample, count) for count in counts], sample.scale.repeats))
     panel = Panel(
-        title="wrong first guesses by number of grasps",
-        time="decoding and encoding the touches and judging every photo, one thread",
+        title="top-1 error by number of grasps",
+        time="decoding and encoding the touches and scoring every photo, one thread",
         unit="% of queries",
         reference=f"the object in the hand, one of {len(np.unique(owner))}",
         tolerance=round(min(point.error for point in points) + SLACK, 1),
@@ -45,8 +43,8 @@ def grasps(sample: Sample) -> ApproximationResult:
     )
     return ApproximationResult(
         "Grasps of one object",
-        "Logits of several grasps of the object in the hand are added. Every touch starts one set with the next "
-        "touches of its object. The time is that of the computer; the arm's is longer.",
+        "The logits of several grasps of the object in the hand are added. Every touch starts one set with the next "
+        "touches of its object. The time is computing time; the arm needs longer.",
         (panel,),
     )
 

@@ -1,4 +1,4 @@
-"""Which structure finds the candidates: winners that it misses, nearest neighbours that it misses, and its time."""
+"""Kinds of candidate index: missed exhaustive top-1 and missed nearest neighbours against search time."""
 
 from collections.abc import Callable, Iterator
 from itertools import cycle
@@ -17,12 +17,12 @@ from retrieval.frontier.sample import Array, Sample
 NEIGHBOURS = 10
 TOLERANCE = 1.0
 DEFAULT = "flat"
-"""What `build-index` takes unless it is given a budget that exact search breaks."""
+"""Kind that `build-index` uses unless exact search exceeds a given time budget."""
 TimedPoint = tuple[Tradeoff, Callable[[], object]]
 
 
 def index_kinds(sample: Sample) -> ApproximationResult:
-    """Every kind and its ladder on the blended catalogue, by the embedding in use."""
+    """Measure every kind and its ladder of settings on the blended catalogue, with the embedding in use."""
     used = [name for name in sample.catalogue.embeddings if is_used(sample, name)]
     if not used:
         return ApproximationResult("Kind of index", "", skipped="this model has no trained embeddings")
@@ -45,12 +45,14 @@ def index_kinds(sample: Sample) -> ApproximationResult:
     of_top1, of_neighbours = (_time_all(sample, each) for each in (far, near))
     return ApproximationResult(
         "Kind of index",
-        f"Search over {len(embeddings):,} blended photos by the {used[0]}. What counts for an answer is whether the "
-        "classifier's winner is among the candidates; whether nearest neighbours are found is what such indexes are "
-        "usually judged by, and another thing. Exact search is used unless `build-index` is given a bound: it needs no "
-        "training, and what it finds does not hang on the catalogue.",
+        f"Search over {len(embeddings):,} blended photos by the {used[0]}. An answer needs the exhaustive top-1 of the "
+        "classifier among the candidates. Recall of nearest neighbours is the usual measure of such indexes, but a "
+        "different one. Exact search is the default unless `build-index` gets a time bound: it needs no training, and "
+        "its recall does not depend on the catalogue.",
         (
-            _panel(f"missed winners among k = {k:,} candidates", k, "every photo judged", 100 / len(queries), of_top1),
+            _panel(
+                f"missed exhaustive top-1, k = {k:,} candidates", k, "every photo reranked", 100 / len(queries), of_top1
+            ),
             _panel(
                 f"missed nearest {NEIGHBOURS}", NEIGHBOURS, "exact search", smallest_error(of_neighbours), of_neighbours
             ),
@@ -70,9 +72,9 @@ def _panel(title: str, k: int, reference: str, resolution: float, points: tuple[
 
 
 def _structures(sample: Sample, embeddings: Array) -> Iterator[tuple[str, str, VectorIndex]]:
-    """(series, setting, index) of every kind; the ladder of one structure is searched, not built again."""
+    """Yield (series, setting, index) of every kind; search settings of one index do not rebuild it."""
     for kind in KINDS:
-        if kind == "exact":  # the oracle of the others
+        if kind == "exact":  # the reference of the others
             continue
         for name, built in _build_variants(kind, embeddings, sample.scale.quick):
             ladder = list(built.search_variants())
@@ -82,7 +84,7 @@ def _structures(sample: Sample, embeddings: Array) -> Iterator[tuple[str, str, V
 
 
 def _build_variants(kind: str, embeddings: Array, quick: bool) -> Iterator[tuple[str, VectorIndex]]:
-    """(series, index) of a kind, with each value of its `build_ladder` that these embeddings can have."""
+    """Yield (series, index) of a kind, with each value of its `build_ladder` that fits these embeddings."""
     made = load_kind(kind)
     if made.build_ladder is None:
         yield kind, made.build(embeddings)
@@ -91,18 +93,18 @@ def _build_variants(kind: str, embeddings: Array, quick: bool) -> Iterator[tuple
     for value in values[:1] if quick else values:
         try:
             index = made.build(embeddings, made.parameters_from({setting: value}))
-        except ParameterError:  # bytes of a code that do not divide the vector
+        except ParameterError:  # the code size does not divide the vector
             continue
         yield f"{kind}, {setting} = {value}", index
 
 
 def _is_comparable(setting: str, k: int) -> bool:
-    """A graph is searched with a breadth of k at least."""
+    """Return whether the setting can return k candidates: a graph needs a search breadth of at least k."""
     name, _, value = setting.partition(" = ")
     return name != "ef_search" or int(value) >= k
 
 
 def _query_work(index: VectorIndex, queries: Array, k: int) -> Callable[[], object]:
-    """Search of one query after the other; a single one is searched on one thread."""
-    asked = cycle(queries)
-    return lambda: index.search(next(asked)[None], k)
+    """Return a function that searches one query after the other; a single query uses one thread."""
+    remaining = cycle(queries)
+    return lambda: index.search(next(remaining)[None], k)

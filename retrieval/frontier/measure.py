@@ -1,4 +1,4 @@
-"""Measure the approximations: every row once, kept under the folder, so that a stopped run goes on."""
+"""Measure the approximations. Each row is stored in the folder, so that a stopped run resumes."""
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -37,33 +37,32 @@ def measure_frontier(
 ) -> dict[str, Any]:
     """Measure error against run time of every approximation; write frontier.json, frontier.html and figures/.
 
-    Rows that the same software measured before with the same model, recording and scale on the same machine are read.
+    Stored rows are reused if software, model, recording, scale and machine are the same.
 
     Args:
         out: Folder of the results.
-        model: A checkpoint; the shipped one where None.
-        recording: Grasps of objects that the model has not seen; a function that returns the folder is called only
-            where a row needs it.
-        only: Names of rows; all where empty.
-        photos: Of the catalogue that is blended from those of the recording.
-        queries: Touches that are asked there.
-        repeats: Of each time, whose median is taken.
-        quick: Smallest grids and sizes, to see that it runs.
-        table: Name to "module:function" of what can be measured.
-        model_free: Names whose rows depend on neither the model nor the grasps.
-        quiet: No lines and bars on stderr.
+        model: A checkpoint; None takes the shipped one.
+        recording: Grasps of unseen objects; a function that returns the folder is called only if a row needs it.
+        only: Names of rows; empty takes all.
+        photos: Number of photos of the catalogue that is blended from the recording.
+        queries: Number of query touches for that catalogue.
+        repeats: Number of timings; the result is their median.
+        quick: Use the smallest grids and sizes, as a smoke test.
+        table: Name to "module:function" of each approximation.
+        model_free: Names of rows that depend on neither the model nor the grasps.
+        quiet: No output on stderr.
 
     Returns:
         The content of frontier.json.
 
     Raises:
-        ConfigError: A name is unknown. What the measurements raise passes through.
+        ConfigError: A name is unknown. Errors of the measurements pass through.
 
     >>> from pathlib import Path
-    >>> asked = {"only": ["partials"], "quick": True, "quiet": True}
-    >>> document = retrieval.measure_frontier(Path("frontier"), "model.safetensors", "lab", **asked)
+    >>> options = {"only": ["partials"], "quick": True, "quiet": True}
+    >>> document = retrieval.measure_frontier(Path("frontier"), "model.safetensors", "lab", **options)
     >>> document["rows"]["partials"]["title"]
-    'Number format of stored halves'
+    'Number format of stored partial activations'
     """
     require_ours(out / "frontier.json", RESULTS)
     require_ours(out / "frontier.html", PAGE)
@@ -87,24 +86,24 @@ def measure(
 ) -> dict[str, Any]:
     """Measure approximations and write `out`/frontier.json.
 
-    Rows that the same software measured before with the same model, recording and scale on the same machine are read.
-    Each row is printed on stderr as soon as it is measured, one line per panel.
+    Stored rows are reused if software, model, recording, scale and machine are the same. Each row is printed on stderr
+    as soon as it is measured, one line per panel.
 
     Args:
         sample: Model, grasps and scale.
         out: Folder of the results.
-        only: Names of `table`; all of them where empty.
-        table: Name -> "module:function" of what can be measured.
-        model_free: Names whose rows depend on neither the model nor the grasps.
+        only: Names of `table`; empty takes all.
+        table: Name -> "module:function" of each approximation.
+        model_free: Names of rows that depend on neither the model nor the grasps.
 
     Returns:
         The content of frontier.json.
 
     Raises:
-        ConfigError: A name is unknown. What the measurements raise passes through.
+        ConfigError: A name is unknown. Errors of the measurements pass through.
     """
-    asked = list(dict.fromkeys(only)) or list(table)
-    works = {name: load_approximation(name, table) for name in asked}
+    names = list(dict.fromkeys(only)) or list(table)
+    works = {name: load_approximation(name, table) for name in names}
     rows = {name: _row(sample, out, name, work, name in model_free) for name, work in works.items()}
     document = {
         "software": __version__,

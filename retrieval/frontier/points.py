@@ -1,4 +1,4 @@
-"""What a measurement says: points of error and time, which of them nothing beats, and which one to use."""
+"""Results of a measurement: points of error and time, the Pareto front, and the recommended point."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,11 +13,16 @@ from retrieval.metrics.k_way import binomial_interval
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """One setting: what it costs in seconds and how far it is from the reference, in the panel's unit.
+    """One setting with its run time and its error against the reference.
 
-    series: points that differ in one number only, joined by colour. low, high: 95 % interval of the error where it is
-    a share of queries, else None. is_default: what the code uses unless told otherwise. seconds: NaN until
-    `retrieval.frontier.clock` has timed it.
+    Attributes:
+        series: Points that differ in one number only; they have the same colour.
+        setting: The number, in words.
+        error: Error in the panel's unit.
+        low: Lower end of the 95 % interval if the error is a fraction of queries, else None.
+        high: Upper end of that interval.
+        is_default: Whether the code uses this setting by default.
+        seconds: Run time; NaN until `retrieval.frontier.clock` has measured it.
     """
 
     series: str
@@ -36,10 +41,16 @@ class Tradeoff:
 
 @dataclass(frozen=True)
 class Panel:
-    """Points that one plot can hold: one kind of error against one reference, one kind of time.
+    """The points of one plot: one kind of error against one reference, one kind of time.
 
-    time: what the seconds are of. tolerance: the error that is accepted; the recommended point is the cheapest
-    within it. resolution: the smallest error other than 0 that could have been seen.
+    Attributes:
+        title: The kind of error.
+        time: The timed work.
+        unit: Unit of the error.
+        reference: The reference of the error.
+        tolerance: Accepted error; the recommended point is the fastest within it.
+        points: The points.
+        resolution: Smallest measurable error above 0.
     """
 
     title: str
@@ -52,7 +63,7 @@ class Panel:
 
     @property
     def recommended(self) -> Tradeoff:
-        """The cheapest point within the tolerance; where there is none, the one of the least error."""
+        """The fastest point within the tolerance; if there is none, the point of the smallest error."""
         within = [point for point in self.points if point.error <= self.tolerance]
         if within:
             return min(within, key=lambda point: point.seconds)
@@ -60,11 +71,11 @@ class Panel:
 
     @property
     def default(self) -> Tradeoff | None:
-        """The point in use, None where the caller always says."""
+        """The default point; None if the setting has no default."""
         return next((point for point in self.points if point.is_default), None)
 
     def pareto(self) -> list[Tradeoff]:
-        """Points that no other one beats in both time and error, fastest first."""
+        """Return the points that no other point beats in both time and error, fastest first."""
         front: list[Tradeoff] = []
         for point in sorted(self.points, key=lambda point: (point.seconds, point.error)):
             if not front or point.error < front[-1].error:
@@ -72,25 +83,25 @@ class Panel:
         return front
 
     def line(self) -> str:
-        """The panel in one line of text."""
+        """Return the panel as one line of text."""
         best, used = self.recommended, self.default
         within = f"cheapest within {self.tolerance:g}"
-        met = within if best.error <= self.tolerance else f"none within {self.tolerance:g}, nearest"
-        said = [f"{self.title} (against {self.reference})", f"{met}: {self.said(best)}"]
+        label = within if best.error <= self.tolerance else f"none within {self.tolerance:g}, smallest error"
+        parts = [f"{self.title} (against {self.reference})", f"{label}: {self.describe(best)}"]
         if used is None:
-            said.append("no default: the caller says")
+            parts.append("no default")
         elif used == best:
-            said.append("which is the default")
+            parts.append("this is the default")
         else:
-            said.append(f"default {self.said(used)}")
-        return "; ".join(said)
+            parts.append(f"default {self.describe(used)}")
+        return "; ".join(parts)
 
-    def said(self, point: Tradeoff) -> str:
-        """A point in words: its name, its error and its time."""
+    def describe(self, point: Tradeoff) -> str:
+        """Return name, error and time of a point as text."""
         return f"{point.name}: {format_number(point.error)} {self.unit}, {format_duration(point.seconds)}"
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON: the fields, and which points are recommended, default and on the front."""
+        """Return JSON types: the fields, with marks of recommended points and of the Pareto front."""
         front = self.pareto()
         points = [
             asdict(point) | {"recommended": point == self.recommended, "pareto": point in front}
@@ -100,7 +111,7 @@ class Panel:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "Panel":
-        """Inverse of `to_dict`."""
+        """Return the panel of `to_dict`."""
         derived = {"recommended", "pareto"}
         points = tuple(
             Tradeoff(**{key: value for key, value in point.items() if key not in derived}) for point in data["points"]
@@ -110,7 +121,14 @@ class Panel:
 
 @dataclass(frozen=True)
 class ApproximationResult:
-    """One approximation, measured: its panels; text: what it is and how it was measured; skipped: why it was not."""
+    """The measurement of one approximation.
+
+    Attributes:
+        title: Title of the approximation.
+        text: What it is and how it was measured.
+        panels: The measurements.
+        skipped: Why it was not measured, else None.
+    """
 
     title: str
     text: str
@@ -118,16 +136,16 @@ class ApproximationResult:
     skipped: str | None = None
 
     def lines(self) -> list[str]:
-        """One line of text for each panel."""
+        """Return one line of text for each panel."""
         return [panel.line() for panel in self.panels] or [f"{self.title}: left out, {self.skipped}"]
 
     def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return JSON types."""
         return asdict(self) | {"panels": [panel.to_dict() for panel in self.panels], "lines": self.lines()}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> "ApproximationResult":
-        """Inverse of `to_dict`."""
+        """Return the result of `to_dict`."""
         panels = tuple(Panel.from_dict(panel) for panel in data["panels"])
         return cls(data["title"], data["text"], panels, data["skipped"])
 
@@ -135,8 +153,13 @@ class ApproximationResult:
 def miss_rate_point(
     series: str, setting: str, wrong: Sequence[bool] | NDArray[np.bool_], is_default: bool = False
 ) -> Tradeoff:
-    """A point whose error is the share of queries that went wrong, in percent, with its exact 95 % interval for
-    queries that are independent.
+    """Return a point whose error is the percentage of wrong queries.
+
+    Args:
+        series: As in `Tradeoff`.
+        setting: As in `Tradeoff`.
+        wrong: Whether each query is wrong; the 95 % interval is exact for independent queries.
+        is_default: As in `Tradeoff`.
     """
     count, bad = len(wrong), int(np.count_nonzero(wrong))
     low, high = binomial_interval(bad, count)
@@ -144,19 +167,19 @@ def miss_rate_point(
 
 
 def smallest_error(points: Iterable[Tradeoff]) -> float:
-    """The smallest error above 0, for a panel whose errors are no shares; 1 where all are 0."""
+    """Return the smallest error above 0, the resolution of errors that are no fractions; 1 if all are 0."""
     return min((point.error for point in points if point.error > 0), default=1.0)
 
 
 def format_number(value: float) -> str:
-    """Two or three digits, without an exponent where it is short."""
+    """Format a number with two or three digits, without an exponent if it stays short."""
     if value == 0:
         return "0"
     return f"{value:.3g}" if 1e-3 <= abs(value) < 1e5 else f"{value:.1e}"
 
 
 def format_duration(seconds: float) -> str:
-    """Seconds, milliseconds or microseconds with three digits."""
+    """Format a duration in s, ms or us with three digits."""
     for unit, scale in (("s", 1.0), ("ms", 1e3)):
         if seconds * scale >= 1:
             return f"{seconds * scale:.3g} {unit}"

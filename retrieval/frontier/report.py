@@ -1,4 +1,4 @@
-"""The report of `retrieve frontier`: rows in, a plot for each approximation and one HTML page out."""
+"""Report of `retrieve frontier`: a plot for each approximation and one HTML page."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,26 +13,34 @@ from retrieval.report.document import Block, Details, Document, Picture, Section
 from retrieval.report.plots import logarithmic
 from retrieval.report.results import capitalized
 
-# Okabe and Ito's palette, and a marker each for who sees no colours.
+# Palette of Okabe and Ito; the markers distinguish series without colour.
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#6f4e37", "#222222", "#aa3377")
 _MARKERS = "o^sDvPX<>"
 _LABEL: Any = {"textcoords": "offset points", "fontsize": 7.5, "color": "#3a434c"}
 _ABOVE, _BELOW, _NEAR_PX = (7, 5), (7, -10), 20
-"""Where a label stands from its point, in points; below where the one before stands as near as this, in pixels."""
+"""Label offsets above and below a point, in points; a label within `_NEAR_PX` of the previous one goes below."""
 _FLOOR = 0.5
-"""A share of which nothing was seen is drawn at half of the least that could have been."""
+"""An error of 0 is drawn at this fraction of the smallest measurable error."""
 
 LEGEND = (
-    "Lower left is better. The line joins the points that no other one beats in both time and error; the star is the "
-    "recommended one, the cheapest within the tolerance (dashed); the ring is what is used unless you say otherwise. "
-    "An open marker at the lower edge is an error of which none was seen. Whiskers are 95 % intervals."
+    "Lower left is better. The line joins the points that no other point beats in both time and error. The star marks "
+    "the recommended point, the fastest within the tolerance (dashed); the ring marks the default. An open marker at "
+    "the lower edge is a measured error of 0. Whiskers are 95 % intervals."
 )
 
 
 def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
-    """Write `out`/frontier.html and `out`/figures/NAME.png for the document of `frontier.json`; returns the files.
+    """Write `out`/frontier.html and `out`/figures/NAME.png.
 
-    Raises RetrievalError where matplotlib is missing.
+    Args:
+        out: Folder of the report.
+        document: The content of frontier.json.
+
+    Returns:
+        The files.
+
+    Raises:
+        RetrievalError: matplotlib is missing.
     """
     rows = {name: ApproximationResult.from_dict(row) for name, row in document["rows"].items()}
     figures = {out / "figures" / f"{name}.png": row.panels for name, row in rows.items() if row.panels}
@@ -48,13 +56,13 @@ def write_frontier(out: Path, document: Mapping[str, Any]) -> list[Path]:
 def _lead(document: Mapping[str, Any], rows: Mapping[str, ApproximationResult]) -> Iterator[Block]:
     machine, scale = document["machine"], document["scale"]
     yield Text(
-        "Every approximation has a reference that it approximates. Its error against that reference and its run time "
-        f"were measured in one run on this machine: {machine['processor']}, {machine['cores']} core(s), "
+        "The error of each approximation against its reference and its run time were measured in one run on this "
+        f"machine: {machine['processor']}, {machine['cores']} core(s), "
         f"{machine['system']}. Times are medians."
     )
     yield Text(LEGEND)
     if scale["quick"]:
-        yield Text("A quick run: too few queries and repetitions to conclude anything from.", warn=True)
+        yield Text("A quick run: too few queries and repetitions for conclusions.", warn=True)
     found = [(row.title, panel) for row in rows.values() for panel in row.panels]
     yield Table(
         ("approximation", "error", "reference", "tolerance", "recommended", "default"),
@@ -65,8 +73,8 @@ def _lead(document: Mapping[str, Any], rows: Mapping[str, ApproximationResult]) 
 
 def _summary(title: str, panel: Panel) -> tuple[str, ...]:
     best, used = panel.recommended, panel.default
-    default = "the caller says" if used is None else "the same" if used == best else panel.said(used)
-    return (title, panel.title, panel.reference, f"{panel.tolerance:g} {panel.unit}", panel.said(best), default)
+    default = "none" if used is None else "the same" if used == best else panel.describe(used)
+    return (title, panel.title, panel.reference, f"{panel.tolerance:g} {panel.unit}", panel.describe(best), default)
 
 
 def _section(name: str, row: ApproximationResult) -> Iterator[Block]:
@@ -75,9 +83,9 @@ def _section(name: str, row: ApproximationResult) -> Iterator[Block]:
     if row.skipped:
         yield Text(f"Left out: {row.skipped}.", warn=True)
     if row.panels:
-        said = [panel.line() for panel in row.panels]
+        lines = [panel.line() for panel in row.panels]
         yield Picture(
-            f"figures/{name}.png", ". ".join(said), " ".join(f"{line[0].upper()}{line[1:]}." for line in said)
+            f"figures/{name}.png", ". ".join(lines), " ".join(f"{line[0].upper()}{line[1:]}." for line in lines)
         )
         yield Details("Every point", tuple(_points(panel) for panel in row.panels))
 
@@ -110,7 +118,7 @@ def _marks(panel: Panel, point: Tradeoff, front: Sequence[Tradeoff]) -> tuple[tu
 
 
 def figure(panels: Sequence[Panel]) -> Figure:
-    """The panels of one approximation, one below the other."""
+    """Draw the panels of one approximation, one below the other."""
     made = canvas(9.5, 4.1 * len(panels))
     for axes, panel in zip(made.subplots(len(panels), 1, squeeze=False)[:, 0], panels, strict=True):
         _draw(axes, panel)
@@ -138,15 +146,17 @@ def _draw(axes: Axes, panel: Panel) -> None:
 
 def _series(axes: Axes, points: Sequence[Tradeoff], place: int, floor: float, name: str) -> None:
     colour, marker = _COLOURS[place % len(_COLOURS)], _MARKERS[place % len(_MARKERS)]
-    seen = [point for point in points if point.error > 0]
+    positive = [point for point in points if point.error > 0]
     axes.plot([], [], marker, color=colour, label=name or None, ls="")
-    for point in seen:
+    for point in positive:
         if point.low is not None and point.high is not None:
             at = 1e3 * point.seconds
             axes.plot([at, at], [max(point.low, floor), point.high], color=colour, lw=1, alpha=0.35, zorder=1)
-    axes.plot([1e3 * point.seconds for point in seen], [point.error for point in seen], marker, color=colour, ms=5)
+    axes.plot(
+        [1e3 * point.seconds for point in positive], [point.error for point in positive], marker, color=colour, ms=5
+    )
     none = [1e3 * point.seconds for point in points if point.error == 0]
-    if none:  # an empty line that is not clipped counts as one at the figure's corner
+    if none:  # an empty unclipped line would extend the figure to its corner
         axes.plot(none, np.full(len(none), floor), marker, mfc="white", mec=colour, ms=5, clip_on=False)
 
 
@@ -159,15 +169,15 @@ def _front(axes: Axes, panel: Panel, floor: float) -> None:
     axes.plot(
         *_place(best, floor), "*", ms=11, color="#c8382e", mec="white", mew=0.6, clip_on=False, label="recommended"
     )
-    step = 1 if len(front) < 8 else 2  # every second point of a long front has its label
-    axes.get_xlim(), axes.get_ylim()  # so that places in pixels are those that will be drawn
-    before = np.full(2, np.inf)
+    step = 1 if len(front) < 8 else 2  # a long front has a label at every second point
+    axes.get_xlim(), axes.get_ylim()  # fixes the limits, so that pixel positions are final
+    previous = np.full(2, np.inf)
     for point in {id(one): one for one in (*panel.pareto()[::step], best)}.values():
         at = axes.transData.transform(_place(point, floor))
-        side = _BELOW if np.abs(at - before).max() < _NEAR_PX else _ABOVE
+        side = _BELOW if np.abs(at - previous).max() < _NEAR_PX else _ABOVE
         label = axes.annotate(point.setting or point.series, _place(point, floor), xytext=side, **_LABEL)
         label.set_in_layout(False)
-        before = at
+        previous = at
 
 
 def _place(point: Tradeoff, floor: float) -> tuple[float, float]:

@@ -1,6 +1,6 @@
-"""What the approximations are measured on: a model, grasps that it never saw, and catalogues blended from them.
+"""Inputs of the frontier measurements: a model, grasps of unseen objects, and catalogues blended from them.
 
-Everything is made when it is first asked for: a row that needs no recording makes none.
+Everything is computed on first use: a row without a recording collects none.
 """
 
 from collections.abc import Callable, Mapping
@@ -27,8 +27,14 @@ _BLOCK = 8192
 
 @dataclass(frozen=True)
 class Scale:
-    """How much is measured. photos: of the blended catalogue; queries: touches asked there; touches: touches whose
-    images are encoded again in every setting; repeats: of every time, whose median is taken. quick: smallest grids.
+    """Scale of the measurements.
+
+    Attributes:
+        photos: Photos of the blended catalogue.
+        queries: Query touches for that catalogue.
+        touches: Touches whose images are encoded in every setting.
+        repeats: Timings of each point; the result is their median.
+        quick: Whether to use the smallest grids.
     """
 
     photos: int = 100_000
@@ -43,7 +49,12 @@ QUICK = Scale(photos=2000, queries=12, touches=12, repeats=2, quick=True)
 
 @dataclass(frozen=True, eq=False)
 class BlendedCatalogue:
-    """N photos. halves (N, half) float16, as an index keeps them. embeddings: name of what made them -> (N, d)."""
+    """A catalogue of N blended photos.
+
+    Attributes:
+        partials: (N, partial_width) float16 partial activations, as in an index.
+        embeddings: Name of the embedding -> (N, d).
+    """
 
     partials: NDArray[np.float16]
     embeddings: Mapping[str, Array]
@@ -51,11 +62,17 @@ class BlendedCatalogue:
 
 @dataclass(frozen=True, eq=False)
 class Sample:
-    """Grasps of objects that the model has not seen: of each object the photos of the first half of its grasps, and
-    the touches of the others. No grasp gives both.
+    """Grasps of unseen objects: photos of the first half of each object's grasps, touches of the second half.
 
-    model: a checkpoint's file. recording: gives the folder, and may first collect it. folder: where encoded features
-    are kept.
+    No grasp provides both a photo and a touch.
+
+    Attributes:
+        model: File of the checkpoint.
+        recording: Function that returns the folder of the recording, and may collect it first.
+        folder: Folder of encoded features.
+        scale: Scale of the measurements.
+        quiet: No output on stderr.
+        seed: Seed of the random draws.
     """
 
     model: Path
@@ -72,22 +89,26 @@ class Sample:
 
     @cached_property
     def grasps(self) -> list[Grasp]:
-        """Grasps of unseen objects with two grasps or more, in order of objects. Raises DatasetError for none."""
+        """Grasps of unseen objects with at least two grasps, sorted by object.
+
+        Raises:
+            DatasetError: There are fewer than two such objects.
+        """
         folder, split = self.recording(), self.checkpoint.split
-        seen = {*split.train, *split.validation} if split else set()
-        found = [grasp for grasp in load_grasps(folder) if grasp.object_id not in seen]
-        names = [grasp.object_id for grasp in found]
-        kept = [grasp for grasp in found if names.count(grasp.object_id) > 1]
-        if len({grasp.object_id for grasp in kept}) < 2:
+        trained = {*split.train, *split.validation} if split else set()
+        unseen = [grasp for grasp in load_grasps(folder) if grasp.object_id not in trained]
+        names = [grasp.object_id for grasp in unseen]
+        usable = [grasp for grasp in unseen if names.count(grasp.object_id) > 1]
+        if len({grasp.object_id for grasp in usable}) < 2:
             raise DatasetError(
-                f"{folder} must hold two objects or more that the model was not trained on, each with two grasps or "
-                "more; give another --recording, or none and one is collected"
+                f"{folder} needs at least 2 objects that the model was not trained on, with at least 2 grasps each. "
+                "Give another --recording, or omit it to collect one."
             )
-        return sorted(kept, key=lambda grasp: (grasp.object_id, grasp.grasp_id))
+        return sorted(usable, key=lambda grasp: (grasp.object_id, grasp.grasp_id))
 
     @cached_property
     def digest(self) -> str:
-        """A digest of the grasps: of their ids and images."""
+        """Digest of the ids and images of the grasps."""
         return data_digest(self.grasps)
 
     @cached_property
@@ -103,7 +124,7 @@ class Sample:
 
     @cached_property
     def touch_rows(self) -> NDArray[np.int64]:
-        """Rows of `grasps` whose touches are queries, in a random order: the first n are of many objects."""
+        """Rows of `grasps` whose touches are queries, in random order, so that the first n have many objects."""
         rows = np.flatnonzero(~self._is_photo)
         return np.random.default_rng([self.seed, 1]).permutation(rows)
 
@@ -122,26 +143,23 @@ class Sample:
     # Codes -------------------------------------------------------------------------------------------------
 
     def touch_encodings(self, rows: NDArray[np.int64]) -> dict[str, Array]:
-        """ "half" (n, hidden), and embeddings by name, of the touches at these rows of `grasps`."""
+        """Return "partial" (n, partial_width) and embeddings by name of the touches at these rows of `grasps`."""
         return self._codes(self.features.touch[rows].reshape(len(rows), -1), photo=False)
 
     def photo_encodings(self, rows: NDArray[np.int64]) -> dict[str, Array]:
-        """As `touch_encodings`, of the photos at these rows."""
+        """Return the same as `touch_encodings` for the photos at these rows."""
         return self._codes(self.features.photo[rows], photo=True)
 
     @torch.inference_mode()
     def _codes(self, features: Array, photo: bool) -> dict[str, Array]:
         matcher, config = self.checkpoint.matcher, self.checkpoint.config
-        given = torch.from_numpy(features)
-        code: ImageEncoding = matcher.photo_encoding(given) if photo else matcher.touch_encoding(given)
+        inputs = torch.from_numpy(features)
+        code: ImageEncoding = matcher.photo_encoding(inputs) if photo else matcher.touch_encoding(inputs)
         codes = {"partial": code.partial.numpy()}
         if matcher.candidate_encoder is not None:
-            by_pruner = (
-                matcher.candidate_encoder.photo(code.partial)
-                if photo
-                else matcher.candidate_encoder.touch(code.partial)
-            )
-            codes["candidate encoder"] = by_pruner.numpy()
+            encoder = matcher.candidate_encoder
+            encoded = encoder.photo(code.partial) if photo else encoder.touch(code.partial)
+            codes["candidate encoder"] = encoded.numpy()
         if config.training.trains_embeddings:
             codes["contrastive embedding"] = code.embedding.numpy()
         return codes
@@ -155,9 +173,9 @@ class Sample:
 
     @cached_property
     def catalogue(self) -> BlendedCatalogue:
-        """`scale.photos` photos: each a blend w A + (1 - w) B of the features of two, w uniform in 1/2..1.
+        """Blended photos: each is w A + (1 - w) B of the features of two photos, w uniform in 1/2..1.
 
-        Blends lie where the model's photos lie, in clumps around them; white noise would not.
+        Blends are clustered around real photos, unlike white noise.
         """
         rng = np.random.default_rng([self.seed, 2])
         blocks: dict[str, list[Array]] = {}
@@ -170,13 +188,14 @@ class Sample:
 
     @cached_property
     def queries(self) -> dict[str, Array]:
-        """Codes of the touches that are asked on `catalogue`."""
+        """Codes of the query touches for `catalogue`."""
         return self.touch_encodings(self.touch_rows[: self.scale.queries])
 
     @cached_property
     def exhaustive_top1(self) -> NDArray[np.int64]:
-        """For each of `queries` the photo of `catalogue` that the full classifier ranks first of all; kept in `folder`,
-        since it takes the longest.
+        """The photo of `catalogue` that the full classifier ranks first, for each of `queries`.
+
+        It is stored in `folder`, because it takes the longest.
         """
         scale = self.scale
         cache_key = {"model": self.checkpoint.digest, "grasps": self.digest, "seed": self.seed, "photos": scale.photos}
@@ -188,20 +207,26 @@ class Sample:
     def _find_exhaustive_top1(self) -> list[int]:
         partials, found = self.queries["partial"], list[int]()
         with Bar("exhaustive rerank", len(partials), "queries", quiet=self.quiet) as bar:
-            for partial_activation in partials:
-                found.append(int(self.logits(partial_activation, self.catalogue.partials).argmax()))
+            for touch_partial in partials:
+                found.append(int(self.logits(touch_partial, self.catalogue.partials).argmax()))
                 bar.advance()
         return found
 
-    def logits(self, partial_activation: Array, photos: NDArray[Any], rows: NDArray[np.int64] | None = None) -> Array:
-        """Match logits of one touch, or summed over touches (G, half), with photos (N, half), at `rows` or all."""
+    def logits(self, touch_partials: Array, photos: NDArray[Any], rows: NDArray[np.int64] | None = None) -> Array:
+        """Return match logits of one touch, or summed over several, with photos.
+
+        Args:
+            touch_partials: (partial_width,) of one touch or (G, partial_width) of several.
+            photos: (N, partial_width) of the photos.
+            rows: Rows of `photos` to score; None scores all.
+        """
         return score_partials(
-            self.checkpoint.matcher.head, torch.from_numpy(np.atleast_2d(partial_activation)), photos, rows
+            self.checkpoint.matcher.head, torch.from_numpy(np.atleast_2d(touch_partials)), photos, rows
         )
 
 
 def blend(features: Array, count: int, rng: np.random.Generator) -> Array:
-    """(count, F): w A + (1 - w) B of rows of (n, F), A and B drawn at random, w uniform in 1/2..1."""
+    """Return blends (count, F): w A + (1 - w) B of random rows A and B of (n, F), w uniform in 1/2..1."""
     one, other = rng.integers(len(features), size=(2, count))
     weight = rng.uniform(0.5, 1.0, size=(count, 1)).astype(np.float32)
     return np.asarray(weight * features[one] + (1 - weight) * features[other])

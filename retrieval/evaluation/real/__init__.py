@@ -1,4 +1,4 @@
-"""Protocols of real data: each says how a recording of one data set is split, what is asked, what others reached."""
+"""Benchmark protocols of real data sets: splits, queries, measures and published results."""
 
 from typing import TYPE_CHECKING
 
@@ -8,7 +8,8 @@ from retrieval.errors import ConfigError
 if TYPE_CHECKING:
     from retrieval.evaluation.real.protocol import Protocol
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
+"""Schema version of the benchmark's results.json."""
 PROTOCOLS: "Registry[Protocol]" = Registry(
     "protocol",
     "protocols",

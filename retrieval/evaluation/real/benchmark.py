@@ -1,4 +1,4 @@
-"""The benchmark of real data: every protocol, seed, fold and line is measured once and kept; then all is summed up."""
+"""Real-data benchmark: measure each protocol, seed, fold and condition once, store it, then aggregate."""
 
 import dataclasses
 import re
@@ -28,7 +28,7 @@ from retrieval.evaluation.real.conditions import (
 )
 from retrieval.evaluation.real.fold_measures import (
     FoldMeasures,
-    measure,
+    measure_fold,
     pool_folds,
     read_fold_measures,
     write_fold_measures,
@@ -53,7 +53,7 @@ PRESET = "real"
 DEFAULT_METHODS = ("cca_towers", "cca_pca", "cca", "late_fusion", "chance")
 DRAWS = 10_000
 MAX_GRASPS = {"train": 1, "validation": 12, "test": 40}
-"""ShardResult grasps of an object, by part."""
+"""Maximum number of scored grasps of one object, by part."""
 EXAMPLES = 6
 
 
@@ -73,27 +73,27 @@ def benchmark(
 ) -> dict[str, Any]:
     """Evaluate methods by protocols of real data, with controls; write results.json.
 
-    Files under `cache` that the same settings made are read, so that a stopped run goes on.
+    A stopped run resumes: files under `cache` from the same settings are reused.
 
     Args:
-        recordings: A folder, or what `robot.read_recording` returns; or one for each data set, by its name.
+        recordings: A folder, or the object that `robot.read_recording` returns; or one for each data set, by its name.
         out: Folder of the results.
-        protocols: Names, or protocols of your own, which are called by their titles.
-        config: Frozen towers, and heads, as an object (`Config.using` takes a tower of your own) or as `load_config`
-            takes it.
-        preset: What the report calls the configuration; its name where None.
-        methods: Names, or classes of your own.
-        models: Name to checkpoint; each is a row of its own, which is not fitted.
-        seeds: How often folds are drawn and methods fitted.
+        protocols: Names, or your own protocols, which are named by their titles.
+        config: Frozen towers and heads: a `Config` (`Config.using` accepts your own tower), or an argument of
+            `load_config`.
+        preset: Name of the configuration in the report; None takes its own name.
+        methods: Names, or your own classes.
+        models: Name to checkpoint; each is a separate row, which is not fitted.
+        seeds: Number of draws of the folds and of fits.
         skipped: Protocol to the reason why it is left out, for the report.
-        cache: Folder of features and measures; `out`/cache where None.
+        cache: Folder of features and measures; None takes `out`/cache.
         quiet: No progress on stderr.
 
     Returns:
         The content of results.json.
 
     Raises:
-        BadInput: No protocol can be asked, or there is neither method nor model.
+        BadInput: No protocol can run, or there is neither method nor model.
         ConfigError: A protocol or method is unknown.
         DatasetError: A recording does not fit a protocol.
         CheckpointError: A model cannot be read.
@@ -104,47 +104,50 @@ def benchmark(
     >>> def halves(facts, seed):
     ...     return folds(facts.names, [facts.names[::2], facts.names[1::2]], seed)
     >>> protocol = retrieval.Protocol("mine", "Halves", "Objects are halved by name.", halves, topn_accuracy(5))
-    >>> asked = {"protocols": [protocol], "methods": ["cca", "chance"], "config": "tiny", "seeds": 1}
-    >>> results = retrieval.benchmark("lab", Path("halves"), **asked, quiet=True)
+    >>> options = {"protocols": [protocol], "methods": ["cca", "chance"], "config": "tiny", "seeds": 1}
+    >>> results = retrieval.benchmark("lab", Path("halves"), **options, quiet=True)
     >>> list(results["protocols"]["halves"]["rows"])
     ['cca', 'chance']
     """
-    fitted = [METHODS.name_of(method) for method in methods]
-    if not (fitted or models) or seeds < 1:
-        raise BadInput("give one method or model and one seed at least")
-    config, called = named_config(config, preset)
-    kept = cache or out / "cache"
-    asked = dict(map(_named, protocols))
+    names = [METHODS.name_of(method) for method in methods]
+    if not (names or models) or seeds < 1:
+        raise BadInput(
+            f"A benchmark needs at least 1 method or model and 1 seed, got {len(names) + len(models)} and {seeds}."
+        )
+    config, preset_name = named_config(config, preset)
+    cache = cache or out / "cache"
+    selected = dict(map(_named, protocols))
     if not isinstance(recordings, Mapping):
-        recordings = dict.fromkeys((protocol.data_set for protocol in asked.values()), recordings)
+        recordings = dict.fromkeys((protocol.data_set for protocol in selected.values()), recordings)
     facts = {name: read_recording_facts(folder_of(recording)) for name, recording in recordings.items()}
     tables: dict[str, Any] = {}
     left_out = dict(skipped)
     rows: dict[str, list[BenchmarkRow]] = {}
-    with resumable(kept):
-        for name, protocol in asked.items():
-            of = protocol.data_set
-            if of not in rows:
-                rows[of] = _rows(facts[of], config, fitted, models, kept / "features", quiet)
+    with resumable(cache):
+        for name, protocol in selected.items():
+            data_set = protocol.data_set
+            if data_set not in rows:
+                rows[data_set] = _rows(facts[data_set], config, names, models, cache / "features", quiet)
             if isinstance(protocol, TouchToTouch):
                 tables[name] = touch_to_touch_entry(
-                    protocol, facts[of], rows[of], list(range(seeds)), kept, DRAWS, quiet
+                    protocol, facts[data_set], rows[data_set], list(range(seeds)), cache, DRAWS, quiet
                 )
                 continue
-            taken = [row for row in rows[of] if protocol.entry == PHOTO or row.method in ANY_WIDTH_METHODS]
-            if not taken:
-                left_out[name] = (
-                    f"it shows objects by touches, which of the methods only {', '.join(ANY_WIDTH_METHODS)} can take"
-                )
+            usable = [row for row in rows[data_set] if protocol.entry == PHOTO or row.method in ANY_WIDTH_METHODS]
+            if not usable:
+                left_out[name] = f"its catalogue entries are touches, which only {', '.join(ANY_WIDTH_METHODS)} accept"
                 continue
-            tables[name] = _ProtocolRun(name, protocol, facts[of], taken, list(range(seeds)), kept, quiet).entry()
+            tables[name] = _ProtocolRun(
+                name, protocol, facts[data_set], usable, list(range(seeds)), cache, quiet
+            ).entry()
     if not tables:
-        raise BadInput(f"no protocol could be asked; {'; '.join(f'{name}: {why}' for name, why in left_out.items())}")
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in left_out.items())
+        raise BadInput(f"No protocol can run. {reasons}")
     results = {
         "schema_version": SCHEMA_VERSION,
         "software": __version__,
         "setting": {
-            "preset": called,
+            "preset": preset_name,
             "config": config.without_paths(),
             "seeds": list(range(seeds)),
             "draws": DRAWS,
@@ -158,7 +161,7 @@ def benchmark(
 
 
 def _named(choice: str | Protocol) -> tuple[str, Protocol]:
-    """A protocol and its name; one of a user's own is called by its title."""
+    """Return the name and the protocol; a user's own protocol is named by its title."""
     if isinstance(choice, Protocol):
         return re.sub(r"[^a-z0-9]+", "-", choice.title.lower()).strip("-"), choice
     name = PROTOCOLS.name_of(choice)
@@ -177,7 +180,17 @@ def _rows(
 
 @dataclass(frozen=True, eq=False)
 class _ProtocolRun:
-    """One protocol on one recording. all_facts: of the recording, also the grasps that the protocol does not ask."""
+    """One protocol on one recording.
+
+    Attributes:
+        name: Name of the protocol.
+        protocol: The protocol.
+        all_facts: The recording with all grasps, also those without a query.
+        rows: The rows of the table.
+        seeds: Seeds of folds and fits.
+        cache: Folder of features and measures.
+        quiet: No progress on stderr.
+    """
 
     name: str
     protocol: Protocol
@@ -189,19 +202,17 @@ class _ProtocolRun:
 
     @cached_property
     def _contact(self) -> dict[str, float] | None:
-        """How much each grasp changes the gel image, in grey levels; None where frames before the contact are missing.
-        It reads every touch, so it is kept.
-        """
+        """Gel change of each grasp, grey levels; None without no-contact frames. Stored: it reads all touches."""
         grasps = self.all_facts.grasps
         if any(len(grasp.backgrounds) != len(grasp.touches) for grasp in grasps):
             return None
         digest = data_digest(grasps)
-        return cached_document(self.cache / "contact" / f"{digest[:32]}.json", {"grasps": digest}, self._compare)
+        return cached_document(self.cache / "contact" / f"{digest[:32]}.json", {"grasps": digest}, self._gel_changes)
 
-    def _compare(self) -> dict[str, float]:
+    def _gel_changes(self) -> dict[str, float]:
         grasps = self.all_facts.grasps
         found = {}
-        with Bar("compare with untouched", len(grasps), "grasps", quiet=self.quiet) as bar:
+        with Bar("compare with no-contact frames", len(grasps), "grasps", quiet=self.quiet) as bar:
             for grasp in grasps:
                 found[grasp.grasp_id] = gel_change(grasp)
                 bar.advance()
@@ -209,8 +220,9 @@ class _ProtocolRun:
 
     @cached_property
     def facts(self) -> RecordingFacts:
-        """What is known of the grasps that ask: of all, or where reference touches are asked for, of those that have
-        one, which then stands in place of their photo.
+        """The recording with the grasps that are queries.
+
+        With reference touches these are the grasps that have a reference, which replaces their photo.
         """
         return self.all_facts if self.protocol.entry == PHOTO else facts_with_references(self.all_facts)
 
@@ -218,27 +230,27 @@ class _ProtocolRun:
     def _references(self) -> dict[str, Grasp]:
         return assign_references(self.all_facts.grasps)
 
-    def _features(self, line: Condition) -> Features:
-        features = line.features()
+    def _features(self, condition: Condition) -> Features:
+        features = condition.features()
         if self.protocol.entry == PHOTO:
             return features
         return features_with_references(features, self._references, self.protocol.entry)
 
     def entry(self) -> dict[str, Any]:
-        """The protocol's entry of results.json."""
+        """Return the protocol's entry of results.json."""
         seeds = self.seeds[:1] if self.protocol.choices else self.seeds
         folds = {seed: self.protocol.folds(self.facts, seed) for seed in seeds}
-        lines = self._conditions()
-        found: dict[str, list[list[FoldMeasures]]] = {line.key: [] for line in lines}
-        count = len(lines) * sum(map(len, folds.values()))
+        conditions = self._conditions()
+        found: dict[str, list[list[FoldMeasures]]] = {condition.key: [] for condition in conditions}
+        count = len(conditions) * sum(map(len, folds.values()))
         with Bar(self.name, count, "fits", quiet=self.quiet) as bar:
             for seed, splits in folds.items():
-                for line in lines:
-                    some = []
+                for condition in conditions:
+                    measured = []
                     for number, split in enumerate(splits):
-                        some.append(self._fold_measures(line, seed, number, split))
-                        bar.advance(note=line.key)
-                    found[line.key].append(some)
+                        measured.append(self._fold_measures(condition, seed, number, split))
+                        bar.advance(note=condition.key)
+                    found[condition.key].append(measured)
         return {
             "title": self.protocol.title,
             "rule": self.protocol.rule,
@@ -261,34 +273,34 @@ class _ProtocolRun:
         }
 
     def _conditions(self) -> list[Condition]:
-        lines = []
+        conditions = []
         for row in self.rows:
-            lines += [
+            conditions += [
                 Condition(row, kind)
                 for kind in (("touch",) if row.method in TRIVIAL_BASELINES else ("touch", "low_pass"))
             ]
-        first = BenchmarkRow(CONTROL_METHOD, CONTROL_METHOD, self._frozen)
-        return lines + [Condition(first, kind) for kind in CONTROLS if self._missing_reason(kind) is None]
+        control = BenchmarkRow(CONTROL_METHOD, CONTROL_METHOD, self._frozen)
+        return conditions + [Condition(control, kind) for kind in CONTROLS if self._missing_reason(kind) is None]
 
     @property
     def _frozen(self) -> TowerEncoder:
-        """The towers that controls stand on."""
+        """The towers of the controls."""
         return self.rows[0].towers
 
     def _missing_reason(self, kind: str) -> str | None:
         if kind == "background" and self.protocol.entry != PHOTO:
-            return "an object is shown by touches"
+            return "the catalogue entries are touches"
         return missing_no_contact_reason(self.facts.grasps) if kind == "no_contact" else None
 
     def _aggregation(self, folds: Mapping[int, Sequence[Split]]) -> Aggregation:
         if not self.protocol.choices:
             return Aggregation(DRAWS, self.seeds[0])
-        splits = [split for some in folds.values() for split in some]
+        splits = [split for of_seed in folds.values() for split in of_seed]
         test = sum(len(split.test) for split in splits)
         return Aggregation(DRAWS, self.seeds[0], test / sum(len(split.train + split.validation) for split in splits))
 
     def _measures_by_seed(self, folds_of: Sequence[Sequence[FoldMeasures]]) -> BySeed:
-        """Measures by seed, over all its folds; of a protocol of choices those of each fold."""
+        """Return the measures of each seed over all folds; with `choices`, those of each fold."""
         if self.protocol.choices:
             return [pool_folds([one]) for folds in folds_of for one in folds]
         return [pool_folds(folds) for folds in folds_of]
@@ -296,9 +308,9 @@ class _ProtocolRun:
     def _row(
         self, row: BenchmarkRow, found: Mapping[str, list[list[FoldMeasures]]], aggregation: Aggregation
     ) -> dict[str, Any]:
-        lines = (f"{row.name}-touch", f"{row.name}-blurred", "order")
-        touch, low_pass, order = (self._measures_by_seed(found.get(key, ())) for key in lines)
-        model, mine = row.towers.checkpoint, found[lines[0]]
+        keys = (f"{row.name}-touch", f"{row.name}-low_pass", "order")
+        touch, low_pass, order = (self._measures_by_seed(found.get(key, ())) for key in keys)
+        model, mine = row.towers.checkpoint, found[keys[0]]
         return {
             "method": row.method,
             "model": model.digest if model else None,
@@ -310,12 +322,12 @@ class _ProtocolRun:
     def _controls(self, found: Mapping[str, list[list[FoldMeasures]]], aggregation: Aggregation) -> dict[str, Any]:
         entries: dict[str, Any] = {}
         for kind, description in CONTROLS.items():
-            taken = self._measures_by_seed(found.get(kind, ()))
-            entries[kind] = control_entry(self.protocol, description, self._missing_reason(kind), taken, aggregation)
+            by_seed = self._measures_by_seed(found.get(kind, ()))
+            entries[kind] = control_entry(self.protocol, description, self._missing_reason(kind), by_seed, aggregation)
         return entries
 
     def _examples(self, found: Mapping[str, list[list[FoldMeasures]]]) -> dict[str, Any]:
-        """The best and the worst queries of all folds, of the first seed, for the first row that looks at its input."""
+        """Return the best and the worst queries of the first seed, for the first row that is no trivial baseline."""
         row = next((row for row in self.rows if row.method not in TRIVIAL_BASELINES), self.rows[0])
         folds = found[f"{row.name}-touch"][0]
         every = {kind: [one for fold in folds for one in fold.examples[kind]] for kind in ("best", "worst")}
@@ -325,13 +337,14 @@ class _ProtocolRun:
 
     # One fold ----------------------------------------------------------------------------------------
 
-    def _fold_measures(self, line: Condition, seed: int, number: int, split: Split) -> FoldMeasures:
-        """The measures of one line in one fold: those that are kept, else the line is fitted and asked, and its
-        measures are kept. Scores are not kept: those of all folds fill gigabytes.
+    def _fold_measures(self, condition: Condition, seed: int, number: int, split: Split) -> FoldMeasures:
+        """Return the stored measures of one condition in one fold, or fit, score and store them.
+
+        Scores are not stored: those of all folds take gigabytes.
         """
-        self._require_unseen(line, split)
-        features, towers = self._features(line), line.row.towers
-        work = self.cache / "fits" / f"{self.name}-{line.key}-{seed}-{number}"
+        self._require_unseen(condition, split)
+        features, towers = self._features(condition), condition.row.towers
+        work = self.cache / "fits" / f"{self.name}-{condition.key}-{seed}-{number}"
         experiment = Experiment(
             folder=work,
             config=towers.config,
@@ -339,35 +352,35 @@ class _ProtocolRun:
             features=features,
             pairs=None,
             queries=draw_queries(self.facts.grasps, split, seed, MAX_GRASPS),
-            checkpoint=towers.checkpoint if line.kind in ("touch", "low_pass") else None,
-            shuffled=line.kind == "permuted",
+            checkpoint=towers.checkpoint if condition.kind in ("touch", "low_pass") else None,
+            shuffled=condition.kind == "permuted",
             quiet=True,
             fit_on_validation=True,
             kind_of=self.facts.kind_of,
         )
         protocol = self.protocol
-        cache_key = experiment.cache_key(line.method, seed) | {
+        cache_key = experiment.cache_key(condition.method, seed) | {
             "protocol": self.name,
             "measures": list(protocol.measures),
             "shown": [protocol.allows_own_photos, protocol.is_by_sequence, protocol.gallery_of(self.facts, split)],
-            "line": line.key,
+            "line": condition.key,
             "contact": self._contact is not None,
         }
-        path = self.cache / "measures" / self.name / f"{line.key}-{seed}-{number}.safetensors"
-        if (kept := read_fold_measures(path, cache_key)) is not None:
-            return kept
-        judged = MethodScores(experiment.queries, experiment.run(line.method, seed), seed)
-        measured = measure(judged, protocol, self.facts, split, features.grasp_ids, self._contact)
+        path = self.cache / "measures" / self.name / f"{condition.key}-{seed}-{number}.safetensors"
+        if (stored := read_fold_measures(path, cache_key)) is not None:
+            return stored
+        method_scores = MethodScores(experiment.queries, experiment.run(condition.method, seed), seed)
+        measured = measure_fold(method_scores, protocol, self.facts, split, features.grasp_ids, self._contact)
         write_fold_measures(path, measured, cache_key)
         shutil.rmtree(work)
         return measured
 
-    def _require_unseen(self, line: Condition, split: Split) -> None:
-        """A model must not have been trained on the objects that it is tested with."""
-        model = line.row.towers.checkpoint
-        seen = {*model.split.train, *model.split.validation} if model and model.split else set()
-        if shared := seen & set(split.test):
+    def _require_unseen(self, condition: Condition, split: Split) -> None:
+        """Raise BadInput if the model was trained on a test object."""
+        model = condition.row.towers.checkpoint
+        trained = {*model.split.train, *model.split.validation} if model and model.split else set()
+        if shared := trained & set(split.test):
             raise BadInput(
-                f"the model {line.row.name} was trained on {len(shared)} of the objects that {self.name} tests, such "
-                f"as {min(shared)}; give one that has not seen them"
+                f"Model {condition.row.name} was trained on {len(shared)} test objects of {self.name}, such as "
+                f"{min(shared)}. Give a model that was not trained on them."
             )

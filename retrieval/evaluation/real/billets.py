@@ -1,5 +1,7 @@
-"""Steel billets: which place of a billet was touched. Welded billets alone where there are such: touches of ground ones
-look nearly blank, and what names those is the drift of the capture.
+"""Steel billets: identify the place of a billet that was touched.
+
+Only welded billets are used if the recording has some. Touches of ground billets are nearly blank, so that only the
+drift of the capture identifies them.
 """
 
 from collections import defaultdict
@@ -14,7 +16,11 @@ _PARTS = 4
 
 
 def by_billet(facts: RecordingFacts) -> dict[str, list[str]]:
-    """Places of each welded billet, sorted; of all billets where none is called welded. Raises DatasetError."""
+    """Return the sorted places of each welded billet, or of all billets if none is named welded.
+
+    Raises:
+        DatasetError: There are fewer than three billets.
+    """
     found: dict[str, list[str]] = defaultdict(list)
     for place, billet in facts.sequence_of.items():
         found[billet].append(place)
@@ -22,7 +28,7 @@ def by_billet(facts: RecordingFacts) -> dict[str, list[str]]:
     billets = {name: sorted(places) for name, places in sorted((welded or found).items())}
     if len(billets) < 3:
         raise DatasetError(
-            f"to train, to choose and to test there must be 3 billets at least; there are {len(billets)}"
+            f"Training, validation and test need at least 3 billets, but the recording has {len(billets)}."
         )
     return billets
 
@@ -33,9 +39,9 @@ def _unseen(facts: RecordingFacts, seed: int) -> list[Split]:
     found = []
     for number, name in enumerate(names):
         others = names[number + 1 :] + names[:number]
-        chooses = others[seed % len(others)]
-        trains = [place for other in others if other != chooses for place in billets[other]]
-        found.append(Split(seed, tuple(sorted(trains)), tuple(billets[chooses]), tuple(billets[name])))
+        validation = others[seed % len(others)]
+        train = [place for other in others if other != validation for place in billets[other]]
+        found.append(Split(seed, tuple(sorted(train)), tuple(billets[validation]), tuple(billets[name])))
     return found
 
 
@@ -47,16 +53,17 @@ def _places(facts: RecordingFacts, seed: int) -> list[Split]:
             parts[turn % _PARTS].append(places[place])
     found = []
     for number, test in enumerate(parts):
-        chooses = parts[(number + 1) % _PARTS]
-        trains = [place for part in parts if part is not test and part is not chooses for place in part]
-        found.append(Split(seed, tuple(sorted(trains)), tuple(sorted(chooses)), tuple(sorted(test))))
+        validation = parts[(number + 1) % _PARTS]
+        train = [place for part in parts if part is not test and part is not validation for place in part]
+        found.append(Split(seed, tuple(sorted(train)), tuple(sorted(validation)), tuple(sorted(test))))
     return found
 
 
 UNSEEN = Protocol(
     "billets",
     "Billets: a place of an unseen welded billet",
-    "Each welded billet is left out once, another one chooses settings; the gallery holds the places of that billet.",
+    "Each welded billet is the test billet once, another one validates settings. The gallery contains the places of "
+    "the test billet.",
     _unseen,
     {**topn_accuracy(5), **topn_accuracy(10), **topn_accuracy(16), **registered_metrics("pair_auc")},
     allows_own_photos=True,
@@ -66,8 +73,8 @@ UNSEEN = Protocol(
 PLACES = Protocol(
     "billets",
     "Billets: an unseen place of a seen welded billet",
-    "A quarter of the places of each welded billet tests, a quarter chooses, half trains; every place is tested once. "
-    "The gallery holds the four test places of the same billet.",
+    "Of the places of each welded billet a quarter is for test, a quarter for validation and half for training; every "
+    "place is tested once. The gallery contains the four test places of the same billet.",
     _places,
     {**topn_accuracy(4), **registered_metrics("pair_auc")},
     allows_own_photos=True,

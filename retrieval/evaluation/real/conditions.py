@@ -1,4 +1,4 @@
-"""Lines of the benchmark: a method on frozen towers, and what stands for touch and photo in it."""
+"""Conditions of the benchmark: a method on frozen towers, with touches and photos or their control inputs."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -17,20 +17,24 @@ from retrieval.model.fusion import Matcher
 from retrieval.training.features import Features, encode_recording
 
 CONTROL_METHOD = "cca_pca"
-"""By which controls are asked; it takes features of any length."""
+"""Method of the controls; it accepts features of any width."""
 CONTROLS = {
-    "permuted": "touches are dealt to other objects before fitting, so that there is nothing to learn",
-    "no_contact": "the frames of the untouched gel stand in for the touch, in fitting and in judging",
-    "order": "the place of the touch in the order of capture stands in for it: what a perfect clock could tell, and so "
-    "the most that drift of the sensor could",
-    "background": "of each photo its margin alone is shown, an eighth of each side, in fitting and in judging",
+    "permuted": "touches are randomly assigned to other objects before fitting, so there is nothing to learn",
+    "no_contact": "no-contact frames replace the touches, in fitting and in scoring",
+    "order": "the place of the touch in the order of capture replaces it: an upper bound on the information in sensor "
+    "drift",
+    "background": "only the margin of each photo is used, an eighth of each side, in fitting and in scoring",
 }
 _BUMPS = (4, 16, 64)
 
 
 def clock_features(count: int) -> NDArray[np.float32]:
-    """(count, F): the place of each of so many grasps in their order, as bumps of three widths along it, so that near
-    places are alike and a linear method can tell far ones.
+    """Encode the places 0..count-1 of an order as Gaussian bumps of three widths.
+
+    Near places have similar features, and a linear method can distinguish distant ones.
+
+    Returns:
+        (count, F) float32.
     """
     place = np.linspace(0, 1, count)[:, None]
     bumps = [np.exp(-0.5 * ((place - np.linspace(0, 1, number)) * number) ** 2) for number in _BUMPS]
@@ -38,24 +42,30 @@ def clock_features(count: int) -> NDArray[np.float32]:
 
 
 def with_clock_touches(features: Features) -> Features:
-    """The features with the order of capture in place of the touch."""
+    """Return the features with the order of capture in place of the touch."""
     return dataclasses.replace(features, touch=clock_features(len(features))[:, None])
 
 
 def missing_no_contact_reason(grasps: Sequence[Grasp]) -> str | None:
-    """Why the untouched frames of a recording cannot stand in for touches; None where they can."""
+    """Return why no-contact frames cannot replace touches; None if they can."""
     if not all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps):
-        return "the recording lacks untouched frames"
+        return "the recording lacks no-contact frames"
     if len({grasp.backgrounds for grasp in grasps}) == 1:
-        return "one untouched frame serves all touches; it is the same for each, and so says nothing of any"
+        return "all touches share one no-contact frame, so it contains no information about the object"
     return None
 
 
 @dataclass(frozen=True, eq=False)
 class TowerEncoder:
-    """Towers that make the features of a recording, each kind once.
+    """Towers that encode a recording; each variant of touches and photos is encoded once.
 
-    checkpoint: the model that they are of, which is asked as it is; None where methods are fitted on their features.
+    Attributes:
+        grasps: The grasps of the recording.
+        config: Configuration of towers and heads.
+        matcher: Matcher with the towers.
+        checkpoint: The model of the towers, which scores as it is; None if methods are fitted on the features.
+        cache: Folder of encoded features.
+        quiet: No progress on stderr.
     """
 
     grasps: list[Grasp]
@@ -64,37 +74,47 @@ class TowerEncoder:
     checkpoint: Checkpoint | None
     cache: Path
     quiet: bool
-    _made: dict[tuple[str, str], Features] = field(default_factory=dict)
+    _encoded: dict[tuple[str, str], Features] = field(default_factory=dict)
 
     @classmethod
     def of_config(cls, grasps: list[Grasp], config: Config, cache: Path, quiet: bool) -> "TowerEncoder":
-        """The frozen towers of a configuration."""
+        """Return the frozen towers of a configuration."""
         matcher = dataclasses.replace(config.matcher, fingers=finger_count(grasps))
         config = dataclasses.replace(config, matcher=matcher)
         return cls(grasps, config, frozen_matcher(config), None, cache, quiet)
 
     @classmethod
     def of_model(cls, grasps: list[Grasp], model: Path, cache: Path, quiet: bool) -> "TowerEncoder":
-        """The towers of a checkpoint. Where it has two fingers and the recording one, both are shown that one's touch.
+        """Return the towers of a checkpoint.
 
-        Raises CheckpointError, and DatasetError where the recording has more fingers.
+        If the model has two fingers and the recording one, both fingers get the same touch.
+
+        Args:
+            grasps: The grasps of the recording.
+            model: The checkpoint.
+            cache: Folder of encoded features.
+            quiet: No progress on stderr.
+
+        Raises:
+            CheckpointError: The model cannot be read.
+            DatasetError: The recording has more fingers than the model.
         """
         checkpoint = load_checkpoint(model)
-        wanted, there = checkpoint.config.matcher.fingers, finger_count(grasps)
-        if there not in (1, wanted):
-            raise DatasetError(f"{model} was made for {wanted} finger(s), and the recording has {there}")
-        if there < wanted:
+        fingers, recorded = checkpoint.config.matcher.fingers, finger_count(grasps)
+        if recorded not in (1, fingers):
+            raise DatasetError(f"{model} needs {fingers} finger(s), but the recording has {recorded}.")
+        if recorded < fingers:
             grasps = [
-                dataclasses.replace(one, touches=one.touches * wanted, backgrounds=one.backgrounds * wanted)
+                dataclasses.replace(one, touches=one.touches * fingers, backgrounds=one.backgrounds * fingers)
                 for one in grasps
             ]
         return cls(grasps, checkpoint.config, checkpoint.matcher, checkpoint, cache, quiet)
 
     def features(self, touch_variant: str = "touch", photo_variant: str = "photo") -> Features:
-        """The features of all grasps, of this variant of the touch and of what is shown of the photo."""
-        if (touch_variant, photo_variant) not in self._made:
+        """Return the features of all grasps, for a variant of the touches and one of the photos."""
+        if (touch_variant, photo_variant) not in self._encoded:
             base = None if (touch_variant, photo_variant) == ("touch", "photo") else self.features()
-            made = encode_recording(
+            encoded = encode_recording(
                 self.grasps,
                 self.matcher,
                 self.config,
@@ -104,13 +124,13 @@ class TowerEncoder:
                 photo_features_from=base if photo_variant == "photo" else None,
                 quiet=self.quiet,
             )
-            self._made[touch_variant, photo_variant] = made
-        return self._made[touch_variant, photo_variant]
+            self._encoded[touch_variant, photo_variant] = encoded
+        return self._encoded[touch_variant, photo_variant]
 
 
 @dataclass(frozen=True, eq=False)
 class BenchmarkRow:
-    """A line of the table: a method, the towers under it, and what it is called there."""
+    """A row of the result table: its name, a method, and the towers under it."""
 
     name: str
     method: str
@@ -119,9 +139,11 @@ class BenchmarkRow:
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """What is fitted and asked in every fold: a row of the table, and what stands for touch and photo in it.
+    """One row with its touches and photos, or with control inputs; fitted and scored in every fold.
 
-    kind: "touch", "blurred" or one of `CONTROLS`.
+    Attributes:
+        row: The row of the table.
+        kind: "touch", "low_pass" or one of `CONTROLS`.
     """
 
     row: BenchmarkRow
@@ -129,16 +151,16 @@ class Condition:
 
     @property
     def method(self) -> str:
-        """The method that is fitted."""
+        """The method to fit."""
         return CONTROL_METHOD if self.kind in CONTROLS else self.row.method
 
     @property
     def key(self) -> str:
-        """What files of it are called."""
+        """The name of its files."""
         return self.kind if self.kind in CONTROLS else f"{self.row.name}-{self.kind}"
 
     def features(self) -> Features:
-        """What it is fitted on and asked."""
+        """Return the features to fit and score on."""
         towers = self.row.towers
         if self.kind == "order":
             return with_clock_touches(towers.features())

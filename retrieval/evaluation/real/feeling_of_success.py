@@ -10,22 +10,22 @@ _OBJECTS, _TEST = 98, 18
 
 
 def _paper(facts: RecordingFacts, seed: int) -> list[Split]:
-    """One split, as in the paper; with the seed only those who choose change."""
+    """Return one split, as in the paper; the seed changes only the validation objects."""
     rng = np.random.default_rng(37)
     names = [facts.names[place] for place in rng.permutation(len(facts.names))[:_OBJECTS]]
-    tested = max(2, round(_TEST / _OBJECTS * len(names)))
-    return [fold(names[tested:], names[:tested], (seed, 0), MIN_THRESHOLD_OBJECTS)]
+    tests = max(2, round(_TEST / _OBJECTS * len(names)))
+    return [fold(names[tests:], names[:tests], (seed, 0), MIN_THRESHOLD_OBJECTS)]
 
 
 PAPER = Protocol(
     "feeling-of-success",
-    "The Feeling of Success, as the paper asks",
-    "98 objects by lot, of which 18 test and 80 train (ten of these choose settings and the threshold of pairs); "
-    "grasps that held. A touch is never shown the photo of its own grasp.",
+    "The Feeling of Success, by the paper's protocol",
+    "98 random objects: 18 for test and 80 for training, of which ten validate settings and the pair threshold. Only "
+    "successful grasps. A touch is never compared with the photo of its own grasp.",
     _paper,
     registered_metrics("topn_k5", "topn_k10", "pair_accuracy", "pair_auc"),
     published_results=(
-        "On data of its own, with this rig's sensors, the paper reports a pair accuracy of 64.3 % (Lin, Calandra, "
-        "Levine, ICRA 2019); its guess curves are printed without numbers.",
+        "On its own data, with this rig's sensors, the paper reports a pair accuracy of 64.3 % (Lin, Calandra, "
+        "Levine, ICRA 2019); it gives its top-K curves without numbers.",
     ),
 )

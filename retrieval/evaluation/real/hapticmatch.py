@@ -1,4 +1,4 @@
-"""HapticMatch: which material's surface was pressed, of materials that nothing has seen."""
+"""HapticMatch: identify the pressed material among unseen materials."""
 
 from retrieval.evaluation.real.protocol import Protocol, registered_metrics, topn_accuracy
 from retrieval.evaluation.real.rct import five_folds
@@ -7,7 +7,7 @@ MATERIALS = Protocol(
     "hapticmatch",
     "HapticMatch: unseen materials",
     "Materials are randomly assigned to five folds, again for each seed; all samples of a material stay together. A "
-    "touch is never shown the photo of its own patch, so what must be recognised is the material.",
+    "touch is never compared with the photo of its own patch, so the material must be recognised.",
     five_folds,
     {**topn_accuracy(10), **topn_accuracy(5), **registered_metrics("pair_auc")},
 )

@@ -1,4 +1,4 @@
-"""ObjectFolder's cross-sensory retrieval: mean average precision over unseen objects, by the published split."""
+"""ObjectFolder's cross-sensory retrieval: mean average precision on unseen objects, with the published split."""
 
 from retrieval.data.dataset import Split
 from retrieval.errors import DatasetError
@@ -8,8 +8,8 @@ from retrieval.evaluation.real.protocol import Protocol, RecordingFacts, registe
 def _published(facts: RecordingFacts, seed: int) -> list[Split]:
     if not facts.splits:
         raise DatasetError(
-            "the recording must hold splits/published.json, which parts objects; import a pack of the benchmark with "
-            "its split.json. Where that split parts pictures, it judges no unseen object, and is not kept"
+            "The recording lacks splits/published.json, a split by object. Import a pack of the benchmark with its "
+            "split.json. The import drops a split by image, because it tests no unseen object."
         )
     split = next(iter(facts.splits.values()))
     return [Split(seed, split.train, split.validation, split.test)]
@@ -18,8 +18,8 @@ def _published(facts: RecordingFacts, seed: int) -> list[Split]:
 PUBLISHED = Protocol(
     "objectfolder",
     "ObjectFolder: cross-sensory retrieval",
-    "The published split: its test objects are asked, its validation objects choose. Any picture of the object is "
-    "right, that of the query's own number too.",
+    "The published split: its test objects are queries, its validation objects validate settings. Every image of the "
+    "object is a correct answer, also the one with the query's own number.",
     _published,
     registered_metrics("objectfolder_touch_to_photo", "objectfolder_photo_to_touch", "pair_auc", "topn_k10"),
     published_results=(

@@ -1,11 +1,12 @@
-"""PhysiCLeAR: which object part was pressed, by other press videos of it."""
+"""PhysiCLeAR: identify the pressed object part from other press videos of it."""
 
 from retrieval.evaluation.real.touch_to_touch import TouchToTouch
 
 LEAVE_ONE_VIDEO_OUT = TouchToTouch(
     "physiclear",
     "PhysiCLeAR: touch to touch, one video left out",
-    "Each press video asks in turn; the other videos of all parts are the gallery, and the nearest one names the part. "
-    "Nothing is trained. A video is the mean of its frames of strongest contact. The videos of a part were made one "
-    "after the other: the order of capture is that of the file names, part by part; no time of capture is published.",
+    "Each press video is the query in turn; the other videos of all parts are the gallery, and the nearest one gives "
+    "the part. Nothing is trained. A video is the mean of its frames of strongest contact. The videos of a part were "
+    "recorded one after the other. The order of capture is that of the file names, part by part, as no times are "
+    "published.",
 )

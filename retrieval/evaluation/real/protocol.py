@@ -1,4 +1,4 @@
-"""What a protocol is: a rule that splits, a rule for the gallery, and what is measured."""
+"""Protocols: how to split a data set, which gallery to search, and what to measure."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,17 +13,21 @@ from retrieval.errors import DatasetError
 from retrieval.metrics.registry import METRICS, Metric, k_way_measure
 
 PHOTO, REFERENCE, BOTH, TOUCHES = "photo", "reference", "both", "touches"
-"""What an entry of the catalogue shows: a photo, a reference touch, the one with the other, or touches that nothing is
-fitted to (`retrieval.evaluation.real.touch_to_touch`)."""
+"""Content of a catalogue entry: a photo, a reference touch, both, or touches without any training
+(`retrieval.evaluation.real.touch_to_touch`)."""
 VALIDATION_OBJECTS = 5
-"""Objects, of those that do not test, by which methods choose their settings."""
+"""Default number of validation objects, on which methods select their settings."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecordingFacts:
-    """A recording as protocols see it.
+    """A recording with the facts that protocols need.
 
-    objects: object_id -> what the data set says of it; splits: name -> a published split.
+    Attributes:
+        source: Source of the recording.
+        grasps: The grasps.
+        objects: object_id -> metadata of the data set.
+        splits: Name -> published split.
     """
 
     source: str
@@ -33,18 +37,18 @@ class RecordingFacts:
 
     @property
     def names(self) -> list[str]:
-        """The objects that were touched, sorted."""
+        """The touched objects, sorted."""
         return sorted({grasp.object_id for grasp in self.grasps})
 
     @property
     def kind_of(self) -> dict[str, str] | None:
-        """The class of every object; None where the recording does not name it of all."""
+        """The class of every object; None if the recording lacks the class of one."""
         found = {name: str(self.objects[name]["class"]) for name in self.names if "class" in self.objects.get(name, {})}
         return found if len(found) == len(self.names) else None
 
     @property
     def sequence_of(self) -> dict[str, str]:
-        """The sequence of each object's first grasp; the object itself where there is none."""
+        """The sequence of each object's first grasp; the object itself if it has none."""
         found: dict[str, str] = {}
         for grasp in self.grasps:
             found.setdefault(grasp.object_id, grasp.sequence_id or grasp.object_id)
@@ -52,11 +56,16 @@ class RecordingFacts:
 
 
 def read_recording_facts(folder: Path) -> RecordingFacts:
-    """What is known of a recording's grasps. Raises DatasetError."""
-    grasps = load_grasps(folder)  # which checks the files that are read here
+    """Read the facts of a recording from its folder.
+
+    Raises:
+        DatasetError: A file is missing or invalid.
+    """
+    grasps = load_grasps(folder)  # also checks recording.json
     info = read_json(folder / "recording.json")
-    said = info.get("objects")
-    objects = {name: about for name, about in said.items() if isinstance(about, dict)} if isinstance(said, dict) else {}
+    entries = info.get("objects")
+    entries = entries if isinstance(entries, dict) else {}
+    objects = {name: about for name, about in entries.items() if isinstance(about, dict)}
     splits = {}
     for path in sorted((folder / "splits").glob("*.json")):
         try:
@@ -68,17 +77,25 @@ def read_recording_facts(folder: Path) -> RecordingFacts:
 
 @dataclass(frozen=True)
 class Protocol:
-    """One way to ask one data set.
+    """One benchmark protocol of a data set.
 
-    data_set: the importer that reads it. rule: how it is split, in words, as a sentence. folds: the splits for a seed;
-    the test objects of all folds together are the same for every seed. measures: by name; the first of them decides
-    whether a result counts as touch. own_photos: a touch may be shown the photo of its own grasp (its data set pairs
-    them by lot, or has one photo of an object). by_sequence: a gallery holds the objects of one sequence, and sequences
-    are what intervals resample. counted: a measure of right and wrong answers alone, which are counted too, with an
-    exact binomial interval. anchors: what others reached, a sentence each. entry: what an object's entries in the
-    catalogue show, one of `PHOTO`, `REFERENCE`, `BOTH` (`retrieval.evaluation.real.reference_rows`). galleries: the gallery
-    in which each test object of a split stands, where there are several. choices: every fold is another choice of test
-    objects, which share objects with those of others; values are means over the folds, and intervals cover the choice.
+    Attributes:
+        data_set: The importer of the data set.
+        title: Title in the report.
+        rule: The split, described in sentences.
+        folds: Function from recording and seed to splits. The test objects of all folds together are the same for every
+            seed.
+        measures: Measures by name; the first one decides whether a result counts as touch.
+        allows_own_photos: Whether a touch is compared with the photo of its own grasp, because the data set pairs them
+            at random or has one photo of each object.
+        is_by_sequence: Whether a gallery contains the objects of one sequence; intervals then resample sequences.
+        binomial_measure: A measure of right and wrong answers, whose counts get an exact binomial interval.
+        published_results: Results of others, one sentence each.
+        entry: Content of the catalogue entries: `PHOTO`, `REFERENCE` or `BOTH`
+            (`retrieval.evaluation.real.reference_rows`).
+        galleries: Function from recording and split to the gallery of each test object, if there are several galleries.
+        choices: Whether the folds are different, overlapping choices of test objects. Values are then means over the
+            folds, and intervals cover the choice.
 
     >>> from retrieval.evaluation.real.protocol import topn_accuracy, folds
     >>> def halves(facts, seed):
@@ -102,22 +119,27 @@ class Protocol:
     choices: bool = False
 
     def gallery_of(self, facts: RecordingFacts, split: Split) -> Mapping[str, str]:
-        """The name of the gallery in which each test object of a split stands."""
+        """Return the name of the gallery of each test object."""
         if self.galleries:
             return self.galleries(facts, split)
         return {name: facts.sequence_of[name] if self.is_by_sequence else "" for name in split.test}
 
     @property
     def main(self) -> str:
-        """The name of the measure that decides."""
+        """The name of the deciding measure."""
         return next(iter(self.measures))
 
 
 def fold(
     rest: Sequence[str], test: Sequence[str], seed: Sequence[int], validation_objects: int = VALIDATION_OBJECTS
 ) -> Split:
-    """A split that tests on `test`; of the other objects `validation_objects`, or a quarter where that is fewer, validate, and
-    the rest train.
+    """Return a split with the given test objects; the others are for training and validation.
+
+    Args:
+        rest: Objects for training and validation.
+        test: Test objects.
+        seed: Seeds of the draw; the first one is that of the split.
+        validation_objects: Number of validation objects; a quarter of `rest`, at least 2, if that is fewer.
     """
     order = np.random.default_rng([*seed, 17]).permutation(len(rest))
     count = max(2, min(validation_objects, len(rest) // 4))
@@ -130,7 +152,7 @@ def fold(
 
 
 def folds(names: Sequence[str], tests: Sequence[Sequence[str]], seed: int) -> list[Split]:
-    """A fold for each set of test objects; of `names` the others train and choose."""
+    """Return a split for each set of test objects; the others of `names` are for training and validation."""
     return [
         fold([name for name in names if name not in set(test)], test, (seed, number))
         for number, test in enumerate(tests)
@@ -141,16 +163,21 @@ def folds(names: Sequence[str], tests: Sequence[Sequence[str]], seed: int) -> li
 
 
 def registered_metrics(*names: str) -> dict[str, Metric]:
-    """Metrics of every evaluation, by name."""
+    """Return registered metrics by name."""
     return {name: METRICS[name] for name in names}
 
 
 def topn_accuracy(k: int, *, grasps: int = 1, photos: int = 1, entries: str = "photos") -> dict[str, Metric]:
-    """The first guess among k objects, after so many touches, each object shown by so many photos, or what `entries`
-    calls them.
+    """Return the metric of top-1..top-k accuracy among k objects.
+
+    Args:
+        k: Number of candidate objects.
+        grasps: Touches of a query.
+        photos: Photos of a candidate.
+        entries: Plural name of the catalogue entries for the label.
     """
     name = f"topn_k{k}" + (f"_g{grasps}" if grasps > 1 else "") + (f"_p{photos}" if photos > 1 else "")
-    label = f"first guess of {k}"
+    label = f"top-1 of {k}"
     label += f", {grasps} touches" if grasps > 1 else ""
     label += f", {photos} {entries}" if photos > 1 else ""
     return {

@@ -1,4 +1,4 @@
-"""RCT: which material was pressed, of materials that nothing has seen."""
+"""RCT: identify the pressed material among unseen materials."""
 
 import numpy as np
 
@@ -9,7 +9,7 @@ _FOLDS = 5
 
 
 def five_folds(facts: RecordingFacts, seed: int) -> list[Split]:
-    """Objects dealt by lot into five folds."""
+    """Return five folds of randomly assigned objects."""
     names = facts.names
     order = [names[place] for place in np.random.default_rng([seed, 31]).permutation(len(names))]
     return folds(names, [order[turn::_FOLDS] for turn in range(_FOLDS)], seed)
@@ -18,8 +18,8 @@ def five_folds(facts: RecordingFacts, seed: int) -> list[Split]:
 MATERIALS = Protocol(
     "rct",
     "RCT: unseen materials",
-    "Materials are dealt by lot into five folds, again for each seed; all presses of a material stay together. "
-    "There is one photo of a material, which every press of it is shown.",
+    "Materials are randomly assigned to five folds, again for each seed; all presses of a material stay together. "
+    "Each material has one photo, and every press is compared with it.",
     five_folds,
     {**topn_accuracy(10), **topn_accuracy(5), **registered_metrics("pair_auc")},
     allows_own_photos=True,

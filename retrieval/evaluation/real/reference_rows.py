@@ -1,9 +1,9 @@
-"""Reference touches: a catalogue whose objects are shown by touches, alone or beside photos.
+"""Reference touches: catalogue entries that are touches, alone or with photos.
 
-An object's touches are taken in the order of capture: its first quarter are references, its last half asks, what lies
-between is left out, so that no query is the neighbour of a reference. A catalogue's entry is a reference touch, or that
-touch with its grasp's photo. With photos `cca_towers` weighs both by what validation objects say; alone they are
-matched with touches as photos otherwise are, so that no photo is needed to learn from.
+An object's touches are split in the order of capture: the first quarter are references, the last half are queries. The
+touches between them are left out, so that no query is next to a reference. A catalogue entry is a reference touch,
+alone or with the photo of its grasp. With photos `cca_towers` weights both by validation accuracy. Alone, reference
+touches are matched as photos otherwise are, so that training needs no photo.
 """
 
 import dataclasses
@@ -20,14 +20,22 @@ if TYPE_CHECKING:
     from retrieval.training.features import Features
 
 MAX_QUERIES = 30
-"""Queries of an object, evenly spaced: more of them cost fits time and say little."""
+"""Maximum number of queries of one object, evenly spaced; more slow down the fits and add little information."""
 ANY_WIDTH_METHODS = ("cca_towers", "cca_pca", "cca", "plsca", "chance", "constant")
-"""Methods that take an entry of any width; the others are heads for photos."""
+"""Methods that accept entries of any width; the others have heads for photos."""
 
 
 def assign_references(grasps: Sequence[Grasp]) -> dict[str, Grasp]:
-    """Grasp id of each query -> the reference that is its entry in the catalogue; references are dealt in turn. Raises
-    DatasetError for an object of fewer than four touches.
+    """Assign to each query a reference touch, its catalogue entry; the references of an object are used in turn.
+
+    Args:
+        grasps: All grasps, in the order of capture.
+
+    Returns:
+        Grasp id of the query -> reference.
+
+    Raises:
+        DatasetError: An object has fewer than four touches.
     """
     by_object: dict[str, list[Grasp]] = {}
     for grasp in grasps:
@@ -35,19 +43,18 @@ def assign_references(grasps: Sequence[Grasp]) -> dict[str, Grasp]:
     found: dict[str, Grasp] = {}
     for name, own in by_object.items():
         if len(own) < 4:
-            raise DatasetError(
-                f"reference touches and queries of one object need four touches of it; {name} has {len(own)}"
-            )
-        references, asking = own[: len(own) // 4], own[len(own) // 2 :]
-        places = np.linspace(0, len(asking) - 1, min(MAX_QUERIES, len(asking))).round().astype(int)
+            raise DatasetError(f"Reference touches need at least 4 touches of each object, but {name} has {len(own)}.")
+        references, queries = own[: len(own) // 4], own[len(own) // 2 :]
+        places = np.linspace(0, len(queries) - 1, min(MAX_QUERIES, len(queries))).round().astype(int)
         for turn, place in enumerate(places):
-            found[asking[place].grasp_id] = references[turn % len(references)]
+            found[queries[place].grasp_id] = references[turn % len(references)]
     return found
 
 
 def replace_photos_by_references(grasps: Sequence[Grasp]) -> list[Grasp]:
-    """The queries, each with the gel image of its reference (the first finger's) in place of its photo: what tells the
-    entries of the catalogue apart, and what a report shows of them.
+    """Return the queries, each with the gel image of its reference in place of its photo.
+
+    The gel image (of the first finger) identifies the catalogue entry, also in a report.
     """
     references = assign_references(grasps)
     return [
@@ -58,18 +65,22 @@ def replace_photos_by_references(grasps: Sequence[Grasp]) -> list[Grasp]:
 
 
 def facts_with_references(facts: RecordingFacts) -> RecordingFacts:
-    """The recording with such grasps alone."""
+    """Return the recording with only the grasps of `replace_photos_by_references`."""
     return dataclasses.replace(facts, grasps=replace_photos_by_references(facts.grasps))
 
 
 def features_with_references(features: "Features", references: Mapping[str, Grasp], entry: str) -> "Features":
-    """Features of the queries, with those of their references in place of those of photos; where `entry` is "both",
-    after those of the reference's photo. Whatever stands for touches stands for references, too.
+    """Return the features of the queries with reference features in place of photo features.
+
+    Args:
+        features: Features of all grasps. A control that replaces touches also replaces the references.
+        references: Grasp id of each query -> its reference.
+        entry: With "both" the features of the reference's photo precede those of its touch.
     """
     row_of = {grasp_id: row for row, grasp_id in enumerate(features.grasp_ids)}
-    asked = features.select(np.array([row_of[name] for name in references], np.int64))
-    there = np.array([row_of[one.grasp_id] for one in references.values()], np.int64)
-    shown = features.touch[there].reshape(len(there), -1)
+    queries = features.select(np.array([row_of[name] for name in references], np.int64))
+    rows = np.array([row_of[one.grasp_id] for one in references.values()], np.int64)
+    entries = features.touch[rows].reshape(len(rows), -1)
     if entry == BOTH:
-        shown = np.concatenate([features.photo[there], shown], axis=1)
-    return dataclasses.replace(asked, photo=shown)
+        entries = np.concatenate([features.photo[rows], entries], axis=1)
+    return dataclasses.replace(queries, photo=entries)

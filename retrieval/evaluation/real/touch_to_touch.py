@@ -1,13 +1,13 @@
-"""Touch to touch: an object is found by other touches of it, one sequence (such as one press video) left out at a time.
+"""Touch to touch: identify an object from other touches of it, leaving out one sequence (such as a press video).
 
 A sequence is one vector: the mean of its touches' tower features, in one of two representations:
 
     difference      features of the touches, minus those of the no-contact frame
     common-frame    features of the contact difference (touch minus no-contact frame) on ONE common no-contact frame
 
-Where objects are touched one after the other, the no-contact frame of a sequence names its object by drift. The first
-representation keeps part of that leak, the second one removes what is additive in the picture. A sequence is compared
-with every other one by the cosine of their first principal components; scaling and components are fitted without it.
+If objects are touched one after the other, drift makes the no-contact frame of a sequence identify its object. The
+first representation retains part of that leak; the second one removes additive effects in the image. The score of two
+sequences is the cosine of their first principal components; scaling and components are fitted without the query.
 """
 
 import dataclasses
@@ -44,8 +44,8 @@ from retrieval.training.features import Features, encode_recording
 COMPONENTS = 60
 REPRESENTATIONS = ("difference", "common-frame")
 FROZEN = "frozen"
-"""What the rows of the configuration's own towers are called."""
-PERMUTED = "the objects of the sequences are permuted: what chance gives"
+"""Row name of the configuration's own towers."""
+PERMUTED = "the objects of the sequences are permuted: the level of chance"
 
 Vectors = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ MEASURES = {
     "recall_5": Metric("R@5", "R@5", "real", lambda of: protocols.recall(of.test, 5)),
     "map": Metric("mAP", "mAP", "real", lambda of: protocols.average_precision(of.test)),
 }
-"""Of sequences that find sequences; the first one decides."""
+"""Measures of sequence-to-sequence retrieval; the first one decides."""
 
 
 def _no_folds(facts: RecordingFacts, seed: int) -> list[Split]:
@@ -63,9 +63,9 @@ def _no_folds(facts: RecordingFacts, seed: int) -> list[Split]:
 
 @dataclass(frozen=True)
 class TouchToTouch(Protocol):
-    """A protocol without training: sequences of touches ask, and the other sequences are the gallery.
+    """A protocol without training: each sequence of touches is a query, the other sequences are the gallery.
 
-    It needs a no-contact frame for each touch. Methods are not fitted; a row is a tower in one of `REPRESENTATIONS`.
+    It needs a no-contact frame for each touch. Methods are not fitted; a row is a tower with one of `REPRESENTATIONS`.
     """
 
     folds: Any = _no_folds
@@ -74,14 +74,14 @@ class TouchToTouch(Protocol):
 
 
 def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDArray[np.float32]:
-    """Return the cosine of each row's vector with every other's, after principal components that do not know the row.
+    """Return the cosine of each vector with every other one, after principal components fitted without it.
 
     Args:
         vectors: (S, F), a vector for each sequence.
-        components: How many principal components, at most S - 2.
+        components: Number of principal components, at most S - 2.
 
     Returns:
-        (S, S) float32, 0 on the diagonal. Row q: mean, standard deviation and components of all vectors but q.
+        (S, S) float32, 0 on the diagonal. Row q uses mean, standard deviation and components of all vectors but q.
     """
     count = len(vectors)
     scores = np.zeros((count, count), np.float32)
@@ -89,11 +89,11 @@ def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDAr
         others = np.arange(count) != row
         mean, deviation = vectors[others].mean(0), vectors[others].std(0)
         scaled = (vectors - mean) / np.where(deviation > 1e-9 * max(1.0, np.abs(mean).max()), deviation, np.inf)
-        # Through the Gram matrix: there are fewer sequences than features.
+        # Use the Gram matrix: there are fewer sequences than features.
         gallery = scaled[others]
         values, directions = np.linalg.eigh(gallery @ gallery.T)
-        kept = np.flatnonzero(values > 1e-9 * max(values[-1], 1e-12))[::-1][: min(components, count - 2)]
-        codes = scaled @ (gallery.T @ (directions[:, kept] / np.sqrt(values[kept])))
+        used = np.flatnonzero(values > 1e-9 * max(values[-1], 1e-12))[::-1][: min(components, count - 2)]
+        codes = scaled @ (gallery.T @ (directions[:, used] / np.sqrt(values[used])))
         norms = np.maximum(np.linalg.norm(codes, axis=1), 1e-12)
         scores[row, others] = (codes[others] @ codes[row]) / (norms[others] * norms[row])
     return scores
@@ -101,7 +101,14 @@ def leave_one_out_scores(vectors: Vectors, components: int = COMPONENTS) -> NDAr
 
 @dataclass(frozen=True, eq=False)
 class Sequences:
-    """The sequences of a recording, in the order in which they were recorded. rows: places of each one's grasps."""
+    """The sequences of a recording, in the order of capture.
+
+    Attributes:
+        grasps: All grasps.
+        names: Name of each sequence.
+        objects: Object of each sequence.
+        rows: Places of the grasps of each sequence.
+    """
 
     grasps: Sequence[Grasp]
     names: tuple[str, ...]
@@ -110,48 +117,60 @@ class Sequences:
 
     @classmethod
     def of(cls, grasps: Sequence[Grasp]) -> "Sequences":
-        """Group grasps by object and sequence. Raises DatasetError where an object has fewer than two sequences, and
-        for fewer than two objects.
+        """Group grasps by object and sequence.
+
+        Raises:
+            DatasetError: There are fewer than two objects, or an object has fewer than two sequences.
         """
         places: dict[tuple[str, str], list[int]] = {}
         for place, grasp in enumerate(grasps):
             places.setdefault((grasp.object_id, grasp.sequence_id or grasp.grasp_id), []).append(place)
         objects = [name for name, _ in places]
-        lonely = sorted({name for name in objects if objects.count(name) < 2})
-        if lonely or len(set(objects)) < 2:
+        single = sorted({name for name in objects if objects.count(name) < 2})
+        if single or len(set(objects)) < 2:
             raise DatasetError(
-                "touch to touch needs two objects, and two sequences of each; "
-                + (f"{lonely[0]} has one" if lonely else f"there are {len(set(objects))} objects")
+                "Touch to touch needs at least 2 objects with 2 sequences each, but "
+                + (f"{single[0]} has 1 sequence." if single else f"the recording has {len(set(objects))} object(s).")
             )
         rows = tuple(np.array(each, np.int64) for each in places.values())
         return cls(grasps, tuple(name for _, name in places), tuple(objects), rows)
 
     @cached_property
     def owner(self) -> NDArray[np.int64]:
-        """(S,) number of each sequence's object, among the sorted names."""
+        """(S,) object number of each sequence, in the order of the sorted names."""
         return np.unique(np.array(self.objects), return_inverse=True)[1].astype(np.int64)
 
     @property
     def middle(self) -> list[str]:
-        """The grasp that shows each sequence in a report."""
+        """The grasp that represents each sequence in a report: the middle one."""
         return [self.grasps[rows[len(rows) // 2]].grasp_id for rows in self.rows]
 
     def mean(self, features: NDArray[np.float32]) -> Vectors:
-        """(S, F): the mean over each sequence's grasps of (G, F)."""
+        """Return the mean (S, F) of features (G, F) over the grasps of each sequence."""
         return np.stack([features[rows].mean(0, dtype=np.float64) for rows in self.rows])
 
     def table(self, scores: NDArray[np.float32], owner: NDArray[np.int64] | None = None) -> ScoreTable:
-        """Scores (S, S) as a table: every sequence asks, and does not find itself."""
+        """Return scores (S, S) as a table: each sequence is a query, and is not compared with itself."""
         owner = self.owner if owner is None else owner
         words = {"row_words": "sequences", "column_words": "sequences"}
         return ScoreTable(scores, owner, owner, np.eye(len(owner), dtype=np.bool_), **words)
 
 
 def with_common_frame(grasps: Sequence[Grasp], folder: Path, *, quiet: bool = True) -> list[Grasp]:
-    """Return the grasps with each contact difference added to one common no-contact frame, as pictures in `folder`.
+    """Add the contact difference of each grasp to one common no-contact frame; write the images to `folder`.
 
-    The common frame is that of the first grasp. A picture is common + touch - no-contact frame in 8 bits, clipped.
-    Pictures that are there are taken as they are. Raises DatasetError for frames of different sizes.
+    The common frame is that of the first grasp. An image is common + touch - no-contact frame, clipped to 8 bits.
+
+    Args:
+        grasps: Grasps with no-contact frames.
+        folder: Folder of the images; existing images are reused.
+        quiet: No progress on stderr.
+
+    Returns:
+        The grasps with the new images as touches, and the common frame as no-contact frame.
+
+    Raises:
+        DatasetError: The frames differ in size.
     """
     common = [read_rgb(path) for path in grasps[0].backgrounds]
     folder.mkdir(parents=True, exist_ok=True)
@@ -173,27 +192,27 @@ def _on_common_frame(touch: Path, before: Path, common: NDArray[np.float32]) -> 
     pressed, no_contact = read_rgb(touch), read_rgb(before)
     if not pressed.shape == no_contact.shape == common.shape:
         raise DatasetError(
-            f"{touch}, its no-contact frame and the first one of the recording must be of one size; got "
-            f"{pressed.shape}, {no_contact.shape} and {common.shape}"
+            f"{touch}, its no-contact frame and the first no-contact frame of the recording must have the same size, "
+            f"got {pressed.shape}, {no_contact.shape} and {common.shape}."
         )
     return common + pressed - no_contact
 
 
 def _png(image: NDArray[np.float32]) -> bytes:
-    """(H, W, 3) in 0..1, red first, as the content of a PNG file."""
+    """Return an RGB image (H, W, 3) in 0..1 as the bytes of a PNG file."""
     return encode_image(np.clip(np.rint(255 * image), 0, 255).astype(np.uint8))
 
 
 @dataclass(frozen=True, eq=False)
 class _SequenceEncoder:
-    """The sequences of a recording as the towers of one row see them; each kind of picture is encoded once."""
+    """Encodes the sequences of a recording with the towers of one row; each kind of image is encoded once."""
 
     sequences: Sequences
     towers: TowerEncoder
     common: Sequence[Grasp]
 
     def vectors(self, representation: str, touch_variant: str) -> Vectors:
-        """(S, F) of a representation; variant: "touch", or "blurred" for the low-pass control."""
+        """Return vectors (S, F) of a representation; `touch_variant` is "touch" or, for the control, "low_pass"."""
         if representation == "common-frame":
             return self.sequences.mean(self._features(self.common, touch_variant))
         return self.sequences.mean(self._features(self.sequences.grasps, touch_variant)) - self.no_contact(
@@ -201,15 +220,15 @@ class _SequenceEncoder:
         )
 
     def no_contact(self, touch_variant: str = "touch") -> Vectors:
-        """(S, F): features of each sequence's no-contact frame, that of its first grasp."""
+        """Return the features (S, F) of each sequence's no-contact frame, that of its first grasp."""
         first = [self.sequences.grasps[rows[0]] for rows in self.sequences.rows]
         frames = [dataclasses.replace(grasp, touches=grasp.backgrounds) for grasp in first]
         return self._features(frames, touch_variant).astype(np.float64)
 
     def _features(self, grasps: Sequence[Grasp], touch_variant: str) -> NDArray[np.float32]:
-        """(G, fingers * F) of these touches; photos are not looked at."""
+        """Return the features (G, fingers * F) of these touches; photos are not encoded."""
         fingers = self.towers.config.matcher.fingers
-        if fingers > 1 and len(grasps[0].touches) == 1:  # a model of two fingers feels with both what one felt
+        if fingers > 1 and len(grasps[0].touches) == 1:  # both fingers of the model get the same touch
             grasps = [
                 dataclasses.replace(one, touches=one.touches * fingers, backgrounds=one.backgrounds * fingers)
                 for one in grasps
@@ -241,27 +260,27 @@ def touch_to_touch_entry(
     """Return the protocol's entry of results.json.
 
     Args:
-        protocol: What is asked.
+        protocol: The protocol.
         facts: The recording. Each touch must have a no-contact frame, and each object two sequences.
-        rows: Of these the towers are taken, each once; methods are not fitted.
-        seeds: How often the objects are permuted.
-        cache: Folder for features and for pictures on the common frame.
+        rows: Rows whose towers are used, each once; methods are not fitted.
+        seeds: Seeds of the permutations of the objects.
+        cache: Folder of features and of images on the common frame.
         draws: Resamples of an interval.
-        quiet: No progress.
+        quiet: No progress on stderr.
 
     Raises:
-        DatasetError: Where no-contact frames or second sequences are missing.
+        DatasetError: No-contact frames or second sequences are missing.
     """
     sequences = Sequences.of(facts.grasps)
     if reason := missing_no_contact_reason(facts.grasps):
-        raise DatasetError(f"touch to touch needs the no-contact frame of each sequence: {reason}")
+        raise DatasetError(f"Touch to touch needs the no-contact frame of each sequence: {reason}.")
     digest = data_digest(facts.grasps)
     common = with_common_frame(facts.grasps, cache / "common-frame" / digest[:32], quiet=quiet)
     aggregation = Aggregation(draws, seeds[0])
     order = _measures(protocol, sequences, clock_features(len(sequences.names)).astype(np.float64))
     entries: dict[str, Any] = {}
     controls: dict[str, list[dict[str, Measure]]] = {"order": [order]}
-    shown: tuple[str, ScoreTable] | None = None
+    first_row: tuple[str, ScoreTable] | None = None
     frozen: dict[str, dict[str, Measure]] = {}
     for label, towers in _towers(rows):
         encoder = _SequenceEncoder(sequences, towers, common)
@@ -283,10 +302,10 @@ def touch_to_touch_entry(
                 "best_params": [],
             }
             controls.setdefault("permuted", list(_permuted_measures(protocol, sequences, table.scores, seeds)))
-            shown = shown or (name, table)
-    assert shown is not None
+            first_row = first_row or (name, table)
+    assert first_row is not None
     objects = sorted(set(sequences.objects))
-    examples = ExampleGrasps(shown[1], objects, sequences.middle, sequences.middle).examples(one_of_each=True)
+    examples = ExampleGrasps(first_row[1], objects, sequences.middle, sequences.middle).examples(one_of_each=True)
     return {
         "title": protocol.title,
         "rule": protocol.rule,
@@ -305,19 +324,21 @@ def touch_to_touch_entry(
         "folds": [[{"test": [name]} for name in sequences.names]],
         "rows": entries,
         "controls": {
-            name: control_entry(protocol, PERMUTED if name == "permuted" else CONTROLS[name], None, taken, aggregation)
-            for name, taken in controls.items()
+            name: control_entry(
+                protocol, PERMUTED if name == "permuted" else CONTROLS[name], None, by_seed, aggregation
+            )
+            for name, by_seed in controls.items()
         },
-        "examples": {"row": shown[0], **examples},
+        "examples": {"row": first_row[0], **examples},
     }
 
 
 def _towers(rows: Sequence[BenchmarkRow]) -> Iterator[tuple[str, TowerEncoder]]:
-    """The towers under the rows, each once, and what they are called."""
-    seen: list[TowerEncoder] = []
+    """Yield the name and the towers of the rows, each towers once."""
+    distinct: list[TowerEncoder] = []
     for row in rows:
-        if not any(row.towers is one for one in seen):
-            seen.append(row.towers)
+        if not any(row.towers is one for one in distinct):
+            distinct.append(row.towers)
             yield (row.name if row.towers.checkpoint else FROZEN), row.towers
 
 
@@ -326,7 +347,7 @@ def _measures(protocol: Protocol, sequences: Sequences, vectors: Vectors) -> dic
 
 
 def _measure_table(protocol: Protocol, table: ScoreTable) -> dict[str, Measure]:
-    """The measures of a table, queries in the order of their objects."""
+    """Return the measures of a table, queries in the order of their objects."""
     found = {
         name: metric.compute(MethodScoreTables(table, table, {}, None, 0)) for name, metric in protocol.measures.items()
     }

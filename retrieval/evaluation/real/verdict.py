@@ -1,4 +1,4 @@
-"""Summing up: values with intervals, paired differences from the controls, and whether a result counts as touch."""
+"""Aggregate measures: values with intervals, paired differences from the controls, and the verdict."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from retrieval.metrics.measure import Measure
 from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
 
 RULE = (
-    "A result counts as touch only where its first measure beats its controls, each by more than the interval of the "
-    "paired difference: the same method on blurred touches, and the order of capture in place of the touch; where "
-    "touches find touches, also the no-contact frame in place of the touch."
+    "A result counts as touch only if its first measure is above each control, with the whole interval of the paired "
+    "difference above 0. The controls are the same method on low-pass touches and the order of capture in place of the "
+    "touch; for touch to touch also the no-contact frame in place of the touch."
 )
 CONTROL_NAMES = {
-    "low_pass_differences": "the blurred control",
+    "low_pass_differences": "the low-pass control",
     "order_differences": "the order of capture",
     "no_contact_differences": "the no-contact frame alone",
 }
-"""Key of a row's paired differences -> what the control is called."""
+"""Key of a row's paired differences -> name of the control."""
 CONFIDENCE_BINS = 10
 
 BySeed = Sequence[Mapping[str, Measure]]
@@ -31,24 +31,27 @@ BySeed = Sequence[Mapping[str, Measure]]
 
 @dataclass(frozen=True)
 class Aggregation:
-    """How measures become numbers: over seeds, intervals resampling objects; or over choices of test objects.
+    """Aggregates measures over seeds, with intervals that resample objects, or over choices of test objects.
 
-    ratio: test objects of a choice for each training object; None: measures are those of seeds.
+    Attributes:
+        draws: Resamples of an interval.
+        seed: Seed of the resamples.
+        ratio: Test objects for each training object of a choice; None if the measures are those of seeds.
     """
 
     draws: int
     seed: int
     ratio: float | None = None
 
-    def summaries(self, taken: BySeed) -> dict[str, Any]:
-        """Values with intervals, by name; those that all have."""
-        found = {name: [one[name] for one in taken] for name in _shared(taken)}
+    def summaries(self, by_seed: BySeed) -> dict[str, Any]:
+        """Return values with intervals, for measures that all seeds have."""
+        found = {name: [one[name] for one in by_seed] for name in _shared(by_seed)}
         if self.ratio is not None:
             return {name: summarise_splits(measures, self.ratio) for name, measures in found.items()}
         return {name: summarise(measures, draws=self.draws, seed=self.seed) for name, measures in found.items()}
 
     def differences(self, a: BySeed, b: BySeed) -> dict[str, Any]:
-        """Paired differences `a` - `b`, by name."""
+        """Return paired differences `a` - `b`, by name."""
         names = [name for name in _shared(a) if name in _shared(b)]
         pairs = {name: ([one[name] for one in a], [one[name] for one in b]) for name in names}
         if self.ratio is not None:
@@ -56,8 +59,8 @@ class Aggregation:
         return {name: compare(*pair, draws=self.draws, seed=self.seed) for name, pair in pairs.items()}
 
 
-def _shared(taken: BySeed) -> list[str]:
-    return [name for name in taken[0] if all(name in one for one in taken)]
+def _shared(by_seed: BySeed) -> list[str]:
+    return [name for name in by_seed[0] if all(name in one for one in by_seed)]
 
 
 def row_entry(
@@ -68,10 +71,15 @@ def row_entry(
     aggregation: Aggregation,
     no_contact: BySeed = (),
 ) -> dict[str, Any]:
-    """The numbers of a row: measures of touches, of blurred touches, paired differences from the controls, verdict.
+    """Return the numbers of a row: measures, low-pass measures, paired differences from the controls, verdict.
 
-    blurred is empty for a method that looks at nothing, which has no verdict. order: of the control of that name.
-    untouched: of the no-contact frames alone, where the verdict counts them.
+    Args:
+        protocol: The protocol.
+        touch: Measures of the touches.
+        low_pass: Measures of low-pass touches; empty for a trivial baseline, which has no verdict.
+        order: Measures of the control of that name.
+        aggregation: How measures are aggregated.
+        no_contact: Measures of the no-contact frames alone, if the verdict uses them.
     """
     measures = aggregation.summaries(touch)
     entry: dict[str, Any] = {"measures": measures, "low_pass": None, "verdict": None, **dict.fromkeys(CONTROL_NAMES)}
@@ -90,22 +98,24 @@ def row_entry(
 
 
 def control_entry(
-    protocol: Protocol, description: str, reason: str | None, taken: BySeed, aggregation: Aggregation
+    protocol: Protocol, description: str, reason: str | None, by_seed: BySeed, aggregation: Aggregation
 ) -> dict[str, Any]:
-    """The numbers of a control, or why there are none."""
+    """Return the numbers of a control, or the reason why there are none."""
     return {
         "description": description,
         "reason": reason,
-        "measures": aggregation.summaries(taken) if taken else None,
-        "correct_counts": _correct_counts(taken, protocol.binomial_measure),
+        "measures": aggregation.summaries(by_seed) if by_seed else None,
+        "correct_counts": _correct_counts(by_seed, protocol.binomial_measure),
     }
 
 
 def verdict(summary: Mapping[str, Any], *differences: Mapping[str, Any]) -> dict[str, Any]:
-    """Whether a row's main measure counts as touch, and why, in words.
+    """Return whether a row's main measure counts as touch, and the reason in words.
 
-    differences: paired, from the first controls of `CONTROL_NAMES` in turn; all must lie above 0 with their whole
-    interval.
+    Args:
+        summary: The main measure.
+        *differences: Paired differences from the controls, in the order of `CONTROL_NAMES`; the whole interval of each
+            must be above 0.
     """
     counts = all(one["low"] > 0 for one in differences)
     found = [_against(one, name) for one, name in zip(differences, CONTROL_NAMES.values(), strict=False)]
@@ -121,27 +131,30 @@ def _against(difference: Mapping[str, Any], control: str) -> str:
         return f"{points} over {control}"
     if high < 0:
         return f"{points} below {control}"
-    return f"{points} against {control}, an interval that holds 0"
+    return f"{points} against {control}, an interval that contains 0"
 
 
 def reliability_entry(confidences: Sequence[Mapping[str, NDArray[np.float64]]]) -> dict[str, list[dict[str, Any]]]:
-    """Whether stated probabilities of first guesses came true, by what was searched: for each bin of .1 that is not
-    empty {"from", "to", "stated", "true", "count"}.
+    """Return reliability bins of top-1 confidences, by searched set.
 
-    stated: for each fold, by what was searched (Q, 2), the probability and the share that is right.
+    Args:
+        confidences: For each fold, by searched set, (Q, 2): probability and accuracy of the top-1 answer.
+
+    Returns:
+        For each non-empty bin of width 0.1 {"from", "to", "confidence", "accuracy", "count"}.
     """
     names = dict.fromkeys(name for one in confidences for name in one)
     return {name: _bins(np.concatenate([one[name] for one in confidences if name in one])) for name in names}
 
 
 def _bins(confidences: NDArray[np.float64]) -> list[dict[str, Any]]:
-    said, right = confidences.T
-    which = np.minimum((said * CONFIDENCE_BINS).astype(int), CONFIDENCE_BINS - 1)
+    stated, right = confidences.T
+    which = np.minimum((stated * CONFIDENCE_BINS).astype(int), CONFIDENCE_BINS - 1)
     return [
         {
             "from": place / CONFIDENCE_BINS,
             "to": (place + 1) / CONFIDENCE_BINS,
-            "confidence": float(said[which == place].mean()),
+            "confidence": float(stated[which == place].mean()),
             "accuracy": float(right[which == place].mean()),
             "count": int((which == place).sum()),
         }
@@ -150,12 +163,13 @@ def _bins(confidences: NDArray[np.float64]) -> list[dict[str, Any]]:
 
 
 def _correct_counts(by_seed: BySeed, name: str | None) -> dict[str, Any] | None:
-    """Right first answers, by seed, and the exact interval of their mean number: the queries of all seeds are the same,
-    so that more seeds make no more of them.
+    """Return the number of right top-1 answers by seed, and the exact interval of the mean rate.
+
+    All seeds have the same queries, so more seeds do not add queries.
     """
     if name is None or not by_seed or any(name not in found for found in by_seed):
         return None
     values = [found[name].values[:, 0] for found in by_seed]
-    right, asked = [float(one.sum()) for one in values], len(values[0])
-    low, high = clopper_pearson(sum(right) / len(right), asked, LEVEL)
-    return {"measure": name, "right": right, "queries": asked, "low": low, "high": high}
+    right, queries = [float(one.sum()) for one in values], len(values[0])
+    low, high = clopper_pearson(sum(right) / len(right), queries, LEVEL)
+    return {"measure": name, "right": right, "queries": queries, "low": low, "high": high}

@@ -1,5 +1,6 @@
-"""VT60: nine everyday objects, of which one was touched. One of the two classes of bottles is left out: 08_bottlefull
-and 02_bottleempty are the same things, and no photo tells them apart.
+"""VT60: identify the touched one of nine everyday objects.
+
+08_bottlefull is left out: its bottles are those of 02_bottleempty, and no photo distinguishes them.
 """
 
 from collections import defaultdict
@@ -30,7 +31,9 @@ _MEASURES = {
     **topn_accuracy(GALLERY, grasps=5, photos=3),
     **registered_metrics("pair_auc"),
 }
-_SPLIT_NOTE = "08_bottlefull is left out, which is 02_bottleempty filled. Five of the other objects choose settings."
+_SPLIT_NOTE = (
+    "08_bottlefull is left out, because it is 02_bottleempty filled. Five of the other objects validate settings."
+)
 _REFERENCE_MEASURES = {
     **topn_accuracy(GALLERY),
     **topn_accuracy(GALLERY, photos=3, entries="references"),
@@ -38,19 +41,23 @@ _REFERENCE_MEASURES = {
     **registered_metrics("pair_auc"),
 }
 _REFERENCE_SPLIT = (
-    "Of each object the first quarter of its touches are references, the last half asks. References and queries are of "
-    "one sitting and one finger, so that the control of the order knows all: only what the blur loses is touch."
+    "The first quarter of each object's touches are references, the last half are queries. Both come from one session "
+    "and one finger, so the order of capture identifies every object; only the loss of the low-pass control is touch."
 )
 
 
 def by_class(facts: RecordingFacts) -> dict[str, list[str]]:
-    """Objects of each class, sorted; without the class that is left out. Raises DatasetError where none is told."""
+    """Return the sorted objects of each class, without the class that is left out.
+
+    Raises:
+        DatasetError: The recording lacks the class of an object.
+    """
     found: dict[str, list[str]] = defaultdict(list)
     for name in facts.names:
         kind = facts.objects.get(name, {}).get("class")
         if kind is None:
             raise DatasetError(
-                f"recording.json must say of {name} what class it is of; make it with `retrieve import vt60`"
+                f"recording.json lacks the class of {name}. Import the data set again with `retrieve import vt60`."
             )
         if kind != LEFT_OUT:
             found[str(kind)].append(name)
@@ -58,32 +65,36 @@ def by_class(facts: RecordingFacts) -> dict[str, list[str]]:
 
 
 def _seen_classes(facts: RecordingFacts, seed: int) -> list[Split]:
-    """Instance number i of every class."""
+    """Return a fold for each instance number i, which tests instance i of every class."""
     classes = by_class(facts)
-    least = min(map(len, classes.values()))
-    tests = [[names[turn] for names in classes.values()] for turn in range(least)]
+    fewest = min(map(len, classes.values()))
+    tests = [[names[turn] for names in classes.values()] for turn in range(fewest)]
     return folds([name for names in classes.values() for name in names], tests, seed)
 
 
 def _choices(facts: RecordingFacts, seed: int) -> list[Split]:
-    """Two instances of every class: all pairs of instance numbers, the same in every class, then seeded draws. Raises
-    DatasetError for fewer than three instances of a class.
+    """Return folds that test two instances of every class.
+
+    All pairs of instance numbers, the same in every class, come first, then seeded draws.
+
+    Raises:
+        DatasetError: A class has fewer than three instances.
     """
     classes = by_class(facts)
     rng = np.random.default_rng([seed, 31])
-    least = min(map(len, classes.values()))
-    if least < 3:
+    fewest = min(map(len, classes.values()))
+    if fewest < 3:
         raise DatasetError(
-            f"two instances of each class test and others train; a class has {least}, give three or more"
+            f"Each class needs at least 3 instances, 2 for test and the others for training, but a class has {fewest}."
         )
-    tests = [[names[turn] for names in classes.values() for turn in pair] for pair in combinations(range(least), 2)]
+    tests = [[names[turn] for names in classes.values() for turn in pair] for pair in combinations(range(fewest), 2)]
     for _ in range(DRAWN_CHOICES):
         tests.append([name for names in classes.values() for name in rng.choice(names, 2, replace=False).tolist()])
     return folds([name for names in classes.values() for name in names], tests, seed)
 
 
 def _one_of_each_class(facts: RecordingFacts, split: Split) -> dict[str, str]:
-    """Galleries of one test object of each class: the first of each, the second, and so on."""
+    """Return galleries with one test object of each class: the first of each, the second, and so on."""
     test = set(split.test)
     return {
         name: f"instance {place}"
@@ -111,7 +122,7 @@ def _classes(facts: RecordingFacts, seed: int) -> list[Split]:
 SEEN_CLASSES = Protocol(
     "vt60",
     "VT60: an unseen instance of each seen class",
-    "A fold tests one instance of each of nine classes, the other instances train; every object is tested once. "
+    "A fold tests one instance of each of nine classes and trains on the others; every object is tested once. "
     f"{_SPLIT_NOTE}",
     _seen_classes,
     _MEASURES,
@@ -120,10 +131,10 @@ SEEN_CLASSES = Protocol(
 CHOICES = Protocol(
     "vt60",
     "VT60: two unseen instances of each class, over choices of them",
-    "A fold tests two instances of each of nine classes and learns from the others. All pairs of instance numbers are "
+    "A fold tests two instances of each of nine classes and trains on the others. All pairs of instance numbers are "
     f"held out, the same in every class, and {DRAWN_CHOICES} seeded draws of two instances in each class. A gallery "
-    "holds one test object of each class, and both galleries are asked. 08_bottlefull is left out, which is "
-    "02_bottleempty filled. Settings are chosen within the training objects of each fold.",
+    "contains one test object of each class; each query searches its own gallery. 08_bottlefull is left out, because "
+    "it is 02_bottleempty filled. Settings are selected within the training objects of each fold.",
     _choices,
     _MEASURES,
     allows_own_photos=True,
@@ -133,7 +144,7 @@ CHOICES = Protocol(
 RANDOM = Protocol(
     "vt60",
     "VT60: nine random unseen objects",
-    f"Objects are dealt by lot into folds of nine, again for each seed; every object is tested once. {_SPLIT_NOTE}",
+    f"Objects are randomly assigned to folds of nine, again for each seed; every object is tested once. {_SPLIT_NOTE}",
     _random,
     _MEASURES,
     allows_own_photos=True,
@@ -141,8 +152,8 @@ RANDOM = Protocol(
 CLASSES = Protocol(
     "vt60",
     "VT60: unseen classes",
-    "A fold tests all instances of three classes that nothing else has seen, drawn again for each seed; of their "
-    f"objects nine stand in a gallery. {_SPLIT_NOTE}",
+    "A fold tests all instances of three unseen classes, drawn again for each seed; a gallery contains nine of their "
+    f"objects. {_SPLIT_NOTE}",
     _classes,
     _MEASURES,
     allows_own_photos=True,
@@ -150,15 +161,15 @@ CLASSES = Protocol(
 
 
 def _with_references(name: str, protocol: Protocol, entry: str) -> Protocol:
-    """The protocol `name` with a catalogue of reference touches."""
-    called, held = {
+    """Return the protocol `name` with a catalogue of reference touches."""
+    label, content = {
         REFERENCE: ("reference touches", "touches in place of photos"),
         BOTH: ("reference touches with photos", "a touch with each photo"),
     }[entry]
     return replace(
         protocol,
-        title=protocol.title.replace("VT60", f"VT60, {called}"),
-        rule=f"As {name}, the catalogue holding {held}. {_REFERENCE_SPLIT} {_SPLIT_NOTE}",
+        title=protocol.title.replace("VT60", f"VT60, {label}"),
+        rule=f"As {name}, but the catalogue contains {content}. {_REFERENCE_SPLIT} {_SPLIT_NOTE}",
         measures=_REFERENCE_MEASURES,
         entry=entry,
     )

@@ -1,4 +1,4 @@
-"""Fitting to a new sensor: linear maps, objects left out once each, and a checkpoint like any other."""
+"""Adaptation to a new sensor: linear maps, cross-validation over objects, and an ordinary checkpoint."""
 
 import dataclasses
 import json
@@ -41,13 +41,13 @@ from retrieval.training.train import build_matcher
 
 @pytest.fixture
 def unchecked(monkeypatch):
-    """Without the check of touches, whose 700 foreign pictures take most of the time."""
+    """Skip the gel check, whose 700 foreign images take most of the time."""
     monkeypatch.setattr("retrieval.adaptation.fitting.with_verdicts", lambda made, *_, **__: made)
 
 
 def correlated_features(objects=30, grasps=6, seed=0):
-    """Features of touches (n, 12) and photos (n, 10) that share five numbers of their object, with noise, and whose
-    each grasp is (n,)."""
+    """Return noisy features of touches (n, 12) and photos (n, 10) with five common factors of their object, and the
+    owner (n,) of each grasp."""
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(objects), grasps)
     shared = rng.standard_normal((objects, 5))[owner]
@@ -67,19 +67,19 @@ def test_codes_distinguish_unseen_objects():
     projections = dict(fit_projections(touch, photo, owner, ([12], [10])))
     assert set(projections) == set(GRID)
     assert all(top1_accuracy(found, *other) > 0.9 for found in projections.values())  # chance 1 / 30
-    dealt = np.random.default_rng(2).permutation(30)[owner]  # photos of other objects
-    nothing = dict(fit_projections(touch, photo[np.argsort(dealt, kind="stable")], owner, ([12], [10])))
-    assert all(top1_accuracy(found, *other) < 0.2 for found in nothing.values())
+    permuted = np.random.default_rng(2).permutation(30)[owner]  # photos of other objects
+    control = dict(fit_projections(touch, photo[np.argsort(permuted, kind="stable")], owner, ([12], [10])))
+    assert all(top1_accuracy(found, *other) < 0.2 for found in control.values())
 
 
-def test_towers_side_by_side_weigh_the_same_whatever_their_unit():
+def test_combined_towers_have_equal_weight_at_any_scale():
     touch, photo, owner = correlated_features()
-    louder = touch * np.where(np.arange(12) < 4, 1000, 1).astype(np.float32)
-    plain, loud = (dict(fit_projections(x, photo, owner, ([4, 8], [10])))[CcaSettings()] for x in (touch, louder))
-    assert np.allclose(plain.cosines(touch, photo), loud.cosines(louder, photo), atol=1e-4)
+    scaled = touch * np.where(np.arange(12) < 4, 1000, 1).astype(np.float32)
+    plain, rescaled = (dict(fit_projections(x, photo, owner, ([4, 8], [10])))[CcaSettings()] for x in (touch, scaled))
+    assert np.allclose(plain.cosines(touch, photo), rescaled.cosines(scaled, photo), atol=1e-4)
 
 
-def test_a_map_and_another_after_it_are_one():
+def test_two_maps_compose_to_one():
     rng = np.random.default_rng(0)
     first = AffineMap(rng.standard_normal((4, 3)), rng.standard_normal(3))
     second = AffineMap(rng.standard_normal((3, 2)), rng.standard_normal(2))
@@ -87,12 +87,12 @@ def test_a_map_and_another_after_it_are_one():
     assert np.allclose(first.compose(second)(x), second(first(x)))
 
 
-def test_every_object_is_left_out_once_and_objects_of_one_sequence_together(recording):
+def test_every_object_is_held_out_once_and_objects_of_one_sequence_together(recording):
     grasps = load_grasps(recording)
     names = sorted({grasp.object_id for grasp in grasps})
     twins = {names[0], names[7]}
     grasps = [
-        dataclasses.replace(grasp, sequence_id="one sitting" if grasp.object_id in twins else None) for grasp in grasps
+        dataclasses.replace(grasp, sequence_id="one session" if grasp.object_id in twins else None) for grasp in grasps
     ]
     for seed in range(5):
         folds = draw_folds(grasps, seed)
@@ -100,44 +100,44 @@ def test_every_object_is_left_out_once_and_objects_of_one_sequence_together(reco
         assert any(twins <= set(fold) for fold in folds)
         assert min(map(len, folds)) >= 3
     few = [grasp for grasp in grasps if grasp.object_id in names[:5]]
-    with pytest.raises(BadInput, match="6 objects or more"):
+    with pytest.raises(BadInput, match="at least 6 objects, got 5"):
         draw_folds(few, 0)
 
 
 def with_noise(features, names, seed):
-    """The same grasps, those of `names` replaced by noise."""
+    """Return the features with those of `names` replaced by noise."""
     rng, rows = np.random.default_rng(seed), np.isin(features.object_ids, names)
     touch, photo = features.touch.copy(), features.photo.copy()
     touch[rows], photo[rows] = (rng.standard_normal(part[rows].shape) for part in (touch, photo))
     return dataclasses.replace(features, touch=touch, photo=photo)
 
 
-def test_a_fold_that_is_left_out_chooses_no_settings_and_teaches_nothing(monkeypatch):
+def test_a_held_out_fold_affects_neither_settings_nor_fit(monkeypatch):
     touch, photo, owner = correlated_features(objects=24)
     names = tuple(f"object-{number:02}" for number in owner)
     features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
     data = SimpleNamespace(grasps=[], kind_of=None, blocks=([12], [10]))
     drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
-    asked = []
-    monkeypatch.setattr(folds, "select_settings", lambda *given: asked.append(given) or select_settings(*given))
+    calls = []
+    monkeypatch.setattr(folds, "select_settings", lambda *args: calls.append(args) or select_settings(*args))
 
-    def fit(shown):
-        return list(folds.fit_folds(shown, drawn, data, seed=0, label="touches", quiet=True))
+    def fit(inputs):
+        return list(folds.fit_folds(inputs, drawn, data, seed=0, label="touches", quiet=True))
 
-    for fold, (shown, _, inner) in zip(fit(features), asked, strict=False):
-        assert not set(fold.left_out.object_ids) & {*shown.object_ids, *(name for part in inner for name in part)}
+    for fold, (fitted, _, inner) in zip(fit(features), calls, strict=False):
+        assert not set(fold.left_out.object_ids) & {*fitted.object_ids, *(name for part in inner for name in part)}
     first = fit(features)[0]
     noise, other = (fit(with_noise(features, drawn[0], seed))[0] for seed in range(2))
     for found in (noise, other):
         assert found.settings == first.settings
         np.testing.assert_array_equal(found.projections.touch.weight, first.projections.touch.weight)
-    # The objects that do teach matter, so that the same assertion can fail.
-    taught = fit(with_noise(features, drawn[1], 0))[0]
-    assert not np.array_equal(taught.projections.touch.weight, first.projections.touch.weight)
+    # Noise in fitted objects does change the fit.
+    changed = fit(with_noise(features, drawn[1], 0))[0]
+    assert not np.array_equal(changed.projections.touch.weight, first.projections.touch.weight)
 
 
-def test_a_setting_that_is_best_on_the_left_out_fold_alone_is_not_chosen(monkeypatch):
-    """Planted: one setting ranks the objects of one fold perfectly and all others not at all."""
+def test_a_setting_that_is_best_only_on_the_held_out_fold_is_not_selected(monkeypatch):
+    """Planted: one setting is perfect on the objects of one fold and useless on all others."""
     touch, photo, owner = correlated_features(objects=24)
     names = tuple(f"object-{number:02}" for number in owner)
     features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
@@ -146,25 +146,25 @@ def test_a_setting_that_is_best_on_the_left_out_fold_alone_is_not_chosen(monkeyp
     planted, plain = GRID[0], GRID[-1]
     current = []
     fit = cca_towers._fit
-    monkeypatch.setattr(cca_towers, "_fit", lambda *given: (current.append(one[0]) or one for one in fit(*given)))
+    monkeypatch.setattr(cca_towers, "_fit", lambda *args: (current.append(one[0]) or one for one in fit(*args)))
     monkeypatch.setattr(
         Validator,
-        "touches",
+        "touch_auc",
         lambda self, _: float(
             current[-1] == planted if set(self.features.object_ids) <= set(drawn[0]) else current[-1] == plain
         ),
     )
     found = list(folds.fit_folds(features, drawn, data, seed=0, label="touches", quiet=True))
     assert found[0].settings == plain
-    # Had the fold been asked, the planted setting would have been chosen.
+    # With the fold itself the planted setting is selected.
     assert select_settings(features, ([12], [10]), drawn[:1]).settings == planted
 
 
-def test_places_of_hand_made_scores():
+def test_accuracy_of_hand_made_scores():
     features = Features(
         tuple("1234"), ("a", "b", "c", "a"), np.zeros((4, 1, 1), np.float32), np.zeros((4, 1), np.float32)
     )
-    # Of a's touches the own photo is of the other grasp: 1 is shown photo 4, and 4 photo 1.
+    # The own photo of a touch of a is that of the other grasp: photo 4 for touch 1, photo 1 for touch 4.
     scores = np.array([[9, 2, 3, 4], [5, 5, 1, 5], [0, 1, 2, 3], [2, 2, 1, 9]], np.float32)
     found = score_accuracy(scores, features)
     assert found.objects == 3
@@ -175,38 +175,38 @@ def test_places_of_hand_made_scores():
     assert pair_accuracy([found]) == pytest.approx(np.mean(by_object))
 
 
-def test_the_preset_makes_the_towers_that_adapt_makes_of_the_shipped_model(tmp_path):
+def test_the_preset_builds_the_same_towers_as_adapt_with_the_shipped_model(tmp_path):
     torch.manual_seed(0)
     weights = tmp_path / "published.pth"
     torch.save(build_tower("mobilenet_v2", "stages").state_dict(), weights)
     preset = training_config("adapt", None, init=str(weights))
     preset = dataclasses.replace(preset, matcher=dataclasses.replace(preset.matcher, fingers=1))
     start = load_checkpoint(retrieval.shipped_model(1))
-    wanted = Matcher(config_for(start, 1, PUBLISHED_TOWER, seed=0).matcher, 2)
+    expected = Matcher(config_for(start, 1, PUBLISHED_TOWER, seed=0).matcher, 2)
     made = build_matcher(preset)
     for side in ("touch_tower", "photo_tower"):
-        load_start_weights(getattr(wanted, side), getattr(start.matcher, side), str(weights))
-        for name, tensor in getattr(wanted, side).state_dict().items():
+        load_start_weights(getattr(expected, side), getattr(start.matcher, side), str(weights))
+        for name, tensor in getattr(expected, side).state_dict().items():
             assert torch.equal(getattr(made, side).state_dict()[name], tensor), name
-    said = preset.without_paths()["training"]
-    assert (said["init"], said["init_touch"]) == ("published.pth", "shipped+init")
+    training = preset.without_paths()["training"]
+    assert (training["init"], training["init_touch"]) == ("published.pth", "shipped+init")
 
 
 @pytest.mark.slow
-def test_the_adapted_checkpoint_is_one_like_any_other(recording, model, catalogue, touch, tmp_path, monkeypatch):
+def test_the_adapted_checkpoint_is_an_ordinary_checkpoint(recording, model, catalogue, touch, tmp_path, monkeypatch):
     monkeypatch.setattr(Estimate, "is_baseline_better", False)
     out = tmp_path / "own.safetensors"
     data = adapt(recording, out, load_checkpoint(model), init="none", quiet=True).data
     made = load_checkpoint(out)
     assert set(made.split.train) == {grasp.object_id for grasp in load_grasps(recording)}
     assert made.posterior is not None
-    # The logit is the scaled cosine of projections and nothing else.
+    # The logit is only the scaled cosine of the projections.
     matcher, features = made.matcher, data.features
     with torch.inference_mode():
-        felt = matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1))
-        seen = matcher.photo_encoding(torch.from_numpy(features.photo))
-        logits = matcher.head(felt.partial, seen.partial)
-        cosines = (felt.embedding * seen.embedding).sum(1)
+        touch_codes = matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1))
+        photo_codes = matcher.photo_encoding(torch.from_numpy(features.photo))
+        logits = matcher.head(touch_codes.partial, photo_codes.partial)
+        cosines = (touch_codes.embedding * photo_codes.embedding).sum(1)
     assert torch.allclose(logits, matcher.cosine_scale.item() * cosines + matcher.head.out.bias.item(), atol=1e-4)
     assert matcher.cosine_scale > 0
     retrieval.build_index(catalogue, made, tmp_path / "index", quiet=True)
@@ -224,7 +224,7 @@ def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model,
     monkeypatch.setattr(Estimate, "is_baseline_better", True)
     estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True).estimate
     made = load_checkpoint(tmp_path / "own.safetensors")
-    assert "it is kept" in estimate.lines()[-1]
+    assert "unadapted model is used" in estimate.lines()[-1]
     assert made.config == start.config
     for name, tensor in start.matcher.state_dict().items():
         assert torch.equal(tensor, made.matcher.state_dict()[name])
@@ -233,7 +233,7 @@ def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model,
     other = dataclasses.replace(estimate, folds=estimate.folds)
     object.__setattr__(other.baseline.start.config.matcher, "fingers", 1)
     monkeypatch.undo()
-    assert not other.is_baseline_better  # of another number of fingers
+    assert not other.is_baseline_better  # another number of fingers
 
 
 @pytest.mark.usefixtures("unchecked")
@@ -255,55 +255,59 @@ def test_too_few_objects_give_a_checkpoint_without_probabilities(recording, mode
     estimate = adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=split).estimate
     made = load_checkpoint(tmp_path / "own.safetensors")
     assert (estimate, made.posterior, made.provenance["metrics"]) == (None, None, {})
-    assert "6 objects or more can be judged" in capsys.readouterr().err
+    assert (
+        "no accuracy estimate: Leaving each object out once needs at least 6 objects, got 4." in capsys.readouterr().err
+    )
     one = Split(0, tuple(names[:1]), (), tuple(names[1:]))
-    with pytest.raises(BadInput, match="two own objects at least"):
+    with pytest.raises(BadInput, match="at least 2 own objects"):
         adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=one)
 
 
 @pytest.fixture(scope="module")
-def beside(tmp_path_factory):
-    """Weights of a tower that was published nowhere."""
+def published(tmp_path_factory):
+    """Random weights in place of those of a published tower."""
     path = tmp_path_factory.mktemp("weights") / "mobilenet_v2.pth"
     torch.manual_seed(0)
     torch.save(build_tower("mobilenet_v2", "pooled").state_dict(), path)
     return path
 
 
-def test_features_of_towers_side_by_side_are_those_of_each(model, beside):
+def test_features_of_combined_towers_are_those_of_each(model, published):
     start = load_checkpoint(model)
     config = config_for(start, 2, PUBLISHED_TOWER, seed=0)
     matcher = Matcher(config.matcher, 2).eval()
-    load_start_weights(matcher.touch_tower, start.matcher.touch_tower, str(beside))
-    own, published = start.matcher.touch_tower, build_tower("mobilenet_v2", "pooled").eval()
-    initialise_tower(published, str(beside))
+    load_start_weights(matcher.touch_tower, start.matcher.touch_tower, str(published))
+    own, added = start.matcher.touch_tower, build_tower("mobilenet_v2", "pooled").eval()
+    initialise_tower(added, str(published))
     images = torch.rand(2, 3, 64, 64)
     with torch.inference_mode():
-        together = torch.cat([own(images), published(images)], 1)
+        together = torch.cat([own(images), added(images)], 1)
         assert torch.allclose(matcher.touch_tower(images), together, atol=1e-5)
 
 
-def test_the_published_tower_is_chosen_by_name_or_as_a_class(model):
+def test_the_published_tower_is_a_name_or_a_class(model):
     start = load_checkpoint(model)
     assert config_for(start, 2, "resnet18", seed=0).matcher.tower == "small+resnet18"
     assert config_for(start, 2, SmallTower, seed=0).matcher.tower == "small+small"
     assert config_for(start, 2, None, seed=0).matcher.tower == "small"
 
 
-def test_first_weights_are_one_for_all_towers_or_one_for_each(beside):
+def test_initial_weights_are_for_all_towers_or_for_each(published):
     two = build_tower("mobilenet_v2+small", "pooled")
-    initialise_tower(two, f"{beside}+random")
-    assert torch.equal(two.parts[0].features[0][0].weight, torch.load(beside, weights_only=True)["features.0.0.weight"])
-    with pytest.raises(CheckpointError, match="2 towers side by side take first weights for each"):
+    initialise_tower(two, f"{published}+random")
+    assert torch.equal(
+        two.parts[0].features[0][0].weight, torch.load(published, weights_only=True)["features.0.0.weight"]
+    )
+    with pytest.raises(CheckpointError, match="2 concatenated towers need initial weights each"):
         initialise_tower(two, "random+random+random")
 
 
 @pytest.mark.slow
-def test_the_curve_holds_fits_on_less_and_what_they_are_compared_with(recording, model, beside, tmp_path, monkeypatch):
+def test_the_curve_has_smaller_fits_and_their_comparisons(recording, model, published, tmp_path, monkeypatch):
     monkeypatch.setattr("retrieval.adaptation.curve.OBJECTS", (4, 1000))
     monkeypatch.setattr("retrieval.adaptation.curve.TOUCHES", (1, 100))
     start = load_checkpoint(model)
-    data = load_adaptation_data(recording, start, init=str(beside), split=None, cache=None, seed=0, quiet=True)
+    data = load_adaptation_data(recording, start, init=str(published), split=None, cache=None, seed=0, quiet=True)
     points = learning_curve(data, start, quiet=True)
     assert [point.label for point in points] == [
         UNADAPTED,
@@ -324,27 +328,27 @@ def test_the_curve_holds_fits_on_less_and_what_they_are_compared_with(recording,
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_the_command_says_what_it_found_and_goes_on_from_its_cache(recording, model, tmp_path, capsys):
+def test_the_command_prints_the_estimate_and_reuses_its_cache(recording, model, tmp_path, capsys):
     out, cache = tmp_path / "own.safetensors", tmp_path / "cache"
     line = ["adapt", str(recording), "--out", str(out), "--model", str(model), "--init", "none", "--cache", str(cache)]
     assert main(line) == 0
-    said = capsys.readouterr().err
-    for part in ("first guess", "blurred touch", "pair accuracy", "fitted to 12 objects, 36 touches"):
-        assert part in said
-    kept = sorted(cache.iterdir())
-    assert kept
+    output = capsys.readouterr().err
+    for part in ("top-1 accuracy", "low-pass touch", "pair accuracy", "fitted to 12 objects, 36 touches"):
+        assert part in output
+    stored = sorted(cache.iterdir())
+    assert stored
     assert main(line) == 0
-    assert sorted(cache.iterdir()) == kept
+    assert sorted(cache.iterdir()) == stored
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_a_report_that_cannot_be_made_is_said_to_be_missing(recording, model, tmp_path, capsys):
+def test_a_report_that_cannot_be_written_is_reported_as_missing(recording, model, tmp_path, capsys):
     names = sorted({grasp.object_id for grasp in load_grasps(recording)})
     split = tmp_path / "split.json"
     split.write_text(json.dumps(Split(0, tuple(names[:4]), (), tuple(names[4:])).to_dict()))
     line = ["adapt", str(recording), "--out", str(tmp_path / "own.safetensors"), "--model", str(model)]
     assert main([*line, "--init", "none", "--split", str(split), "--report", str(tmp_path / "curve")]) == 0
-    said = capsys.readouterr().err
-    assert "6 objects or more can be judged" in said
-    assert f"{tmp_path / 'curve'} is not written" in said
+    output = capsys.readouterr().err
+    assert "at least 6 objects, got 4" in output
+    assert f"{tmp_path / 'curve'} was not written" in output
     assert not (tmp_path / "curve").exists()

@@ -1,5 +1,4 @@
-"""The leakage audit: planted copies are found whatever was done to their bytes, and different frames are not taken
-for copies."""
+"""Leakage audit: planted copies are found after re-encoding, different frames are not reported as copies."""
 
 import shutil
 
@@ -16,7 +15,7 @@ from tests.retrieval.data.test_appearance_checks import COPIES, GENTLE
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory):
-    """10 objects, 3 grasps each, a photo and two touches."""
+    """Recording of 10 objects with 3 grasps each, a photo and two touches."""
     folder = tmp_path_factory.mktemp("audit") / "recording"
     return synthetic.write_recording(folder, synthetic.make_objects(10), 3, before=False)
 
@@ -31,13 +30,13 @@ def split_of(grasps):
     return Split(seed=0, train=tuple(names[:5]), validation=tuple(names[5:7]), test=tuple(names[7:]))
 
 
-def judge(folder, split=None):
+def run_audit(folder, split=None):
     grasps = load_grasps(folder)
     return audit(grasps, split or split_of(grasps), quiet=True)
 
 
 def one_of_each(folder):
-    """A training grasp, a validation grasp and a test grasp."""
+    """Return a training grasp, a validation grasp and a test grasp."""
     grasps = load_grasps(folder)
     return (split_of(grasps).select(grasps, part)[0] for part in ("train", "validation", "test"))
 
@@ -46,10 +45,10 @@ def brighter(picture, levels):
     return np.clip(picture.astype(np.int16) + levels, 0, 255).astype(np.uint8)
 
 
-def test_a_clean_recording_is_said_to_be_clean(recording):
-    found = judge(recording)
+def test_a_clean_recording_is_reported_as_clean(recording):
+    found = run_audit(recording)
     assert found["clean"]
-    assert found["verdict"].startswith("No object, sequence or file stands in two parts")
+    assert found["verdict"].startswith("No object, sequence or file is in two parts")
     assert (found["shared"], found["identical"]) == ([], {"count": 0, "examples": []})
     assert found["objects"] == {"train": 5, "validation": 2, "test": 3}
     assert found["grasps"] == {"train": 15, "validation": 6, "test": 9}
@@ -60,27 +59,28 @@ def test_a_clean_recording_is_said_to_be_clean(recording):
         assert frames["to_train_validation"][0] > 0.1
     checked = [found["frames"][kind]["checked"] for kind in ("photo", "touch a", "touch b")]
     assert checked[0] >= 7
-    assert f"{checked[0]} of 9 (photo), {checked[1]} of 9 (touch a), {checked[2]} of 9 (touch b)" in found["verdict"]
-    assert "none has one" in found["verdict"]
+    counts = f"{checked[0]} of 9 (photo), {checked[1]} of 9 (touch a), {checked[2]} of 9 (touch b) test frames"
+    assert counts in found["verdict"]
+    assert "none was found" in found["verdict"]
 
 
 def test_a_copied_file_is_found_under_another_name_and_in_another_column(recording):
     train, _, test = one_of_each(recording)
     shutil.copy(train.touches[0], test.touches[1])
-    found = judge(recording)
+    found = run_audit(recording)
     assert found["identical"]["count"] == 1
     assert found["identical"]["examples"] == [[f"test: {test.grasp_id} touch b", f"train: {train.grasp_id} touch a"]]
     assert not found["clean"]
-    assert "1 file(s) stand byte for byte in two parts" in found["verdict"]
+    assert "1 file(s) are byte-identical in two parts" in found["verdict"]
 
 
 @pytest.mark.parametrize("how", COPIES)
-def test_a_copy_encoded_again_made_brighter_moved_or_flipped_is_found(recording, how):
-    """The harder changes wipe out the fine relief of the drawn touches, which are said not to be checked."""
+def test_a_copy_that_is_re_encoded_brighter_moved_or_flipped_is_found(recording, how):
+    """Harder changes remove the fine relief of the drawn touches, which are then reported as unchecked."""
     train, _, test = one_of_each(recording)
     for source, copy in zip((train.photo, *train.touches), (test.photo, *test.touches), strict=True):
         cv2.imwrite(str(copy), COPIES[how](cv2.imread(str(source))))
-    found = judge(recording)
+    found = run_audit(recording)
     for kind in ("photo", "touch a", "touch b") if how in GENTLE else ("photo",):
         assert found["frames"][kind]["near_copies"] == 1
         assert f"1 of 9 test frames ({kind})" in found["verdict"]
@@ -88,8 +88,8 @@ def test_a_copy_encoded_again_made_brighter_moved_or_flipped_is_found(recording,
     assert (nearest["test"], nearest["train_validation"]) == (test.grasp_id, train.grasp_id)
 
 
-def test_bytes_alone_and_whole_numbers_alone_would_miss_it(recording):
-    """What the audit does not rely on: equal digests, and a difference of unsigned bytes."""
+def test_digests_and_unsigned_differences_miss_a_copy(recording):
+    """Naive checks that fail: equal digests, and a difference of unsigned bytes."""
     train, *_ = one_of_each(recording)
     picture = cv2.imread(str(train.photo))
     data = cv2.imencode(".jpg", brighter(picture, -1), [cv2.IMWRITE_JPEG_QUALITY, 95])[1]
@@ -102,18 +102,18 @@ def test_bytes_alone_and_whole_numbers_alone_would_miss_it(recording):
 
 
 def test_a_copy_of_a_validation_frame_counts_too(recording):
-    """The test objects must be new to what was chosen as well as to what was fitted."""
+    """Validation objects select settings, so test objects must differ from them too."""
     _, validation, test = one_of_each(recording)
     shutil.copy(validation.photo, test.photo)
-    found = judge(recording)
+    found = run_audit(recording)
     assert found["identical"]["count"] == found["frames"]["photo"]["near_copies"] == 1
 
 
-def test_shared_objects_and_sequences_are_said(recording):
+def test_shared_objects_and_sequences_are_reported(recording):
     grasps = load_grasps(recording)
     good = split_of(grasps)
     bad = Split(seed=0, train=(*good.train, good.test[0]), validation=good.validation, test=good.test)
-    found = judge(recording, bad)
+    found = run_audit(recording, bad)
     assert not found["clean"]
     assert "the split shares 1 object(s)" in found["verdict"]
 
@@ -121,21 +121,21 @@ def test_shared_objects_and_sequences_are_said(recording):
 def test_objects_outside_the_split_are_left_out(recording):
     grasps = load_grasps(recording)
     whole = split_of(grasps)
-    found = judge(recording, Split(seed=0, train=whole.train[:2], validation=(), test=whole.test))
+    found = run_audit(recording, Split(seed=0, train=whole.train[:2], validation=(), test=whole.test))
     assert found["grasps"] == {"train": 6, "validation": 0, "test": 9}
     assert found["frames"]["photo"]["train_validation"] == 6
 
 
-def test_without_frames_on_one_side_there_is_nothing_to_compare(recording):
-    """A model trained elsewhere: the recording holds test objects only."""
+def test_frames_of_one_side_only_are_not_compared(recording):
+    """A model trained elsewhere: the recording has only test objects."""
     grasps = load_grasps(recording)
     names = tuple(sorted({grasp.object_id for grasp in grasps}))
-    found = judge(recording, Split(seed=0, train=(), validation=(), test=names))
+    found = run_audit(recording, Split(seed=0, train=(), validation=(), test=names))
     assert found["frames"]["photo"]["to_train_validation"] is None
     assert found["frames"]["photo"]["nearest"] == []
     assert found["clean"]
-    assert "no frames of both sides to compare" in found["verdict"]
-    nothing = judge(recording, Split(seed=0, train=names, validation=(), test=()))["frames"]["photo"]
+    assert "near copies were not checked, as one side has no frames" in found["verdict"]
+    nothing = run_audit(recording, Split(seed=0, train=names, validation=(), test=()))["frames"]["photo"]
     assert (nothing["test"], nothing["to_train_validation"], nothing["within_object"]) == (0, None, None)
 
 
@@ -143,22 +143,22 @@ def test_a_damaged_image_is_named(recording):
     train, *_ = one_of_each(recording)
     train.photo.write_bytes(b"no picture")
     with pytest.raises(ImageError, match=train.photo.name):
-        judge(recording)
+        run_audit(recording)
 
 
 def test_two_runs_agree_to_the_last_digit(recording):
-    assert judge(recording) == judge(recording)
+    assert run_audit(recording) == run_audit(recording)
 
 
 def test_low_contact_touches_are_reported_as_unchecked(recording):
-    """Of the untouched gel, with noise of its own, no copy can be told: the verdict does not call it checked."""
+    """Noisy no-contact frames lack detail to recognise a copy, so the verdict does not count them as checked."""
     rng = np.random.default_rng(0)
     gel = cv2.imread(str(load_grasps(recording)[0].touches[0]))
     for grasp in load_grasps(recording):
         noisy = np.clip(gel + rng.normal(0, 1.5, gel.shape), 0, 255).astype(np.uint8)
         cv2.imwrite(str(grasp.touches[0]), noisy)
-    found = judge(recording)
+    found = run_audit(recording)
     frames = found["frames"]["touch a"]
     assert (frames["checked"], frames["near_copies"], frames["nearest"]) == (0, 0, [])
     assert "0 of 9 (touch a)" in found["verdict"]
-    assert "the others show too little to tell a copy by" in found["verdict"]
+    assert "the other test frames have too little detail to recognise a copy" in found["verdict"]

@@ -1,4 +1,4 @@
-"""Calibration of pairs, of sums of grasps and of objects: true odds found again, and hard scores."""
+"""Calibration of pairs, sums of grasps and objects: planted odds are recovered; hard scores."""
 
 import json
 import math
@@ -31,7 +31,7 @@ def table_of(scores, owner, rows=None, own=None):
 
 
 def planted(objects=20, grasps=10, seed=0, scale=1.0):
-    """True pairs score N(1, 2), false ones N(-1, 2): the log-odds of a score are the score itself."""
+    """Return scores N(1, 2) of true pairs and N(-1, 2) of false ones: the log-odds equal the score."""
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(objects), grasps)
     signs = np.where(owner[:, None] == owner, 1, -1)
@@ -39,7 +39,7 @@ def planted(objects=20, grasps=10, seed=0, scale=1.0):
 
 
 def sets_of(table, grasps, shared, seed=0):
-    """Scores of sums of grasps whose errors are the same to the share `shared`."""
+    """Return scores of sums of grasps; a fraction `shared` of the error variance is common to all grasps."""
     rng = np.random.default_rng(seed)
     owner = table.photo_owner
     signs = np.where(owner[:, None] == owner, 1, -1)
@@ -48,21 +48,21 @@ def sets_of(table, grasps, shared, seed=0):
     return table_of(grasps * signs + common + single, owner)
 
 
-# Which pairs are matches -----------------------------------------------------------------------------------
+# Pair threshold -----------------------------------------------------------------------------------
 
 
-def test_no_threshold_is_fitted_on_fewer_than_ten_objects_and_the_reason_is_said():
+def test_fewer_than_ten_objects_give_no_threshold_but_a_reason():
     found = pair_rule({}, planted(objects=9))
     assert found.rule is None
     assert found.to_dict() == {
         "at": None,
         "from": None,
-        "reason": "pair accuracy needs a threshold: a checkpoint's own, or one fitted on 10 validation objects; "
-        "there are 9",
+        "reason": "pair accuracy needs a threshold of the checkpoint, or one fitted on at least 10 validation objects; "
+        "the split has 9",
     }
 
 
-def test_of_ten_objects_a_threshold_is_fitted_where_the_log_odds_are_0():
+def test_ten_objects_give_a_threshold_at_log_odds_0():
     table = planted(objects=10)
     found = pair_rule({}, table)
     assert found.rule == calibrate_pairs(table)
@@ -70,20 +70,20 @@ def test_of_ten_objects_a_threshold_is_fitted_where_the_log_odds_are_0():
     assert found.rule.log_odds(found.to_dict()["at"]) == pytest.approx(0, abs=1e-9)
 
 
-def test_a_checkpoints_own_threshold_goes_before_one_that_validation_objects_would_give():
+def test_a_checkpoints_own_threshold_has_priority():
     for objects in (2, 20):
         found = pair_rule({"pair_threshold": 1.5}, planted(objects=objects))
         assert found.to_dict() == {"at": 1.5, "from": "the checkpoint", "reason": None}
-        # By hand: a match scores above 1.5, exactly 1.5 is a coin.
+        # By hand: a match scores above 1.5; exactly 1.5 counts 1/2.
         table = table_of([[9, 2.0], [1.5, 1]], [0, 1], own=np.zeros((2, 2), bool))
         assert pair_accuracy(table, found.rule).values.ravel().tolist() == [(1 + 0) / 2, (0 + 0.5) / 2]
 
 
-# What is drawn ---------------------------------------------------------------------------------------------
+# Drawn pairs and tests ---------------------------------------------------------------------------------------------
 
 
-def test_drawn_pairs_are_even_in_every_row_and_hold_no_own_photo():
-    """Scores name row and column, so every pair can be told."""
+def test_drawn_pairs_are_balanced_in_every_row_and_exclude_the_own_photo():
+    """Each score encodes its row and column, so every pair is identified."""
     owner = np.repeat([0, 1, 2], [3, 4, 12])
     table = table_of(np.arange(19 * 19).reshape(19, 19), owner)
     scores, labels = draw_pairs(table, seed=0)
@@ -92,8 +92,8 @@ def test_drawn_pairs_are_even_in_every_row_and_hold_no_own_photo():
     np.testing.assert_array_equal(labels, owner[rows] == owner[columns])
     assert len(np.unique(scores[labels == 1])) == labels.sum()  # without replacement
     for row in range(19):
-        wanted = min(8, np.sum(owner == owner[row]) - 1)
-        assert [np.sum((rows == row) & (labels == label)) for label in (0, 1)] == [wanted, wanted]
+        expected = min(8, np.sum(owner == owner[row]) - 1)
+        assert [np.sum((rows == row) & (labels == label)) for label in (0, 1)] == [expected, expected]
 
 
 def test_the_object_of_a_false_pair_is_drawn_before_its_photo():
@@ -102,7 +102,7 @@ def test_the_object_of_a_false_pair_is_drawn_before_its_photo():
     assert np.mean(scores[labels == 0][:72] == 1) == pytest.approx(0.5, abs=0.2)  # naively, by photos, 2 / 92
 
 
-def test_drawn_choices_have_the_true_object_first_and_rivals_without_replacement():
+def test_drawn_tests_have_the_true_object_first_and_rivals_without_replacement():
     owner = np.repeat(np.arange(7), 3)
     scores = draw_k_way_tests(table_of(np.tile(owner, (21, 1)), owner), KWayTest(4, photos=2), seed=0)
     assert scores.shape == (4 * 21, 4)
@@ -112,37 +112,37 @@ def test_drawn_choices_have_the_true_object_first_and_rivals_without_replacement
     assert counts.min() > 18  # 36 each on average
 
 
-def test_with_few_objects_a_choice_is_among_those_that_there_are():
+def test_a_test_has_at_most_as_many_candidates_as_objects():
     assert draw_k_way_tests(planted(objects=3), KWayTest(10), seed=0).shape[1] == 3
-    with pytest.raises(BadInput, match="two objects at least; got 1"):
+    with pytest.raises(BadInput, match="at least 2 objects, got 1"):
         draw_k_way_tests(table_of(np.zeros((2, 2)), [0, 0]), KWayTest(5), seed=0)
-    with pytest.raises(BadInput, match="two objects at least; got 1"):
+    with pytest.raises(BadInput, match="at least 2 objects, got 1"):
         draw_pairs(table_of(np.zeros((2, 2)), [0, 0]), seed=0)
 
 
 # Pairs and sums --------------------------------------------------------------------------------------------
 
 
-def test_true_odds_of_pairs_are_found_again_at_any_scale():
+def test_planted_odds_of_pairs_are_recovered_at_any_scale():
     for scale in (1.0, 5.0, 0.2):
         fitted = calibrate_pairs(planted(scale=scale))
         assert fitted.slope * scale == pytest.approx(1, abs=0.08)
         assert fitted.intercept == pytest.approx(0, abs=0.15)
 
 
-def test_sums_of_grasps_that_err_alike_get_a_smaller_slope_than_the_sum_of_log_odds_would_have():
-    """Errors wholly shared: the sum of 5 is 5 times one, and its slope a fifth; wholly apart: log-odds add up."""
+def test_sums_of_grasps_with_common_errors_get_a_smaller_slope():
+    """Common errors: the sum of 5 is 5 times one, its slope 1/5. Independent errors: log-odds add."""
     one = planted()
     for shared, slope in ((1.0, 0.2), (0.0, 1.0), (0.5, 1 / 3)):
         fitted = calibrate_pairs(sets_of(one, 5, shared))
         assert fitted.slope == pytest.approx(slope, rel=0.15)
-    # Naively, by one grasp's calibration, a sum of alike ones is far too sure of itself.
+    # Naive: with the calibration of one grasp, a sum with common errors is overconfident.
     sums = sets_of(one, 5, 1.0, seed=1)
     scores, labels = draw_pairs(sums, seed=0)
     single = calibrate_pairs(one)
     added = expit(single.slope * scores + 5 * single.intercept)
-    said = (added, calibrate_pairs(sets_of(one, 5, 1.0)).probability(scores))
-    naive, ours = (reliability_bins(probability, labels)["ece"] for probability in said)
+    probabilities = (added, calibrate_pairs(sets_of(one, 5, 1.0)).probability(scores))
+    naive, ours = (reliability_bins(probability, labels)["ece"] for probability in probabilities)
     assert ours < 0.04 < 0.08 < naive
 
 
@@ -150,7 +150,7 @@ def test_sums_of_grasps_that_err_alike_get_a_smaller_slope_than_the_sum_of_log_o
 
 
 def views(objects=20, grasps=10, seed=0, scale=1.0, shift=0.0):
-    """As `planted`, the photos of an object alike to a row: one tells what all do, and the posterior is as planted."""
+    """Return `planted` scores that are equal for all photos of an object, so the posterior is as planted."""
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(objects), grasps)
     noise = rng.normal(size=(len(owner), objects))[:, owner]
@@ -158,22 +158,22 @@ def views(objects=20, grasps=10, seed=0, scale=1.0, shift=0.0):
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1, 0), (5, 0), (0.2, 1000)])
-def test_true_odds_of_objects_are_found_again_in_any_unit(scale, shift):
+def test_planted_odds_of_objects_are_recovered_in_any_unit(scale, shift):
     fitted = calibrate({1: views(objects=40, scale=scale, shift=shift)}).posteriors[1]
     assert fitted.slope * scale == pytest.approx(1, abs=0.15)
     for log_ratio in (-1.0, 0.0, 2.0):
         assert fitted.slope * (scale * log_ratio + shift) + fitted.offset == pytest.approx(log_ratio, abs=0.3)
 
 
-def test_a_set_of_grasps_counts_as_one_grasp_with_a_posterior_of_its_own():
-    """What the method made of five grasps is five times what it made of one: a fifth of the slope."""
+def test_a_set_of_grasps_has_its_own_posterior():
+    """The score of five grasps is five times that of one, so the slope is 1/5."""
     fitted = calibrate({1: views(), 5: views(scale=5)}).posteriors
     assert fitted[5].slope == pytest.approx(fitted[1].slope / 5, rel=1e-2)
-    assert fitted[5].dependence == 1.0  # a row is not taken apart
+    assert fitted[5].dependence == 1.0  # a row counts as one grasp
 
 
-def test_a_candidate_is_shown_by_what_the_posterior_makes_of_its_photos():
-    """Photos of 3 and 0, and none is another's: log of the mean of e^3 and 1, where the mean is 1.5."""
+def test_the_posterior_combines_the_photos_of_a_candidate():
+    """Photos score 3 and 0: the posterior gives the log of the mean of e^3 and 1; the plain mean is 1.5."""
     owner = np.repeat([0, 1], 2)
     table = table_of(np.tile([3.0, 0.0, 0.0, 3.0], (4, 1)), owner, own=np.zeros((4, 4), dtype=bool))
     pooled = draw_k_way_tests(table, KWayTest(2, photos=2), 0, Posterior())
@@ -184,7 +184,7 @@ def test_a_candidate_is_shown_by_what_the_posterior_makes_of_its_photos():
     )
 
 
-def test_choices_that_never_err_have_a_finite_slope_and_a_doubt():
+def test_error_free_scores_give_a_finite_slope_and_a_probability_below_1():
     owner = np.repeat(np.arange(6), 4)
     table = table_of(np.where(owner[:, None] == owner, 3.0, 0.0), owner)
     fitted = calibrate({1: table}).posteriors[1]
@@ -193,7 +193,7 @@ def test_choices_that_never_err_have_a_finite_slope_and_a_doubt():
 
 
 @pytest.mark.parametrize("value", [0.0, 1e6, -1e6, 3e38])
-def test_constant_scores_say_nothing_and_get_even_chances(value):
+def test_constant_scores_get_chance_probabilities(value):
     table = constant(value)
     for photos in (1, 3):
         found = reliability(calibrate({1: table}), {1: table}, [KWayTest(5, photos=photos)])
@@ -217,7 +217,7 @@ def test_a_score_that_is_not_finite_never_reaches_a_posterior(bad):
 
 
 def test_inverted_scores_get_low_probabilities():
-    """The smaller the slope the better: every candidate is about as likely."""
+    """A small slope is best: every candidate is about equally likely."""
     owner = np.repeat(np.arange(6), 4)
     fitted = calibrate({1: table_of(np.where(owner[:, None] == owner, -3.0, 0.0), owner)}).posteriors[1]
     assert fitted.slope < 0.02
@@ -233,12 +233,12 @@ def test_scores_of_any_size_give_finite_probabilities(scale):
     assert all(0 <= found[name]["ece"] <= 1 for name in ("pairs", "k5", "k10"))
 
 
-def test_two_objects_leave_the_posterior_out_and_pairs_in():
+def test_two_objects_give_a_pair_calibration_but_no_posterior():
     fitted = calibrate({1: planted(objects=2)})
     assert list(fitted.pairs) == [1]
     assert fitted.posteriors == {}
     assert set(reliability(fitted, {1: planted(objects=2)}, [KWayTest(2)])) == {"pairs"}
-    with pytest.raises(BadInput, match="three objects at least"):
+    with pytest.raises(BadInput, match="at least three objects"):
         posterior_questions(planted(objects=2))
 
 
@@ -246,7 +246,7 @@ def test_two_objects_leave_the_posterior_out_and_pairs_in():
 
 
 def test_bins_and_their_error_by_hand():
-    """Bins of a 15th: .1 alone; .30 and .32 in one, half of them true; 1.0 in the last."""
+    """Bins of width 1/15: .1 alone; .30 and .32 in one, half of them true; 1.0 in the last."""
     found = reliability_bins([0.1, 0.3, 0.32, 1.0], [0, 1, 0, 1])
     assert found["bins"] == [
         {"probability": pytest.approx(0.1), "frequency": 0, "count": 1},
@@ -256,23 +256,23 @@ def test_bins_and_their_error_by_hand():
     assert found["ece"] == pytest.approx((0.1 + 2 * 0.19 + 0) / 4)
 
 
-def test_the_error_is_that_which_the_fit_of_a_checkpoint_states():
+def test_the_calibration_error_equals_that_of_a_checkpoints_fit():
     scores, labels = draw_pairs(planted(), seed=0)
     fitted = fit_calibration(scores, labels)
     assert reliability_bins(fitted.probability(scores), labels)["ece"] == pytest.approx(fitted.ece_after, abs=1e-12)
 
 
-def test_equals_count_by_their_share():
+def test_fractional_outcomes_are_averaged():
     assert reliability_bins([0.25, 0.25], [0.25, 0.25])["ece"] == 0
 
 
-def test_no_probabilities_and_impossible_ones_are_refused():
+def test_missing_and_invalid_probabilities_are_refused():
     for bad in ([], [1.2], [math.nan], [-0.1]):
         with pytest.raises(BadInput, match="between 0 and 1"):
             reliability_bins(bad, [1.0] * len(bad))
 
 
-def test_what_was_fitted_on_validation_objects_holds_on_others_where_scores_are_made_alike():
+def test_a_calibration_transfers_to_objects_with_the_same_score_distribution():
     fitted = calibrate({1: views(), 5: views(scale=5)})
     tests = {1: views(seed=7), 5: views(scale=5, seed=7)}
     found = reliability(fitted, tests, [KWayTest(5), KWayTest(5, 5, 3)])
@@ -283,7 +283,7 @@ def test_what_was_fitted_on_validation_objects_holds_on_others_where_scores_are_
     assert json.loads(json.dumps(found, allow_nan=False)) == found
 
 
-def test_a_choice_that_the_test_objects_cannot_fill_is_left_out_and_so_is_one_of_grasps_without_a_posterior():
+def test_tests_with_too_few_objects_or_no_posterior_are_left_out():
     fitted = calibrate({1: planted(objects=4)})
     assert list(fitted.posteriors) == [1]
     test = planted(objects=4, seed=1)

@@ -1,4 +1,4 @@
-"""An evaluation from recording to results: the same to the byte each time, resumable, equal to what plain loops say."""
+"""Evaluation from recording to results: byte-identical, resumable, equal to plain loops."""
 
 import dataclasses
 import json
@@ -33,7 +33,7 @@ FEW = ("late_fusion", "retrieve_rerank", "cca", "constant")
 
 @pytest.fixture(scope="module")
 def grasped(tmp_path_factory):
-    """18 drawn objects, 4 grasps each: 6 test objects, enough for guesses among five."""
+    """18 drawn objects with 4 grasps each: 6 test objects, enough for top-1 of 5."""
     return synthetic.write_recording(tmp_path_factory.mktemp("grasped") / "drawn", synthetic.make_objects(18), 4)
 
 
@@ -44,18 +44,18 @@ def cache(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(grasped, cache):
-    """Evaluate the recording into a folder, quietly."""
+    """Function that evaluates the recording into a folder."""
 
     def run(out, **changes):
-        given = {"config": CONFIG, "preset": "test", "methods": FEW, "cache": cache, "quiet": True} | changes
-        return evaluate(given.pop("recording", grasped), out, **given)
+        options = {"config": CONFIG, "preset": "test", "methods": FEW, "cache": cache, "quiet": True} | changes
+        return evaluate(options.pop("recording", grasped), out, **options)
 
     return run
 
 
 @pytest.fixture(scope="module")
 def made(run, tmp_path_factory):
-    """(results, folder) of an evaluation with two seeds."""
+    """Results and folder of an evaluation with two seeds."""
     out = tmp_path_factory.mktemp("made") / "report"
     return run(out, seeds=2), out
 
@@ -79,14 +79,14 @@ def test_results_describe_data_and_settings(made, grasped):
     assert {(one["a"], one["b"]) for one in results["comparisons"]} == {("late_fusion", name) for name in FEW[1:]}
     assert results["audit"]["clean"]
     assert set(results["low_contact"]["methods"]) == set(FEW)
-    assert results["low_contact"]["touches"] == 1  # a twentieth of 24
+    assert results["low_contact"]["touches"] == 1  # 5 % of 24
     assert results["low_contact"]["methods"]["late_fusion"]["others"]["topn_k5"]["queries"] == 23
     summary = results["methods"]["late_fusion"]["measures"]["topn_k5"]
     assert (summary["objects"], summary["queries"], len(summary["value"])) == (6, 24, 5)
 
 
 class Loudest(Method):
-    """Every touch fits the photo with the largest features best."""
+    """Method that ranks the photo with the largest features first for every touch."""
 
     is_seeded = False
 
@@ -103,7 +103,7 @@ class Loudest(Method):
         return touch_encodings @ photo_encodings.T
 
 
-def test_a_method_of_ones_own_stands_in_the_report_beside_ours(run, tmp_path, grasped, monkeypatch):
+def test_a_users_own_method_appears_in_the_report(run, tmp_path, grasped, monkeypatch):
     out, name = tmp_path / "report", f"{__name__}:Loudest"
     results = run(out, methods=("constant", Loudest), seeds=2)
     assert list(results["methods"]) == ["constant", name]
@@ -121,9 +121,9 @@ def test_a_method_of_ones_own_stands_in_the_report_beside_ours(run, tmp_path, gr
     assert [type(method) for method in fitted] == [Loudest]
 
 
-def test_labelled_pairs_are_fitted_on_beside_the_training_objects_and_judged_by_nothing(run, cache, tmp_path):
-    apart = synthetic.write_recording(tmp_path / "apart", synthetic.make_objects(5, seed=7), 1)
-    training = dataclasses.replace(CONFIG.training, **label_recording(apart, tmp_path))
+def test_labelled_pairs_train_but_neither_validate_nor_test(run, cache, tmp_path):
+    other = synthetic.write_recording(tmp_path / "apart", synthetic.make_objects(5, seed=7), 1)
+    training = dataclasses.replace(CONFIG.training, **label_recording(other, tmp_path))
     config = dataclasses.replace(CONFIG, training=training)
     fitted_on = []
     with pytest.MonkeyPatch.context() as patch:
@@ -131,7 +131,7 @@ def test_labelled_pairs_are_fitted_on_beside_the_training_objects_and_judged_by_
         patch.setattr(Method, "fit", lambda self, *parts: fitted_on.append(parts) or fit(self, *parts))
         results = run(tmp_path / "report", config=config, methods=("cca", "late_fusion"))
     assert results["setting"]["features"]["pairs"] == 5
-    assert results["setting"]["config"]["training"]["photos"] == "photos"  # where it lay is nobody's concern
+    assert results["setting"]["config"]["training"]["photos"] == "photos"  # without its folder
     assert len(fitted_on) == 7  # two methods, three controls, two ceilings
     for fitted, validation in fitted_on[:5]:
         assert len({name for name in fitted.object_ids if name.startswith("like ")}) == 5
@@ -140,7 +140,7 @@ def test_labelled_pairs_are_fitted_on_beside_the_training_objects_and_judged_by_
     assert not any("like" in name for part in ("train", "validation", "test") for name in results["split"][part])
 
 
-def test_each_measure_has_its_interval_and_ten_candidates_need_ten_objects(made):
+def test_each_measure_has_an_interval_and_ten_candidates_need_ten_objects(made):
     for method in made[0]["methods"].values():
         assert {"pair_auc", "topn_k5", "topn_k5_g1_p3", "map", "paired_top1"} <= set(method["measures"])
         assert "topn_k10" not in method["measures"]
@@ -149,23 +149,23 @@ def test_each_measure_has_its_interval_and_ten_candidates_need_ten_objects(made)
             assert parts == set(summary)
 
 
-def test_four_validation_objects_give_no_threshold_and_pair_accuracy_is_missing_with_the_reason(made):
+def test_four_validation_objects_give_no_threshold_and_a_reason_instead_of_pair_accuracy(made):
     results, folder = made
-    why = "one fitted on 10 validation objects; there are 4"
+    reason = "one fitted on at least 10 validation objects; the split has 4"
     for method in results["methods"].values():
         assert "pair_accuracy" not in method["measures"]
-        assert method["pair_threshold"]["reason"].endswith(why)
+        assert method["pair_threshold"]["reason"].endswith(reason)
     assert not any("pair_accuracy" in one["measures"] for one in results["controls"].values())
     write_report(folder, None)
-    assert f"{why}." in (folder / "report.md").read_text()
+    assert f"{reason}." in (folder / "report.md").read_text()
 
 
-def test_a_method_that_says_nothing_is_exactly_at_chance_in_every_measure(made):
+def test_a_constant_scorer_is_exactly_at_chance_in_every_measure(made):
     for name, summary in made[0]["methods"]["constant"]["measures"].items():
         assert summary["value"] == pytest.approx(summary["chance"], abs=1e-12), name
 
 
-def test_whether_it_is_any_of_these_is_asked_of_single_grasps_and_by_the_number_of_grasps(made):
+def test_rejection_is_measured_for_single_grasps_and_by_number_of_grasps(made):
     for name, method in made[0]["methods"].items():
         found = method["reject"]
         assert set(found) == {
@@ -177,19 +177,21 @@ def test_whether_it_is_any_of_these_is_asked_of_single_grasps_and_by_the_number_
         assert set(method["calibration"]) == {"pairs", "posteriors"}
         assert set(method["reliability"]) == {"pairs", "k5"}
     constant = made[0]["methods"]["constant"]["reject"]
-    said = [constant[key]["value"][0] for key in ("auroc", "false_accepts_at_95", "balanced_accuracy")]
-    assert said == pytest.approx([0.5, 0.95, 0.5], abs=1e-12)
-    assert constant["risk_coverage"] == [[pytest.approx(1), pytest.approx(0.9)]]  # one of five, of half
+    values = [constant[key]["value"][0] for key in ("auroc", "false_accepts_at_95", "balanced_accuracy")]
+    assert values == pytest.approx([0.5, 0.95, 0.5], abs=1e-12)
+    assert constant["risk_coverage"] == [
+        [pytest.approx(1), pytest.approx(0.9)]
+    ]  # one right of five, in half of the queries
 
 
-def test_seeds_are_trained_where_they_make_a_difference(made):
+def test_only_methods_with_seeds_are_trained_for_each_seed(made):
     measures = {name: made[0]["methods"][name]["measures"]["pair_auc"] for name in FEW}
     assert [len(measures[name]["by_seed"]) for name in FEW] == [2, 2, 1, 1]
     assert measures["late_fusion"]["value"][0] == pytest.approx(np.mean(measures["late_fusion"]["by_seed"]))
 
 
 def match_logits(matcher, grasps):
-    """Table of every touch with every photo, from the images, one by one."""
+    """Return the logits of every touch with every photo, from the images, one by one."""
     load = CONFIG.preprocessing
     table = np.empty((len(grasps), len(grasps)))
     with torch.inference_mode():
@@ -218,11 +220,11 @@ def test_measures_equal_plain_loops_over_images_and_the_checkpoint_of_the_fit(se
     for name, by_object in (("recall_1", first), ("pair_auc", areas)):
         expected = np.mean([np.mean(values) for values in by_object.values()])
         found = results["methods"]["late_fusion"]["measures"][name]["by_seed"][seed][0]
-        # One pair of 1,440 may change places: features were encoded in batches of another size.
+        # One pair of 1,440 may swap: features were encoded in batches of another size.
         assert found == pytest.approx(expected, abs=1e-3)
 
 
-def test_two_runs_give_the_same_results_to_the_byte_and_no_paths_or_times(made, run, tmp_path):
+def test_results_are_byte_identical_and_contain_no_paths_or_times(made, run, tmp_path):
     run(tmp_path / "again", seeds=2)
     text = (tmp_path / "again" / "results.json").read_text()
     assert text == (made[1] / "results.json").read_text()
@@ -236,7 +238,7 @@ def test_two_runs_give_the_same_results_to_the_byte_and_no_paths_or_times(made, 
     assert times["methods"]["retrieve_rerank"]["fit_s"] == times["methods"]["late_fusion"]["fit_s"]
 
 
-def test_a_second_run_fits_nothing_and_another_method_is_added(made, run, monkeypatch):
+def test_a_second_run_fits_only_new_methods(made, run, monkeypatch):
     with monkeypatch.context() as during:
         no_fits(during)
         during.setattr("retrieval.evaluation.evaluate.audit", lambda *_, **__: pytest.fail("audited"))
@@ -246,28 +248,28 @@ def test_a_second_run_fits_nothing_and_another_method_is_added(made, run, monkey
     assert "chance" in added["methods"]
 
 
-def test_a_run_that_was_stopped_goes_on_where_it_was(run, tmp_path, monkeypatch, made):
+def test_a_stopped_run_resumes(run, tmp_path, monkeypatch, made):
     fitted = []
-    real = Experiment._fit
+    fit = Experiment._fit
 
     def stopping(self, name, seed):
         if name == "cca":
             raise KeyboardInterrupt
         fitted.append(name)
-        return real(self, name, seed)
+        return fit(self, name, seed)
 
     with monkeypatch.context() as during:
         during.setattr(Experiment, "_fit", stopping)
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path / "out", seeds=2)
     assert fitted == ["late_fusion", "late_fusion", "retrieve_rerank", "retrieve_rerank"]
-    monkeypatch.setattr(Experiment, "_fit", lambda self, *job: fitted.append(job[0]) or real(self, *job))
+    monkeypatch.setattr(Experiment, "_fit", lambda self, *job: fitted.append(job[0]) or fit(self, *job))
     assert run(tmp_path / "out", seeds=2) == made[0]
     assert fitted[4:6] == ["cca", "constant"]
     assert fitted[6:] == [*["late_fusion"] * 3, "cca", "cca"]  # the controls and the ceilings
 
 
-def test_ctrl_c_while_a_head_trains_says_how_to_go_on(run, tmp_path, monkeypatch):
+def test_ctrl_c_during_training_prints_how_to_resume(run, tmp_path, monkeypatch):
     loss = Trainer.loss
 
     def interrupted(self, loaded):
@@ -275,11 +277,11 @@ def test_ctrl_c_while_a_head_trains_says_how_to_go_on(run, tmp_path, monkeypatch
         return loss(self, loaded)
 
     monkeypatch.setattr(Trainer, "loss", interrupted)
-    with pytest.raises(JobInterrupted, match="the same command goes on with it"):
+    with pytest.raises(JobInterrupted, match="run the same command to continue"):
         run(tmp_path / "out", methods=("late_fusion",))
 
 
-def test_shuffled_touches_stay_in_their_part_and_photos_where_they_are():
+def test_shuffling_permutes_touches_and_leaves_photos():
     touch = np.arange(40, dtype=np.float32).reshape(20, 1, 2)
     features = Features(tuple(map(str, range(20))), ("a",) * 10 + ("b",) * 10, touch, touch[:, 0])
     permuted = _permute_touches(features, 0)
@@ -289,7 +291,7 @@ def test_shuffled_touches_stay_in_their_part_and_photos_where_they_are():
     assert permuted.object_ids == features.object_ids
 
 
-def test_a_control_is_left_out_where_the_frames_for_it_were_not_recorded(run, tmp_path):
+def test_a_control_is_left_out_without_no_contact_frames(run, tmp_path):
     bare = synthetic.write_recording(tmp_path / "bare", synthetic.make_objects(12), 3, before=False)
     results = run(tmp_path / "out", recording=bare, methods=("chance",))
     assert set(results["controls"]) == {"shuffled", "low_pass"}
@@ -298,8 +300,8 @@ def test_a_control_is_left_out_where_the_frames_for_it_were_not_recorded(run, tm
     assert set(results["methods"]["chance"]["reliability"]) == {"pairs"}
 
 
-def test_a_side_that_knows_the_object_reaches_its_ceiling_and_one_that_does_not_stays_at_chance(tmp_path):
-    """Photos name the object; touches are noise."""
+def test_an_informative_modality_has_a_high_ceiling_and_noise_stays_at_chance(tmp_path):
+    """Photos identify the object; touches are noise."""
     rng = np.random.default_rng(0)
     names = [f"object-{number:02}" for number in range(24)]
     owners = tuple(name for name in names for _ in range(6))
@@ -309,8 +311,8 @@ def test_a_side_that_knows_the_object_reaches_its_ceiling_and_one_that_does_not_
     grasps = [Grasp(str(row), owner, None, Path(f"{row}.png"), (), ()) for row, owner in enumerate(owners)]
     split = Split(0, tuple(names[:12]), tuple(names[12:16]), tuple(names[16:]))
     features = Features(tuple(map(str, range(144))), owners, touch, photo)
-    asked = draw_queries(grasps, split, 0)
-    experiment = Experiment(tmp_path, CONFIG, split, features, None, asked, None, shuffled=False, quiet=True)
+    queries = draw_queries(grasps, split, 0)
+    experiment = Experiment(tmp_path, CONFIG, split, features, None, queries, None, shuffled=False, quiet=True)
     found = {}
     for name, ceiling in ceiling_experiments(experiment).items():
         entry = score_control(CEILINGS[name], "cca", ceiling, 0, draws=100)
@@ -319,7 +321,7 @@ def test_a_side_that_knows_the_object_reaches_its_ceiling_and_one_that_does_not_
     assert found["touch_to_touch"] < 0.4  # chance is .2
 
 
-def test_objects_with_one_photo_have_no_ceiling_of_photos():
+def test_objects_with_one_photo_have_no_photo_ceiling():
     one = np.zeros((6, 1, 2), np.float32)
     features = Features(tuple("abcdef"), tuple("xxyyzz"), one, np.arange(3, dtype=np.float32).repeat(2)[:, None])
     experiment = Experiment(Path(), CONFIG, None, features, None, None, None, shuffled=False, quiet=True)
@@ -328,14 +330,14 @@ def test_objects_with_one_photo_have_no_ceiling_of_photos():
 
 def test_grasps_are_thinned_evenly(grasped):
     grasps = load_grasps(grasped)
-    kept = thin_grasps(grasps, 2)
-    assert [grasps.index(grasp) % 4 for grasp in kept] == [0, 3] * 18
+    thinned = thin_grasps(grasps, 2)
+    assert [grasps.index(grasp) % 4 for grasp in thinned] == [0, 3] * 18
     assert thin_grasps(grasps, 9) == grasps
 
 
 @pytest.fixture(scope="module")
 def model(grasped, tmp_path_factory):
-    """A checkpoint whose towers were trained, and what it is judged by without being fitted."""
+    """A checkpoint with trained towers."""
     out = tmp_path_factory.mktemp("m") / "m.safetensors"
     return train(
         grasped,
@@ -346,13 +348,11 @@ def model(grasped, tmp_path_factory):
 
 
 def test_a_checkpoint_is_evaluated_on_its_unseen_objects(model, run, tmp_path, monkeypatch):
-    no_fits_of_heads = []
-    real = Method.fit
-    monkeypatch.setattr(
-        Method, "fit", lambda self, *parts: no_fits_of_heads.append(type(self).__name__) or real(self, *parts)
-    )
+    fitted = []
+    fit = Method.fit
+    monkeypatch.setattr(Method, "fit", lambda self, *parts: fitted.append(type(self).__name__) or fit(self, *parts))
     results = run(tmp_path / "out", model=model.path, methods=("late_fusion", "cca"), seeds=2)
-    assert no_fits_of_heads == ["Cca", *["LateFusion"] * 3, "Cca", "Cca"]  # the controls and the ceilings
+    assert fitted == ["Cca", *["LateFusion"] * 3, "Cca", "Cca"]  # the controls and the ceilings
     assert results["split"] == {**model.split.to_dict(), "from": "the model's own"}
     assert results["setting"]["model"] == model.digest
     own = -model.posterior.offset / model.posterior.slope  # where slope * logit + offset is 0
@@ -367,40 +367,38 @@ def test_a_checkpoint_is_evaluated_on_its_unseen_objects(model, run, tmp_path, m
     assert "pair_accuracy" not in results["methods"]["cca"]["measures"]
     assert all(one["measure"] != "pair_accuracy" for one in results["comparisons"])
     times = json.loads((tmp_path / "out" / "timings.json").read_text())["methods"]
-    assert times["late_fusion"]["fit_s"] is None  # nobody measured it
+    assert times["late_fusion"]["fit_s"] is None  # a checkpoint is not fitted
     assert times["cca"]["fit_s"] > 0
 
 
 def test_a_checkpoint_of_another_recording_gets_a_new_split(model, run, tmp_path):
     other = synthetic.write_recording(tmp_path / "other", synthetic.make_objects(12, seed=50), 3)
     results = run(tmp_path / "out", recording=other, model=model.path, methods=("late_fusion",))
-    assert results["split"]["from"] == "drawn; the model has seen none of its objects"
+    assert results["split"]["from"] == "drawn; the model was trained on none of its objects"
 
 
-def test_a_model_that_saw_some_of_the_objects_needs_a_split(model, run, tmp_path):
+def test_a_model_trained_on_some_of_the_objects_needs_a_split(model, run, tmp_path):
     part = synthetic.write_recording(tmp_path / "part", synthetic.make_objects(9), 3)
-    with pytest.raises(DatasetError, match="give a split with --split"):
+    with pytest.raises(DatasetError, match="Give a split with --split"):
         run(tmp_path / "out", recording=part, model=model.path)
     split = make_split(load_grasps(part), validation=0.3, test=0.3, seed=0)
     results = run(tmp_path / "out", recording=part, model=model.path, split=split, methods=("late_fusion",))
     assert results["split"] == {**split.to_dict(), "from": "given"}
 
 
-def test_a_preset_that_trains_its_towers_trains_them_first_and_late_fusion_is_that_model(
-    run, model, tmp_path, monkeypatch
-):
+def test_a_preset_with_trained_towers_uses_them_for_late_fusion(run, model, tmp_path, monkeypatch):
     config = dataclasses.replace(CONFIG, training=dataclasses.replace(TRAINING, freeze_towers=False))
     results = run(tmp_path / "out", config=config, methods=("late_fusion", "retrieve_rerank"))
     made = load_checkpoint(tmp_path / "out" / "model.safetensors")
-    assert results["setting"]["model"] == made.digest == model.digest  # what `retrieve train` makes
+    assert results["setting"]["model"] == made.digest == model.digest  # the checkpoint of `retrieve train`
     no_fits(monkeypatch)
     assert run(tmp_path / "out", config=config, methods=("late_fusion", "retrieve_rerank")) == results
 
 
-def test_wrong_use_is_said_before_anything_is_read(run, tmp_path):
+def test_wrong_arguments_are_refused_before_anything_is_read(run, tmp_path):
     with pytest.raises(ConfigError, match=r"late_fusion, .*; got 'oracle'"):
         run(tmp_path / "out", methods=("cca", "oracle"))
-    with pytest.raises(BadInput, match="one seed at least"):
+    with pytest.raises(BadInput, match="at least 1 method and 1 seed, got 4 and 0"):
         run(tmp_path / "out", seeds=0)
     assert not (tmp_path / "out").exists()
 
@@ -409,14 +407,14 @@ def test_the_command_writes_a_report_and_one_json_document(grasped, tmp_path, ca
     out = tmp_path / "report"
     command = ["evaluate", str(grasped), "--out", str(out), "--preset", "tiny", "--iterations", "6"]
     assert main([*command, "--methods", "late_fusion,cca,chance", "--json"]) == 0
-    said = capsys.readouterr()
-    for role in ("", " (control: shuffled)", " (control: blurred)"):
-        assert f"evaluate: late_fusion, seed 0{role}\n" in said.err
-    assert json.loads(said.out) == json.loads((out / "results.json").read_text())
-    assert f"report: {out / 'report.md'}" in said.err
+    output = capsys.readouterr()
+    for role in ("", " (control: shuffled)", " (control: low_pass)"):
+        assert f"evaluate: late_fusion, seed 0{role}\n" in output.err
+    assert json.loads(output.out) == json.loads((out / "results.json").read_text())
+    assert f"report: {out / 'report.md'}" in output.err
     assert (out / "report.html").is_file()
-    assert json.loads(said.out)["setting"]["preset"] == "tiny"
-    assert main([*command, "--methods", "late_fusion,cca,chance"]) == 0  # goes on with what is there
+    assert json.loads(output.out)["setting"]["preset"] == "tiny"
+    assert main([*command, "--methods", "late_fusion,cca,chance"]) == 0  # resumes
     table = capsys.readouterr().out.splitlines()
     assert table[0].split()[:3] == ["method,", "%", "pair"]
     assert any(line.startswith("No pair accuracy of CCA, random scores: ") for line in table)
@@ -426,13 +424,13 @@ def test_the_command_writes_a_report_and_one_json_document(grasped, tmp_path, ca
         "random scores",
         "chance, closed form",
     ]
-    assert [line.count("[") for line in table[1:4]] == [2, 1, 1]  # late fusion brings a threshold of its own
+    assert [line.count("[") for line in table[1:4]] == [2, 1, 1]  # late fusion has its own threshold
     assert "queries of" in table[5]
 
 
-def test_the_command_refuses_what_it_would_not_look_at(grasped, tmp_path, capsys):
+def test_the_command_refuses_conflicting_options(grasped, tmp_path, capsys):
     command = ["evaluate", str(grasped), "--out", str(tmp_path / "r"), "--model", "m.safetensors"]
     assert main([*command, "--preset", "paper"]) == 2
-    assert "give --model, or --preset and --init" in capsys.readouterr().err
+    assert "give either --model or --preset and --init" in capsys.readouterr().err
     assert main([*command[:-2], "--methods", "oracle"]) == 2
     assert main(command) == 2

@@ -1,4 +1,4 @@
-"""Touches that hardly press the gel."""
+"""Low-contact touches, which hardly press the gel."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from retrieval.evaluation.low_contact import find_low_contact_touches, gel_chang
 
 
 def pressed(folder, name, levels, size=(6, 4)):
-    """A grasp of two fingers, whose images differ from the grey before by these levels in half of the pixels."""
+    """Write a grasp of two fingers whose images differ by these levels from no-contact frames in half the pixels."""
     touches, backgrounds = [], []
     for finger, level in zip("ab", levels, strict=True):
         before = np.full((*size, 3), 100, np.uint8)
@@ -45,5 +45,5 @@ def test_low_contact_needs_no_contact_frames(tmp_path):
 
 def test_a_frame_of_another_size_is_refused(tmp_path):
     one, other = pressed(tmp_path, "one", (4, 20)), pressed(tmp_path, "two", (4, 20), size=(8, 4))
-    with pytest.raises(DatasetError, match=r"of one size; got \(6, 4, 3\) and \(8, 4, 3\)"):
+    with pytest.raises(DatasetError, match=r"must have the same size, got \(6, 4, 3\) and \(8, 4, 3\)"):
         gel_change(replace(one, backgrounds=other.backgrounds))

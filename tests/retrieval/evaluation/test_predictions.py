@@ -1,4 +1,4 @@
-"""What methods are asked, and the file between predicting and scoring."""
+"""Queries, and the prediction files between prediction and scoring."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ SPLIT = Split(0, train=("a", "b"), validation=("c", "d"), test=("e", "f"))
 
 
 def recorded(counts):
-    """Grasps of objects, one object after another; every third photo is used for the next grasp too."""
+    """Return grasps of objects in turn; every third photo is shared with the next grasp."""
     grasps = []
     for name, count in counts.items():
         for number in range(count):
@@ -41,7 +41,7 @@ def test_queries_hold_all_test_grasps_and_some_of_the_others():
     assert len(set(QUERIES.touches.tolist())) == len(QUERIES.touches)
 
 
-def test_touches_and_photos_know_their_objects_and_parts():
+def test_touches_and_photos_have_the_right_objects_and_parts():
     assert QUERIES.objects == ("a", "b", "c", "d", "e", "f")
     for rows, owner in ((QUERIES.touches, QUERIES.touch_owner), (QUERIES.photos, QUERIES.photo_owner)):
         assert [GRASPS[row].object_id for row in rows] == [QUERIES.objects[number] for number in owner]
@@ -50,13 +50,13 @@ def test_touches_and_photos_know_their_objects_and_parts():
         assert {GRASPS[row].object_id for row in QUERIES.touches[places]} == set(getattr(SPLIT, part))
 
 
-def test_a_photo_file_stands_once_however_many_grasps_share_it():
+def test_a_shared_photo_file_is_listed_once():
     files = [GRASPS[row].photo for row in QUERIES.photos]
     assert len(set(files)) == len(files) < len(QUERIES.touches)
     assert [files[column] for column in QUERIES.own_photo] == [GRASPS[row].photo for row in QUERIES.touches]
 
 
-def test_sets_hold_different_grasps_of_one_object_and_leave_it_three_photos():
+def test_sets_have_different_grasps_of_one_object_and_leave_three_photos():
     have = {"c": 12, "d": 6, "e": 24, "f": 2}
     for size in SET_SIZES:
         sets = QUERIES.sets[size]
@@ -68,7 +68,7 @@ def test_sets_hold_different_grasps_of_one_object_and_leave_it_three_photos():
         assert set(counts.tolist()) == {SETS_OF_AN_OBJECT}
 
 
-def test_the_same_is_asked_for_one_seed_and_something_else_for_another():
+def test_queries_depend_on_the_seed():
     assert draw_queries(GRASPS, SPLIT, 0).digest == QUERIES.digest
     assert draw_queries(GRASPS, SPLIT, 1).digest != QUERIES.digest
     assert replace(QUERIES, sets={1: QUERIES.sets[1]}).digest != QUERIES.digest
@@ -77,7 +77,7 @@ def test_the_same_is_asked_for_one_seed_and_something_else_for_another():
 @pytest.mark.parametrize("part", ["train", "validation", "test"])
 def test_two_objects_of_each_part_must_be_recorded(part):
     lacking = [grasp for grasp in GRASPS if grasp.object_id != getattr(SPLIT, part)[0]]
-    with pytest.raises(DatasetError, match=f"two {part} objects at least; the recording has 1"):
+    with pytest.raises(DatasetError, match=f"at least 2 {part} objects, but the recording has 1"):
         draw_queries(lacking, SPLIT, 0)
 
 
@@ -96,7 +96,7 @@ def fitted(cls, features):
 
 
 class Largest(Chance):
-    """Fuses a set by its largest score."""
+    """Method that scores a set by its largest score."""
 
     def _score_sets(self, touch_encodings, photo_encodings, sets):
         return self._score(touch_encodings, photo_encodings)[sets].max(1)
@@ -113,11 +113,11 @@ def test_predictions_are_the_scores_of_the_queries_in_their_order(features, pred
     for row, column in ((0, 0), (7, 20), (30, 5)):
         touch = features.touch[QUERIES.touches[row]][None]
         photo = features.photo[QUERIES.photos[column]][None]
-        alone = method.score(method.encode_touch(touch), method.encode_photo(photo))
-        assert predictions.scores[row, column] == pytest.approx(alone[0, 0], abs=1e-6)
+        single = method.score(method.encode_touch(touch), method.encode_photo(photo))
+        assert predictions.scores[row, column] == pytest.approx(single[0, 0], abs=1e-6)
 
 
-def test_scores_of_sets_are_those_of_the_method_whether_it_adds_or_fuses(features, predictions):
+def test_scores_of_sets_are_those_of_the_method(features, predictions):
     method = fitted(Chance, features)
     codes = method.encode_touch(features.touch[QUERIES.touches]), method.encode_photo(features.photo[QUERIES.photos])
     for size, sets in QUERIES.sets.items():
@@ -128,18 +128,18 @@ def test_scores_of_sets_are_those_of_the_method_whether_it_adds_or_fuses(feature
         np.testing.assert_array_equal(fused.set_scores[size], expected)
 
 
-def test_times_are_told_apart_from_scores(predictions):
+def test_times_of_each_step_are_recorded(predictions):
     assert predictions.seconds["fit"] == 2.5
     assert set(predictions.seconds) == {"fit", "encode_touch", "encode_photo", "score", "query"}
     assert all(value >= 0 for value in predictions.seconds.values())
 
 
-MADE_BY = {"method": "chance", "seed": 0, "features": "ab" * 32, "queries": QUERIES.digest}
+CACHE_KEY = {"method": "chance", "seed": 0, "features": "ab" * 32, "queries": QUERIES.digest}
 
 
-def test_what_was_written_is_read(predictions, tmp_path):
-    write_predictions(tmp_path / "p.safetensors", predictions, MADE_BY)
-    found = read_predictions(tmp_path / "p.safetensors", MADE_BY)
+def test_written_predictions_are_read_back(predictions, tmp_path):
+    write_predictions(tmp_path / "p.safetensors", predictions, CACHE_KEY)
+    found = read_predictions(tmp_path / "p.safetensors", CACHE_KEY)
     np.testing.assert_array_equal(found.scores, predictions.scores)
     assert list(found.set_scores) == list(predictions.set_scores) == sorted(SET_SIZES)
     for size, scores in predictions.set_scores.items():
@@ -147,30 +147,30 @@ def test_what_was_written_is_read(predictions, tmp_path):
     assert (found.best_params, found.seconds) == (predictions.best_params, predictions.seconds)
 
 
-@pytest.mark.parametrize("key", [*MADE_BY, "model"])
-def test_scores_that_something_else_made_are_not_read(key, predictions, tmp_path):
-    write_predictions(tmp_path / "p.safetensors", predictions, MADE_BY)
-    assert read_predictions(tmp_path / "p.safetensors", {**MADE_BY, key: "other"}) is None
+@pytest.mark.parametrize("key", [*CACHE_KEY, "model"])
+def test_scores_with_another_key_are_not_read(key, predictions, tmp_path):
+    write_predictions(tmp_path / "p.safetensors", predictions, CACHE_KEY)
+    assert read_predictions(tmp_path / "p.safetensors", {**CACHE_KEY, key: "other"}) is None
 
 
 def test_a_flipped_bit_a_missing_file_and_a_nan_are_not_read(predictions, tmp_path):
     path = tmp_path / "p.safetensors"
-    assert read_predictions(path, MADE_BY) is None
-    write_predictions(path, predictions, MADE_BY)
+    assert read_predictions(path, CACHE_KEY) is None
+    write_predictions(path, predictions, CACHE_KEY)
     data = bytearray(path.read_bytes())
     data[-3] ^= 4
     path.write_bytes(data)
-    assert read_predictions(path, MADE_BY) is None
-    write_predictions(path, Predictions(np.full((1, 1), np.nan, np.float32), {}, {}, {}), MADE_BY)
-    assert read_predictions(path, MADE_BY) is None
+    assert read_predictions(path, CACHE_KEY) is None
+    write_predictions(path, Predictions(np.full((1, 1), np.nan, np.float32), {}, {}, {}), CACHE_KEY)
+    assert read_predictions(path, CACHE_KEY) is None
     write_tensors(path, {}, {})
-    assert read_predictions(path, MADE_BY) is None
+    assert read_predictions(path, CACHE_KEY) is None
 
 
-def test_showing_the_true_object_by_fewer_photos_would_favour_a_method_that_knows_nothing():
-    """Why sets leave three photos: means of one score against means of three, all of them noise."""
+def test_fewer_photos_of_the_true_object_favour_an_uninformative_method():
+    """Reason why sets leave three photos: compare means of one noise score with means of three."""
     noise = np.random.default_rng(0).standard_normal((20_000, 5, 3))
     candidates = noise.mean(2)
     assert np.mean(candidates.argmax(1) == 0) == pytest.approx(0.2, abs=0.01)
-    candidates[:, 0] = noise[:, 0, 0]  # the naive way: a set of 5 of 6 grasps leaves one photo
+    candidates[:, 0] = noise[:, 0, 0]  # naive: a set of 5 of 6 grasps leaves one photo
     assert np.mean(candidates.argmax(1) == 0) > 0.28

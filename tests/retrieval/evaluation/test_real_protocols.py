@@ -1,4 +1,4 @@
-"""Protocols of real data: nothing that tests is trained on, every object is tested once a seed, galleries as told."""
+"""Real-data protocols: disjoint splits, every object tested once for each seed, the right galleries."""
 
 from collections import Counter
 from pathlib import Path
@@ -45,7 +45,7 @@ def billets():
     return facts({f"{kind}-{place:02}": kind for kind in kinds for place in range(16)})
 
 
-MADE = {
+RECORDINGS = {
     "vt60-choices": vt60(),
     "vt60-seen-classes": vt60(),
     "vt60-random": vt60(),
@@ -65,38 +65,38 @@ MADE = {
     "feeling-of-success": facts(dict.fromkeys(f"o{n}" for n in range(105))),
 }
 WITHOUT_SPLIT = {"physiclear"}
-"""Nothing is trained; test_touch_to_touch has what holds of them."""
+"""Protocols without training; test_touch_to_touch tests them."""
 
 
 def folds(name, seed=0):
-    return PROTOCOLS.load(name).folds(MADE[name], seed)
+    return PROTOCOLS.load(name).folds(RECORDINGS[name], seed)
 
 
-def test_there_is_a_recording_here_for_every_protocol():
-    assert set(MADE) | WITHOUT_SPLIT == set(PROTOCOLS)
+def test_every_protocol_has_a_recording_here():
+    assert set(RECORDINGS) | WITHOUT_SPLIT == set(PROTOCOLS)
     assert all(isinstance(PROTOCOLS.load(name), TouchToTouch) == (name in WITHOUT_SPLIT) for name in PROTOCOLS)
 
 
-@pytest.mark.parametrize("name", MADE)
-def test_no_object_stands_in_two_parts_and_two_objects_at_least_in_each(name):
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_parts_are_disjoint_and_have_at_least_two_objects(name):
     for split in folds(name):
         parts = [set(part) for part in (split.train, split.validation, split.test)]
         assert sum(map(len, parts)) == len(set.union(*parts))
         assert min(map(len, parts)) >= 2
-        assert set.union(*parts) <= set(MADE[name].names)
+        assert set.union(*parts) <= set(RECORDINGS[name].names)
 
 
-@pytest.mark.parametrize("name", MADE)
+@pytest.mark.parametrize("name", RECORDINGS)
 def test_every_seed_tests_the_same_objects_each_once(name):
     tested = [Counter(each for split in folds(name, seed) for each in split.test) for seed in range(3)]
     if PROTOCOLS.load(name).choices:
-        assert all(set(each) == set(tested[0]) for each in tested)  # each of them, by some choice
+        assert all(set(each) == set(tested[0]) for each in tested)  # each object in some choice
     else:
         assert tested[0] == tested[1] == tested[2]
         assert set(tested[0].values()) == {1}
 
 
-def test_choices_hold_out_all_pairs_of_instance_numbers_and_then_drawn_ones():
+def test_choices_hold_out_all_pairs_of_instance_numbers_then_random_ones():
     splits = folds("vt60-choices")
     assert [len(split.test) for split in splits] == [18] * 15
     assert [len(split.train + split.validation) for split in splits] == [18] * 15
@@ -108,33 +108,33 @@ def test_choices_hold_out_all_pairs_of_instance_numbers_and_then_drawn_ones():
 
 
 def test_two_instances_of_a_class_leave_none_to_train():
-    with pytest.raises(DatasetError, match="a class has 2, give three or more"):
+    with pytest.raises(DatasetError, match=r"at least 3 instances, .* but a class has 2"):
         PROTOCOLS.load("vt60-choices").folds(vt60(instances=2), 0)
 
 
 def test_a_choice_has_two_galleries_of_one_object_of_each_class():
     protocol = PROTOCOLS.load("vt60-choices")
     for split in folds("vt60-choices"):
-        gallery_of = protocol.gallery_of(MADE["vt60-choices"], split)
+        gallery_of = protocol.gallery_of(RECORDINGS["vt60-choices"], split)
         assert set(gallery_of) == set(split.test)
         for gallery in set(gallery_of.values()):
             members = [name[:-2] for name in split.test if gallery_of[name] == gallery]
             assert (len(members), len(set(members))) == (9, 9)
 
 
-def test_a_protocol_without_galleries_of_its_own_has_one_or_one_of_each_sequence():
+def test_default_galleries_are_one_or_one_of_each_sequence():
     split = folds("vt60-random")[0]
-    assert set(PROTOCOLS.load("vt60-random").gallery_of(MADE["vt60-random"], split).values()) == {""}
+    assert set(PROTOCOLS.load("vt60-random").gallery_of(RECORDINGS["vt60-random"], split).values()) == {""}
     places = PROTOCOLS.load("billets-places")
-    assert set(places.gallery_of(MADE["billets-places"], folds("billets-places")[0]).values()) == {
+    assert set(places.gallery_of(RECORDINGS["billets-places"], folds("billets-places")[0]).values()) == {
         f"welded{number}" for number in range(5)
     }
 
 
-@pytest.mark.parametrize("name", MADE)
-def test_a_seed_draws_the_same_folds_each_time_and_another_one_others(name):
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_folds_depend_on_the_seed(name):
     assert folds(name, 1) == folds(name, 1)
-    if name != "objectfolder":  # which is split as published
+    if name != "objectfolder":  # has a published split
         assert [set(one.train) for one in folds(name, 0)] != [set(one.train) for one in folds(name, 1)]
 
 
@@ -145,14 +145,14 @@ def test_full_bottles_are_in_no_part():
         assert sum(len(split.test) for split in folds(name)) == 36
 
 
-def test_a_fold_of_seen_classes_tests_one_instance_of_each_and_knows_the_others():
+def test_a_fold_of_seen_classes_tests_one_instance_of_each_class():
     for split in folds("vt60-seen-classes"):
         kinds = [each.split("-")[0] for each in split.test]
         assert len(kinds) == len(set(kinds)) == 9
         assert set(kinds) == {each.split("-")[0] for each in (*split.train, *split.validation)}
 
 
-def test_a_fold_of_unseen_classes_tests_all_of_three_and_knows_none_of_them():
+def test_a_fold_of_unseen_classes_tests_all_objects_of_three_classes():
     for split in folds("vt60-classes"):
         kinds = {each.split("-")[0] for each in split.test}
         assert len(kinds) == 3
@@ -160,16 +160,16 @@ def test_a_fold_of_unseen_classes_tests_all_of_three_and_knows_none_of_them():
         assert not kinds & {each.split("-")[0] for each in (*split.train, *split.validation)}
 
 
-def test_random_folds_hold_nine_objects():
+def test_random_folds_have_nine_objects():
     assert [len(split.test) for split in folds("vt60-random")] == [9] * 4
 
 
-def test_a_recording_that_names_no_classes_is_refused():
+def test_a_recording_without_classes_is_refused():
     with pytest.raises(DatasetError, match="retrieve import vt60"):
         PROTOCOLS.load("vt60-random").folds(facts(dict.fromkeys("ab")), 0)
 
 
-def test_a_billet_that_tests_is_seen_by_nothing_and_ground_ones_are_left_out():
+def test_a_test_billet_is_unseen_and_ground_billets_are_left_out():
     tested = []
     for split in folds("billets-unseen"):
         sides = [{each.split("-")[0] for each in part} for part in (split.train, split.validation, split.test)]
@@ -186,16 +186,16 @@ def test_places_of_all_welded_billets_test_and_train():
 
 
 def test_two_billets_are_too_few():
-    with pytest.raises(DatasetError, match="3 billets at least; there are 2"):
+    with pytest.raises(DatasetError, match="at least 3 billets, but the recording has 2"):
         PROTOCOLS.load("billets-unseen").folds(facts({"a-1": "a", "b-1": "b"}), 0)
 
 
-def test_the_papers_protocol_takes_98_objects_and_tests_18():
+def test_the_papers_protocol_uses_98_objects_and_tests_18():
     (split,) = folds("feeling-of-success")
     assert (len(split.test), len(split.train) + len(split.validation)) == (18, 80)
 
 
-def test_objectfolder_takes_the_published_split_and_asks_for_it_where_there_is_none():
+def test_objectfolder_requires_the_published_split():
     (split,) = folds("objectfolder", seed=2)
     assert (split.seed, split.train, split.validation, split.test) == (2, tuple("abcd"), tuple("ef"), tuple("gh"))
     with pytest.raises(DatasetError, match=r"split\.json"):
@@ -219,9 +219,9 @@ def touched(counts):
     ]
 
 
-def test_the_first_quarter_of_an_objects_touches_are_references_and_the_last_half_asks():
+def test_the_first_quarter_of_touches_are_references_and_the_last_half_queries():
     found = assign_references(touched({"mug": 8, "tin": 5}))
-    assert {asked: reference.grasp_id for asked, reference in found.items()} == {
+    assert {query: reference.grasp_id for query, reference in found.items()} == {
         "mug-4": "mug-0",
         "mug-5": "mug-1",
         "mug-6": "mug-0",
@@ -230,22 +230,22 @@ def test_the_first_quarter_of_an_objects_touches_are_references_and_the_last_hal
         "tin-3": "tin-0",
         "tin-4": "tin-0",
     }
-    shown = replace_photos_by_references(touched({"mug": 8}))
-    assert [(one.grasp_id, one.photo.name) for one in shown][:2] == [("mug-4", "mug-gel-0"), ("mug-5", "mug-gel-1")]
+    replaced = replace_photos_by_references(touched({"mug": 8}))
+    assert [(one.grasp_id, one.photo.name) for one in replaced][:2] == [("mug-4", "mug-gel-0"), ("mug-5", "mug-gel-1")]
 
 
-def test_of_many_touches_some_ask_evenly_spaced_from_the_first_to_the_last():
+def test_queries_of_many_touches_are_evenly_spaced():
     found = list(assign_references(touched({"mug": 400})))
     assert len(found) == MAX_QUERIES
     assert (found[0], found[-1]) == ("mug-200", "mug-399")
 
 
-def test_an_object_of_three_touches_has_no_references():
-    with pytest.raises(DatasetError, match="four touches of it; tin has 3"):
+def test_three_touches_of_an_object_are_too_few_for_references():
+    with pytest.raises(DatasetError, match="at least 4 touches of each object, but tin has 3"):
         assign_references(touched({"mug": 8, "tin": 3}))
 
 
-def test_entries_are_the_references_own_features_and_never_those_of_the_query():
+def test_entries_are_features_of_the_reference_not_of_the_query():
     grasps = touched({"mug": 8, "tin": 4})
     rows = np.arange(len(grasps), dtype=np.float32)
     features = Features(
@@ -268,7 +268,7 @@ def test_entries_are_the_references_own_features_and_never_those_of_the_query():
 # Controls and verdicts -------------------------------------------------------------------------------
 
 
-def test_places_near_in_the_order_of_capture_are_alike_and_far_ones_are_not():
+def test_clock_features_are_similar_for_near_places_only():
     found = clock_features(100)
     assert found.shape == (100, 84)
     steps = np.linalg.norm(found - found[50], axis=1)
@@ -276,7 +276,7 @@ def test_places_near_in_the_order_of_capture_are_alike_and_far_ones_are_not():
     assert steps[51] < steps[90] / 3
 
 
-def test_the_clock_stands_in_for_the_touch_alone():
+def test_the_clock_replaces_only_the_touch():
     features = Features(
         ("a", "b"), ("mug", "tin"), np.zeros((2, 3, 5), np.float32), np.arange(4, dtype=np.float32).reshape(2, 2)
     )
@@ -287,7 +287,7 @@ def test_the_clock_stands_in_for_the_touch_alone():
 
 
 def test_no_contact_control_needs_one_frame_per_grasp():
-    grasps = MADE["rct"].grasps[:4]
+    grasps = RECORDINGS["rct"].grasps[:4]
     assert "lacks" in missing_no_contact_reason(grasps)
 
     def with_frames(names):
@@ -296,7 +296,7 @@ def test_no_contact_control_needs_one_frame_per_grasp():
             for one, name in zip(grasps, names, strict=True)
         ]
 
-    assert "one untouched frame" in missing_no_contact_reason(with_frames("xxxx"))
+    assert "share one no-contact frame" in missing_no_contact_reason(with_frames("xxxx"))
     assert missing_no_contact_reason(with_frames("xxxy")) is None
 
 
@@ -307,15 +307,15 @@ ABOVE = {"difference": 0.1, "low": 0.01, "high": 0.2}
     ("low", "high", "counts", "words"),
     [
         (0.01, 0.2, True, "+10.0 points [+1.0, +20.0] over"),
-        (-0.01, 0.2, False, "+10.0 points [-1.0, +20.0] against the {}, an interval that holds 0"),
+        (-0.01, 0.2, False, "+10.0 points [-1.0, +20.0] against the {}, an interval that contains 0"),
         (0.0, 0.2, False, "+10.0 points [+0.0, +20.0] against the {}"),
         (-0.2, -0.01, False, "+10.0 points [-20.0, -1.0] below the {}"),
     ],
 )
-def test_a_result_counts_as_touch_only_where_both_whole_intervals_lie_above_0(low, high, counts, words):
+def test_a_result_counts_as_touch_only_if_both_intervals_are_above_0(low, high, counts, words):
     summary, tried = {"low": [0.3], "chance": [0.2]}, {"difference": 0.1, "low": low, "high": high}
     for control, found in (
-        ("blurred control", verdict(summary, tried, ABOVE)),
+        ("low-pass control", verdict(summary, tried, ABOVE)),
         ("order of capture", verdict(summary, ABOVE, tried)),
     ):
         assert found["counts_as_touch"] is counts
@@ -324,13 +324,13 @@ def test_a_result_counts_as_touch_only_where_both_whole_intervals_lie_above_0(lo
         assert found["above_chance"]
 
 
-def test_a_value_whose_interval_holds_chance_is_not_above_it():
+def test_a_value_whose_interval_contains_chance_is_not_above_it():
     found = verdict({"low": [0.2], "chance": [0.2]}, ABOVE, ABOVE)
     assert not found["above_chance"]
 
 
 def of_choices(*values):
-    """A measure of each choice: its value for two objects that differ from it by .1 either way."""
+    """Return a measure of each choice: its objects differ from the value by 0.1 in either direction."""
     numbers = ((0, 1), (1, 2), (0, 2))
     return [
         Measure(np.array([[value - 0.1], [value + 0.1], [value + 0.1]]), np.array([a, b, b]), np.array([0.25]), "four")
@@ -338,33 +338,33 @@ def of_choices(*values):
     ]
 
 
-def test_an_interval_over_choices_is_that_of_the_corrected_resampled_t_test():
+def test_an_interval_over_choices_is_the_corrected_resampled_t_interval():
     found = summarise_splits(of_choices(0.5, 0.6, 0.7), ratio=1.0)
     # s^2 = .01; (1 / 3 + 1) s^2 = .01333; t of 2 degrees of freedom at .975: 4.30265
     half = 4.30265 * np.sqrt((1 / 3 + 1) * 0.01)
     assert found["value"] == [pytest.approx(0.6)]
     assert found["low"] == [pytest.approx(0.6 - half, abs=1e-5)]
-    assert found["high"] == [1.0]  # .6 + .4968, but a share
+    assert found["high"] == [1.0]  # .6 + .4968, limited to 1
     assert (found["min"], found["max"]) == ([pytest.approx(0.5)], [pytest.approx(0.7)])
     assert (found["objects"], found["queries"], found["few_objects"]) == (3, 9, True)
     difference = compare_splits(of_choices(0.5, 0.6, 0.7), of_choices(0.4, 0.4, 0.4), ratio=1.0)
     assert difference["difference"] == pytest.approx(0.2)
     assert difference["low"] == pytest.approx(0.2 - half, abs=1e-5)
     assert (difference["min"], difference["max"]) == (pytest.approx(0.1), pytest.approx(0.3))
-    # t = .2 / sqrt(.01333) = 1.7321; of 2 degrees of freedom both tails beyond it hold 1 - t / sqrt(t^2 + 2)
+    # t = .2 / sqrt(.01333) = 1.7321; of 2 degrees of freedom both tails beyond it have 1 - t / sqrt(t^2 + 2)
     assert difference["p"] == pytest.approx(1 - 1.7320508 / np.sqrt(5))
-    with pytest.raises(BadInput, match="needs two choices at least; got 1"):
+    with pytest.raises(BadInput, match="needs at least two splits; got 1"):
         summarise_splits(of_choices(0.5, 0.6, 0.7)[:1], ratio=1.0)
 
 
-def test_quartiles_of_contact_are_of_each_object_and_equals_go_by_their_order():
+def test_contact_quartiles_are_within_each_object_and_ties_stay_in_order():
     contact = np.array([5.0, 1, 3, 7, 2, 9, 4, 8, 0.3, 0.1, 0.1])
     owner = np.array([0] * 8 + [1] * 3)
     # Of object 0, weakest first: 1 2 | 3 4 | 5 7 | 8 9. Of object 1: .1 (row 9), .1 (row 10), .3.
     assert contact_quartiles(contact, owner).tolist() == [3, 1, 2, 3, 1, 4, 2, 4, 3, 1, 2]
 
 
-def test_reliability_is_counted_in_bins_of_a_tenth():
+def test_reliability_bins_have_width_0_1():
     confidences = [
         {"gallery": np.array([[0.72, 1.0], [0.78, 0.0]]), "all": np.array([[1.0, 1.0]])},
         {"gallery": np.array([[0.7, 0.5], [0.05, 0.0]])},
@@ -378,10 +378,10 @@ def test_reliability_is_counted_in_bins_of_a_tenth():
     assert found["all"] == [{"from": 0.9, "to": 1.0, "confidence": 1.0, "accuracy": 1.0, "count": 1}]
 
 
-def test_pooled_galleries_hold_every_query_of_each_under_its_unit():
+def test_pooled_galleries_have_every_query_under_its_unit():
     one = Measure(np.array([[0.5], [1.0]]), np.array([3, 7]), np.array([0.25]), "four")
     two = Measure(np.array([[0.0]]), np.array([3]), np.array([0.5]), "two")
     whole = pooled([one, two], [{3: 1, 7: 0}, {3: 1}])
     assert whole.owner.tolist() == [0, 1, 1]
     assert whole.values.ravel().tolist() == [1.0, 0.5, 0.0]
-    assert whole.chance.tolist() == [pytest.approx((0.25 + (0.25 + 0.5) / 2) / 2)]  # units alike
+    assert whole.chance.tolist() == [pytest.approx((0.25 + (0.25 + 0.5) / 2) / 2)]  # equal unit weights

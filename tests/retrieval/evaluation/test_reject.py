@@ -1,4 +1,4 @@
-"""Is the object in the catalogue: by loops, with scorers that know nothing or everything, and hard scores."""
+"""Open-set rejection: plain loops, perfect and uninformative scorers, and hard scores."""
 
 import json
 
@@ -21,7 +21,7 @@ def table_of(scores, owner):
 
 
 def planted(objects=12, grasps=8, gap=3.0, seed=0, scale=1.0):
-    """Scores of true pairs are higher by `gap`, on noise of deviation 1."""
+    """Return noise of deviation 1, with scores of true pairs higher by `gap`."""
     rng = np.random.default_rng(seed)
     owner = np.repeat(np.arange(objects), grasps)
     return table_of(scale * (gap * (owner[:, None] == owner) + rng.normal(size=(len(owner),) * 2)), owner)
@@ -31,12 +31,12 @@ def fit(table):
     return fit_posterior_to_trials([posterior_questions(table)])
 
 
-def scored(gap, **more):
+def rejection(gap, **more):
     return reject(fit(planted(gap=gap, seed=1, **more)), planted(gap=gap, seed=2, **more))
 
 
 def statistics(ratios, true):
-    """With the object in the gallery, and without."""
+    """Return the statistics with the object in the gallery and without it."""
     return tuple(statistic(gallery) for gallery in galleries(ratios, true))
 
 
@@ -44,12 +44,12 @@ def value(measure):
     return summarise([measure])["value"][0]
 
 
-def test_a_scorer_that_knows_is_always_right_and_one_that_knows_nothing_is_at_chance():
-    knowing = scored(gap=50)
-    assert value(knowing.auroc) == pytest.approx(1)
-    assert value(knowing.balanced_accuracy) == 1
-    assert value(knowing.false_accepts_at_95) == pytest.approx(0, abs=1e-12)
-    blind = scored(gap=0, grasps=40)
+def test_a_perfect_scorer_is_always_right_and_an_uninformative_one_is_at_chance():
+    perfect = rejection(gap=50)
+    assert value(perfect.auroc) == pytest.approx(1)
+    assert value(perfect.balanced_accuracy) == 1
+    assert value(perfect.false_accepts_at_95) == pytest.approx(0, abs=1e-12)
+    blind = rejection(gap=0, grasps=40)
     assert value(blind.auroc) == pytest.approx(0.5, abs=0.04)
     assert value(blind.false_accepts_at_95) == pytest.approx(0.95, abs=0.03)
     assert blind.auroc.chance.tolist() == blind.balanced_accuracy.chance.tolist() == [0.5]
@@ -64,12 +64,12 @@ def test_a_constant_scorer_is_exactly_at_chance():
     assert value(found.balanced_accuracy) == 0.5
     assert value(found.false_accepts_at_95) == pytest.approx(0.95, abs=1e-12)
     assert found.roc == [[0, 0], [pytest.approx(1), pytest.approx(1)]]
-    # Of four objects that are alike one is right: an eighth of all answers, half of which have none that is.
+    # One of four tied objects is right: 1/8 of all answers, as half of the queries are without their object.
     assert found.risk_coverage == [[pytest.approx(1), pytest.approx(7 / 8)]]
 
 
-def test_naively_a_gallery_with_the_object_has_one_more_and_a_scorer_that_knows_nothing_seems_to_know():
-    """Of n + 1 random scores the best is higher than of n: .6 for galleries of 3 and 2, by exchangeability."""
+def test_a_larger_gallery_with_the_object_makes_an_uninformative_scorer_seem_better():
+    """The best of n + 1 random scores exceeds the best of n: 0.6 for galleries of 3 and 2, by exchangeability."""
     rng = np.random.default_rng(0)
     odds, true = rng.normal(size=(20_000, 3)), np.tile([True, False, False], (20_000, 1))
     naive = [odds.max(1), odds[:, 1:].max(1)]
@@ -85,24 +85,24 @@ def test_the_statistic_is_the_log_of_the_mean_likelihood_ratio():
     assert np.exp(present[0]) in (pytest.approx((2 + 4) / 2), pytest.approx((2 + 8) / 2))
 
 
-def test_every_rival_is_dropped_as_often():
+def test_every_rival_is_dropped_equally_often():
     odds, true = np.log(np.tile([[2.0, 4.0, 8.0]], (1000, 1))), np.tile([True, False, False], (1000, 1))
     present, _ = statistics(odds, true)
     assert np.mean(np.isclose(np.exp(present), 3)) == pytest.approx(0.5, abs=0.06)
 
 
-def test_the_area_is_that_of_two_loops_and_so_is_the_balanced_accuracy():
+def test_area_and_balanced_accuracy_equal_plain_loops():
     posterior, table = fit(planted(gap=1.5, seed=1)), planted(gap=1.5, seed=2)
     found = reject(posterior, table)
     present, absent = by_hand(posterior, table)
     won = [1.0 if a > b else 0.5 if a == b else 0.0 for a in present for b in absent]
     assert value(found.auroc) == pytest.approx(np.mean(won))
-    accepted = [np.mean([said >= 0 for said in part]) for part in (present, absent)]
+    accepted = [np.mean([each >= 0 for each in part]) for part in (present, absent)]
     assert value(found.balanced_accuracy) == pytest.approx((accepted[0] + 1 - accepted[1]) / 2)
 
 
 def by_hand(posterior, table):
-    """Statistics of every row, one at a time; which rival is dropped comes from the module itself."""
+    """Return the statistics of every row, one at a time; the module itself drops the rival."""
     ratios, true = [], []
     for row, mine in enumerate(table.touch_owner):
         logs = []
@@ -112,8 +112,8 @@ def by_hand(posterior, table):
                 for c in range(len(table.photo_owner))
                 if table.photo_owner[c] == name and c != row
             ]
-            likely = np.mean([np.exp(posterior.slope * score) for score in scores])
-            logs.append(np.log(likely) + posterior.offset)
+            likelihood = np.mean([np.exp(posterior.slope * score) for score in scores])
+            logs.append(np.log(likelihood) + posterior.offset)
         ratios.append(logs)
         true.append([name == mine for name in np.unique(table.photo_owner)])
     return statistics(np.array(ratios), np.array(true))
@@ -124,14 +124,14 @@ def test_the_decision_is_that_of_a_query_at_even_prior():
     ratios = posterior_questions(table).log_ratios(posterior)
     true = table.touch_owner[:, None] == table.objects
     for gallery in galleries(ratios, true):
-        for row, said in zip(gallery, statistic(gallery), strict=True):
+        for row, log_odds in zip(gallery, statistic(gallery), strict=True):
             logits = (row[np.isfinite(row)] - posterior.offset) / posterior.slope
             none = posterior.probabilities(logits, none_prior=0.5).none
-            assert said == pytest.approx(np.log((1 - none) / none))
+            assert log_odds == pytest.approx(np.log((1 - none) / none))
 
 
-def test_false_accepts_are_those_of_the_threshold_that_accepts_95_in_100_with_the_object():
-    """Of 200 queries the 190th of the sorted is the last that is let in."""
+def test_false_accepts_use_the_threshold_with_95_percent_true_accepts():
+    """Of 200 sorted queries the 190th is the last accepted one."""
     posterior, table = Posterior(), planted(objects=100, grasps=2, gap=1.5)
     found = reject(posterior, table)
     ratios, true = posterior_questions(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
@@ -140,15 +140,15 @@ def test_false_accepts_are_those_of_the_threshold_that_accepts_95_in_100_with_th
     assert value(found.false_accepts_at_95) == pytest.approx(np.mean(absent >= threshold))
 
 
-def test_the_risk_is_that_of_a_loop_over_the_surest_answers():
+def test_the_risk_equals_a_loop_over_the_most_confident_answers():
     posterior, table = fit(planted(gap=1.5, seed=1)), planted(gap=1.5, seed=2, objects=5, grasps=3)
     found = np.array(reject(posterior, table).risk_coverage)
     ratios, true = posterior_questions(table).log_ratios(posterior), table.touch_owner[:, None] == table.objects
     answers = []
     for gallery in galleries(ratios, true):
         for row, own in zip(gallery, true, strict=True):
-            share = [0.25 * np.exp(ratio) for ratio in row]  # of four objects each
-            answers.append((max(share) / (1 + sum(share)), bool(own[np.argmax(row)])))
+            odds = [0.25 * np.exp(ratio) for ratio in row]  # of four objects each
+            answers.append((max(odds) / (1 + sum(odds)), bool(own[np.argmax(row)])))
     answers.sort(reverse=True)
     assert len(found) == len(answers) == 30
     for count, (coverage, risk) in enumerate(found, start=1):
@@ -157,17 +157,17 @@ def test_the_risk_is_that_of_a_loop_over_the_surest_answers():
     assert found[-1, 1] >= 0.5  # without the object no answer is right
 
 
-def test_equally_sure_answers_are_given_together_and_of_equal_guesses_each_is_as_likely():
+def test_answers_of_equal_confidence_are_grouped_and_tied_objects_are_equally_likely():
     owner = np.repeat([0, 1, 2], 2)
     table = table_of(np.where(owner[:, None] == owner, 2.0, np.where(owner == 2, 2.0, 0.0)), owner)
     found = reject(Posterior(), table).risk_coverage
     assert found[-1][0] == pytest.approx(1)
     assert all(len(point) == 2 and 0 <= point[1] <= 1 for point in found)
-    assert len(found) <= 3  # two equal ratios, one alone, or none
+    assert len(found) <= 3  # two equal ratios, one, or none
 
 
-def test_the_curve_runs_from_corner_to_corner_and_has_the_area_that_is_said():
-    found = scored(gap=1.5, grasps=5)
+def test_the_roc_runs_from_corner_to_corner_and_has_the_reported_area():
+    found = rejection(gap=1.5, grasps=5)
     alarms, hits = np.array(found.roc).T
     assert found.roc[0] == [0, 0]
     assert found.roc[-1] == [pytest.approx(1), pytest.approx(1)]
@@ -179,14 +179,14 @@ def test_the_curve_runs_from_corner_to_corner_and_has_the_area_that_is_said():
 
 
 def test_a_long_curve_is_thinned_and_keeps_its_area():
-    found = scored(gap=1.5, objects=15, grasps=30)
+    found = rejection(gap=1.5, objects=15, grasps=30)
     alarms, hits = np.array(found.roc).T
     assert len(found.roc) == 200
     assert np.trapezoid(hits, alarms) == pytest.approx(value(found.auroc), abs=0.002)
 
 
-def test_the_values_spread_over_objects_as_the_area_does_over_draws_of_objects():
-    """Half of P(present > absent) + P(present > absent) would have the right mean and half the spread."""
+def test_values_vary_over_objects_as_the_area_varies_over_draws_of_objects():
+    """Naive: half of P(present > absent) + P(present > absent) has the right mean but half the spread."""
     areas, errors, naive = [], [], []
     rng, posterior = np.random.default_rng(0), fit(planted())
     for trial in range(60):
@@ -199,28 +199,28 @@ def test_the_values_spread_over_objects_as_the_area_does_over_draws_of_objects()
         areas.append(means.mean())
         errors.append(means.std(ddof=1) / np.sqrt(14))
         naive.append(((means + means.mean()) / 2).std(ddof=1) / np.sqrt(14))
-    assert np.mean(errors) == pytest.approx(np.std(areas, ddof=1), rel=0.3)  # 60 trials tell a deviation to 10 %
+    assert np.mean(errors) == pytest.approx(np.std(areas, ddof=1), rel=0.3)  # 60 trials measure a deviation to 10 %
     assert np.mean(naive) < 0.7 * np.std(areas, ddof=1)
 
 
-def test_the_share_of_false_accepts_spreads_over_objects_as_it_does_over_draws_of_objects():
-    """With the threshold taken as given the spread would be far smaller than it is."""
-    shares, errors, naive = [], [], []
+def test_the_false_accept_rate_varies_over_objects_as_over_draws_of_objects():
+    """Naive: with a fixed threshold the spread is far too small."""
+    rates, errors, naive = [], [], []
     rng = np.random.default_rng(0)
     for _ in range(200):
         owner = np.repeat(np.arange(18), 12)
         present = (2 + rng.normal(size=18))[owner] + rng.normal(size=len(owner))
         absent = rng.normal(size=18)[owner] + rng.normal(size=len(owner))
         means = object_means(_false_accepts(present, absent, owner)[:, None], owner)[1]
-        shares.append(means.mean())
+        rates.append(means.mean())
         errors.append(means.std(ddof=1) / np.sqrt(18))
-        let_in = (absent >= np.quantile(present, 0.05))[:, None].astype(float)
-        naive.append(object_means(let_in, owner)[1].std(ddof=1) / np.sqrt(18))
-    assert np.mean(errors) == pytest.approx(np.std(shares, ddof=1), rel=0.2)
-    assert np.mean(naive) < 0.75 * np.std(shares, ddof=1)
+        accepted = (absent >= np.quantile(present, 0.05))[:, None].astype(float)
+        naive.append(object_means(accepted, owner)[1].std(ddof=1) / np.sqrt(18))
+    assert np.mean(errors) == pytest.approx(np.std(rates, ddof=1), rel=0.2)
+    assert np.mean(naive) < 0.75 * np.std(rates, ddof=1)
 
 
-def test_the_decision_comes_from_validation_objects_alone():
+def test_the_decision_depends_on_validation_objects_only():
     posterior, table = fit(planted(seed=1)), planted(seed=2)
     found = reject(posterior, table_of(table.scores + 100, table.touch_owner))
     assert value(found.balanced_accuracy) == 0.5  # all are accepted
@@ -229,28 +229,27 @@ def test_the_decision_comes_from_validation_objects_alone():
 
 @pytest.mark.parametrize("scale", [1e-6, 1e6, 1e30])
 def test_rejection_works_at_any_score_scale(scale):
-    found = scored(gap=50, scale=scale)
+    found = rejection(gap=50, scale=scale)
     assert 0.5 <= value(found.auroc) <= 1
     assert 0 <= value(found.false_accepts_at_95) <= 0.95
     assert np.isfinite(found.risk_coverage).all()
 
 
-def test_of_two_objects_none_can_be_missed_beside_a_rival():
+def test_two_objects_are_too_few():
     table = planted(objects=2)
-    with pytest.raises(BadInput, match="three objects at least"):
+    with pytest.raises(BadInput, match="at least three objects"):
         reject(Posterior(), table)
 
 
-def test_one_object_that_can_be_asked_has_a_share_and_no_spread():
+def test_one_object_with_queries_has_a_rate_without_spread():
     owner = np.array([0, 0, 1, 2])
     scores = np.random.default_rng(0).normal(size=(4, 4))
     found = reject(Posterior(), ScoreTable(scores.astype(np.float32), owner, owner, np.eye(4, dtype=bool)))
     assert len(set(found.false_accepts_at_95.values[:, 0])) == 1
 
 
-def test_known_areas_are_met():
-    """Photos of an object are alike to a row, and its log ratio is normal, that of the own one higher by 2: the own
-    object beside a rival, against two rivals."""
+def test_known_areas_are_reproduced():
+    """Log ratios are normal, that of the own object is higher by 2: the own object and a rival against two rivals."""
     rng = np.random.default_rng(0)
     owner = np.repeat([0, 1, 2], 200)
     ratios = rng.normal(size=(600, 3)) + 2.0 * (owner[:, None] == np.arange(3))

@@ -1,4 +1,4 @@
-"""Touch to touch: the left-out sequence is known to nothing, the common frame takes the leak away, controls stand."""
+"""Touch to touch: nothing uses the left-out sequence, the common frame removes the leak, controls are measured."""
 
 import dataclasses
 import json
@@ -24,7 +24,7 @@ RNG = np.random.default_rng(3)
 
 
 def by_plain_loops(vectors, components):
-    """Standardise and find components by an SVD without row q; then a cosine at a time."""
+    """Standardise and fit components by an SVD without row q; then compute each cosine."""
     scores = np.zeros((len(vectors), len(vectors)))
     for q in range(len(vectors)):
         others = np.delete(vectors, q, axis=0)
@@ -39,15 +39,15 @@ def by_plain_loops(vectors, components):
 
 
 @pytest.mark.parametrize("components", [1, 3, 8])
-def test_scores_are_cosines_of_principal_components_that_do_not_know_the_row(components):
+def test_scores_are_cosines_of_principal_components_without_the_query(components):
     vectors = RNG.normal(size=(11, 20)) * np.linspace(0.1, 30, 20) + 5
     np.testing.assert_allclose(
         leave_one_out_scores(vectors, components), by_plain_loops(vectors, components), atol=1e-5
     )
 
 
-def test_components_of_all_rows_would_know_the_row_that_asks():
-    """The naive way: noise alone, 30 sequences; components fitted with the query change its scores."""
+def test_components_of_all_rows_depend_on_the_query():
+    """Naive: with 30 sequences of noise, components fitted with the query change its scores."""
     vectors = RNG.normal(size=(30, 200))
     scaled = (vectors - vectors.mean(0)) / vectors.std(0)
     codes = scaled @ np.linalg.svd(scaled, full_matrices=False)[2][:20].T
@@ -58,15 +58,15 @@ def test_components_of_all_rows_would_know_the_row_that_asks():
     assert np.abs(naive - strict)[off].max() > 0.1
 
 
-def test_a_feature_that_never_changes_and_vectors_that_are_all_equal_say_nothing():
+def test_constant_features_and_equal_vectors_do_not_affect_scores():
     vectors = RNG.normal(size=(8, 5))
     flat = np.concatenate([vectors, np.full((8, 2), 1e6)], axis=1)
     np.testing.assert_allclose(leave_one_out_scores(flat, 3), leave_one_out_scores(vectors, 3), atol=1e-5)
     assert not leave_one_out_scores(np.full((8, 5), 0.3), 3).any()
 
 
-def test_vectors_that_say_nothing_get_exactly_chance():
-    """Three objects of two videos: a random order has the one right video of five first in 1 of 5."""
+def test_constant_vectors_get_exactly_chance():
+    """Three objects with two videos: a random order ranks the right one of five videos first in 1 of 5."""
     sequences = Sequences.of(grasps({"a": 2, "b": 2, "c": 2}))
     measure = protocols.recall(sequences.table(leave_one_out_scores(np.zeros((6, 4)))), 1)
     assert measure.values.ravel().tolist() == [pytest.approx(0.2)] * 6
@@ -101,9 +101,11 @@ def test_a_sequence_is_the_mean_of_its_own_grasps():
     assert sequences.middle == ["a-0-1", "a-1-1", "b-0-1", "b-1-1"]
 
 
-@pytest.mark.parametrize(("counts", "said"), [({"a": 2, "b": 1}, "b has one"), ({"a": 3}, "there are 1 objects")])
-def test_an_object_of_one_sequence_and_one_object_alone_cannot_be_asked(counts, said):
-    with pytest.raises(DatasetError, match=said):
+@pytest.mark.parametrize(
+    ("counts", "message"), [({"a": 2, "b": 1}, "b has 1 sequence"), ({"a": 3}, r"the recording has 1 object\(s\)")]
+)
+def test_one_sequence_of_an_object_or_one_object_is_refused(counts, message):
+    with pytest.raises(DatasetError, match=message):
         Sequences.of(grasps(counts))
 
 
@@ -118,26 +120,26 @@ def test_a_sequence_never_finds_itself():
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """The miniature as a recording: 2 parts, 3 videos each; the gel's colour names the part."""
+    """The miniature as a recording: 2 parts with 3 videos each; the colour of the gel identifies the part."""
     folder = tmp_path_factory.mktemp("physiclear")
     physiclear.write(folder / "data" / "physiclear")
     import_physiclear(folder / "data" / "physiclear", folder / "recording")
     return folder
 
 
-def test_on_the_common_frame_is_the_contact_difference_and_nothing_else(recording, tmp_path):
+def test_images_on_the_common_frame_contain_only_the_contact_difference(recording, tmp_path):
     own = load_grasps(recording / "recording")
     moved = with_common_frame(own, tmp_path / "common")
     common = np.rint(255 * read_rgb(own[0].backgrounds[0]))
     for before, after in zip(own, moved, strict=True):
         touch, rest = (np.rint(255 * read_rgb(path)) for path in (before.touches[0], before.backgrounds[0]))
-        wanted = np.clip(common + touch - rest, 0, 255)
-        np.testing.assert_array_equal(np.rint(255 * read_rgb(after.touches[0])), wanted)
+        expected = np.clip(common + touch - rest, 0, 255)
+        np.testing.assert_array_equal(np.rint(255 * read_rgb(after.touches[0])), expected)
         assert after.backgrounds == own[0].backgrounds
 
 
-def test_drift_that_names_the_object_is_gone_on_the_common_frame(tmp_path):
-    """Planted: touches without contact on gels of each object's own colour. Each picture becomes the common frame."""
+def test_drift_that_identifies_the_object_is_removed_on_the_common_frame(tmp_path):
+    """Planted: touches without contact on gels of each object's own colour. Each image becomes the common frame."""
     made = []
     for number in range(3):
         for video in range(2):
@@ -148,7 +150,7 @@ def test_drift_that_names_the_object_is_gone_on_the_common_frame(tmp_path):
     assert {read_rgb(one.touches[0]).tobytes() for one in moved} == {read_rgb(made[0].touches[0]).tobytes()}
 
 
-def test_pictures_that_are_there_are_not_made_again(recording, tmp_path, monkeypatch):
+def test_existing_images_are_reused(recording, tmp_path, monkeypatch):
     own = load_grasps(recording / "recording")[:4]
     with_common_frame(own, tmp_path / "common")
     monkeypatch.setattr("retrieval.evaluation.real.touch_to_touch.write_atomically", None)
@@ -158,7 +160,7 @@ def test_pictures_that_are_there_are_not_made_again(recording, tmp_path, monkeyp
 def test_frames_of_two_sizes_are_refused(recording, tmp_path):
     own, small = load_grasps(recording / "recording")[:1], tmp_path / "small.png"
     cv2.imwrite(str(small), np.zeros((4, 4, 3), np.uint8))
-    with pytest.raises(DatasetError, match="must be of one size"):
+    with pytest.raises(DatasetError, match="must have the same size"):
         with_common_frame([*own, dataclasses.replace(own[0], grasp_id="x", touches=(small,))], tmp_path / "other")
 
 
@@ -166,8 +168,8 @@ def test_frames_of_two_sizes_are_refused(recording, tmp_path):
 
 
 def benchmark(recording, out, *more):
-    asked = ["--preset", "tiny", "--protocols", "physiclear", "--seeds", "2", "--methods", "chance", *more]
-    return main(["benchmark", "real", str(recording / "data"), "--out", str(out), *asked])
+    options = ["--preset", "tiny", "--protocols", "physiclear", "--seeds", "2", "--methods", "chance", *more]
+    return main(["benchmark", "real", str(recording / "data"), "--out", str(out), *options])
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +179,7 @@ def out(recording, tmp_path_factory):
     return folder
 
 
-def test_each_representation_has_its_low_pass_and_three_controls_that_decide(out):
+def test_each_representation_is_compared_with_three_controls(out):
     entry = json.loads((out / "results.json").read_text())["protocols"]["physiclear"]
     assert set(entry["rows"]) == {"frozen-difference", "frozen-common-frame"}
     for row in entry["rows"].values():
@@ -192,26 +194,26 @@ def test_each_representation_has_its_low_pass_and_three_controls_that_decide(out
         assert row["tower_differences"] is None
     assert set(entry["controls"]) == {"no_contact", "order", "permuted"}
     assert len(entry["controls"]["permuted"]["measures"]["recall_1"]["by_seed"]) == 2
-    # Gels of each part's own colour: the untouched frame finds the part, and so does a clock within it.
+    # The gels have a colour for each part: the no-contact frame identifies the part, and so does the order.
     assert entry["controls"]["no_contact"]["measures"]["recall_1"]["value"][0] == 1.0
     assert entry["controls"]["order"]["measures"]["recall_1"]["value"][0] >= 2 / 3
 
 
-def test_the_report_shows_touches_that_find_touches(out):
+def test_the_report_shows_touch_to_touch_results(out):
     text = (out / "report.md").read_text().replace("\\", "")
     for words in ("one video left out", "control: permuted", "frozen-common-frame", "the best touch of each object"):
         assert words in text
     assert (out / "figures" / "physiclear-best.jpg").is_file()
 
 
-def test_a_second_run_comes_out_the_same_to_the_byte(recording, out):
+def test_a_second_run_is_byte_identical(recording, out):
     before = (out / "results.json").read_bytes()
     assert benchmark(recording, out) == 0
     assert (out / "results.json").read_bytes() == before
 
 
 @pytest.mark.slow
-def test_a_shipped_model_is_called_by_its_name_and_compared_with_the_frozen_towers(recording, out):
+def test_a_shipped_model_has_its_name_and_is_compared_with_the_frozen_towers(recording, out):
     assert benchmark(recording, out, "--model", "shipped=shipped-one-finger") == 0
     rows = json.loads((out / "results.json").read_text())["protocols"]["physiclear"]["rows"]
     for representation in ("difference", "common-frame"):

@@ -1,4 +1,4 @@
-"""Error against run time: what a panel recommends, what every row measures, that defaults are what the code uses."""
+"""Error against run time: recommended points, measurements of every row, defaults equal to those of the code."""
 
 import dataclasses
 import json
@@ -41,7 +41,7 @@ def panel(*points, tolerance=1.0):
 
 @pytest.fixture(scope="module")
 def unseen(tmp_path_factory):
-    """A recording of eight objects that no model was trained on, four grasps each."""
+    """A recording of eight unseen objects with four grasps each."""
     folder = tmp_path_factory.mktemp("unseen") / "recording"
     return synthetic.write_recording(folder, synthetic.make_objects(8, seed=77), 4)
 
@@ -60,7 +60,7 @@ def rows(sample):
 # Points ----------------------------------------------------------------------------------------------------
 
 
-def test_the_front_holds_the_points_that_nothing_beats_in_both():
+def test_the_front_has_the_points_that_no_other_beats_in_both():
     made = panel((1, 5), (2, 6), (2, 3), (3, 3), (4, 1))
     assert [point.setting for point in made.pareto()] == ["s0", "s2", "s4"]
 
@@ -71,28 +71,28 @@ def test_the_cheapest_within_the_tolerance_is_recommended():
     assert "cheapest within 1: s2: 1 %, 2 s" in made.line()
 
 
-def test_where_nothing_is_within_the_tolerance_the_least_error_is_and_the_line_says_so():
+def test_the_smallest_error_is_recommended_if_none_is_within_the_tolerance():
     made = panel((1, 5), (3, 2), (2, 2))
     assert made.recommended.setting == "s2"
-    assert "none within 1, nearest: s2" in made.line()
+    assert "none within 1, smallest error: s2" in made.line()
 
 
-def test_a_line_says_whether_the_default_is_the_recommended():
+def test_a_line_compares_the_default_with_the_recommended_point():
     made = panel((1, 0.5), (2, 0))
-    assert made.line().endswith("no default: the caller says")
+    assert made.line().endswith("; no default")
     used = dataclasses.replace(made.points[0], is_default=True)
-    assert dataclasses.replace(made, points=(used, made.points[1])).line().endswith("which is the default")
+    assert dataclasses.replace(made, points=(used, made.points[1])).line().endswith("this is the default")
     used = dataclasses.replace(made.points[1], is_default=True)
     assert dataclasses.replace(made, points=(made.points[0], used)).line().endswith("default s1: 0 %, 2 s")
 
 
-def test_a_share_comes_in_percent_with_its_exact_interval():
+def test_a_miss_rate_is_in_percent_with_its_exact_interval():
     point = miss_rate_point("a", "b", [True, False, False, False])
     low, high = binomial_interval(1, 4)
     assert (point.error, point.low, point.high) == (25.0, 100 * low, 100 * high)
 
 
-def test_a_row_survives_json():
+def test_a_row_round_trips_through_json():
     row = ApproximationResult("title", "text", (panel((1, 5), (2, 0.5)),), None)
     assert ApproximationResult.from_dict(json.loads(json.dumps(row.to_dict()))) == row
 
@@ -105,11 +105,11 @@ def test_numbers_are_short(value, text):
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(2.0, "2 s"), (0.0123, "12.3 ms"), (4.5e-5, "45 us")])
-def test_times_have_the_unit_that_reads_best(seconds, text):
+def test_durations_have_a_readable_unit(seconds, text):
     assert format_duration(seconds) == text
 
 
-def test_works_take_turns_so_that_a_busy_moment_slows_all_of_them():
+def test_timed_works_take_turns():
     calls = []
     points = panel((0, 1), (0, 2)).points
     made = time_points(
@@ -124,7 +124,7 @@ def test_works_take_turns_so_that_a_busy_moment_slows_all_of_them():
 
 
 @pytest.mark.parametrize("name", sorted(APPROXIMATIONS))
-def test_every_row_measures_points_and_names_its_reference(name, rows):
+def test_every_row_has_points_and_a_reference(name, rows):
     row = rows[name]
     assert row.title
     assert row.text
@@ -143,7 +143,7 @@ def test_every_row_measures_points_and_names_its_reference(name, rows):
 
 
 @pytest.mark.parametrize("name", sorted(APPROXIMATIONS))
-def test_every_panel_of_ours_marks_one_default(name, rows):
+def test_every_panel_marks_one_default(name, rows):
     for one in rows[name].panels:
         assert sum(point.is_default for point in one.points) == 1, one.title
 
@@ -157,26 +157,28 @@ def test_an_unknown_name_lists_the_known_ones():
 
 
 class WithQueries:
-    """A checkpoint of a sample, as `build-index` sees it: touches of its own to measure with."""
+    """Checkpoint stand-in for `build-index` with the calibration touches of a sample."""
 
     def __init__(self, sample):
         self.matcher, self.config = sample.checkpoint.matcher, sample.checkpoint.config
         self.queries = sample.queries["partial"].astype(np.float16)
 
 
-def test_the_default_number_of_candidates_is_the_one_that_build_index_writes(pruning_sample):
-    photos = pruning_sample.catalogue
+def test_the_default_number_of_candidates_is_that_of_build_index(candidate_sample):
+    photos = candidate_sample.catalogue
     slots = np.arange(len(photos.partials))
-    bench = ExhaustiveBench(WithQueries(pruning_sample), photos.embeddings["candidate encoder"], slots, photos.partials)
-    settled = choose_by_agreement(bench, SearchRequirements())
-    assert default_k(pruning_sample) == settled.candidates["k"]
-    kinds = load_approximation("index_kinds")(pruning_sample)
-    assert all(one.default.series == settled.kind for one in kinds.panels)
+    bench = ExhaustiveBench(
+        WithQueries(candidate_sample), photos.embeddings["candidate encoder"], slots, photos.partials
+    )
+    point = choose_by_agreement(bench, SearchRequirements())
+    assert default_k(candidate_sample) == point.candidates["k"]
+    kinds = load_approximation("index_kinds")(candidate_sample)
+    assert all(one.default.series == point.kind for one in kinds.panels)
 
 
 @pytest.fixture(scope="module")
-def pruning_sample(sample):
-    """The sample with a candidate_encoder that knows nothing."""
+def candidate_sample(sample):
+    """The sample with an untrained candidate encoder."""
     import torch
 
     from retrieval.model.candidate_encoder import CandidateEncoder
@@ -209,8 +211,8 @@ def test_an_index_stores_partials_in_the_default_format(catalogue, model, tmp_pa
     from retrieval.search.build.build_index import build_index
 
     build_index(catalogue, load_checkpoint(model), tmp_path / "index", quiet=True)
-    kept = IndexStore(tmp_path / "index").open().arrays["partials"]
-    assert [name for name, _, _, is_default in FORMATS if is_default] == [str(np.asarray(kept[:1]).dtype)]
+    stored = IndexStore(tmp_path / "index").open().arrays["partials"]
+    assert [name for name, _, _, is_default in FORMATS if is_default] == [str(np.asarray(stored[:1]).dtype)]
 
 
 def test_images_have_the_default_size_in_a_query(rows, sample):
@@ -224,14 +226,14 @@ def test_images_have_the_default_size_in_a_query(rows, sample):
 # Sample ----------------------------------------------------------------------------------------------------
 
 
-def test_no_grasp_gives_both_a_photo_and_a_touch_and_every_object_gives_both(sample):
+def test_grasps_provide_a_photo_or_a_touch_and_every_object_both(sample):
     photos, touches = set(sample.photo_rows.tolist()), set(sample.touch_rows.tolist())
     assert not photos & touches
     assert photos | touches == set(range(len(sample.grasps)))
     assert len(np.unique(sample.owner[sample.photo_rows])) == len(np.unique(sample.owner[sample.touch_rows])) == 8
 
 
-def test_objects_that_the_model_was_trained_on_are_left_out(model, recording, tmp_path):
+def test_trained_objects_are_left_out(model, recording, tmp_path):
     split = load_checkpoint(model).split
     own = Sample(model, lambda: recording, tmp_path, TINY, quiet=True)
     assert {grasp.object_id for grasp in own.grasps} == set(split.test)
@@ -242,7 +244,7 @@ def test_a_recording_of_trained_objects_only_is_refused(model, tmp_path):
     few = synthetic.write_recording(tmp_path / "few", synthetic.make_objects(12)[:1], 3)
     own = Sample(model, lambda: few, tmp_path, TINY, quiet=True)
     assert split is not None
-    with pytest.raises(DatasetError, match="two objects or more that the model was not trained on"):
+    with pytest.raises(DatasetError, match="at least 2 objects that the model was not trained on"):
         _ = own.grasps
 
 
@@ -263,10 +265,10 @@ def test_ranks_count_the_photos_nearer_than_the_exhaustive_top1():
 
 def test_exhaustive_top1_is_the_highest_logit_and_is_cached(sample, monkeypatch):
     partials = sample.catalogue.partials.astype(np.float32)
-    table = np.array([sample.logits(partial_activation, partials) for partial_activation in sample.queries["partial"]])
+    table = np.array([sample.logits(touch_partial, partials) for touch_partial in sample.queries["partial"]])
     assert sample.exhaustive_top1.tolist() == table.argmax(1).tolist()
     again = dataclasses.replace(sample)
-    monkeypatch.setattr(Sample, "_find_exhaustive_top1", nobody)
+    monkeypatch.setattr(Sample, "_find_exhaustive_top1", not_needed)
     assert again.exhaustive_top1.tolist() == sample.exhaustive_top1.tolist()
 
 
@@ -277,13 +279,13 @@ TABLE = {"one": "nowhere:one", "other": "nowhere:other"}
 measure = partial(measuring_module.measure, table=TABLE, model_free=TABLE)
 
 
-def nobody():
+def not_needed():
     raise AssertionError("no recording is needed")
 
 
 @pytest.fixture
 def bare(model, tmp_path, monkeypatch):
-    """A sample without a recording; and the names of the rows that were measured, each of one point."""
+    """A sample without a recording, and the names of the measured rows, each with one point."""
     calls = []
 
     def measuring(name, table):
@@ -292,7 +294,7 @@ def bare(model, tmp_path, monkeypatch):
         return lambda sample: calls.append(name) or ApproximationResult(name, "text", (panel((1e-3, 2)),))
 
     monkeypatch.setattr(measuring_module, "load_approximation", measuring)
-    return Sample(model, nobody, tmp_path / "features", TINY, quiet=True), calls
+    return Sample(model, not_needed, tmp_path / "features", TINY, quiet=True), calls
 
 
 def test_rows_that_need_no_recording_collect_none(bare, tmp_path):
@@ -306,7 +308,7 @@ def test_rows_that_need_no_recording_collect_none(bare, tmp_path):
     assert (point["recommended"], point["pareto"], point["is_default"]) == (True, True, False)
 
 
-def test_a_second_run_measures_nothing_again_unless_what_made_it_changed(bare, tmp_path):
+def test_a_row_is_measured_again_only_if_its_inputs_change(bare, tmp_path):
     made, calls = bare
     first = measure(made, tmp_path, ["one"])
     assert measure(made, tmp_path, ["one"]) == first
@@ -323,7 +325,7 @@ def test_a_damaged_part_is_measured_again(bare, tmp_path):
     assert calls == ["one"] * 2
 
 
-def test_a_run_that_was_stopped_keeps_the_rows_that_were_done(bare, tmp_path, monkeypatch):
+def test_a_stopped_run_reuses_its_finished_rows(bare, tmp_path, monkeypatch):
     made, calls = bare
     measuring = measuring_module.load_approximation
 

@@ -1,4 +1,4 @@
-"""`retrieve frontier` as users meet it: plots, a page, exit codes."""
+"""`retrieve frontier` from the command line: plots, page, exit codes."""
 
 import json
 from pathlib import Path
@@ -30,31 +30,31 @@ def points(errors):
     )
 
 
-@pytest.mark.parametrize("errors", [(3.0, 1.0, 0.0), (0.0, 0.0), (5.0,)], ids=["falling", "none seen", "one point"])
+@pytest.mark.parametrize("errors", [(3.0, 1.0, 0.0), (0.0, 0.0), (5.0,)], ids=["falling", "no errors", "one point"])
 def test_a_page_has_the_plot_the_lines_and_every_point(errors, tmp_path):
-    made = Panel("missed", "one query", "%", "every photo judged", 1.5, points(errors), 0.5)
+    made = Panel("missed", "one query", "%", "every photo reranked", 1.5, points(errors), 0.5)
     page, plot = write_frontier(tmp_path, document(made))
     text = page.read_text()
     assert plot.read_bytes().startswith(b"\x89PNG")
     assert text.count("data:image/png;base64,") == 1
-    assert "every photo judged" in text
+    assert "every photo reranked" in text
     assert "a &lt;fast&gt; one" in text
     assert "A quick run" in text
     assert all(f"k = {k}" in text for k in range(len(errors)))
 
 
-def test_a_row_that_was_left_out_says_why_and_has_no_plot(tmp_path):
+def test_a_skipped_row_has_a_reason_and_no_plot(tmp_path):
     (page,) = write_frontier(tmp_path, document(skipped="nothing to measure"))
     assert "Left out: nothing to measure." in page.read_text()
 
 
-def test_the_page_of_performance_says_how_many_approximations_there_are():
-    said = (Path(__file__).parents[3] / "docs" / "performance.md").read_text()
-    assert f"for {len(APPROXIMATIONS)} approximations of a search" in " ".join(said.split())
-    assert f"for {len(KERNELS)} approximations of our kernels" in " ".join(said.split())
+def test_the_performance_page_has_the_number_of_approximations():
+    text = (Path(__file__).parents[3] / "docs" / "performance.md").read_text()
+    assert f" {len(APPROXIMATIONS)} approximations of a search" in " ".join(text.split())
+    assert f" {len(KERNELS)} approximations of our kernels" in " ".join(text.split())
 
 
-def test_labels_of_points_that_stand_together_stand_above_and_below():
+def test_labels_of_near_points_are_above_and_below():
     near = (Tradeoff("a", "one", 1.0, seconds=1.0), Tradeoff("a", "other", 0.98, seconds=1.01))
     far = Tradeoff("a", "third", 0.01, seconds=9.0)
     (axes,) = figure([Panel("missed", "one query", "%", "all", 0.5, (*near, far), 0.01)]).axes
@@ -63,13 +63,13 @@ def test_labels_of_points_that_stand_together_stand_above_and_below():
     assert heights["third"] > 0
 
 
-def test_the_command_writes_a_page_and_says_a_line_for_each_panel(model, recording, tmp_path, capsys):
+def test_the_command_writes_a_page_and_prints_a_line_for_each_panel(model, recording, tmp_path, capsys):
     command = ["frontier", "--out", str(tmp_path), "--model", str(model), "--recording", str(recording), "--quick"]
     assert main([*command, "--only", "partials", "--json"]) == 0
-    said = capsys.readouterr()
-    assert json.loads(said.out)["rows"].keys() == {"partials"}
-    assert "halves: largest error of a match logit (against halves in float32)" in said.err
-    assert (tmp_path / "figures" / "halves.png").is_file()
+    output = capsys.readouterr()
+    assert json.loads(output.out)["rows"].keys() == {"partials"}
+    assert "partials: largest error of a match logit (against partial activations in float32)" in output.err
+    assert (tmp_path / "figures" / "partials.png").is_file()
     assert (tmp_path / "frontier.html").is_file()
     assert not (tmp_path / "recording").exists()
 
