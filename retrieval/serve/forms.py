@@ -1,6 +1,6 @@
 """Parser of multipart/form-data bodies (RFC 7578) with a limit on the number of parts.
 
-It uses `bytes` methods, which run in C. A general parser calls Python for each header and for each byte that could begin
+It uses `bytes` methods, which run in C. A general parser calls Python for each header and for each byte that may begin
 a boundary, without a limit.
 """
 
