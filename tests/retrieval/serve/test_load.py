@@ -61,7 +61,7 @@ def post_query(url, body, **more):
     return httpx.post(f"{url}/v1/query", json={**body, **more}, timeout=60)
 
 
-def test_beyond_the_queue_requests_are_told_to_come_again_and_the_others_are_answered(index, body):
+def test_requests_beyond_the_queue_get_429_and_the_others_are_answered(index, body):
     with held(index, queue=3) as (url, encoder, parts, client_threads):
         first = [client_threads.submit(post_query, url, body) for _ in range(3)]
         wait_until(lambda: parts.queue.held == 3)
@@ -76,7 +76,7 @@ def test_beyond_the_queue_requests_are_told_to_come_again_and_the_others_are_ans
         assert value(url, 'retrieve_dropped_total{why="busy"}') == 4
 
 
-def test_who_has_left_or_waited_too_long_is_not_worked_on(index, body):
+def test_requests_of_disconnected_clients_and_late_requests_are_dropped(index, body):
     with held(index) as (url, encoder, parts, client_threads):
         first = client_threads.submit(post_query, url, body)
         wait_until(lambda: encoder.calls == [1])
@@ -91,7 +91,7 @@ def test_who_has_left_or_waited_too_long_is_not_worked_on(index, body):
         assert encoder.calls == [1, 1]
 
 
-def test_queries_that_wait_are_encoded_together_and_get_the_answers_that_they_would_get_alone(index, body):
+def test_waiting_queries_are_encoded_in_a_batch_with_unchanged_answers(index, body):
     with held(index, queue=6, max_batch=3) as (url, encoder, parts, client_threads):
         first = client_threads.submit(post_query, url, body)
         wait_until(lambda: encoder.calls == [1])
@@ -105,7 +105,7 @@ def test_queries_that_wait_are_encoded_together_and_get_the_answers_that_they_wo
             assert [one["logit"] for one in other] == pytest.approx([one["logit"] for one in alone], abs=1e-4)
 
 
-def test_queries_within_the_window_are_encoded_together_and_a_bad_one_spoils_none(index, body):
+def test_queries_in_the_batch_window_are_encoded_together_and_a_bad_one_affects_no_other(index, body):
     short = {"touches": [body["touches"][0][:1]]}  # a finger too few
     with held(index, batch_ms=1000, max_batch=3) as (url, encoder, _, client_threads):
         encoder.go.set()
@@ -119,7 +119,7 @@ def test_queries_within_the_window_are_encoded_together_and_a_bad_one_spoils_non
         assert [len(one.result().json()["results"]) for one in other] == [2, 3]
 
 
-def test_a_core_is_left_to_the_event_loop_and_blas_has_no_threads_that_spin(index, monkeypatch):
+def test_one_core_stays_free_for_the_event_loop_and_blas_uses_one_thread(index, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 9)
     assert [ServiceSettings(index=index, workers=workers).threads for workers in (1, 2, 9)] == [8, 4, 1]
     monkeypatch.setattr("os.cpu_count", lambda: 2)
@@ -150,7 +150,7 @@ def grown(catalogue, index, tmp_path, model):
     return own, build
 
 
-def test_a_new_generation_is_taken_up_and_no_answer_is_of_two(grown, body):
+def test_a_new_generation_is_served_and_no_answer_mixes_two(grown, body):
     own, build = grown
     objects, ended, failures = {"gen-000001": 8}, threading.Event(), []
 
@@ -177,7 +177,7 @@ def test_a_new_generation_is_taken_up_and_no_answer_is_of_two(grown, body):
     assert dict(sorted(answers)) == objects
 
 
-def test_one_that_cannot_be_opened_leaves_the_old_one_answering(grown, body):
+def test_a_broken_generation_leaves_the_previous_one_served(grown, body):
     own, build = grown
     with listening(own, poll_s=0.05) as (url, _):
         build()
@@ -190,7 +190,7 @@ def test_one_that_cannot_be_opened_leaves_the_old_one_answering(grown, body):
 
 
 @pytest.mark.slow
-def test_an_index_that_is_none_is_told_at_the_start(tmp_path):
+def test_a_missing_index_is_reported_at_the_start(tmp_path):
     line = [sys.executable, "-m", "retrieval", "serve", "--index", str(tmp_path), "--port", "0", "--no-history"]
     done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 2
@@ -201,7 +201,7 @@ def test_an_index_that_is_none_is_told_at_the_start(tmp_path):
 
 
 @pytest.mark.parametrize("sign", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
-def test_what_is_in_flight_when_it_is_told_to_end_is_answered(index, body, sign, tmp_path):
+def test_requests_in_flight_at_the_end_signal_are_answered(index, body, sign, tmp_path):
     with (
         command("--index", index, "--port", "0", "--queue", "40", "--history", tmp_path / "kept") as (process, url, _),
         ThreadPoolExecutor(12) as client_threads,
@@ -256,7 +256,7 @@ def status(address):
         return stream.status_code
 
 
-def test_more_streams_than_places_are_refused_and_a_place_is_free_again(index):
+def test_streams_beyond_the_limit_are_refused_until_one_ends(index):
     rig = LiveRig({"a": lambda: b"picture", "b": lambda: 1 / 0})
     with listening(index, rig, streams=1) as (url, _):
         address = f"{url}/v1/sensors/a/stream"

@@ -89,14 +89,14 @@ def test_pictures_are_removed_completed_and_their_fingers_swapped(opened, files)
     assert opened.locator(".grasp").count() == 0
 
 
-def test_what_is_no_picture_is_refused_before_it_is_sent(opened, tmp_path):
+def test_files_other_than_pictures_are_refused_before_they_are_sent(opened, tmp_path):
     (tmp_path / "notes.txt").write_text("no picture")
     choose(opened, "Choose gel images", [tmp_path / "notes.txt"])
     opened.get_by_text("notes.txt is no picture.").wait_for()
     assert opened.locator(".grasp").count() == 0
 
 
-def test_fewer_objects_than_there_are_leave_the_others_a_bar(opened, files):
+def test_objects_that_are_not_shown_share_one_bar(opened, files):
     opened.get_by_text("Options").click()
     opened.get_by_label("Objects to show").fill("3")
     opened.get_by_label("Objects to show").blur()
@@ -115,7 +115,7 @@ def test_fewer_objects_than_there_are_leave_the_others_a_bar(opened, files):
         ("uncalibrated", None, "This model was never calibrated"),
     ],
 )
-def test_every_verdict_is_said_in_words(opened, files, searcher, verdict, claim, told):
+def test_every_verdict_has_its_text(opened, files, searcher, verdict, claim, told):
     document = searcher.query(files[:2]).to_dict() | {"verdict": verdict}
     if verdict != "none of these":
         document |= dict.fromkeys(("none_probability", "unlisted_probability", "posterior", "information"))
@@ -146,13 +146,13 @@ def test_probabilities_if_present_and_the_advice_of_the_service_are_shown(opened
     assert len(shown) == len(document["results"])
 
 
-def test_the_probability_of_the_objects_that_are_not_listed_is_the_one_of_the_service(opened, files, searcher):
+def test_the_probability_of_unlisted_objects_is_that_of_the_service(opened, files, searcher):
     document = searcher.query(files[:2], top=3).to_dict() | {"unlisted_probability": 0.4375}
     ask_for(document, opened, files)
     assert opened.locator(".photo.rest .p").inner_text() == "43.8\u00a0%"
 
 
-def test_an_answer_of_before_there_was_advice_is_still_shown(opened, files, searcher):
+def test_an_answer_without_advice_of_an_earlier_version_is_shown(opened, files, searcher):
     """The history of a service holds such."""
     document = searcher.query(files[:2], none_prior=0.999).to_dict()
     del document["advice"], document["more_grasps"], document["information"], document["unlisted_probability"]
@@ -163,7 +163,7 @@ def test_an_answer_of_before_there_was_advice_is_still_shown(opened, files, sear
     assert opened.locator(".advice, .if-present, .another").count() == 0
 
 
-def test_a_photo_shows_where_it_agrees_with_the_touch(opened, files):
+def test_a_photo_shows_its_agreement_with_the_touch(opened, files):
     ask(opened, files[:2])
     opened.locator(".photo.object button").first.click()
     button = opened.get_by_role("button", name="Where it agrees with the touch")
@@ -178,7 +178,7 @@ def test_a_photo_shows_where_it_agrees_with_the_touch(opened, files):
     assert shade.count() == 0
 
 
-def test_nearest_photos_of_a_photo_lead_on_to_their_objects(opened, files):
+def test_similar_photos_open_their_objects(opened, files):
     ask(opened, files[:2])
     opened.locator(".photo.object button").first.click()
     near = opened.locator(".alike li button").first
@@ -204,7 +204,7 @@ def test_metadata_of_an_object_are_searched_and_shown(browser, catalogue, model,
         assert facts.locator("dt, dd").all_inner_texts() == ["maker", "Wedgwood", "price", "3"]
 
 
-def test_grasp_something_closes_the_jaws_and_asks(opened):
+def test_grasp_something_grasps_and_queries(opened):
     opened.get_by_role("button", name="Grasp something").click()
     opened.locator(".answer").wait_for()
     held = opened.locator(".held strong").inner_text()
@@ -228,7 +228,7 @@ def test_live_sensors_are_shown_and_taken_as_a_touch(opened):
     assert live.count() == 0
 
 
-def test_the_browsers_camera_takes_one_finger_after_the_other(opened):
+def test_the_browsers_camera_takes_pictures_finger_by_finger(opened):
     opened.get_by_role("button", name="Camera").click()
     opened.get_by_role("button", name="Take finger a").click()
     opened.get_by_role("button", name="Take finger b").click()
@@ -236,7 +236,7 @@ def test_the_browsers_camera_takes_one_finger_after_the_other(opened):
     assert opened.get_by_role("button", name="Ask", exact=True).is_enabled()
 
 
-def test_what_the_service_cannot_do_has_no_button(browser, index, files):
+def test_unavailable_features_have_no_button(browser, index, files):
     with address(index) as url, page(browser, url) as opened:
         assert opened.get_by_role("button", name="Grasp something").count() == 0
         assert opened.get_by_role("button", name="Live sensors").count() == 0
@@ -245,7 +245,7 @@ def test_what_the_service_cannot_do_has_no_button(browser, index, files):
         assert opened.get_by_role("link", name="History").count() == 0
 
 
-def test_the_page_asks_for_the_token_once(browser, index):
+def test_the_page_requests_the_token_once(browser, index):
     token = "sixteen letters or more"
     with address(index, token=token) as url, page(browser, url) as opened:
         opened.get_by_label("Token", exact=True).last.fill("another one, which is wrong")
@@ -258,7 +258,7 @@ def test_the_page_asks_for_the_token_once(browser, index):
         opened.get_by_role("heading", name="Which object is in the hand?").wait_for()
 
 
-def test_what_the_service_refuses_is_said_in_its_own_sentence(opened, tmp_path):
+def test_a_refused_query_shows_the_message_of_the_service(opened, tmp_path):
     (tmp_path / "a.png").write_bytes(b"\x89PNG but no more")
     choose(opened, "Choose gel images", [tmp_path / "a.png"])
     choose(opened, "Choose finger b", [tmp_path / "a.png"])
@@ -267,7 +267,7 @@ def test_what_the_service_refuses_is_said_in_its_own_sentence(opened, tmp_path):
     assert opened.get_by_role("button", name="Try again").is_visible()
 
 
-def test_the_keyboard_alone_asks_and_looks(opened, files):
+def test_a_query_works_with_the_keyboard_only(opened, files):
     choose(opened, "Choose gel images", files[:2])  # the system's own dialog; Ask has the focus then
     opened.keyboard.press("Enter")
     opened.locator(".answer").wait_for()

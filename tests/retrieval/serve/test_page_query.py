@@ -13,7 +13,7 @@ def opened(index, browser, files):
         yield found
 
 
-def test_the_answer_is_photos_with_bars_that_add_up_to_1_none_of_these_among_them(opened):
+def test_the_bars_of_the_answer_including_none_of_these_add_up_to_1(opened):
     bars = [float(one) for one in opened.locator("[data-p]").evaluate_all("all => all.map((one) => one.dataset.p)")]
     assert len(bars) == 9  # eight objects, none of these
     assert sum(bars) == pytest.approx(1, abs=1e-6)
@@ -27,7 +27,7 @@ def test_the_answer_is_photos_with_bars_that_add_up_to_1_none_of_these_among_the
     assert opened.locator(".photo img").evaluate_all("all => all.every((one) => one.loading === 'lazy')")
 
 
-def test_a_click_shows_all_photos_of_an_object_beside_the_touch_and_enlarges_them(opened):
+def test_a_click_shows_all_photos_of_an_object_next_to_the_touch_and_enlarges_them(opened):
     name = opened.locator(".photo.object .name").first.inner_text()
     opened.locator(".photo.object button").first.click()
     dialog = opened.get_by_role("dialog", name=name)

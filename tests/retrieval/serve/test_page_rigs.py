@@ -46,7 +46,7 @@ def live(opened):
     return picture
 
 
-def test_the_simulated_jaws_close_and_their_untouched_gels_go_with_the_touch(browser, index, tmp_path):
+def test_simulated_grasps_include_their_no_contact_frames(browser, index, tmp_path):
     with (
         with_history(index, tmp_path, rig=simulated_live_rig(index), serve=address) as url,
         page(browser, url) as opened,
@@ -64,7 +64,7 @@ def test_the_simulated_jaws_close_and_their_untouched_gels_go_with_the_touch(bro
         opened.get_by_role("region", name="Grasp by grasp").get_by_text("would tell most").wait_for()
 
 
-def test_gels_of_a_rigs_file_are_live_and_taken_untouched_and_touched(browser, index):
+def test_sensors_of_a_rig_file_are_live_and_give_no_contact_frames_and_touches(browser, index):
     with replay_file() as file, address(index, load_live_rig(str(file), index)) as url, page(browser, url) as opened:
         live(opened)
         assert opened.get_by_role("button", name="Grasp something").count() == 0  # nobody moves a rig from here

@@ -35,7 +35,7 @@ def to(opened, name):
     opened.get_by_role("navigation").get_by_role("link", name=name).click()
 
 
-def test_how_the_answer_changed_grasp_by_grasp_is_drawn_and_told_in_numbers(opened, files):
+def test_the_cumulative_query_is_plotted_and_tabulated(opened, files):
     ask(opened, files)
     section = opened.get_by_role("region", name="Grasp by grasp")
     section.get_by_text("changed the answer most").wait_for()
@@ -83,7 +83,7 @@ def test_the_information_of_an_answer_is_shown_as_the_service_sends_it(opened, f
     assert row.all_inner_texts() == ["0.50 bits", "3.13 bits"]
 
 
-def test_another_grasp_of_under_a_hundredth_bit_would_tell_hardly_anything(opened, files, searcher):
+def test_another_grasp_below_a_hundredth_bit_adds_almost_no_information(opened, files, searcher):
     document = informed(searcher.query(files[:2]), next_grasp_bits=0.004)
     opened.route("**/v1/query", lambda route: route.fulfill(json=document))
     ask(opened, files[:2])
@@ -109,7 +109,7 @@ def test_feedback_is_stored_and_shown_in_the_history(opened, files):
 @pytest.mark.parametrize(
     ("button", "told"), [("Right", "Said to be right."), ("None of the catalogue", "Said to be none of these.")]
 )
-def test_right_and_none_are_a_click_each_and_the_history_shows_them(opened, files, button, told):
+def test_feedback_right_and_none_take_one_click_and_appear_in_the_history(opened, files, button, told):
     opened.get_by_text("Options").click()
     prior = opened.get_by_label("Chance, before anything is felt, that the catalogue lacks it")
     prior.fill("0.001")  # so that an object is the answer, of which both can be said
@@ -138,7 +138,7 @@ def test_the_history_is_searched_and_exported(opened, files):
         assert len(archive.read("history.jsonl").splitlines()) >= 1
 
 
-def test_touches_that_feel_alike_are_found_from_a_touch(opened, files):
+def test_similar_touches_are_found_from_a_touch(opened, files):
     ask(opened, files[:2])
     ask(opened, files[2:])
     to(opened, "History")
@@ -147,7 +147,7 @@ def test_touches_that_feel_alike_are_found_from_a_touch(opened, files):
     opened.get_by_role("region", name="Touches that feel alike").locator(".query").first.wait_for()
 
 
-def test_the_catalogue_is_searched_and_its_photos_lead_to_their_neighbours(opened, catalogue):
+def test_the_catalogue_is_searched_and_its_photos_open_similar_photos(opened, catalogue):
     name = sorted(path.name for path in catalogue.iterdir() if path.is_dir())[0]
     to(opened, "Catalogue")
     opened.locator(".grid li").nth(23).wait_for()
@@ -185,7 +185,7 @@ def many(opened):
     return opened, offsets
 
 
-def test_of_100_000_photos_those_on_the_screen_are_drawn_and_their_pages_asked_for(many):
+def test_of_100_000_photos_only_those_on_the_screen_are_requested_and_drawn(many):
     opened, offsets = many
     to(opened, "Catalogue")
     opened.get_by_text("100,000 photos of").wait_for()
@@ -202,7 +202,7 @@ def test_of_100_000_photos_those_on_the_screen_are_drawn_and_their_pages_asked_f
     assert len(set(offsets)) < 12  # of 500 pages
 
 
-def test_the_keyboard_walks_through_the_catalogue_to_its_end(many):
+def test_the_keyboard_moves_through_the_catalogue_to_its_end(many):
     opened, _ = many
     to(opened, "Catalogue")
     opened.locator(".grid button").first.focus()
@@ -217,7 +217,7 @@ def test_the_keyboard_walks_through_the_catalogue_to_its_end(many):
     assert opened.evaluate(focus).strip() == "object 0"
 
 
-def test_ten_choices_are_made_by_mouse_and_by_key_and_the_result_stands_beside_the_models(opened):
+def test_trials_work_by_mouse_and_key_and_show_both_results(opened):
     to(opened, "Test")
     opened.get_by_role("button", name="Begin").wait_for()
     assert opened.locator("main").get_by_text("false", exact=True).count() == 0

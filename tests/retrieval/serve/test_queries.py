@@ -34,7 +34,7 @@ def same(document, result):
     )
 
 
-def test_openapi_says_the_form_that_answers_have(client, searcher, grasps):
+def test_openapi_describes_the_fields_of_answers(client, searcher, grasps):
     answer = searcher.query(grasps).to_dict()
     assert set(answer) == set(QueryDocument.model_fields)
     assert set(answer["results"][0]) == set(MatchDocument.model_fields) - {"reference"}  # the catalogue has no touches
@@ -50,7 +50,7 @@ def test_json_and_multipart_give_the_document_of_the_searcher(client, searcher, 
         assert same(by_form.json(), expected), by_form.text
 
 
-def test_a_batch_gives_an_answer_for_each_object_in_their_order(client, searcher, grasps):
+def test_a_batch_returns_one_answer_per_object_in_order(client, searcher, grasps):
     objects = [grasps, grasps[1:]]
     answers = client.post("/v1/query/batch", json={"objects": [encoded(one) for one in objects]}).json()["answers"]
     for answer, expected in zip(answers, searcher.query_many(objects), strict=True):
@@ -69,7 +69,7 @@ def test_cumulative_query_returns_cumulative_and_per_grasp_answers(client, searc
         assert same(answer, expected)
 
 
-def test_the_map_of_a_photo_that_is_all_of_one_colour_is_flat_and_a_real_one_is_not(client, searcher, grasps):
+def test_the_occlusion_map_of_a_photo_is_not_flat(client, searcher, grasps):
     photo = searcher.generation.rows[0]["path"]
     found = client.post("/v1/agreement", json={"photo": photo, "touches": encoded(grasps), "squares": 2}).json()
     assert (found["rows"], found["columns"], [len(row) for row in found["falls"]]) == (2, 2, [2, 2])
@@ -86,11 +86,11 @@ def test_the_map_of_a_photo_that_is_all_of_one_colour_is_flat_and_a_real_one_is_
         ({"touches": [["aGk="]], "none_prior": 1}, "none_prior: Input should be less than 1"),
     ],
 )
-def test_a_body_of_the_wrong_form_is_told_by_place(client, body, said):
+def test_an_invalid_body_is_reported_with_the_place(client, body, said):
     assert said in problem(client.post("/v1/query", json=body), 422, "bad-input")
 
 
-def test_what_is_no_picture_and_a_missing_finger_are_told_in_our_sentences(client, grasps):
+def test_bad_pictures_and_missing_fingers_get_clear_messages(client, grasps):
     told = problem(client.post("/v1/query", json={"touches": [["aGk=", "aGk="]]}), 422, "bad-image")
     assert told.startswith("grasp 1, finger a: not a PNG, JPEG, BMP")
     told = problem(client.post("/v1/query", json={"touches": [encoded(grasps)[0][:1]]}), 422, "bad-input")
@@ -99,7 +99,7 @@ def test_what_is_no_picture_and_a_missing_finger_are_told_in_our_sentences(clien
     assert "gelsight must be given 2 times for each grasp; got 1" in told
 
 
-def test_a_body_of_another_kind_and_broken_json_are_refused(client):
+def test_other_content_types_and_broken_json_are_refused(client):
     problem(client.post("/v1/query", content=b"x", headers={"content-type": "text/plain"}), 415, "unsupported-type")
     problem(client.post("/v1/query", content=b"x"), 415, "unsupported-type")
     broken = client.post("/v1/query", content=b"{", headers={"content-type": "application/json"})

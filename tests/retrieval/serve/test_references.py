@@ -24,7 +24,7 @@ def files(grasp):
     return {"files": [("gelsight", (path.name, path.read_bytes())) for path in grasp]}
 
 
-def test_the_gel_images_that_an_answer_names_are_shown(index, catalogue_with_touches, touches):
+def test_the_reference_gel_images_of_an_answer_are_served(index, catalogue_with_touches, touches):
     with service(index) as client:
         found = client.post("/v1/query", **files(touches[NAMES[1]][1])).json()
         best = {match["object_id"]: match for match in found["results"]}[NAMES[1]]
@@ -39,7 +39,7 @@ def test_the_gel_images_that_an_answer_names_are_shown(index, catalogue_with_tou
         assert problem(client.get(f"/v1/photos/{NAMES[5]}/touch_0_a.png"), 404, "unknown")
 
 
-def test_a_gel_image_is_no_photo_to_compare_with(index, touches):
+def test_reference_gel_images_have_no_similar_photos(index, touches):
     """Neither that of an object with photos, nor the one that stands for the photo of an object without."""
     with service(index) as client:
         for name in (NAMES[0], NAMES[2]):
@@ -62,7 +62,7 @@ def test_feedback_on_an_object_without_photos_adds_no_photo(index, touches, tmp_
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
-def test_the_page_shows_the_nearest_reference_touch_beside_photo_and_touch(browser, index, touches, width):
+def test_the_page_shows_the_nearest_reference_touch_next_to_photo_and_touch(browser, index, touches, width):
     with address(index) as url, page(browser, url, width) as opened:
         ask(opened, touches[NAMES[1]][1])
         card = opened.locator(".photo.object", has_text=NAMES[1])
@@ -80,7 +80,7 @@ def test_the_page_shows_the_nearest_reference_touch_beside_photo_and_touch(brows
 
 
 @pytest.mark.slow
-def test_an_object_without_photos_is_said_to_be_one_on_the_page(browser, index, touches):
+def test_the_page_marks_an_object_without_photos(browser, index, touches):
     with address(index) as url, page(browser, url) as opened:
         ask(opened, touches[NAMES[2]][0])
         opened.locator(".photo.object", has_text=NAMES[2]).locator("button").click()

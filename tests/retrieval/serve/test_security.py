@@ -16,7 +16,7 @@ def guarded(index):
         yield opened
 
 
-def test_another_bind_than_this_machine_needs_a_token(index):
+def test_a_host_other_than_this_machine_requires_a_token(index):
     for host in ("0.0.0.0", "::", "192.168.1.4", "robot.local"):
         with pytest.raises(ConfigError, match=f"{host} can be reached from other machines, so a token must be given"):
             ServiceSettings(index=index, host=host)
@@ -28,11 +28,11 @@ def test_another_bind_than_this_machine_needs_a_token(index):
 
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:8000", "", "[::1"])
-def test_a_name_that_leads_here_from_elsewhere_is_refused(client, host):
+def test_foreign_host_names_are_refused(client, host):
     problem(client.get("/v1/index", headers={"host": host}), 421, "wrong-host")
 
 
-def test_a_page_of_another_origin_may_not_ask(client):
+def test_requests_from_pages_of_another_origin_are_refused(client):
     for headers in ({"origin": "https://evil.example"}, {"origin": "null"}, {"sec-fetch-site": "cross-site"}):
         response = client.post("/v1/query", headers=headers)
         problem(response, 403, "refused")
@@ -41,7 +41,7 @@ def test_a_page_of_another_origin_may_not_ask(client):
     problem(client.options("/v1/query", headers={"origin": "https://evil.example"}), 403, "refused")
 
 
-def test_only_who_knows_the_token_is_answered(guarded):
+def test_requests_without_the_token_are_refused(guarded):
     for headers in (
         {},
         {"authorization": "Bearer wrong"},
@@ -67,7 +67,7 @@ def test_the_page_gets_a_cookie_that_scripts_cannot_read_for_the_token(guarded):
 
 
 @pytest.mark.parametrize("path", ["/", "/v1/index", "/v1/nothing", "/v1/photos/x", "/openapi.json", "/healthz"])
-def test_every_response_tells_browsers_to_run_no_script_but_ours(client, path):
+def test_every_response_has_the_security_headers(client, path):
     response = client.get(path)
     for name, value in HEADERS.items():
         assert response.headers[name] == value
@@ -75,14 +75,14 @@ def test_every_response_tells_browsers_to_run_no_script_but_ours(client, path):
     assert "default-src 'none'" in HEADERS["content-security-policy"]
 
 
-def test_the_page_holds_no_inline_script_or_style(client):
+def test_the_page_has_no_inline_script_or_style(client):
     page = client.get("/").text
     assert "<style" not in page
     assert " style=" not in page
     assert "<script>" not in page
 
 
-def test_a_failure_says_nothing_of_the_inside(client, monkeypatch):
+def test_an_unexpected_error_reveals_no_internals(client, monkeypatch):
     parts = client.app.state.service
     monkeypatch.setattr(parts.metrics, "page", lambda: 1 / 0)
     response = client.get("/metrics")
@@ -91,7 +91,7 @@ def test_a_failure_says_nothing_of_the_inside(client, monkeypatch):
     assert response.headers["x-content-type-options"] == "nosniff"
 
 
-def test_the_pages_files_are_looked_up_by_name_and_nothing_else_is(client):
+def test_only_the_files_of_the_page_are_served(client):
     whole = client.get("/")
     assert (whole.status_code, whole.headers["content-type"]) == (200, "text/html; charset=utf-8")
     assert client.get("/index.html").content == whole.content

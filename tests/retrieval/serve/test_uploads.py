@@ -31,7 +31,7 @@ def test_a_picture_of_more_than_20_million_pixels_is_refused_by_its_header(clien
     assert "20" in told
 
 
-def test_a_large_jpeg_is_refused_although_files_of_that_size_are_read_at_a_part_of_it(client):
+def test_a_large_jpeg_is_refused_although_it_could_be_decoded_at_reduced_size(client):
     file = io.BytesIO()
     Image.new("L", (6000, 4000)).save(file, "JPEG")
     assert "6000 x 4000 pixels; at most 20,000,000 are taken" in problem(
@@ -52,12 +52,12 @@ def test_a_large_jpeg_is_refused_although_files_of_that_size_are_read_at_a_part_
     ],
     ids=["empty", "zeros", "gif", "too few samples", "cut off", "svg", "jpeg's first bytes"],
 )
-def test_what_is_no_whole_picture_is_refused_with_its_place(client, image):
+def test_incomplete_pictures_are_refused_with_their_place(client, image):
     good = png_file(8, 8, samples=b"\x00" * 8 * 25)
     assert "grasp 1, finger b" in problem(post(client, good, image), 422, "bad-image")
 
 
-def test_the_pictures_of_one_request_have_a_bound_together(client):
+def test_the_pictures_of_one_request_have_a_common_limit(client):
     one = base64.b64encode(png_file(4000, 4000)).decode()
     told = problem(client.post("/v1/query", json={"touches": [[one] * 2] * 4}), 413, "too-large")
     assert "may have 100,000,000 pixels together; the large ones have 128,000,000" in told
@@ -83,7 +83,7 @@ MANY = {
 
 
 @pytest.mark.parametrize("name", MANY)
-def test_a_body_of_more_values_than_pictures_need_is_refused_before_they_are_made(client, name):
+def test_a_body_with_too_many_values_is_refused_before_parsing(client, name):
     begun = time.process_time()
     told = problem(client.post("/v1/query", content=MANY[name], headers=JSON), 422, "bad-input")
     assert told.startswith("a body may hold at most 2,000 JSON values; got up to ")
@@ -168,7 +168,7 @@ def answer(connection):
 
 
 @pytest.mark.parametrize("kind", ["application/json", "multipart/form-data; boundary=x", "text/plain"])
-def test_two_gigabytes_that_are_announced_are_refused_before_the_first_byte(url, kind):
+def test_an_announced_body_of_two_gigabytes_is_refused_before_the_first_byte(url, kind):
     with line(url) as connection:
         connection.sendall((HEAD.format(kind=kind) + f"content-length: {2 * 2**30}\r\n\r\n").encode())
         status, data = answer(connection)
@@ -176,7 +176,7 @@ def test_two_gigabytes_that_are_announced_are_refused_before_the_first_byte(url,
 
 
 @pytest.mark.parametrize("kind", ["application/json", "multipart/form-data; boundary=x"])
-def test_a_body_that_announces_nothing_is_cut_at_the_limit(url, kind):
+def test_a_body_without_content_length_is_cut_at_the_limit(url, kind):
     with line(url) as connection:
         connection.sendall((HEAD.format(kind=kind) + "transfer-encoding: chunked\r\n\r\n").encode())
         first = b'--x\r\ncontent-disposition: form-data; name="gelsight"; filename="a"\r\n\r\n'
@@ -194,7 +194,7 @@ def test_a_body_that_announces_nothing_is_cut_at_the_limit(url, kind):
     assert httpx.get(f"{url}/healthz").status_code == 200
 
 
-def test_a_slow_body_is_given_up_and_half_a_body_is_no_matter(url):
+def test_a_slow_body_is_refused_and_a_partial_body_is_harmless(url):
     with line(url) as connection:
         connection.sendall((HEAD.format(kind="application/json") + "content-length: 1000\r\n\r\n{").encode())
         begun = time.monotonic()
@@ -208,7 +208,7 @@ def test_a_slow_body_is_given_up_and_half_a_body_is_no_matter(url):
         assert answer(connection)[0] == 200
 
 
-def test_bodies_on_their_way_have_a_bound_together_and_large_ones_leave_room_for_others(index):
+def test_concurrent_bodies_have_a_common_limit_and_large_ones_leave_room_for_others(index):
     with service(index) as client:
         limit = next(each for each in middlewares(client.app) if type(each).__name__ == "BodyLimit")
         small, large_bodies = {"touches": [["aGk="]]}, {"touches": [["aGkk" * 300_000]]}

@@ -12,16 +12,8 @@ export function agreementTool(query) {
   const known = new Map();
   return {
     of(id, image, frame) {
-      const legend = h(
-        "span",
-        { class: "legend", hidden: true },
-        LEGEND,
-      );
-      const button = h(
-        "button",
-        { type: "button", class: "link", "aria-pressed": "false" },
-        LABEL,
-      );
+      const legend = h("span", { class: "legend", hidden: true }, LEGEND);
+      const button = h("button", { type: "button", class: "link", "aria-pressed": "false" }, LABEL);
       let canvas = null;
       button.addEventListener("click", async () => {
         if (canvas) {

@@ -61,7 +61,8 @@ function verdictBlock(answer, graspedObject) {
     h("h2", { class: "claim" }, text.claim),
     h("p", { class: "below" }, text.below),
     answer.advice && h("p", { class: "advice" }, answer.advice),
-    graspedObject && h("p", { class: "grasped-object" }, "Grasped object: ", h("strong", {}, graspedObject), `, ${where}.`),
+    graspedObject &&
+      h("p", { class: "grasped-object" }, "Grasped object: ", h("strong", {}, graspedObject), `, ${where}.`),
   );
 }
 

@@ -24,7 +24,11 @@ export function askView(index) {
   const askButton = h("button", { type: "button", class: "primary", onclick: () => ask() }, "Ask");
   const clearButton = h("button", { type: "button", class: "quiet", onclick: () => start() }, "Start again");
   const live = livePanel(index, tray);
-  const again = h("button", { type: "button", class: "quiet", onclick: () => graspSomething(graspedObject) }, "Grasp it again");
+  const again = h(
+    "button",
+    { type: "button", class: "quiet", onclick: () => graspSomething(graspedObject) },
+    "Grasp it again",
+  );
   const graspButton = h(
     "button",
     { type: "button", class: "quiet", onclick: () => graspSomething() },

@@ -8,8 +8,8 @@ import { count, nearness } from "./wording.js";
 
 const MAX_PHOTOS = 500;
 
-/** Open the dialog on a photo. `query` contains the touches of the query, null in the catalogue view; `reference` is the
- *  object's nearest reference touch, null if it has none. */
+/** Open the dialog on a photo. `query` contains the touches of the query, null in the catalogue view; `reference` is
+ *  the object's nearest reference touch, null if it has none. */
 export function openDetail({ index, photo, objectId, query = null, reference = null }) {
   const dialog = h("dialog", { class: "detail", "aria-labelledby": "detail-title" });
   const close = () => dialog.close();
