@@ -161,9 +161,7 @@ decode_process.serve_pictures()
             5,
             5_000_000,
             b"memory",
-            marks=pytest.mark.skipif(
-                sys.platform != "linux", reason="only Linux enforces the memory limit of a process"
-            ),
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="only Linux enforces the memory limit"),
         ),
         (0, 200_000_000, None),
     ],

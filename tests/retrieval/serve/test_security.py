@@ -1,4 +1,4 @@
-"""Who may ask the service, and what every response says to browsers."""
+"""Access control of the service, and the security headers of every response."""
 
 import pytest
 
@@ -12,18 +12,18 @@ TOKEN = "a token of some length"
 
 @pytest.fixture(scope="module")
 def guarded(index):
-    with service(index, host="0.0.0.0", token=TOKEN) as opened:
-        yield opened
+    with service(index, host="0.0.0.0", token=TOKEN) as client:
+        yield client
 
 
 def test_a_host_other_than_this_machine_requires_a_token(index):
     for host in ("0.0.0.0", "::", "192.168.1.4", "robot.local"):
-        with pytest.raises(ConfigError, match=f"{host} can be reached from other machines, so a token must be given"):
+        with pytest.raises(ConfigError, match=f"Other machines can reach {host}, so a token is required"):
             ServiceSettings(index=index, host=host)
         ServiceSettings(index=index, host=host, token=TOKEN)
     for host in ("127.0.0.1", "::1", "localhost", "127.3.2.1"):
         ServiceSettings(index=index, host=host)
-    with pytest.raises(ConfigError, match="a token must be 16 or more ASCII characters; got 5"):
+    with pytest.raises(ConfigError, match="A token must have at least 16 ASCII characters, got 5"):
         ServiceSettings(index=index, token="short")
 
 
@@ -84,10 +84,10 @@ def test_the_page_has_no_inline_script_or_style(client):
 
 def test_an_unexpected_error_reveals_no_internals(client, monkeypatch):
     parts = client.app.state.service
-    monkeypatch.setattr(parts.metrics, "page", lambda: 1 / 0)
+    monkeypatch.setattr(parts.metrics, "render", lambda: 1 / 0)
     response = client.get("/metrics")
-    told = problem(response, 500, "failed")
-    assert told == "unexpected ZeroDivisionError; the log of the service says more"
+    detail = problem(response, 500, "failed")
+    assert detail == "Unexpected ZeroDivisionError. See the log of the service."
     assert response.headers["x-content-type-options"] == "nosniff"
 
 
