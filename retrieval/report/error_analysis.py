@@ -64,7 +64,7 @@ def _confusion_blocks(builder: Builder, name: str) -> Iterator[Block]:
         pairs,
         {grasp.object_id: grasp.photo for grasp in reversed(list(builder.grasps.values()))},
         spots={
-            str(place): [(f"{one['object_id']} taken for {one['mistaken_for']}", one.get("grasps", ()))]
+            str(place): [(f"{one['object_id']} mistaken for {one['mistaken_for']}", one.get("grasps", ()))]
             for place, one in enumerate(pairs)
         },
     )
