@@ -167,7 +167,7 @@ function searchDetails(answer) {
       rows.push([
         "Reference touches",
         `${references.touches.toLocaleString("en")} of ${count(references.objects, "object")}; calibrated ` +
-          `on ${count(references.worth.touches, "touch")} of ${count(references.worth.objects, "object")} ` +
+          `on ${count(references.calibration.touches, "touch")} of ${count(references.calibration.objects, "object")} ` +
           `(${references.by})`,
       ]);
     const unscored = posterior.objects - posterior.scored_objects;
