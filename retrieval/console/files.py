@@ -60,10 +60,10 @@ def require_private(path: Path, status: os.stat_result, *owners: int) -> None:
         BadInput: Another user owns the file or can write to it.
     """
     if status.st_uid not in {0, os.geteuid(), *owners}:
-        raise BadInput(f"{path} belongs to another user (uid {status.st_uid}).")
+        raise BadInput(f"{path} belongs to another user (uid {status.st_uid})")
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         mode = stat.S_IMODE(status.st_mode)
-        raise BadInput(f"Other users can write to {path} (mode {mode:04o}). Run `chmod go-w` on it.")
+        raise BadInput(f"{path} can be written to by other users (mode {mode:04o}; run `chmod go-w` on it)")
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ def require_ours(path: Path, kind: Kind) -> None:
         reason = reason if reason.startswith(("is ", "has ")) else f"cannot be opened ({reason})"
         raise BadInput(f"{path} {reason}. Name a file for {kind.name}.") from error
     raise BadInput(
-        f"{path} is not {kind.name} of this program, so it is not overwritten. Name another file, or move it away."
+        f"{path} is not {kind.name} that this program wrote, so it is not overwritten. Name another file, or move it away."
     )
 
 

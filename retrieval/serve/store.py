@@ -122,13 +122,13 @@ class HistoryStore:
         except FileNotFoundError:  # SQLite creates it
             pass
         except OSError as error:
-            raise BadInput(f"{path}: not a history of this service ({error.strerror}). Use another folder.") from error
+            raise BadInput(f"{path} must be the history of a service: {error.strerror}. Use another folder.") from error
         self._database = sqlite3.connect(path, check_same_thread=False, isolation_level=None)
         try:
             self._prepare()
         except sqlite3.DatabaseError as error:
             self._database.close()
-            raise BadInput(f"{path}: not a history of this service ({error}). Use another folder.") from error
+            raise BadInput(f"{path} must be the history of a service: {error}. Use another folder.") from error
         self._files = self._identity()
 
     def _prepare(self) -> None:

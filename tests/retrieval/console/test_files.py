@@ -51,7 +51,7 @@ def test_only_files_of_the_same_kind_are_overwritten(tmp_path):
         path = tmp_path / name
         path.write_bytes(data)
         for kind in KINDS:
-            with pytest.raises(BadInput, match="of this program, so it is not overwritten"):
+            with pytest.raises(BadInput, match="that this program wrote, so it is not overwritten"):
                 write_output(path, b"ours", kind)
             assert path.read_bytes() == data
 

@@ -176,7 +176,7 @@ def test_a_file_of_another_program_is_no_history(tmp_path):
     from retrieval.errors import BadInput
 
     (tmp_path / "x").write_bytes(b"not a database, for sure" * 100)
-    with pytest.raises(BadInput, match="not a history of this service"):
+    with pytest.raises(BadInput, match="must be the history of a service"):
         HistoryStore(tmp_path / "x", 1, 1)
 
 
