@@ -1,4 +1,4 @@
-"""A real browser on the page: Debian's Chromium, driven by playwright, and the service in this process."""
+"""A real browser for the page: Debian's Chromium, driven by playwright, with the service in this process."""
 
 import shutil
 import signal
@@ -17,20 +17,20 @@ from tests.waiting import wait_until
 
 NAMES = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome")
 CAMERA = ("--use-fake-device-for-media-stream", "--use-fake-ui-for-media-stream")
-"""Chromium's camera that shows a turning disc, and a yes to whoever asks for it."""
+"""Chromium's fake camera, which shows a turning disc, and permission to use it."""
 LIMIT_MS = 60_000
-"""Of one wait, on a busy machine."""
+"""Time limit of one wait, on a busy machine."""
 
 
 @contextmanager
 def chromium():
-    """The browser. The test is skipped where none is installed."""
+    """Yield the browser; skip the test if none is installed."""
     path = next(filter(None, map(shutil.which, NAMES)), None)
     if path is None:
         pytest.skip(f"no browser: none of {', '.join(NAMES)} is on PATH (apt-get install chromium)")
     with sync_playwright() as driver:
         try:
-            # Its sandbox wants rights that containers do not give; it shows our own page only.
+            # The sandbox needs rights that containers lack; the browser shows only our own page.
             opened = driver.chromium.launch(executable_path=path, args=[*CAMERA, "--no-sandbox"])
         except Error as error:
             pytest.skip(f"{path} does not start: {str(error).splitlines()[0]}")
@@ -39,9 +39,9 @@ def chromium():
 
 
 @contextmanager
-def address(index, *beside, **settings):
-    """Where the service of an index listens, on a port of its own."""
-    app = create_app(ServiceSettings(index=index, **settings), *beside)
+def address(index, *parts, **settings):
+    """Serve an index on a free port; yield the address. parts: further arguments of `create_app`."""
+    app = create_app(ServiceSettings(index=index, **settings), *parts)
     ports = []
     config = uvicorn.Config(app, port=0, log_level="warning", access_log=False, ws="none", timeout_graceful_shutdown=2)
     server = Server(config, app.state.service, ports.append)
@@ -57,22 +57,22 @@ def address(index, *beside, **settings):
 
 @contextmanager
 def page(browser, url, width=1280, **context):
-    """A page of its own, which must say nothing wrong on the browser's console and throw nothing."""
+    """Yield a new page, which must print no errors on the browser's console."""
     with browser.new_context(viewport={"width": width, "height": 844}, **context) as own:
         opened = own.new_page()
         opened.set_default_timeout(LIMIT_MS)
-        said = []
-        opened.on("console", lambda message: said.append(message.text) if message.type == "error" else None)
-        opened.on("pageerror", lambda error: said.append(str(error)))
+        errors = []
+        opened.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        opened.on("pageerror", lambda error: errors.append(str(error)))
         opened.goto(url)
         opened.locator("h1, dialog").first.wait_for()
         yield opened
-        # What the service refuses, Chromium writes on the console too; the tests read what the page says of it.
-        assert [text for text in said if not text.startswith("Failed to load resource")] == []
+        # Chromium also prints refused requests on the console; the tests check the page's own message.
+        assert [text for text in errors if not text.startswith("Failed to load resource")] == []
 
 
 def serious(opened):
-    """What axe-core finds that is serious or critical, as lines."""
+    """Return the serious and critical findings of axe-core, as lines."""
     found = Axe().run(opened).response["violations"]
     return [
         f"{one['id']}: {one['help']}: {node['html'][:200]}"
@@ -83,14 +83,14 @@ def serious(opened):
 
 
 def choose(opened, button, files):
-    """Choose files as with the mouse."""
+    """Choose files with a button of the page."""
     with opened.expect_file_chooser() as chooser:
         opened.get_by_role("button", name=button).click()
     chooser.value.set_files([str(path) for path in files])
 
 
 def ask(opened, files):
-    """Choose gel images, ask, and wait for the answer."""
+    """Choose gel images, press Ask, and wait for the answer."""
     choose(opened, "Choose gel images", files)
     opened.get_by_role("button", name="Ask", exact=True).click()
     opened.locator(".answer").wait_for()

@@ -15,13 +15,13 @@ from retrieval.serve.settings import ServiceSettings
 from robot.recording.folder import RecordingWriter
 from tests.waiting import run_process
 
-INFO = {"source": "what people said of queries", "sensor": "drawn gel"}
-"""Of the recording of what people said."""
+INFO = {"source": "feedback on queries", "sensor": "drawn gel"}
+"""Information of the feedback recording."""
 
 
 @contextmanager
 def service(index, rig=None, recorder=None, trials=None, **settings):
-    """A client of the application, which runs in this process."""
+    """Yield a client of the application, which runs in this process."""
     app = create_app(ServiceSettings(index=index, **settings), rig, recorder, trials)
     with TestClient(app, base_url="http://127.0.0.1:8000", raise_server_exceptions=False) as client:
         yield client
@@ -29,8 +29,7 @@ def service(index, rig=None, recorder=None, trials=None, **settings):
 
 @contextmanager
 def with_history(index, folder, trials=None, rig=None, serve=service, info=INFO):
-    """What `serve` gives (`service`, `listening` or `browser.address`), of a service that stores its history in a
-    folder."""
+    """Run `serve` (`service`, `listening` or `browser.address`) with a history in `folder`; yield its result."""
     with (
         RecordingWriter(folder / "recording", info) as writer,
         serve(index, rig, writer, trials, history=folder) as found,
@@ -40,7 +39,7 @@ def with_history(index, folder, trials=None, rig=None, serve=service, info=INFO)
 
 @contextmanager
 def listening(index, rig=None, recorder=None, trials=None, **settings):
-    """Address of the application on a port of its own, served by a thread, and its parts."""
+    """Serve the application in a thread on a free port; yield its address and its parts."""
     app = create_app(ServiceSettings(index=index, port=0, **settings), rig, recorder, trials)
     ports = queue.Queue()
     server = Server(uvicorn_config(app), app.state.service, ports.put)
@@ -56,27 +55,27 @@ def listening(index, rig=None, recorder=None, trials=None, **settings):
 
 @contextmanager
 def command(*options, **popen):
-    """`retrieve serve` as a process, its address, and what it says on stderr, a growing list."""
+    """Run `retrieve serve` as a process; yield the process, its address, and the list of its stderr lines."""
     line = [sys.executable, "-m", "retrieval", "serve", *map(str, options)]
     with run_process(line, **popen) as process:
-        said, listening = [], threading.Event()
+        output, listening = [], threading.Event()
 
         def listen():
             for text in process.stderr:
-                said.append(text)
+                output.append(text)
                 if "listening on" in text:
                     listening.set()
             listening.set()
 
         threading.Thread(target=listen, daemon=True).start()
         assert listening.wait(120), "it did not listen within two minutes"
-        found = re.search(r"listening on (\S+)", "".join(said))
-        assert found, "".join(said)
-        yield process, found[1], said
+        found = re.search(r"listening on (\S+)", "".join(output))
+        assert found, "".join(output)
+        yield process, found[1], output
 
 
 def problem(response, status, kind):
-    """The sentence of a response that must be the problem document of that kind."""
+    """Return the detail of a response that must be a problem document of this kind."""
     assert (response.status_code, response.headers["content-type"]) == (status, "application/problem+json"), (
         response.text
     )

@@ -71,7 +71,7 @@ def reliability(rng):
     counts = rng.integers(5, 5000, 10)
     counts[3] = 0
     bins = [
-        {"probability": float(p), "share": float(s) if n else None, "count": int(n)}
+        {"probability": float(p), "frequency": float(s) if n else None, "count": int(n)}
         for p, s, n in zip(centres, shares, counts, strict=True)
     ]
     return {"ece": float(np.abs(centres - shares).mean()), "bins": bins}

@@ -1,1 +1,1 @@
-"""What every command shares: where it speaks, what it writes, progress, and Ctrl-C."""
+"""Shared parts of all commands: terminal output, output files, progress, and Ctrl-C."""

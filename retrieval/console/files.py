@@ -1,4 +1,4 @@
-"""Files that commands write: whole or not at all, and never over a file of another kind."""
+"""Output files of commands: written atomically, and never over a file of another kind."""
 
 import os
 import stat
@@ -12,20 +12,22 @@ from _touch_retrieval.files import named_write_errors, open_regular, parse_json,
 from retrieval.errors import BadInput
 
 GENERATOR = "touch-retrieval"
-"""What our pages, texts and pictures say that they were made by."""
+"""Generator name in our pages, texts and pictures."""
 GENERATOR_COMMENT = f"<!-- {GENERATOR} -->"
-"""Stands on top of our reports in Markdown."""
+"""First line of our Markdown reports."""
 HEADER = "touch_retrieval"
-"""Our entry among the metadata of a `.safetensors` file."""
+"""Key of our entry in the metadata of a `.safetensors` file."""
 SEAL = b"touch_retrieval.sha256"
-"""Stands near the end of our ONNX files."""
+"""Key near the end of our ONNX files."""
 _HEAD = 4096
-_MAX_HEADER_BYTES = 100_000_000  # what safetensors itself reads
+_MAX_HEADER_BYTES = 100_000_000  # the limit of safetensors
 
 
 def cache_folder() -> Path | None:
-    """What may be made or fetched again is kept here: `$XDG_CACHE_HOME/touch-retrieval` (`~/.cache` where it is not
-    set). None where the user has no home.
+    """Return the folder for files that can be created or downloaded again.
+
+    Returns:
+        `$XDG_CACHE_HOME/touch-retrieval`, by default under `~/.cache`; None if the user has no home folder.
     """
     try:
         home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -35,7 +37,11 @@ def cache_folder() -> Path | None:
 
 
 def make_cache_folder(folder: Path) -> None:
-    """Make the cache folder with mode 0700, whatever the umask. One that exists stays as it is. Raises OSError."""
+    """Create the cache folder with mode 0700, independent of the umask; an existing folder stays unchanged.
+
+    Raises:
+        OSError: The folder cannot be created.
+    """
     folder.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     with suppress(FileExistsError):
         folder.mkdir(mode=0o700)
@@ -43,21 +49,31 @@ def make_cache_folder(folder: Path) -> None:
 
 
 def require_private(path: Path, status: os.stat_result, *owners: int) -> None:
-    """Raise BadInput unless `path` belongs to this user, to root or to one of `owners` (user ids), and nobody else can
-    write to it.
+    """Check that only trusted users can write to a file.
 
-    status: of the opened file, so that nothing is swapped between this check and the reading.
+    Args:
+        path: The file, for messages.
+        status: Status of the opened file, so that the file cannot be swapped between this check and the reading.
+        *owners: User ids that may own the file, in addition to this user and root.
+
+    Raises:
+        BadInput: Another user owns the file or can write to it.
     """
     if status.st_uid not in {0, os.geteuid(), *owners}:
         raise BadInput(f"{path} belongs to another user (uid {status.st_uid})")
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         mode = stat.S_IMODE(status.st_mode)
-        raise BadInput(f"{path} can be written to by other users (mode {mode:04o}; `chmod go-w` takes that away)")
+        raise BadInput(f"{path} can be written to by other users (mode {mode:04o}; run `chmod go-w` on it)")
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file that we write. is_ours: whether an opened file is one, by its content."""
+    """A kind of file that commands write.
+
+    Attributes:
+        name: Name of the kind for messages, with its article.
+        is_ours: Whether an opened file is of this kind, by its content.
+    """
 
     name: str
     is_ours: Callable[[BinaryIO], bool]
@@ -82,17 +98,17 @@ def _has_header(file: BinaryIO) -> bool:
     return isinstance(about, dict) and HEADER in about
 
 
-def _holds(*keys: str) -> Callable[[BinaryIO], bool]:
+def _has_keys(*keys: str) -> Callable[[BinaryIO], bool]:
     return lambda file: set(keys) <= set(_parsed(file.read(_MAX_HEADER_BYTES)))
 
 
 def _parsed(text: bytes) -> dict[str, Any]:
-    """The JSON object that a text holds; an empty one where it holds none."""
+    """Return the JSON object in a text, or an empty one."""
     try:
-        found = parse_json(text)
+        document = parse_json(text)
     except ValueError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return document if isinstance(document, dict) else {}
 
 
 PAGE = Kind("a page", _begins_with(f'content="{GENERATOR}"'))
@@ -100,39 +116,61 @@ CARD = Kind("a model card", _begins_with("\n\nMatches touches of "))
 TEXT = Kind("a report", _begins_with(GENERATOR_COMMENT))
 CHECKPOINT = Kind("a checkpoint", _has_header)
 EXPORT = Kind("an export", _ends_with_seal)
-RESULTS = Kind("results", _holds("software"))
-TIMINGS = Kind("timings", _holds("machine", "methods"))
-HAND_EYE = Kind("a hand-eye calibration", _holds("rigid", "points"))
+RESULTS = Kind("results", _has_keys("software"))
+TIMINGS = Kind("timings", _has_keys("machine", "methods"))
+HAND_EYE = Kind("a hand-eye calibration", _has_keys("rigid", "points"))
 PREVIEW = Kind("a preview", _begins_with(GENERATOR))
 
 
 def require_ours(path: Path, kind: Kind) -> None:
-    """Raise BadInput unless nothing stands at `path`, or an empty file, or one of that kind: another one is of the
-    user, who gave the wrong name. Asked before the work whose result is to be written there.
+    """Check that writing a file of this kind overwrites no other file; called before the work for it begins.
+
+    Args:
+        path: The file to write.
+        kind: Its kind.
+
+    Raises:
+        BadInput: `path` exists, is not empty and is not of this kind.
     """
     try:
         with open_regular(path) as file:
             if not os.fstat(file.fileno()).st_size or kind.is_ours(file):
                 return
-    except (FileNotFoundError, NotADirectoryError):  # what is wrong with its folder is said when it is written
+    except (FileNotFoundError, NotADirectoryError):  # the writing reports problems of the folder
         return
     except OSError as error:
-        why = error.strerror or str(error)
-        why = why if why.startswith(("is ", "has ")) else f"cannot be opened ({why})"
-        raise BadInput(f"{path} {why}; name a file to write {kind.name} to") from error
+        reason = error.strerror or str(error)
+        reason = reason if reason.startswith(("is ", "has ")) else f"cannot be opened ({reason})"
+        raise BadInput(f"{path} {reason}. Name a file for {kind.name}.") from error
     raise BadInput(
-        f"{path} is not {kind.name} that this program wrote, and is left as it is; name another file, or move it away"
+        f"{path} is not {kind.name} that this program wrote, so it is not overwritten. Name another file, or move it away."
     )
 
 
 def require_folder(path: Path) -> None:
-    """Raise BadInput unless the folder of a file to write exists: a wrong path is more likely than a wish for it."""
+    """Check that the folder of an output file exists; a missing one is more likely a typing error than intended.
+
+    Raises:
+        BadInput: The folder does not exist.
+    """
     if not path.parent.is_dir():
-        raise BadInput(f"{path} cannot be written, as there is no folder {path.parent}; make it, or name another file")
+        raise BadInput(
+            f"{path} cannot be written: the folder {path.parent} does not exist. Create it, or name another file."
+        )
 
 
 def write_output(path: Path, data: bytes, kind: Kind) -> None:
-    """Write what a command was asked for, its folder too; see `require_ours` and `write_atomically`."""
+    """Write an output file of a command atomically, and create its folder.
+
+    Args:
+        path: The file.
+        data: Its content.
+        kind: Its kind; a file of another kind is not overwritten (`require_ours`).
+
+    Raises:
+        BadInput: A file of another kind exists at `path`.
+        RetrievalError: The file cannot be written.
+    """
     require_ours(path, kind)
     with named_write_errors(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -140,7 +178,8 @@ def write_output(path: Path, data: bytes, kind: Kind) -> None:
 
 
 def text_bytes(text: str) -> bytes:
-    """The text of a page in UTF-8; characters that UTF-8 cannot hold (of names in unknown coding) become HTML's numeric
-    references.
+    """Return the text of a page in UTF-8.
+
+    Surrogates, from file names in unknown encodings, become numeric character references of HTML.
     """
     return text.encode("utf-8", "xmlcharrefreplace")

@@ -1,4 +1,4 @@
-"""Ctrl-C: one that lets the step at hand end, and one that is raised as usual but remembered."""
+"""Handling of Ctrl-C: finish the current step first, or raise as usual and record the signal."""
 
 import signal
 import threading
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def interruption() -> Iterator[threading.Event]:
-    """An event that the first Ctrl-C sets; the second one raises KeyboardInterrupt as usual."""
+    """Yield an event that the first Ctrl-C sets; the second one raises KeyboardInterrupt as usual."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop
@@ -27,22 +27,23 @@ def interruption() -> Iterator[threading.Event]:
 
 @contextmanager
 def record_interrupts() -> Iterator[list[int]]:
-    """The Ctrl-C and SIGTERM signals so far; each raises KeyboardInterrupt, so that a rig is closed with its jaws open
-    and a recording is whole. One that breaks off an import may come out as
-    another error: numpy.linalg half loaded raises RecursionError.
+    """Yield the list of the Ctrl-C and SIGTERM signals so far.
+
+    Each signal raises KeyboardInterrupt, so that a rig opens its gripper and closes, and a recording is complete. A
+    signal during an import may surface as another error: a partly loaded numpy.linalg raises RecursionError.
     """
-    seen: list[int] = []
+    signals: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield seen
+        yield signals
         return
 
     def on_interrupt(number: int, frame: object) -> None:
-        seen.append(number)
+        signals.append(number)
         raise KeyboardInterrupt
 
     before = {number: signal.signal(number, on_interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield seen
+        yield signals
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -1,7 +1,7 @@
-"""Where the command line speaks: results to stdout, all else to stderr.
+"""Output of the command line: results to stdout, everything else to stderr.
 
-Names of objects and files are of strangers. What a terminal would obey or hide (control characters, marks that turn
-the direction of writing, line breaks inside a line) is shown as an escape; JSON stays exact.
+Names of objects and files are untrusted. Characters that a terminal would obey or hide (control characters, direction
+marks, line breaks within a line) are shown as escapes. JSON stays exact.
 """
 
 import contextlib
@@ -17,42 +17,46 @@ from retrieval.errors import RetrievalError
 
 
 def print_json(document: Any) -> None:
-    """One JSON document on stdout, in ASCII."""
+    """Print one JSON document to stdout, in ASCII."""
     with checked_stdout():
         print(json.dumps(document, allow_nan=False))
 
 
 def show(text: str) -> None:
-    """A line of results for a person, on stdout."""
+    """Print a line of results to stdout."""
     with checked_stdout():
         print(printable(text), flush=True)
 
 
 @contextlib.contextmanager
 def checked_stdout() -> Iterator[None]:
-    """Raises RetrievalError where stdout takes nothing more, as on a full disk. A reader that left is no error."""
+    """Convert write errors of stdout, such as a full disk; BrokenPipeError passes unchanged.
+
+    Raises:
+        RetrievalError: Standard output cannot be written.
+    """
     try:
         yield
     except BrokenPipeError:
         raise
     except OSError as error:
         discard_stdout()
-        raise RetrievalError(f"standard output cannot be written: {error.strerror or error}") from error
+        raise RetrievalError(f"Standard output cannot be written: {error.strerror or error}") from error
 
 
 def discard_stdout() -> None:
-    """Throw away what is still to be printed, so that the end of Python does not fail on it."""
+    """Discard buffered output, so that Python does not fail on it at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def say(text: str) -> None:
-    """A line for a person, on stderr; one that cannot be said, as on a full disk, fails nothing."""
+    """Print a line to stderr; write errors, such as a full disk, are ignored."""
     with contextlib.suppress(OSError):
         print(printable(text), file=sys.stderr, flush=True)
 
 
 def printable(text: str) -> str:
-    """`text` on one line, with escapes for everything that would not be seen as it is."""
+    """Return `text` on one line, with escapes for unprintable characters."""
     return "".join(
         character
         if character.isprintable() or unicodedata.category(character) == "Zs"  # spaces of any width
@@ -62,21 +66,21 @@ def printable(text: str) -> str:
 
 
 def abbreviate_list(names: Sequence[str], shown: int = 5) -> str:
-    """The first of many names, and how many there are beside them."""
+    """Return the first `shown` names, and the number of further names."""
     more = f" and {len(names) - shown} more" if len(names) > shown else ""
     return ", ".join(names[:shown]) + more
 
 
 class PrintableFormatter(logging.Formatter):
-    """What the packages log, with names escaped like everywhere."""
+    """Formatter that escapes unprintable characters of log messages."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record's message on one line."""
+        """Return the record's message on one line."""
         return printable(super().format(record))
 
 
 def prepare_streams() -> None:
-    """Letters that the terminal's coding lacks are escaped rather than refused; logging speaks as `say` does."""
+    """Escape characters that the terminal's encoding lacks, and send log messages to stderr, as `say` does."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")

@@ -1,4 +1,4 @@
-"""Progress of long work on stderr: a bar with time left on a terminal, else a line now and then."""
+"""Progress of long work on stderr: a bar with the remaining time on a terminal, else a line every 15 s."""
 
 import sys
 import time
@@ -8,10 +8,14 @@ from retrieval.console.output import printable, say
 
 
 class Bar:
-    """A bar for `total` units of work; use as a context manager.
+    """A progress bar, used as a context manager.
 
-    `unit` names what is counted (the rate is printed per second); `done` starts above 0 when work resumes;
-    `quiet` prints nothing.
+    Args:
+        title: Name of the work.
+        total: Number of units of work.
+        unit: Name of the units.
+        done: Number of finished units; above 0 if work resumes.
+        quiet: Whether to print nothing.
     """
 
     _LINE_EVERY_S = 15.0
@@ -29,7 +33,7 @@ class Bar:
             from rich.progress import Progress as RichProgress
             from rich.table import Column
 
-            # Where the terminal is narrow the bar gives way; unless told otherwise, rich cuts the figures off first.
+            # On a narrow terminal, shorten the bar; by default rich cuts the numbers first.
             self._rich = RichProgress(
                 TextColumn("{task.description}", markup=False),
                 BarColumn(),
@@ -43,15 +47,15 @@ class Bar:
         return self
 
     def advance(self, count: int = 1, note: str = "") -> None:
-        """Say that `count` more units are done; `note` shows the latest figures."""
+        """Add `count` finished units; `note` shows the latest figures."""
         self.done += count
         if self._rich:
             self._rich.update(self._task, advance=count, note=printable(note))
         elif not self._quiet and (time.monotonic() - self._last_line > self._LINE_EVERY_S or self.done == self.total):
             self._last_line = time.monotonic()
             rate = (self.done - self._first) / max(time.monotonic() - self._start, 1e-9)
-            left = (self.total - self.done) / rate if rate else float("nan")
-            text = f"{self.title}: {self.done}/{self.total} {self.unit}, {rate:.1f} per second, {left:.0f} s left"
+            left_s = (self.total - self.done) / rate if rate else float("nan")
+            text = f"{self.title}: {self.done}/{self.total} {self.unit}, {rate:.1f} per second, {left_s:.0f} s left"
             say(f"{text}  {note}".rstrip())
 
     def __exit__(self, *error: object) -> None:
@@ -60,13 +64,19 @@ class Bar:
 
 
 class CountedBar:
-    """A bar that is made at its first call, which says how many units are done and how many there are."""
+    """A progress bar that is created at its first call.
+
+    Args:
+        title: Name of the work.
+        unit: Name of the units.
+    """
 
     def __init__(self, title: str, unit: str) -> None:
         self.title, self.unit = title, unit
         self._bar: Bar | None = None
 
     def __call__(self, done: int, total: int, note: str = "") -> None:
+        """Show `done` of `total` units; `note` shows the latest figures."""
         if self._bar is None:
             self._bar = Bar(self.title, total, self.unit, done=done).__enter__()
         self._bar.advance(done - self._bar.done, note)

@@ -1,4 +1,4 @@
-"""Results for people: a query's table and page, the report of an evaluation, and that of the frontier.
+"""Results for people: the table and page of a query, and the reports of evaluations and benchmarks.
 
-Nothing is imported here: a query's table should not pay for plots.
+The package imports nothing here, so that the table of a query does not import plotting libraries.
 """

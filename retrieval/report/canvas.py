@@ -1,4 +1,4 @@
-"""How the report's figures look: colours that colour-blind readers tell apart, light background, files."""
+"""Style and files of the report's figures: colours that colour-blind readers can distinguish, light background."""
 
 import io
 import warnings
@@ -19,7 +19,7 @@ Axes = Any
 MUTED_COLOUR = "#8a949e"
 PART_COLOURS = {"test": "#c8382e", "validation": "#9aa3ab", "train": "#2f6fb3"}
 FIGURE_DPI = 144
-# No $...$ formulas: an object may be called anything.
+# No $...$ formulas, because object names may contain dollar signs.
 _RC: Any = {
     "font.size": 9.5,
     "axes.titlesize": 10,
@@ -37,14 +37,14 @@ _RC: Any = {
 
 @dataclass(frozen=True)
 class Style:
-    """A method's colour, marker and line, the same in every figure."""
+    """Colour, marker and line of a method, the same in every figure."""
 
     colour: str
     marker: str
     line: str = "-"
 
 
-# Okabe and Ito's palette for the main ones, and a marker each for who sees no colours.
+# The palette of Okabe and Ito for the main methods, and a marker for each method, for readers without colours.
 _STYLES = {
     "late_fusion": Style("#0072b2", "o"),
     "set_fusion": Style("#56b4e9", "s"),
@@ -61,19 +61,19 @@ _STYLES = {
 
 
 def style_of(method: str) -> Style:
-    """The style of a method; one that is not known is black."""
+    """Return the style of a method; unknown methods are black."""
     return _STYLES.get(method, Style("#222222", "*"))
 
 
 def canvas(width_in: float, height_in: float) -> Figure:
-    """An empty figure."""
+    """Return an empty figure."""
     from matplotlib.figure import Figure as MatplotlibFigure
 
     return MatplotlibFigure((width_in, height_in), FIGURE_DPI, layout="constrained", facecolor="white")
 
 
 def percent_axis(panel: Axes, label: str) -> None:
-    """A vertical axis from 0 to 100 %."""
+    """Set a vertical axis from 0 to 100 %."""
     panel.set_ylim(0, 102)
     panel.set_yticks(range(0, 101, 20))
     panel.set_ylabel(label)
@@ -81,7 +81,7 @@ def percent_axis(panel: Axes, label: str) -> None:
 
 @dataclass(frozen=True)
 class RelativeBox:
-    """Where something stands in a figure, in shares of its width and height; left and top from its upper left."""
+    """Position in a figure, as fractions of its width and height, from its upper left corner."""
 
     left: float
     top: float
@@ -90,27 +90,35 @@ class RelativeBox:
 
 
 def draw(path: Path, make: Callable[..., Figure], *arguments: Any) -> dict[str, list[RelativeBox]]:
-    """Write the figure that `make(*arguments)` gives; a .jpg holds photographs, a .png holds lines.
+    """Write the figure that `make(*arguments)` returns.
 
-    Returns where what the figure gave a name to (`gid`) stands: a line's points, the box of anything else. Raises
-    RetrievalError where matplotlib is missing.
+    Args:
+        path: File to write; .jpg for photographs, .png for plots.
+        make: Function that draws the figure.
+        *arguments: Arguments of `make`.
+
+    Returns:
+        `gid` of an artist -> its positions: the points of a line, the box of anything else.
+
+    Raises:
+        RetrievalError: matplotlib is not installed.
     """
     try:
         from matplotlib import rc_context
         from matplotlib.backends.backend_agg import FigureCanvasAgg
     except ImportError as error:
         raise RetrievalError(
-            f"figures need matplotlib, and {error.name} is missing; run pip install 'touch-retrieval[evaluation]'"
+            f"Figures need matplotlib, but {error.name} is missing. Run: pip install 'touch-retrieval[evaluation]'"
         ) from error
     path.parent.mkdir(parents=True, exist_ok=True)
     with rc_context(_RC), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing")  # a name in a script that the font lacks
+        warnings.filterwarnings("ignore", message="Glyph .* missing")  # names in scripts that the font lacks
         agg: Any = FigureCanvasAgg(figure := make(*arguments))
         agg.draw()
     image, data = Image.fromarray(np.ascontiguousarray(np.asarray(agg.buffer_rgba())[..., :3])), io.BytesIO()
     if path.suffix == ".jpg":
         image.save(data, "JPEG", quality=86)
-    else:  # a plot has few colours: 256 of its own make the file three times smaller
+    else:  # a palette of 256 colours makes the file of a plot three times smaller
         image.quantize(256, dither=Image.Dither.NONE).save(data, "PNG", optimize=True)
     write_atomically(path, data.getvalue())
     width, height = agg.get_width_height()

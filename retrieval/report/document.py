@@ -1,6 +1,6 @@
-"""A document of headings, paragraphs, tables and pictures, written as Markdown and as one HTML page.
+"""Documents of headings, paragraphs, tables and pictures, written as Markdown and as one HTML page.
 
-Both are made from the same blocks, so they cannot say different things.
+Both are made from the same blocks, so their contents agree.
 """
 
 import json
@@ -22,7 +22,7 @@ _CARD_PX = 128
 
 @dataclass(frozen=True)
 class Text:
-    """A paragraph. warn: set apart, as something not to be overlooked."""
+    """A paragraph; `warn` highlights it."""
 
     kind: ClassVar[str] = "text"
     text: str
@@ -31,21 +31,27 @@ class Text:
 
 @dataclass(frozen=True)
 class Listing:
-    """Text in a fixed font, as it stands."""
+    """Preformatted text."""
 
     kind: ClassVar[str] = "listing"
     text: str
 
     @classmethod
     def of_json(cls, data: Any) -> "Listing":
-        """Data of JSON types, one item a line."""
+        """Return data of JSON types as text, one item per line."""
         return cls(json.dumps(data, indent=2, sort_keys=True, ensure_ascii=False))
 
 
 @dataclass(frozen=True)
 class Table:
-    """Cells of plain text. words: columns of sentences, not of numbers; bold: (row, column) of cells that stand out;
-    notes: paragraphs below.
+    """A table of plain text cells.
+
+    Attributes:
+        header: Column headings.
+        rows: Cells of each row.
+        notes: Paragraphs below the table.
+        words: Columns of text, which are left-aligned.
+        bold: (row, column) of bold cells.
     """
 
     kind: ClassVar[str] = "table"
@@ -58,7 +64,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Card:
-    """A line of text, and photographs with what each shows; None for one that is not there."""
+    """A line of text, and photographs with their captions; the path None means a missing photograph."""
 
     text: str
     pictures: tuple[tuple[str, Path | None], ...]
@@ -66,7 +72,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Spot:
-    """A place of a picture that shows cards when it is clicked. label: what is clicked, and what stands above them."""
+    """A clickable place of a picture, which shows cards; `label` is its text and the heading of the cards."""
 
     box: RelativeBox
     label: str
@@ -75,7 +81,7 @@ class Spot:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture in a file under the document's folder. alt: what it shows, for those who cannot see it."""
+    """A picture in a file under the document's folder; `alt` is its text alternative."""
 
     kind: ClassVar[str] = "picture"
     file: str
@@ -86,7 +92,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Details:
-    """Blocks that a page keeps folded until they are asked for."""
+    """Blocks that a page shows folded."""
 
     kind: ClassVar[str] = "details"
     title: str
@@ -98,7 +104,7 @@ Block = Text | Listing | Table | Picture | Details
 
 @dataclass(frozen=True)
 class Section:
-    """A heading and what stands under it."""
+    """A heading and its blocks."""
 
     title: str
     blocks: tuple[Block, ...]
@@ -106,7 +112,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """A title, paragraphs on top, and sections."""
+    """A title, leading blocks, and sections."""
 
     title: str
     lead: tuple[Block, ...]
@@ -114,7 +120,15 @@ class Document:
 
 
 def write_document(document: Document, out: Path) -> list[Path]:
-    """Write a document, whose pictures lie under `out`, as report.md and report.html; returns both paths."""
+    """Write a document as report.md and report.html.
+
+    Args:
+        document: The document.
+        out: Folder to write to; it contains the document's pictures.
+
+    Returns:
+        The paths of both files.
+    """
     text, page = out / "report.md", out / "report.html"
     write_output(text, text_bytes(f"{GENERATOR_COMMENT}\n\n{to_markdown(document)}"), TEXT)
     write_output(page, text_bytes(to_html(document, out)), PAGE)
@@ -125,11 +139,11 @@ def write_document(document: Document, out: Path) -> list[Path]:
 
 
 def to_html(document: Document, folder: Path) -> str:
-    """One page with every picture, read from under `folder`, inside it; those of cards once each."""
+    """Return one HTML page that embeds the pictures under `folder`; photographs of cards are embedded once each."""
     photographs: dict[Path, str] = {}
 
     def photograph_id(path: Path) -> str:
-        """By which a card finds its picture on the page."""
+        """Return the id by which a card finds its photograph on the page."""
         return photographs.setdefault(path, f"p{len(photographs)}")
 
     def photograph(path: Path) -> str | None:
@@ -140,7 +154,7 @@ def to_html(document: Document, folder: Path) -> str:
         return data_uri((folder / file).read_bytes(), "png" if file.endswith(".png") else "jpeg")
 
     def width(file: str) -> int:
-        """Of the figure on the page, so that letters have one size in all of them."""
+        """Return the width of a figure on the page, so that the letters of all figures have one size."""
         with Image.open(folder / file) as image:
             return round(image.width * _PAGE_DPI / FIGURE_DPI)
 
@@ -165,7 +179,7 @@ def to_html(document: Document, folder: Path) -> str:
 
 
 def to_markdown(document: Document) -> str:
-    """The same as GitHub Markdown; pictures are links to their files."""
+    """Return the document as GitHub Markdown; pictures are links to their files."""
     parts = [f"# {_plain(document.title)}", *_blocks(document.lead, 2)]
     for section in document.sections:
         parts += [f"## {_plain(section.title)}", *_blocks(section.blocks, 3)]
@@ -188,12 +202,12 @@ def _blocks(blocks: tuple[Block, ...], level: int) -> Iterator[str]:
             ruler = ["---" if column in block.words | {0} else "---:" for column in range(len(block.header))]
             lines = [block.header, ruler]
             for number, row in enumerate(block.rows):
-                marked = [(_plain(cell), (number, column) in block.bold) for column, cell in enumerate(row)]
-                lines.append([f"**{text}**" if bold else text for text, bold in marked])
-            yield "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+                cells = [(_plain(cell), (number, column) in block.bold) for column, cell in enumerate(row)]
+                lines.append([f"**{text}**" if bold else text for text, bold in cells])
+            yield "\n".join(f"| {' | '.join(line)} |" for line in lines)
             yield from map(_plain, block.notes)
 
 
 def _plain(text: str) -> str:
-    """The text with what Markdown or HTML would take for markup made harmless, on one line."""
+    """Return the text on one line, with the markup characters of Markdown and HTML escaped."""
     return re.sub(r"([\\`*_\[\]|<>&])", r"\\\1", " ".join(text.split()))

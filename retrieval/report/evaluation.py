@@ -1,6 +1,6 @@
-"""The report of an evaluation: results.json and the recording's pictures in, Markdown, one HTML page and figures out.
+"""The report of an evaluation: Markdown, one HTML page and figures, from results.json and the recording's pictures.
 
-Every number comes from results.json or timings.json; nothing is measured here.
+Every number comes from results.json or timings.json; the report measures nothing.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,22 +24,30 @@ from retrieval.report.results import (
 PAPER = (
     "For orientation only: on its own data (98 real objects, real GelSight fingers) the paper reports a pair accuracy "
     "of 64.3 % (chance 50 %) on its 18 unseen objects (Lin, Calandra, Levine: Learning to Identify Object Instances by "
-    "Touch, ICRA 2019). Other objects, other pictures: it is no rival to the numbers here."
+    "Touch, ICRA 2019). Its objects and pictures differ, so the numbers are not comparable."
 )
 SIMULATION = (
     "This recording is simulated. It can show that the code works, how methods compare on the same data, and how "
-    "accuracy moves with objects, grasps and time. It cannot say how well any of them does on real sensors and real "
-    "objects: relief, material and light are drawn from a program, photo and touch come from one geometry without "
-    "wear, dirt or error of calibration, and objects differ only by what the program varies."
+    "accuracy depends on objects, grasps and time. It cannot show the accuracy on real sensors and real objects: a "
+    "program generates relief, material and light; photo and touch come from one geometry without wear, dirt or "
+    "calibration errors; and objects differ only in the properties that the program varies."
 )
 
 
 def write_report(out: Path, recording: AnyRecording | None) -> list[Path]:
-    """Write report.md, report.html and figures/ under `out` from its results.json (and timings.json where it is).
+    """Write report.md, report.html and figures/ from results.json, and from timings.json if it exists.
 
-    recording: where the pictures of the galleries are; None leaves the galleries out. Returns the files written.
-    Raises BadInput for results that cannot be read, DatasetError for a recording that cannot, RetrievalError where
-    matplotlib is missing.
+    Args:
+        out: Folder of results.json, to which the report is written.
+        recording: Recording with the pictures of the galleries; None: no galleries.
+
+    Returns:
+        The written files.
+
+    Raises:
+        BadInput: The results cannot be read.
+        DatasetError: The recording cannot be read.
+        RetrievalError: matplotlib is not installed.
 
     >>> import dataclasses
     >>> from pathlib import Path
@@ -66,8 +74,8 @@ def _lead(builder: Builder) -> Iterator[Block]:
     parts, recording = data["split"], data["recording"]
     yield Text(
         f"{recording['objects']} objects, {recording['grasps']:,} grasps, source: {recording['source']}. "
-        f"Fitted on {len(parts['train'])} objects, chosen and calibrated on {len(parts['validation'])}, judged on "
-        f"{len(parts['test'])} that nothing has seen. Seeds: {', '.join(map(str, data['setting']['seeds']))}."
+        f"Trained on {len(parts['train'])} objects, selected and calibrated on {len(parts['validation'])}, tested on "
+        f"{len(parts['test'])} unseen objects. Seeds: {', '.join(map(str, data['setting']['seeds']))}."
     )
     keys = ("pair_accuracy", "topn_k5", "topn_k5_g5_p3")
     found = [(key, summary) for key in keys if (summary := builder.results.summary(builder.main, key))]
@@ -102,10 +110,10 @@ def _setting(builder: Builder) -> Iterator[Block | None]:
     yield Table(("setting", "value"), rows, words=frozenset({1}))
     yield Details("Objects of each part", (tables.split(builder.results),))
     yield Details("Configuration", (Listing.of_json(setting["config"]),))
-    if chosen := {
+    if selected := {
         name: one["best_params"] for name, one in data["methods"].items() if any(one.get("best_params") or ())
     }:
-        yield Details("Chosen on validation objects, for each seed", (Listing.of_json(chosen),))
+        yield Details("Parameters selected on validation objects, for each seed", (Listing.of_json(selected),))
 
 
 def _everything(builder: Builder) -> Iterator[Block | None]:
@@ -113,21 +121,21 @@ def _everything(builder: Builder) -> Iterator[Block | None]:
 
 
 SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
-    "Methods side by side": method_comparison.method_overview,
-    "Guess curves": method_comparison.guess_curves,
-    "More grasps of an object, more photos": method_comparison.grasps_and_photos,
+    "Comparison of methods": method_comparison.method_overview,
+    "Top-N accuracy": method_comparison.guess_curves,
+    "Several grasps, several photos": method_comparison.grasps_and_photos,
     "Accuracy and time": method_comparison.time,
     "Full gallery": method_comparison.gallery,
     "Differences between methods": method_comparison.comparisons,
     "Controls": method_comparison.controls,
     "Ceilings": method_comparison.ceilings,
-    "Touches that hardly press": method_comparison.low_contact,
+    "Low-contact touches": method_comparison.low_contact,
     "Leakage audit": method_comparison.audit,
-    "Object by object": error_analysis.objects,
-    "What was mistaken for what": error_analysis.confusions,
+    "Accuracy by object": error_analysis.objects,
+    "Confusions": error_analysis.confusions,
     "Best and worst queries": error_analysis.examples,
     "Calibration": error_analysis.calibration,
     "Is the object in the catalogue?": error_analysis.reject,
-    "How this was made": _setting,
-    "Every number": _everything,
+    "Settings": _setting,
+    "All measures": _everything,
 }

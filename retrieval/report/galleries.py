@@ -1,6 +1,6 @@
-"""Figures of photographs: what an object was mistaken for, best and worst queries, the nearest frames of an audit.
+"""Figures of photographs: confusions, best and worst queries, and the nearest frames of an audit.
 
-All pictures of a figure lie in one pair of axes, in units of a tile: many axes are slow to lay out.
+All pictures of a figure share one pair of axes, in units of a tile, because the layout of many axes is slow.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,14 +15,14 @@ from retrieval.report.results import format_number, percent, shortened
 
 _TILE_PX = 150
 _RIGHT, _WRONG, _LINE = "#0a9d58", "#c8382e", "#c3cad1"
-_LETTERS = 21  # of a small label under a tile, a line
+_LETTERS = 21  # per line of a label under a tile
 
 Grasps = Mapping[str, Grasp]
-"""Grasps of the recording by grasp_id; what it lacks is left blank."""
+"""Grasps of the recording by grasp_id; missing grasps are left blank."""
 
 
 def examples(queries: Sequence[Any], grasps: Grasps) -> Figure:
-    """A row for each query: its gel images, then the photos in the order found, the true object framed green."""
+    """Draw a row for each query: gel images, then photos by rank, with green frames for the true object."""
     fingers = max(
         (len(grasps[query["grasp_id"]].touches) for query in queries if query["grasp_id"] in grasps), default=1
     )
@@ -30,7 +30,7 @@ def examples(queries: Sequence[Any], grasps: Grasps) -> Figure:
     figure, panel = _sheet(columns, 1.4 * len(queries) - 0.1)
     for column in range(fingers):
         panel.text(column + 0.46, -0.12, f"finger {ascii_lowercase[column]}", ha="center", fontsize=8)
-    panel.text(fingers + 0.35, -0.12, "of the catalogue, most likely first", fontsize=8)
+    panel.text(fingers + 0.35, -0.12, "catalogue, most likely first", fontsize=8)
     for row, query in enumerate(queries):
         top, own = 1.4 * row, grasps.get(query["grasp_id"])
         for column in range(fingers):
@@ -42,16 +42,17 @@ def examples(queries: Sequence[Any], grasps: Grasps) -> Figure:
             f"{shortened(query['object_id'], 2 * _LETTERS + 4)}\nrank {format_number(query['true_rank'])}",
         )
         for place, name in enumerate(query["ranked"]):
-            shown, left = grasps.get(name), fingers + 0.35 + place
-            right = shown is not None and shown.object_id == query["object_id"]
-            _tile(panel, left, top, shown.photo if shown else None, _RIGHT if right else _LINE, 3 if right else 0.8)
-            _label(panel, left, top, f"{place + 1}. {_two_lines(shown.object_id if shown else name)}")
+            found, left = grasps.get(name), fingers + 0.35 + place
+            right = found is not None and found.object_id == query["object_id"]
+            _tile(panel, left, top, found.photo if found else None, _RIGHT if right else _LINE, 3 if right else 0.8)
+            _label(panel, left, top, f"{place + 1}. {_two_lines(found.object_id if found else name)}")
     return figure
 
 
 def confusions(pairs: Sequence[Any], photo_of: Mapping[str, Path]) -> Figure:
-    """Object and what it was taken for, side by side, with the share of its queries where that came first; the Nth pair
-    is called N.
+    """Draw each object next to the object that it was mistaken for, with the fraction of its queries.
+
+    The `gid` of the Nth pair is N.
     """
     from matplotlib.patches import Rectangle
 
@@ -76,12 +77,12 @@ def confusions(pairs: Sequence[Any], photo_of: Mapping[str, Path]) -> Figure:
 
 
 def nearest_frames(frames: Mapping[str, Any], grasps: Grasps) -> Figure:
-    """The nearest pairs of the audit, a row for each kind of frame: test frame beside the frame fitted or chosen on."""
+    """Draw the nearest pairs of the audit, a row for each kind: test frame next to training or validation frame."""
     kinds = [kind for kind in frames if frames[kind]["nearest"]]
-    shown = min(3, max(len(frames[kind]["nearest"]) for kind in kinds))
-    figure, panel = _sheet(2.35 * shown - 0.35, 1.5 * len(kinds) - 0.1)
+    count = min(3, max(len(frames[kind]["nearest"]) for kind in kinds))
+    figure, panel = _sheet(2.35 * count - 0.35, 1.5 * len(kinds) - 0.1)
     for row, kind in enumerate(kinds):
-        for column, pair in enumerate(frames[kind]["nearest"][:shown]):
+        for column, pair in enumerate(frames[kind]["nearest"][:count]):
             left, top = 2.35 * column, 1.5 * row
             panel.text(left, top - 0.05, f"{kind}: distance {pair['distance']:.2f}", fontsize=8)
             for side, part in enumerate(("test", "train_validation")):
@@ -97,7 +98,7 @@ def nearest_frames(frames: Mapping[str, Any], grasps: Grasps) -> Figure:
 
 
 def _sheet(width: float, height: float) -> tuple[Figure, Axes]:
-    """A figure of that many tiles, each 1.15 inch; y grows downwards."""
+    """Return a figure of this many tiles of 1.15 inch; y points downwards."""
     figure = canvas(1.15 * (width + 0.1), 1.15 * (height + 0.3))
     figure.set_layout_engine("none")
     panel = figure.add_axes((0, 0, 1, 1))
@@ -107,7 +108,7 @@ def _sheet(width: float, height: float) -> tuple[Figure, Axes]:
 
 
 def _tile(panel: Axes, left: float, top: float, path: Path | None, frame: str = _LINE, width: float = 0.8) -> None:
-    """One picture in its own shape, centred in a tile of 0.92; blank where there is none."""
+    """Draw one picture, in its aspect ratio, centred in a tile of 0.92; blank if there is none."""
     from matplotlib.patches import Rectangle
 
     image = thumbnail(path, _TILE_PX) if path else None
@@ -128,9 +129,9 @@ def _label(panel: Axes, left: float, top: float, text: str) -> None:
     panel.text(left, top + 0.97, text, va="top", fontsize=6.5, linespacing=1.15)
 
 
-def _two_lines(name: str, taken: int = 3) -> str:
-    """The name on at most two lines, parted where it has a mark, its middle left out where it is longer."""
-    length = _LETTERS - taken
+def _two_lines(name: str, reserved: int = 3) -> str:
+    """Return the name on at most two lines, broken at a mark, shortened in its middle if it is too long."""
+    length = _LETTERS - reserved
     if len(name) <= length:
         return name
     marks = [at + 1 for at, letter in enumerate(name[:length]) if letter in "-_. " and len(name) - at - 1 <= length]

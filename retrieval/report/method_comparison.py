@@ -1,4 +1,4 @@
-"""Sections that set the methods side by side, and say whether the result can be believed."""
+"""Report sections that compare the methods and check whether the result is valid."""
 
 from collections.abc import Iterator
 
@@ -16,55 +16,55 @@ from retrieval.report.document import Block, Details, Listing, Text
 from retrieval.report.results import method_label
 
 INTERVALS = (
-    "Brackets hold 95 % intervals: a bootstrap that resamples objects, since queries of one object are alike. Every "
-    "value is the mean over objects of each object's mean, averaged over seeds where there are several. The interval "
-    "covers other objects of this kind; it does not cover another recording, split or rig. "
-    "Equal scores count by their expected rank, so a constant scorer gets exactly chance."
+    "Brackets contain 95 % intervals of a bootstrap that resamples objects, because queries of one object are "
+    "correlated. Every value is the mean over objects of each object's mean, averaged over seeds. The interval covers "
+    "other objects of this kind; it does not cover another recording, split or rig. Ties count by their expected rank, "
+    "so a constant scorer gets exactly chance."
 )
 
 
 SECTIONS = {
     TOUCH_TO_PHOTO: "From a touch to all photos of the unseen objects; any photo of the object is right.",
-    PHOTO_TO_TOUCH: "The other way: from a photo to all touches.",
-    "objectfolder": "ObjectFolder's cross-sensory retrieval: mAP over all instances, those of the query's grasp too.",
-    "paired": "Paired, as TVL does it: the whole test set is one batch, and only the photo of the same grasp is right; "
+    PHOTO_TO_TOUCH: "From a photo to all touches of the unseen objects.",
+    "objectfolder": "ObjectFolder's cross-sensory retrieval: mAP over all instances, including the query's grasp.",
+    "paired": "Paired, as in TVL: the whole test set is one batch, and only the photo of the same grasp is right; "
     "mean of both directions.",
 }
-"""Tables of the full gallery, and what stands above each."""
+"""Sections of the full gallery, with the text above each table."""
 
 
 def method_overview(builder: Builder) -> Iterator[Block | None]:
-    """The main measures of all methods."""
+    """Yield the main measures of all methods."""
     if builder.any(*plots.OVERVIEW):
-        shown = [key for key in plots.OVERVIEW if builder.any(key)]
+        keys = [key for key in plots.OVERVIEW if builder.any(key)]
         yield builder.picture(
             "overview.png",
-            f"Dots with intervals. {'. '.join(builder.values(key) for key in shown)}.",
+            f"Dots with intervals. {'. '.join(builder.values(key) for key in keys)}.",
             "Value and 95 % interval of each method; dashed: chance in closed form.",
             plots.overview,
             builder.results,
         )
     yield tables.section(builder.results, "main")
-    yield Text("Bold: the highest of a column, whether or not the next one is apart from it.")
+    yield Text("Bold: the highest value of a column, even if it does not differ significantly from the next one.")
     yield Text(INTERVALS)
 
 
 def guess_curves(builder: Builder) -> Iterator[Block | None]:
-    """How often the object is found within N guesses."""
+    """Yield the top-N accuracy: how often the object is among the first N answers."""
     if not builder.any("topn_k5", "topn_k10"):
         return
     methods = builder.results.data["methods"]
     yield builder.picture(
         "guess-curves.png",
         f"Rising curves. {builder.values('topn_k5')}. {builder.values('topn_k10')}.",
-        "How often the object is found within N guesses, the true one among K − 1 others. Bands: 95 % intervals. On "
-        "the page a click on a point shows grasps that it stands for.",
+        "How often the object is among the first N answers, with K − 1 other objects as candidates. Bands: 95 % "
+        "intervals. On the page, click a point to see grasps with this rank.",
         plots.guess_curves,
         builder.results,
         spots={
             f"{name} topn_k{k}": [
-                (f"{method_label(name)}: found with guess {number} of {k}", shown)
-                for number, shown in enumerate(methods[name].get("examples_by_rank", {}).get(str(k), []), start=1)
+                (f"{method_label(name)}: rank {number} of {k}", grasps)
+                for number, grasps in enumerate(methods[name].get("examples_by_rank", {}).get(str(k), []), start=1)
             ]
             for name in reversed(builder.results.learned)  # the last lies on top
             for k in (5, 10)
@@ -76,15 +76,15 @@ def guess_curves(builder: Builder) -> Iterator[Block | None]:
 
 
 def grasps_and_photos(builder: Builder) -> Iterator[Block | None]:
-    """What several grasps of one object add, and several photos of each candidate."""
+    """Yield the effect of several grasps of one object, and of several photos of each candidate."""
     keys = [*map(grasps_metric_name, SET_SIZES), *map(photos_metric_name, PHOTO_COUNTS[1:])]
     if builder.any(*keys):
         yield builder.picture(
             "grasps.png",
-            "First guess against grasps in a query, and against photos of a candidate. "
+            "Top-1 accuracy against grasps in a query, and against photos of a candidate. "
             f"{'. '.join(builder.values(k) for k in keys if builder.any(k))}.",
             "Left: a query of several grasps of one object against three photos of each of five objects. Right: a "
-            "query of one grasp against several. Dashed: chance.",
+            "query of one grasp against several photos of each. Dashed: chance.",
             plots.grasps_and_photos,
             builder.results,
         )
@@ -93,14 +93,13 @@ def grasps_and_photos(builder: Builder) -> Iterator[Block | None]:
 
 
 def time(builder: Builder) -> Iterator[Block | None]:
-    """Accuracy against run time, and every time."""
+    """Yield accuracy against run time, and all run times."""
     if builder.results.timings.get("methods"):
         if builder.any("topn_k5"):
             yield builder.picture(
                 "time.png",
                 f"Accuracy against time on a logarithmic scale. {builder.values('topn_k5')}. Times in the table.",
-                "Upper left is better. The grey steps join the methods that no other one beats in both; dashed: "
-                "chance.",
+                "Upper left is better. The grey steps join the methods on the Pareto front; dashed: chance.",
                 plots.accuracy_and_time,
                 builder.results,
             )
@@ -108,7 +107,7 @@ def time(builder: Builder) -> Iterator[Block | None]:
 
 
 def gallery(builder: Builder) -> Iterator[Block | None]:
-    """Ranks in the full gallery, both ways, and the protocols of ObjectFolder and TVL."""
+    """Yield ranks in the full gallery, in both directions, and the protocols of ObjectFolder and TVL."""
     for name, text in SECTIONS.items():
         if table := tables.section(builder.results, name):
             yield Text(text)
@@ -116,43 +115,43 @@ def gallery(builder: Builder) -> Iterator[Block | None]:
 
 
 def comparisons(builder: Builder) -> Iterator[Block | None]:
-    """Paired differences between methods."""
+    """Yield paired differences between methods."""
     if builder.results.data.get("comparisons"):
         yield tables.comparisons(builder.results)
 
 
-# Can it be believed? --------------------------------------------------------------------------------
+# Validity ------------------------------------------------------------------------------------------
 
 
 def controls(builder: Builder) -> Iterator[Block | None]:
-    """What is left when the answer is taken out of the input."""
+    """Yield the controls, in which the input contains no information about the answer."""
     if builder.results.data.get("controls"):
-        yield Text("The same method after what could give the answer was taken away. Chance is what should be left.")
+        yield Text("The same method on inputs without the information about the answer. The result should be chance.")
         yield tables.controls(builder.results)
 
 
 def ceilings(builder: Builder) -> Iterator[Block | None]:
-    """How much of the object each side knows by itself."""
+    """Yield the accuracy within each modality, which bounds the accuracy between them."""
     if builder.results.data.get("ceilings"):
         yield Text(
-            "CCA fitted and asked within one modality. A match of touch and photo is hardly better than the worse of "
-            "both; what lies between that and the result is lost on the way from one to the other."
+            "CCA trained and tested within one modality. Matching between touch and photo is hardly better than the "
+            "worse of both; the gap between that and the result is lost between the modalities."
         )
         yield tables.ceilings(builder.results)
 
 
 def low_contact(builder: Builder) -> Iterator[Block | None]:
-    """Touches that hardly pressed, apart."""
+    """Yield the accuracy on low-contact touches, and on all others."""
     if found := builder.results.data.get("low_contact"):
         yield Text(
-            f"The {found['touches']} test touches that changed the gel least, by at most {found['change']:.1f} grey "
-            "levels on average (of the finger that felt more), and all others."
+            f"The {found['touches']} test touches that changed the gel image least, by at most {found['change']:.1f} "
+            "grey levels on average (of the finger with the larger change), and all others."
         )
         yield tables.low_contact(builder.results)
 
 
 def audit(builder: Builder) -> Iterator[Block | None]:
-    """What the parts of the split share."""
+    """Yield the audit of leakage between the parts of the split."""
     if not (found := builder.results.data.get("audit")):
         return
     yield Text(found["verdict"], warn=not found["clean"])
@@ -165,9 +164,9 @@ def audit(builder: Builder) -> Iterator[Block | None]:
         ]
         yield builder.picture(
             "nearest.jpg",
-            f"Test frames beside the nearest frames fitted or chosen on; distances: {', '.join(gaps)}.",
-            "The nearest frames on both sides of the split. Copies would look the same here; two light touches "
-            "look alike without being copies.",
+            f"Test frames next to the nearest training or validation frames; distances: {', '.join(gaps)}.",
+            "The nearest frames on both sides of the split. Copies would look the same; two light touches look similar "
+            "without being copies.",
             galleries.nearest_frames,
             found["frames"],
             builder.grasps,

@@ -1,6 +1,4 @@
-"""What pages are made of: the package's templates, thumbnails of image files, images inside a page; and contact sheets
-of what the matcher sees of a catalogue's photos.
-"""
+"""Parts of pages: templates, scripts, thumbnails, embedded images; and contact sheets of photo views."""
 
 import base64
 import io
@@ -24,25 +22,25 @@ from retrieval.data.resize import resize
 from retrieval.errors import ImageError
 
 ThumbnailPixels = NDArray[np.uint8]
-"""(H, W, 3) red first."""
+"""(H, W, 3) RGB."""
 COLUMNS = 2
-"""Photos of a contact sheet side by side."""
+"""Photos per row of a contact sheet."""
 
 
 def render(name: str, **values: Any) -> str:
-    """The template `name` with these values, whose text is escaped."""
+    """Return the template `name`, filled with these values; their text is escaped."""
     source = (resources.files("retrieval") / "templates" / name).read_text("utf-8")
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     return environment.from_string(source).render(**values)
 
 
 def script(name: str) -> Markup:
-    """A script of the package, to stand inside a page."""
+    """Return a script of the package, for embedding in a page."""
     return Markup((resources.files("retrieval") / "templates" / name).read_text("utf-8"))
 
 
 def thumbnail(path: Path, px: int) -> ThumbnailPixels | None:
-    """The image at `path`, its longer side at most `px`; None where it cannot be read."""
+    """Return the image at `path` with a longer side of at most `px`, or None if it cannot be read."""
     try:
         image = read_rgb(path)
     except ImageError:
@@ -54,25 +52,35 @@ def thumbnail(path: Path, px: int) -> ThumbnailPixels | None:
 
 
 def jpeg(image: ThumbnailPixels) -> bytes:
-    """The image as the bytes of a JPEG file."""
+    """Return the image as a JPEG file."""
     _, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 88])
     return data.tobytes()
 
 
 def data_uri(data: bytes, kind: str) -> str:
-    """The bytes of an image file as an address that needs no file; kind is "jpeg" or "png"."""
+    """Return an image file as a data URI; `kind` is "jpeg" or "png"."""
     return f"data:image/{kind};base64," + base64.b64encode(data).decode("ascii")
 
 
 def write_views(photos: Sequence[Path], settings: Preprocessing, out: Path) -> None:
-    """Write a PNG with the views of photos, one at least, two to a row. Raises ImageError, BadInput."""
+    """Write a PNG file with the views of photos, two photos per row.
+
+    Args:
+        photos: The photos, at least one.
+        settings: Preprocessing that makes the views.
+        out: File to write.
+
+    Raises:
+        ImageError: A photo cannot be read.
+        BadInput: `out` exists and is not a preview.
+    """
     strips = [np.rint(255 * settings.load_photo(path)).astype(np.uint8) for path in photos]
     height, width = strips[0].shape[:2]
     columns = min(COLUMNS, len(strips))
     sheet = Image.new("RGB", (columns * width, -(-len(strips) // columns) * height), "white")
     for place, strip in enumerate(strips):
         sheet.paste(Image.fromarray(strip), (place % columns * width, place // columns * height))
-    made_by, content = PngInfo(), io.BytesIO()
-    made_by.add_text("Software", GENERATOR)
-    sheet.save(content, "PNG", pnginfo=made_by)
+    info, content = PngInfo(), io.BytesIO()
+    info.add_text("Software", GENERATOR)
+    sheet.save(content, "PNG", pnginfo=info)
     write_output(out, content.getvalue(), PREVIEW)

@@ -1,4 +1,4 @@
-"""Plots of an evaluation, one function each: results in, a matplotlib figure out."""
+"""Plots of an evaluation: each function returns a matplotlib figure of the results."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ _LABELLED_OBJECTS = 130
 
 
 def overview(results: Results) -> Figure:
-    """A row for each method, a panel for each of the main measures: value, interval, chance."""
+    """Plot value, interval and chance: a row for each method, a panel for each main measure."""
     keys = [key for key in OVERVIEW if any(results.summary(name, key) for name in results.methods)]
     figure = canvas(10.5, 0.9 + 0.32 * len(results.methods))
     panels = figure.subplots(1, len(keys), sharey=True, squeeze=False)[0]
@@ -38,19 +38,19 @@ def overview(results: Results) -> Figure:
 
 
 def _first(summary: Any) -> tuple[float, float, float]:
-    """Value, low and high of the first place, in percent."""
+    """Return the first value of a measure and its interval, in percent."""
     value, low, high = (_percents(summary[key])[0] for key in ("value", "low", "high"))
     return float(value), float(low), float(high)
 
 
-def _percents(shares: Sequence[float | None]) -> NDArray[np.float64]:
-    return 100 * np.array([math.nan if share is None else share for share in shares])
+def _percents(fractions: Sequence[float | None]) -> NDArray[np.float64]:
+    return 100 * np.array([math.nan if fraction is None else fraction for fraction in fractions])
 
 
 def guess_curves(results: Results) -> Figure:
-    """Share of queries whose object is among the first N guesses, for 5 and, where there are so many, 10 candidates."""
-    both = ("topn_k5", "topn_k10")
-    keys = [key for key in both if any(results.summary(name, key) for name in results.methods)] or both
+    """Plot the top-N accuracy for 5 candidates and, if there are enough objects, for 10."""
+    all_keys = ("topn_k5", "topn_k10")
+    keys = [key for key in all_keys if any(results.summary(name, key) for name in results.methods)] or all_keys
     figure = canvas(2.5 + 4 * len(keys), 4.6)
     for panel, key in zip(figure.subplots(1, len(keys), squeeze=False)[0], keys, strict=True):
         for name in reversed(results.methods):
@@ -64,15 +64,15 @@ def guess_curves(results: Results) -> Figure:
             if name not in TRIVIAL_BASELINES:
                 panel.fill_between(guesses, low, high, color=style.colour, alpha=0.13, lw=0)
         panel.set_title(f"{key.removeprefix('topn_k')} candidate objects")
-        panel.set_xlabel("guesses")
+        panel.set_xlabel("N")
         panel.xaxis.get_major_locator().set_params(integer=True)
-        percent_axis(panel, "object found within so many guesses, %")
+        percent_axis(panel, "object among the first N answers, %")
     _legend(figure, results.methods)
     return figure
 
 
 def _legend(figure: Figure, names: Sequence[str]) -> None:
-    """One legend on the right, in the order of the tables."""
+    """Add one legend on the right, in the order of the tables."""
     from matplotlib.lines import Line2D
 
     handles = [
@@ -84,7 +84,7 @@ def _legend(figure: Figure, names: Sequence[str]) -> None:
 
 
 def grasps_and_photos(results: Results) -> Figure:
-    """First guess of five against grasps of a query (three photos of each candidate) and against photos (one grasp)."""
+    """Plot top-1 accuracy of five against grasps (3 photos of each candidate), and against photos (1 grasp)."""
     figure = canvas(12.5, 4.4)
     left, right = figure.subplots(1, 2)
     _against_counts(left, results, grasps_metric_name, SET_SIZES)
@@ -96,7 +96,7 @@ def grasps_and_photos(results: Results) -> Figure:
 
 
 def _against_counts(panel: Axes, results: Results, metric: Callable[[int], str], counts: Sequence[int]) -> None:
-    """Each method's values of a metric of so many, side by side, over the chance of each; of counts that were asked."""
+    """Plot each method's values of a metric for each count, with its chance; counts without values are left out."""
     counts = [count for count in counts if any(results.summary(name, metric(count)) for name in results.methods)]
     for place, name in enumerate(results.methods):
         shift, style = 0.055 * (place - (len(results.methods) - 1) / 2), style_of(name)
@@ -107,38 +107,39 @@ def _against_counts(panel: Axes, results: Results, metric: Callable[[int], str],
         for at, summary in found:
             panel.hlines(100 * summary["chance"][0], at - 0.4, at + 0.4, color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
     panel.set_xticks(range(len(counts)), list(map(str, counts)))
-    percent_axis(panel, "right first guess among 5 objects, %")
+    percent_axis(panel, "top-1 accuracy among 5 objects, %")
 
 
 # Objects ---------------------------------------------------------------------------------------------
 
 
 def objects_among_test(results: Results, method: str) -> Figure:
-    """First guess of five for every test object, candidates from test objects only."""
-    shares = results.data["methods"][method]["per_object"]["test_candidates"]
-    ranked = sorted(shares, key=lambda name: (-shares[name], name))
+    """Plot the top-1 accuracy of five for every test object, with candidates from test objects only."""
+    accuracies = results.data["methods"][method]["per_object"]["test_candidates"]
+    ranked = sorted(accuracies, key=lambda name: (-accuracies[name], name))
     figure = canvas(10.5, 3.6)
     panel = figure.subplots()
-    bars = [(name, shares[name], PART_COLOURS["test"]) for name in ranked]
+    bars = [(name, accuracies[name], PART_COLOURS["test"]) for name in ranked]
     _bars(panel, bars, results, "topn_k5", method, letters=36)
     return figure
 
 
 def objects_among_all(results: Results, method: str) -> Figure:
-    """First guess of five for every object, candidates from all objects; the parts of the split coloured apart."""
+    """Plot the top-1 accuracy of five for every object, with all objects as candidates, coloured by split part."""
     from matplotlib.patches import Patch
 
-    shares = results.data["methods"][method]["per_object"]["all_candidates"]
+    accuracies = results.data["methods"][method]["per_object"]["all_candidates"]
     bars = [
-        (name, shares[name], PART_COLOURS[part])
+        (name, accuracies[name], PART_COLOURS[part])
         for part in ("test", "validation", "train")
-        for name in sorted(set(results.data["split"][part]) & set(shares), key=lambda name: (-shares[name], name))
+        for name in sorted(
+            set(results.data["split"][part]) & set(accuracies), key=lambda name: (-accuracies[name], name)
+        )
     ]
     figure = canvas(13, 3.8)
     panel = figure.subplots()
     _bars(panel, bars, results, "topn_k5_all_objects", method, letters=24)
-    names = {"test": "test: never seen", "validation": "validation: chosen on", "train": "train: fitted on"}
-    handles = [Patch(color=PART_COLOURS[part], label=label) for part, label in names.items()]
+    handles = [Patch(color=PART_COLOURS[part], label=part) for part in ("test", "validation", "train")]
     panel.legend(handles=handles, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, frameon=False)
     return figure
 
@@ -151,8 +152,9 @@ def _bars(
     method: str,
     letters: int,
 ) -> None:
-    """Bars of (object, share, colour), names of at most so many letters, and the chance of the measure."""
-    panel.bar(range(len(bars)), [100 * share for _, share, _ in bars], 0.78, color=[colour for _, _, colour in bars])
+    """Plot bars of (object, accuracy, colour), with names of at most `letters` letters, and the measure's chance."""
+    values = [100 * accuracy for _, accuracy, _ in bars]
+    panel.bar(range(len(bars)), values, 0.78, color=[colour for _, _, colour in bars])
     if summary := results.summary(method, measure):
         panel.axhline(100 * summary["chance"][0], color="#333333", ls="--", lw=1.2)
         panel.text(len(bars) - 0.4, 100 * summary["chance"][0], " chance", va="center", fontsize=8)
@@ -166,21 +168,21 @@ def _bars(
         panel.set_xlabel(f"{len(bars)} objects")
     panel.set_xlim(-0.7, len(bars) - 0.3)
     panel.grid(axis="x", visible=False)
-    percent_axis(panel, "right first guess, %")
+    percent_axis(panel, "top-1 accuracy, %")
 
 
 def test_object_accuracy(results: Results) -> dict[str, dict[str, float]]:
-    """By method, then by test object: share of right first guesses among test objects."""
+    """Return the top-1 accuracy among test objects, by method and test object."""
     found = {name: results.data["methods"][name].get("per_object", {}) for name in results.learned}
-    return {name: shares["test_candidates"] for name, shares in found.items() if shares.get("test_candidates")}
+    return {name: entry["test_candidates"] for name, entry in found.items() if entry.get("test_candidates")}
 
 
 def objects_by_method(results: Results) -> Figure:
-    """Every test object against every method: are the hard ones hard for all?"""
-    shares = test_object_accuracy(results)
-    names = list(shares)
-    objects = sorted(shares[names[0]], key=lambda item: (-shares[names[0]][item], item))
-    values = np.array([[100 * shares[name].get(item, math.nan) for name in names] for item in objects])
+    """Plot every test object against every method, to show whether all methods fail on the same objects."""
+    accuracies = test_object_accuracy(results)
+    names = list(accuracies)
+    objects = sorted(accuracies[names[0]], key=lambda item: (-accuracies[names[0]][item], item))
+    values = np.array([[100 * accuracies[name].get(item, math.nan) for name in names] for item in objects])
     figure = canvas(3.2 + 0.95 * len(names), 1.6 + 0.24 * len(objects))
     panel = figure.subplots()
     image = panel.imshow(values, cmap="cividis", vmin=0, vmax=100, aspect="auto")
@@ -193,7 +195,7 @@ def objects_by_method(results: Results) -> Figure:
     panel.set_yticks(range(len(objects)), [shortened(item, 40) for item in objects], fontsize=8)
     panel.tick_params(length=0, top=True, labeltop=True, bottom=False, labelbottom=False)
     panel.grid(visible=False)
-    figure.colorbar(image, ax=panel, label="right first guess of 5, %", shrink=0.9)
+    figure.colorbar(image, ax=panel, label="top-1 accuracy of 5, %", shrink=0.9)
     return figure
 
 
@@ -208,7 +210,7 @@ RELIABILITIES = {
 
 
 def reliability(results: Results, method: str) -> Figure:
-    """Share of right answers against the probability that was given, on test objects; counts below."""
+    """Plot the fraction of right answers against the stated probability, on test objects, with counts below."""
     diagrams = results.data["methods"][method]["reliability"]
     kinds = [kind for kind in RELIABILITIES if kind in diagrams]
     figure = canvas(0.6 + 2.7 * len(kinds), 4.1)
@@ -216,23 +218,23 @@ def reliability(results: Results, method: str) -> Figure:
     colour = style_of(method).colour
     for panel, counts, kind in zip(*grid, kinds, strict=True):
         bins = [found for found in diagrams[kind]["bins"] if found["count"]]
-        given, found = _percents([one["probability"] for one in bins]), _percents([one["frequency"] for one in bins])
+        stated, right = _percents([one["probability"] for one in bins]), _percents([one["frequency"] for one in bins])
         panel.plot([0, 100], [0, 100], color=MUTED_COLOUR, ls="--", lw=1.2)
-        panel.vlines(given, given, found, color=colour, lw=1, alpha=0.5)
-        panel.plot(given, found, "o-", color=colour, ms=5)
+        panel.vlines(stated, stated, right, color=colour, lw=1, alpha=0.5)
+        panel.plot(stated, right, "o-", color=colour, ms=5)
         panel.set_xlim(-2, 102)
         panel.set_title(f"{RELIABILITIES[kind]}\nECE {percent(diagrams[kind]['ece'])} %", fontsize=9)
-        counts.bar(given, [one["count"] for one in bins], width=6, color=colour, alpha=0.6)
+        counts.bar(stated, [one["count"] for one in bins], width=6, color=colour, alpha=0.6)
         counts.set_yscale("log")
         logarithmic(counts.yaxis, (1,))
-        counts.set_xlabel("probability given, %")
+        counts.set_xlabel("stated probability, %")
     percent_axis(grid[0][0], "right answers, %")
     grid[1][0].set_ylabel("answers")
     return figure
 
 
 def logarithmic(axis: Any, steps: tuple[int, ...]) -> None:
-    """Ticks of a logarithmic axis, so many times a power of ten, as plain numbers: matplotlib's own are formulas."""
+    """Label a logarithmic axis with plain numbers, at `steps` times powers of ten; matplotlib's labels are formulas."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_major_locator(LogLocator(subs=steps, numticks=16))
@@ -241,7 +243,7 @@ def logarithmic(axis: Any, steps: tuple[int, ...]) -> None:
 
 
 def reject(results: Results) -> Figure:
-    """True against false accepts of "it is one of these", and the risk of first guesses against their coverage."""
+    """Plot the ROC curve of "the catalogue contains the object", and the top-1 risk against coverage."""
     figure = canvas(10.5, 4.4)
     accepts, risk = figure.subplots(1, 2)
     names = [name for name in results.methods if results.data["methods"][name].get("reject")]
@@ -251,9 +253,9 @@ def reject(results: Results) -> Figure:
         _decisions(risk, name, found["risk_coverage"])
     accepts.plot([0, 100], [0, 100], color=MUTED_COLOUR, ls="--", lw=1.2)
     accepts.axhline(95, color=MUTED_COLOUR, lw=0.8)
-    accepts.set(xlabel="accepted though its object is absent, %", ylabel="accepted where its object is there, %")
+    accepts.set(xlabel="accepted, object absent (false accepts), %", ylabel="accepted, object present, %")
     risk.axhline(50, color=MUTED_COLOUR, lw=0.8)
-    risk.set(xlabel="queries answered, the surest first, %", ylabel="wrong first guesses among these, %")
+    risk.set(xlabel="answered queries, most confident first, %", ylabel="wrong top-1 answers among these, %")
     for panel in (accepts, risk):
         panel.set(xlim=(-1, 101), ylim=(-1, 101))
         panel.set_aspect("equal", adjustable="box")
@@ -262,7 +264,7 @@ def reject(results: Results) -> Figure:
 
 
 def _decisions(panel: Axes, name: str, corners: Sequence[Sequence[float]]) -> None:
-    """A curve of many corners, with a few markers."""
+    """Plot a curve of many corners with a few markers."""
     points, style = 100 * np.array(corners), style_of(name)
     panel.plot(points[:, 0], points[:, 1], color=style.colour, ls=style.line)
     step = max(1, len(points) // 6)
@@ -273,14 +275,14 @@ def _decisions(panel: Axes, name: str, corners: Sequence[Sequence[float]]) -> No
 
 
 def accuracy_and_time(results: Results) -> Figure:
-    """First guess of five against the time of a query and against the time of fitting; upper left is better."""
+    """Plot top-1 accuracy of five against the time of a query, and against the time of fitting."""
     figure = canvas(10.5, 4.4)
     panels = figure.subplots(1, 2, sharey=True)
     titles = {"query_ms": "one query against the whole gallery, ms", "fit_s": "fitting, s"}
-    for panel, (what, title) in zip(panels, titles.items(), strict=True):
+    for panel, (key, title) in zip(panels, titles.items(), strict=True):
         front: list[tuple[float, float]] = []
         for name in results.methods:
-            time, summary = results.time(name, what), results.summary(name, "topn_k5")
+            time, summary = results.time(name, key), results.summary(name, "topn_k5")
             if not (time and summary):
                 continue
             value, low, high = _first(summary)
@@ -289,7 +291,7 @@ def accuracy_and_time(results: Results) -> Figure:
                 time, value, [[value - low], [high - value]], fmt=style_of(name).marker, color=style_of(name).colour
             )
             panel.axhline(100 * summary["chance"][0], color=MUTED_COLOUR, ls="--", lw=1.2, zorder=0)
-        # Steps through the methods that no other one beats in both time and accuracy.
+        # The Pareto front of time and accuracy.
         front = [
             (time, value)
             for time, value in sorted(front)
@@ -301,6 +303,6 @@ def accuracy_and_time(results: Results) -> Figure:
         low, high = panel.get_xlim()
         logarithmic(panel.xaxis, (1, 2, 5) if high < 1000 * low else (1,))
         panel.set_xlabel(title)
-    percent_axis(panels[0], "right first guess among 5 objects, %")
+    percent_axis(panels[0], "top-1 accuracy among 5 objects, %")
     _legend(figure, results.methods)
     return figure

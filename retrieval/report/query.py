@@ -1,4 +1,4 @@
-"""Results of a query for people: the self-contained HTML page."""
+"""The self-contained HTML page of a query's result."""
 
 from pathlib import Path
 from string import ascii_lowercase
@@ -10,9 +10,14 @@ _THUMBNAIL_PX = 320
 
 
 def query_html(result: QueryResult, catalogue: Path) -> str:
-    """One HTML page with the gel images, the photos and the probabilities; images are inside the file.
+    """Return one HTML page with the gel images, the photos and the probabilities of a query.
 
-    A photo that has vanished since the index was built is left blank.
+    Args:
+        result: The result.
+        catalogue: Folder of the photos; a missing photo is left blank.
+
+    Returns:
+        The page; it embeds its images.
     """
     touches = [
         [
@@ -35,6 +40,6 @@ def query_html(result: QueryResult, catalogue: Path) -> str:
 
 
 def _data_uri(path: Path) -> str:
-    """The image, no larger than a thumbnail, as a data URI; empty where it cannot be read."""
+    """Return a thumbnail of the image as a data URI; empty if the image cannot be read."""
     image = thumbnail(path, _THUMBNAIL_PX)
     return "" if image is None else data_uri(jpeg(image), "jpeg")

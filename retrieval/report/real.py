@@ -1,6 +1,4 @@
-"""The report of the benchmark of real data: its results.json and the recordings' pictures in, Markdown, HTML and
-figures out.
-"""
+"""The report of the real-data benchmark: Markdown, HTML and figures, from results.json and the recordings' pictures."""
 
 import dataclasses
 from collections.abc import Iterator, Mapping
@@ -35,23 +33,31 @@ from retrieval.report.terminal import print_columns
 
 Entry = Mapping[str, Any]
 INTERVALS = (
-    "In percent; brackets hold 95 % intervals that resample {unit}s, since queries of one {unit} are alike; seeds are "
-    "averaged first. Equal scores count by their expected rank, so that a constant scorer gets exactly chance."
+    "In percent. Brackets contain 95 % intervals that resample {unit}s, because queries of one {unit} are correlated; "
+    "seeds are averaged first. Ties count by their expected rank, so a constant scorer gets exactly chance."
 )
 INTERVALS_OVER_CHOICES = (
-    "In percent: the mean over choices of test objects. Brackets hold 95 % intervals that cover the choice of objects "
-    "that test and of those that train (corrected resampled t-test: choices share objects). Equal scores count by "
-    "their expected rank, so that a constant scorer gets exactly chance."
+    "In percent: the mean over choices of test objects. Brackets contain 95 % intervals that cover the choice of test "
+    "and training objects (corrected resampled t-test, because choices share objects). Ties count by their expected "
+    "rank, so a constant scorer gets exactly chance."
 )
-SEARCH_SPACES = {"gallery": "a gallery", "all": "all test objects, look-alikes among them"}
-LOW_PASS_LABEL = "the same, touches blurred to 8 x 6"
+SEARCH_SPACES = {"gallery": "a gallery", "all": "all test objects, including look-alikes"}
+LOW_PASS_LABEL = "low-pass control (8 x 6)"
 
 
 def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
-    """Write report.md, report.html and figures/ under `out` from its results.json.
+    """Write report.md, report.html and figures/ from results.json.
 
-    recordings: by data set, for the pictures of queries; those that are missing are left out. Returns the files
-    written. Raises BadInput for results that cannot be read, RetrievalError where matplotlib is missing.
+    Args:
+        out: Folder of results.json, to which the report is written.
+        recordings: Folder of each data set's recording, for the pictures of queries; missing ones are left out.
+
+    Returns:
+        The written files.
+
+    Raises:
+        BadInput: The results cannot be read.
+        RetrievalError: matplotlib is not installed.
     """
     results = read_results_file(out / "results.json", SCHEMA_VERSION, "benchmark real")
     entries = _ordered(results)
@@ -67,15 +73,15 @@ def write_report(out: Path, recordings: Mapping[str, Path]) -> list[Path]:
     lead: tuple[Block, ...] = (
         Text(RULE),
         Picture("figures/overview.png", words, OVERVIEW),
-        *(Text(f"{name} was not asked: {why}.") for name, why in results["skipped"].items()),
+        *(Text(f"{name} was skipped: {why}.") for name, why in results["skipped"].items()),
     )
-    settings = Section("How this was made", (Details("Settings", (Listing.of_json(results["setting"]),)),))
-    document = Document("What a touch says, on real data", lead, (*sections, settings))
+    settings = Section("Settings", (Details("Settings", (Listing.of_json(results["setting"]),)),))
+    document = Document("Identification by touch on real data", lead, (*sections, settings))
     return [*write_document(document, out), *figures]
 
 
 def _grasps(recording: Path, entry: str) -> list[Grasp]:
-    """Those that a protocol asked, with what showed their objects."""
+    """Return the grasps of a protocol, each with the image that represents its object in the gallery as `photo`."""
     grasps = load_grasps(recording)
     if entry == TOUCHES:
         return [dataclasses.replace(grasp, photo=grasp.touches[0]) for grasp in grasps]
@@ -83,7 +89,7 @@ def _grasps(recording: Path, entry: str) -> list[Grasp]:
 
 
 def _ordered(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """The protocols, their measures and rows in the order in which they are known; the file's is that of letters."""
+    """Return the protocols and their rows in their canonical order; the file's order is alphabetical."""
     entries: Mapping[str, Entry] = results["protocols"]
 
     def place(name: str, known: list[str] = [*METHOD_LABELS, *PROTOCOLS]) -> tuple[int, str]:  # noqa: B006
@@ -100,7 +106,7 @@ def _ordered(results: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 def print_verdicts(results: Mapping[str, Any]) -> None:
-    """Print a table for each protocol, and what its rows say of touch."""
+    """Print a table and the verdicts of each protocol."""
     for entry in _ordered(results).values():
         table = numbers(entry)
         print_columns(entry["title"], table.header, table.rows, words=(0,))
@@ -140,15 +146,15 @@ def _section(name: str, entry: Entry, grasps: Grasps, out: Path, figures: list[P
             )
 
 
-# Words and tables --------------------------------------------------------------------------------------
+# Verdicts and tables -----------------------------------------------------------------------------------
 
 
 def verdicts(entry: Entry) -> list[str]:
-    """A sentence for each row that looks at its input."""
+    """Return a sentence for each row except the trivial baselines."""
     label = entry["labels"][entry["main"]]
     return [
         f"{_label(name, row)}, {label}: {with_interval(row['measures'][entry['main']])}, "
-        f"{'above' if row['verdict']['above_chance'] else 'not apart from'} chance "
+        f"{'above' if row['verdict']['above_chance'] else 'not significantly different from'} chance "
         f"({percent(row['measures'][entry['main']]['chance'][0])}); {row['verdict']['words']}."
         for name, row in entry["rows"].items()
         if row["verdict"]
@@ -156,12 +162,12 @@ def verdicts(entry: Entry) -> list[str]:
 
 
 def _label(name: str, row: Entry) -> str:
-    """What a row is called: a method as everywhere, a model by the name that it was given."""
-    return method_label(name) if row["model"] is None else f"{name} (as it is)"
+    """Return the label of a row: that of the method, or the name of an unadapted model."""
+    return method_label(name) if row["model"] is None else f"{name} (unadapted)"
 
 
 def numbers(entry: Entry) -> Table:
-    """A row for each method with touches, one with blurred touches, those of the controls, and chance."""
+    """Return the main table: each method and its low-pass control, the other controls, and chance."""
     labels: Mapping[str, str] = entry["labels"]
     counted = any(row["correct_counts"] for row in entry["rows"].values())
     rows = []
@@ -182,14 +188,14 @@ def numbers(entry: Entry) -> Table:
     rows.append(("chance, closed form", *chance, *_counts(None, counted), ""))
     basis = next(iter(first.values()))
     over_choices = entry["unit"] == "choice"
-    asked = f"{basis['queries']:,} queries of {basis['objects']} {'object' if over_choices else entry['unit']}s"
+    queries = f"{basis['queries']:,} queries of {basis['objects']} {'object' if over_choices else entry['unit']}s"
     notes = [
         INTERVALS_OVER_CHOICES if over_choices else INTERVALS.format(unit=entry["unit"]),
-        f"{asked} {'in all' if over_choices else 'a seed'}. Gallery: {basis['gallery']}.",
+        f"{queries} {'in total' if over_choices else 'per seed'}. Gallery: {basis['gallery']}.",
     ]
     if counted:
         notes.append(
-            "Right: right first guesses, mean of the seeds, with an exact binomial interval: of "
+            "Right: number of right top-1 answers, mean over the seeds, with an exact binomial interval, for "
             f"{labels[next(row['counted']['measure'] for row in entry['rows'].values() if row['counted'])]}."
         )
     if any(FEW_OBJECTS_MARK in cell for row in rows for cell in row):
@@ -202,25 +208,25 @@ def _values(measures: Mapping[str, Any], labels: Mapping[str, str]) -> list[str]
     return [with_interval(measures.get(key)) for key in labels]
 
 
-def _counts(counted: Mapping[str, Any] | None, wanted: bool) -> list[str]:
-    if not wanted or counted is None:
-        return [""] if wanted else []
+def _counts(counted: Mapping[str, Any] | None, has_column: bool) -> list[str]:
+    if not has_column or counted is None:
+        return [""] if has_column else []
     right = sum(counted["right"]) / len(counted["right"])
     return [f"{right:.3g} of {counted['asked']} [{percent(counted['low'])}, {percent(counted['high'])}]"]
 
 
 def controls(entry: Entry) -> Table:
-    """What each control is, and what it gives by the measure that decides."""
-    rows = [("low_pass", "each gel image is reduced to a blur of 8 x 6 pixels, in fitting and in judging", "see above")]
+    """Return the description and the main measure of each control."""
+    rows = [("low_pass", "each gel image is low-pass filtered to 8 x 6 pixels, in training and test", "see above")]
     for name, one in entry["controls"].items():
         value = with_interval(one["measures"].get(entry["main"])) if one["measures"] else f"none: {one['why_not']}"
         rows.append((name, one["description"], value))
-    header = ("control", "what was done", f"{entry['labels'][entry['main']]}, %")
+    header = ("control", "description", f"{entry['labels'][entry['main']]}, %")
     return Table(header, tuple(rows), words=frozenset({1, 2}))
 
 
 def differences(entry: Entry) -> Table:
-    """Paired differences of each row from its controls."""
+    """Return the paired differences between each row and its controls."""
     rows = [
         (_label(name, row), entry["labels"][key], control, _points(one), probability(one["p"]))
         for name, row in entry["rows"].items()
@@ -228,12 +234,12 @@ def differences(entry: Entry) -> Table:
         for key, one in (row[which] or {}).items()
         if key in entry["labels"]
     ]
-    header = ("method", "measure", "control", "touch less control, points", "p")
+    header = ("method", "measure", "control", "touch minus control, points", "p")
     return Table(header, tuple(rows), words=frozenset({1, 2}))
 
 
 def towers(entry: Entry) -> Table | None:
-    """Paired differences of each tower from the first one; None where there is one tower, or methods are compared."""
+    """Return the paired differences between each tower and the first one; None unless towers are compared."""
     rows = [
         (_label(name, row), entry["labels"][key], _points(one), probability(one["p"]))
         for name, row in entry["rows"].items()
@@ -248,7 +254,7 @@ def _points(one: Mapping[str, Any]) -> str:
 
 
 def choices(entry: Entry) -> Table | None:
-    """How much the measure that decides differs between choices of test objects; None where there are none."""
+    """Return the spread of the main measure over choices of test objects; None if the protocol has no choices."""
     if entry["unit"] != "choice":
         return None
     rows = []
@@ -260,7 +266,7 @@ def choices(entry: Entry) -> Table | None:
         if one["measures"]:
             rows.append((f"control: {name}", *_spread(one["measures"][entry["main"]])))
     label = entry["labels"][entry["main"]]
-    return Table((f"{label}, over choices", "mean, %", "least, %", "most, %", "choices"), tuple(rows))
+    return Table((f"{label}, over choices", "mean, %", "minimum, %", "maximum, %", "choices"), tuple(rows))
 
 
 def _spread(summary: Mapping[str, Any]) -> list[str]:
@@ -269,11 +275,11 @@ def _spread(summary: Mapping[str, Any]) -> list[str]:
 
 
 def contact(entry: Entry) -> Table | None:
-    """The measure that decides by quartile of contact; None where the gel before the contact was not recorded."""
+    """Return the main measure by quartile of contact; None if the recording has no no-contact frames."""
     names = [quartile_name(entry["main"], quartile) for quartile in range(1, QUARTILES + 1)]
     rows = []
     for name, row in entry["rows"].items():
-        if not row["verdict"] or not set(names) <= set(row["measures"]):  # objects of few touches lack some
+        if not row["verdict"] or not set(names) <= set(row["measures"]):  # objects with few touches lack quartiles
             continue
         rows.append((_label(name, row), *(with_interval(row["measures"][key]) for key in names)))
         rows.append((LOW_PASS_LABEL, *(with_interval(row["low_pass"][key]) for key in names)))
@@ -282,13 +288,13 @@ def contact(entry: Entry) -> Table | None:
                 rows.append((f"points over {control}", *(_points(row[which][key]) for key in names)))
     if not rows:
         return None
-    header = ("by contact", "weakest quarter", "second", "third", "strongest quarter")
-    note = "Quarters of each object's touches, by the mean difference of the gel image from the untouched one."
+    header = ("by contact", "weakest quartile", "second", "third", "strongest quartile")
+    note = "Quartiles of each object's touches, by the mean difference between gel image and no-contact frame."
     return Table(header, tuple(rows), (note,))
 
 
 def reliability(entry: Entry) -> Table | None:
-    """Whether stated probabilities of first guesses came true; None where no row states any."""
+    """Return the reliability of the top-1 probabilities; None if no row has probabilities."""
     rows = [
         (
             _label(name, row),
@@ -306,23 +312,22 @@ def reliability(entry: Entry) -> Table | None:
     if not rows:
         return None
     note = (
-        "First guesses of one touch among the objects searched, each shown by one photo, one of them known to be "
-        "true; the posterior is fitted on held-out training objects of each fold."
+        "Top-1 answers to one touch, among objects with one photo each, one of which is known to be the true object. "
+        "The posterior is fitted on held-out training objects of each fold."
     )
-    header = ("method", "searched", "confidence", "mean stated", "accuracy", "difference", "answers")
+    header = ("method", "gallery", "confidence", "mean confidence", "accuracy", "difference", "answers")
     return Table(header, tuple(rows), (note,), words=frozenset({1}))
 
 
 # Figure ------------------------------------------------------------------------------------------------
 
 OVERVIEW = (
-    "The measure that decides, of each protocol: filled with touches, hollow with blurred ones, and 95 % intervals; "
-    "dashed: chance."
+    "The main measure of each protocol with 95 % intervals. Filled: touches; hollow: low-pass control; dashed: chance."
 )
 
 
 def overview(entries: Mapping[str, Entry]) -> Figure:
-    """A panel for each protocol, a line for each row: with touches and with blurred ones."""
+    """Plot a panel for each protocol with each row and its low-pass control."""
     max_rows = max(len(entry["rows"]) for entry in entries.values())
     columns = min(2, len(entries))
     lines = -(-len(entries) // columns)

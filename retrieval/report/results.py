@@ -1,4 +1,4 @@
-"""results.json and timings.json as the report reads them, and how numbers, measures and methods are called in it."""
+"""Reader of results.json and timings.json, and the report's labels of methods, measures and numbers."""
 
 import re
 from collections.abc import Mapping
@@ -15,11 +15,11 @@ from retrieval.metrics.registry import METRICS
 
 MISSING_VALUE = "–"
 
-# Order of every table and figure. A method that is not here comes last, under its own name.
+# Order of every table and figure. Other methods come last, under their own names.
 METHOD_LABELS = {
     "late_fusion": "late fusion",
     "set_fusion": "set fusion",
-    "retrieve_rerank": "prune + rerank",
+    "retrieve_rerank": "retrieve + rerank",
     "contrastive": "contrastive, InfoNCE",
     "contrastive_sigmoid": "contrastive, sigmoid",
     "cca_towers": "CCA, tower by tower",
@@ -34,30 +34,30 @@ Summary = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Results:
-    """An evaluation's results and timings, as they stand in the files."""
+    """Results and timings of an evaluation, as in the files."""
 
     data: Mapping[str, Any]
     timings: Mapping[str, Any]
 
     @property
     def methods(self) -> list[str]:
-        """The methods that were judged, in the order of METHODS."""
+        """The evaluated methods, in the order of `METHOD_LABELS`."""
         known = list(METHOD_LABELS)
         return sorted(self.data["methods"], key=lambda name: (known.index(name) if name in known else 99, name))
 
     @property
     def learned(self) -> list[str]:
-        """The methods that look at their input."""
+        """The methods without the trivial baselines."""
         return [name for name in self.methods if name not in TRIVIAL_BASELINES]
 
     def summary(self, method: str, measure: str) -> Summary | None:
-        """Value, interval, chance and basis of a measure; None where it was not taken."""
+        """Return value, interval, chance and basis of a measure; None if the method lacks it."""
         found: Summary | None = self.data["methods"].get(method, {}).get("measures", {}).get(measure)
         return found
 
-    def time(self, method: str, what: str) -> float | None:
-        """A time of timings.json; None where it was not taken."""
-        found: float | None = self.timings.get("methods", {}).get(method, {}).get(what)
+    def time(self, method: str, key: str) -> float | None:
+        """Return a time of timings.json; None if the method lacks it."""
+        found: float | None = self.timings.get("methods", {}).get(method, {}).get(key)
         return found
 
     @property
@@ -67,57 +67,73 @@ class Results:
 
 
 def read_results(out: Path) -> Results:
-    """Read `out`/results.json, and `out`/timings.json where it is. Raises BadInput."""
+    """Read `out`/results.json, and `out`/timings.json if it exists.
+
+    Raises:
+        BadInput: A file cannot be read.
+    """
     timings = out / "timings.json"
     data = read_results_file(out / "results.json", SCHEMA_VERSION, "evaluate")
     return Results(data, read_results_file(timings, None, "evaluate") if timings.exists() else {})
 
 
 def read_results_file(path: Path, version: int | None, command: str) -> dict[str, Any]:
-    """Read a JSON object of `retrieve COMMAND`, of this schema version unless it is None. Raises BadInput."""
+    """Read a JSON object that a command wrote.
+
+    Args:
+        path: The file.
+        version: Required schema version; None: any.
+        command: Command that writes the file, for messages.
+
+    Returns:
+        The object.
+
+    Raises:
+        BadInput: The file cannot be read or has another schema version.
+    """
     try:
         data = read_json(path)
     except (OSError, ValueError) as error:
-        raise BadInput(f"{path} must hold results in JSON ({error}); run `retrieve {command}`") from error
+        raise BadInput(f"{path} must contain results in JSON ({error}). Run `retrieve {command}`.") from error
     if not isinstance(data, dict):
-        raise BadInput(f"{path} must hold a JSON object, got a {type(data).__name__}; run `retrieve {command}`")
+        raise BadInput(f"{path} must contain a JSON object, got {type(data).__name__}. Run `retrieve {command}`.")
     if version is not None and (found := data.get("schema_version")) != version:
-        raise BadInput(f"{path} must have schema version {version}, got {found!r}; run `retrieve {command}`")
+        raise BadInput(f"{path} must have schema version {version}, got {found!r}. Run `retrieve {command}`.")
     return data
 
 
-# Words -----------------------------------------------------------------------------------------------
+# Labels ----------------------------------------------------------------------------------------------
 
 
 def method_label(name: str) -> str:
-    """What a method is called in the report."""
+    """Return the report's label of a method."""
     return METHOD_LABELS.get(name, name.rpartition(":")[2].replace("_", " "))
 
 
 def capitalized(label: str) -> str:
-    """The label as a sentence begins with it: CCA stays CCA."""
+    """Return the label with an upper-case first letter; CCA stays CCA."""
     return label[:1].upper() + label[1:]
 
 
 def measure_label(name: str) -> str:
-    """What a measure is called in the report."""
+    """Return the report's label of a measure."""
     return METRICS[name].label if name in METRICS else name.replace("_", " ")
 
 
-def percent(share: float | None, digits: int = 1) -> str:
-    """A share in percent, without the sign."""
-    return MISSING_VALUE if share is None else f"{100 * share:.{digits}f}"
+def percent(fraction: float | None, digits: int = 1) -> str:
+    """Return a fraction in percent, without the percent sign."""
+    return MISSING_VALUE if fraction is None else f"{100 * fraction:.{digits}f}"
 
 
 FEW_OBJECTS_MARK = " †"
 FEW_OBJECTS_NOTE = (
-    f"† Fewer than {FEW_OBJECTS} objects: the interval is too narrow. In simulated samples it held the truth in "
-    "50 % of cases for 2 objects, 74 % for 3 and 87 % for 4, instead of 95 %."
+    f"† Fewer than {FEW_OBJECTS} objects: the interval is too narrow. In simulated samples it contained the true value "
+    "in 50 % of cases for 2 objects, 74 % for 3 and 87 % for 4, instead of 95 %."
 )
 
 
 def with_interval(summary: Summary | None, place: int = 0) -> str:
-    """Value and interval in percent, as in "71.2 [65.0, 77.1]"; marked where objects are too few for it."""
+    """Return value and interval in percent, as in "71.2 [65.0, 77.1]", with a mark if there are too few objects."""
     if summary is None or summary["value"][place] is None:
         return MISSING_VALUE
     low, high = percent(summary["low"][place]), percent(summary["high"][place])
@@ -125,24 +141,24 @@ def with_interval(summary: Summary | None, place: int = 0) -> str:
 
 
 def few_objects_mark(summary: Mapping[str, Any]) -> str:
-    """The mark of an interval from too few objects, else nothing."""
+    """Return the mark of an interval from too few objects, else an empty text."""
     return FEW_OBJECTS_MARK if summary.get("few_objects") else ""
 
 
 def format_number(value: float | None) -> str:
-    """Three significant digits; whole numbers and all from 100 on without a point."""
+    """Return a number with three significant digits; integers and numbers from 100 on without decimals."""
     if value is None:
         return MISSING_VALUE
     return f"{value:,.0f}" if abs(value) >= 99.95 or value == int(value) else f"{value:#.3g}"
 
 
 def file_name(name: str) -> str:
-    """The name with nothing in it that a path could trip over."""
+    """Return the name with all characters that are unsafe in paths replaced by "-"."""
     return re.sub(r"[^A-Za-z0-9_-]+", "-", name)
 
 
 def shortened(name: str, length: int) -> str:
-    """The name, its middle left out where it is longer than `length`: the ends tell objects apart."""
+    """Return the name, shortened in its middle to `length` characters, because the ends distinguish objects."""
     if len(name) <= length:
         return name
     head = (length - 1) // 2

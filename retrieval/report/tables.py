@@ -1,4 +1,4 @@
-"""Tables of an evaluation: results in, blocks of the document out."""
+"""Tables of an evaluation: each function returns a table block of the document."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -23,27 +23,27 @@ from retrieval.report.results import (
 )
 
 Column = tuple[str, str, int]
-"""Heading, measure, place in the measure's list of values."""
+"""Heading, measure, index in the measure's list of values."""
 
 
 def section(results: Results, name: str) -> Table | None:
-    """A row for each method and a column for each metric of the section that was taken; None where none was."""
+    """Return a row for each method and a column for each measured metric of a section; None if there is none."""
     return _table(results, [(metric.column, key, 0) for key, metric in METRICS.items() if metric.section == name])
 
 
 def measures(results: Results, keys: Sequence[str]) -> Table | None:
-    """The same of any metrics."""
+    """Return a row for each method and a column for each of these measures; None if there is none."""
     return _table(results, [(measure_label(key), key, 0) for key in keys])
 
 
 def guesses(results: Results, measure: str) -> Table | None:
-    """A guess curve in numbers: a column for each number of guesses."""
+    """Return the top-N accuracies, with a column for each N; None if there are none."""
     lengths = [len(found["value"]) for name in results.methods if (found := results.summary(name, measure))]
     return _table(results, [(f"N = {place + 1}", measure, place) for place in range(max(lengths, default=0))])
 
 
 def _with_notes(table: Table) -> Table:
-    """The table, with what its marks mean below it."""
+    """Return the table, with the explanation of its marks below."""
     if any(FEW_OBJECTS_MARK in cell for row in table.rows for cell in row):
         return dataclasses.replace(table, notes=(*table.notes, FEW_OBJECTS_NOTE))
     return table
@@ -73,7 +73,7 @@ def _table(results: Results, columns: Sequence[Column]) -> Table | None:
 
 
 def _without_threshold(results: Results) -> list[str]:
-    """Which methods have no pair accuracy, and why."""
+    """Return the reasons why methods have no pair accuracy."""
     reasons: dict[str, list[str]] = {}
     for name in results.methods:
         if why := (results.data["methods"][name].get("pair_threshold") or {}).get("reason"):
@@ -82,7 +82,7 @@ def _without_threshold(results: Results) -> list[str]:
 
 
 def _best(results: Results, columns: Sequence[Column]) -> list[tuple[int, int]]:
-    """The highest value of each column, where one is highest."""
+    """Return the cell of the unique highest value of each column."""
     found = []
     for at, (_, key, place) in enumerate(columns, start=1):
         values = {
@@ -97,7 +97,7 @@ def _best(results: Results, columns: Sequence[Column]) -> list[tuple[int, int]]:
 
 
 def _basis(results: Results, keys: Sequence[str]) -> list[str]:
-    """Queries, objects and gallery of the columns, those of one basis named together."""
+    """Return queries, objects and gallery of the columns; measures with the same basis are grouped."""
     bases: dict[str, list[str]] = {}
     for key in keys:
         for name in results.methods:
@@ -111,12 +111,12 @@ def _basis(results: Results, keys: Sequence[str]) -> list[str]:
 
 
 def basis(summary: Summary) -> str:
-    """What a measure was taken over, in words."""
+    """Return queries, objects and gallery of a measure as a sentence."""
     return f"{summary['queries']:,} queries of {summary['objects']} objects. Gallery: {summary['gallery']}."
 
 
 def everything(results: Results) -> Table:
-    """Every measure of every method with interval, chance, queries, objects, seeds and gallery."""
+    """Return all measures of all methods with interval, chance, queries, objects, seeds and gallery."""
     known = [key for name in results.methods for key in results.data["methods"][name].get("measures", {})]
     keys = sorted(set(known), key=lambda key: known.index(key))
     rows = [
@@ -124,7 +124,7 @@ def everything(results: Results) -> Table:
             method_label(name),
             measure_label(key),
             "; ".join(with_interval(found, place) for place in range(len(found["value"]))),
-            "; ".join(percent(share) for share in found["chance"]),
+            "; ".join(percent(chance) for chance in found["chance"]),
             ", ".join(percent(values[0]) for values in found["by_seed"]),
             f"{found['queries']:,}",
             str(found["objects"]),
@@ -139,43 +139,42 @@ def everything(results: Results) -> Table:
 
 
 def comparisons(results: Results) -> Table:
-    """Paired differences on the same queries."""
+    """Return the paired differences between methods on the same queries."""
     rows = [
         (
             f"{method_label(one['a'])} − {method_label(one['b'])}",
             measure_label(one["measure"]),
-            f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]{few_objects_mark(one)}",
+            f"{100 * one['difference']:+.1f} [{100 * one['low']:+.1f}, {100 * one['high']:+.1f}]"
+            f"{few_objects_mark(one)}",
             probability(one["p"]),
         )
         for one in results.data["comparisons"]
     ]
-    note = (
-        "Same queries for both. Interval: bootstrap over objects; p: sign flips of the objects' differences, two-sided."
-    )
+    note = "Same queries for both. Interval: bootstrap over objects; p: two-sided sign-flip test over objects."
     return _with_notes(Table(("methods", "measure", "difference, points", "p"), tuple(rows), (note,), frozenset({1})))
 
 
 def probability(value: float) -> str:
-    """A p-value: never 0."""
+    """Return a p-value as text, never 0."""
     return "< 0.0001" if value < 0.0001 else f"{value:.2g}" if value < 0.1 else f"{value:.2f}"
 
 
 def controls(results: Results) -> Table:
-    """What late fusion gives when the answer is taken out of its input, and whether that is chance."""
+    """Return the measures of the controls of late fusion, and whether they equal chance."""
     keys = ("pair_accuracy", "topn_k5")
     real = (with_interval(results.summary("late_fusion", key)) for key in keys)
-    rows = [("the result", "late fusion as it is", *real, "")]
+    rows = [("the result", "late fusion without a control", *real, "")]
     for name, control in results.data["controls"].items():
-        left, at_chance = (control["measures"].get(key) for key in keys), MISSING_VALUE
+        values, at_chance = (control["measures"].get(key) for key in keys), MISSING_VALUE
         if found := next((control["measures"][key] for key in keys if key in control["measures"]), None):
             at_chance = "yes" if found["low"][0] <= found["chance"][0] <= found["high"][0] else "no"
-        rows.append((name, control["description"], *map(with_interval, left), at_chance))
-    header = ("control", "what was done", *(f"{measure_label(key)}, %" for key in keys), "chance in the interval")
+        rows.append((name, control["description"], *map(with_interval, values), at_chance))
+    header = ("control", "description", *(f"{measure_label(key)}, %" for key in keys), "chance in the interval")
     return _with_notes(Table(header, tuple(rows), tuple(_without_threshold(results)), words=frozenset({1})))
 
 
 def ceilings(results: Results) -> Table:
-    """CCA between touch and photo, and between two touches or two photos of an object."""
+    """Return the measures of CCA between touch and photo, and between two touches or two photos of an object."""
     keys = ("pair_accuracy", "topn_k5", "topn_k10")
     rows = [
         (name.replace("_", " "), one["description"], *(with_interval(one["measures"].get(key)) for key in keys))
@@ -184,25 +183,25 @@ def ceilings(results: Results) -> Table:
     if "cca" in results.methods:
         real = (with_interval(results.summary("cca", key)) for key in keys)
         rows.insert(0, ("touch to photo", "the result of CCA", *real))
-    header = ("ceiling", "what was done", *(f"{measure_label(key)}, %" for key in keys))
+    header = ("ceiling", "description", *(f"{measure_label(key)}, %" for key in keys))
     return _with_notes(Table(header, tuple(rows), words=frozenset({1})))
 
 
 def low_contact(results: Results) -> Table:
-    """The faintest touches and the others, of every method that looks at them."""
+    """Return the measures of low-contact touches and of all others, without the trivial baselines."""
     keys = ("pair_accuracy", "topn_k5", "topn_k10")
     rows = [
-        (method_label(name), words, *(with_interval(parts[part].get(key)) for key in keys))
+        (method_label(name), label, *(with_interval(parts[part].get(key)) for key in keys))
         for name, parts in results.data["low_contact"]["methods"].items()
         if name not in TRIVIAL_BASELINES
-        for part, words in (("low_contact", "faintest"), ("others", "others"))
+        for part, label in (("low_contact", "low-contact"), ("others", "others"))
     ]
     header = ("method", "touches", *(f"{measure_label(key)}, %" for key in keys))
     return _with_notes(Table(header, tuple(rows), words=frozenset({1})))
 
 
 def rejects(results: Results) -> Table:
-    """The decision that the object is in the catalogue."""
+    """Return the measures of the decision that the object is in the catalogue."""
     found = {
         name: results.data["methods"][name]["reject"] for name in results.methods if _has_entry(results, name, "reject")
     }
@@ -219,14 +218,14 @@ def rejects(results: Results) -> Table:
     header = ("method", "AUROC, %", "false accepts at 95 % true accepts, %", "balanced accuracy, %")
     notes = (
         f"{basis(first)} Chance is 50, 95 and 50 %.",
-        "Balanced accuracy is that of accepting where the posterior, fitted on validation objects, thinks one of the "
-        f"gallery's at least as likely as none: {FORMULA}.",
+        "Balanced accuracy: a query is accepted if the posterior, fitted on validation objects, is at least as high "
+        f"for the gallery as for none of its objects: {FORMULA}.",
     )
     return _with_notes(Table(header, tuple(rows), notes))
 
 
 def rejects_by_grasps(results: Results) -> Table | None:
-    """What more grasps of the object in hand do for that decision; None where there are single ones only."""
+    """Return the measures of that decision by the number of grasps; None if all queries have one grasp."""
     found = {
         name: results.data["methods"][name]["reject"]["by_grasps"]
         for name in results.methods
@@ -242,16 +241,16 @@ def rejects_by_grasps(results: Results) -> Table | None:
         for key, label in measures.items()
     ]
     header = ("%, by grasps in a query", *map(str, sizes))
-    note = "A set of grasps is asked as a whole; each number of grasps has a posterior of its own."
+    note = "A set of grasps is one query; each number of grasps has its own posterior."
     return _with_notes(Table(header, tuple(rows), (note,)))
 
 
-def _has_entry(results: Results, name: str, what: str) -> bool:
-    return bool(results.data["methods"][name].get(what))
+def _has_entry(results: Results, name: str, entry: str) -> bool:
+    return bool(results.data["methods"][name].get(entry))
 
 
 def calibrations(results: Results, kinds: Mapping[str, str]) -> Table:
-    """Expected calibration errors."""
+    """Return the expected calibration errors."""
     found = {name: results.data["methods"][name].get("reliability") for name in results.methods}
     rows = [
         (method_label(name), *(percent(diagrams.get(kind, {}).get("ece")) for kind in kinds))
@@ -259,14 +258,14 @@ def calibrations(results: Results, kinds: Mapping[str, str]) -> Table:
         if diagrams
     ]
     note = (
-        "On test objects; fitted on validation objects. Among candidates, of which one is known to be true, it is the "
-        "posterior's probability of the first guess, with a prior of none of 0."
+        "On test objects; fitted on validation objects. Among candidates that contain the true object, it is the error "
+        "of the posterior's top-1 probability, with a none_prior of 0."
     )
     return Table(("expected calibration error, %", *kinds.values()), tuple(rows), (note,))
 
 
 def times(results: Results) -> Table:
-    """How long each method takes."""
+    """Return the run times of each method."""
     columns = {
         "fit_s": "fit, s",
         "encode_touch_ms": "encode a touch, ms",
@@ -280,30 +279,31 @@ def times(results: Results) -> Table:
         if name in results.timings.get("methods", {})
     ]
     towers, machine = results.timings.get("encode", {}), results.timings.get("machine", {})
+    cpus, threads = (machine.get(key, MISSING_VALUE) for key in ("cpus", "threads"))
+    touch_ms, photo_ms = (format_number(towers.get(key)) for key in ("touch_ms", "photo_ms"))
     note = (
-        f"On {machine.get('cpus', MISSING_VALUE)} CPU(s) with {machine.get('threads', MISSING_VALUE)} thread(s). Times of the "
-        "methods alone: one query is one touch against the whole gallery, features given. The towers, shared "
-        f"by all methods, take {format_number(towers.get('touch_ms'))} ms for a touch and {format_number(towers.get('photo_ms'))} ms "
-        "for a photo."
+        f"On {cpus} CPU(s) with {threads} thread(s). Times of the methods alone: one query is one touch against the "
+        "whole gallery, with precomputed features. The towers, shared by all methods, take "
+        f"{touch_ms} ms for a touch and {photo_ms} ms for a photo."
     )
     return Table(("method", *columns.values()), tuple(rows), (note,))
 
 
 def split(results: Results) -> Table:
-    """Objects of each part."""
+    """Return the objects of each part of the split."""
     found = results.data["split"]
     rows = tuple(
         (part, str(len(found[part])), ", ".join(sorted(found[part]))) for part in ("train", "validation", "test")
     )
-    return Table(("part", "objects", "which"), rows, words=frozenset({2}))
+    return Table(("part", "objects", "ids"), rows, words=frozenset({2}))
 
 
 def audit(found: Any) -> Table:
-    """Distances from the test frames to frames fitted or chosen on, beside those within an object."""
-    points = [f"{100 * share:g} %" if share else "nearest" for share in found["quantiles"]]
+    """Return the distances of test frames to training and validation frames, and to frames of the same object."""
+    points = [f"{100 * quantile:g} %" if quantile else "nearest" for quantile in found["quantiles"]]
     rows = []
     for kind, frames in found["frames"].items():
-        for key, what in (
+        for key, label in (
             ("to_train_validation", "to training and validation objects"),
             ("within_object", "to its own object"),
         ):
@@ -313,7 +313,7 @@ def audit(found: Any) -> Table:
                 if key == "to_train_validation"
                 else ("", "")
             )
-            rows.append((f"{kind}, {what}", *values, *counts))
+            rows.append((f"{kind}, {label}", *values, *counts))
     return Table(
         ("nearest frame of each test frame", *points, "copies of those checked", "test frames"),
         tuple(rows),

@@ -1,4 +1,4 @@
-"""Results for people, as tables on stdout: drawn on a terminal, plain lines that nothing cuts where they are piped."""
+"""Tables on stdout: drawn on a terminal, else plain lines that are never cut."""
 
 import sys
 from collections.abc import Collection, Sequence
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from retrieval.report.results import Results
 
 MEASURES = ("pair_accuracy", "topn_k5", "topn_k10", "map")
-"""What the table of an evaluation shows; the report has the others."""
+"""Measures of an evaluation's table; the report contains all measures."""
 
 
 def print_table(result: QueryResult) -> None:
-    """Print the ranking of a query, with "none of these" at its end; nothing where there is no ranking."""
+    """Print the ranking of a query, with "none of these" at its end; print nothing if there is no ranking."""
     if not result.results:
         return
     rows: list[tuple[str, ...]] = [
@@ -41,25 +41,32 @@ def print_table(result: QueryResult) -> None:
 
 
 def _reference(nearest: NearestReference | None) -> tuple[str, str, str]:
-    """Its first gel image, how near it is, and what the object's references add to the logit of its photos."""
+    """Return the nearest reference's first gel image, its cosine, and the logit that the references add."""
     if nearest is None:
         return "", "", ""
     return nearest.touch[0], f"{nearest.cosine:.2f}", "no photo" if nearest.adds is None else f"{nearest.adds:+.2f}"
 
 
 def print_measures(results: "Results") -> None:
-    """Print the main measures of every method, with what they were taken over."""
-    from retrieval.report import tables  # a query's table needs none of what this imports
+    """Print the main measures of every method, with their queries, objects and gallery."""
+    from retrieval.report import tables  # imported here, because the table of a query does not need it
 
     table = tables.measures(results, MEASURES)
     if table is not None:
-        print_columns("On objects that no method saw", table.header, table.rows, words=(0,))
+        print_columns("On unseen objects", table.header, table.rows, words=(0,))
         for note in table.notes:
             show(note)
 
 
 def print_columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int]) -> None:
-    """Print a table of text. words: columns of names, set to the left; numbers are set to the right."""
+    """Print a table.
+
+    Args:
+        title: Title, shown on a terminal only.
+        header: Column headings.
+        rows: Cells of each row.
+        words: Columns of text, which are left-aligned; all others are right-aligned.
+    """
     printable_rows = [[printable(cell) for cell in row] for row in rows]
     if not sys.stdout.isatty():
         widths = [max(map(len, column)) for column in zip(header, *printable_rows, strict=True)]
@@ -74,9 +81,9 @@ def print_columns(title: str, header: Sequence[str], rows: Sequence[Sequence[str
 
     table = Table(title=title)
     for column, name in enumerate(header):
-        # Names are the answer: folded where they are long, never cut.
+        # Fold long names; never cut them.
         table.add_column(name, justify="left" if column in words else "right", overflow="fold")
     for row in printable_rows:
-        table.add_row(*map(Text, row))  # as Text: a name may hold what rich takes for markup, such as "[bold]"
+        table.add_row(*map(Text, row))  # Text: names may contain markup of rich, such as "[bold]"
     with checked_stdout():
         Console().print(table)

@@ -1,15 +1,15 @@
-"""The service: the same answers over HTTP, and a page to look at them.
+"""The HTTP service: queries over HTTP, and a web page.
 
-    app          puts the parts together; `create_app` is all that others need
-    settings     what an operator may choose
-    security     who may ask: this machine, or who knows the token; headers of every response
-    uploads      bodies of requests: how large, how long, what pictures; forms takes multipart bodies apart
-    decoders     pictures of requests, decoded in processes of their own (decode_process)
-    queue        who waits, for how long, and who is answered together
-    generations  which generation of the index answers
-    queries, catalogue, history, trials, rig, health    the paths
-    store        what is kept: queries, what people said of them, trials
-    client       the same `query` on another machine
+    app             creates the application from its parts; other packages need only `create_app`
+    settings        options of the operator
+    security        access control (local requests, or a token), and headers of every response
+    uploads, forms  request bodies: limits, JSON, multipart
+    decoders        image decoding in separate processes (decode_process)
+    queue           admission, deadlines and batches of requests
+    generations     the generation of the index that answers
+    queries, catalogue, history, human_baseline, live, health    the routes
+    store           SQLite database: queries, feedback, trials
+    client          `Searcher.query` for an index on another machine
 
-The layer stands after `report` and knows nothing of rigs: the command hands it callables.
+The layer follows `report` and does not import `robot`: the command passes callables.
 """

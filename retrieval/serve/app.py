@@ -1,4 +1,4 @@
-"""The application: its parts, put together."""
+"""The application, created from its parts."""
 
 import asyncio
 import logging
@@ -36,13 +36,13 @@ from retrieval.version import __version__
 
 log = logging.getLogger(__name__)
 THREADS = 4
-"""That read files and make thumbnails; the model and the rig have their own."""
+"""Threads that read files and make thumbnails. The model and the rig have their own."""
 MAX_RIG_GRASPS = 4
-"""Grasps of the rig that are held at once, the one in work among them."""
+"""Maximum number of pending rig grasps, including the one in progress."""
 MAX_FRAMES = 8
-"""Requests for single pictures of a sensor that are held at once, besides streams."""
+"""Maximum number of pending requests for single sensor pictures, in addition to streams."""
 _CLOSING_S = 1.0
-"""For each part of the service to end; what hangs is left to itself."""
+"""Time for each part of the service to close; parts that hang are abandoned."""
 _BODIES: tuple[type[BaseModel], ...] = (
     QueryBody,
     BatchBody,
@@ -62,12 +62,17 @@ def create_app(
     trials: Path | None = None,
     shards: OpenShards | None = None,
 ) -> FastAPI:
-    """The service over the index of `settings`, which is opened when the application starts.
+    """Create the service for the index of `settings`, which opens when the application starts.
 
-    shards: opens those of a cluster; None: in this process.
+    Args:
+        settings: Options of the operator.
+        rig: Sensors and gripper for the live routes; None: none.
+        recorder: Writes feedback into the recording in the history folder; None: no history is stored.
+        trials: Recording whose unseen objects serve for the human baseline; None: no trials.
+        shards: Opens the shards of a sharded index; None: in this process.
 
-    recorder: writes what people said into the recording in the history's folder; nothing is kept without it. trials: a
-    recording with whose unseen objects people are tested. Raises BadInput.
+    Raises:
+        BadInput: An input cannot be used.
     """
     metrics, rig = Metrics(), rig or LiveRig()
     generations = Generations(settings, metrics, shards)
@@ -94,15 +99,15 @@ def create_app(
         title="touch-retrieval",
         summary="From the gel images of a grasp, find which catalogue photo shows the object in the hand.",
         version=__version__,
-        docs_url=None,  # its page loads scripts from elsewhere
+        docs_url=None,  # the default page loads scripts from other hosts
         redoc_url=None,
         lifespan=_lifespan,
         separate_input_output_schemas=False,
     )
     app.state.service = parts
     errors.install_handlers(app)
-    for paths in (queries, catalogue, live, history, human_baseline, health):
-        app.include_router(paths.router)
+    for module in (queries, catalogue, live, history, human_baseline, health):
+        app.include_router(module.router)
     app.include_router(page_files.router_of())
     app.openapi = lambda: _document(app)  # type: ignore[method-assign]
     app.add_middleware(BodyLimit, seconds=settings.body_s)
@@ -112,7 +117,7 @@ def create_app(
 
 @asynccontextmanager
 async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
-    """Opens the index; ends when what is in flight is done, which the server waits for."""
+    """Open the index and start the parts; close them after the requests in flight are done."""
     parts: Service = app.state.service
     anyio.to_thread.current_default_thread_limiter().total_tokens = THREADS
     if not parts.generations.ready:
@@ -125,7 +130,7 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         parts.history_writer.start()
     watching = asyncio.ensure_future(parts.generations.watch())
     try:
-        with threadpool_limits(parts.settings.threads, "blas"):  # its threads spin between two queries
+        with threadpool_limits(parts.settings.threads, "blas"):  # BLAS threads spin between two queries
             yield
     finally:
         parts.stopping.set()
@@ -140,15 +145,15 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
 
 
 def _in_daemon(work: Callable[[], None]) -> asyncio.Future[None]:
-    """Work in a thread of its own, for which the process does not wait: all others may hang."""
+    """Run `work` in a daemon thread, so that a hanging part does not keep the process alive."""
     loop, done = asyncio.get_running_loop(), asyncio.get_running_loop().create_future()
 
     def run() -> None:
         try:
             work()
         except Exception:
-            log.exception("a part of the service did not end well")
-        with suppress(RuntimeError):  # the loop has ended meanwhile
+            log.exception("A part of the service failed to close.")
+        with suppress(RuntimeError):  # the loop has ended
             loop.call_soon_threadsafe(done.set_result, None)
 
     Thread(target=run, daemon=True).start()
@@ -156,21 +161,21 @@ def _in_daemon(work: Callable[[], None]) -> asyncio.Future[None]:
 
 
 def _document(app: FastAPI) -> dict[str, Any]:
-    """OpenAPI, with the bodies that the paths read themselves."""
+    """Return the OpenAPI document, including the bodies that the routes parse themselves."""
     if app.openapi_schema is None:
         document = FastAPI.openapi(app)
         schemas = document.setdefault("components", {}).setdefault("schemas", {})
         for model in _BODIES:
-            found = model.model_json_schema(ref_template="#/components/schemas/{model}")
-            schemas |= found.pop("$defs", {})
-            schemas[model.__name__] = found
-        for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own words for what are problems here
+            schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas |= schema.pop("$defs", {})
+            schemas[model.__name__] = schema
+        for name in ("HTTPValidationError", "ValidationError"):  # the service returns problem documents instead
             schemas.pop(name, None)
         for path in document["paths"].values():
             for operation in path.values():
                 if "application/json" in operation["responses"].get("422", {}).get("content", {}):
                     operation["responses"] |= {
-                        str(status): said for status, said in errors.problem_responses("bad-input").items()
+                        str(status): response for status, response in errors.problem_responses("bad-input").items()
                     }
         app.openapi_schema = document
     return app.openapi_schema

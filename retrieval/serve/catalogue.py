@@ -1,6 +1,6 @@
-"""The paths of the catalogue: its photos by page, by search, by nearness; pictures and thumbnails by id; the index.
+"""Routes of the catalogue: pages of photos, search, similar photos, images, thumbnails, and the index.
 
-An id is looked up in the index, and the file is the one that the index names: no text of a request is part of a path.
+The index maps an id to its file. No text of a request becomes part of a file path.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,48 +25,52 @@ from retrieval.serve.documents import (
 )
 from retrieval.serve.errors import HttpProblem, problem_responses
 from retrieval.serve.generations import ServedGeneration
-from retrieval.serve.history_writer import recordable
+from retrieval.serve.history_writer import as_png_or_jpeg
 from retrieval.serve.service import Parts
 from retrieval.version import __version__
 
 router = APIRouter(tags=["catalogue"])
 BROWSER_IMAGE_TYPES = {b"\x89PNG\r\n\x1a\n": "image/png", b"\xff\xd8\xff": "image/jpeg"}
-"""Files that every browser shows, by their first bytes; others are sent as JPEG."""
+"""First bytes of the image formats that every browser shows -> media type. Other formats are converted."""
 IMAGE_RESPONSES: dict[int | str, dict[str, Any]] = {
-    200: {"content": {"image/jpeg": {}, "image/png": {}}, "description": "the picture"}
+    200: {"content": {"image/jpeg": {}, "image/png": {}}, "description": "The picture."}
 }
 MAX_PHOTO_PX = 4096
-"""Longer side of a photo that is sent as another file than it is."""
+"""Maximum longer side, in pixels, of a photo that is converted to JPEG."""
 
 
 def photo_of(generation: ServedGeneration, photo: str) -> ListedPhoto:
-    """The photo of that id. Raises Problem where the index has none."""
+    """Return the photo with this id.
+
+    Raises:
+        HttpProblem: The index has no such photo.
+    """
     row = _row(generation, photo)
     if row.get("touch"):
-        raise HttpProblem("unknown", f"{photo!r} is a gel image of a reference touch, and no photo")
+        raise HttpProblem("unknown", f"{photo!r} is a gel image of a reference touch, not a photo.")
     return listed_photo(row)
 
 
 def _row(generation: ServedGeneration, photo: str) -> dict[str, object]:
     (row,) = generation.shard.rows([photo])
     if row is None:
-        raise HttpProblem("unknown", f"the index has no photo {photo!r}; /v1/catalogue lists them")
+        raise HttpProblem("unknown", f"The index has no photo {photo!r}. /v1/catalogue lists the photos.")
     return row
 
 
 Offset = Annotated[int, Query(ge=0, le=2**31)]
-Limit = Annotated[int, Query(ge=1, le=500, description="photos of a page")]
+Limit = Annotated[int, Query(ge=1, le=500, description="Photos per page.")]
 Search = Annotated[
-    str, Query(max_length=200, description="words that object, path and metadata must hold, all of them")
+    str, Query(max_length=200, description="Words that must all occur in the object, the path or the metadata.")
 ]
-ObjectFilter = Annotated[str | None, Query(max_length=1000, alias="object", description="photos of this object alone")]
+ObjectFilter = Annotated[str | None, Query(max_length=1000, alias="object", description="Only photos of this object.")]
 
 
 @router.get("/v1/catalogue", responses=problem_responses("bad-input", "not-ready"))
 def catalogue(
     parts: Parts, offset: Offset = 0, limit: Limit = 100, search: Search = "", name: ObjectFilter = None
 ) -> CatalogueDocument:
-    """Photos of the index, in its order, page by page."""
+    """Return one page of the index's photos, in index order."""
     generation = parts.generations.current
     found = generation.shard.page(search.casefold().split(), name, offset, limit)
     end = offset + len(found.rows)
@@ -87,7 +91,7 @@ def _document(photo: ListedPhoto) -> PhotoDocument:
     "/v1/photos/{photo:path}", response_class=Response, responses={**IMAGE_RESPONSES, **problem_responses("unknown")}
 )
 def photo(request: Request, photo: str, parts: Parts) -> Response:
-    """A photo of the catalogue, or a gel image of a reference touch, as it is; what browsers do not show, as JPEG."""
+    """Return the file of a photo or of a reference gel image; formats that browsers lack are converted to JPEG."""
 
     def read(path: Path, _: dict[str, object]) -> bytes | None:
         data = read_bytes(path)
@@ -108,9 +112,9 @@ def get_thumbnail(
     request: Request,
     photo: str,
     parts: Parts,
-    px: Annotated[int, Query(ge=32, le=1024, description="of the longer side")] = 320,
+    px: Annotated[int, Query(ge=32, le=1024, description="Pixels of the longer side.")] = 320,
 ) -> Response:
-    """A photo, or a gel image of a reference touch, as a small JPEG."""
+    """Return a photo, or a gel image of a reference touch, as a small JPEG."""
 
     def read(path: Path, row: dict[str, object]) -> bytes | None:
         return parts.thumbnails.of(path, str(row.get("digest")), px)
@@ -121,7 +125,7 @@ def get_thumbnail(
 def _catalogue_image_response(
     request: Request, parts: Parts, photo: str, size: str, read: Callable[[Path, dict[str, object]], bytes | None]
 ) -> Response:
-    """What `read` makes of the photo's file, PNG or JPEG, unless the client has it; it is gone where that is None."""
+    """Return the image that `read` makes of the photo's file, or 304 if the client has it; None means unreadable."""
     generation = parts.generations.current
     row = _row(generation, photo)
     headers = {"etag": f'"{row.get("digest")}-{size}"', "cache-control": "private, no-cache"}
@@ -132,23 +136,27 @@ def _catalogue_image_response(
     with suppress(ImageError):
         data = read(generation.searcher.catalogue / listed.path, row)
     if data is None:
-        detail = f"the photo {listed.path!r} cannot be read any more; run `retrieve build-index` again"
+        detail = f"The photo {listed.path!r} cannot be read any more. Run `retrieve build-index` again."
         raise HttpProblem("unknown", detail)
     return image_response(data, headers)
 
 
 def image_response(data: bytes, headers: Mapping[str, str] | None = None) -> Response:
-    """A picture's file as a response: PNG or JPEG as it is, another as PNG. Raises ImageError."""
-    data = recordable(data)
+    """Return an image file as a response; formats other than PNG and JPEG become PNG.
+
+    Raises:
+        ImageError: The image cannot be decoded.
+    """
+    data = as_png_or_jpeg(data)
     kind = next(kind for magic, kind in BROWSER_IMAGE_TYPES.items() if data.startswith(magic))
     return Response(data, media_type=kind, headers=headers)
 
 
 @router.get("/v1/nearest/{photo:path}", responses=problem_responses("unknown", "bad-input"))
 def nearest(photo: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)] = 12) -> NearPhotosDocument:
-    """Photos that look to the model like this one."""
+    """Return visually similar photos, by the model's embeddings."""
     generation = parts.generations.current
-    photo_of(generation, photo)  # says what is missing
+    photo_of(generation, photo)  # raises if the photo is missing
     items = [
         NearPhoto(**_document(near.photo).model_dump(), score=near.score)
         for near in nearest_photos(generation.searcher, photo, count)
@@ -158,7 +166,7 @@ def nearest(photo: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)]
 
 @router.get("/v1/index", responses=problem_responses("not-ready"))
 def index(parts: Parts) -> IndexDocument:
-    """What answers, and with what it is asked."""
+    """Return a description of the index, its model and the service."""
     generation = parts.generations.current
     searcher, info = generation.searcher, generation.searcher.info
     measured = info.about.get("candidates") or {}

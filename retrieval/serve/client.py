@@ -1,4 +1,4 @@
-"""The same `query` as an opened index has, of an index on another machine."""
+"""Client of the service: `Searcher.query` for an index on another machine."""
 
 import base64
 import io
@@ -21,7 +21,7 @@ from retrieval.search.query.answer import Match, QueryResult
 try:
     import httpx
 except ImportError as missing:
-    raise BadInput("a client needs httpx; run: pip install 'touch-retrieval[serve]'") from missing
+    raise BadInput("A client needs httpx. Run: pip install 'touch-retrieval[serve]'") from missing
 
 _PNG_MODES = frozenset({"1", "L", "LA", "P", "RGB", "RGBA"})
 _BAD_INPUT_KINDS = frozenset(
@@ -30,7 +30,7 @@ _BAD_INPUT_KINDS = frozenset(
 
 
 class QueryOptions(TypedDict, total=False):
-    """The keywords of `Searcher.query`, which says what they mean and what holds where one is left out."""
+    """The keyword arguments of `Searcher.query`, with the same meanings and defaults."""
 
     background: Sequence[AnyImage] | None
     top: int
@@ -39,15 +39,20 @@ class QueryOptions(TypedDict, total=False):
 
 
 class Client:
-    """A service of `retrieve serve`, asked as a `Searcher` is: a robot's code does not change when the index moves.
+    """Client of `retrieve serve` with the query methods of `Searcher`.
 
-    url: where it listens. token: what it asks for, where it listens to other machines. timeout_s: for one answer,
-    waiting for a place in the queue included. Any number of threads may use it. `close` it, or use it by `with`.
+    A robot's code does not change if the index moves to another machine. Any number of threads may share a client.
+    Call `close`, or use it in a `with` statement.
+
+    Args:
+        url: Address of the service.
+        token: Token of the service; required if it listens to other machines.
+        timeout_s: Time limit for one answer in seconds, including the wait for a place in the queue.
 
     >>> with retrieval.Client("http://127.0.0.1:1") as client:
     ...     client.query(["a.png", "b.png"])
     Traceback (most recent call last):
-    retrieval.errors.RetrievalError: http://127.0.0.1:1 cannot be reached (...); is `retrieve serve` running there?
+    retrieval.errors.RetrievalError: Cannot reach http://127.0.0.1:1 (...). Is `retrieve serve` running there?
     """
 
     def __init__(
@@ -59,7 +64,7 @@ class Client:
         self._fingers: int | None = None
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection."""
         self._http.close()
 
     def __enter__(self) -> Self:
@@ -69,17 +74,28 @@ class Client:
         self.close()
 
     def query(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> QueryResult:
-        """`Searcher.query` with its keywords, answered there. Paths are of this machine, `Match.photo_path` is of the
-        other: `photo` gets the picture. Raises what that raises, and RetrievalError where no answer can be had.
+        """Run `Searcher.query` on the service.
+
+        Args:
+            touches: As for `Searcher.query`; paths refer to this machine.
+            **options: Keyword arguments of `Searcher.query`.
+
+        Returns:
+            The result. `Match.photo_path` refers to the other machine; `photo` returns the picture.
+
+        Raises:
+            BadInput: The input cannot be used.
+            ImageError: An image cannot be read.
+            RetrievalError: No answer is available.
         """
         return self._ask("query", touches, options)[0]
 
     def query_cumulative(self, touches: AnyTouches, **options: Unpack[QueryOptions]) -> list[QueryResult]:
-        """`Searcher.query_cumulative`, answered there; see `query`."""
+        """Run `Searcher.query_cumulative` on the service; see `query`."""
         return self._ask("query/cumulative", touches, options)
 
     def query_many(self, objects: Sequence[AnyTouches], **options: Unpack[QueryOptions]) -> list[QueryResult]:
-        """`Searcher.query_many`, answered there; see `query`."""
+        """Run `Searcher.query_many` on the service; see `query`."""
         if not objects:
             return []
         queries = [self._grasps(one, f"object {number}, ") for number, one in enumerate(objects, start=1)]
@@ -88,7 +104,11 @@ class Client:
         return [_result(answer, grasps) for answer, grasps in zip(answers, queries, strict=True)]
 
     def photo(self, match: Match) -> bytes:
-        """The file of a match's photo. Raises BadInput where it is gone."""
+        """Return the file of a match's photo.
+
+        Raises:
+            BadInput: The service has no such photo.
+        """
         return self._send("GET", f"photos/{quote(match.photo)}").content
 
     def _ask(self, path: str, touches: AnyTouches, options: QueryOptions) -> list[QueryResult]:
@@ -102,17 +122,17 @@ class Client:
         return parse_grasps(touches, self._fingers, of=of)
 
     def _send(self, method: str, path: str, **request: Any) -> httpx.Response:
-        """The response; where the service is busy, it is asked again when it says so, until the time is over."""
+        """Send a request; while the service is busy, retry after its `Retry-After` until the time limit."""
         until = time.monotonic() + self._timeout_s
         while True:
             try:
                 response = self._http.request(method, f"/v1/{path}", **request)
             except (httpx.HTTPError, httpx.InvalidURL) as error:
                 raise RetrievalError(
-                    f"{self.url} cannot be reached ({error}); is `retrieve serve` running there?"
+                    f"Cannot reach {self.url} ({error}). Is `retrieve serve` running there?"
                 ) from error
             retry_after = response.headers.get("retry-after", "")
-            pause = float(retry_after) if retry_after.isdecimal() else 1.0  # a proxy may name a date
+            pause = float(retry_after) if retry_after.isdecimal() else 1.0  # a proxy may send a date
             if response.status_code not in (429, 503) or time.monotonic() + pause > until:
                 break
             time.sleep(pause)
@@ -122,9 +142,7 @@ class Client:
 
 
 def _document(response: httpx.Response, *keys: str) -> dict[str, Any]:
-    """The JSON object of a response, which has these keys. Raises RetrievalError for another one: what listens there
-    is no service of ours.
-    """
+    """Return the JSON object of a response, or raise RetrievalError if one of `keys` is missing."""
     try:
         found = response.json()
     except ValueError as error:
@@ -135,11 +153,13 @@ def _document(response: httpx.Response, *keys: str) -> dict[str, Any]:
 
 
 def _unexpected_response(response: httpx.Response) -> RetrievalError:
-    return RetrievalError(f"{response.url} answered {response.status_code}, and not as `retrieve serve` does")
+    return RetrievalError(
+        f"{response.url}: unexpected response ({response.status_code}); not a `retrieve serve` service."
+    )
 
 
 def _error(response: httpx.Response) -> RetrievalError:
-    """What a problem document means in Python."""
+    """Return the exception for a problem document."""
     try:
         problem = response.json()
         kind, detail = problem["type"].rpartition(":")[2], problem["detail"]
@@ -152,14 +172,14 @@ def _error(response: httpx.Response) -> RetrievalError:
 
 
 def _result(answer: dict[str, Any], grasps: list[list[InputImage]]) -> QueryResult:
-    """The answer, whose images are called as they were given here."""
+    """Return the answer, with the image names of this machine."""
     result = QueryResult.from_dict(answer)
     names = [[image.name for image in grasp] for grasp in grasps]
     return replace(result, touches=names[: len(result.touches)])
 
 
 def _request_options(options: QueryOptions) -> dict[str, Any]:
-    """The options of a query as the service takes them in a body, beside the touches."""
+    """Return the options of a query as keys of a request body."""
     frames = options.get("background")
     if frames is None:
         return dict(options)
@@ -171,20 +191,20 @@ def _encoded(grasps: list[list[InputImage]]) -> list[list[str]]:
     return [[_base64(image) for image in grasp] for grasp in grasps]
 
 
-def _base64(given: InputImage) -> str:
-    return base64.b64encode(_file(given)).decode("ascii")
+def _base64(source: InputImage) -> str:
+    return base64.b64encode(_file(source)).decode("ascii")
 
 
-def _file(given: InputImage) -> bytes:
-    """An image as a file that reads as the same numbers there. Raises ImageError."""
-    image = given.image
+def _file(source: InputImage) -> bytes:
+    """Return an image file that decodes to the same samples, or raise ImageError."""
+    image = source.image
     if isinstance(image, bytes | bytearray | memoryview):
         return bytes(image)
     if isinstance(image, Image.Image) and image.mode in _PNG_MODES:
-        return _png(image, given.name)
+        return _png(image, source.name)
     if isinstance(image, Image.Image | np.ndarray):
-        return _png(Image.fromarray(np.rint(255 * given.read()).astype(np.uint8)), given.name)
-    assert not isinstance(image, GelImage), "only the service reads gel images ahead"
+        return _png(Image.fromarray(np.rint(255 * source.read()).astype(np.uint8)), source.name)
+    assert not isinstance(image, GelImage), "only the service reads gel images in advance"
     return read_bytes(os.fspath(image))
 
 
@@ -192,6 +212,6 @@ def _png(image: Image.Image, name: str) -> bytes:
     file = io.BytesIO()
     try:
         image.save(file, "PNG", compress_level=1, exif=image.getexif())
-    except OSError as error:  # the file behind it is damaged
+    except OSError as error:  # Pillow reads lazily: the source file is damaged
         raise ImageError(name, f"damaged or truncated: {error}") from error
     return file.getvalue()

@@ -1,8 +1,8 @@
-"""Connections of clients: how many, how long each may take over a request, and how large its headers may be.
+"""Limits on client connections: their number, the time for one request, and the size of its headers.
 
-uvicorn bounds none of this by itself: half-sent headers hold a connection for ever, and its limit of concurrent
-connections answers 503 to every client once it is reached. Here a new connection is always taken. Where that exceeds a
-limit, the oldest connection that waits for its client is closed: first those that never completed a request.
+uvicorn has no such limits: half-sent headers hold a connection for ever, and at its limit of concurrent connections it
+answers 503 to every client. This module accepts every new connection. If that exceeds a limit, it closes the oldest
+connection that waits for its client, first those that never completed a request.
 """
 
 import asyncio
@@ -18,20 +18,19 @@ from retrieval.serve.errors import HttpProblem
 MAX_CONNECTIONS = 512
 MAX_CONNECTIONS_OF_ADDRESS = 128
 HEADERS_S = 5.0
-"""From the connection, or from the first byte of a later request, to the end of the request's headers."""
+"""Time limit from the connection, or from the first byte of a later request, to the end of the headers."""
 IDLE_S = 5
-"""Between the end of a response and the first byte of the next request."""
+"""Time limit between the end of a response and the first byte of the next request."""
 UNREAD_S = 30.0
-"""For a client that does not read its response."""
+"""Time limit for a client that does not read its response."""
 CLOSING_S = 2.0
-"""For a client that does not read the last bytes of a connection that is being closed."""
+"""Time limit for a client that does not read the last bytes of a closing connection."""
 MAX_HEADER_BYTES = 16_384
-"""Of the request line and all headers of one request."""
+"""Maximum size of the request line and all headers of one request."""
 MAX_HEADERS = 100
-"""Of one request: each costs as much work as a hundred bytes."""
+"""Maximum number of headers of one request; one header costs as much work as a hundred bytes."""
 FREE_CHUNKS, MIN_CHUNK_BYTES = 1_000, 256
-"""Chunks of one body beyond the first 1,000 must hold this many bytes on average: each costs as much work as a
-kilobyte."""
+"""Beyond 1,000 chunks, the chunks of a body must average 256 bytes; one chunk costs as much work as a kilobyte."""
 _HEADER_PIECE, _BODY_PIECE = 4_096, 65_536
 
 
@@ -43,7 +42,7 @@ class ConnectionTable:
         self._by_address: dict[str, _Group] = {}
 
     def admit(self, connection: "Connection") -> None:
-        """Count a new connection; close the oldest one that waits for its client where a limit is exceeded."""
+        """Count a new connection; if that exceeds a limit, close the oldest one that waits for its client."""
         groups = (
             self._by_address.setdefault(connection.address, _Group(self._limit_of_address)),
             self._all,
@@ -58,7 +57,7 @@ class ConnectionTable:
                 oldest.transport.abort()
 
     def update(self, connection: "Connection") -> None:
-        """Note whether a connection waits for its client now."""
+        """Update whether a connection waits for its client."""
         for group in self._groups(connection):
             if not connection.waits_for_client:
                 group.waiting_new.pop(connection, None)
@@ -67,7 +66,7 @@ class ConnectionTable:
                 group.waiting_idle.setdefault(connection)
 
     def remove(self, connection: "Connection") -> None:
-        """Count a connection no more; a second call does nothing."""
+        """Stop counting a connection; a second call does nothing."""
         for group in self._groups(connection):
             group.waiting_new.pop(connection, None)
             group.waiting_idle.pop(connection, None)
@@ -81,8 +80,13 @@ class ConnectionTable:
 
 
 class _Group:
-    """Connections that share a limit. waiting_new, waiting_idle: those that wait for their client, the oldest first
-    (sets in order): before their first request is complete, and later.
+    """Connections that share a limit.
+
+    Attributes:
+        limit: Maximum number of connections.
+        count: Current number of connections.
+        waiting_new: Ordered set of connections that wait for their client and completed no request, the oldest first.
+        waiting_idle: The same for connections that completed a request.
     """
 
     def __init__(self, limit: int) -> None:
@@ -92,9 +96,9 @@ class _Group:
 
 
 class Connection(H11Protocol):
-    """A connection of uvicorn that keeps to the limits of this module.
+    """A uvicorn connection with the limits of this module.
 
-    It parses with h11, which parses one request after the other: what a client sends ahead stays bytes.
+    h11 parses one request at a time, so pipelined requests stay unparsed bytes.
     """
 
     def __init__(
@@ -116,30 +120,28 @@ class Connection(H11Protocol):
 
     @property
     def waits_for_client(self) -> bool:
-        """Whether no request is complete that is not answered yet."""
+        """Whether the connection has no complete, unanswered request."""
         return not self._has_request or bool(self.cycle.more_body)
 
     @property
     def _has_request(self) -> bool:
-        """Whether the headers of a request have come that is not answered yet."""
+        """Whether the headers of an unanswered request have arrived."""
         return self.cycle is not None and not self.cycle.response_complete
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """A client has connected (asyncio)."""
+        """Register the connection (asyncio callback)."""
         super().connection_made(transport)
         self.address, self.counted = self.client[0] if self.client else "", True
         self._headers_since = self.loop.time()
         self.table.admit(self)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection is closed (asyncio)."""
+        """Remove the connection (asyncio callback)."""
         self.table.remove(self)
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Bytes of the client have come (asyncio). They are parsed in pieces, so that headers are refused soon after
-        they exceed their limit.
-        """
+        """Parse received bytes (asyncio callback), in pieces, to refuse oversized headers early."""
         start = 0
         while start < len(data) and not self.transport.is_closing():
             piece = data[start : start + (_BODY_PIECE if self._has_request else _HEADER_PIECE)]
@@ -147,7 +149,7 @@ class Connection(H11Protocol):
             if self.conn.their_state is h11.IDLE:
                 self._header_lines += piece.partition(b"\r\n\r\n")[0].count(b"\n")
             if self._header_lines > MAX_HEADERS:
-                self._refuse(HttpProblem("too-large-headers", f"a request may have at most {MAX_HEADERS} headers"))
+                self._refuse(HttpProblem("too-large-headers", f"A request may have at most {MAX_HEADERS} headers."))
                 return
             super().data_received(piece)
             if self._has_request:
@@ -157,13 +159,13 @@ class Connection(H11Protocol):
         self._note_state()
 
     def on_response_complete(self) -> None:
-        """A response has been sent (uvicorn)."""
+        """Update the state after a response (uvicorn callback)."""
         super().on_response_complete()
         self._header_lines = 0
         self._note_state()
 
     def _note_state(self) -> None:
-        """Note since when the headers of a request come, and whether the connection waits for its client."""
+        """Update the start time of the headers, and whether the connection waits for its client."""
         if self._has_request:
             self._headers_since = None
         elif self._headers_since is None and self.conn.trailing_data[0]:
@@ -171,26 +173,26 @@ class Connection(H11Protocol):
         self.table.update(self)
 
     def pause_writing(self) -> None:
-        """The client does not read (asyncio)."""
+        """Start the time limit of a client that does not read (asyncio callback)."""
         self._unread_since = self.loop.time()
         super().pause_writing()
 
     def resume_writing(self) -> None:
-        """The client has read (asyncio)."""
+        """Stop the time limit of a client that does not read (asyncio callback)."""
         self._unread_since = None
         super().resume_writing()
 
     def send_400_response(self, msg: str) -> None:
-        """Refuse what is not HTTP, or is too much of it (uvicorn)."""
+        """Refuse invalid HTTP or oversized headers (uvicorn callback)."""
         if self._has_request or len(self.conn.trailing_data[0]) <= MAX_HEADER_BYTES:
             self._refuse(HttpProblem("malformed", msg))
         else:
             self._refuse(
-                HttpProblem("too-large-headers", f"a request may have at most {MAX_HEADER_BYTES:,} bytes of headers")
+                HttpProblem("too-large-headers", f"A request may have at most {MAX_HEADER_BYTES:,} bytes of headers.")
             )
 
     def close_if_late(self, now: float) -> None:
-        """Close the connection where a deadline of this module has passed. now: time of the event loop."""
+        """Close the connection if it exceeds a time limit of this module; `now` is the event loop's time."""
         if self.transport.is_closing():
             self._closing_since = self._closing_since or now
             if now - self._closing_since > CLOSING_S:
@@ -199,13 +201,13 @@ class Connection(H11Protocol):
             self.transport.abort()
         elif self._headers_since is not None and now - self._headers_since > HEADERS_S:
             if self.conn.trailing_data[0]:
-                self._refuse(HttpProblem("too-slow", f"the headers of a request must come within {HEADERS_S:g} s"))
+                self._refuse(HttpProblem("too-slow", f"The headers of a request must arrive within {HEADERS_S:g} s."))
             self.transport.close()
 
     def _refuse(self, problem: HttpProblem) -> None:
-        """Answer with a problem document where no response has begun, and close the connection."""
+        """Send a problem document unless a response has begun, and close the connection."""
         if self._has_request:
-            self.cycle.disconnected = True  # the application's answer comes too late
+            self.cycle.disconnected = True  # discard the application's answer
             self.cycle.message_event.set()
         if self.conn.our_state in (h11.IDLE, h11.SEND_RESPONSE):
             response = problem.response()
@@ -220,12 +222,12 @@ class Connection(H11Protocol):
 
 
 class _Parser(h11.Connection):
-    """A parser that refuses bodies of many tiny chunks."""
+    """An h11 parser that refuses bodies of many tiny chunks."""
 
     _chunks = _chunk_bytes = 0
 
     def next_event(self) -> Any:
-        """The next part of a request (h11). Raises RemoteProtocolError."""
+        """Return the next event of h11, or raise RemoteProtocolError."""
         event = super().next_event()
         if isinstance(event, h11.Request):
             self._chunks = self._chunk_bytes = 0
@@ -233,5 +235,5 @@ class _Parser(h11.Connection):
             self._chunks += event.chunk_start
             self._chunk_bytes += len(event.data)
             if self._chunks > FREE_CHUNKS + self._chunk_bytes / MIN_CHUNK_BYTES:
-                raise h11.RemoteProtocolError("the chunks of the body are too small")
+                raise h11.RemoteProtocolError("The chunks of the body are too small.")
         return event

@@ -1,7 +1,7 @@
-"""What runs in a process of `retrieval.serve.decoders`: it reads one picture after the other from its standard input.
+"""Worker process of `retrieval.serve.decoders`: it decodes pictures from its standard input, one after the other.
 
-A request and its answer are a frame each: the lengths of a JSON document and of bytes, and both. The module imports
-little, for each process pays for it.
+A request and its answer are one frame each: the lengths of a JSON document and of a byte string, then both. The module
+imports little, because each process pays for its imports.
 """
 
 import json
@@ -22,20 +22,20 @@ from retrieval.model.fusion_scorer import BLOCKS
 from retrieval.model.gel_images import GelImage, PictureSize, read_gel_image
 
 DECODE_CPU_S = 5
-"""Processor time of one picture; the slowest one of the most pixels that we could make takes 2 s."""
+"""Maximum CPU time for one picture. The slowest picture of maximum size that we could construct takes 2 s."""
 DECODE_BYTES = 200_000_000
-"""Memory of one picture. PNG, JPEG, BMP and TIFF pictures of the most pixels take less, some others more."""
+"""Maximum memory for one picture. PNG, JPEG, BMP and TIFF pictures of maximum size need less, some formats more."""
 LENGTHS = struct.Struct(">II")
 READY: dict[str, Any] = {"ready": True}
 
 
 def serve_pictures() -> None:
-    """Read pictures until standard input ends."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # they end the service, which lets its processes finish
+    """Decode pictures until standard input ends."""
+    for number in (signal.SIGINT, signal.SIGTERM):  # the service handles them and ends its processes
         signal.signal(number, signal.SIG_IGN)
     _one_thread()
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints is no answer
+    os.dup2(2, 1)  # keep output of libraries out of the answers
     answers.write(frame(READY))
     answers.flush()
     while lengths := sys.stdin.buffer.read(LENGTHS.size):
@@ -44,13 +44,18 @@ def serve_pictures() -> None:
 
 
 def frame(document: dict[str, Any], *contents: bytes | memoryview) -> bytes:
-    """A request or an answer."""
+    """Return a request or an answer as bytes."""
     text = json.dumps(document).encode()
     return b"".join((LENGTHS.pack(len(text), sum(map(len, contents))), text, *contents))
 
 
 def image_of(document: dict[str, Any], content: bytes) -> GelImage | PictureSize:
-    """The inverse of an answer. Raises ImageError, and MemoryError where the process had not enough."""
+    """Return the picture, or the picture's size, from an answer.
+
+    Raises:
+        ImageError: The picture cannot be decoded.
+        MemoryError: The process ran out of memory.
+    """
     match document:
         case {"size": size}:
             return PictureSize(*size)
@@ -69,7 +74,7 @@ def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
     options, data = json.loads(requests.read(text)), requests.read(content)
     try:
         _limit(resource.RLIMIT_CPU, math.ceil(time.process_time()) + DECODE_CPU_S)
-        if sys.platform == "linux":  # elsewhere the system does not hold a process to it
+        if sys.platform == "linux":  # other systems do not enforce the limit
             pages = int(Path("/proc/self/statm").read_text().split()[5])
             _limit(resource.RLIMIT_DATA, pages * resource.getpagesize() + DECODE_BYTES)
         found = read_gel_image(data, **options)
@@ -87,7 +92,7 @@ def _answer(requests: BinaryIO, text: int, content: int) -> bytes:
 
 
 def _one_thread() -> None:
-    """Decode each picture in one thread: the memory of others counts, too."""
+    """Decode each picture in one thread, because the memory of further threads counts towards the limit."""
     from PIL import AvifImagePlugin
 
     AvifImagePlugin.DEFAULT_MAX_THREADS = 1
@@ -98,7 +103,7 @@ def _one_thread() -> None:
     pillow_heif.options.DECODE_THREADS = 1
 
 
-def _limit(what: int, value: int) -> None:
-    """Set a soft limit, under the hard one."""
-    hard = resource.getrlimit(what)[1]
-    resource.setrlimit(what, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+def _limit(kind: int, value: int) -> None:
+    """Set a soft resource limit, capped by the hard limit."""
+    hard = resource.getrlimit(kind)[1]
+    resource.setrlimit(kind, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))

@@ -1,9 +1,9 @@
-"""Pictures of requests, decoded in processes of their own.
+"""Image decoding for requests, in separate processes.
 
-A decoder in a thread could not be stopped: it would keep a core and its memory until it ends. A process that needs more
-processor time or memory than a picture may cost ends itself, and one whose request is over is ended; the next picture
-gets a new process. Pictures as small as those of sensors are decoded next to each other; larger ones one at a time, so
-that no small one waits for them and their memory does not add up.
+A decoder in a thread cannot be stopped: it occupies a core and its memory until it ends. A decoder process ends itself
+if a picture exceeds the limits of CPU time or memory, and the service kills the process of a finished request. The next
+picture gets a new process. Small pictures, such as those of sensors, are decoded in parallel; large ones one at a time,
+so that small ones do not wait for them and their memory does not add up.
 """
 
 import asyncio
@@ -21,13 +21,13 @@ from retrieval.serve.settings import MAX_BODY_PIXELS
 
 PROGRAM = "from retrieval.serve.decode_process import serve_pictures; serve_pictures()"
 _BUFFER_BYTES = 1 << 20
-PROCESSES = 2  # a touch has as many images
+PROCESSES = 2  # the number of images of a touch
 SMALL_PIXELS = 1 << 21
-"""Of a picture that is decoded next to others; a sensor of 1920 x 1080 pixels has fewer."""
+"""Maximum pixels of a picture that is decoded in parallel; a sensor of 1920 x 1080 pixels has fewer."""
 
 
 class Decoders:
-    """Processes that read the pictures of requests, for the event loop that uses it first."""
+    """Processes that decode the pictures of requests; bound to the event loop of the first use."""
 
     def __init__(self) -> None:
         self._idle: list[_Process] = []
@@ -36,51 +36,67 @@ class Decoders:
         self._running: set[asyncio.Task[GelImage | PictureSize]] = set()
 
     async def start(self) -> None:
-        """Start the processes, so that the first query does not wait for them. Raises RetrievalError."""
+        """Start the processes, so that the first query does not wait for them.
+
+        Raises:
+            RetrievalError: A process cannot be started.
+        """
         self._idle += await asyncio.gather(*(_Process.start() for _ in range(PROCESSES)))
 
     async def close(self) -> None:
-        """End all processes; what is being read fails."""
+        """End all processes; decoding in progress fails."""
         for task in self._running:
             task.cancel()
         await asyncio.gather(*self._running, return_exceptions=True)
         idle, self._idle = self._idle, []
         await asyncio.gather(*self._ending, *(process.end() for process in idle))
 
-    async def read(self, named: Sequence[tuple[str, bytes]], px: int, compares_contact: bool) -> list[GelImage]:
-        """Read pictures, each with its name, at the sizes of a model whose `touch_px` is px.
+    async def read(self, named_files: Sequence[tuple[str, bytes]], px: int, compares_contact: bool) -> list[GelImage]:
+        """Decode pictures to the input size of the model.
 
-        Nothing large is decoded before the sizes of all are known. Raises ImageError for the first picture that cannot
-        be used, and Problem for pictures that are too large together.
+        Large pictures are decoded only after the sizes of all pictures are known.
+
+        Args:
+            named_files: Name (for messages) and file content of each picture.
+            px: `touch_px` of the model.
+            compares_contact: Whether the contact check needs the block means of the pictures.
+
+        Returns:
+            The gel images, in the order of `named_files`.
+
+        Raises:
+            ImageError: A picture cannot be used; the first one is reported.
+            HttpProblem: The pictures are too large together.
         """
-        small = (self._read_small(name, data, px, compares_contact) for name, data in named)
+        small = (self._read_small(name, data, px, compares_contact) for name, data in named_files)
         found = await asyncio.gather(*small, return_exceptions=True)
-        for (name, _), one in zip(named, found, strict=True):
+        for (name, _), one in zip(named_files, found, strict=True):
             if isinstance(one, BaseException):
                 raise one
             if isinstance(one, PictureSize) and one.pixels > MAX_PIXELS:
-                told = f"{one.width} x {one.height} pixels; at most {MAX_PIXELS:,} are taken: send a smaller picture"
-                raise ImageError(name, told)
+                reason = f"{one.width} x {one.height} pixels exceed the limit of {MAX_PIXELS:,}: send a smaller picture"
+                raise ImageError(name, reason)
         first = [one for one in found if not isinstance(one, BaseException)]
         total = sum(one.pixels for one in first if isinstance(one, PictureSize))
         if total > MAX_BODY_PIXELS:
             raise HttpProblem(
                 "too-large",
-                f"the pictures of a request may have {MAX_BODY_PIXELS:,} pixels together; "
-                f"the large ones have {total:,}",
+                f"The pictures of a request may have {MAX_BODY_PIXELS:,} pixels in total; "
+                f"the large ones have {total:,}.",
             )
         images = []
-        for (name, data), one in zip(named, first, strict=True):
+        for (name, data), one in zip(named_files, first, strict=True):
             if isinstance(one, PictureSize):
                 async with self._large:
                     one = await self._run(name, data, px, compares_contact, MAX_PIXELS)
-            assert isinstance(one, GelImage), "of MAX_PIXELS at most"
+            assert isinstance(one, GelImage), "the picture has at most MAX_PIXELS"
             images.append(one)
         return images
 
     async def _read_small(self, name: str, data: bytes, px: int, compares_contact: bool) -> GelImage | PictureSize:
-        """A small picture, or the size of a large one. Its process goes on where nobody waits for it any more: it will
-        be needed sooner than a new one could start.
+        """Decode a small picture, or return the size of a large one.
+
+        If the request is cancelled, the process continues: this is faster than starting a new one.
         """
         await self._small.acquire()
         task = asyncio.ensure_future(self._run(name, data, px, compares_contact, SMALL_PIXELS))
@@ -95,8 +111,9 @@ class Decoders:
     async def _run(
         self, name: str, data: bytes, px: int, compares_contact: bool, max_pixels: int
     ) -> GelImage | PictureSize:
-        """What a process makes of a picture; it is ended where this is cancelled. Raises ImageError, and RetrievalError
-        where no process can be started.
+        """Decode a picture in a process; cancelling ends the process.
+
+        Raises ImageError if the picture cannot be decoded, RetrievalError if no process can be started.
         """
         process = self._idle.pop() if self._idle else await _Process.start()
         try:
@@ -108,7 +125,7 @@ class Decoders:
         except (EOFError, ConnectionError, MemoryError):
             raise ImageError(
                 name,
-                f"decoding it takes more than {DECODE_CPU_S} s of processor time or {DECODE_BYTES // 10**6} MB: "
+                f"decoding needs more than {DECODE_CPU_S} s of CPU time or {DECODE_BYTES // 10**6} MB: "
                 "send a smaller picture",
             ) from None
         finally:
@@ -119,14 +136,14 @@ class Decoders:
 
 
 class _Process:
-    """A process that reads pictures."""
+    """A decoder process."""
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         self._process = process
 
     @classmethod
     async def start(cls) -> "_Process":
-        """Start one, and wait until it has imported what it needs. Raises RetrievalError."""
+        """Start a process and wait until its imports are done, or raise RetrievalError."""
         program = f"import sys; sys.path[:] = {sys.path!r}; {PROGRAM}"
         pipe = asyncio.subprocess.PIPE
         try:
@@ -136,7 +153,7 @@ class _Process:
                 )
             )
         except OSError as error:
-            raise RetrievalError(f"no process can be started that decodes pictures: {error}") from error
+            raise RetrievalError(f"The image decoder process cannot be started: {error}") from error
         try:
             if (await process._answer())[0] == READY:
                 return process
@@ -146,10 +163,10 @@ class _Process:
             await process.end()
             raise
         await process.end()
-        raise RetrievalError("the process that decodes pictures ended as it started; the log of the service says more")
+        raise RetrievalError("The image decoder process ended during its start. See the log of the service.")
 
     async def request(self, document: dict[str, Any], content: bytes) -> tuple[dict[str, Any], bytes]:
-        """What it answers. Raises EOFError or ConnectionError where it ended."""
+        """Send a request and return the answer; raises EOFError or ConnectionError if the process ended."""
         assert self._process.stdin is not None
         self._process.stdin.write(frame(document, content))
         await self._process.stdin.drain()
@@ -162,7 +179,7 @@ class _Process:
         return json.loads(await read(text)), await read(content)
 
     async def end(self) -> None:
-        """End it, whatever it does, and wait until its pipes are closed, too: the event loop may end next."""
+        """Kill the process and wait until its pipes are closed, because the event loop may end next."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         if self._process.returncode is None:

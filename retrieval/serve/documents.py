@@ -1,7 +1,7 @@
-"""The documents of the service as OpenAPI describes them, and those that the service makes itself.
+"""Response documents of the service, as OpenAPI describes them.
 
-`QueryResult.to_dict` (`retrieval.search.query.answer`) makes the answer to a query, which is sent as it is. OpenAPI
-reads its dataclasses; the rest of its form stands here, and a test compares.
+`QueryResult.to_dict` (`retrieval.search.query.answer`) makes the answer to a query, which is sent unchanged. OpenAPI
+reads its dataclasses. The models here describe the remaining fields, and a test compares both.
 """
 
 from typing import Any
@@ -57,8 +57,10 @@ EXAMPLE: dict[str, Any] = {
 
 
 class MatchDocument(BaseModel):
-    """One object of a ranking, shown by its best photo, whose id is `photo`. probability_if_present: given that the
-    catalogue has the object. reference: only where the catalogue has touches of the object.
+    """One object of a ranking, with the id of its best photo.
+
+    probability_if_present: probability given that the catalogue contains the object. reference: only if the catalogue
+    contains touches of the object.
     """
 
     rank: int
@@ -72,10 +74,12 @@ class MatchDocument(BaseModel):
 
 
 class QueryDocument(BaseModel):
-    """The document of `retrieve query --json`. unlisted_probability: of all objects that `results` does not list.
-    more_grasps: further grasps after which the verdict is expected to be "match"; null for other verdicts than "none of
-    these", and where more grasps do not help. advice: a sentence for people on how to get a clearer answer. Optional
-    keys are absent from answers that a history holds of earlier versions.
+    """The document of `retrieve query --json`.
+
+    unlisted_probability: total probability of the objects that `results` does not list. more_grasps: number of further
+    grasps after which the verdict is expected to be "match"; null for other verdicts than "none of these", and if more
+    grasps do not help. advice: a sentence on how to get a clearer answer. Answers that an earlier version stored in the
+    history lack the optional keys.
     """
 
     model_config = {"json_schema_extra": {"examples": [EXAMPLE]}}
@@ -94,14 +98,15 @@ class QueryDocument(BaseModel):
 
 
 class BatchDocument(BaseModel):
-    """An answer for each object, in the order in which they were given."""
+    """One answer for each object, in the order of the request."""
 
     answers: list[QueryDocument]
 
 
 class CumulativeQueryDocument(BaseModel):
-    """The answer after the first grasp, after the first two, and so on. alone: what each grasp says by itself, where
-    that was asked.
+    """Answers to a cumulative query: after the first grasp, after the first two, and so on.
+
+    per_grasp: the answer to each grasp alone; empty unless the request has `per_grasp=true`.
     """
 
     answers: list[QueryDocument]
@@ -109,7 +114,7 @@ class CumulativeQueryDocument(BaseModel):
 
 
 class PhotoDocument(BaseModel):
-    """A photo of the catalogue; `id` names it in all paths. metadata: the user's own."""
+    """A photo of the catalogue. All routes use its `id`. metadata: the user's own."""
 
     id: str = Field(examples=["mug/1.jpg"])
     object_id: str = Field(examples=["mug"])
@@ -117,7 +122,7 @@ class PhotoDocument(BaseModel):
 
 
 class CatalogueDocument(BaseModel):
-    """A page of photos. total: photos that were looked for; next: offset of the next page, null at the end."""
+    """One page of photos. total: number of matching photos; next: offset of the next page, null at the end."""
 
     generation: str = Field(examples=["gen-000007"])
     total: int
@@ -127,13 +132,13 @@ class CatalogueDocument(BaseModel):
 
 
 class NearPhoto(PhotoDocument):
-    """score: inner product of the two unit embeddings, 1 for equal pictures."""
+    """A similar photo. score: inner product of the two unit embeddings, 1 for equal pictures."""
 
     score: float
 
 
 class NearPhotosDocument(BaseModel):
-    """Photos near a photo, the nearest first, itself left out."""
+    """Photos similar to a photo, the most similar first, without the photo itself."""
 
     generation: str
     photo: str
@@ -141,9 +146,9 @@ class NearPhotosDocument(BaseModel):
 
 
 class AgreementDocument(BaseModel):
-    """Where a photo agrees with a touch: by how much the match logit falls when that square of the photo is hidden.
+    """Occlusion map of a photo: by how much the match logit falls if one square of the photo is hidden.
 
-    falls: rows from the top, columns from the left; negative where the photo without it would agree better.
+    falls: rows from the top, columns from the left; negative if hiding the square raises the logit.
     """
 
     generation: str
@@ -155,8 +160,10 @@ class AgreementDocument(BaseModel):
 
 
 class IndexDocument(BaseModel):
-    """What answers, and with what it is asked. sensors: names of live pictures; can_grasp: whether POST /v1/grasp
-    works; keeps: whether queries and what is said of them are kept; trials: unseen objects for the human test.
+    """Description of the index, its model and the service.
+
+    sensors: names of live sensors; can_grasp: whether POST /v1/grasp works; stores_history: whether queries and
+    feedback are stored; trials: number of unseen objects for the human baseline.
     """
 
     generation: str
@@ -178,7 +185,7 @@ class IndexDocument(BaseModel):
 
 
 class GraspDocument(BaseModel):
-    """Gel images of one grasp of the simulated rig, as PNG files in base64, and the object that it closed on."""
+    """Gel images of one grasp of the simulated rig, as PNG files in base64, and the grasped object."""
 
     object_id: str
     touches: list[str]

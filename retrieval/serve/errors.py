@@ -1,4 +1,4 @@
-"""What goes wrong, as problem documents (RFC 9457): a type that programs compare, and our sentence for people."""
+"""Problem documents (RFC 9457) for all errors: a type for programs, and a sentence for people."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -17,36 +17,36 @@ from retrieval.errors import BadInput, ImageError, IncompleteSearch, RetrievalEr
 MEDIA_TYPE = "application/problem+json"
 PREFIX = "urn:touch-retrieval:problem:"
 MAX_DETAIL_CHARACTERS = 2000
-"""Characters of a sentence; what stands in a hostile request may be of any length."""
+"""Maximum length of a detail, because text from a hostile request may have any length."""
 
 KINDS: Mapping[str, tuple[int, str]] = {
-    "malformed": (400, "The request is not what it says it is"),
-    "no-token": (401, "A token is needed"),
+    "malformed": (400, "The request is malformed"),
+    "no-token": (401, "A token is required"),
     "refused": (403, "The request is refused"),
-    "unknown": (404, "There is no such thing"),
-    "not-allowed": (405, "This path does not take that method"),
-    "too-slow": (408, "The request did not come in time"),
-    "conflict": (409, "This was said already"),
+    "unknown": (404, "Not found"),
+    "not-allowed": (405, "This path does not support the method"),
+    "too-slow": (408, "The request took too long to arrive"),
+    "conflict": (409, "A different value is stored already"),
     "too-large": (413, "The request is too large"),
-    "unsupported-type": (415, "The body is of a kind that is not read"),
+    "unsupported-type": (415, "The content type of the body is not supported"),
     "wrong-host": (421, "The request is meant for another host"),
     "bad-input": (422, "The input cannot be used"),
     "bad-image": (422, "An image cannot be read"),
-    "busy": (429, "The service has all it can hold"),
+    "busy": (429, "The service is at capacity"),
     "too-large-headers": (431, "The headers of the request are too large"),
     "failed": (500, "The service failed"),
     "not-ready": (503, "The service is not ready"),
     "late": (504, "The deadline passed"),
 }
-"""Kind of a problem -> status and title."""
+"""Kind of a problem -> HTTP status and title."""
 _OF_STATUS = {400: "malformed", 404: "unknown", 405: "not-allowed", 413: "too-large", 415: "unsupported-type"}
 
 
 class DocumentResponse(JSONResponse):
-    """JSON, in which U+FFFD stands for what UTF-8 cannot hold, such as names of files on the disk."""
+    """JSON response that replaces text that UTF-8 cannot encode, such as some file names, by U+FFFD."""
 
     def render(self, content: Any) -> bytes:
-        """The document as bytes (Starlette)."""
+        """Return the document as bytes (Starlette callback)."""
         try:
             return super().render(content)
         except UnicodeEncodeError:
@@ -54,7 +54,7 @@ class DocumentResponse(JSONResponse):
 
 
 class ProblemDocument(BaseModel):
-    """What every error of the service is, as `application/problem+json`."""
+    """Every error of the service, as `application/problem+json`."""
 
     type: str = Field(examples=[PREFIX + "bad-image"])
     title: str = Field(examples=["An image cannot be read"])
@@ -65,7 +65,13 @@ class ProblemDocument(BaseModel):
 
 
 class HttpProblem(Exception):
-    """A request that is not answered as asked: its kind, of KINDS, and why."""
+    """An error that becomes a problem document.
+
+    Args:
+        kind: A key of `KINDS`.
+        detail: A sentence for people.
+        headers: Further headers of the response.
+    """
 
     def __init__(self, kind: str, detail: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(detail)
@@ -73,11 +79,11 @@ class HttpProblem(Exception):
 
     @property
     def status(self) -> int:
-        """The status of HTTP."""
+        """The HTTP status."""
         return KINDS[self.kind][0]
 
     def response(self) -> JSONResponse:
-        """The problem document as a response."""
+        """Return the problem document as a response."""
         status, title = KINDS[self.kind]
         detail = (
             self.detail if len(self.detail) <= MAX_DETAIL_CHARACTERS else self.detail[:MAX_DETAIL_CHARACTERS] + " ..."
@@ -89,7 +95,7 @@ class HttpProblem(Exception):
 
 
 def problem_of(error: Exception) -> HttpProblem:
-    """What an exception means to the one who asked."""
+    """Return the problem document for an exception."""
     match error:
         case HttpProblem():
             return error
@@ -104,22 +110,22 @@ def problem_of(error: Exception) -> HttpProblem:
         case RequestValidationError():
             return HttpProblem("bad-input", validation_message(error.errors()))
         case ClientDisconnect():
-            return HttpProblem("malformed", "the connection ended before the whole body had come")
+            return HttpProblem("malformed", "The connection ended before the whole body arrived.")
         case HTTPException():
             kind = _OF_STATUS.get(error.status_code, "malformed" if error.status_code < 500 else "failed")
             return HttpProblem(kind, str(error.detail), error.headers)
         case _:
-            return HttpProblem("failed", f"unexpected {type(error).__name__}; the log of the service says more")
+            return HttpProblem("failed", f"Unexpected {type(error).__name__}. See the log of the service.")
 
 
 def validation_message(errors: Any) -> str:
-    """Pydantic's findings in a sentence: the first ones, each with its place."""
+    """Return the first five validation errors of pydantic, each with its place, as one sentence."""
     messages = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in list(errors)[:5]]
-    return "; ".join(messages) or "the request does not have the form that /openapi.json says"
+    return "; ".join(messages) or "The request does not match the schema in /openapi.json."
 
 
 def install_handlers(app: FastAPI) -> None:
-    """What a path raises on purpose becomes its problem document; `security.Guard` answers for the rest."""
+    """Convert the errors of this project to problem documents; `security.Guard` converts all others."""
 
     async def answer(request: Request, error: Exception) -> JSONResponse:
         return problem_of(error).response()
@@ -129,7 +135,7 @@ def install_handlers(app: FastAPI) -> None:
 
 
 def problem_responses(*kinds: str) -> dict[int | str, dict[str, Any]]:
-    """The `responses` of a path for OpenAPI: those of these kinds, and what every path may say."""
+    """Return the OpenAPI `responses` of a route for these kinds and the kinds that every route may return."""
     found: dict[int | str, dict[str, Any]] = {}
     for kind in (*kinds, "malformed", "no-token", "refused", "wrong-host", "failed"):
         status, title = KINDS[kind]

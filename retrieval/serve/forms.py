@@ -1,6 +1,7 @@
-"""Bodies of the kind multipart/form-data (RFC 7578), taken apart by searches in C and with a bound on their parts.
+"""Parser of multipart/form-data bodies (RFC 7578) with a limit on the number of parts.
 
-A general parser calls Python for each header and for each byte that begins like a boundary, however many there are.
+It uses `bytes` methods, which run in C. A general parser calls Python for each header and for each byte that may begin
+a boundary, without a limit.
 """
 
 from email.message import Message
@@ -12,12 +13,12 @@ from retrieval.serve.errors import HttpProblem
 from retrieval.serve.settings import MAX_PICTURES
 
 MAX_PARTS = MAX_PICTURES + 8
-"""Pictures, and options of the query."""
+"""Maximum number of parts: pictures, and options of the query."""
 MAX_PART_HEADER_BYTES = 4096
 
 
 class FormPart(NamedTuple):
-    """A field of a form, or a file where it was sent with a file's name."""
+    """A field of a form; `is_file` if it was sent with a file name."""
 
     name: str
     is_file: bool
@@ -25,20 +26,24 @@ class FormPart(NamedTuple):
 
 
 def form_parts(body: bytes, content_type: str) -> list[FormPart]:
-    """The parts of a form, in their order. Raises Problem."""
+    """Return the parts of a form, in their order.
+
+    Raises:
+        HttpProblem: The body is not a valid form, or it has too many parts.
+    """
     header = Message()
     header["content-type"] = content_type
     boundary = header.get_boundary("")
     if not boundary or not boundary.isascii() or len(boundary) > 70:
-        raise HttpProblem("malformed", "multipart/form-data needs a boundary of 1 to 70 ASCII characters")
+        raise HttpProblem("malformed", "multipart/form-data requires a boundary of 1 to 70 ASCII characters.")
     delimiter = b"\r\n--" + boundary.encode("ascii")
     body = b"\r\n" + body
-    found = body.count(delimiter) - 1  # the last one ends the form
+    found = body.count(delimiter) - 1  # the last delimiter ends the form
     if found > MAX_PARTS:
-        raise HttpProblem("bad-input", f"a form may have at most {MAX_PARTS} parts; got {found}")
+        raise HttpProblem("bad-input", f"A form may have at most {MAX_PARTS} parts, got {found}.")
     _, *parts = body.split(delimiter)
     if not parts or not parts[-1].startswith(b"--"):
-        raise HttpProblem("bad-input", "the form is not whole: it must end with its boundary and two dashes")
+        raise HttpProblem("bad-input", "The form is incomplete: it must end with its boundary and two dashes.")
     return [_part(part) for part in parts[:-1]]
 
 
@@ -46,10 +51,10 @@ def _part(part: bytes) -> FormPart:
     end = part.find(b"\r\n\r\n", 0, MAX_PART_HEADER_BYTES)
     if end < 0:
         raise HttpProblem(
-            "bad-input", f"each part of a form must begin with at most {MAX_PART_HEADER_BYTES} bytes of headers"
+            "bad-input", f"Each part of a form must begin with headers of at most {MAX_PART_HEADER_BYTES} bytes."
         )
     headers = HeaderParser().parsestr(part[:end].decode("utf-8", "replace").lstrip())
     name = headers.get_param("name", header="content-disposition")
     if name is None:
-        raise HttpProblem("bad-input", "each part of a form must name its field in content-disposition")
+        raise HttpProblem("bad-input", "Each part of a form must name its field in content-disposition.")
     return FormPart(collapse_rfc2231_value(name), headers.get_filename() is not None, part[end + 4 :])

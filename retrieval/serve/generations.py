@@ -1,5 +1,7 @@
-"""Which generation of the index answers: the newest that could be opened. Whoever asks takes `current` once, so that an
-answer comes from one generation; the one before is let go of when nobody uses it any more.
+"""The served generation of the index: the newest that can be opened.
+
+Each request reads `Generations.current` once, so that its answer comes from one generation. The previous generation is
+released when no request uses it.
 """
 
 import asyncio
@@ -18,11 +20,18 @@ from retrieval.serve.settings import ServiceSettings
 
 log = logging.getLogger(__name__)
 _RETRY_S = 10.0
-"""After which one that could not be opened is tried again."""
+"""Time after which a generation that failed to open is reported again."""
 
 
 class ServedGeneration:
-    """A generation that is served: its searcher, and what is made of it when it is first asked for."""
+    """A served generation: its searcher, and the whole model, which is loaded at the first use.
+
+    Attributes:
+        searcher: Searcher of the generation.
+        shard: Its index.
+        model: Digest of the checkpoint.
+        fingers: Gel images of one grasp.
+    """
 
     def __init__(self, searcher: Searcher) -> None:
         self.searcher, self.shard = searcher, searcher.shard
@@ -36,7 +45,7 @@ class ServedGeneration:
         return self.searcher.info.name
 
     def checkpoint(self) -> Checkpoint:
-        """The whole model, photo tower too, which queries do without."""
+        """Return the whole model, including the photo tower, which queries do not need."""
         with self._lock:
             return self._checkpoint
 
@@ -46,7 +55,13 @@ class ServedGeneration:
 
 
 class Generations:
-    """The generations of one index folder, or of one cluster, as they come. shards: opens those of a cluster."""
+    """The current generation of one index, replaced when a new generation appears.
+
+    Args:
+        settings: Options of the service.
+        metrics: Metrics of the service.
+        shards: Opens the shards of a sharded index; None: in this process.
+    """
 
     def __init__(self, settings: ServiceSettings, metrics: Metrics, shards: OpenShards | None = None) -> None:
         self._settings, self._metrics, self._shards = settings, metrics, shards
@@ -59,13 +74,13 @@ class Generations:
 
     @property
     def current(self) -> ServedGeneration:
-        """What answers now. Raises Problem before anything could be opened."""
+        """The generation that answers; raises HttpProblem before the first one is open."""
         if self._current is None:
-            raise HttpProblem("not-ready", "no index is open yet", {"retry-after": "1"})
+            raise HttpProblem("not-ready", "No index is open yet.", {"retry-after": "1"})
         return self._current
 
     def open(self) -> None:
-        """Open the newest generation. Raises the errors of `Searcher.open`."""
+        """Open the newest generation; raises the errors of `Searcher.open`."""
         settings = self._settings
         generation = ServedGeneration(
             Searcher.open(
@@ -78,25 +93,27 @@ class Generations:
         )
         self._current = generation
         self._metrics.set_generation(generation.name)
-        gc.collect()  # what the one before held in circles
+        gc.collect()  # free reference cycles of the previous generation
 
     async def watch(self) -> None:
-        """Take up each new generation. One that cannot be opened is reported, and the old one goes on answering; the
-        same failure is reported again after _AGAIN_S.
+        """Open each new generation.
+
+        If a generation cannot be opened, the failure is logged, again every `_RETRY_S`, and the previous generation
+        continues to answer.
         """
         failed: str | None = None
         retry_at = 0.0
         while True:
             await asyncio.sleep(self._settings.poll_s)
-            now, name = asyncio.get_running_loop().time(), ""  # "": of a manifest that cannot be read
+            now, name = asyncio.get_running_loop().time(), ""  # "": the manifest cannot be read
             try:
                 name = (await asyncio.to_thread(manifest_of, self._settings.index)).generation
                 if name != self.current.name and (name != failed or now >= retry_at):
                     await asyncio.to_thread(self.open)
-                    log.warning("generation %s answers from now on", self.current.name)
-            except Exception as error:  # whatever is wrong with it
+                    log.warning("Generation %s is now served.", self.current.name)
+            except Exception as error:
                 if name == failed and now < retry_at:
                     continue
                 failed, retry_at = name, now + _RETRY_S
                 self._metrics.reload_failures.inc()
-                log.warning("a new generation cannot be taken up, %s goes on answering: %s", self.current.name, error)
+                log.warning("A new generation cannot be opened; %s is still served: %s", self.current.name, error)

@@ -1,4 +1,4 @@
-"""Whether the service lives, whether it is ready, and its numbers; and the page's cookie."""
+"""Routes for liveness, readiness and metrics, and for the session cookie of the page."""
 
 from fastapi import APIRouter, Request, Response
 from pydantic import BaseModel, Field
@@ -12,28 +12,28 @@ router = APIRouter(tags=["health"])
 
 
 class Health(BaseModel):
-    """status: "ok", or why not."""
+    """State of the service. status: "ok" and, for readiness, the generation."""
 
     status: str
 
 
 @router.get("/healthz")
 async def healthz() -> Health:
-    """The process answers."""
+    """Return "ok" while the process runs."""
     return Health(status="ok")
 
 
 @router.get("/readyz", responses=problem_responses("not-ready"))
 async def ready(parts: Parts) -> Health:
-    """An index is open, and the service is not about to end."""
+    """Return "ok" and the generation if an index is open and the service is not shutting down."""
     if parts.stopping.is_set():
-        raise HttpProblem("not-ready", "the service is about to end")
+        raise HttpProblem("not-ready", "The service is shutting down.")
     return Health(status=f"ok: {parts.generations.current.name}")
 
 
 @router.get("/metrics", response_class=Response, responses={200: {"content": {"text/plain": {}}}})
 async def metrics(parts: Parts) -> Response:
-    """Numbers for Prometheus."""
+    """Return the metrics for Prometheus."""
     return Response(parts.metrics.render(), media_type="text/plain; version=0.0.4; charset=utf-8")
 
 
@@ -50,22 +50,23 @@ class SessionBody(RequestBody):
     openapi_extra=json_body("SessionBody"),
 )
 async def session(request: Request, parts: Parts) -> Response:
-    """For the page of a service with a token: the token becomes a cookie that scripts cannot read, for pictures cannot
-    send a header.
+    """Store the token in a cookie that scripts cannot read.
+
+    The page needs it, because requests for images cannot send a header.
     """
     body = await read_json(request, SessionBody)
-    wanted = parts.settings.token
-    if wanted is not None and not same_token(body.token, wanted):
-        raise HttpProblem("no-token", "this is not the service's token", {"www-authenticate": "Bearer"})
+    token = parts.settings.token
+    if token is not None and not same_token(body.token, token):
+        raise HttpProblem("no-token", "This is not the service's token.", {"www-authenticate": "Bearer"})
     response = Response(status_code=204)
-    if wanted is not None:
-        response.set_cookie(COOKIE, wanted, httponly=True, samesite="strict", path="/")
+    if token is not None:
+        response.set_cookie(COOKIE, token, httponly=True, samesite="strict", path="/")
     return response
 
 
 @router.delete("/v1/session", status_code=204)
 async def end_session() -> Response:
-    """Take the cookie away."""
+    """Delete the cookie."""
     response = Response(status_code=204)
     response.delete_cookie(COOKIE, httponly=True, samesite="strict", path="/")
     return response

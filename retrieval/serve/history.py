@@ -1,4 +1,4 @@
-"""The paths of the history: queries that were answered, touches near a touch, what people said; all of it as a file."""
+"""Routes of the history: answered queries, similar touches, feedback, and an export of everything."""
 
 import asyncio
 import io
@@ -32,8 +32,9 @@ FeedbackValue = Literal["right", "object", "none"]
 
 
 class HistoryItem(BaseModel):
-    """A query that was answered. touches: where the gel images of each grasp lie; said, object_id: what a person said
-    of it, null before.
+    """An answered query.
+
+    touches: paths of the gel images of each grasp; feedback, object_id: feedback of a person, null if there is none.
     """
 
     id: str
@@ -48,7 +49,7 @@ class HistoryItem(BaseModel):
 
 
 class HistoryDocument(BaseModel):
-    """A page of the history, the newest first."""
+    """One page of the history, the newest query first."""
 
     total: int
     offset: int
@@ -63,13 +64,13 @@ class HistoryEntry(HistoryItem):
 
 
 class NearTouch(HistoryItem):
-    """score: inner product of the two mean embeddings, 1 for equal touches."""
+    """A similar touch. score: inner product of the two mean embeddings, 1 for equal touches."""
 
     score: float
 
 
 class NearTouchesDocument(BaseModel):
-    """Touches near a touch, the nearest first. compared: how many the same model encoded."""
+    """Touches similar to a touch, the most similar first. compared: number of touches that the same model encoded."""
 
     id: str
     compared: int
@@ -77,17 +78,22 @@ class NearTouchesDocument(BaseModel):
 
 
 class FeedbackBody(RequestBody):
-    """right: the answer was; object: it was the object named; none: it is not in the catalogue."""
+    """Feedback on an answer.
 
-    query: str = Field(min_length=1, max_length=64, description="the X-Query-Id of the answer")
+    feedback: "right" if the answer is correct, "object" if it is the object in `object_id`, "none" if the object is not
+    in the catalogue.
+    """
+
+    query: str = Field(min_length=1, max_length=64, description="The X-Query-Id of the answer.")
     feedback: FeedbackValue
     object_id: str | None = Field(None, min_length=1, max_length=1000)
 
 
 class FeedbackDocument(BaseModel):
-    """What is kept. recorded: whether the grasps are in the recording: the object must have a photo, a grasp must have
-    felt something, and the disk must have room. Where it had none, the grasps are recorded after a later feedback, or
-    when the service starts again.
+    """The stored feedback.
+
+    recorded: whether the grasps are in the recording. This requires a photo of the object, a grasp with contact, and
+    room on the disk. If the disk is full, the grasps are recorded after a later feedback or at the next start.
     """
 
     query: str
@@ -98,12 +104,12 @@ class FeedbackDocument(BaseModel):
 
 def _require_history(parts: Service) -> HistoryWriter:
     if parts.history_writer is None:
-        raise HttpProblem("unknown", "this service keeps no queries; it was started with --no-history")
+        raise HttpProblem("unknown", "This service stores no queries: it was started with --no-history.")
     return parts.history_writer
 
 
 async def _entry(parts: Service, name: str) -> StoredQuery:
-    """A query by its id; one that was answered just now is being written."""
+    """Return a query by its id, after pending queries are written; raises HttpProblem if it is missing."""
     history_writer = _require_history(parts)
     await history_writer.drain()
     stored = await run_in_threadpool(history_writer.store.query, name)
@@ -136,10 +142,12 @@ async def history(
     parts: Parts,
     offset: Annotated[int, Query(ge=0, le=2**31)] = 0,
     limit: Annotated[int, Query(ge=1, le=500)] = 50,
-    search: Annotated[str, Query(max_length=200, description="words of verdict, object and what was said")] = "",
+    search: Annotated[
+        str, Query(max_length=200, description="Words of the verdict, the object and the feedback.")
+    ] = "",
     feedback: Annotated[Literal["right", "object", "none", "missing"] | None, Query()] = None,
 ) -> HistoryDocument:
-    """Queries that were answered, the newest first."""
+    """Return one page of the answered queries, the newest first."""
     history_writer = _require_history(parts)
     await history_writer.drain()
     total, found = await run_in_threadpool(
@@ -150,12 +158,12 @@ async def history(
     return HistoryDocument(total=total, offset=offset, next=end if offset < end < total else None, items=items)
 
 
-# What an answer did not say, such as a reference touch, it does not say here either.
+# Fields that the original answer lacks, such as a reference touch, stay absent.
 @router.get(
     "/v1/history/{name}", responses=problem_responses("unknown", "not-ready"), response_model_exclude_unset=True
 )
 async def entry(name: str, parts: Parts) -> HistoryEntry:
-    """A query with its whole answer."""
+    """Return a query with its whole answer."""
     stored = await _entry(parts, name)
     return HistoryEntry(**_item(stored), answer=QueryDocument(**stored.answer))
 
@@ -166,26 +174,30 @@ async def entry(name: str, parts: Parts) -> HistoryEntry:
     responses={**IMAGE_RESPONSES, **problem_responses("unknown", "not-ready")},
 )
 async def touch(name: str, grasp: int, finger: str, parts: Parts) -> Response:
-    """A gel image as it was sent; what browsers do not show, as PNG. grasp: from 1, 0 for the no-contact frames."""
+    """Return a gel image of a query; formats that browsers lack are converted to PNG.
+
+    grasp: counted from 1; 0 for the no-contact frames.
+    """
     stored = await _entry(parts, name)
     data = None
     if BACKGROUND <= grasp <= len(stored.answer["query"]["touches"]):
         data = await run_in_threadpool(_require_history(parts).store.picture, name, grasp, finger)
     if data is None:
-        raise HttpProblem("unknown", f"the query has no picture of grasp {grasp}, finger {finger[:10]!r}")
+        raise HttpProblem("unknown", f"The query has no picture of grasp {grasp}, finger {finger[:10]!r}.")
     headers = {"cache-control": "private, max-age=86400, immutable"}
     return await run_in_threadpool(image_response, data, headers)
 
 
 @router.get("/v1/history/{name}/nearest", responses=problem_responses("unknown", "bad-input", "not-ready"))
 async def nearest(name: str, parts: Parts, count: Annotated[int, Query(ge=1, le=100)] = 12) -> NearTouchesDocument:
-    """Touches of the history that feel to the model like this one."""
+    """Return the touches of the history that are most similar to this one, by the model's embeddings."""
     await _entry(parts, name)
     store, model = _require_history(parts).store, parts.generations.current.model
     names, vectors = await run_in_threadpool(store.vectors, model)
     if name not in names:
         raise HttpProblem(
-            "bad-input", "another model encoded this touch, or it felt nothing: there is nothing to compare"
+            "bad-input",
+            "This touch has no embedding of the current model: another model encoded it, or it has no contact.",
         )
     own = names.index(name)
     scores = vectors @ vectors[own]
@@ -198,7 +210,7 @@ async def nearest(name: str, parts: Parts, count: Annotated[int, Query(ge=1, le=
     return NearTouchesDocument(id=name, compared=len(names), items=items)
 
 
-# What people say ------------------------------------------------------------------------------------------------------
+# Feedback -------------------------------------------------------------------------------------------------------------
 
 
 @router.post(
@@ -208,8 +220,10 @@ async def nearest(name: str, parts: Parts, count: Annotated[int, Query(ge=1, le=
     openapi_extra=json_body("FeedbackBody"),
 )
 async def post_feedback(request: Request, parts: Parts, response: Response) -> FeedbackDocument:
-    """Say whether an answer was right. When this is answered, what was said outlives the machine; saying the same twice
-    is saying it once (200), saying another thing is refused.
+    """Store whether an answer is right.
+
+    The response is sent after the feedback is on the disk. Repeating the same feedback returns 200; different feedback
+    on the same query is refused.
     """
     body = await read_json(request, FeedbackBody)
     stored = await _entry(parts, body.query)
@@ -225,7 +239,7 @@ async def post_feedback(request: Request, parts: Parts, response: Response) -> F
         new, recorded, name = await asyncio.shield(asyncio.to_thread(add_feedback))
     except BadInput as error:
         raise HttpProblem("conflict", str(error)) from error
-    except KeyError as error:  # one of the oldest, which went meanwhile
+    except KeyError as error:  # the query was deleted in the meantime
         raise history_writer.missing_query_problem(body.query) from error
     response.status_code = 201 if new else 200
     return FeedbackDocument(query=body.query, feedback=body.feedback, object_id=name, recorded=recorded)
@@ -234,33 +248,34 @@ async def post_feedback(request: Request, parts: Parts, response: Response) -> F
 def _resolve_feedback(
     body: FeedbackBody, stored: StoredQuery, generation: ServedGeneration
 ) -> tuple[str, str | None, bytes | None]:
-    """What is kept of a word: what was said, of which object, and its photo. Raises Problem."""
+    """Return the feedback to store, its object and the object's photo; raises HttpProblem."""
     results = stored.answer["results"]
     if body.feedback == RIGHT:
         if body.object_id is not None:
-            raise HttpProblem("bad-input", 'said "right" names no object; say "object" to name one')
+            raise HttpProblem("bad-input", 'Feedback "right" takes no object_id. Send "object" to name an object.')
         if stored.verdict == NONE_OF_THESE:
             return RIGHT, None, None
         if stored.verdict not in (MATCH, UNCALIBRATED):
-            raise HttpProblem("bad-input", f'the answer was "{stored.verdict}", which says nothing of an object')
+            raise HttpProblem("bad-input", f'The answer "{stored.verdict}" names no object, so it cannot be right.')
         return RIGHT, results[0]["object_id"], _read_photo(generation, results[0]["photo"])
     if body.feedback == NONE:
         return NONE, body.object_id, None
     if body.object_id is None:
-        raise HttpProblem("bad-input", 'said "object" must name it in object_id')
+        raise HttpProblem("bad-input", 'Feedback "object" requires object_id.')
     shown = next((one["photo"] for one in results if one["object_id"] == body.object_id), None)
     if shown is None:
         rows = generation.shard.page([], body.object_id, 0, 1).rows
         if not rows:
-            told = f'the index has no object {body.object_id!r}; say "none" where the catalogue lacks it'
-            raise HttpProblem("bad-input", told)
+            detail = f'The index has no object {body.object_id!r}. Send "none" if the catalogue lacks the object.'
+            raise HttpProblem("bad-input", detail)
         shown = listed_photo(rows[0]).path
     return OBJECT, body.object_id, _read_photo(generation, shown)
 
 
 def _read_photo(generation: ServedGeneration, photo: str) -> bytes | None:
-    """The file of a catalogue's photo. None where it is gone, or where a gel image stands for a photo: the grasps are
-    then kept, but in no recording.
+    """Return the file of a catalogue photo.
+
+    None if the file is gone, or if the row is a gel image of a reference touch: the feedback is stored, not recorded.
     """
     (row,) = generation.shard.rows([photo])
     try:
@@ -279,11 +294,16 @@ def _read_photo(generation: ServedGeneration, photo: str) -> bytes | None:
 @router.get(
     "/v1/export.zip",
     response_class=StreamingResponse,
-    responses={200: {"content": {"application/zip": {}}, "description": "the archive"}, **problem_responses("unknown")},
+    responses={
+        200: {"content": {"application/zip": {}}, "description": "The archive."},
+        **problem_responses("unknown"),
+    },
 )
 async def export(parts: Parts) -> StreamingResponse:
-    """All that is kept, as an archive: `recording/`, which `retrieve train` reads, and `history.jsonl`, a line for each
-    query with its answer and what was said.
+    """Return the whole history as a ZIP archive.
+
+    It contains `recording/`, which `retrieve train` reads, and `history.jsonl`, one line for each query with its answer
+    and feedback.
     """
     history_writer = _require_history(parts)
     await history_writer.drain()
@@ -292,11 +312,11 @@ async def export(parts: Parts) -> StreamingResponse:
 
 
 def _archive(history_writer: HistoryWriter) -> Iterator[bytes]:
-    """One file after the other, so that memory holds one."""
+    """Yield the archive file by file, so that memory contains one file at a time."""
     sink = _ZipBuffer()
     with zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive:  # pictures are compressed already
         folder = history_writer.folder / "recording"
-        # Lines of metadata come after the images, so that what they name is in the archive.
+        # The metadata comes after the images, so that the archive contains all images that it names.
         for path in (folder / "recording.json", *sorted((folder / "images").glob("*.*")), folder / "metadata.jsonl"):
             if path.is_file() and path.suffix != ".part":
                 archive.write(path, f"recording/{path.relative_to(folder)}")
@@ -310,23 +330,23 @@ def _archive(history_writer: HistoryWriter) -> Iterator[bytes]:
 
 
 class _ZipBuffer(io.RawIOBase):
-    """A file for `zipfile` to write to, out of which what was written is taken as it comes."""
+    """Write-only file for `zipfile` whose content can be taken while it is written."""
 
     def __init__(self) -> None:
         super().__init__()
         self._data = bytearray()
 
     def writable(self) -> bool:
-        """Always: this is what `zipfile` asks."""
+        """Return True; `zipfile` requires it."""
         return True
 
     def write(self, data: Any) -> int:
-        """Hold it until it is taken."""
+        """Append data to the buffer."""
         self._data += data
         return len(data)
 
     def take(self) -> bytes:
-        """All that was written since."""
+        """Return the data written since the last call, and clear the buffer."""
         data = bytes(self._data)
         self._data.clear()
         return data

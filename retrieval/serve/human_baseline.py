@@ -1,4 +1,4 @@
-"""The paths of the human test (`retrieval.serve.trials`)."""
+"""Routes of the human baseline (`retrieval.serve.trials`)."""
 
 import secrets
 import time
@@ -23,7 +23,10 @@ Number = Annotated[int, InPath(ge=1, le=10_000)]
 
 
 class RunBody(RequestBody):
-    """A series to be done: how many trials, by whom; the same seed gives the same trials."""
+    """A new series of trials.
+
+    count: number of trials; participant: name of the person; seed: the same seed gives the same trials.
+    """
 
     count: int = Field(20, ge=1, le=10_000)
     participant: str = Field("", max_length=200)
@@ -31,7 +34,7 @@ class RunBody(RequestBody):
 
 
 class RunDocument(BaseModel):
-    """A series and how it stands. next: the first trial that was not done, null at the end."""
+    """A series and its results so far. next: the first open trial, null at the end."""
 
     id: str
     participant: str
@@ -46,7 +49,7 @@ class RunDocument(BaseModel):
 
 
 class TrialsDocument(BaseModel):
-    """What can be done, and the series so far."""
+    """The available objects, and all series of the recording."""
 
     recording: str
     objects: int
@@ -55,7 +58,7 @@ class TrialsDocument(BaseModel):
 
 
 class TrialDocument(BaseModel):
-    """A trial. choice, truth, model: counted from 1, and null until it was done."""
+    """One trial. choice, truth, model: photo numbers counted from 1, null until the trial is done."""
 
     number: int
     touches: list[str]
@@ -66,7 +69,7 @@ class TrialDocument(BaseModel):
 
 
 class ChoiceBody(RequestBody):
-    """The photo that shows the object, counted from 1."""
+    """The chosen photo, counted from 1."""
 
     choice: int = Field(ge=1, le=CHOICES)
 
@@ -74,23 +77,25 @@ class ChoiceBody(RequestBody):
 def _require_trials(parts: Service) -> tuple[Trials, HistoryStore]:
     if parts.trials is None:
         raise HttpProblem(
-            "unknown", "this service has no recording to test people on; start it with --trials RECORDING"
+            "unknown", "This service has no recording for the human baseline. Start it with --trials RECORDING."
         )
     history_writer: HistoryWriter | None = parts.history_writer
     if history_writer is None:
-        raise HttpProblem("unknown", "this service keeps nothing, and so no trials; start it without --no-history")
+        raise HttpProblem(
+            "unknown", "This service stores no history, which trials require. Start it without --no-history."
+        )
     return parts.trials, history_writer.store
 
 
 def _document(run: TrialRun, store: HistoryStore) -> RunDocument:
-    chosen = store.choices(run.id)
-    human_baseline, model = trial_accuracies(chosen)
-    left = set(range(1, run.count + 1)) - {one.number for one in chosen}
+    choices = store.choices(run.id)
+    human_baseline, model = trial_accuracies(choices)
+    remaining = set(range(1, run.count + 1)) - {one.number for one in choices}
     return RunDocument(
         **vars(run),
         choices=CHOICES,
-        completed=len(chosen),
-        next=min(left, default=None),
+        completed=len(choices),
+        next=min(remaining, default=None),
         human_baseline=human_baseline,
         model=model,
         chance=1 / CHOICES,
@@ -101,19 +106,19 @@ def _run(parts: Service, name: str) -> TrialRun:
     trials, store = _require_trials(parts)
     found = next((run for run in store.runs(trials.folder.name) if run.id == name), None)
     if found is None:
-        raise HttpProblem("unknown", f"there is no series of trials {name[:64]!r} for {trials.folder.name}")
+        raise HttpProblem("unknown", f"{trials.folder.name} has no series of trials {name[:64]!r}.")
     return found
 
 
 def _trial(parts: Service, run: TrialRun, number: int) -> Trial:
     if number > run.count:
-        raise HttpProblem("unknown", f"this series has {run.count} trials; got {number}")
+        raise HttpProblem("unknown", f"This series has {run.count} trials, got number {number}.")
     return _require_trials(parts)[0].trial(parts.generations.current, run.seed, number)
 
 
 @router.get("/v1/trials", responses=problem_responses("unknown"))
 def trials(parts: Parts) -> TrialsDocument:
-    """The objects that the model never saw, and the series of trials so far."""
+    """Return the number of unseen objects, and all series of the recording."""
     known, store = _require_trials(parts)
     return TrialsDocument(
         recording=known.folder.name,
@@ -130,13 +135,13 @@ def trials(parts: Parts) -> TrialsDocument:
     openapi_extra=json_body("RunBody"),
 )
 async def begin_run(request: Request, parts: Parts) -> RunDocument:
-    """Begin a series."""
+    """Begin a series of trials."""
     body = await read_json(request, RunBody)
 
     def create() -> RunDocument:
         known, store = _require_trials(parts)
         seed = secrets.randbelow(2**31) if body.seed is None else body.seed
-        known.trial(parts.generations.current, seed, 1)  # says what is missing
+        known.trial(parts.generations.current, seed, 1)  # raises if a trial is impossible
         run = TrialRun(new_id(), time.time(), body.participant, seed, body.count, known.folder.name)
         store.add_run(run)
         return _document(run, store)
@@ -146,13 +151,13 @@ async def begin_run(request: Request, parts: Parts) -> RunDocument:
 
 @router.get("/v1/trials/{name}", responses=problem_responses("unknown"))
 def get_run(name: str, parts: Parts) -> RunDocument:
-    """How a series stands: the person's share beside the model's in the same trials."""
+    """Return a series with the accuracy of the person and of the model in the same trials."""
     return _document(_run(parts, name), _require_trials(parts)[1])
 
 
 @router.get("/v1/trials/{name}/{number}", responses=problem_responses("unknown", "bad-input"))
 def trial(name: str, number: Number, parts: Parts) -> TrialDocument:
-    """A trial; what is right is told when it was done."""
+    """Return a trial; the right photo is included only after the trial is done."""
     run = _run(parts, name)
     sampled_trial = _trial(parts, run, number)
     done = next((one for one in _require_trials(parts)[1].choices(name) if one.number == number), None)
@@ -171,14 +176,14 @@ def trial(name: str, number: Number, parts: Parts) -> TrialDocument:
     openapi_extra=json_body("ChoiceBody"),
 )
 async def choose(request: Request, name: str, number: Number, parts: Parts) -> TrialDocument:
-    """Choose, once; what was right and what the model chose is in the answer."""
+    """Store the choice of a trial, once; the response contains the right photo and the model's choice."""
     body = await read_json(request, ChoiceBody)
     known, store = _require_trials(parts)
     sampled_trial = await run_in_threadpool(lambda: _trial(parts, _run(parts, name), number))
     model = await parts.queue.submit(lambda generation: known.model_choice(generation, sampled_trial), request)
     choice = TrialChoice(number, body.choice, sampled_trial.truth, model)
     if not await run_in_threadpool(store.choose, name, choice):
-        raise HttpProblem("conflict", f"trial {number} was done already")
+        raise HttpProblem("conflict", f"Trial {number} is done already.")
     return await run_in_threadpool(trial, name, number, parts)
 
 
@@ -188,11 +193,11 @@ async def choose(request: Request, name: str, number: Number, parts: Parts) -> T
     responses={**IMAGE_RESPONSES, **problem_responses("unknown")},
 )
 def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
-    """A gel image of the grasp."""
+    """Return a gel image of the trial's grasp."""
     files = _trial(parts, _run(parts, name), number).grasp.touches
     place = ascii_lowercase.find(finger) if len(finger) == 1 else -1
     if not 0 <= place < len(files):
-        raise HttpProblem("unknown", f"the grasp has no finger {finger[:10]!r}")
+        raise HttpProblem("unknown", f"The grasp has no finger {finger[:10]!r}.")
     return image_response(read_bytes(files[place]))
 
 
@@ -202,5 +207,5 @@ def touch(name: str, number: Number, finger: str, parts: Parts) -> Response:
     responses={**IMAGE_RESPONSES, **problem_responses("unknown")},
 )
 def photo(name: str, number: Number, place: Annotated[int, InPath(ge=1, le=CHOICES)], parts: Parts) -> Response:
-    """One of the photos, counted from 1."""
+    """Return one of the trial's photos, counted from 1."""
     return image_response(read_bytes(_trial(parts, _run(parts, name), number).photos[place - 1]))

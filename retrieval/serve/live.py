@@ -1,4 +1,4 @@
-"""The paths of a live rig: pictures of its sensors as they come, and jaws that close on something."""
+"""Routes of a live rig: sensor pictures, MJPEG streams, and grasps."""
 
 import asyncio
 import base64
@@ -16,39 +16,40 @@ from retrieval.serve.service import Parts, Service
 
 router = APIRouter(tags=["live"])
 MAX_OBJECT_NAMES = 1000
-"""Objects among which one is drawn to be grasped."""
+"""Maximum number of objects among which a random one is chosen for a grasp."""
 BOUNDARY = "picture"
-ObjectParameter = Annotated[str | None, Query(max_length=1000, alias="object", description="close on this object")]
-Rate = Annotated[float, Query(gt=0, le=30, description="pictures a second at most")]
+ObjectParameter = Annotated[str | None, Query(max_length=1000, alias="object", description="Object to grasp.")]
+Rate = Annotated[float, Query(gt=0, le=30, description="Maximum pictures per second.")]
 
 
 @router.post("/v1/grasp", responses=problem_responses("unknown", "bad-input", "failed", "busy", "late", "not-ready"))
 async def grasp(request: Request, parts: Parts, name: ObjectParameter = None) -> GraspDocument:
-    """Close the jaws on one of the catalogue's objects: the one that is named, else one drawn at random. The rig makes
-    one grasp after the other.
+    """Grasp one of the catalogue's objects: the named one, else a random one.
+
+    The rig makes one grasp at a time.
     """
     close = parts.rig.grasp
     if close is None:
-        raise HttpProblem("unknown", "no rig can grasp here: neither the catalogue nor --rig is of the simulated one")
+        raise HttpProblem("unknown", "No rig can grasp: neither the catalogue nor --rig is that of the simulated rig.")
     try:
         grasped = await parts.grasps.submit(lambda generation: close(_object_ids(generation, name)), request)
     except HttpProblem:
         raise
     except Exception as error:  # of any rig
-        raise HttpProblem("failed", f"the rig could not grasp: {error}") from error
+        raise HttpProblem("failed", f"The rig could not grasp: {error}") from error
     encoded = [
-        [base64.b64encode(data).decode("ascii") for data in some]
-        for some in (grasped.touches, grasped.background or [])
+        [base64.b64encode(data).decode("ascii") for data in images]
+        for images in (grasped.touches, grasped.background or [])
     ]
     return GraspDocument(object_id=grasped.object_id, touches=encoded[0], background=encoded[1] or None)
 
 
 def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:
-    """Names of objects, spread over the catalogue; the one that is named alone. Raises Problem."""
+    """Return `[name]` if a name is given, else ids of objects spread over the catalogue; raises HttpProblem."""
     shard, photos = generation.shard, generation.searcher.info.photos
     if name is not None:
         if not shard.page([], name, 0, 1).total:
-            raise HttpProblem("unknown", f"the index has no object {name!r}; /v1/catalogue lists them")
+            raise HttpProblem("unknown", f"The index has no object {name!r}. /v1/catalogue lists the objects.")
         return [name]
     step = max(1, photos // MAX_OBJECT_NAMES)
     rows = [row for number in range(0, photos, step) for row in shard.page([], None, number, 1).rows]
@@ -59,12 +60,12 @@ def _object_ids(generation: ServedGeneration, name: str | None) -> list[str]:
     "/v1/sensors/{name}/frame",
     response_class=Response,
     responses={
-        200: {"content": {"image/jpeg": {}}, "description": "the picture"},
+        200: {"content": {"image/jpeg": {}}, "description": "The picture."},
         **problem_responses("unknown", "failed", "busy", "late"),
     },
 )
 async def frame(name: str, request: Request, parts: Parts) -> Response:
-    """The newest picture of a sensor."""
+    """Return the newest picture of a sensor."""
     return Response(await _read(parts, name, request), media_type="image/jpeg")
 
 
@@ -72,21 +73,22 @@ async def frame(name: str, request: Request, parts: Parts) -> Response:
     "/v1/sensors/{name}/stream",
     response_class=StreamingResponse,
     responses={
-        200: {"content": {"multipart/x-mixed-replace": {}}, "description": "pictures without end (MJPEG)"},
+        200: {"content": {"multipart/x-mixed-replace": {}}, "description": "Endless stream of pictures (MJPEG)."},
         **problem_responses("unknown", "failed", "busy", "late"),
     },
 )
 async def stream(name: str, request: Request, parts: Parts, rate: Rate = 10.0) -> StreamingResponse:
-    """The pictures of a sensor as they come; an `<img>` shows them."""
+    """Stream the pictures of a sensor; an `<img>` element shows them."""
     if parts.streams.locked():
-        raise HttpProblem("busy", f"{parts.settings.streams} streams run already", {"retry-after": "5"})
-    first = await _read(parts, name, request)  # what fails, fails before the stream begins
+        raise HttpProblem("busy", f"{parts.settings.streams} streams are running already.", {"retry-after": "5"})
+    first = await _read(parts, name, request)  # errors are raised before the stream begins
     return StreamingResponse(
         _pictures(parts, name, request, first, 1 / rate), media_type=f"multipart/x-mixed-replace; boundary={BOUNDARY}"
     )
 
 
 async def _pictures(parts: Service, name: str, request: Request, first: bytes, pause_s: float) -> AsyncIterator[bytes]:
+    """Yield the parts of an MJPEG stream until the sensor fails or the service stops."""
     async with parts.streams:
         data: bytes | None = first
         while data is not None and not parts.stopping.is_set():
@@ -100,17 +102,17 @@ async def _pictures(parts: Service, name: str, request: Request, first: bytes, p
                 data = await _read(parts, name, request)
             except HttpProblem as problem:
                 if problem.kind != "busy":
-                    data = None  # the sensor was unplugged: the stream ends
+                    data = None  # the sensor failed: end the stream
 
 
 async def _read(parts: Service, name: str, request: Request) -> bytes:
     read = parts.rig.sensors.get(name)
     if read is None:
-        known = ", ".join(sorted(parts.rig.sensors)) or "none; name a rig with --rig"
-        raise HttpProblem("unknown", f"there is no sensor {name[:100]!r}; known: {known}")
+        known = ", ".join(sorted(parts.rig.sensors)) or "none; connect a rig with --rig"
+        raise HttpProblem("unknown", f"There is no sensor {name[:100]!r}. Known sensors: {known}.")
     try:
         return await parts.frames[name].submit(lambda _: read(), request)
     except HttpProblem:
         raise
     except Exception as error:  # of any driver
-        raise HttpProblem("failed", f"sensor {name}: {error}") from error
+        raise HttpProblem("failed", f"Sensor {name}: {error}") from error

@@ -1,4 +1,4 @@
-"""What Prometheus reads at /metrics."""
+"""Prometheus metrics of the service, for /metrics."""
 
 from collections.abc import Mapping
 
@@ -11,7 +11,7 @@ _SIZES = (1, 2, 4, 8, 16, 32)
 
 
 class Metrics:
-    """The numbers of one service; each service has its own registry."""
+    """The metrics of one service; each service has its own registry."""
 
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
@@ -25,25 +25,28 @@ class Metrics:
             "retrieve_batch_queries", "Queries answered together", buckets=_SIZES, registry=self.registry
         )
         self.in_flight = Gauge(
-            "retrieve_requests_in_flight", "Requests that wait or are in work", registry=self.registry
+            "retrieve_requests_in_flight", "Requests that wait or are being processed", registry=self.registry
         )
         self.verdicts = Counter("retrieve_verdicts", "Answers by verdict", ["verdict"], registry=self.registry)
         self.dropped = Counter(
-            "retrieve_dropped", "Requests that were not worked on", ["reason"], registry=self.registry
+            "retrieve_dropped", "Requests that were not processed, by reason", ["reason"], registry=self.registry
         )
         self.responses = Counter("retrieve_responses", "Responses by status", ["status"], registry=self.registry)
         self.problems = Counter("retrieve_problems", "Problem documents by kind", ["kind"], registry=self.registry)
-        self.reloads = Counter("retrieve_reloads", "Generations taken up", registry=self.registry)
+        self.reloads = Counter("retrieve_reloads", "Generations opened", registry=self.registry)
         self.reload_failures = Counter(
             "retrieve_reload_failures", "Generations that could not be opened", registry=self.registry
         )
         self.history_failures = Counter(
-            "retrieve_history_failures", "What could not be kept, by what", ["kind"], registry=self.registry
+            "retrieve_history_failures",
+            "Queries and feedback that could not be stored or recorded",
+            ["kind"],
+            registry=self.registry,
         )
-        self.generation = Gauge("retrieve_generation", "1 for the one that answers", ["name"], registry=self.registry)
+        self.generation = Gauge("retrieve_generation", "1 for the served generation", ["name"], registry=self.registry)
 
     def count_answer(self, results: Mapping[str, float] | QueryResult) -> None:
-        """Count an answer and its stages."""
+        """Count a verdict and the stages of its query, or stages alone, in milliseconds by name."""
         if isinstance(results, QueryResult):
             self.verdicts.labels(results.verdict).inc()
             results = results.timing_ms
@@ -51,11 +54,11 @@ class Metrics:
             self.stages.labels(stage).observe(ms / 1e3)
 
     def set_generation(self, generation: str) -> None:
-        """A generation was taken up."""
+        """Set the served generation and count the reload."""
         self.generation.clear()
         self.generation.labels(generation).set(1)
         self.reloads.inc()
 
     def render(self) -> bytes:
-        """All numbers, in the text format of Prometheus."""
+        """Return all metrics in the text format of Prometheus."""
         return generate_latest(self.registry)

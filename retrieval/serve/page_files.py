@@ -1,4 +1,4 @@
-"""The page's files, read once: what a request names is looked up among them, and never in the file system."""
+"""Routes of the page's files, which are read once; a request never reaches the file system."""
 
 import hashlib
 import mimetypes
@@ -13,7 +13,7 @@ _TYPES = {".js": "text/javascript", ".svg": "image/svg+xml", ".woff2": "font/wof
 
 
 def router_of(folder: Path = FOLDER) -> APIRouter:
-    """A path for each file of a folder; `/` is its index.html."""
+    """Return routes for all files of a folder; `/` is its index.html."""
     router = APIRouter(include_in_schema=False)
     files = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
     answers = {f"/{name}": _answer(path) for name, path in files.items()}
@@ -23,7 +23,7 @@ def router_of(folder: Path = FOLDER) -> APIRouter:
     async def file(request: Request, name: str) -> Response:
         found = answers.get(f"/{name}")
         if found is None:
-            raise HttpProblem("unknown", f"there is no page /{name[:200]}; /openapi.json lists the paths")
+            raise HttpProblem("unknown", f"There is no page /{name[:200]}. /openapi.json lists the paths.")
         data, headers = found
         if request.headers.get("if-none-match") == headers["etag"]:
             return Response(status_code=304, headers=headers)
@@ -33,7 +33,7 @@ def router_of(folder: Path = FOLDER) -> APIRouter:
 
 
 def _answer(path: Path) -> tuple[bytes, dict[str, str]]:
-    """The bytes of a file, and what is said of them; browsers ask whether they are still the same."""
+    """Return the bytes of a file and its response headers; browsers revalidate with the etag."""
     data = path.read_bytes()
     kind = _TYPES.get(path.suffix) or mimetypes.guess_type(path.name)[0] or "application/octet-stream"
     charset = "; charset=utf-8" if kind.startswith("text/") else ""

@@ -1,4 +1,4 @@
-"""The paths of queries: one object, several, an answer grasp by grasp, and where a photo agrees with a touch."""
+"""Routes of queries: one object, several objects, cumulative queries, and occlusion maps."""
 
 from fastapi import APIRouter, Request
 from pydantic import Field
@@ -37,12 +37,12 @@ _PROBLEMS = problem_responses(
     summary="Which object is in the hand?",
 )
 async def query(request: Request, parts: Parts) -> DocumentResponse:
-    """The document of `retrieve query --json` for one or several grasps of one object."""
+    """Return the document of `retrieve query --json` for one or several grasps of one object."""
     parts.queue.require_capacity()
     parsed_query = await read_query(request, parts.generations.current.fingers)
-    count_answer = await parts.queue.answer(parsed_query, request)
-    name = parts.history_writer.keep(parsed_query, count_answer) if parts.history_writer else None
-    return DocumentResponse(count_answer.result.to_dict(), headers={"x-query-id": name} if name else None)
+    answer = await parts.queue.answer(parsed_query, request)
+    name = parts.history_writer.submit(parsed_query, answer) if parts.history_writer else None
+    return DocumentResponse(answer.result.to_dict(), headers={"x-query-id": name} if name else None)
 
 
 @router.post(
@@ -52,8 +52,9 @@ async def query(request: Request, parts: Parts) -> DocumentResponse:
     openapi_extra={"requestBody": QUERY_BODY},
 )
 async def query_cumulative(request: Request, parts: Parts, per_grasp: bool = False) -> DocumentResponse:
-    """How the answer changes grasp by grasp: after the first, after the first two, and so on; `per_grasp`: and what each
-    grasp says by itself.
+    """Return the answers after the first grasp, after the first two, and so on.
+
+    per_grasp: also return the answer to each grasp alone.
     """
     parts.queue.require_capacity()
     parsed_query = await read_query(request, parts.generations.current.fingers)
@@ -72,7 +73,7 @@ async def query_cumulative(request: Request, parts: Parts, per_grasp: bool = Fal
 
 @router.post("/v1/query/batch", response_model=BatchDocument, responses=_PROBLEMS, openapi_extra=json_body("BatchBody"))
 async def query_batch(request: Request, parts: Parts) -> DocumentResponse:
-    """Several objects in one request: their touches are encoded together, an answer for each in their order."""
+    """Return one answer for each of several objects, in their order; their touches are encoded together."""
     parts.queue.require_capacity()
     body = await read_json(request, BatchBody)
     parsed_query = ParsedQuery(pictures_of(body.objects, body.background, is_batch=True), body)
@@ -93,7 +94,7 @@ class AgreementBody(RequestBody):
     photo: str = Field(min_length=1, max_length=4096, examples=["mug/1.jpg"])
     touches: Grasps
     background: list[Base64Image] | None = None
-    squares: int = Field(8, ge=2, le=16, description="squares of a side")
+    squares: int = Field(8, ge=2, le=16, description="Squares per side.")
 
 
 @router.post(
@@ -103,7 +104,7 @@ class AgreementBody(RequestBody):
     openapi_extra=json_body("AgreementBody"),
 )
 async def agree(request: Request, parts: Parts) -> AgreementDocument:
-    """Where a photo agrees with a touch: the match logit's fall as one square after the other is hidden."""
+    """Return the occlusion map of a photo: the fall of the match logit if one square is hidden, for each square."""
     parts.queue.require_capacity()
     body = await read_json(request, AgreementBody)
     pictures = pictures_of([body.touches], body.background)

@@ -1,8 +1,8 @@
-"""Who waits for the model, and for how long.
+"""Queue of the requests that need the model.
 
-So many requests are held at once, those in work among them; the next is told at once to come again. A request whose
-asker has left, or whose deadline has passed, is dropped before it is worked on. Queries that wait and ask alike are
-answered together: an encoder takes as long for each as alone, but the interpreter's work is done once for all of them.
+The number of requests in flight is limited; further requests get 429 at once. A request is dropped before its work
+begins if its client disconnects or its deadline passes. Waiting queries with equal options are answered as one batch:
+the encoder takes the same time for each, but the interpreter's work is done once.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 
 
 class QueryAnswer(NamedTuple):
-    """An answer, and the digest of the model that gave it."""
+    """An answer, and the digest of the model that produced it."""
 
     result: QueryResult
     model: str
@@ -36,7 +36,15 @@ class QueryAnswer(NamedTuple):
 
 @dataclass(eq=False)
 class _Job:
-    """Work for the model, its pictures read. asked: the query, where it is one and nothing else."""
+    """Work for the model, with decoded pictures.
+
+    Attributes:
+        work: The function to run with the served generation.
+        parsed_query: The query if the work is a plain query, which can be batched; else None.
+        answer: Receives the result.
+        began: Arrival of the request (`time.monotonic`).
+        deadline: Time after which the work is dropped (`time.monotonic`).
+    """
 
     work: Callable[[ServedGeneration], Any]
     parsed_query: ParsedQuery | None
@@ -46,8 +54,12 @@ class _Job:
 
 
 class Queue:
-    """Requests that wait for the model, in the order in which they came. The threads that work on them take one after
-    the other themselves: none waits for the event loop in between. held: requests that wait or are in work.
+    """Requests that wait for the model, in the order of their arrival.
+
+    Worker threads take jobs from the queue directly, so that they do not wait for the event loop.
+
+    Attributes:
+        in_flight: Number of requests that wait or are being processed.
     """
 
     def __init__(
@@ -61,14 +73,14 @@ class Queue:
         self.in_flight = 0
 
     def start(self) -> None:
-        """Begin to answer, for the event loop that calls."""
+        """Start the worker threads for the running event loop."""
         loop = asyncio.get_running_loop()
         self._threads = [Thread(target=self._work, args=(loop,), daemon=True) for _ in range(self._settings.workers)]
         for thread in self._threads:
             thread.start()
 
     def close(self, seconds: float) -> None:
-        """Answer what waits, and end; work that takes longer than `seconds` is left to itself."""
+        """Finish the waiting jobs and end; abandon work that takes longer than `seconds`."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -77,18 +89,30 @@ class Queue:
             thread.join(max(0.0, until - time.monotonic()))
 
     def require_capacity(self) -> None:
-        """Raises Problem where one more request would not be held; asked before its body is read."""
+        """Raise HttpProblem if the queue is full; called before the body of a request is read."""
         if self.in_flight >= self._settings.queue:
             self._metrics.dropped.labels("busy").inc()
             raise HttpProblem(
                 "busy",
-                f"{self.in_flight} requests are held already; come again",
+                f"{self.in_flight} requests are in flight already. Try again.",
                 {"retry-after": "1", "connection": "close"},
             )
 
     async def answer(self, parsed_query: ParsedQuery, request: Request) -> QueryAnswer:
-        """Answer a query. Raises Problem, and the errors of `Searcher.query`."""
-        count_answer: QueryAnswer = await self.submit(
+        """Answer a query.
+
+        Args:
+            parsed_query: The query.
+            request: Its request, to notice that the client disconnects.
+
+        Returns:
+            The answer.
+
+        Raises:
+            HttpProblem: The queue is full, the client disconnects or the deadline passes.
+            RetrievalError: The errors of `Searcher.query`.
+        """
+        answer: QueryAnswer = await self.submit(
             lambda generation: QueryAnswer(
                 generation.searcher.query(parsed_query.pictures.images[0], **parsed_query.keywords), generation.model
             ),
@@ -97,8 +121,8 @@ class Queue:
             parsed_query.pictures,
             parsed_query,
         )
-        self._metrics.count_answer(count_answer.result)
-        return count_answer
+        self._metrics.count_answer(answer.result)
+        return answer
 
     async def submit(
         self,
@@ -108,8 +132,22 @@ class Queue:
         pictures: RequestPictures | None = None,
         parsed_query: ParsedQuery | None = None,
     ) -> Result:
-        """Have `pictures` read, and `work` done with the generation that answers when its turn comes. Raises Problem,
-        ImageError, and what the work raises.
+        """Decode `pictures`, then run `work` with the generation that is served at its turn.
+
+        Args:
+            work: Function of the generation; it runs in a worker thread.
+            request: The request, to notice that the client disconnects.
+            deadline_ms: Deadline of the client in milliseconds; the service's own deadline also applies.
+            pictures: Pictures to decode first.
+            parsed_query: The query, if the work is a plain query that can be batched.
+
+        Returns:
+            The result of `work`.
+
+        Raises:
+            HttpProblem: The queue is full, the client disconnects or the deadline passes.
+            ImageError: A picture cannot be decoded.
+            Exception: The errors of `work`.
         """
         self.require_capacity()
         now = time.monotonic()
@@ -126,7 +164,7 @@ class Queue:
                 client_left = disconnected.done()
                 self._metrics.dropped.labels("disconnected" if client_left else "late").inc()
                 raise HttpProblem(
-                    "late", "who asked has left" if client_left else f"no answer within {1e3 * seconds:g} ms"
+                    "late", "The client disconnected." if client_left else f"No answer within {1e3 * seconds:g} ms."
                 )
             return answer.result()
         finally:
@@ -141,7 +179,7 @@ class Queue:
         began: float,
         deadline: float,
     ) -> Result:
-        """Have pictures read, then wait for the model. Cancelling stops both."""
+        """Decode the pictures, then wait for the model; cancelling stops both."""
         if pictures is not None:
             px = self._generations.current.searcher.checkpoint.config.preprocessing.touch_px
             images = await self._decoders.read(pictures.named_files(), px, pictures.background is not None)
@@ -163,7 +201,7 @@ class Queue:
         self.in_flight -= 1
         self._metrics.in_flight.dec()
         if not answer.cancelled():
-            answer.exception()  # which nobody may be there to ask for
+            answer.exception()  # mark as retrieved: the client may have disconnected
 
     def _work(self, loop: asyncio.AbstractEventLoop) -> None:
         while jobs := self._next_batch():
@@ -172,11 +210,11 @@ class Queue:
                 self._metrics.waiting.observe(now - job.began)
             self._metrics.batches.observe(len(jobs))
             answers = _answers(generation, jobs)
-            with suppress(RuntimeError):  # the loop has ended meanwhile
+            with suppress(RuntimeError):  # the loop has ended
                 loop.call_soon_threadsafe(_set_results, jobs, answers)
 
     def _next_batch(self) -> list[_Job]:
-        """The next job, and those that wait or come in the window and can be answered with it; none at the end."""
+        """Return the next job and the jobs of the time window that can be batched with it; empty at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._jobs or self._closed)
             if not self._jobs:
@@ -194,7 +232,7 @@ class Queue:
 
 
 async def _wait_for_disconnect(request: Request) -> None:
-    """Ends when the connection does; the body has been read."""
+    """Return when the client disconnects; the body must have been read."""
     while (await request.receive())["type"] != "http.disconnect":
         pass
 
@@ -210,12 +248,12 @@ def _set_results(jobs: list[_Job], answers: list[Any]) -> None:
 
 
 def _answers(generation: ServedGeneration, jobs: list[_Job]) -> list[Any]:
-    """The answer of each job, or the exception that is its answer; one bad query spoils no other."""
-    parsed_query = [job.parsed_query for job in jobs if job.parsed_query is not None]
+    """Return the result or the exception of each job; a failing query does not affect the others."""
+    parsed_queries = [job.parsed_query for job in jobs if job.parsed_query is not None]
     if len(jobs) > 1:
-        with suppress(BaseException):  # else each alone says which of them it was
+        with suppress(BaseException):  # if the batch fails, each query is answered alone
             found = generation.searcher.query_many(
-                [one.pictures.images[0] for one in parsed_query], **parsed_query[0].keywords
+                [one.pictures.images[0] for one in parsed_queries], **parsed_queries[0].keywords
             )
             return [QueryAnswer(result, generation.model) for result in found]
     return [_answer(generation, job) for job in jobs]
@@ -223,7 +261,7 @@ def _answers(generation: ServedGeneration, jobs: list[_Job]) -> list[Any]:
 
 def _answer(generation: ServedGeneration, job: _Job) -> Any:
     if time.monotonic() > job.deadline:
-        return HttpProblem("late", "the deadline passed before the request's turn came")
+        return HttpProblem("late", "The deadline passed before the request was processed.")
     try:
         return job.work(generation)
     except BaseException as error:

@@ -1,6 +1,6 @@
-"""What a rig gives to the service: pictures of its sensors, and, of the simulated one, jaws that close on an object.
+"""Live rigs of the service: sensor pictures, and grasps with the simulated rig.
 
-A real rig shows its sensors only: nothing that comes over HTTP moves it.
+A real rig only shows its sensors: no HTTP request moves it.
 """
 
 import random
@@ -30,14 +30,22 @@ if TYPE_CHECKING:
     from robot.sim.rig import SimRig  # needs an extra
 
 _SIMULATED_OBJECT_ID = re.compile(r".+-(\d{4,})-\d{5,}")
-"""How the simulated rig calls its objects: their seed, and their number."""
+"""Object ids of the simulated rig: prefix, seed, number."""
 _FIRST_UNRECORDED_ATTEMPT = 10_000
-"""Attempts from this number on are in no recording."""
+"""No recording contains attempts from this number on."""
 _MAX_ATTEMPTS = 20
 
 
 def load_live_rig(spec: str, index: str | Path) -> LiveRig:
-    """The sensors of a rig, which are connected at once. Raises RobotError."""
+    """Return the sensors of a rig, and connect them.
+
+    Args:
+        spec: Name or file of the rig, as for `--rig`.
+        index: Index folder; the simulated rig takes its seed from it.
+
+    Raises:
+        RobotError: The rig cannot be loaded or connected.
+    """
     rig = load_rig(spec, seed=_seed(index) or 0)
     if rig.info["rig"] == "sim":
         return _simulated_rig(cast("SimRig", rig))
@@ -52,7 +60,7 @@ def load_live_rig(spec: str, index: str | Path) -> LiveRig:
 
 
 def simulated_live_rig(index: str | Path) -> LiveRig | None:
-    """The simulated rig, where the index shows its objects and the extra `sim` is installed."""
+    """Return the simulated rig if the index shows its objects and the extra `sim` is installed, else None."""
     seed = _seed(index)
     if seed is None:
         return None
@@ -63,8 +71,9 @@ def simulated_live_rig(index: str | Path) -> LiveRig | None:
 
 
 def _seed(index: str | Path) -> int | None:
-    """The seed of the simulated objects that an index shows; None where its first object is none of the simulated rig,
-    and for an index behind a URL.
+    """Return the seed of the simulated objects of an index.
+
+    None if the first object is not one of the simulated rig, and for an index behind a URL.
     """
     if is_url(index):
         return None
@@ -73,34 +82,34 @@ def _seed(index: str | Path) -> int | None:
         folder = folder / read_sharded_manifest(folder).shards[0].folder if is_sharded(folder) else folder
         first = listed_photo(IndexStore(folder).open(verify=False).rows[0]).object_id
     except IndexesError:
-        return None  # said when it is opened
+        return None  # reported when the index is opened
     found = _SIMULATED_OBJECT_ID.fullmatch(first)
     return int(found[1]) if found else None
 
 
 class _SimulatedGripper:
-    """The simulated rig from several threads, one after the other; its gels show what they closed on last."""
+    """Thread-safe wrapper of the simulated rig; its gels show the last grasp."""
 
     def __init__(self, rig: "SimRig") -> None:
         self._rig, self._lock = rig, Lock()
         self._gels: dict[str, npt.NDArray[np.uint8]] = {}
 
     def grasp(self, names: list[str]) -> GraspResult:
-        """Close on one of these objects, drawn at random; again where they close on air."""
-        draw = random.SystemRandom()
+        """Grasp a random one of these objects, again with another one if the grasp misses."""
+        rng = random.SystemRandom()
         with self._lock:
             for _ in range(_MAX_ATTEMPTS):
-                name = draw.choice(names)
-                grasped = self._rig.press(name, _FIRST_UNRECORDED_ATTEMPT + draw.randrange(1_000_000))
+                name = rng.choice(names)
+                grasped = self._rig.press(name, _FIRST_UNRECORDED_ATTEMPT + rng.randrange(1_000_000))
                 if grasped:
                     fingers = sorted(self._rig.sensors)
                     self._gels = {finger: grasped[f"touch_{finger}"] for finger in fingers}
                     before = [encode_image(grasped[f"touch_{finger}_before"]) for finger in fingers]
                     return GraspResult(name, [encode_image(self._gels[finger]) for finger in fingers], before)
-        raise BadInput(f"{_MAX_ATTEMPTS} times the jaws closed on air; try again")
+        raise BadInput(f"{_MAX_ATTEMPTS} grasps in a row missed the object. Try again.")
 
     def picture(self, finger: str) -> bytes:
-        """The gel of a finger, as it was pressed last."""
+        """Return the gel image of a finger after the last grasp, as JPEG."""
         with self._lock:
             if finger not in self._gels:
                 self._rig.prepare(self._rig.object_ids(1)[0], 0)
@@ -109,6 +118,6 @@ class _SimulatedGripper:
 
 
 def _simulated_rig(rig: "SimRig") -> LiveRig:
-    jaws = _SimulatedGripper(rig)
-    sensors: dict[str, Callable[[], bytes]] = {finger: partial(jaws.picture, finger) for finger in rig.sensors}
-    return LiveRig(sensors, jaws.grasp)
+    gripper = _SimulatedGripper(rig)
+    sensors: dict[str, Callable[[], bytes]] = {finger: partial(gripper.picture, finger) for finger in rig.sensors}
+    return LiveRig(sensors, gripper.grasp)

@@ -1,7 +1,7 @@
-"""Who may ask, and the headers of every response.
+"""Access control, and the security headers of every response.
 
-Without a token the service hears this machine alone. A page of a stranger, open in a browser here, is not this
-machine: its requests name the stranger's host or origin, and are refused.
+Without a token the service answers only this machine. Requests that a foreign page in a local browser sends name the
+foreign host or origin, and are refused.
 """
 
 import asyncio
@@ -22,8 +22,7 @@ log = logging.getLogger(__name__)
 COOKIE = "retrieve-token"
 _LOCAL_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 _OPEN_PATHS = frozenset({"/healthz", "/readyz", "/v1/session", "/openapi.json"})
-"""Without a token: whether it lives, how to say the token, and what it can be asked; the page too, which holds nothing
-of anyone."""
+"""Paths that need no token, in addition to the files of the page, which contain no user data."""
 CONTENT_SECURITY_POLICY = "; ".join(
     (
         "default-src 'none'",
@@ -50,20 +49,20 @@ HEADERS = {
 }
 
 
-def same_token(given: str, token: str) -> bool:
-    """Whether two tokens are equal, in a time that says nothing of either."""
-    digests = [hashlib.sha256(text.encode("utf-8", "replace")).digest() for text in (given, token)]
+def same_token(candidate: str, token: str) -> bool:
+    """Compare two tokens in constant time."""
+    digests = [hashlib.sha256(text.encode("utf-8", "replace")).digest() for text in (candidate, token)]
     return hmac.compare_digest(*digests)
 
 
 class Guard:
-    """Refuses strangers before anything of a request is read, adds HEADERS to every response, and counts it."""
+    """Middleware that refuses unauthorised requests unread, and adds HEADERS to every response and counts it."""
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings, metrics: Metrics) -> None:
         self.app, self.settings, self.metrics = app, settings, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or refuse it (ASGI)."""
+        """Pass a request on, or refuse it (ASGI)."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -87,13 +86,13 @@ class Guard:
             return
         try:
             await self.app(scope, receive, with_headers)
-        except asyncio.CancelledError:  # the server ends, and has waited long enough
+        except asyncio.CancelledError:  # the server shuts down, and the grace period is over
             if not begun:
-                ending = HttpProblem("not-ready", "the service ends", {"retry-after": "1", "connection": "close"})
-                await ending.response()(scope, receive, with_headers)
+                detail, headers = "The service is shutting down.", {"retry-after": "1", "connection": "close"}
+                await HttpProblem("not-ready", detail, headers).response()(scope, receive, with_headers)
         except Exception as error:
-            log.exception("unexpected error at %s", scope["path"])
-            if begun:  # the connection is cut off, so that nobody takes half an answer for one
+            log.exception("Unexpected error at %s", scope["path"])
+            if begun:  # the connection is cut, so that the client does not take a partial answer for a whole one
                 raise
             await problem_of(error).response()(scope, receive, with_headers)
 
@@ -103,25 +102,25 @@ class Guard:
         except ValueError:
             host = None
         if self.settings.is_local and host not in _LOCAL_NAMES:
-            return HttpProblem("wrong-host", "this service hears this machine alone: ask it as localhost or 127.0.0.1")
+            return HttpProblem(
+                "wrong-host", "This service answers only this machine: use the host localhost or 127.0.0.1."
+            )
         origin = headers.get("origin")
         if origin is not None and urlsplit(origin).netloc != headers.get("host"):
-            return HttpProblem("refused", "a page of another origin may not ask this service")
+            return HttpProblem("refused", "Pages of another origin may not use this service.")
         if headers.get("sec-fetch-site") in ("cross-site", "same-site") and headers.get("sec-fetch-mode") != "navigate":
-            return HttpProblem("refused", "a page of another site may not ask this service")
+            return HttpProblem("refused", "Pages of another site may not use this service.")
         token = self.settings.token
         if token is None or path in _OPEN_PATHS or not path.startswith(("/v1/", "/metrics")):
             return None
-        if any(same_token(given, token) for given in _given_tokens(headers)):
+        if any(same_token(candidate, token) for candidate in _request_tokens(headers)):
             return None
-        why = "send the service's token as `Authorization: Bearer TOKEN`"
-        return HttpProblem("no-token", why, {"www-authenticate": "Bearer"})
+        detail = "Send the service's token as `Authorization: Bearer TOKEN`."
+        return HttpProblem("no-token", detail, {"www-authenticate": "Bearer"})
 
 
-def _given_tokens(headers: Headers) -> list[str]:
-    """The tokens that a request carries: in the header, as programs send it, and in the cookie of the page, whose
-    pictures cannot send a header.
-    """
+def _request_tokens(headers: Headers) -> list[str]:
+    """Return the tokens of a request: from the header (programs) and from the cookie (the page)."""
     scheme, _, value = headers.get("authorization", "").partition(" ")
     found = [value.strip()] if scheme.lower() == "bearer" else []
     try:

@@ -1,4 +1,4 @@
-"""The server around the application: it listens, and SIGTERM or Ctrl-C lets it finish what is in flight."""
+"""The HTTP server; on SIGTERM or Ctrl-C it finishes the requests in flight and ends."""
 
 import asyncio
 import contextlib
@@ -20,30 +20,36 @@ from retrieval.serve.connections import IDLE_S, MAX_CONNECTIONS, Connection, Con
 from retrieval.serve.service import Service
 
 DRAIN_S = 0.5
-"""For which, told to end, it still takes requests: those that were sent before, and lie unread in a socket."""
+"""Time after the signal in which it still accepts requests: those sent before may lie unread in a socket."""
 SHUTDOWN_GRACE_S = 4
-"""For requests in flight, after the last call."""
+"""Time limit for requests in flight, after `DRAIN_S`."""
 MAX_SHUTDOWN_S = 7.5
-"""From the signal to the end of the process, whatever hangs."""
+"""Maximum time from the signal to the end of the process, even if a thread hangs."""
 _SWEEP_TICKS = 5
-"""Ticks of a tenth of a second from one look at the connections' deadlines to the next."""
+"""Ticks of 0.1 s between two checks of the connections' deadlines."""
 
 
 class Server(uvicorn.Server):
-    """Ends when it is told to, and then its process has done what it was asked: no signal is raised again."""
+    """A uvicorn server that ends on a signal without raising it again, so that the process exits with status 0.
 
-    def __init__(self, config: uvicorn.Config, parts: Service, started: Callable[[int], object]) -> None:
+    Args:
+        config: Configuration of uvicorn.
+        parts: Parts of the service.
+        on_started: Called with the port when the server listens.
+    """
+
+    def __init__(self, config: uvicorn.Config, parts: Service, on_started: Callable[[int], object]) -> None:
         super().__init__(config)
-        self._parts, self._on_started = parts, started
+        self._parts, self._on_started = parts, on_started
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Listen, and say at which port."""
+        """Listen, and pass the port to `on_started`."""
         await super().startup(sockets)
         if self.started:
             self._on_started(self.servers[0].sockets[0].getsockname()[1])
 
     async def on_tick(self, counter: int) -> bool:
-        """Close connections whose deadline has passed, twice a second; whether to end (uvicorn)."""
+        """Close late connections twice a second; return whether to end (uvicorn callback)."""
         if counter % _SWEEP_TICKS == 0:
             now = asyncio.get_running_loop().time()
             for connection in list(self.server_state.connections):
@@ -52,13 +58,13 @@ class Server(uvicorn.Server):
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Answer what was sent until now, and end."""
+        """Answer the requests sent so far, and end."""
         await asyncio.sleep(DRAIN_S)
         await super().shutdown(sockets)
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Both signals end it while it serves; what they were before is put back."""
+        """Handle both signals while the server runs; restore their handlers afterwards."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
@@ -70,15 +76,21 @@ class Server(uvicorn.Server):
                 signal.signal(number, handler)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Streams, which never end by themselves, end now."""
+        """End the streams, which never end by themselves, and the server."""
         self._parts.stopping.set()
         super().handle_exit(sig, frame)
 
 
-def serve(app: FastAPI, started: Callable[[int], object]) -> None:
-    """Serve until SIGTERM or Ctrl-C, which the process outlives by END_S at most, even where a thread hangs. `started`
-    is told the port as soon as it listens. Raises BadInput where it cannot listen, and the errors of
-    `Searcher.open`.
+def serve(app: FastAPI, on_started: Callable[[int], object]) -> None:
+    """Serve until SIGTERM or Ctrl-C; the process then ends within `MAX_SHUTDOWN_S`, even if a thread hangs.
+
+    Args:
+        app: Application of `create_app`.
+        on_started: Called with the port when the server listens.
+
+    Raises:
+        BadInput: The server cannot listen at the host and port.
+        RetrievalError: The errors of `Searcher.open`.
     """
     parts: Service = app.state.service
     threading.Thread(target=_enforce_shutdown, args=(parts.stopping,), daemon=True).start()
@@ -88,33 +100,34 @@ def serve(app: FastAPI, started: Callable[[int], object]) -> None:
         family, *_, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         listening = socket.create_server(address[:2], family=family)
     except OSError as error:
-        raise BadInput(f"{host}, port {port}, cannot be listened on: {error.strerror or error}") from error
+        raise BadInput(f"Cannot listen on {host}, port {port}: {error.strerror or error}") from error
     with listening:
-        Server(uvicorn_config(app), parts, started).run([listening])
+        Server(uvicorn_config(app), parts, on_started).run([listening])
 
 
 def _enforce_shutdown(stopping: threading.Event) -> None:
-    """End the process END_S after `stopping` is set: the interpreter would wait for threads that hang in a driver, in
-    the disk or in a decoder.
+    """End the process `MAX_SHUTDOWN_S` after `stopping` is set.
+
+    The interpreter itself would wait for threads that hang in a driver, in the disk or in a decoder.
     """
     stopping.wait()
-    signal.setitimer(
-        signal.ITIMER_REAL, MAX_SHUTDOWN_S + 1
-    )  # the system ends it, where the interpreter is too busy ending
+    # SIGALRM ends the process if the interpreter itself hangs.
+    signal.setitimer(signal.ITIMER_REAL, MAX_SHUTDOWN_S + 1)
     time.sleep(MAX_SHUTDOWN_S)
     hanging = ", ".join(
         thread.name for thread in threading.enumerate() if not thread.daemon and thread is not threading.main_thread()
     )
     with contextlib.suppress(OSError, ValueError):
         sys.stderr.write(
-            f"did not end within {MAX_SHUTDOWN_S:g} s of the signal, and is cut off; threads that hang: {hanging}\n"
+            f"The service did not end within {MAX_SHUTDOWN_S:g} s of the signal and is killed. "
+            f"Hanging threads: {hanging}\n"
         )
         sys.stderr.flush()
     os._exit(1)
 
 
 def uvicorn_config(app: FastAPI) -> uvicorn.Config:
-    """How the application is served."""
+    """Return the configuration of uvicorn for the application."""
     settings = app.state.service.settings
     return uvicorn.Config(
         app,
@@ -124,7 +137,7 @@ def uvicorn_config(app: FastAPI) -> uvicorn.Config:
         access_log=False,
         server_header=False,
         proxy_headers=False,
-        http=partial(Connection, table=ConnectionTable()),  # type: ignore[arg-type]  # it is only called
+        http=partial(Connection, table=ConnectionTable()),  # type: ignore[arg-type]  # uvicorn only calls it
         ws="none",
         backlog=MAX_CONNECTIONS,
         timeout_keep_alive=IDLE_S,

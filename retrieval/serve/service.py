@@ -1,4 +1,4 @@
-"""What the paths share: the parts of one service, which stand in the application's state."""
+"""The parts of one service, which all routes share through the application's state."""
 
 from asyncio import Semaphore
 from collections.abc import Callable, Mapping
@@ -20,8 +20,12 @@ from retrieval.serve.trials import Trials
 
 @dataclass(frozen=True)
 class GraspResult:
-    """What a rig felt: the name of the object, and PNG files of the fingers, in their order; of the untouched gels
-    where the rig has seen them.
+    """Result of one grasp.
+
+    Attributes:
+        object_id: Name of the grasped object.
+        touches: PNG file of each finger's gel image, in finger order.
+        background: PNG file of each finger's no-contact frame; None if the rig has none.
     """
 
     object_id: str
@@ -31,10 +35,13 @@ class GraspResult:
 
 @dataclass(frozen=True)
 class LiveRig:
-    """What a rig gives the service (`retrieval.serve.rig`), as callables that may be asked from any thread.
+    """Functions of a rig (`retrieval.serve.rig`), callable from any thread.
 
-    sensors: name -> the newest picture as a JPEG file. grasp: closes jaws on one of the objects of these names; None
-    where nothing can be closed. Both may raise anything; the sentence is shown.
+    Both may raise any exception; the user gets its message.
+
+    Attributes:
+        sensors: Name of a sensor -> function that returns its newest picture as a JPEG file.
+        grasp: Function that grasps one of the named objects; None if the rig cannot grasp.
     """
 
     sensors: Mapping[str, Callable[[], bytes]] = field(default_factory=dict)
@@ -43,8 +50,22 @@ class LiveRig:
 
 @dataclass(frozen=True, eq=False)
 class Service:
-    """The parts of one service. grasps: the queue of the rig; frames: one for each sensor, by name. streams: places for
-    live pictures. stopping: set when it is to end, for what would never end by itself.
+    """The parts of one service.
+
+    Attributes:
+        settings: Options of the operator.
+        metrics: Prometheus metrics.
+        generations: The served generation of the index.
+        decoders: Processes that decode pictures.
+        queue: Queue of the model.
+        grasps: Queue of the rig's gripper.
+        frames: Queue of each sensor, by name.
+        rig: Functions of the live rig.
+        thumbnails: Cache of small pictures.
+        history_writer: Writer of the history; None if no history is stored.
+        trials: Trials of the human baseline; None if there is no recording for them.
+        streams: Limits the number of live streams.
+        stopping: Set at shutdown, to end streams.
     """
 
     settings: ServiceSettings
@@ -62,10 +83,10 @@ class Service:
     stopping: Event = field(default_factory=Event)
 
 
-async def _service(request: Request) -> Service:  # what is no coroutine function is called in a thread
+async def _service(request: Request) -> Service:  # async, because FastAPI calls plain functions in a thread
     found: Service = request.app.state.service
     return found
 
 
 Parts = Annotated[Service, Depends(_service)]
-"""A parameter of a path that wants the service."""
+"""Type of a route's parameter that receives the service."""

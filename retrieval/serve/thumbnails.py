@@ -1,4 +1,4 @@
-"""Small pictures of photos; the last ones asked for are kept."""
+"""Cache of small pictures of photos (least recently used pictures are dropped)."""
 
 from collections import OrderedDict
 from pathlib import Path
@@ -7,17 +7,27 @@ from threading import Lock
 from retrieval.report.pages import jpeg, thumbnail
 
 CACHED_BYTES = 32 * 2**20
+"""Default size limit of the cache."""
 
 
 class Thumbnails:
-    """Small JPEG pictures of photo files, kept in memory by the content of the file."""
+    """Memory cache of small JPEG pictures, keyed by path, digest and size."""
 
     def __init__(self, max_bytes: int = CACHED_BYTES) -> None:
         self._cache: OrderedDict[tuple[Path, str, int], bytes] = OrderedDict()
         self._bytes, self._max_bytes, self._lock = 0, max_bytes, Lock()
 
     def of(self, path: Path, digest: str, px: int) -> bytes | None:
-        """A JPEG file whose longer side is at most `px`; None where the picture at `path` cannot be read."""
+        """Return a small JPEG file of a photo.
+
+        Args:
+            path: File of the photo.
+            digest: Digest of its content.
+            px: Maximum longer side in pixels.
+
+        Returns:
+            The JPEG file; None if the photo cannot be read.
+        """
         key = (path, digest, px)
         with self._lock:
             if (found := self._cache.get(key)) is not None:

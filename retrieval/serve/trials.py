@@ -1,8 +1,8 @@
-"""The human test: a touch is shown, and ten photos, one of them of the object that was touched.
+"""Trials of the human baseline: a person matches a touch with one of ten photos.
 
-Lin, Calandra and Levine (ICRA 2019) had people do 420 such trials. Here they are drawn from a recording's objects that
-the model never saw: a grasp, a photo of the same object from another grasp, and a photo each of nine other objects. A
-series is a seed, so that it is drawn again wherever it is asked for.
+In Lin, Calandra and Levine (ICRA 2019) people did 420 such trials. Here a trial uses objects of a recording that the
+model was not trained on: a grasp, a photo of the same object from another grasp, and one photo of each of nine other
+objects. The seed of a series determines its trials, so they need not be stored.
 """
 
 from collections import defaultdict
@@ -25,7 +25,13 @@ CHOICES = 10
 
 @dataclass(frozen=True)
 class Trial:
-    """A grasp whose touch is shown, and the photos to choose from; truth: the right one, counted from 1."""
+    """One trial.
+
+    Attributes:
+        grasp: Grasp whose touch is shown.
+        photos: Photos to choose from.
+        truth: Number of the right photo, counted from 1.
+    """
 
     grasp: Grasp
     photos: tuple[Path, ...]
@@ -34,7 +40,10 @@ class Trial:
 
 @dataclass(frozen=True)
 class TrialAccuracy:
-    """How many trials were right, and the exact interval of 95 % (Clopper and Pearson 1934); None before the first."""
+    """Accuracy with its exact 95 % confidence interval (Clopper and Pearson 1934).
+
+    `accuracy`, `low` and `high` are null before the first trial.
+    """
 
     right: int
     trials: int
@@ -44,7 +53,7 @@ class TrialAccuracy:
 
 
 def trial_accuracy(right: int, trials: int) -> TrialAccuracy:
-    """The share and its interval."""
+    """Return the accuracy and its confidence interval for `right` of `trials` right choices."""
     if not trials:
         return TrialAccuracy(0, 0, None, None, None)
     low, high = binomial_interval(right, trials)
@@ -52,13 +61,20 @@ def trial_accuracy(right: int, trials: int) -> TrialAccuracy:
 
 
 def trial_accuracies(choices: list[TrialChoice]) -> tuple[TrialAccuracy, TrialAccuracy]:
-    """The shares of right choices: of the person, and of the model in the same trials."""
+    """Return the accuracy of the person, and of the model in the same trials."""
     right = [sum(one.choice == one.truth for one in choices), sum(one.model == one.truth for one in choices)]
     return trial_accuracy(right[0], len(choices)), trial_accuracy(right[1], len(choices))
 
 
 class Trials:
-    """The trials of one recording. Raises DatasetError for one that cannot be read."""
+    """The trials of one recording.
+
+    Args:
+        folder: Folder of the recording.
+
+    Raises:
+        DatasetError: The recording cannot be read.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -73,37 +89,47 @@ class Trials:
         return found
 
     def unseen(self, generation: ServedGeneration) -> list[str]:
-        """Objects that the model was neither trained nor calibrated on, sorted."""
+        """Return the objects that the model was neither trained nor calibrated on, sorted."""
         split = generation.checkpoint().split
-        seen = {*split.train, *split.validation} if split else set()
-        return sorted(set(self._by_object) - seen)
+        training_objects = {*split.train, *split.validation} if split else set()
+        return sorted(set(self._by_object) - training_objects)
 
     def trial(self, generation: ServedGeneration, seed: int, number: int) -> Trial:
-        """Trial `number`, from 1, of a series. Raises BadInput where the recording has too few unseen objects, or the
-        model is for another number of fingers.
+        """Return one trial of a series.
+
+        Args:
+            generation: The generation whose model is compared.
+            seed: Seed of the series.
+            number: Number of the trial, counted from 1.
+
+        Returns:
+            The trial.
+
+        Raises:
+            BadInput: The recording has too few unseen objects, or another number of fingers than the model.
         """
         names = self.unseen(generation)
         if len(names) < CHOICES:
             raise BadInput(
-                f"a trial needs {CHOICES} objects that the model was not trained on; {self.folder} has {len(names)}"
+                f"A trial requires {CHOICES} objects that the model was not trained on; {self.folder} has {len(names)}."
             )
         if (fingers := finger_count(self._grasps)) != generation.fingers:
-            raise BadInput(f"the model takes {generation.fingers} gel image(s); {self.folder} has {fingers}")
-        turn, place = divmod(number - 1, len(names))  # every object once before any comes again
-        name = names[np.random.default_rng([seed, turn]).permutation(len(names))[place]]
-        rng = np.random.default_rng([seed, turn, place])
+            raise BadInput(f"The model takes {generation.fingers} gel image(s); {self.folder} has {fingers}.")
+        cycle, place = divmod(number - 1, len(names))  # each cycle shows every object once
+        name = names[np.random.default_rng([seed, cycle]).permutation(len(names))[place]]
+        rng = np.random.default_rng([seed, cycle, place])
         own = self._by_object[name]
         grasp = own[rng.integers(len(own))]
         others = [each for each in own if each.photo != grasp.photo] or [grasp]
-        drawn = rng.permutation([other for other in names if other != name])[: CHOICES - 1]
-        photos = [self._by_object[str(other)] for other in drawn]
-        shown = [each[rng.integers(len(each))].photo for each in photos]
+        distractors = rng.permutation([other for other in names if other != name])[: CHOICES - 1]
+        groups = [self._by_object[str(other)] for other in distractors]
+        photos = [grasps[rng.integers(len(grasps))].photo for grasps in groups]
         truth = int(rng.integers(CHOICES))
-        shown.insert(truth, others[rng.integers(len(others))].photo)
-        return Trial(grasp, tuple(shown), truth + 1)
+        photos.insert(truth, others[rng.integers(len(others))].photo)
+        return Trial(grasp, tuple(photos), truth + 1)
 
     def model_choice(self, generation: ServedGeneration, trial: Trial) -> int:
-        """What the model chooses in the same trial, counted from 1: the photo of largest match logit."""
+        """Return the model's choice in a trial, counted from 1: the photo with the largest match logit."""
         background = generation.searcher.checkpoint.config.preprocessing.background
         reference = trial.grasp.backgrounds if background != "none" else None
         partials = generation.searcher.encode([trial.grasp.touches], background=reference).partials

@@ -1,5 +1,5 @@
-// Places of a picture: a click shows the grasps that it stands for, another click hides them; arrows walk from one to the
-// next, so that the keyboard stops once at a picture.
+// Clickable places of a picture: a click shows the grasps of a place, another click hides them. Arrow keys move between
+// the places, so that each picture is one tab stop.
 const photographs = document.querySelector(".photographs")?.content;
 
 for (const picture of document.querySelectorAll(".picture")) {
@@ -19,8 +19,8 @@ for (const picture of document.querySelectorAll(".picture")) {
     });
   });
 
-  function show(spot, wanted) {
-    spots.forEach((each) => (each.ariaExpanded = String(wanted && each === spot)));
+  function show(spot, expanded) {
+    spots.forEach((each) => (each.ariaExpanded = String(expanded && each === spot)));
     const cards = spot.nextElementSibling.content.cloneNode(true);
     for (const tile of cards.querySelectorAll("[data-picture]")) {
       const found = photographs?.querySelector(`[data-name="${tile.dataset.picture}"]`)?.cloneNode();
@@ -28,7 +28,7 @@ for (const picture of document.querySelectorAll(".picture")) {
       found.alt = tile.nextElementSibling.textContent;
       tile.append(found);
     }
-    shown.replaceChildren(...(wanted ? [cards] : []));
-    shown.hidden = !wanted;
+    shown.replaceChildren(...(expanded ? [cards] : []));
+    shown.hidden = !expanded;
   }
 }

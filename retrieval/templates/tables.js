@@ -1,4 +1,4 @@
-// Tables of a report: a click on a heading sorts, words in the field leave the rows that hold all of them.
+// Tables of a report: a click on a heading sorts; the filter field shows the rows that contain all its words.
 const number = (text) => parseFloat(text.replace(/^< /, "").replace("−", "-").replace(/,(?=\d{3})/g, ""));
 
 for (const table of document.querySelectorAll("table")) {
@@ -14,24 +14,24 @@ for (const table of document.querySelectorAll("table")) {
     heading.append(button);
   });
 
-  // Down, up, and as it was.
+  // The sort order cycles: descending, ascending, original.
   function sort(column) {
     const heading = headings[column];
     const next = { none: "descending", descending: "ascending", ascending: "none" }[heading.ariaSort ?? "none"];
     headings.forEach((other) => other.removeAttribute("aria-sort"));
     if (next !== "none") heading.ariaSort = next;
-    const turn = next === "ascending" ? 1 : -1;
+    const sign = next === "ascending" ? 1 : -1;
     const cell = (row) => row.cells[column];
-    body.append(...(next === "none" ? rows : [...rows].sort((one, other) => order(cell(one), cell(other), turn))));
+    body.append(...(next === "none" ? rows : [...rows].sort((one, other) => order(cell(one), cell(other), sign))));
   }
 
-  // Numbers by size, words by letter; what is empty comes last either way.
-  function order(one, other, turn) {
+  // Numbers by value, text alphabetically; cells without a number come last in both directions.
+  function order(one, other, sign) {
     const [a, b] = [one, other].map((cell) => cell.textContent.trim());
     const [x, y] = [number(a), number(b)];
-    if (one.className === "words" || (isNaN(x) && isNaN(y))) return turn * a.localeCompare(b, "en", { numeric: true });
+    if (one.className === "words" || (isNaN(x) && isNaN(y))) return sign * a.localeCompare(b, "en", { numeric: true });
     if (isNaN(x) || isNaN(y)) return isNaN(x) - isNaN(y);
-    return turn * (x - y);
+    return sign * (x - y);
   }
 
   if (rows.length < 6) continue;

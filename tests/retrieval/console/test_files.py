@@ -1,4 +1,4 @@
-"""What commands write: whole, over nothing but files of their own kind, and swept after those that were killed."""
+"""Output files of commands: written atomically, only over files of their kind, with cleanup after killed writers."""
 
 import contextlib
 import errno
@@ -38,8 +38,8 @@ KINDS = (CARD, CHECKPOINT, EXPORT, HAND_EYE, PAGE, PREVIEW, RESULTS, TEXT, TIMIN
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(64)
 
 
-def test_nothing_but_a_file_of_its_kind_is_written_over(tmp_path):
-    theirs = {
+def test_only_files_of_the_same_kind_are_overwritten(tmp_path):
+    foreign = {
         "photo": PNG,
         "index": b"gen-000001\n",
         "page": b"<!doctype html><title>mine</title>",
@@ -47,16 +47,16 @@ def test_nothing_but_a_file_of_its_kind_is_written_over(tmp_path):
         "weights": (8).to_bytes(8, "little") + b"{}      ",
         "huge header": (2**63).to_bytes(8, "little"),
     }
-    for name, data in theirs.items():
+    for name, data in foreign.items():
         path = tmp_path / name
         path.write_bytes(data)
         for kind in KINDS:
-            with pytest.raises(BadInput, match="that this program wrote"):
+            with pytest.raises(BadInput, match="that this program wrote, so it is not overwritten"):
                 write_output(path, b"ours", kind)
             assert path.read_bytes() == data
 
 
-def test_nothing_there_or_an_empty_file_is_written_to(tmp_path):
+def test_missing_and_empty_files_are_written(tmp_path):
     (tmp_path / "empty").touch()
     write_output(tmp_path / "empty", b"1", PAGE)
     write_output(tmp_path / "new" / "deep" / "page", b"2", PAGE)
@@ -84,7 +84,7 @@ def test_a_file_of_its_kind_is_replaced(tmp_path, kind, data):
     assert path.read_bytes() == b"new"
 
 
-def test_pipes_sockets_devices_and_folders_are_refused_and_stay(tmp_path):
+def test_pipes_sockets_devices_and_folders_are_refused_and_unchanged(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     server = socket.socket(socket.AF_UNIX)
     server.bind(str(tmp_path / "socket"))
@@ -104,14 +104,14 @@ def test_a_link_is_followed_and_stays_a_link(tmp_path):
     assert (tmp_path / "there").read_bytes() == b"1"
 
 
-def test_a_link_in_a_circle_is_an_error_of_that_file(tmp_path):
+def test_a_circular_link_is_reported_for_its_file(tmp_path):
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
     with pytest.raises(BadInput, match=r"a cannot be opened \(Too many levels of symbolic links\)"):
         require_ours(tmp_path / "a", PAGE)
-    with pytest.raises(OSError, match="circle") as told:
+    with pytest.raises(OSError, match="circle") as error:
         write_atomically(tmp_path / "a", b"")
-    assert told.value.filename == str(tmp_path / "a")
+    assert error.value.filename == str(tmp_path / "a")
 
 
 def test_a_full_disk_error_names_the_file(tmp_path):
@@ -121,17 +121,17 @@ def test_a_full_disk_error_names_the_file(tmp_path):
     before = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
     try:
-        with pytest.raises(OSError, match="File too large") as told:
+        with pytest.raises(OSError, match="File too large") as error:
             write_atomically(path, bytes(5000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         signal.signal(signal.SIGXFSZ, before)
-    assert (told.value.errno, told.value.filename) == (errno.EFBIG, str(path))
+    assert (error.value.errno, error.value.filename) == (errno.EFBIG, str(path))
     assert [one.name for one in tmp_path.iterdir()] == ["page.html"]
     assert path.read_bytes() == b"old"
 
 
-def test_what_a_killed_writer_left_is_swept_by_the_next_write_to_that_name(tmp_path):
+def test_the_next_write_removes_the_files_of_a_killed_writer(tmp_path):
     path = tmp_path / "m.safetensors"
     code = (
         "import os, signal, sys\nfrom pathlib import Path\nfrom _touch_retrieval import files\n"
@@ -141,13 +141,13 @@ def test_what_a_killed_writer_left_is_swept_by_the_next_write_to_that_name(tmp_p
     done = subprocess.run([sys.executable, "-c", code, str(path)], cwd=ROOT, timeout=60, check=False)
     assert done.returncode == -signal.SIGKILL
     assert len(list(tmp_path.iterdir())) == 1
-    (tmp_path / f".m.safetensors.{os.getpid()}.tmp").touch()  # of an older version, its number given out again
+    (tmp_path / f".m.safetensors.{os.getpid()}.tmp").touch()  # of an older version, with a reused process id
     (tmp_path / ".other.1.tmp").touch()
     write_atomically(path, b"whole")
     assert sorted(one.name for one in tmp_path.iterdir()) == [".other.1.tmp", "m.safetensors"]
 
 
-def test_what_another_writer_is_writing_is_not_swept(tmp_path, monkeypatch):
+def test_files_of_a_running_writer_are_not_removed(tmp_path, monkeypatch):
     path = tmp_path / "page"
 
     def meanwhile(descriptor):
@@ -161,7 +161,7 @@ def test_what_another_writer_is_writing_is_not_swept(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("number", [errno.EINVAL, errno.EACCES, errno.EIO])
-def test_a_disk_that_flushes_no_folders_is_written_to_and_a_broken_one_is_told(tmp_path, monkeypatch, number):
+def test_disks_without_folder_fsync_work_and_broken_disks_are_reported(tmp_path, monkeypatch, number):
     real = os.fsync
 
     def refusing(descriptor):
@@ -170,35 +170,35 @@ def test_a_disk_that_flushes_no_folders_is_written_to_and_a_broken_one_is_told(t
         real(descriptor)
 
     monkeypatch.setattr(os, "fsync", refusing)
-    told = pytest.raises(OSError, match="cannot be written") if number == errno.EIO else contextlib.nullcontext()
-    with told:
+    outcome = pytest.raises(OSError, match="cannot be written") if number == errno.EIO else contextlib.nullcontext()
+    with outcome:
         write_atomically(tmp_path / "page", b"whole")
     assert (tmp_path / "page").read_bytes() == b"whole"
 
 
-def test_a_name_as_long_as_the_disk_takes_can_be_written(tmp_path):
+def test_names_of_the_maximum_length_can_be_written(tmp_path):
     for name in ("n" * 255, "ü" * 127):
         write_atomically(tmp_path / name, b"x")
         assert (tmp_path / name).read_bytes() == b"x"
 
 
-def test_a_name_that_the_disk_does_not_take_is_told(tmp_path):
+def test_a_name_that_is_too_long_is_reported(tmp_path):
     with pytest.raises(BadInput, match="File name too long"):
         write_output(tmp_path / ("n" * 10_000), b"", PAGE)
 
 
-def test_a_written_file_has_the_rights_of_any_new_file(tmp_path):
+def test_a_written_file_has_default_permissions(tmp_path):
     (tmp_path / "plain").touch()
     write_atomically(tmp_path / "ours", b"x")
     assert (tmp_path / "ours").stat().st_mode == (tmp_path / "plain").stat().st_mode
 
 
-def test_a_page_with_a_name_of_unknown_coding_can_be_written():
+def test_a_page_with_a_name_in_an_unknown_encoding_can_be_written():
     assert text_bytes("m\udcfcg") == b"m&#56572;g"
 
 
 @given(st.binary(max_size=300))
-def test_no_bytes_are_taken_for_a_file_of_ours_by_an_error(data):
+def test_the_check_of_a_kind_never_raises(data):
     import io
 
     for kind in KINDS:

@@ -1,4 +1,4 @@
-"""The progress of long work: lines where nobody watches, a bar on a terminal, nothing where asked to be quiet."""
+"""The progress of long work: lines in a pipe, a bar on a terminal, nothing with `quiet`."""
 
 import pytest
 
@@ -8,7 +8,7 @@ from retrieval.console.progress import Bar
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock that stands still until `clock[0]` is moved on."""
+    """A fake clock; the test sets `clock[0]`."""
     now = [100.0]
     monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
     return now
@@ -28,33 +28,33 @@ def test_a_line_comes_every_fifteen_seconds_and_at_the_end(clock, capsys):
     ]
 
 
-def test_resumed_work_is_counted_in_full_and_timed_from_where_it_went_on(clock, capsys):
+def test_resumed_work_is_counted_in_full_and_timed_from_its_resumption(clock, capsys):
     with Bar("embed", 100, "photos", done=60) as bar:
         clock[0] += 20.0
         bar.advance(10)
     assert capsys.readouterr().err == "embed: 70/100 photos, 0.5 per second, 60 s left\n"
 
 
-def test_work_that_takes_no_time_is_not_divided_by_zero(clock, capsys):
+def test_instant_work_causes_no_division_by_zero(clock, capsys):
     with Bar("check", 2, "images") as bar:
         bar.advance(2)
     assert "check: 2/2 images" in capsys.readouterr().err
 
 
-def test_quiet_work_says_nothing(clock, capsys):
+def test_quiet_work_prints_nothing(clock, capsys):
     with Bar("check", 3, "images", quiet=True) as bar:
         clock[0] += 100.0
         bar.advance(3)
     assert capsys.readouterr() == ("", "")
 
 
-def test_an_error_inside_goes_on_its_way():
+def test_an_error_inside_is_propagated():
     with pytest.raises(KeyError), Bar("check", 3, "images", quiet=True):
         raise KeyError
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_on_a_terminal_there_is_a_bar_that_stops_whatever_happens(monkeypatch, capsys, fails):
+def test_a_terminal_shows_a_bar_that_stops_even_after_an_error(monkeypatch, capsys, fails):
     monkeypatch.setattr(progress.sys.stderr, "isatty", lambda: True, raising=False)
     bar = Bar("train", 5, "steps", done=2)
     try:
@@ -73,7 +73,7 @@ def test_on_a_terminal_there_is_a_bar_that_stops_whatever_happens(monkeypatch, c
     assert "3/5" in err
 
 
-def test_on_a_narrow_terminal_the_bar_gives_way_and_the_figures_stay(monkeypatch, capsys):
+def test_a_narrow_terminal_shortens_the_bar_and_keeps_the_numbers(monkeypatch, capsys):
     monkeypatch.setattr(progress.sys.stderr, "isatty", lambda: True, raising=False)
     monkeypatch.setenv("COLUMNS", "80")
     with Bar("collect", 120, "grasps") as bar:

@@ -1,4 +1,4 @@
-"""The page of an evaluation in a real browser, from the disk: its tables sort and filter, its pictures show grasps."""
+"""The page of an evaluation in a real browser, from the disk: sorting, filters, and grasps of clicked pictures."""
 
 import pytest
 
@@ -20,18 +20,22 @@ def opened(tmp_path_factory):
         yield found
 
 
-def test_a_heading_sorts_its_table_down_up_and_as_it_was(opened):
+def test_a_heading_sorts_its_table_in_three_orders(opened):
     table = opened.locator("table").first
     first = lambda: [float(text.split()[0]) for text in table.locator("td:nth-child(2)").all_inner_texts()]  # noqa: E731
     before = first()
     heading = table.get_by_role("columnheader").nth(1)
-    for turn, order in (("descending", sorted(before, reverse=True)), ("ascending", sorted(before)), (None, before)):
+    for direction, order in (
+        ("descending", sorted(before, reverse=True)),
+        ("ascending", sorted(before)),
+        (None, before),
+    ):
         heading.get_by_role("button").click()
-        assert (heading.get_attribute("aria-sort"), first()) == (turn, order)
+        assert (heading.get_attribute("aria-sort"), first()) == (direction, order)
     assert before != sorted(before)
 
 
-def test_words_leave_the_rows_that_hold_them_all(opened):
+def test_the_filter_shows_the_rows_that_contain_all_words(opened):
     opened.get_by_text("Every measure of every method").click()
     field = opened.get_by_label("Filter the rows of this table").last
     rows = opened.locator("details[open] tbody tr:visible")
@@ -44,37 +48,37 @@ def test_words_leave_the_rows_that_hold_them_all(opened):
     assert rows.count() == before
 
 
-def test_a_click_on_a_confusion_shows_touches_that_were_mistaken_with_their_pictures(opened):
-    pair = opened.get_by_role("button", name="taken for").first
-    told = pair.get_attribute("aria-label")
+def test_a_click_on_a_confusion_shows_its_touches_with_pictures(opened):
+    pair = opened.get_by_role("button", name="mistaken for").first
+    label = pair.get_attribute("aria-label")
     pair.click()
-    shown = opened.get_by_role("region", name="Grasps that were clicked")
-    assert shown.get_by_role("heading").inner_text() == told
+    shown = opened.get_by_role("region", name="Grasps of the clicked place")
+    assert shown.get_by_role("heading").inner_text() == label
     cards = shown.locator(".cards li")
     names = cards.locator("figcaption").filter(has_text="the object: ").all_inner_texts()
-    assert set(names) == {f"the object: {told.split(' taken for ')[0]}"}
+    assert set(names) == {f"the object: {label.split(' mistaken for ')[0]}"}
     pictures = shown.locator("img")
-    assert (cards.count(), pictures.count()) == (2, 8)  # two gels, the object, and what was found, of each
+    assert (cards.count(), pictures.count()) == (2, 8)  # two gels, the object and the found photo of each
     assert pictures.evaluate_all("all => all.every((one) => one.complete && one.naturalWidth > 0)")
     pair.click()
     assert shown.count() == 0
 
 
-def test_a_point_of_a_guess_curve_stands_where_it_is_drawn_and_shows_grasps(opened):
+def test_a_point_of_a_top_n_curve_is_clickable_at_its_place_and_shows_grasps(opened):
     figure = opened.locator("figure", has=opened.get_by_alt_text("Rising curves")).first
-    points = figure.get_by_role("button", name="late fusion: found with guess")
-    assert points.count() == 15  # of five candidates and of ten
+    points = figure.get_by_role("button", name="late fusion: rank")
+    assert points.count() == 15  # for five candidates and for ten
     colour = (0, 114, 178)  # the method's
     for point in (points.nth(0), points.nth(3), points.nth(14)):
         point.click()
         assert figure.locator(".shown h3").inner_text() == point.get_attribute("aria-label")
         assert figure.locator(".shown img").count() > 0
         opened.keyboard.press("Escape")
-        near = opened.evaluate(PIXELS, point.element_handle())
-        assert any(max(abs(a - b) for a, b in zip(pixel, colour, strict=True)) < 40 for pixel in near)
+        pixels = opened.evaluate(PIXELS, point.element_handle())
+        assert any(max(abs(a - b) for a, b in zip(pixel, colour, strict=True)) < 40 for pixel in pixels)
     points.nth(0).focus()
     opened.keyboard.press("ArrowRight")
-    assert "guess 2 of 5" in opened.evaluate("document.activeElement.ariaLabel")
+    assert "rank 2 of 5" in opened.evaluate("document.activeElement.ariaLabel")
 
 
 PIXELS = """(spot) => {
@@ -87,9 +91,9 @@ PIXELS = """(spot) => {
     const found = canvas.getImageData(x - 3, y - 3, 7, 7).data;
     return Array.from({ length: 49 }, (_, n) => [...found.slice(4 * n, 4 * n + 3)]);
 }"""
-"""Colours of the picture under the middle of a place."""
+"""Returns the colours of the picture under the centre of a place."""
 
 
 def test_axe_finds_nothing_serious(opened):
-    opened.get_by_role("button", name="taken for").first.click()
+    opened.get_by_role("button", name="mistaken for").first.click()
     assert serious(opened) == []

@@ -1,5 +1,5 @@
-"""The report of an evaluation: its numbers are those of results.json, its page needs nothing outside itself, and
-whatever was not measured, or is called strangely, leaves it whole."""
+"""The report of an evaluation: numbers equal results.json, the page is self-contained, and missing measures or strange
+names break nothing."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from tests import synthetic
 from tests.pages import HtmlPage
 from tests.synthetic_evaluation import write_synthetic_results
 
-FEW = ("late_fusion", "cca", "chance")
+METHODS = ("late_fusion", "cca", "chance")
 
 
 @pytest.fixture(scope="module")
@@ -27,15 +27,15 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def made(folder, tmp_path_factory):
+def report(folder, tmp_path_factory):
     """(files, folder) of a whole report."""
-    out = write_synthetic_results(folder, tmp_path_factory.mktemp("out") / "report", FEW)
+    out = write_synthetic_results(folder, tmp_path_factory.mktemp("out") / "report", METHODS)
     return write_report(out, folder), out
 
 
 @pytest.fixture
-def words_only(monkeypatch):
-    """Figures of one pixel, where a test reads the words."""
+def text_only(monkeypatch):
+    """Replace figures by single pixels, for tests that read the text."""
 
     def draw(path, make, *arguments):
         path.parent.mkdir(exist_ok=True)
@@ -45,9 +45,9 @@ def words_only(monkeypatch):
     monkeypatch.setattr("retrieval.report.builder.draw", draw)
 
 
-def remake(made, tmp_path, recording=None, change=None):
-    """The report once more, without pictures unless asked for, after `change(results)`."""
-    results = json.loads((made[1] / "results.json").read_text())
+def remake(report, tmp_path, recording=None, change=None):
+    """Write the report again after `change(results)`, by default without galleries."""
+    results = json.loads((report[1] / "results.json").read_text())
     if change:
         change(results)
     (tmp_path / "results.json").write_text(json.dumps(results))
@@ -55,8 +55,8 @@ def remake(made, tmp_path, recording=None, change=None):
     return (tmp_path / "report.html").read_text("utf-8"), (tmp_path / "report.md").read_text("utf-8"), files
 
 
-def test_it_writes_what_it_says_and_every_figure_opens(made):
-    files, out = made
+def test_returned_files_exist_and_every_figure_opens(report):
+    files, out = report
     assert files[:2] == [out / "report.md", out / "report.html"]
     figures = set(files[2:])
     assert figures == set((out / "figures").iterdir())
@@ -71,12 +71,12 @@ def test_it_writes_what_it_says_and_every_figure_opens(made):
             assert 500 < image.width < 2500
 
 
-def test_the_page_needs_nothing_outside_itself_and_every_picture_has_words(made):
-    files, out = made
+def test_the_page_is_self_contained_and_every_picture_has_a_text_alternative(report):
+    files, out = report
     page = HtmlPage((out / "report.html").read_text("utf-8"))
     assert {tag for tag, _ in page.tags}.isdisjoint({"link", "iframe", "object"})
-    assert page.all("script") == [{}]  # our own, inside
-    figures = [image for image in page.all("img") if "data-name" not in image]  # the others wait for a click
+    assert page.all("script") == [{}]  # embedded
+    figures = [image for image in page.all("img") if "data-name" not in image]  # the others appear on click
     assert len(figures) == len(files) - 2
     assert all(len(image["alt"]) > 20 for image in figures)
     for image in page.all("img"):
@@ -85,8 +85,8 @@ def test_the_page_needs_nothing_outside_itself_and_every_picture_has_words(made)
     assert {link["href"] for link in page.all("a")} == {f"#{name}" for name in targets}
 
 
-def test_every_measure_of_every_method_is_printed_with_interval_chance_and_basis(made):
-    _, out = made
+def test_every_measure_of_every_method_is_printed_with_interval_chance_and_basis(report):
+    _, out = report
     results = json.loads((out / "results.json").read_text())
     page, text = HtmlPage((out / "report.html").read_text("utf-8")).text, (out / "report.md").read_text("utf-8")
     for method in results["methods"].values():
@@ -98,46 +98,46 @@ def test_every_measure_of_every_method_is_printed_with_interval_chance_and_basis
     assert "792 queries of 18 objects" in page
 
 
-@pytest.mark.usefixtures("words_only")
-def test_nothing_is_computed_anew(made, tmp_path):
-    """A value that contradicts all others is printed as it stands."""
+@pytest.mark.usefixtures("text_only")
+def test_numbers_are_printed_without_recomputation(report, tmp_path):
+    """A value that contradicts all others is printed unchanged."""
 
     def change(results):
         results["methods"]["cca"]["measures"]["pair_accuracy"] |= {"value": [0.12345], "low": [0.9], "high": [0.1]}
 
-    page, text, _ = remake(made, tmp_path, change=change)
+    page, text, _ = remake(report, tmp_path, change=change)
     assert "12.3 [90.0, 10.0]" in page
     assert r"12.3 \[90.0, 10.0\]" in text
 
 
-@pytest.mark.usefixtures("words_only")
-def test_the_best_of_a_column_is_bold_and_equals_are_not(made, tmp_path):
+@pytest.mark.usefixtures("text_only")
+def test_the_highest_value_of_a_column_is_bold_and_ties_are_not(report, tmp_path):
     def change(results):
-        for name, share in (("late_fusion", 0.7), ("cca", 0.7), ("chance", 0.5)):
-            results["methods"][name]["measures"]["pair_accuracy"]["value"] = [share]
-            results["methods"][name]["measures"]["pair_auc"]["value"] = [share + 0.1 * (name == "cca")]
+        for name, value in (("late_fusion", 0.7), ("cca", 0.7), ("chance", 0.5)):
+            results["methods"][name]["measures"]["pair_accuracy"]["value"] = [value]
+            results["methods"][name]["measures"]["pair_auc"]["value"] = [value + 0.1 * (name == "cca")]
 
-    rows = remake(made, tmp_path, change=change)[1].splitlines()
+    rows = remake(report, tmp_path, change=change)[1].splitlines()
     cca = next(row for row in rows if row.startswith("| CCA |")).split(" | ")
     assert cca[1].startswith("70.0")
     assert cca[2].startswith("**80.0")
 
 
-@pytest.mark.usefixtures("words_only")
-def test_the_papers_figure_stands_beside_as_its_own_and_simulation_is_named(made, tmp_path):
-    page, _, _ = remake(made, tmp_path)
+@pytest.mark.usefixtures("text_only")
+def test_the_report_cites_the_papers_number_and_names_simulation(report, tmp_path):
+    page, _, _ = remake(report, tmp_path)
     assert "64.3 %" in page
-    assert "no rival" in page
+    assert "the numbers are not comparable" in page
     assert "This recording is simulated." in page
 
     def real(results):
         results["recording"]["source"] = "billets"
 
-    assert "This recording is simulated." not in remake(made, tmp_path, change=real)[0]
+    assert "This recording is simulated." not in remake(report, tmp_path, change=real)[0]
 
 
-@pytest.mark.usefixtures("words_only")
-def test_a_control_says_whether_chance_lies_in_its_interval(made, tmp_path):
+@pytest.mark.usefixtures("text_only")
+def test_a_control_states_whether_chance_lies_in_its_interval(report, tmp_path):
     def change(results):
         results["controls"]["no_contact"]["measures"]["pair_accuracy"] |= {
             "low": [0.51],
@@ -146,19 +146,19 @@ def test_a_control_says_whether_chance_lies_in_its_interval(made, tmp_path):
         }
         results["controls"]["shuffled"]["measures"]["pair_accuracy"] |= {"low": [0.49], "chance": [0.5], "high": [0.6]}
 
-    rows = remake(made, tmp_path, change=change)[1].splitlines()
-    assert next(row for row in rows if row.startswith("| before |")).endswith("| no |")
+    rows = remake(report, tmp_path, change=change)[1].splitlines()
+    assert next(row for row in rows if row.startswith(r"| no\_contact |")).endswith("| no |")
     assert next(row for row in rows if row.startswith("| shuffled |")).endswith("| yes |")
 
 
-@pytest.mark.usefixtures("words_only")
-def test_the_decision_is_shown_with_the_formula_and_by_number_of_grasps(made, tmp_path):
+@pytest.mark.usefixtures("text_only")
+def test_the_decision_is_shown_with_the_formula_and_by_number_of_grasps(report, tmp_path):
     def change(results):
         found = results["methods"]["cca"]["reject"]
         found["false_accepts_at_95"] |= {"value": [0.8123], "low": [0.7], "high": [0.9]}
         found["by_grasps"]["3"]["auroc"] |= {"value": [0.9119], "low": [0.85], "high": [0.95]}
 
-    page, text, _ = remake(made, tmp_path, change=change)
+    page, text, _ = remake(report, tmp_path, change=change)
     words = HtmlPage(page).text
     assert "81.2 [70.0, 90.0]" in words
     assert "91.2 [85.0, 95.0]" in words
@@ -168,120 +168,120 @@ def test_the_decision_is_shown_with_the_formula_and_by_number_of_grasps(made, tm
     assert not any("threshold" in row for row in rows if row.startswith("| method | AUROC"))
 
 
-@pytest.mark.usefixtures("words_only")
-def test_single_grasps_alone_need_no_table_by_grasps(made, tmp_path):
+@pytest.mark.usefixtures("text_only")
+def test_single_grasps_have_no_table_by_grasps(report, tmp_path):
     def change(results):
         for method in results["methods"].values():
             method["reject"]["by_grasps"].pop("3")
 
-    assert "by grasps in a query" not in remake(made, tmp_path, change=change)[1]
+    assert "by grasps in a query" not in remake(report, tmp_path, change=change)[1]
 
 
-def test_too_few_objects_for_a_posterior_are_said(made, tmp_path):
+def test_too_few_objects_for_a_posterior_are_reported(report, tmp_path):
     def change(results):
         for method in results["methods"].values():
             method["reject"] = None
             method["calibration"]["posteriors"] = {}
             method["reliability"] = {"pairs": method["reliability"]["pairs"]}
 
-    _, text, files = remake(made, tmp_path, change=change)
-    assert "three validation objects at least" in text
+    _, text, files = remake(report, tmp_path, change=change)
+    assert "at least three validation objects" in text
     assert "reject.png" not in {path.name for path in files}
 
 
-@pytest.mark.usefixtures("words_only")
-def test_intervals_of_too_few_objects_are_marked_and_explained_in_every_table_that_holds_one(made, tmp_path):
+@pytest.mark.usefixtures("text_only")
+def test_intervals_of_too_few_objects_are_marked_and_explained_in_every_table(report, tmp_path):
     def change(results):
         for method in results["methods"].values():
             method["measures"]["pair_accuracy"]["few_objects"] = True
         results["comparisons"][0]["few_objects"] = True
 
-    assert "† Fewer than 5 objects" not in remake(made, tmp_path)[1]
-    page, text, _ = remake(made, tmp_path, change=change)
+    assert "† Fewer than 5 objects" not in remake(report, tmp_path)[1]
+    page, text, _ = remake(report, tmp_path, change=change)
     for written in (page, text):
         assert "] †" in written
-        # The headline, the methods side by side, the differences, the controls, the ceilings, and every number.
+        # The headline, the comparison of methods, the differences, the controls, the ceilings, and all measures.
         assert written.count("† Fewer than 5 objects: the interval is too narrow.") == 6
     row = next(line for line in text.splitlines() if line.startswith("| late fusion |"))
-    assert row.count("†") == 1  # of its columns only the one from too few objects
+    assert row.count("†") == 1  # only the column from too few objects
 
 
-@pytest.mark.usefixtures("words_only")
-def test_leakage_is_set_apart(made, tmp_path):
+@pytest.mark.usefixtures("text_only")
+def test_leakage_is_highlighted(report, tmp_path):
     def change(results):
         results["audit"] |= {"clean": False, "verdict": "Leakage is possible: 3 file(s)."}
         results["audit"]["identical"] = {"count": 1, "examples": [["test: a photo", "train: b photo"]]}
 
-    page, text, _ = remake(made, tmp_path, change=change)
+    page, text, _ = remake(report, tmp_path, change=change)
     assert '<p class="warn">Leakage audit: Leakage is possible: 3 file(s).</p>' in page
     assert "> Leakage audit: Leakage is possible" in text
     assert "test: a photo  =  train: b photo" in page
 
 
-@pytest.mark.usefixtures("words_only")
-def test_touches_that_hardly_press_are_shown_apart(made, tmp_path):
-    text = remake(made, tmp_path)[1]
-    assert "The 40 test touches that changed the gel least, by at most 2.5 grey levels" in text
-    rows = [line.split("|")[1:3] for line in text.splitlines() if "faintest |" in line or "| others |" in line]
-    assert [" late fusion ", " faintest "] in rows
+@pytest.mark.usefixtures("text_only")
+def test_low_contact_touches_have_their_own_table(report, tmp_path):
+    text = remake(report, tmp_path)[1]
+    assert "The 40 test touches that changed the gel image least, by at most 2.5 grey levels" in text
+    rows = [line.split("|")[1:3] for line in text.splitlines() if "low-contact |" in line or "| others |" in line]
+    assert [" late fusion ", " low-contact "] in rows
     assert [" late fusion ", " others "] in rows
     assert not any("random" in name for name, _ in rows)
 
 
-def test_what_was_not_measured_is_left_out(made, tmp_path):
+def test_missing_measures_are_left_out(report, tmp_path):
     def change(results):
         for method in results["methods"].values():
-            for what in ("per_object", "confusions", "reliability", "calibration", "reject", "examples", "best_params"):
-                method.pop(what)
+            for key in ("per_object", "confusions", "reliability", "calibration", "reject", "examples", "best_params"):
+                method.pop(key)
             method["measures"] = {"pair_accuracy": method["measures"]["pair_accuracy"]}
         results |= {"controls": {}, "ceilings": {}, "low_contact": None, "comparisons": []}
         results.pop("audit")
 
-    _, text, files = remake(made, tmp_path, change=change)
+    _, text, files = remake(report, tmp_path, change=change)
     assert [path.name for path in files[2:]] == ["overview.png"]
     for heading in (
-        "Guess curves",
+        "Top-N accuracy",
         "Controls",
         "Ceilings",
         "Leakage audit",
-        "Object by object",
+        "Accuracy by object",
         "Calibration",
         "Accuracy and time",
     ):
         assert f"## {heading}" not in text
-    assert "## Methods side by side" in text
+    assert "## Comparison of methods" in text
 
 
-def test_a_recording_of_few_objects_has_no_shares_by_object(made, tmp_path):
-    """Fewer test objects than candidates."""
+def test_a_recording_of_few_objects_has_no_accuracy_by_object(report, tmp_path):
+    """There are fewer test objects than candidates."""
 
     def change(results):
         for method in results["methods"].values():
             method["per_object"] = {"test_candidates": {}, "all_candidates": {}}
             method["measures"] = {"map": method["measures"]["map"]}
 
-    _, text, files = remake(made, tmp_path, change=change)
-    assert "## Object by object" not in text
+    _, text, files = remake(report, tmp_path, change=change)
+    assert "## Accuracy by object" not in text
     assert {path.name for path in files[2:]} >= {"overview.png", "reject.png"}
 
 
-def test_values_that_could_not_be_taken_are_dashes(made, tmp_path):
+def test_missing_values_are_dashes(report, tmp_path):
     def change(results):
         results["methods"]["cca"]["measures"].pop("pair_auc")
         results["methods"]["cca"]["measures"]["topn_k5"] |= {key: [None] * 5 for key in ("value", "low", "high")}
 
-    rows = remake(made, tmp_path, change=change)[1].splitlines()
+    rows = remake(report, tmp_path, change=change)[1].splitlines()
     cca = next(row for row in rows if row.startswith("| CCA |")).split(" | ")
     assert (cca[2], cca[3]) == ("–", "–")
 
 
-def test_a_method_and_a_measure_that_the_report_does_not_know_are_shown_under_their_names(made, tmp_path):
+def test_unknown_methods_and_measures_are_shown_under_their_names(report, tmp_path):
     def change(results):
         new = json.loads(json.dumps(results["methods"]["cca"]))
         new["measures"]["brand_new_measure"] = new["measures"]["pair_accuracy"]
         results["methods"]["brand/new_method"] = new
 
-    page, _, files = remake(made, tmp_path, change=change)
+    page, _, files = remake(report, tmp_path, change=change)
     assert "brand/new method" in page
     assert "brand new measure" in page
     assert "objects-test-brand-new_method.png" in {path.name for path in files}
@@ -300,52 +300,52 @@ def rename(results, old, new):
 @pytest.mark.parametrize(
     "name", ["<script>alert(1)</script>", "$\\frac{1}$ | *x* [y](z)", "x" * 400, "mug 茶碗 🍵 100 %d {} a&b"]
 )
-def test_any_name_of_an_object_is_harmless(made, tmp_path, name):
-    results = json.loads((made[1] / "results.json").read_text())
+def test_any_name_of_an_object_is_harmless(report, tmp_path, name):
+    results = json.loads((report[1] / "results.json").read_text())
     changed = rename(results, results["split"]["test"][0], name)
-    page, text, _ = remake(made, tmp_path, change=lambda results: (results.clear(), results.update(changed)))
+    page, text, _ = remake(report, tmp_path, change=lambda results: (results.clear(), results.update(changed)))
     assert HtmlPage(page).all("script") == [{}]
     assert name in HtmlPage(page).text
     for line in text.splitlines():
         assert not re.search(r"(?<!\\)<script", line)
 
 
-def test_a_picture_that_has_gone_leaves_a_blank(made, folder, tmp_path):
+def test_a_missing_picture_leaves_a_blank(report, folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "copy")
     for path in (copy / "images").glob("*photo*"):
         path.unlink()
-    _, _, files = remake(made, tmp_path, recording=copy)
+    _, _, files = remake(report, tmp_path, recording=copy)
     assert any(path.name.startswith("confusions") for path in files)
 
 
-@pytest.mark.usefixtures("words_only")
-def test_without_the_recording_there_are_no_galleries(made, tmp_path):
-    page, _, files = remake(made, tmp_path)
+@pytest.mark.usefixtures("text_only")
+def test_without_the_recording_there_are_no_galleries(report, tmp_path):
+    page, _, files = remake(report, tmp_path)
     assert not [path for path in files if path.suffix == ".jpg"]
     assert "The pictures need the recording" in page
 
 
-@pytest.mark.usefixtures("words_only")
-def test_two_reports_of_the_same_results_are_equal(made, tmp_path):
-    first = remake(made, tmp_path)[:2]
-    assert remake(made, tmp_path)[:2] == first
+@pytest.mark.usefixtures("text_only")
+def test_two_reports_of_the_same_results_are_equal(report, tmp_path):
+    first = remake(report, tmp_path)[:2]
+    assert remake(report, tmp_path)[:2] == first
 
 
 @pytest.mark.parametrize("text", ["", "[1]", "{", '{"schema_version": 99}'])
-def test_results_that_cannot_be_read_are_one_clear_error(tmp_path, text):
+def test_unreadable_results_are_one_clear_error(tmp_path, text):
     (tmp_path / "results.json").write_text(text)
     with pytest.raises(BadInput, match="retrieve evaluate"):
         write_report(tmp_path, None)
 
 
-def test_missing_results_and_a_missing_recording_are_clear_errors(made, tmp_path):
+def test_missing_results_and_a_missing_recording_are_clear_errors(report, tmp_path):
     with pytest.raises(BadInput, match=r"results\.json"):
         write_report(tmp_path, None)
     with pytest.raises(DatasetError):
-        write_report(made[1], tmp_path / "nowhere")
+        write_report(report[1], tmp_path / "nowhere")
 
 
-# Words -----------------------------------------------------------------------------------------------
+# Labels ----------------------------------------------------------------------------------------------
 
 
 def test_numbers_are_written_for_readers():
@@ -364,7 +364,7 @@ def test_a_long_name_keeps_both_ends():
     assert [capitalized("late fusion"), capitalized("CCA"), capitalized("")] == ["Late fusion", "CCA", ""]
 
 
-def test_markdown_and_html_say_the_same(tmp_path):
+def test_markdown_and_html_have_the_same_content(tmp_path):
     Image.new("RGB", (144, 10)).save(tmp_path / "p.png")
     table = Table(
         ("a", "b", "c"), (("1|2", "3", "x"), ("<4>", "5", "y")), ("note",), frozenset({2}), frozenset({(1, 1)})

@@ -1,4 +1,4 @@
-"""What several tests of the service share."""
+"""Shared fixtures of the service's tests."""
 
 import base64
 
@@ -10,8 +10,8 @@ from tests.serving import service
 @pytest.fixture(scope="module")
 def client(index):
     """A client of a service in this process."""
-    with service(index) as opened:
-        yield opened
+    with service(index) as client:
+        yield client
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,7 @@ def body(touch):
 
 @pytest.fixture(scope="module")
 def browser():
-    """Chromium; the test is skipped where none is installed."""
+    """Chromium; the test is skipped if none is installed."""
     from tests.browser import chromium
 
     with chromium() as found:
@@ -31,7 +31,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def files(touch, tmp_path_factory):
-    """The gel images of two grasps, named as a person may name them."""
+    """The gel images of two grasps, with typical file names."""
     folder = tmp_path_factory.mktemp("gels")
     names = [folder / f"{grasp}_{finger}.png" for grasp in ("first", "second") for finger in "ab"]
     for name, source in zip(names, [*touch, *touch], strict=True):

@@ -1,4 +1,4 @@
-"""The catalogue over HTTP: pages, search, photos by id, nearness; and no file that the index does not name."""
+"""The catalogue over HTTP: pages, search, photos by id, similar photos, and no files outside the index."""
 
 import io
 
@@ -8,7 +8,7 @@ from PIL import Image
 from tests.serving import problem
 
 
-def test_the_pages_hold_every_photo_once_in_the_order_of_the_index(client, searcher):
+def test_pages_contain_every_photo_once_in_index_order(client, searcher):
     found, offset = [], 0
     while offset is not None:
         page = client.get("/v1/catalogue", params={"offset": offset, "limit": 7}).json()
@@ -18,7 +18,7 @@ def test_the_pages_hold_every_photo_once_in_the_order_of_the_index(client, searc
     assert client.get("/v1/catalogue", params={"offset": 500}).json()["items"] == []
 
 
-def test_an_object_and_words_narrow_the_catalogue_down(client, searcher):
+def test_object_and_words_filter_the_catalogue(client, searcher):
     name = searcher.generation.rows[0]["object_id"]
     own = client.get("/v1/catalogue", params={"object": name}).json()["items"]
     assert {item["object_id"] for item in own} == {name}
@@ -46,12 +46,12 @@ def test_a_photo_is_its_file_and_a_thumbnail_is_small(client, catalogue, searche
 @pytest.mark.parametrize(
     "name", ["nobody/1.jpg", "../index/CURRENT", "..%2F..%2Fetc%2Fpasswd", "%2Fetc%2Fpasswd", "%00", "%FF", "."]
 )
-def test_what_the_index_does_not_name_is_unknown_wherever_it_lies(client, path, name):
+def test_names_outside_the_index_are_unknown(client, path, name):
     response = client.get(f"/v1/{path}/{name}")
     assert problem(response, 404, "unknown")
 
 
-def test_the_nearest_photos_are_those_of_the_searcher(client, searcher):
+def test_nearest_photos_equal_those_of_the_searcher(client, searcher):
     from retrieval import nearest_photos
 
     name = searcher.generation.rows[0]["path"]
@@ -63,7 +63,7 @@ def test_the_nearest_photos_are_those_of_the_searcher(client, searcher):
     assert [item["score"] for item in items] == sorted((item["score"] for item in items), reverse=True)
 
 
-def test_the_index_says_what_answers(client, searcher):
-    said = client.get("/v1/index").json()
-    assert (said["photos"], said["objects"], said["fingers"]) == (24, 8, 2)
-    assert (said["generation"], said["can_grasp"], said["sensors"]) == (searcher.generation.name, False, [])
+def test_index_route_describes_the_index(client, searcher):
+    info = client.get("/v1/index").json()
+    assert (info["photos"], info["objects"], info["fingers"]) == (24, 8, 2)
+    assert (info["generation"], info["can_grasp"], info["sensors"]) == (searcher.generation.name, False, [])

@@ -1,4 +1,4 @@
-"""Half-sent, flooding and unread connections: they end soon, cost little, and keep no other client out."""
+"""Half-sent, flooding and unread connections: they end soon, cost little, and do not block other clients."""
 
 import socket
 import time
@@ -24,7 +24,7 @@ def service_at(index):
 
 @contextmanager
 def opened(address, count, sent=HALF, source="127.0.0.1"):
-    """So many connections from an address, on each of which this was sent."""
+    """Open `count` connections from an address and send `sent` on each."""
     with ExitStack() as stack:
         lines = []
         for _ in range(count):
@@ -35,7 +35,7 @@ def opened(address, count, sent=HALF, source="127.0.0.1"):
 
 
 def received(line):
-    """All that the service sends until it closes the connection."""
+    """Return all bytes that the service sends until it closes the connection."""
     data = b""
     try:
         while more := line.recv(65536):
@@ -46,7 +46,7 @@ def received(line):
 
 
 def is_closed(line):
-    """Whether the service has closed a connection, on which it sends nothing else."""
+    """Return whether the service has closed a connection without sending anything."""
     line.setblocking(False)
     try:
         return not line.recv(1)
@@ -58,8 +58,8 @@ def is_closed(line):
         line.setblocking(True)
 
 
-def lives(url, source="127.0.0.1"):
-    """Seconds until /healthz answers on a new connection from an address."""
+def health_latency(url, source="127.0.0.1"):
+    """Return the seconds until /healthz answers on a new connection from an address."""
     began = time.monotonic()
     with httpx.Client(transport=httpx.HTTPTransport(local_address=source), timeout=10) as client:
         assert client.get(f"{url}/healthz").status_code == 200
@@ -70,10 +70,10 @@ def test_half_sent_headers_end_at_a_deadline_and_a_silent_connection_too(service
     _, address, _ = service_at
     monkeypatch.setattr(connections, "HEADERS_S", 0.3)
     with opened(address, 1) as (half,), opened(address, 1, b"") as (silent,):
-        told = received(half)
-        assert told.startswith(b"HTTP/1.1 408 ")
-        assert b"urn:touch-retrieval:problem:too-slow" in told
-        assert b"within 0.3 s" in told
+        response = received(half)
+        assert response.startswith(b"HTTP/1.1 408 ")
+        assert b"urn:touch-retrieval:problem:too-slow" in response
+        assert b"within 0.3 s" in response
         assert received(silent) == b""
 
 
@@ -91,13 +91,13 @@ def test_headers_that_come_byte_by_byte_do_not_outlive_the_deadline(service_at, 
             pytest.fail("the connection lived for 10 s")
 
 
-def test_half_of_a_second_request_ends_at_a_deadline(service_at, monkeypatch):
+def test_a_half_sent_second_request_ends_at_a_deadline(service_at, monkeypatch):
     _, address, _ = service_at
     monkeypatch.setattr(connections, "HEADERS_S", 0.5)
     with opened(address, 1, b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n" + HALF) as (line,):
-        told = received(line)
-        assert told.startswith(b"HTTP/1.1 200 ")
-        assert b"HTTP/1.1 408 " in told
+        response = received(line)
+        assert response.startswith(b"HTTP/1.1 200 ")
+        assert b"HTTP/1.1 408 " in response
 
 
 def test_a_request_that_takes_longer_than_the_headers_may_is_answered(service_at, monkeypatch):
@@ -115,24 +115,24 @@ def slow(function, seconds):
     return call
 
 
-def test_half_sent_headers_of_512_connections_shut_nobody_out(service_at):
+def test_half_sent_headers_of_512_connections_block_no_client(service_at):
     url, address, _ = service_at
     with opened(address, MAX_CONNECTIONS) as lines:
-        assert lives(url, "127.0.0.2") < 5
-        assert lives(url) < 5  # from the same address, too
+        assert health_latency(url, "127.0.0.2") < 5
+        assert health_latency(url) < 5  # from the same address, too
         wait_until(lambda: sum(map(is_closed, lines)) >= MAX_CONNECTIONS - MAX_CONNECTIONS_OF_ADDRESS)
         assert [is_closed(line) for line in (lines[0], lines[-1])] == [True, False]  # the oldest are closed
 
 
-def test_half_sent_headers_from_many_addresses_shut_nobody_out(service_at):
+def test_half_sent_headers_from_many_addresses_block_no_client(service_at):
     url, address, _ = service_at
     with ExitStack() as stack:
         for number in range(10, 15):
             stack.enter_context(opened(address, MAX_CONNECTIONS_OF_ADDRESS, source=f"127.0.0.{number}"))
-        assert lives(url, "127.0.0.2") < 5
+        assert health_latency(url, "127.0.0.2") < 5
 
 
-def test_connections_in_work_are_not_closed_for_new_ones(service_at, monkeypatch):
+def test_busy_connections_are_not_closed_for_new_ones(service_at, monkeypatch):
     _, address, parts = service_at
     monkeypatch.setattr(parts.generations.current.shard, "page", slow(parts.generations.current.shard.page, 3))
     whole = b"GET /v1/catalogue HTTP/1.1\r\nhost: 127.0.0.1\r\nconnection: close\r\n\r\n"
@@ -163,12 +163,12 @@ def test_headers_larger_than_the_limit_are_refused_at_once(service_at):
         (b"x-a: b\r\n" * 10**5, b"100 headers"),
     ):
         with opened(address, 1, begin + flood[: 2 * MAX_HEADER_BYTES]) as (line,):
-            told = received(line)
-            assert told.startswith(b"HTTP/1.1 431 ")
-            assert b"a request may have at most " + limit in told
+            response = received(line)
+            assert response.startswith(b"HTTP/1.1 431 ")
+            assert b"A request may have at most " + limit in response
 
 
-def test_a_body_of_many_lines_is_no_flood_of_headers(service_at):
+def test_the_lines_of_a_body_do_not_count_as_headers(service_at):
     url, address, _ = service_at
     with httpx.Client(timeout=30) as client:
         for _ in range(3):
@@ -180,12 +180,12 @@ def test_a_body_of_many_lines_is_no_flood_of_headers(service_at):
         assert received(line).count(b"HTTP/1.1 200 ") == 3
 
 
-def test_what_is_not_http_is_answered_by_a_problem_document(service_at):
+def test_invalid_http_gets_a_problem_document(service_at):
     _, address, _ = service_at
     with opened(address, 1, b"\x16\x03\x01 hello\r\n\r\n") as (line,):
-        told = received(line)
-        assert told.startswith(b"HTTP/1.1 400 ")
-        assert b"urn:touch-retrieval:problem:malformed" in told
+        response = received(line)
+        assert response.startswith(b"HTTP/1.1 400 ")
+        assert b"urn:touch-retrieval:problem:malformed" in response
 
 
 def test_a_body_of_tiny_chunks_is_refused_and_one_of_larger_chunks_is_read(service_at):
@@ -193,9 +193,9 @@ def test_a_body_of_tiny_chunks_is_refused_and_one_of_larger_chunks_is_read(servi
     head = b"POST /v1/session HTTP/1.1\r\nhost: 127.0.0.1\r\ncontent-type: application/json\r\n"
     head += b"transfer-encoding: chunked\r\n\r\n"
     with opened(address, 1, head + b"1\r\n \r\n" * 20_000) as (line,):
-        told = received(line)
-        assert told.startswith(b"HTTP/1.1 400 ")
-        assert b"malformed" in told
+        response = received(line)
+        assert response.startswith(b"HTTP/1.1 400 ")
+        assert b"malformed" in response
     chunks = (b" " * 300 for _ in range(2_000))
     answer = httpx.post(f"{url}/v1/query", content=chunks, headers={"content-type": "application/json"}, timeout=30)
     assert answer.json()["type"].endswith(("malformed", "bad-input"))  # no JSON, but read
@@ -204,7 +204,7 @@ def test_a_body_of_tiny_chunks_is_refused_and_one_of_larger_chunks_is_read(servi
 def test_a_flood_of_pipelined_requests_is_answered_one_by_one(service_at):
     url, address, _ = service_at
     with opened(address, 1, b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n" * 1_000) as (line,):
-        assert lives(url) < 5
+        assert health_latency(url) < 5
         data = b""
         while data.count(b"HTTP/1.1 200 ") < 1_000:
             data += (more := line.recv(65536))

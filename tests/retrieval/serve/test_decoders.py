@@ -1,4 +1,4 @@
-"""Pictures in processes of their own: what costs too much ends with its process, and others are served meanwhile."""
+"""Image decoding in separate processes: expensive pictures end with their process, and others are served meanwhile."""
 
 import asyncio
 import base64
@@ -43,24 +43,24 @@ SMALL = saved(np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8))
 
 
 @asynccontextmanager
-async def opened():
-    both = Decoders()
+async def running_decoders():
+    decoders = Decoders()
     try:
-        yield both
+        yield decoders
     finally:
-        await both.close()
+        await decoders.close()
 
 
-def read(*named, compares_contact=False, timeout=120):
+def read(*named_files, compares_contact=False, timeout=120):
     async def run():
         async with asyncio.timeout(timeout):
-            async with opened() as both:
-                return await both.read(named, 32, compares_contact)
+            async with running_decoders() as pool:
+                return await pool.read(named_files, 32, compares_contact)
 
     return asyncio.run(run())
 
 
-def test_images_come_in_their_order_with_the_numbers_that_this_process_makes_of_them():
+def test_images_are_decoded_in_order_as_in_this_process():
     grey = saved(np.full((20, 40), 7, np.uint8))
     found = read(("a", LARGE), ("b", SMALL), ("c", grey), compares_contact=True)
     for image, data in zip(found, (LARGE, SMALL, grey), strict=True):
@@ -70,7 +70,7 @@ def test_images_come_in_their_order_with_the_numbers_that_this_process_makes_of_
     assert read(("b", SMALL))[0].blocks is None
 
 
-def test_the_first_picture_that_cannot_be_used_is_told():
+def test_the_first_bad_picture_is_reported():
     with pytest.raises(ImageError, match="b: not a PNG") as error:
         read(("a", SMALL), ("b", b"junk"), ("c", b"junk"), ("d", LARGE))
     assert (error.value.path, error.value.reason[:9]) == ("b", "not a PNG")
@@ -80,30 +80,30 @@ def test_the_first_picture_that_cannot_be_used_is_told():
         read(*[("a", png_of_zeros(4000, 5000))] * 6)
 
 
-def test_a_process_that_ends_is_the_fault_of_its_picture_and_the_next_one_gets_a_new_one(monkeypatch):
+def test_a_crashed_process_is_reported_for_its_picture_and_replaced(monkeypatch):
     monkeypatch.setattr(decoders, "PROGRAM", decoding.DIE)
 
     async def run():
-        async with opened() as both:
+        async with running_decoders() as pool:
             for _ in range(2):
-                with pytest.raises(ImageError, match="b: decoding it takes more than 5 s of processor time or 200 MB"):
-                    await both.read([("a", SMALL), ("b", LARGE)], 32, False)
-            return await both.read([("a", SMALL)], 32, False)
+                with pytest.raises(ImageError, match="b: decoding needs more than 5 s of CPU time or 200 MB"):
+                    await pool.read([("a", SMALL), ("b", LARGE)], 32, False)
+            return await pool.read([("a", SMALL)], 32, False)
 
     assert asyncio.run(run())[0].file_bytes == len(SMALL)
 
 
-def test_a_large_picture_keeps_no_small_one_waiting_and_its_process_ends_when_it_is_abandoned(monkeypatch, tmp_path):
+def test_a_large_picture_does_not_delay_small_ones_and_its_process_ends_on_cancellation(monkeypatch, tmp_path):
     monkeypatch.setattr(decoders, "PROGRAM", decoding.HANG)
 
     async def run():
         names = [str(tmp_path / "first"), str(tmp_path / "second")]
-        async with opened() as both:
-            hanging = [asyncio.ensure_future(both.read([(name, LARGE)], 32, False)) for name in names]
+        async with running_decoders() as pool:
+            hanging = [asyncio.ensure_future(pool.read([(name, LARGE)], 32, False)) for name in names]
             async with asyncio.timeout(60):
                 while not (found := list(tmp_path.iterdir())) or not found[0].read_text():
                     await asyncio.sleep(0.01)
-            assert len(await both.read([("a", SMALL)] * 10, 32, False)) == 10
+            assert len(await pool.read([("a", SMALL)] * 10, 32, False)) == 10
             (file,) = tmp_path.iterdir()  # large ones are decoded one at a time
             process = int(file.read_text())
             assert is_running(process)
@@ -111,36 +111,36 @@ def test_a_large_picture_keeps_no_small_one_waiting_and_its_process_ends_when_it
                 one.cancel()
             await asyncio.wait(hanging)
             assert all(one.cancelled() for one in hanging)
-            await asyncio.gather(*both._ending)
+            await asyncio.gather(*pool._ending)
             assert not is_running(process)
-            assert len(await both.read([("a", SMALL)] * 2, 32, False)) == 2
+            assert len(await pool.read([("a", SMALL)] * 2, 32, False)) == 2
 
     asyncio.run(run())
 
 
-def test_who_leaves_while_small_pictures_are_read_ends_no_process_and_leaves_nothing_to_do():
+def test_cancelled_small_pictures_keep_their_processes():
     async def run():
-        async with opened() as both:
-            await both.start()
-            before = {process._process.pid for process in both._idle}
+        async with running_decoders() as pool:
+            await pool.start()
+            before = {process._process.pid for process in pool._idle}
             for _ in range(3):
-                asked = asyncio.ensure_future(both.read([("a", SMALL)] * 50, 32, False))
+                request = asyncio.ensure_future(pool.read([("a", SMALL)] * 50, 32, False))
                 await asyncio.sleep(0.01)
-                asked.cancel()
-                await asyncio.wait([asked])
-            assert len(both._running) <= 2
-            assert len(await both.read([("a", SMALL)] * 2, 32, False)) == 2
-            await asyncio.gather(*both._running)
-            assert {process._process.pid for process in both._idle} == before
+                request.cancel()
+                await asyncio.wait([request])
+            assert len(pool._running) <= 2
+            assert len(await pool.read([("a", SMALL)] * 2, 32, False)) == 2
+            await asyncio.gather(*pool._running)
+            assert {process._process.pid for process in pool._idle} == before
         for process in before:
             assert not is_running(process)
 
     asyncio.run(run())
 
 
-def test_a_process_that_cannot_start_is_no_fault_of_the_picture(monkeypatch):
+def test_a_process_that_cannot_start_is_not_reported_as_a_bad_picture(monkeypatch):
     monkeypatch.setattr(decoders, "PROGRAM", decoding.FAIL)
-    with pytest.raises(RetrievalError, match="ended as it started") as error:
+    with pytest.raises(RetrievalError, match="ended during its start") as error:
         read(("a", SMALL))
     assert not isinstance(error.value, ImageError)
 
@@ -154,26 +154,26 @@ decode_process.serve_pictures()
 
 
 @pytest.mark.parametrize(
-    ("seconds", "size", "said"),
+    ("seconds", "size", "output"),
     [
         (5, 200_000_000, b"file_bytes"),
         pytest.param(
             5,
             5_000_000,
             b"memory",
-            marks=pytest.mark.skipif(sys.platform != "linux", reason="only Linux holds a process to its memory"),
+            marks=pytest.mark.skipif(sys.platform != "linux", reason="only Linux enforces the memory limit"),
         ),
         (0, 200_000_000, None),
     ],
 )
-def test_a_process_ends_itself_beyond_its_processor_time_and_refuses_what_takes_more_memory(seconds, size, said):
+def test_a_process_ends_beyond_its_cpu_limit_and_refuses_pictures_beyond_its_memory_limit(seconds, size, output):
     line = [sys.executable, "-c", LIMITS, str(seconds), str(size)]
-    asked = frame({"name": "x", "px": 32, "compares_contact": False, "most": MAX_PIXELS}, LARGE)
-    done = subprocess.run(line, input=asked * (1 if said else 200), capture_output=True, check=False, timeout=300)
-    if said is None:
+    request = frame({"name": "x", "px": 32, "compares_contact": False, "max_pixels": MAX_PIXELS}, LARGE)
+    done = subprocess.run(line, input=request * (1 if output else 200), capture_output=True, check=False, timeout=300)
+    if output is None:
         assert done.returncode == -signal.SIGXCPU
     else:
-        assert said in done.stdout, done.stderr.decode()
+        assert output in done.stdout, done.stderr.decode()
 
 
 # The service ----------------------------------------------------------------------------------------------------------
@@ -183,7 +183,7 @@ def body_of(*images):
     return {"touches": [[base64.b64encode(image).decode() for image in images]]}
 
 
-def test_a_query_whose_picture_is_abandoned_at_its_deadline_holds_up_nobody(index, touch, monkeypatch, tmp_path):
+def test_a_query_with_a_hanging_picture_ends_at_its_deadline_and_blocks_no_other(index, touch, monkeypatch, tmp_path):
     monkeypatch.setattr(decoders, "PROGRAM", decoding.HANG)
     monkeypatch.setattr("retrieval.serve.uploads.RequestPictures.named_files", _named_in(tmp_path))
     honest = body_of(*(path.read_bytes() for path in touch))
@@ -204,7 +204,7 @@ def test_a_query_whose_picture_is_abandoned_at_its_deadline_holds_up_nobody(inde
 
 
 def _named_in(folder):
-    """Pictures are called by a file of that folder."""
+    """Name the pictures after files of a folder."""
     return lambda pictures: [(str(folder / str(number)), data) for number, data in enumerate(pictures.files[0][0])]
 
 
@@ -221,14 +221,14 @@ def _named_in(folder):
     ],
     ids=["scans", "fifty scans", "thin", "large", "markers"],
 )
-def test_hostile_pictures_leave_the_service_alive_small_and_quick_to_end(index, touch, make):
+def test_service_survives_hostile_pictures_with_bounded_memory_and_ends_quickly(index, touch, make):
     honest, hostile = body_of(*(path.read_bytes() for path in touch)), body_of(make(), make())
     with command("--index", index, "--port", "0", "--no-history") as (process, url, _):
         for _ in range(3):
             assert httpx.post(f"{url}/v1/query", json=honest, timeout=60).status_code == 200
         idle, peak, slowest, ended = memory(process.pid), 0, 0.0, threading.Event()
-        asking = [threading.Thread(target=ask, args=(url, hostile, ended)) for _ in range(3)]
-        for one in asking:
+        attackers = [threading.Thread(target=ask, args=(url, hostile, ended)) for _ in range(3)]
+        for one in attackers:
             one.start()
         honest_answers, end = [], time.monotonic() + 10
         while time.monotonic() < end:
@@ -245,8 +245,8 @@ def test_hostile_pictures_leave_the_service_alive_small_and_quick_to_end(index, 
         assert time.monotonic() - begun < 10
         assert set(honest_answers) == {200}
         assert peak - idle < 300_000_000
-        assert slowest < 2  # on a machine that others keep busy
-        for one in asking:
+        assert slowest < 2  # on a busy machine
+        for one in attackers:
             one.join(60)
 
 
@@ -259,7 +259,7 @@ def ask(url, body, ended):
 
 
 def memory(process):
-    """Bytes of a process and its children that no other process shares."""
+    """Return the private memory of a process and its children, in bytes."""
     total = 0
     for one in (process, *children(process)):
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""What was acknowledged is there after SIGKILL, once."""
+"""Acknowledged feedback survives SIGKILL, once."""
 
 import random
 import signal
@@ -14,66 +14,66 @@ from tests.serving import command, with_history
 
 
 def kill_during_feedback(index, folder, body, name, after_s):
-    """Starts the command, says of one query after the other what it was, and kills it; the words acknowledged."""
+    """Run the command, send feedback on one query after the other, kill it, and return the acknowledged queries."""
     acknowledged = []
     with command("--index", index, "--port", "0", "--history", folder) as (process, url, _):
 
-        def speak():
+        def send_feedback():
             with httpx.Client(base_url=url, timeout=30) as client:
                 while True:
                     try:
                         query = client.post("/v1/query", json=body).headers["x-query-id"]
-                        said = client.post(
+                        response = client.post(
                             "/v1/feedback", json={"query": query, "feedback": "object", "object_id": name}
                         )
                     except httpx.HTTPError:
                         return
-                    if said.status_code == 201:
+                    if response.status_code == 201:
                         acknowledged.append(query)
 
-        speaker = threading.Thread(target=speak)
-        speaker.start()
-        while not acknowledged and speaker.is_alive():
+        sender = threading.Thread(target=send_feedback)
+        sender.start()
+        while not acknowledged and sender.is_alive():
             time.sleep(0.01)
         time.sleep(after_s)
         process.send_signal(signal.SIGKILL)
-        speaker.join(60)
+        sender.join(60)
     return acknowledged
 
 
 @pytest.mark.slow
-def test_every_word_that_was_acknowledged_before_a_kill_is_there_once(index, touch, body, tmp_path, searcher):
-    name, draw, every = searcher.generation.rows[0]["object_id"], random.Random(0), []
+def test_all_acknowledged_feedback_survives_a_kill_once(index, touch, body, tmp_path, searcher):
+    name, rng, every = searcher.generation.rows[0]["object_id"], random.Random(0), []
     for _ in range(3):
-        every += kill_during_feedback(index, tmp_path, body, name, draw.random())
+        every += kill_during_feedback(index, tmp_path, body, name, rng.random())
     with with_history(index, tmp_path, info=feedback_info(tmp_path)) as client:
         client.get("/v1/history")
-        kept = [client.get(f"/v1/history/{query}").json() for query in every]
-    assert [(one["feedback"], one["object_id"]) for one in kept] == [("object", name)] * len(every)
+        stored = [client.get(f"/v1/history/{query}").json() for query in every]
+    assert [(one["feedback"], one["object_id"]) for one in stored] == [("object", name)] * len(every)
     recorded = [grasp.grasp_id for grasp in load_grasps(tmp_path / "recording")]
     assert len(set(recorded)) == len(recorded)
     assert {f"{query}-00" for query in every} <= set(recorded)
 
 
 def feedback_info(folder):
-    """What the recording that the command began says of itself."""
+    """Return the information of the recording that the command began."""
     from robot.recording.folder import read_info
 
     info = read_info(folder / "recording")
     return {key: info[key] for key in ("source", "sensor")}
 
 
-def test_a_database_whose_writer_was_killed_has_all_that_it_said_it_has(tmp_path, searcher, touch):
-    """A copy of the files as they lie while the database is open is what a kill leaves."""
+def test_a_database_of_a_killed_writer_is_complete(tmp_path, searcher, touch):
+    """A copy of the files of the open database equals the state after a kill."""
     import shutil
 
     store = HistoryStore(tmp_path / "a" / "history.sqlite", 10, 2**30)
-    store.keep("1", [[path.read_bytes() for path in touch]], None, searcher.query(touch), "m")
+    store.add_query("1", [[path.read_bytes() for path in touch]], None, searcher.query(touch), "m")
     store.add_feedback("1", "object", "mug", b"photo")
     shutil.copytree(tmp_path / "a", tmp_path / "b")
-    left = HistoryStore(tmp_path / "b" / "history.sqlite", 10, 2**30)
-    assert left.recordable() == [("1", "mug")]
-    assert left.picture("1", 1, "a") == touch[0].read_bytes()
-    assert left.photo("1") == b"photo"
-    left.close()
+    copy = HistoryStore(tmp_path / "b" / "history.sqlite", 10, 2**30)
+    assert copy.recordable() == [("1", "mug")]
+    assert copy.picture("1", 1, "a") == touch[0].read_bytes()
+    assert copy.photo("1") == b"photo"
+    copy.close()
     store.close()

@@ -1,4 +1,4 @@
-"""A service in trouble: writes that fail, a full disk, a database that is gone, a rig or a disk that hangs."""
+"""Failures of a service: failing writes, a full disk, a deleted database, a hanging rig or disk."""
 
 import asyncio
 import base64
@@ -46,8 +46,8 @@ def folder(tmp_path):
 
 @pytest.fixture
 def client(index, folder):
-    with with_history(index, folder) as opened:
-        yield opened
+    with with_history(index, folder) as client:
+        yield client
 
 
 def ask(client, body):
@@ -60,7 +60,7 @@ def ask(client, body):
 
 
 class Unforeseen(BaseException):
-    """What no program expects."""
+    """An exception that no program expects."""
 
 
 UNFORESEEN = (
@@ -90,33 +90,34 @@ def test_the_writer_survives_a_thousand_unforeseen_exceptions(index, folder, gra
         raise error
 
     with with_history(index, folder) as client:
-        stored, names = client.app.state.service.with_history, []
+        writer, names = client.app.state.service.history_writer, []
         with monkeypatch.context() as patch:
-            patch.setattr(stored.store, "keep", fail)
+            patch.setattr(writer.store, "add_query", fail)
             for _ in range(1_000):
-                wait_until(lambda: len(stored._pending) < MAX_PENDING_WRITES)
-                names.append(stored.keep(ParsedQuery(pictures_of([[grasp]], None), Options()), QueryAnswer(None, "m")))
+                wait_until(lambda: len(writer._pending) < MAX_PENDING_WRITES)
+                query = ParsedQuery(pictures_of([[grasp]], None), Options())
+                names.append(writer.submit(query, QueryAnswer(None, "m")))
             wait_until(lambda: len(raised) == 1_000)
         assert client.get("/v1/history").json()["total"] == 0
         assert "could not be stored: 'x'" in problem(client.get(f"/v1/history/{names[1]}"), 404, "unknown")
-        assert b'retrieve_history_failures_total{what="query"} 1000.0' in client.get("/metrics").content
+        assert b'retrieve_history_failures_total{kind="query"} 1000.0' in client.get("/metrics").content
         query = ask(client, body)
         assert [item["id"] for item in client.get("/v1/history").json()["items"]] == [query]
         began = time.monotonic()
     assert time.monotonic() - began < 10
 
 
-def test_the_history_answers_while_the_writer_hangs_and_says_that_a_query_is_being_stored(client, body, monkeypatch):
-    go, store = threading.Event(), client.app.state.service.with_history.store
-    keep = store.keep
-    monkeypatch.setattr(store, "keep", lambda *row: go.wait(60) and keep(*row))
+def test_the_history_answers_while_the_writer_hangs_and_reports_pending_queries(client, body, monkeypatch):
+    go, store = threading.Event(), client.app.state.service.history_writer.store
+    add_query = store.add_query
+    monkeypatch.setattr(store, "add_query", lambda *row: go.wait(60) and add_query(*row))
     query = ask(client, body)
     assert client.get("/v1/history").json()["total"] == 0
-    told = client.post("/v1/feedback", json={"query": query, "feedback": "none"})
-    assert problem(told, 503, "not-ready") == f"query {query} is still being stored; come again"
+    response = client.post("/v1/feedback", json={"query": query, "feedback": "none"})
+    assert problem(response, 503, "not-ready") == f"Query {query} is still being stored. Try again."
     for _ in range(MAX_PENDING_WRITES):
         last = ask(client, body)
-    assert last is None  # too many wait, and the answer says so: it has no id
+    assert last is None  # too many queries wait, so the answer has no id
     go.set()
     wait_until(lambda: client.get("/v1/history").json()["total"] == MAX_PENDING_WRITES)
 
@@ -124,8 +125,8 @@ def test_the_history_answers_while_the_writer_hangs_and_says_that_a_query_is_bei
 # The disk ------------------------------------------------------------------------------------------------------------
 
 
-def test_a_query_that_a_full_disk_refused_is_told_by_its_reason(client, body):
-    store = client.app.state.service.with_history.store
+def test_a_query_refused_by_a_full_disk_is_reported_with_the_reason(client, body):
+    store = client.app.state.service.history_writer.store
     first = ask(client, body)
     client.get("/v1/history")
     (pages,) = store._database.execute("PRAGMA page_count").fetchone()
@@ -135,9 +136,9 @@ def test_a_query_that_a_full_disk_refused_is_told_by_its_reason(client, body):
         client.get(f"/v1/history/{query}"),
         client.post("/v1/feedback", json={"query": query, "feedback": "none"}),
     ):
-        told = problem(response, 404, "unknown")
-        assert told.startswith(f"query {query} could not be stored: ")
-        assert told.endswith("cannot be written: database or disk is full")
+        detail = problem(response, 404, "unknown")
+        assert detail.startswith(f"Query {query} could not be stored: ")
+        assert detail.endswith("cannot be written: database or disk is full")
     store._database.execute("PRAGMA max_page_count = 1000000")
     assert client.get(f"/v1/history/{first}").status_code == 200
     assert client.get(f"/v1/history/{ask(client, body)}").status_code == 200
@@ -145,7 +146,7 @@ def test_a_query_that_a_full_disk_refused_is_told_by_its_reason(client, body):
 
 @pytest.mark.parametrize("name", ["history.sqlite", "history.sqlite-wal"])
 @pytest.mark.parametrize("replaced", [False, True])
-def test_nothing_is_acknowledged_once_the_database_was_deleted_or_replaced(client, body, folder, name, replaced):
+def test_no_feedback_is_acknowledged_after_the_database_is_deleted_or_replaced(client, body, folder, name, replaced):
     query = ask(client, body)
     assert client.get(f"/v1/history/{query}").status_code == 200
     data = (folder / name).read_bytes()
@@ -153,24 +154,25 @@ def test_nothing_is_acknowledged_once_the_database_was_deleted_or_replaced(clien
     if replaced:
         (folder / f"{name}.new").write_bytes(data)
         (folder / f"{name}.new").rename(folder / name)
-    told = problem(client.post("/v1/feedback", json={"query": query, "feedback": "none"}), 500, "failed")
-    assert told == (
-        f"{folder / 'history.sqlite'} was deleted or replaced while the service ran, so nothing can be stored in it; "
-        "start the service again"
+    detail = problem(client.post("/v1/feedback", json={"query": query, "feedback": "none"}), 500, "failed")
+    assert detail == (
+        f"{folder / 'history.sqlite'} was deleted or replaced while the service ran, so nothing can be stored. "
+        "Start the service again."
     )
     problem(client.get("/v1/history"), 500, "failed")
     later = ask(client, body)  # queries are answered
-    client.app.state.service.with_history._writer.submit(int).result()
-    assert client.app.state.service.with_history.missing_query_problem(later).detail.endswith("start the service again")
+    writer = client.app.state.service.history_writer
+    writer._writer.submit(int).result()
+    assert writer.missing_query_problem(later).detail.endswith("Start the service again.")
 
 
-def test_a_database_that_hangs_is_told_and_closing_does_not_wait_for_it(folder, monkeypatch):
+def test_a_hanging_database_is_reported_and_does_not_delay_closing(folder, monkeypatch):
     monkeypatch.setattr("retrieval.serve.store._LOCK_S", 0.1)
-    with RecordingWriter(folder / "recording", INFO) as writer:
-        stored = HistoryWriter(folder, writer, ServiceSettings(index="x"), Metrics())
-        with stored.store._lock, pytest.raises(RetrievalError, match="sqlite does not answer"):
-            stored.store.names()
-        stored.close()
+    with RecordingWriter(folder / "recording", INFO) as recorder:
+        writer = HistoryWriter(folder, recorder, ServiceSettings(index="x"), Metrics())
+        with writer.store._lock, pytest.raises(RetrievalError, match="sqlite does not respond"):
+            writer.store.names()
+        writer.close()
 
 
 # The rig -------------------------------------------------------------------------------------------------------------
@@ -187,20 +189,20 @@ def hanging():
     go.set()
 
 
-def test_grasps_wait_in_few_places_and_hold_up_no_other_request(index, hanging):
+def test_pending_grasps_are_limited_and_block_no_other_request(index, hanging):
     rig, go = hanging
     with listening(index, rig) as (url, parts), ThreadPoolExecutor(60) as client_threads:
-        asked = [client_threads.submit(httpx.post, f"{url}/v1/grasp", timeout=60) for _ in range(60)]
-        wait_until(lambda: sum(one.done() for one in asked) == 60 - MAX_RIG_GRASPS)
-        refused = [one.result() for one in asked if one.done()]
+        requests = [client_threads.submit(httpx.post, f"{url}/v1/grasp", timeout=60) for _ in range(60)]
+        wait_until(lambda: sum(one.done() for one in requests) == 60 - MAX_RIG_GRASPS)
+        refused = [one.result() for one in requests if one.done()]
         for response in refused:
-            assert "are held already; come again" in problem(response, 429, "busy")
+            assert "are in flight already. Try again." in problem(response, 429, "busy")
         frames = [client_threads.submit(httpx.get, f"{url}/v1/sensors/a/frame", timeout=60) for _ in range(10)]
         wait_until(lambda: parts.frames["a"].in_flight == 10)
         for path in ("/healthz", "/v1/catalogue", "/v1/index"):
             assert httpx.get(url + path, timeout=10).status_code == 200
         go.set()
-        answered = [one.result() for one in asked if one.result().status_code == 200]
+        answered = [one.result() for one in requests if one.result().status_code == 200]
         assert len(answered) == MAX_RIG_GRASPS
         assert [one.result().content for one in frames] == [b"picture"] * 10
 
@@ -208,13 +210,13 @@ def test_grasps_wait_in_few_places_and_hold_up_no_other_request(index, hanging):
 def test_a_grasp_and_a_picture_that_hang_end_at_the_deadline(index, hanging):
     rig, _ = hanging
     with listening(index, rig, deadline_s=0.3) as (url, _):
-        assert problem(httpx.post(f"{url}/v1/grasp"), 504, "late") == "no answer within 300 ms"
+        assert problem(httpx.post(f"{url}/v1/grasp"), 504, "late") == "No answer within 300 ms."
         problem(httpx.get(f"{url}/v1/sensors/a/frame"), 504, "late")
         problem(httpx.post(f"{url}/v1/grasp", params={"object": "nobody's"}), 504, "late")  # the rig is still busy
 
 
 @pytest.mark.parametrize("error", [StopIteration("x"), SystemExit(1), KeyboardInterrupt(), OSError("unplugged")])
-def test_whatever_a_rig_raises_the_next_grasp_is_made(index, error):
+def test_the_next_grasp_succeeds_after_any_exception_of_the_rig(index, error):
     raised = iter([error])
 
     def close(names):
@@ -223,7 +225,7 @@ def test_whatever_a_rig_raises_the_next_grasp_is_made(index, error):
         return GraspResult(names[0], [b"x"])
 
     with listening(index, LiveRig({}, close)) as (url, _):
-        assert "the rig could not grasp" in problem(httpx.post(f"{url}/v1/grasp"), 500, "failed")
+        assert "The rig could not grasp" in problem(httpx.post(f"{url}/v1/grasp"), 500, "failed")
         assert httpx.post(f"{url}/v1/grasp").status_code == 200
 
 
@@ -239,26 +241,26 @@ from retrieval.serve.settings import ServiceSettings
 from robot.recording.folder import RecordingWriter
 
 index, folder, where = sys.argv[1:]
-hang = lambda *given, **named: time.sleep(10_000)
+hang = lambda *args, **keywords: time.sleep(10_000)
 rig = LiveRig({"a": hang if where == "sensor" else lambda: b"picture"}, hang)
 with RecordingWriter(Path(folder) / "recording", {"source": "s", "sensor": "t"}) as recorder:
     app = create_app(ServiceSettings(index=index, port=0, history=Path(folder)), rig, recorder)
     parts = app.state.service
-    def started(port):
-        opened = parts.generations.current
+    def on_started(port):
+        generation = parts.generations.current
         if where == "query":
-            opened.searcher.query = opened.searcher.query_many = hang
+            generation.searcher.query = generation.searcher.query_many = hang
         if where == "page":
-            opened.shard.page = hang
+            generation.shard.page = hang
         if where == "write":
-            parts.keeping.store.keep = hang
+            parts.history_writer.store.add_query = hang
         if where == "commit":
-            parts.keeping.store._lock.acquire()
+            parts.history_writer.store._lock.acquire()
         if where == "generation":
             import retrieval.serve.generations
             retrieval.serve.generations.manifest_of = hang
         print(port, flush=True)
-    serve(app, started)
+    serve(app, on_started)
 """
 REQUESTS = {
     "grasp": ("POST", "/v1/grasp"),
@@ -274,7 +276,7 @@ REQUESTS = {
 
 
 ENDED = {"stream": {200, None}, "write": {200}, "commit": {200}, "generation": {200}, "headers": set()}
-"""What the requests in flight were answered; 503 where the work hangs."""
+"""Statuses of the requests in flight; 503 if the work hangs."""
 
 
 @pytest.mark.slow
@@ -303,7 +305,7 @@ def test_sigterm_ends_the_process_within_ten_seconds_whatever_hangs(index, folde
 
 
 def status(method, path, url, body):
-    """The status of an answer; None where it was cut off."""
+    """Return the status of an answer; None if it was cut off."""
     try:
         return httpx.request(method, url + path, json=body if path == "/v1/query" else None, timeout=60).status_code
     except httpx.HTTPError:

@@ -1,4 +1,4 @@
-"""What is kept: queries, what people said of them as a recording that training reads, and trials with people."""
+"""The history: stored queries, feedback as a recording for training, and trials of the human baseline."""
 
 import base64
 import io
@@ -19,7 +19,7 @@ from tests.waiting import wait_until
 
 @pytest.fixture(scope="module")
 def touches(tmp_path_factory):
-    """The contents of two grasps of each of three objects of the catalogue, by object."""
+    """The image files of two grasps of each of three catalogue objects, by object."""
     files = synthetic.write_queries(tmp_path_factory.mktemp("touches"), synthetic.make_objects(3, seed=9), 2)
     return {name: [[path.read_bytes() for path in grasp] for grasp in grasps] for name, grasps in files.items()}
 
@@ -31,19 +31,19 @@ def folder(tmp_path):
 
 @pytest.fixture
 def client(index, folder):
-    with with_history(index, folder) as opened:
-        yield opened
+    with with_history(index, folder) as client:
+        yield client
 
 
-def ask(client, grasps, **more):
+def ask(client, grasps, **options):
     encoded = [[base64.b64encode(image).decode() for image in grasp] for grasp in grasps]
-    response = client.post("/v1/query", json={"touches": encoded, **more})
+    response = client.post("/v1/query", json={"touches": encoded, **options})
     assert response.status_code == 200, response.text
     return response.headers["x-query-id"], response.json()
 
 
-def add_feedback(client, query, said, object_id=None):
-    return client.post("/v1/feedback", json={"query": query, "feedback": said, "object_id": object_id})
+def add_feedback(client, query, feedback, object_id=None):
+    return client.post("/v1/feedback", json={"query": query, "feedback": feedback, "object_id": object_id})
 
 
 def test_history_stores_a_query_with_answer_and_gel_images(client, touches):
@@ -56,16 +56,17 @@ def test_history_stores_a_query_with_answer_and_gel_images(client, touches):
 
 
 def test_the_history_is_paged_from_the_newest_and_searched(client, touches):
-    asked = [ask(client, grasps[:1])[0] for grasps in touches.values()]
-    add_feedback(client, asked[0], "object", sorted(touches)[0])
+    queries = [ask(client, grasps[:1])[0] for grasps in touches.values()]
+    add_feedback(client, queries[0], "object", sorted(touches)[0])
     first = client.get("/v1/history", params={"limit": 2}).json()
     rest = client.get("/v1/history", params={"limit": 2, "offset": first["next"]}).json()
-    assert [item["id"] for item in first["items"] + rest["items"]] == asked[::-1]
+    assert [item["id"] for item in first["items"] + rest["items"]] == queries[::-1]
     assert (first["total"], rest["next"]) == (3, None)
     words = {"search": f"object {sorted(touches)[0].upper()}"}
-    assert [item["id"] for item in client.get("/v1/history", params=words).json()["items"]] == asked[:1]
-    for said, found in (("missing", asked[:0:-1]), ("object", asked[:1]), ("none", [])):
-        assert [item["id"] for item in client.get("/v1/history", params={"feedback": said}).json()["items"]] == found
+    assert [item["id"] for item in client.get("/v1/history", params=words).json()["items"]] == queries[:1]
+    for feedback, found in (("missing", queries[:0:-1]), ("object", queries[:1]), ("none", [])):
+        items = client.get("/v1/history", params={"feedback": feedback}).json()["items"]
+        assert [item["id"] for item in items] == found
 
 
 def test_feedback_becomes_a_readable_recording(client, touches, folder, catalogue):
@@ -83,11 +84,11 @@ def test_feedback_becomes_a_readable_recording(client, touches, folder, catalogu
     assert not [found for found in check_recording(folder / "recording") if found.severity == "error"]
 
 
-def test_the_right_answer_is_recorded_as_the_object_that_was_found(client, touches, folder):
+def test_feedback_right_records_the_found_object(client, touches, folder):
     query, answer = ask(client, next(iter(touches.values())), none_prior=0.001)
     assert answer["verdict"] in ("match", "uncalibrated")
-    said = add_feedback(client, query, "right").json()
-    assert said == {
+    feedback = add_feedback(client, query, "right").json()
+    assert feedback == {
         "query": query,
         "feedback": "right",
         "object_id": answer["results"][0]["object_id"],
@@ -100,7 +101,7 @@ def test_feedback_is_stored_once_and_not_changed(client, touches, folder):
     query, _ = ask(client, next(iter(touches.values())))
     name = sorted(touches)[0]
     assert [add_feedback(client, query, "object", name).status_code for _ in range(3)] == [201, 200, 200]
-    assert "said already: object" in problem(add_feedback(client, query, "none"), 409, "conflict")
+    assert "has different feedback already: object" in problem(add_feedback(client, query, "none"), 409, "conflict")
     assert len(load_grasps(folder / "recording")) == 2
 
 
@@ -111,12 +112,12 @@ def test_feedback_on_an_uncatalogued_object_is_stored_but_not_recorded(client, t
     assert (folder / "recording" / "metadata.jsonl").read_bytes() == b""
 
 
-def test_words_that_mean_nothing_are_refused(client, touches):
+def test_invalid_feedback_is_refused(client, touches):
     query, _ = ask(client, next(iter(touches.values())))
     problem(add_feedback(client, "no such query", "none"), 404, "unknown")
-    assert "must name it" in problem(add_feedback(client, query, "object"), 422, "bad-input")
-    assert "the index has no object" in problem(add_feedback(client, query, "object", "nobody's"), 422, "bad-input")
-    assert "names no object" in problem(add_feedback(client, query, "right", "x"), 422, "bad-input")
+    assert "requires object_id" in problem(add_feedback(client, query, "object"), 422, "bad-input")
+    assert "The index has no object" in problem(add_feedback(client, query, "object", "nobody's"), 422, "bad-input")
+    assert "takes no object_id" in problem(add_feedback(client, query, "right", "x"), 422, "bad-input")
 
 
 def test_unrecorded_feedback_is_recorded_at_the_next_start(index, touches, folder):
@@ -127,36 +128,36 @@ def test_unrecorded_feedback_is_recorded_at_the_next_start(index, touches, folde
     name, grasps = next(iter(touches.items()))
     with Full(folder / "recording", INFO) as writer, service(index, None, writer, history=folder) as client:
         query, _ = ask(client, grasps)
-        said = add_feedback(client, query, "object", name)
-        assert (said.status_code, said.json()["recorded"]) == (201, False)
-        assert b'retrieve_history_failures_total{what="said"} 1.0' in client.get("/metrics").content
-    with with_history(index, folder):  # in a thread of its own, which the end of the service does not wait for
+        response = add_feedback(client, query, "object", name)
+        assert (response.status_code, response.json()["recorded"]) == (201, False)
+        assert b'retrieve_history_failures_total{kind="feedback"} 1.0' in client.get("/metrics").content
+    with with_history(index, folder):  # recorded in a thread that the end of the service does not wait for
         wait_until(lambda: (folder / "recording" / "metadata.jsonl").read_text().count("\n") == 2)
     assert [grasp.object_id for grasp in load_grasps(folder / "recording")] == [name, name]
 
 
 def test_the_nearest_touch_of_a_touch_is_its_copy(client, touches):
-    asked = [ask(client, grasps[:1])[0] for grasps in touches.values()]
+    queries = [ask(client, grasps[:1])[0] for grasps in touches.values()]
     copy, _ = ask(client, next(iter(touches.values()))[:1])
-    near = client.get(f"/v1/history/{copy}/nearest").json()
-    assert near["compared"] == 4
-    assert near["items"][0]["id"] == asked[0]
-    assert near["items"][0]["score"] == pytest.approx(1, abs=1e-5)
-    assert copy not in [item["id"] for item in near["items"]]
+    similar = client.get(f"/v1/history/{copy}/nearest").json()
+    assert similar["compared"] == 4
+    assert similar["items"][0]["id"] == queries[0]
+    assert similar["items"][0]["score"] == pytest.approx(1, abs=1e-5)
+    assert copy not in [item["id"] for item in similar["items"]]
 
 
 def test_oldest_queries_without_feedback_are_deleted(index, touches, tmp_path, searcher):
-    store = HistoryStore(tmp_path / "h.sqlite", keep=2, keep_bytes=2**40)
+    store = HistoryStore(tmp_path / "h.sqlite", max_queries=2, max_bytes=2**40)
     result = searcher.query(next(iter(touches.values())))
     for number in range(40):
-        store.keep(f"{number:03}", [[b"a"]], None, result, "m")
+        store.add_query(f"{number:03}", [[b"a"]], None, result, "m")
         if number == 3:
             store.add_feedback("003", "none", None, None)
     assert store.names() == ["003", *(f"{number:03}" for number in range(30, 40))]
     store.close()
-    small = HistoryStore(tmp_path / "h.sqlite", keep=1000, keep_bytes=3)
+    small = HistoryStore(tmp_path / "h.sqlite", max_queries=1000, max_bytes=3)
     for number in range(40, 72):
-        small.keep(f"{number:03}", [[b"a"]], None, result, "m")
+        small.add_query(f"{number:03}", [[b"a"]], None, result, "m")
     assert small.names() == ["003", "069", "070", "071"]
     small.close()
 
@@ -164,11 +165,11 @@ def test_oldest_queries_without_feedback_are_deleted(index, touches, tmp_path, s
 def test_feedback_on_a_deleted_query_is_refused(client, touches, monkeypatch):
     name, _ = ask(client, next(iter(touches.values())))
     assert client.get(f"/v1/history/{name}").status_code == 200  # it is written
-    store = client.app.state.service.with_history.store
-    read = iter([store.query(name)])  # as the request finds it, just before it goes
+    store = client.app.state.service.history_writer.store
+    read = iter([store.query(name)])  # the first read, just before the query is deleted
     store._database.execute("DELETE FROM queries")
     monkeypatch.setattr(store, "query", lambda name: next(read, None))
-    assert "the oldest are left out" in problem(add_feedback(client, name, "none"), 404, "unknown")
+    assert "The oldest queries are deleted" in problem(add_feedback(client, name, "none"), 404, "unknown")
 
 
 def test_a_file_of_another_program_is_no_history(tmp_path):
@@ -179,18 +180,18 @@ def test_a_file_of_another_program_is_no_history(tmp_path):
         HistoryStore(tmp_path / "x", 1, 1)
 
 
-def test_the_export_holds_the_recording_and_every_query(client, touches, tmp_path):
-    asked = []
+def test_the_export_contains_the_recording_and_every_query(client, touches, tmp_path):
+    queries = []
     for name, grasps in touches.items():
         query, _ = ask(client, grasps)
         add_feedback(client, query, "object", name)
-        asked.append(query)
+        queries.append(query)
     archive = zipfile.ZipFile(io.BytesIO(client.get("/v1/export.zip").content))
     assert archive.testzip() is None
     archive.extractall(tmp_path / "out")
     assert len(load_grasps(tmp_path / "out" / "recording")) == 6
     lines = (tmp_path / "out" / "history.jsonl").read_text().splitlines()
-    assert [json.loads(line)["id"] for line in lines] == asked
+    assert [json.loads(line)["id"] for line in lines] == queries
 
 
 def test_service_without_history_reports_it(index, touches):
@@ -201,46 +202,46 @@ def test_service_without_history_reports_it(index, touches):
             problem(client.get(path), 404, "unknown")
 
 
-# The human test -------------------------------------------------------------------------------------------------------
+# The human baseline ---------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def examined(index, folder, tmp_path):
-    """A service with a recording of twelve objects that the model never saw."""
+def client_with_trials(index, folder, tmp_path):
+    """A service with a recording of twelve unseen objects."""
     unseen = synthetic.write_recording(tmp_path / "unseen", synthetic.make_objects(12, seed=500), 2)
-    with with_history(index, folder, unseen) as opened:
-        yield opened
+    with with_history(index, folder, unseen) as client:
+        yield client
 
 
-def test_a_trial_shows_one_photo_of_the_object_and_nine_of_others(examined):
-    known = examined.app.state.service
-    drawn = [known.trials.trial(known.generations.current, 5, number) for number in range(1, 25)]
-    for trial in drawn:
+def test_a_trial_shows_one_photo_of_the_object_and_nine_of_others(client_with_trials):
+    parts = client_with_trials.app.state.service
+    trials = [parts.trials.trial(parts.generations.current, 5, number) for number in range(1, 25)]
+    for trial in trials:
         owners = [path.name.rsplit("-", 1)[0] for path in trial.photos]
         assert len(set(owners)) == 10
         assert owners[trial.truth - 1] == trial.grasp.object_id
         assert trial.photos[trial.truth - 1] != trial.grasp.photo  # of another grasp
-    assert len({trial.grasp.object_id for trial in drawn[:12]}) == 12
-    assert [trial.truth for trial in drawn] == [
-        known.trials.trial(known.generations.current, 5, number).truth for number in range(1, 25)
+    assert len({trial.grasp.object_id for trial in trials[:12]}) == 12
+    assert [trial.truth for trial in trials] == [
+        parts.trials.trial(parts.generations.current, 5, number).truth for number in range(1, 25)
     ]
 
 
-def test_trial_run_counts_human_and_model_choices(examined):
-    assert examined.get("/v1/trials").json()["objects"] == 12
-    run = examined.post("/v1/trials", json={"count": 4, "participant": "Ada", "seed": 3}).json()
+def test_trial_run_counts_human_and_model_choices(client_with_trials):
+    assert client_with_trials.get("/v1/trials").json()["objects"] == 12
+    run = client_with_trials.post("/v1/trials", json={"count": 4, "participant": "Ada", "seed": 3}).json()
     where, right, model = f"/v1/trials/{run['id']}", 0, 0
     assert (run["next"], run["human_baseline"]["accuracy"], run["chance"]) == (1, None, 0.1)
     for number in (1, 2, 3):
-        trial = examined.get(f"{where}/{number}").json()
+        trial = client_with_trials.get(f"{where}/{number}").json()
         assert (trial["truth"], trial["model"], len(trial["touches"]), len(trial["photos"])) == (None, None, 2, 10)
         for path in (*trial["touches"], *trial["photos"]):
-            assert examined.get(path).headers["content-type"].startswith("image/")
-        done = examined.post(f"{where}/{number}", json={"choice": 4}).json()
+            assert client_with_trials.get(path).headers["content-type"].startswith("image/")
+        done = client_with_trials.post(f"{where}/{number}", json={"choice": 4}).json()
         right, model = right + (done["truth"] == 4), model + (done["model"] == done["truth"])
-    problem(examined.post(f"{where}/1", json={"choice": 1}), 409, "conflict")
-    problem(examined.post(f"{where}/5", json={"choice": 1}), 404, "unknown")
-    state = examined.get(where).json()
+    problem(client_with_trials.post(f"{where}/1", json={"choice": 1}), 409, "conflict")
+    problem(client_with_trials.post(f"{where}/5", json={"choice": 1}), 404, "unknown")
+    state = client_with_trials.get(where).json()
     assert (state["completed"], state["next"]) == (3, 4)
     assert (state["human_baseline"]["right"], state["model"]["right"]) == (right, model)
     assert state["human_baseline"]["trials"] == state["model"]["trials"] == 3
@@ -253,10 +254,10 @@ def test_trial_run_counts_human_and_model_choices(examined):
     )
 
 
-def test_too_few_unseen_objects_are_told(index, folder, recording, tmp_path):
+def test_too_few_unseen_objects_are_reported(index, folder, recording, tmp_path):
     """The model was trained on most objects of that recording."""
     shutil.copytree(recording, tmp_path / "seen")
     with with_history(index, folder, tmp_path / "seen") as client:
-        assert "needs 10 objects that the model was not trained on" in problem(
+        assert "requires 10 objects that the model was not trained on" in problem(
             client.post("/v1/trials", json={}), 422, "bad-input"
         )

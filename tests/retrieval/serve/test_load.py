@@ -1,4 +1,4 @@
-"""Many at once, client_threads who leave, deadlines, queries answered together, new generations of the index, and the end."""
+"""Concurrent requests, disconnects, deadlines, batches, new generations of the index, and the shutdown."""
 
 import shutil
 import signal
@@ -24,7 +24,7 @@ from tests.waiting import wait_until
 
 
 class BlockingEncoder:
-    """An encoder that waits until it may go on, and counts the grasps of each call."""
+    """An encoder that waits for an event, and records the number of grasps of each call."""
 
     def __init__(self, encoder):
         self.encoder, self.calls, self.go = encoder, [], threading.Event()
@@ -40,8 +40,8 @@ class BlockingEncoder:
 
 
 @contextmanager
-def held(index, **settings):
-    """A service whose encoder is held: its address, the encoder, and its parts."""
+def blocked_service(index, **settings):
+    """Run a service with a blocked encoder; yield its address, the encoder, its parts and a thread pool."""
     with listening(index, **settings) as (url, parts), ThreadPoolExecutor(16) as client_threads:
         searcher = parts.generations.current.searcher
         encoder = searcher.reader.encoder = BlockingEncoder(searcher.reader.encoder)
@@ -52,62 +52,62 @@ def held(index, **settings):
 
 
 def value(url, name):
-    """A number of /metrics; 0 where it was never counted."""
+    """Return a number of /metrics; 0 if it is missing."""
     lines = httpx.get(f"{url}/metrics").text.splitlines()
     return next((float(line.rsplit(" ", 1)[1]) for line in lines if line.startswith(f"{name} ")), 0.0)
 
 
-def post_query(url, body, **more):
-    return httpx.post(f"{url}/v1/query", json={**body, **more}, timeout=60)
+def post_query(url, body, **options):
+    return httpx.post(f"{url}/v1/query", json={**body, **options}, timeout=60)
 
 
-def test_beyond_the_queue_requests_are_told_to_come_again_and_the_others_are_answered(index, body):
-    with held(index, queue=3) as (url, encoder, parts, client_threads):
+def test_requests_beyond_the_queue_get_429_and_the_others_are_answered(index, body):
+    with blocked_service(index, queue=3) as (url, encoder, parts, client_threads):
         first = [client_threads.submit(post_query, url, body) for _ in range(3)]
-        wait_until(lambda: parts.queue.held == 3)
+        wait_until(lambda: parts.queue.in_flight == 3)
         for _ in range(4):
             refused = post_query(url, body)
-            assert problem(refused, 429, "busy") == "3 requests are held already; come again"
+            assert problem(refused, 429, "busy") == "3 requests are in flight already. Try again."
             assert refused.headers["retry-after"] == "1"
-        assert httpx.get(f"{url}/readyz").status_code == 200  # who does not ask the model is not held up
+        assert httpx.get(f"{url}/readyz").status_code == 200  # requests without the model are not delayed
         encoder.go.set()
         assert [one.result().status_code for one in first] == [200] * 3
         assert post_query(url, body).status_code == 200
-        assert value(url, 'retrieve_dropped_total{why="busy"}') == 4
+        assert value(url, 'retrieve_dropped_total{reason="busy"}') == 4
 
 
-def test_who_has_left_or_waited_too_long_is_not_worked_on(index, body):
-    with held(index) as (url, encoder, parts, client_threads):
+def test_requests_of_disconnected_clients_and_late_requests_are_dropped(index, body):
+    with blocked_service(index) as (url, encoder, parts, client_threads):
         first = client_threads.submit(post_query, url, body)
         wait_until(lambda: encoder.calls == [1])
-        assert problem(post_query(url, body, deadline_ms=50), 504, "late") == "no answer within 50 ms"
-        with pytest.raises(httpx.ReadTimeout):  # the client closes its connection then
+        assert problem(post_query(url, body, deadline_ms=50), 504, "late") == "No answer within 50 ms."
+        with pytest.raises(httpx.ReadTimeout):  # the client closes its connection
             httpx.post(f"{url}/v1/query", json=body, timeout=0.5)
-        wait_until(lambda: value(url, 'retrieve_dropped_total{why="left"}') == 1)
+        wait_until(lambda: value(url, 'retrieve_dropped_total{reason="disconnected"}') == 1)
         last = client_threads.submit(post_query, url, body)
-        wait_until(lambda: parts.queue.held == 2)
+        wait_until(lambda: parts.queue.in_flight == 2)
         encoder.go.set()
         assert (first.result().status_code, last.result().status_code) == (200, 200)
         assert encoder.calls == [1, 1]
 
 
-def test_queries_that_wait_are_encoded_together_and_get_the_answers_that_they_would_get_alone(index, body):
-    with held(index, queue=6, max_batch=3) as (url, encoder, parts, client_threads):
+def test_waiting_queries_are_encoded_in_a_batch_with_unchanged_answers(index, body):
+    with blocked_service(index, queue=6, max_batch=3) as (url, encoder, parts, client_threads):
         first = client_threads.submit(post_query, url, body)
         wait_until(lambda: encoder.calls == [1])
         waiting = [client_threads.submit(post_query, url, body) for _ in range(5)]
-        wait_until(lambda: len(parts.queue._jobs) == 5)  # whose pictures are read
+        wait_until(lambda: len(parts.queue._jobs) == 5)  # their pictures are decoded
         encoder.go.set()
-        alone, *others = [one.result().json()["results"] for one in (first, *waiting)]
+        single, *others = [one.result().json()["results"] for one in (first, *waiting)]
         assert encoder.calls == [1, 3, 2]
         for other in others:
-            assert [one["object_id"] for one in other] == [one["object_id"] for one in alone]
-            assert [one["logit"] for one in other] == pytest.approx([one["logit"] for one in alone], abs=1e-4)
+            assert [one["object_id"] for one in other] == [one["object_id"] for one in single]
+            assert [one["logit"] for one in other] == pytest.approx([one["logit"] for one in single], abs=1e-4)
 
 
-def test_queries_within_the_window_are_encoded_together_and_a_bad_one_spoils_none(index, body):
+def test_queries_in_the_batch_window_are_encoded_together_and_a_bad_one_affects_no_other(index, body):
     short = {"touches": [body["touches"][0][:1]]}  # a finger too few
-    with held(index, batch_ms=1000, max_batch=3) as (url, encoder, _, client_threads):
+    with blocked_service(index, batch_ms=1000, max_batch=3) as (url, encoder, _, client_threads):
         encoder.go.set()
         good = [client_threads.submit(post_query, url, body) for _ in range(3)]
         assert [one.result().status_code for one in good] == [200] * 3
@@ -119,7 +119,7 @@ def test_queries_within_the_window_are_encoded_together_and_a_bad_one_spoils_non
         assert [len(one.result().json()["results"]) for one in other] == [2, 3]
 
 
-def test_a_core_is_left_to_the_event_loop_and_blas_has_no_threads_that_spin(index, monkeypatch):
+def test_one_core_stays_free_for_the_event_loop_and_blas_uses_one_thread(index, monkeypatch):
     monkeypatch.setattr("os.cpu_count", lambda: 9)
     assert [ServiceSettings(index=index, workers=workers).threads for workers in (1, 2, 9)] == [8, 4, 1]
     monkeypatch.setattr("os.cpu_count", lambda: 2)
@@ -133,7 +133,7 @@ def test_a_core_is_left_to_the_event_loop_and_blas_has_no_threads_that_spin(inde
 
 @pytest.fixture
 def grown(catalogue, index, tmp_path, model):
-    """A copy of the index, and what builds the next generation of it: with one object more or less, in turn."""
+    """A copy of the index, and a function that builds its next generation with one object more or less, in turn."""
     photos, own = tmp_path / "catalog", tmp_path / "index"
     shutil.copytree(catalogue, photos)
     shutil.copytree(index, own)
@@ -150,7 +150,7 @@ def grown(catalogue, index, tmp_path, model):
     return own, build
 
 
-def test_a_new_generation_is_taken_up_and_no_answer_is_of_two(grown, body):
+def test_a_new_generation_is_served_and_no_answer_mixes_two(grown, body):
     own, build = grown
     objects, ended, failures = {"gen-000001": 8}, threading.Event(), []
 
@@ -158,26 +158,26 @@ def test_a_new_generation_is_taken_up_and_no_answer_is_of_two(grown, body):
         while not ended.is_set():
             response = post_query(url, body, top=100)
             document = response.json()
-            seen = document["index"]["generation"], document["index"]["objects"], len(document["results"])
-            if response.status_code != 200 or seen[1] != seen[2]:
+            summary = document["index"]["generation"], document["index"]["objects"], len(document["results"])
+            if response.status_code != 200 or summary[1] != summary[2]:
                 failures.append(document)
-            answers.add(seen[:2])
+            answers.add(summary[:2])
 
     answers = set()
     with listening(own, poll_s=0.05) as (url, _), ThreadPoolExecutor(2) as client_threads:
-        asking = [client_threads.submit(ask, url) for _ in range(2)]
+        clients = [client_threads.submit(ask, url) for _ in range(2)]
         for number in (2, 3):
             build()
             objects[f"gen-{number:06}"] = 9 if number == 2 else 8
-            wait_until(lambda: any(seen[0] == f"gen-{number:06}" for seen in list(answers)), 60)  # noqa: B023
+            wait_until(lambda: any(one[0] == f"gen-{number:06}" for one in list(answers)), 60)  # noqa: B023
         ended.set()
-        for one in asking:
+        for one in clients:
             one.result()
     assert not failures
     assert dict(sorted(answers)) == objects
 
 
-def test_one_that_cannot_be_opened_leaves_the_old_one_answering(grown, body):
+def test_a_broken_generation_leaves_the_previous_one_served(grown, body):
     own, build = grown
     with listening(own, poll_s=0.05) as (url, _):
         build()
@@ -185,12 +185,12 @@ def test_one_that_cannot_be_opened_leaves_the_old_one_answering(grown, body):
         (own / "CURRENT").write_text("gen-000009\n")
         wait_until(lambda: value(url, "retrieve_reload_failures_total") == 1, 60)
         time.sleep(0.5)  # ten polls
-        assert value(url, "retrieve_reload_failures_total") == 1  # and one line in the log, not one for each poll
+        assert value(url, "retrieve_reload_failures_total") == 1  # one line in the log, not one per poll
         assert post_query(url, body).json()["index"]["generation"] == "gen-000002"
 
 
 @pytest.mark.slow
-def test_an_index_that_is_none_is_told_at_the_start(tmp_path):
+def test_a_missing_index_is_reported_at_the_start(tmp_path):
     line = [sys.executable, "-m", "retrieval", "serve", "--index", str(tmp_path), "--port", "0", "--no-history"]
     done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 2
@@ -201,9 +201,13 @@ def test_an_index_that_is_none_is_told_at_the_start(tmp_path):
 
 
 @pytest.mark.parametrize("sign", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
-def test_what_is_in_flight_when_it_is_told_to_end_is_answered(index, body, sign, tmp_path):
+def test_requests_in_flight_at_the_end_signal_are_answered(index, body, sign, tmp_path):
     with (
-        command("--index", index, "--port", "0", "--queue", "40", "--history", tmp_path / "kept") as (process, url, _),
+        command("--index", index, "--port", "0", "--queue", "40", "--history", tmp_path / "store") as (
+            process,
+            url,
+            _,
+        ),
         ThreadPoolExecutor(12) as client_threads,
     ):
         post_query(url, body)
@@ -224,11 +228,11 @@ def test_what_is_in_flight_when_it_is_told_to_end_is_answered(index, body, sign,
         answers = [client_threads.submit(ask) for _ in range(12)]
         for _ in answers:
             connected.acquire(timeout=30)
-        held_now = value(url, "retrieve_requests_in_flight")
+        in_flight = value(url, "retrieve_requests_in_flight")
         process.send_signal(sign)
         found = [one.result(timeout=60) for one in answers]
         assert process.wait(60) == 0
-        assert held_now <= 12
+        assert in_flight <= 12
         assert [data.split(b" ", 2)[1] for data in found] == [b"200"] * 12
         assert all(data.endswith(b"}") for data in found)
 
@@ -240,14 +244,14 @@ def test_a_stream_ends_when_the_service_does(index):
         listening(index, rig) as (url, parts),
         httpx.stream("GET", f"{url}/v1/sensors/a/stream", params={"rate": 30}, timeout=30) as stream,
     ):
-        parts_seen = b""
+        received = b""
         chunks = stream.iter_raw()
-        while b"picture 3" not in parts_seen:
-            parts_seen += next(chunks)
+        while b"picture 3" not in received:
+            received += next(chunks)
         parts.stopping.set()
         rest = b"".join(chunks)  # ends
     assert stream.headers["content-type"] == "multipart/x-mixed-replace; boundary=picture"
-    assert b"--picture\r\ncontent-type: image/jpeg\r\ncontent-length: 9\r\n\r\npicture 0\r\n" in parts_seen
+    assert b"--picture\r\ncontent-type: image/jpeg\r\ncontent-length: 9\r\n\r\npicture 0\r\n" in received
     assert len(rest) < 10_000
 
 
@@ -256,7 +260,7 @@ def status(address):
         return stream.status_code
 
 
-def test_more_streams_than_places_are_refused_and_a_place_is_free_again(index):
+def test_streams_beyond_the_limit_are_refused_until_one_ends(index):
     rig = LiveRig({"a": lambda: b"picture", "b": lambda: 1 / 0})
     with listening(index, rig, streams=1) as (url, _):
         address = f"{url}/v1/sensors/a/stream"
@@ -268,5 +272,5 @@ def test_more_streams_than_places_are_refused_and_a_place_is_free_again(index):
             problem(refused, 429, "busy")
         wait_until(lambda: status(address) == 200)
         assert httpx.get(f"{url}/v1/sensors/a/frame").content == b"picture"
-        assert problem(httpx.get(f"{url}/v1/sensors/b/frame"), 500, "failed") == "sensor b: division by zero"
+        assert problem(httpx.get(f"{url}/v1/sensors/b/frame"), 500, "failed") == "Sensor b: division by zero"
         problem(httpx.get(f"{url}/v1/sensors/c/frame"), 404, "unknown")

@@ -1,4 +1,4 @@
-"""The page in a real browser: asking, the answer, an object in detail, live pictures. Each sentence is a click."""
+"""The page in a real browser: queries, answers, details of an object, live pictures."""
 
 import base64
 import itertools
@@ -19,18 +19,18 @@ JPEG = synthetic._jpeg(synthetic.draw_background(1))
 
 @pytest.fixture(scope="module")
 def touches():
-    """name -> gel images of two grasps, (a, b) each."""
+    """Name -> gel images of two grasps, (a, b) each."""
     objects = synthetic.make_objects(3, seed=9)
     return {one.object_id: [synthetic._touch_files(one, key, "ab", 8.0, False) for key in (1, 2)] for one in objects}
 
 
 @pytest.fixture(scope="module")
 def rig(touches):
-    """Jaws that close on the object that is named, else on one after the other; the gels of two sensors."""
-    drawn = itertools.cycle(sorted(touches))
+    """A rig that grasps the named object, else one object after the other, with two sensors."""
+    cycle = itertools.cycle(sorted(touches))
 
     def close(names):
-        name = names[0] if len(names) == 1 else next(drawn)
+        name = names[0] if len(names) == 1 else next(cycle)
         return GraspResult(name, list(touches[name][0].values()))
 
     return LiveRig({"a": lambda: JPEG, "b": lambda: JPEG}, close)
@@ -48,8 +48,8 @@ def opened(browser, url):
         yield found
 
 
-def ask_for(document, opened, files):
-    """Ask a service that answers with this document."""
+def show_answer(document, opened, files):
+    """Query a service that answers with this document."""
     opened.route("**/v1/query", lambda route: route.fulfill(json=document))
     ask(opened, files[:2])
 
@@ -57,13 +57,13 @@ def ask_for(document, opened, files):
 def test_dropped_gel_images_become_grasps_by_their_names(opened, files):
     data = [{"name": path.name, "text": base64.b64encode(path.read_bytes()).decode()} for path in reversed(files)]
     opened.evaluate(
-        """(given) => {
-            const carried = new DataTransfer();
-            for (const {name, text} of given) {
+        """(files) => {
+            const transfer = new DataTransfer();
+            for (const {name, text} of files) {
                 const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
-                carried.items.add(new File([bytes], name, {type: "image/png"}));
+                transfer.items.add(new File([bytes], name, {type: "image/png"}));
             }
-            dispatchEvent(new DragEvent("drop", {dataTransfer: carried, bubbles: true, cancelable: true}));
+            dispatchEvent(new DragEvent("drop", {dataTransfer: transfer, bubbles: true, cancelable: true}));
         }""",
         data,
     )
@@ -89,14 +89,14 @@ def test_pictures_are_removed_completed_and_their_fingers_swapped(opened, files)
     assert opened.locator(".grasp").count() == 0
 
 
-def test_what_is_no_picture_is_refused_before_it_is_sent(opened, tmp_path):
+def test_files_other_than_pictures_are_refused_before_they_are_sent(opened, tmp_path):
     (tmp_path / "notes.txt").write_text("no picture")
     choose(opened, "Choose gel images", [tmp_path / "notes.txt"])
-    opened.get_by_text("notes.txt is no picture.").wait_for()
+    opened.get_by_text("notes.txt is not a picture.").wait_for()
     assert opened.locator(".grasp").count() == 0
 
 
-def test_fewer_objects_than_there_are_leave_the_others_a_bar(opened, files):
+def test_objects_that_are_not_shown_share_one_bar(opened, files):
     opened.get_by_text("Options").click()
     opened.get_by_label("Objects to show").fill("3")
     opened.get_by_label("Objects to show").blur()
@@ -107,66 +107,66 @@ def test_fewer_objects_than_there_are_leave_the_others_a_bar(opened, files):
 
 
 @pytest.mark.parametrize(
-    ("verdict", "claim", "told"),
+    ("verdict", "claim", "text"),
     [
         ("none of these", "None of these", "The catalogue lacks the object with probability"),
-        ("no contact", "No contact", "The gels look untouched"),
-        ("not a gel image", "Not a gel image", "does not look like a gel"),
-        ("uncalibrated", None, "This model was never calibrated"),
+        ("no contact", "No contact", "The gel images show no contact"),
+        ("not a gel image", "Not a gel image", "do not look like the gel images"),
+        ("uncalibrated", None, "This model is not calibrated"),
     ],
 )
-def test_every_verdict_is_said_in_words(opened, files, searcher, verdict, claim, told):
+def test_every_verdict_has_its_text(opened, files, searcher, verdict, claim, text):
     document = searcher.query(files[:2]).to_dict() | {"verdict": verdict}
     if verdict != "none of these":
         document |= dict.fromkeys(("none_probability", "unlisted_probability", "posterior", "information"))
     if verdict in ("no contact", "not a gel image"):
         document |= {"results": [], "query": {"touches": [["a.png", "b.png"]], "grasps": [verdict]}}
-    ask_for(document, opened, files)
-    shown = opened.locator(".verdict")
-    shown.get_by_text(told).wait_for()
-    assert shown.get_by_role("heading").inner_text() == (claim or opened.locator(".photo .name").first.inner_text())
-    marks = {"no contact": "no contact, not judged", "not a gel image": "not a gel image, not judged"}
+    show_answer(document, opened, files)
+    block = opened.locator(".verdict")
+    block.get_by_text(text).wait_for()
+    assert block.get_by_role("heading").inner_text() == (claim or opened.locator(".photo .name").first.inner_text())
+    marks = {"no contact": "no contact, not scored", "not a gel image": "not a gel image, not scored"}
     assert opened.locator(".mark").all_inner_texts() == ([marks[verdict]] if verdict in marks else [])
 
 
 def test_probabilities_if_present_and_the_advice_of_the_service_are_shown(opened, files, searcher):
-    """The page computes neither."""
+    """The page itself computes neither of them."""
     document = searcher.query(files[:2], none_prior=0.999).to_dict()
     assert document["verdict"] == "none of these"
     document |= {"advice": "Another grasp would help: 2 more."}
     for place, match in enumerate(document["results"]):
         match["probability_if_present"] = 0.625 / 2**place
-    ask_for(document, opened, files)
+    show_answer(document, opened, files)
     best = document["results"][0]["object_id"]
     verdict = opened.locator(".verdict")
-    verdict.get_by_text(f"If it has the object, this is {best} with probability 62.5\u00a0%.").wait_for()
+    verdict.get_by_text(f"If it contains the object, this is {best} with probability 62.5\u00a0%.").wait_for()
     assert verdict.locator(".advice").inner_text() == "Another grasp would help: 2 more."
     shown = opened.locator(".photo.object .if-present").all_inner_texts()
     assert shown[:2] == ["62.5\u00a0% if present", "31.3\u00a0% if present"]
     assert len(shown) == len(document["results"])
 
 
-def test_the_probability_of_the_objects_that_are_not_listed_is_the_one_of_the_service(opened, files, searcher):
+def test_the_probability_of_unlisted_objects_is_that_of_the_service(opened, files, searcher):
     document = searcher.query(files[:2], top=3).to_dict() | {"unlisted_probability": 0.4375}
-    ask_for(document, opened, files)
+    show_answer(document, opened, files)
     assert opened.locator(".photo.rest .p").inner_text() == "43.8\u00a0%"
 
 
-def test_an_answer_of_before_there_was_advice_is_still_shown(opened, files, searcher):
-    """The history of a service holds such."""
+def test_an_answer_without_advice_of_an_earlier_version_is_shown(opened, files, searcher):
+    """The history may contain such answers."""
     document = searcher.query(files[:2], none_prior=0.999).to_dict()
     del document["advice"], document["more_grasps"], document["information"], document["unlisted_probability"]
     for match in document["results"]:
         del match["probability_if_present"]
-    ask_for(document, opened, files)
+    show_answer(document, opened, files)
     opened.locator(".verdict").get_by_text("The nearest objects are shown.").wait_for()
-    assert opened.locator(".advice, .if-present, .another").count() == 0
+    assert opened.locator(".advice, .if-present, .next-grasp").count() == 0
 
 
-def test_a_photo_shows_where_it_agrees_with_the_touch(opened, files):
+def test_a_photo_shows_its_agreement_with_the_touch(opened, files):
     ask(opened, files[:2])
     opened.locator(".photo.object button").first.click()
-    button = opened.get_by_role("button", name="Where it agrees with the touch")
+    button = opened.get_by_role("button", name="Show agreement with the touch")
     button.click()
     shade = opened.locator("canvas.map")
     shade.wait_for()
@@ -178,13 +178,13 @@ def test_a_photo_shows_where_it_agrees_with_the_touch(opened, files):
     assert shade.count() == 0
 
 
-def test_nearest_photos_of_a_photo_lead_on_to_their_objects(opened, files):
+def test_similar_photos_open_their_objects(opened, files):
     ask(opened, files[:2])
     opened.locator(".photo.object button").first.click()
-    near = opened.locator(".alike li button").first
-    near.wait_for()
-    name = near.inner_text()
-    near.click()
+    similar = opened.locator(".similar-photos li button").first
+    similar.wait_for()
+    name = similar.inner_text()
+    similar.click()
     opened.get_by_role("dialog", name=name).wait_for()
 
 
@@ -204,23 +204,23 @@ def test_metadata_of_an_object_are_searched_and_shown(browser, catalogue, model,
         assert facts.locator("dt, dd").all_inner_texts() == ["maker", "Wedgwood", "price", "3"]
 
 
-def test_grasp_something_closes_the_jaws_and_asks(opened):
+def test_grasp_something_grasps_and_queries(opened):
     opened.get_by_role("button", name="Grasp something").click()
     opened.locator(".answer").wait_for()
-    held = opened.locator(".held strong").inner_text()
+    name = opened.locator(".grasped-object strong").inner_text()
     assert opened.get_by_alt_text("Gel image").count() == 2
     opened.get_by_role("button", name="Grasp it again").click()
     opened.locator("legend", has_text="Grasp 2").wait_for()
-    opened.get_by_text("The jaws closed on").wait_for()
-    assert opened.locator(".held strong").inner_text() == held
+    opened.get_by_text("Grasped object:").wait_for()
+    assert opened.locator(".grasped-object strong").inner_text() == name
 
 
 def test_live_sensors_are_shown_and_taken_as_a_touch(opened):
     opened.get_by_role("button", name="Live sensors").click()
     live = opened.get_by_alt_text("Live picture of sensor b")
     live.wait_for()
-    comes = "async (one) => { while (!one.naturalWidth) await new Promise((go) => setTimeout(go, 20)); }"
-    live.evaluate(comes)
+    loaded = "async (one) => { while (!one.naturalWidth) await new Promise((go) => setTimeout(go, 20)); }"
+    live.evaluate(loaded)
     assert live.evaluate("one => one.naturalWidth") == 160
     opened.get_by_role("button", name="Take this touch").click()
     opened.get_by_alt_text("Gel image, grasp 1, finger b").wait_for()
@@ -228,7 +228,7 @@ def test_live_sensors_are_shown_and_taken_as_a_touch(opened):
     assert live.count() == 0
 
 
-def test_the_browsers_camera_takes_one_finger_after_the_other(opened):
+def test_the_browsers_camera_takes_pictures_finger_by_finger(opened):
     opened.get_by_role("button", name="Camera").click()
     opened.get_by_role("button", name="Take finger a").click()
     opened.get_by_role("button", name="Take finger b").click()
@@ -236,7 +236,7 @@ def test_the_browsers_camera_takes_one_finger_after_the_other(opened):
     assert opened.get_by_role("button", name="Ask", exact=True).is_enabled()
 
 
-def test_what_the_service_cannot_do_has_no_button(browser, index, files):
+def test_unavailable_features_have_no_button(browser, index, files):
     with address(index) as url, page(browser, url) as opened:
         assert opened.get_by_role("button", name="Grasp something").count() == 0
         assert opened.get_by_role("button", name="Live sensors").count() == 0
@@ -245,20 +245,20 @@ def test_what_the_service_cannot_do_has_no_button(browser, index, files):
         assert opened.get_by_role("link", name="History").count() == 0
 
 
-def test_the_page_asks_for_the_token_once(browser, index):
+def test_the_page_requests_the_token_once(browser, index):
     token = "sixteen letters or more"
     with address(index, token=token) as url, page(browser, url) as opened:
         opened.get_by_label("Token", exact=True).last.fill("another one, which is wrong")
-        opened.get_by_role("button", name="Go on").click()
-        opened.get_by_text("this is not the service's token").wait_for()
+        opened.get_by_role("button", name="Continue").click()
+        opened.get_by_text("This is not the service's token").wait_for()
         opened.get_by_label("Token", exact=True).last.fill(token)
-        opened.get_by_role("button", name="Go on").click()
+        opened.get_by_role("button", name="Continue").click()
         opened.get_by_role("heading", name="Which object is in the hand?").wait_for()
         opened.reload()
         opened.get_by_role("heading", name="Which object is in the hand?").wait_for()
 
 
-def test_what_the_service_refuses_is_said_in_its_own_sentence(opened, tmp_path):
+def test_a_refused_query_shows_the_message_of_the_service(opened, tmp_path):
     (tmp_path / "a.png").write_bytes(b"\x89PNG but no more")
     choose(opened, "Choose gel images", [tmp_path / "a.png"])
     choose(opened, "Choose finger b", [tmp_path / "a.png"])
@@ -267,8 +267,8 @@ def test_what_the_service_refuses_is_said_in_its_own_sentence(opened, tmp_path):
     assert opened.get_by_role("button", name="Try again").is_visible()
 
 
-def test_the_keyboard_alone_asks_and_looks(opened, files):
-    choose(opened, "Choose gel images", files[:2])  # the system's own dialog; Ask has the focus then
+def test_a_query_works_with_the_keyboard_only(opened, files):
+    choose(opened, "Choose gel images", files[:2])  # then Ask has the focus
     opened.keyboard.press("Enter")
     opened.locator(".answer").wait_for()
     card = opened.locator(".photo.object button").first
@@ -293,6 +293,6 @@ def test_axe_finds_nothing_serious_and_nothing_is_wider_than_the_screen(browser,
         assert serious(opened) == []
         assert opened.evaluate("document.documentElement.scrollWidth") <= width
         opened.locator(".photo.object button").first.click()
-        opened.locator(".alike li").first.wait_for()
+        opened.locator(".similar-photos li").first.wait_for()
         assert serious(opened) == []
         assert opened.locator("dialog").evaluate("one => one.scrollWidth <= one.clientWidth")

@@ -1,4 +1,4 @@
-"""The page in a real browser beside rigs: simulated jaws that close, and gels of a rig's file, live. Each a click."""
+"""The page in a real browser with rigs: grasps of the simulated rig, and live sensors of a rig file."""
 
 import dataclasses
 
@@ -19,12 +19,12 @@ from tests.serving import with_history
 
 pytestmark = pytest.mark.slow
 SEED = 20_000
-SHOWN = "async (one) => { while (!one.naturalWidth) await new Promise((go) => setTimeout(go, 20)); }"
+LOADED = "async (one) => { while (!one.naturalWidth) await new Promise((go) => setTimeout(go, 20)); }"
 
 
 @pytest.fixture(scope="module")
 def index(recording, tmp_path_factory):
-    """Of three simulated objects, with a model that subtracts the untouched gel."""
+    """An index of three simulated objects, with a model that subtracts the no-contact frame."""
     folder, rig = tmp_path_factory.mktemp("simulated"), SimRig(SEED)
     for name in rig.object_ids(3):
         (folder / "catalog" / name).mkdir(parents=True)
@@ -38,15 +38,15 @@ def index(recording, tmp_path_factory):
 
 
 def live(opened):
-    """The live picture of a sensor, which has come."""
+    """Open the live sensors and return the loaded picture of one."""
     opened.get_by_role("button", name="Live sensors").click()
     picture = opened.get_by_alt_text("Live picture of sensor b")
     picture.wait_for()
-    picture.evaluate(SHOWN)
+    picture.evaluate(LOADED)
     return picture
 
 
-def test_the_simulated_jaws_close_and_their_untouched_gels_go_with_the_touch(browser, index, tmp_path):
+def test_simulated_grasps_include_their_no_contact_frames(browser, index, tmp_path):
     with (
         with_history(index, tmp_path, rig=simulated_live_rig(index), serve=address) as url,
         page(browser, url) as opened,
@@ -55,19 +55,19 @@ def test_the_simulated_jaws_close_and_their_untouched_gels_go_with_the_touch(bro
         opened.get_by_role("button", name="Grasp something").click()
         opened.locator(".answer").wait_for()
         names = [path.name for path in (index.parent / "catalog").iterdir()]
-        assert opened.locator(".held strong").inner_text() in names
+        assert opened.locator(".grasped-object strong").inner_text() in names
         assert opened.get_by_alt_text("Gel image").count() == 2
         opened.get_by_role("button", name="Grasp it again").click()
-        opened.get_by_role("region", name="Grasp by grasp").get_by_text("would tell most").wait_for()
+        opened.get_by_role("region", name="Grasp by grasp").get_by_text("gives the most information").wait_for()
         opened.get_by_role("navigation").get_by_role("link", name="History").click()
         opened.locator(".query").first.get_by_role("link").click()
-        opened.get_by_role("region", name="Grasp by grasp").get_by_text("would tell most").wait_for()
+        opened.get_by_role("region", name="Grasp by grasp").get_by_text("gives the most information").wait_for()
 
 
-def test_gels_of_a_rigs_file_are_live_and_taken_untouched_and_touched(browser, index):
+def test_sensors_of_a_rig_file_are_live_and_give_no_contact_frames_and_touches(browser, index):
     with replay_file() as file, address(index, load_live_rig(str(file), index)) as url, page(browser, url) as opened:
         live(opened)
-        assert opened.get_by_role("button", name="Grasp something").count() == 0  # nobody moves a rig from here
+        assert opened.get_by_role("button", name="Grasp something").count() == 0  # the page never moves a real rig
         opened.get_by_role("button", name="Take as no-contact frames").click()
         opened.get_by_text("Options").click()
         opened.get_by_role("button", name="Finger b: taken").wait_for()

@@ -1,4 +1,4 @@
-"""The page in a real browser: what people say, the history, the catalogue, the human test. Each sentence is a click."""
+"""The page in a real browser: cumulative queries, feedback, the history, the catalogue, the human baseline."""
 
 import io
 import json
@@ -17,8 +17,8 @@ MANY = 100_000
 
 @pytest.fixture(scope="module")
 def url(index, tmp_path_factory):
-    """A service that keeps what it is told, with a recording of twelve objects that the model never saw."""
-    folder = tmp_path_factory.mktemp("kept")
+    """A service with a history, and a recording of twelve unseen objects."""
+    folder = tmp_path_factory.mktemp("history")
     unseen = synthetic.write_recording(folder / "unseen", synthetic.make_objects(12, seed=500), 2)
     with with_history(index, folder, unseen, serve=address) as found:
         yield found
@@ -30,12 +30,12 @@ def opened(browser, url):
         yield found
 
 
-def to(opened, name):
-    """Another view, by its link."""
+def open_view(opened, name):
+    """Open a view by its link."""
     opened.get_by_role("navigation").get_by_role("link", name=name).click()
 
 
-def test_how_the_answer_changed_grasp_by_grasp_is_drawn_and_told_in_numbers(opened, files):
+def test_the_cumulative_query_is_plotted_and_tabulated(opened, files):
     ask(opened, files)
     section = opened.get_by_role("region", name="Grasp by grasp")
     section.get_by_text("changed the answer most").wait_for()
@@ -56,38 +56,38 @@ INFORMATION = {
 
 
 def informed(answer, **changes):
-    """The document of an answer with this information, which its probabilities contradict."""
+    """Return the document of an answer with this information, which contradicts its probabilities."""
     return answer.to_dict() | {"information": INFORMATION | changes}
 
 
 def test_the_information_of_an_answer_is_shown_as_the_service_sends_it(opened, files, searcher):
-    """The page computes none: neither that of each grasp by itself, nor that of the next one."""
+    """The page computes neither the information of each grasp nor that of the next one."""
     grasps = [files[:2], files[2:]]
     whole = informed(searcher.query(grasps))
-    alone = [
+    per_grasp = [
         informed(one, gained_bits=bits) for one, bits in zip(searcher.query_many(grasps), (0.5, 3.125), strict=True)
     ]
-    growing = {"answers": [one.to_dict() for one in searcher.query_cumulative(grasps)], "per_grasp": alone}
+    cumulative = {"answers": [one.to_dict() for one in searcher.query_cumulative(grasps)], "per_grasp": per_grasp}
     opened.route("**/v1/query", lambda route: route.fulfill(json=whole))
-    opened.route("**/v1/query/growing*", lambda route: route.fulfill(json=growing))
+    opened.route("**/v1/query/cumulative*", lambda route: route.fulfill(json=cumulative))
     ask(opened, files)
-    another = opened.get_by_role("region", name="Another grasp").inner_text()
-    assert "would tell about 0.38 of the 2.5 bits that are open" in another
-    assert "3 grasps of one object weigh as much as 1.63 independent ones" in another
-    assert "The matcher cannot suggest where to grasp" in another
+    text = opened.get_by_role("region", name="Another grasp").inner_text()
+    assert "would add about 0.38 of the 2.5 missing bits" in text
+    assert "3 grasps of one object count as 1.63 independent ones" in text
+    assert "The matcher cannot suggest where to grasp" in text
     section = opened.get_by_role("region", name="Grasp by grasp")
-    told = section.get_by_text("would tell most").inner_text()
-    assert "grasp 2 would tell most: 3.1 of the 4.0 bits" in told
+    sentence = section.get_by_text("gives the most information").inner_text()
+    assert "grasp 2 gives the most information: 3.1 of the 4.0 bits" in sentence
     section.get_by_text("As numbers").click()
-    row = section.get_by_role("row", name="The grasp by itself tells").get_by_role("cell")
+    row = section.get_by_role("row", name="Information of the grasp on its own").get_by_role("cell")
     assert row.all_inner_texts() == ["0.50 bits", "3.13 bits"]
 
 
-def test_another_grasp_of_under_a_hundredth_bit_would_tell_hardly_anything(opened, files, searcher):
+def test_another_grasp_below_a_hundredth_bit_adds_almost_no_information(opened, files, searcher):
     document = informed(searcher.query(files[:2]), next_grasp_bits=0.004)
     opened.route("**/v1/query", lambda route: route.fulfill(json=document))
     ask(opened, files[:2])
-    assert "would tell hardly anything" in opened.get_by_role("region", name="Another grasp").inner_text()
+    assert "would add almost no information" in opened.get_by_role("region", name="Another grasp").inner_text()
 
 
 def test_feedback_is_stored_and_shown_in_the_history(opened, files):
@@ -96,39 +96,39 @@ def test_feedback_is_stored_and_shown_in_the_history(opened, files):
     name = opened.locator(".photo.object .name").nth(2).inner_text()
     opened.get_by_label("Which object was it?").fill(name)
     opened.get_by_role("list", name="Objects", exact=True).get_by_role("button", name=name).click()
-    opened.get_by_text(f"Said to be {name}.").wait_for()
-    to(opened, "History")
-    opened.get_by_label("Show", exact=True).select_option("Said to be another object")
-    row = opened.locator(".query", has_text=f"Said to be {name}").first
+    opened.get_by_text(f"Feedback: {name}.").wait_for()
+    open_view(opened, "History")
+    opened.get_by_label("Feedback", exact=True).select_option("Another object")
+    row = opened.locator(".query", has_text=f"Feedback: {name}").first
     row.wait_for()
     row.get_by_role("link").click()
-    opened.locator(".answer").get_by_text(f"Said to be {name}.").wait_for()
+    opened.locator(".answer").get_by_text(f"Feedback: {name}.").wait_for()
     assert opened.get_by_alt_text("Gel image").count() == 4
 
 
 @pytest.mark.parametrize(
-    ("button", "told"), [("Right", "Said to be right."), ("None of the catalogue", "Said to be none of these.")]
+    ("button", "text"), [("Right", "Feedback: right."), ("Not in the catalogue", "Feedback: not in the catalogue.")]
 )
-def test_right_and_none_are_a_click_each_and_the_history_shows_them(opened, files, button, told):
+def test_feedback_right_and_none_take_one_click_and_appear_in_the_history(opened, files, button, text):
     opened.get_by_text("Options").click()
-    prior = opened.get_by_label("Chance, before anything is felt, that the catalogue lacks it")
-    prior.fill("0.001")  # so that an object is the answer, of which both can be said
+    prior = opened.get_by_label("Prior probability that the catalogue lacks the object")
+    prior.fill("0.001")  # so that the answer is an object, which has both buttons
     prior.blur()
     ask(opened, files)
-    asked = opened.get_by_role("region", name="Was this right?")
-    asked.get_by_role("button", name=button, exact=True).click()
-    opened.get_by_text(told).wait_for()
-    assert asked.get_by_role("button").count() == 0
-    to(opened, "History")
-    opened.locator(".query").first.get_by_text(told.removesuffix(".")).wait_for()
+    panel = opened.get_by_role("region", name="Was this right?")
+    panel.get_by_role("button", name=button, exact=True).click()
+    opened.get_by_text(text).wait_for()
+    assert panel.get_by_role("button").count() == 0
+    open_view(opened, "History")
+    opened.locator(".query").first.get_by_text(text.removesuffix(".")).wait_for()
 
 
 def test_the_history_is_searched_and_exported(opened, files):
     ask(opened, files[:2])
-    to(opened, "History")
+    open_view(opened, "History")
     opened.locator(".query").first.wait_for()
-    opened.get_by_role("searchbox", name="Search").fill("what nobody ever said")
-    opened.get_by_text("Nothing was found.").wait_for()
+    opened.get_by_role("searchbox", name="Search").fill("words that never occur")
+    opened.get_by_text("No matching questions.").wait_for()
     opened.get_by_role("searchbox", name="Search").fill("")
     opened.locator(".query").first.wait_for()
     with opened.expect_download() as download:
@@ -138,41 +138,41 @@ def test_the_history_is_searched_and_exported(opened, files):
         assert len(archive.read("history.jsonl").splitlines()) >= 1
 
 
-def test_touches_that_feel_alike_are_found_from_a_touch(opened, files):
+def test_similar_touches_are_found_from_a_touch(opened, files):
     ask(opened, files[:2])
     ask(opened, files[2:])
-    to(opened, "History")
-    opened.get_by_role("button", name="Alike").first.click()
-    opened.get_by_role("heading", name="Touches that feel like this one to the model").wait_for()
-    opened.get_by_role("region", name="Touches that feel alike").locator(".query").first.wait_for()
+    open_view(opened, "History")
+    opened.get_by_role("button", name="Similar").first.click()
+    opened.get_by_role("heading", name="Similar touches").wait_for()
+    opened.get_by_role("region", name="Similar touches").locator(".query").first.wait_for()
 
 
-def test_the_catalogue_is_searched_and_its_photos_lead_to_their_neighbours(opened, catalogue):
+def test_the_catalogue_is_searched_and_its_photos_open_similar_photos(opened, catalogue):
     name = sorted(path.name for path in catalogue.iterdir() if path.is_dir())[0]
-    to(opened, "Catalogue")
+    open_view(opened, "Catalogue")
     opened.locator(".grid li").nth(23).wait_for()
     opened.get_by_role("searchbox", name="Search").fill(f"{name} 2.jpg")
     opened.get_by_text("1 photo found").wait_for()
     opened.locator(".grid button").click()
     dialog = opened.get_by_role("dialog", name=name)
     assert dialog.get_by_alt_text(f"Photo {name}/2.jpg").is_visible()
-    assert dialog.get_by_role("button", name="Where it agrees").count() == 0  # with no touch
-    dialog.locator(".alike button").first.click()
-    opened.get_by_role("dialog").locator(".alike li").first.wait_for()
+    assert dialog.get_by_role("button", name="Show agreement").count() == 0  # there is no touch
+    dialog.locator(".similar-photos button").first.click()
+    opened.get_by_role("dialog").locator(".similar-photos li").first.wait_for()
     opened.keyboard.press("Escape")
     opened.get_by_role("searchbox", name="Search").fill("no such words")
-    opened.get_by_text("No photo of the catalogue has all these words.").wait_for()
+    opened.get_by_text("No photo of the catalogue matches all these words.").wait_for()
     assert opened.locator(".grid li").count() == 0
 
 
 @pytest.fixture
 def many(opened):
-    """The page, whose service says that it has 100,000 photos; and the offsets that were asked for."""
+    """The page with a mocked catalogue of 100,000 photos, and the list of requested offsets."""
     offsets = []
 
     def listed(route):
-        asked = {name: values[0] for name, values in parse_qs(urlsplit(route.request.url).query).items()}
-        offset, limit = int(asked.get("offset", 0)), int(asked["limit"])
+        parameters = {name: values[0] for name, values in parse_qs(urlsplit(route.request.url).query).items()}
+        offset, limit = int(parameters.get("offset", 0)), int(parameters["limit"])
         offsets.append(offset)
         last = min(MANY, offset + limit)
         items = [{"id": f"o{one}/1.jpg", "object_id": f"object {one}", "metadata": {}} for one in range(offset, last)]
@@ -185,26 +185,26 @@ def many(opened):
     return opened, offsets
 
 
-def test_of_100_000_photos_those_on_the_screen_are_drawn_and_their_pages_asked_for(many):
+def test_of_100_000_photos_only_those_on_the_screen_are_requested_and_drawn(many):
     opened, offsets = many
-    to(opened, "Catalogue")
+    open_view(opened, "Catalogue")
     opened.get_by_text("100,000 photos of").wait_for()
     opened.locator(".grid li").first.wait_for()
     assert opened.locator(".grid li").count() < 100
-    for share in (0.5, 0.99, 0.2):
-        opened.evaluate("(share) => scrollTo(0, share * document.documentElement.scrollHeight)", share)
+    for fraction in (0.5, 0.99, 0.2):
+        opened.evaluate("(part) => scrollTo(0, part * document.documentElement.scrollHeight)", fraction)
         opened.wait_for_timeout(300)
         opened.locator(".grid li").first.wait_for()
         opened.locator(".grid button").last.get_by_text("object ").wait_for()
         places = [int(one) for one in opened.locator(".grid li").evaluate_all("all => all.map((o) => o.dataset.place)")]
         assert len(places) < 120
-        assert max(places) == pytest.approx(share * MANY, rel=0.02)
+        assert max(places) == pytest.approx(fraction * MANY, rel=0.02)
     assert len(set(offsets)) < 12  # of 500 pages
 
 
-def test_the_keyboard_walks_through_the_catalogue_to_its_end(many):
+def test_the_keyboard_moves_through_the_catalogue_to_its_end(many):
     opened, _ = many
-    to(opened, "Catalogue")
+    open_view(opened, "Catalogue")
     opened.locator(".grid button").first.focus()
     opened.keyboard.press("ArrowRight")
     focus = "document.activeElement.innerText"
@@ -217,12 +217,12 @@ def test_the_keyboard_walks_through_the_catalogue_to_its_end(many):
     assert opened.evaluate(focus).strip() == "object 0"
 
 
-def test_ten_choices_are_made_by_mouse_and_by_key_and_the_result_stands_beside_the_models(opened):
-    to(opened, "Test")
+def test_trials_work_by_mouse_and_key_and_show_both_results(opened):
+    open_view(opened, "Test")
     opened.get_by_role("button", name="Begin").wait_for()
     assert opened.locator("main").get_by_text("false", exact=True).count() == 0
     opened.get_by_label("Trials").fill("2")
-    opened.get_by_label("Your name, if you like").fill("Ada")
+    opened.get_by_label("Your name (optional)").fill("Ada")
     opened.get_by_role("button", name="Begin").click()
     photos = opened.get_by_role("list", name="Photos to choose from").get_by_role("button")
     photos.nth(9).wait_for()
@@ -231,11 +231,11 @@ def test_ten_choices_are_made_by_mouse_and_by_key_and_the_result_stands_beside_t
     opened.get_by_role("button", name="Next").click()
     opened.get_by_text("Trial 2 of 2").wait_for()
     opened.keyboard.press("0")
-    opened.get_by_role("button", name="The result").click()
-    opened.get_by_role("heading", name="The result").wait_for()
+    opened.get_by_role("button", name="Result").click()
+    opened.get_by_role("heading", name="Result").wait_for()
     assert opened.locator(".score .p").count() == 2
     assert all(" of 2, " in text and "[" in text for text in opened.locator(".score .p").all_inner_texts())
-    opened.get_by_role("link", name="All series, and another one").click()
+    opened.get_by_role("link", name="All series").click()
     opened.locator(".series").get_by_text("Ada").first.wait_for()
 
 
@@ -249,7 +249,7 @@ def test_axe_finds_nothing_serious_in_any_view_and_none_is_wider_than_the_screen
         opened.locator(".names button").first.wait_for()
         for name, shown in (("", ""), ("Catalogue", ".grid li"), ("History", ".query"), ("Test", ".begin")):
             if name:
-                to(opened, name)
+                open_view(opened, name)
                 opened.locator(shown).first.wait_for()
             assert serious(opened) == [], name
             assert opened.evaluate("document.documentElement.scrollWidth") <= width, name

@@ -1,4 +1,4 @@
-"""Queries over HTTP: the same answer as in Python, however the pictures are sent."""
+"""Queries over HTTP: the same answers as in Python, for JSON and forms."""
 
 import base64
 
@@ -11,7 +11,7 @@ from tests.serving import problem
 
 @pytest.fixture(scope="module")
 def grasps(tmp_path_factory):
-    """Files' contents of two grasps of one object."""
+    """The image files of two grasps of one object."""
     objects = synthetic.make_objects(1, seed=9)
     files = synthetic.write_queries(tmp_path_factory.mktemp("grasps"), objects, 2)[objects[0].object_id]
     return [[path.read_bytes() for path in grasp] for grasp in files]
@@ -26,15 +26,15 @@ def form(grasps, **fields):
     return {"files": images, "data": fields}
 
 
-def same(document, result):
-    """All of an answer but how long it took."""
+def equal_but_times(document, result):
+    """Return whether a document equals a result, apart from the times."""
     expected = result.to_dict()
     return {**document, "timing_ms": 0} == {**expected, "timing_ms": 0} and set(document["timing_ms"]) == set(
         expected["timing_ms"]
     )
 
 
-def test_openapi_says_the_form_that_answers_have(client, searcher, grasps):
+def test_openapi_describes_the_fields_of_answers(client, searcher, grasps):
     answer = searcher.query(grasps).to_dict()
     assert set(answer) == set(QueryDocument.model_fields)
     assert set(answer["results"][0]) == set(MatchDocument.model_fields) - {"reference"}  # the catalogue has no touches
@@ -42,34 +42,34 @@ def test_openapi_says_the_form_that_answers_have(client, searcher, grasps):
 
 
 def test_json_and_multipart_give_the_document_of_the_searcher(client, searcher, grasps):
-    for given in (grasps[:1], grasps):
-        expected = searcher.query(given, top=3, none_prior=0.2)
-        by_json = client.post("/v1/query", json={"touches": encoded(given), "top": 3, "none_prior": 0.2})
-        by_form = client.post("/v1/query", **form(given, top="3", none_prior="0.2"))
-        assert same(by_json.json(), expected), by_json.text
-        assert same(by_form.json(), expected), by_form.text
+    for touches in (grasps[:1], grasps):
+        expected = searcher.query(touches, top=3, none_prior=0.2)
+        by_json = client.post("/v1/query", json={"touches": encoded(touches), "top": 3, "none_prior": 0.2})
+        by_form = client.post("/v1/query", **form(touches, top="3", none_prior="0.2"))
+        assert equal_but_times(by_json.json(), expected), by_json.text
+        assert equal_but_times(by_form.json(), expected), by_form.text
 
 
-def test_a_batch_gives_an_answer_for_each_object_in_their_order(client, searcher, grasps):
+def test_a_batch_returns_one_answer_per_object_in_order(client, searcher, grasps):
     objects = [grasps, grasps[1:]]
     answers = client.post("/v1/query/batch", json={"objects": [encoded(one) for one in objects]}).json()["answers"]
     for answer, expected in zip(answers, searcher.query_many(objects), strict=True):
-        assert same(answer, expected)
+        assert equal_but_times(answer, expected)
 
 
 def test_cumulative_query_returns_cumulative_and_per_grasp_answers(client, searcher, grasps):
-    asked = {"touches": encoded(grasps)}
-    assert client.post("/v1/query/cumulative", json=asked).json()["per_grasp"] == []
-    found = client.post("/v1/query/growing?alone=true", json=asked).json()
+    query = {"touches": encoded(grasps)}
+    assert client.post("/v1/query/cumulative", json=query).json()["per_grasp"] == []
+    found = client.post("/v1/query/cumulative?per_grasp=true", json=query).json()
     for answer, expected in zip(found["per_grasp"], searcher.query_many([[grasp] for grasp in grasps]), strict=True):
-        assert same(answer, expected)
+        assert equal_but_times(answer, expected)
     answers = found["answers"]
     assert [len(answer["query"]["touches"]) for answer in answers] == [1, 2]
     for answer, expected in zip(answers, searcher.query_cumulative(grasps), strict=True):
-        assert same(answer, expected)
+        assert equal_but_times(answer, expected)
 
 
-def test_the_map_of_a_photo_that_is_all_of_one_colour_is_flat_and_a_real_one_is_not(client, searcher, grasps):
+def test_the_occlusion_map_of_a_photo_is_not_flat(client, searcher, grasps):
     photo = searcher.generation.rows[0]["path"]
     found = client.post("/v1/agreement", json={"photo": photo, "touches": encoded(grasps), "squares": 2}).json()
     assert (found["rows"], found["columns"], [len(row) for row in found["falls"]]) == (2, 2, [2, 2])
@@ -77,29 +77,29 @@ def test_the_map_of_a_photo_that_is_all_of_one_colour_is_flat_and_a_real_one_is_
 
 
 @pytest.mark.parametrize(
-    ("body", "said"),
+    ("body", "message"),
     [
         ({"touches": []}, "touches: List should have at least 1 item"),
-        ({"touches": [["%%%"]]}, "touches.0.0: Value error, must be a picture's file in base64"),
+        ({"touches": [["%%%"]]}, "touches.0.0: Value error, must be an image file in base64"),
         ({"touches": [["aGk="]], "tops": 3}, "tops: Extra inputs are not permitted"),
         ({"touches": [["aGk="]], "top": 0}, "top: Input should be greater than or equal to 1"),
         ({"touches": [["aGk="]], "none_prior": 1}, "none_prior: Input should be less than 1"),
     ],
 )
-def test_a_body_of_the_wrong_form_is_told_by_place(client, body, said):
-    assert said in problem(client.post("/v1/query", json=body), 422, "bad-input")
+def test_an_invalid_body_is_reported_with_the_place(client, body, message):
+    assert message in problem(client.post("/v1/query", json=body), 422, "bad-input")
 
 
-def test_what_is_no_picture_and_a_missing_finger_are_told_in_our_sentences(client, grasps):
-    told = problem(client.post("/v1/query", json={"touches": [["aGk=", "aGk="]]}), 422, "bad-image")
-    assert told.startswith("grasp 1, finger a: not a PNG, JPEG, BMP")
-    told = problem(client.post("/v1/query", json={"touches": [encoded(grasps)[0][:1]]}), 422, "bad-input")
-    assert "this model takes 2 gel image(s) for one touch; got 1" in told
-    told = problem(client.post("/v1/query", **form([grasps[0][:1]])), 422, "bad-input")
-    assert "gelsight must be given 2 times for each grasp; got 1" in told
+def test_bad_pictures_and_missing_fingers_get_clear_messages(client, grasps):
+    detail = problem(client.post("/v1/query", json={"touches": [["aGk=", "aGk="]]}), 422, "bad-image")
+    assert detail.startswith("grasp 1, finger a: not a PNG, JPEG, BMP")
+    detail = problem(client.post("/v1/query", json={"touches": [encoded(grasps)[0][:1]]}), 422, "bad-input")
+    assert "this model takes 2 gel image(s) for one touch; got 1" in detail
+    detail = problem(client.post("/v1/query", **form([grasps[0][:1]])), 422, "bad-input")
+    assert "gelsight must occur 2 times for each grasp, got 1" in detail
 
 
-def test_a_body_of_another_kind_and_broken_json_are_refused(client):
+def test_other_content_types_and_broken_json_are_refused(client):
     problem(client.post("/v1/query", content=b"x", headers={"content-type": "text/plain"}), 415, "unsupported-type")
     problem(client.post("/v1/query", content=b"x"), 415, "unsupported-type")
     broken = client.post("/v1/query", content=b"{", headers={"content-type": "application/json"})

@@ -1,4 +1,4 @@
-"""Reference touches over HTTP and on the page: their gel images by id, and an object that has no photo."""
+"""Reference touches over HTTP and on the page: their gel images by id, and an object without photos."""
 
 import io
 
@@ -15,7 +15,7 @@ from tests.serving import problem, service, with_history
 @pytest.fixture
 def index(catalogue_with_touches, tmp_path):
     build_index(
-        catalogue_with_touches, write_reference_model(tmp_path / "felt.safetensors"), tmp_path / "index", quiet=True
+        catalogue_with_touches, write_reference_model(tmp_path / "model.safetensors"), tmp_path / "index", quiet=True
     )
     return tmp_path / "index"
 
@@ -24,7 +24,7 @@ def files(grasp):
     return {"files": [("gelsight", (path.name, path.read_bytes())) for path in grasp]}
 
 
-def test_the_gel_images_that_an_answer_names_are_shown(index, catalogue_with_touches, touches):
+def test_the_reference_gel_images_of_an_answer_are_served(index, catalogue_with_touches, touches):
     with service(index) as client:
         found = client.post("/v1/query", **files(touches[NAMES[1]][1])).json()
         best = {match["object_id"]: match for match in found["results"]}[NAMES[1]]
@@ -34,45 +34,45 @@ def test_the_gel_images_that_an_answer_names_are_shown(index, catalogue_with_tou
             assert whole.content == (catalogue_with_touches / path).read_bytes()
             assert max(Image.open(io.BytesIO(small.content)).size) == 64
             assert client.get(f"/v1/photos/{path}", headers={"if-none-match": whole.headers["etag"]}).status_code == 304
-        # What lies in the catalogue but was not taken up as a reference is no more shown than any other file.
+        # Files in the catalogue folder that are not references of the index are not served.
         (catalogue_with_touches / NAMES[5]).joinpath("touch_0_a.png").write_bytes(whole.content)
         assert problem(client.get(f"/v1/photos/{NAMES[5]}/touch_0_a.png"), 404, "unknown")
 
 
-def test_a_gel_image_is_no_photo_to_compare_with(index, touches):
-    """Neither that of an object with photos, nor the one that stands for the photo of an object without."""
+def test_reference_gel_images_have_no_similar_photos(index, touches):
+    """This holds for objects with photos, and for an object whose gel image replaces the missing photo."""
     with service(index) as client:
         for name in (NAMES[0], NAMES[2]):
             answer = client.get(f"/v1/nearest/{name}/touch_0_a.png")
-            assert "no photo" in problem(answer, 404, "unknown")
+            assert "not a photo" in problem(answer, 404, "unknown")
         assert client.get(f"/v1/photos/{NAMES[2]}/touch_0_a.png").status_code == 200
 
 
 def test_feedback_on_an_object_without_photos_adds_no_photo(index, touches, tmp_path):
     with with_history(index, tmp_path) as client:
         for name in (NAMES[0], NAMES[2]):
-            asked = client.post("/v1/query", **files(touches[name][0]))
-            said = {"query": asked.headers["x-query-id"], "feedback": "object", "object_id": name}
-            assert client.post("/v1/feedback", json=said).status_code == 201
-            entry = client.get(f"/v1/history/{said['query']}").json()
+            response = client.post("/v1/query", **files(touches[name][0]))
+            feedback = {"query": response.headers["x-query-id"], "feedback": "object", "object_id": name}
+            assert client.post("/v1/feedback", json=feedback).status_code == 201
+            entry = client.get(f"/v1/history/{feedback['query']}").json()
             assert (entry["feedback"], entry["object_id"]) == ("object", name)
-            assert entry["answer"] == asked.json()
+            assert entry["answer"] == response.json()
     assert [grasp.object_id for grasp in load_grasps(tmp_path / "recording")] == [NAMES[0]]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
-def test_the_page_shows_the_nearest_reference_touch_beside_photo_and_touch(browser, index, touches, width):
+def test_the_page_shows_the_nearest_reference_touch_next_to_photo_and_touch(browser, index, touches, width):
     with address(index) as url, page(browser, url, width) as opened:
         ask(opened, touches[NAMES[1]][1])
         card = opened.locator(".photo.object", has_text=NAMES[1])
         assert card.locator(".reference img").count() == 2
         opened.get_by_text("How this was found").click()
-        opened.get_by_text("8 of 4 objects; what they are worth was fitted on 40 touches of 20 objects").wait_for()
+        opened.get_by_text("8 of 4 objects; calibrated on 40 touches of 20 objects").wait_for()
         card.locator("button").click()
         dialog = opened.get_by_role("dialog", name=NAMES[1])
         dialog.get_by_role("img", name="Gel image: Nearest reference touch, finger A").wait_for()
-        dialog.get_by_label("Reference touch beside the photo").select_option("1")
+        dialog.get_by_label("Reference touch next to the photo").select_option("1")
         dialog.get_by_role("img", name="Gel image: Nearest reference touch, finger B").wait_for()
         assert "cosine 1.00; references add" in dialog.inner_text()
         assert serious(opened) == []
@@ -80,10 +80,10 @@ def test_the_page_shows_the_nearest_reference_touch_beside_photo_and_touch(brows
 
 
 @pytest.mark.slow
-def test_an_object_without_photos_is_said_to_be_one_on_the_page(browser, index, touches):
+def test_the_page_marks_an_object_without_photos(browser, index, touches):
     with address(index) as url, page(browser, url) as opened:
         ask(opened, touches[NAMES[2]][0])
         opened.locator(".photo.object", has_text=NAMES[2]).locator("button").click()
         dialog = opened.get_by_role("dialog", name=NAMES[2])
-        dialog.get_by_text("no photo: found by touches alone").wait_for()
-        assert dialog.get_by_role("button", name="Where it agrees with the touch").count() == 0
+        dialog.get_by_text("no photo: scored by its touches only").wait_for()
+        assert dialog.get_by_role("button", name="Show agreement with the touch").count() == 0

@@ -1,4 +1,4 @@
-"""Who may ask the service, and what every response says to browsers."""
+"""Access control of the service, and the security headers of every response."""
 
 import pytest
 
@@ -12,27 +12,27 @@ TOKEN = "a token of some length"
 
 @pytest.fixture(scope="module")
 def guarded(index):
-    with service(index, host="0.0.0.0", token=TOKEN) as opened:
-        yield opened
+    with service(index, host="0.0.0.0", token=TOKEN) as client:
+        yield client
 
 
-def test_another_bind_than_this_machine_needs_a_token(index):
+def test_a_host_other_than_this_machine_requires_a_token(index):
     for host in ("0.0.0.0", "::", "192.168.1.4", "robot.local"):
-        with pytest.raises(ConfigError, match=f"{host} can be reached from other machines, so a token must be given"):
+        with pytest.raises(ConfigError, match=f"Other machines can reach {host}, so a token is required"):
             ServiceSettings(index=index, host=host)
         ServiceSettings(index=index, host=host, token=TOKEN)
     for host in ("127.0.0.1", "::1", "localhost", "127.3.2.1"):
         ServiceSettings(index=index, host=host)
-    with pytest.raises(ConfigError, match="a token must be 16 or more ASCII characters; got 5"):
+    with pytest.raises(ConfigError, match="A token must have at least 16 ASCII characters, got 5"):
         ServiceSettings(index=index, token="short")
 
 
 @pytest.mark.parametrize("host", ["evil.example", "127.0.0.1.evil.example:8000", "", "[::1"])
-def test_a_name_that_leads_here_from_elsewhere_is_refused(client, host):
+def test_foreign_host_names_are_refused(client, host):
     problem(client.get("/v1/index", headers={"host": host}), 421, "wrong-host")
 
 
-def test_a_page_of_another_origin_may_not_ask(client):
+def test_requests_from_pages_of_another_origin_are_refused(client):
     for headers in ({"origin": "https://evil.example"}, {"origin": "null"}, {"sec-fetch-site": "cross-site"}):
         response = client.post("/v1/query", headers=headers)
         problem(response, 403, "refused")
@@ -41,7 +41,7 @@ def test_a_page_of_another_origin_may_not_ask(client):
     problem(client.options("/v1/query", headers={"origin": "https://evil.example"}), 403, "refused")
 
 
-def test_only_who_knows_the_token_is_answered(guarded):
+def test_requests_without_the_token_are_refused(guarded):
     for headers in (
         {},
         {"authorization": "Bearer wrong"},
@@ -67,7 +67,7 @@ def test_the_page_gets_a_cookie_that_scripts_cannot_read_for_the_token(guarded):
 
 
 @pytest.mark.parametrize("path", ["/", "/v1/index", "/v1/nothing", "/v1/photos/x", "/openapi.json", "/healthz"])
-def test_every_response_tells_browsers_to_run_no_script_but_ours(client, path):
+def test_every_response_has_the_security_headers(client, path):
     response = client.get(path)
     for name, value in HEADERS.items():
         assert response.headers[name] == value
@@ -75,23 +75,23 @@ def test_every_response_tells_browsers_to_run_no_script_but_ours(client, path):
     assert "default-src 'none'" in HEADERS["content-security-policy"]
 
 
-def test_the_page_holds_no_inline_script_or_style(client):
+def test_the_page_has_no_inline_script_or_style(client):
     page = client.get("/").text
     assert "<style" not in page
     assert " style=" not in page
     assert "<script>" not in page
 
 
-def test_a_failure_says_nothing_of_the_inside(client, monkeypatch):
+def test_an_unexpected_error_reveals_no_internals(client, monkeypatch):
     parts = client.app.state.service
-    monkeypatch.setattr(parts.metrics, "page", lambda: 1 / 0)
+    monkeypatch.setattr(parts.metrics, "render", lambda: 1 / 0)
     response = client.get("/metrics")
-    told = problem(response, 500, "failed")
-    assert told == "unexpected ZeroDivisionError; the log of the service says more"
+    detail = problem(response, 500, "failed")
+    assert detail == "Unexpected ZeroDivisionError. See the log of the service."
     assert response.headers["x-content-type-options"] == "nosniff"
 
 
-def test_the_pages_files_are_looked_up_by_name_and_nothing_else_is(client):
+def test_only_the_files_of_the_page_are_served(client):
     whole = client.get("/")
     assert (whole.status_code, whole.headers["content-type"]) == (200, "text/html; charset=utf-8")
     assert client.get("/index.html").content == whole.content

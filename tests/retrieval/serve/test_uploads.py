@@ -1,4 +1,4 @@
-"""Hostile bodies: refused with a sentence, soon, before memory is spent, and the service goes on."""
+"""Hostile bodies: the service refuses them quickly with a clear message, before memory is spent."""
 
 import base64
 import io
@@ -26,15 +26,15 @@ def post(client, *images):
 
 @pytest.mark.parametrize(("width", "height"), [(4473, 4473), (50_000, 50_000), (2**31 - 1, 2**31 - 1)])
 def test_a_picture_of_more_than_20_million_pixels_is_refused_by_its_header(client, width, height):
-    told = problem(post(client, png_file(width, height), png_file(8, 8)), 422, "bad-image")
-    assert told.startswith("grasp 1, finger a: ")
-    assert "20" in told
+    detail = problem(post(client, png_file(width, height), png_file(8, 8)), 422, "bad-image")
+    assert detail.startswith("grasp 1, finger a: ")
+    assert "20" in detail
 
 
-def test_a_large_jpeg_is_refused_although_files_of_that_size_are_read_at_a_part_of_it(client):
+def test_a_large_jpeg_is_refused_although_it_could_be_decoded_at_reduced_size(client):
     file = io.BytesIO()
     Image.new("L", (6000, 4000)).save(file, "JPEG")
-    assert "6000 x 4000 pixels; at most 20,000,000 are taken" in problem(
+    assert "6000 x 4000 pixels exceed the limit of 20,000,000" in problem(
         post(client, file.getvalue(), file.getvalue()), 422, "bad-image"
     )
 
@@ -52,23 +52,23 @@ def test_a_large_jpeg_is_refused_although_files_of_that_size_are_read_at_a_part_
     ],
     ids=["empty", "zeros", "gif", "too few samples", "cut off", "svg", "jpeg's first bytes"],
 )
-def test_what_is_no_whole_picture_is_refused_with_its_place(client, image):
+def test_incomplete_pictures_are_refused_with_their_place(client, image):
     good = png_file(8, 8, samples=b"\x00" * 8 * 25)
     assert "grasp 1, finger b" in problem(post(client, good, image), 422, "bad-image")
 
 
-def test_the_pictures_of_one_request_have_a_bound_together(client):
+def test_the_pictures_of_one_request_have_a_common_limit(client):
     one = base64.b64encode(png_file(4000, 4000)).decode()
-    told = problem(client.post("/v1/query", json={"touches": [[one] * 2] * 4}), 413, "too-large")
-    assert "may have 100,000,000 pixels together; the large ones have 128,000,000" in told
+    detail = problem(client.post("/v1/query", json={"touches": [[one] * 2] * 4}), 413, "too-large")
+    assert "may have 100,000,000 pixels in total; the large ones have 128,000,000" in detail
     tiny = base64.b64encode(png_file(1, 1, samples=bytes(4))).decode()
-    told = problem(client.post("/v1/query", json={"touches": [[tiny] * 5] * 26}), 422, "bad-input")
-    assert told == "a request may hold at most 128 pictures; got 130"
+    detail = problem(client.post("/v1/query", json={"touches": [[tiny] * 5] * 26}), 422, "bad-input")
+    assert detail == "A request may have at most 128 pictures, got 130."
     batch = {"objects": [[[tiny] * 5] * 13] * 2}
-    assert problem(client.post("/v1/query/batch", json=batch), 422, "bad-input") == told
+    assert problem(client.post("/v1/query/batch", json=batch), 422, "bad-input") == detail
     background = {"touches": [[tiny] * 2], "background": [tiny, ""]}
-    told = problem(client.post("/v1/query", json=background), 422, "bad-image")
-    assert told == "background of finger b: the file is empty"
+    detail = problem(client.post("/v1/query", json=background), 422, "bad-image")
+    assert detail == "background of finger b: the file is empty"
 
 
 # Bodies of many values ------------------------------------------------------------------------------------------------
@@ -83,10 +83,10 @@ MANY = {
 
 
 @pytest.mark.parametrize("name", MANY)
-def test_a_body_of_more_values_than_pictures_need_is_refused_before_they_are_made(client, name):
+def test_a_body_with_too_many_values_is_refused_before_parsing(client, name):
     begun = time.process_time()
-    told = problem(client.post("/v1/query", content=MANY[name], headers=JSON), 422, "bad-input")
-    assert told.startswith("a body may hold at most 2,000 JSON values; got up to ")
+    detail = problem(client.post("/v1/query", content=MANY[name], headers=JSON), 422, "bad-input")
+    assert detail.startswith("A body may have at most 2,000 JSON values, got up to ")
     assert time.process_time() - begun < 1
 
 
@@ -109,12 +109,12 @@ def test_a_value_of_19_mb_is_refused_soon(client, body):
 def test_only_bodies_with_pictures_may_be_large(client):
     paths = client.get("/openapi.json").json()["paths"]
     schemas = ("QueryBody", "BatchBody", "AgreementBody")
-    holding = {
+    with_pictures = {
         path
         for path, operations in paths.items()
         if any(name in str(operations.get("post", {}).get("requestBody")) for name in schemas)
     }
-    assert holding == PICTURE_PATHS
+    assert with_pictures == PICTURE_PATHS
     posted = {path for path, operations in paths.items() if "post" in operations} - PICTURE_PATHS
     assert posted == {"/v1/session", "/v1/feedback", "/v1/trials", "/v1/trials/{name}/{number}", "/v1/grasp"}
     for path in posted - {"/v1/grasp"}:
@@ -131,20 +131,20 @@ PART = b'\r\n--x\r\ncontent-disposition: form-data; name="top"\r\n\r\n3'
 
 
 @pytest.mark.parametrize(
-    ("body", "said"),
+    ("body", "message"),
     [
-        (PART * 300_000 + b"\r\n--x--", "a form may have at most 136 parts; got 300000"),
-        (b"--x\r\n" + b"a: b\r\n" * 3_000_000 + PART + b"\r\n--x--", "at most 4096 bytes of headers"),
-        (b"--x\r\n" + b"\r\n--" * 4_000_000, "the form is not whole"),
+        (PART * 300_000 + b"\r\n--x--", "A form may have at most 136 parts, got 300000"),
+        (b"--x\r\n" + b"a: b\r\n" * 3_000_000 + PART + b"\r\n--x--", "with headers of at most 4096 bytes"),
+        (b"--x\r\n" + b"\r\n--" * 4_000_000, "The form is incomplete"),
         (b"--x\r\n\r\n\r\n3\r\n--x--", "must name its field"),
         (PART[:-1] + b"1" * 2000 + b"\r\n--x--", "'top' must be a short text"),
-        (b"", "the form is not whole"),
+        (b"", "The form is incomplete"),
     ],
     ids=["parts", "headers", "half boundaries", "no name", "long", "empty"],
 )
-def test_a_hostile_form_is_refused_soon(client, body, said):
+def test_a_hostile_form_is_refused_soon(client, body, message):
     begun = time.process_time()
-    assert said in problem(client.post("/v1/query", content=body, headers=FORM), 422, "bad-input")
+    assert message in problem(client.post("/v1/query", content=body, headers=FORM), 422, "bad-input")
     assert time.process_time() - begun < 1
 
 
@@ -160,7 +160,7 @@ HEAD = "POST /v1/query HTTP/1.1\r\nhost: 127.0.0.1\r\ncontent-type: {kind}\r\n"
 
 
 def answer(connection):
-    """Status of what comes until the connection ends."""
+    """Return status and bytes of the response until the connection ends."""
     data = b""
     while more := connection.recv(65536):
         data += more
@@ -168,7 +168,7 @@ def answer(connection):
 
 
 @pytest.mark.parametrize("kind", ["application/json", "multipart/form-data; boundary=x", "text/plain"])
-def test_two_gigabytes_that_are_announced_are_refused_before_the_first_byte(url, kind):
+def test_an_announced_body_of_two_gigabytes_is_refused_before_the_first_byte(url, kind):
     with line(url) as connection:
         connection.sendall((HEAD.format(kind=kind) + f"content-length: {2 * 2**30}\r\n\r\n").encode())
         status, data = answer(connection)
@@ -176,7 +176,7 @@ def test_two_gigabytes_that_are_announced_are_refused_before_the_first_byte(url,
 
 
 @pytest.mark.parametrize("kind", ["application/json", "multipart/form-data; boundary=x"])
-def test_a_body_that_announces_nothing_is_cut_at_the_limit(url, kind):
+def test_a_body_without_content_length_is_cut_at_the_limit(url, kind):
     with line(url) as connection:
         connection.sendall((HEAD.format(kind=kind) + "transfer-encoding: chunked\r\n\r\n").encode())
         first = b'--x\r\ncontent-disposition: form-data; name="gelsight"; filename="a"\r\n\r\n'
@@ -185,21 +185,21 @@ def test_a_body_that_announces_nothing_is_cut_at_the_limit(url, kind):
             for _ in range(400):
                 connection.sendall(b"10000\r\n" + b"x" * 65536 + b"\r\n")
         except OSError:
-            pass  # it was refused while it was sent
+            pass  # refused while it was sent
         try:
             status, _ = answer(connection)
         except ConnectionError:
-            status = 413  # what was still on its way had the connection reset
+            status = 413  # bytes in transit reset the connection
     assert status in (413, 408)
     assert httpx.get(f"{url}/healthz").status_code == 200
 
 
-def test_a_slow_body_is_given_up_and_half_a_body_is_no_matter(url):
+def test_a_slow_body_is_refused_and_a_partial_body_is_harmless(url):
     with line(url) as connection:
         connection.sendall((HEAD.format(kind="application/json") + "content-length: 1000\r\n\r\n{").encode())
         begun = time.monotonic()
         status, data = answer(connection)
-        assert (status, b"the body must come within 0.3 s" in data) == (408, True)
+        assert (status, b"The body must arrive within 0.3 s" in data) == (408, True)
         assert time.monotonic() - begun < 20
     with line(url) as connection:
         connection.sendall((HEAD.format(kind="application/json") + "content-length: 1000\r\n\r\n{").encode())
@@ -208,15 +208,15 @@ def test_a_slow_body_is_given_up_and_half_a_body_is_no_matter(url):
         assert answer(connection)[0] == 200
 
 
-def test_bodies_on_their_way_have_a_bound_together_and_large_ones_leave_room_for_others(index):
+def test_concurrent_bodies_have_a_common_limit_and_large_ones_leave_room_for_others(index):
     with service(index) as client:
         limit = next(each for each in middlewares(client.app) if type(each).__name__ == "BodyLimit")
         small, large_bodies = {"touches": [["aGk="]]}, {"touches": [["aGkk" * 300_000]]}
         limit.held_bytes = MAX_SMALL_BODIES_BYTES
-        assert "too many requests" in problem(client.post("/v1/query", json=small), 429, "busy")
+        assert "Too many requests" in problem(client.post("/v1/query", json=small), 429, "busy")
         assert limit.held_bytes == MAX_SMALL_BODIES_BYTES
         limit.held_bytes, limit.large_bodies = 0, MAX_LARGE_BODIES
-        assert "too many large requests" in problem(client.post("/v1/query", json=large_bodies), 429, "busy")
+        assert "Too many large requests" in problem(client.post("/v1/query", json=large_bodies), 429, "busy")
         problem(client.post("/v1/query", json=small), 422, "bad-image")
         limit.large_bodies = MAX_LARGE_BODIES - 1
         problem(client.post("/v1/query", json=large_bodies), 422, "bad-image")

@@ -1,25 +1,25 @@
-// An answer: the verdict in words, what adds up to 1, and the photos.
+// An answer: the verdict, the bar of probabilities, and the photos.
 
 import { thumbnailURL } from "./api.js";
 import { h, picture } from "./dom.js";
 import { openDetail } from "./detail.js";
 import { feedbackPanel } from "./feedback.js";
-import { growingPanel } from "./growing.js";
-import { anotherGrasp } from "./information.js";
-import { count, nearness, percent, verdict } from "./words.js";
+import { cumulativePanel } from "./cumulative.js";
+import { nextGraspSection } from "./information.js";
+import { count, nearness, percent, verdict } from "./wording.js";
 
-const LEAST_SHOWN = 0.0005;
+const MIN_SHOWN = 0.0005;
 
 /** The whole panel of an answer. */
-export function answerPanel({ index, answer, id, asked, kept = null }) {
-  const parts = shares(answer);
+export function answerPanel({ index, answer, id, query, stored = null }) {
+  const parts = probabilityParts(answer);
   const open = ({ photo, object_id: objectId, reference = null }) =>
-    openDetail({ index, photo, objectId, asked, reference });
+    openDetail({ index, photo, objectId, query, reference });
   return h(
     "div",
     { class: "answer" },
-    verdictBlock(answer, asked.held),
-    index.keeps && id && feedbackPanel(answer, id, kept),
+    verdictBlock(answer, query.graspedObject),
+    index.stores_history && id && feedbackPanel(answer, id, stored),
     parts.length > 0 && answer.none_probability !== null && strip(parts),
     parts.length > 0 &&
       h(
@@ -27,41 +27,42 @@ export function answerPanel({ index, answer, id, asked, kept = null }) {
         { class: "photos", "aria-label": "Objects, most likely first" },
         parts.map((part) => card(part, answer, open)),
       ),
-    parts.length > 0 && asked.touches.length > 1 && answer.none_probability !== null && growingPanel(asked),
-    parts.length > 0 && answer.information && anotherGrasp(answer),
-    found(answer),
+    parts.length > 0 && query.touches.length > 1 && answer.none_probability !== null && cumulativePanel(query),
+    parts.length > 0 && answer.information && nextGraspSection(answer),
+    searchDetails(answer),
   );
 }
 
-/** What the probability is shared among: objects shown, none of these, all the others; most likely first. */
-function shares(answer) {
+/** The parts of the total probability, most likely first: shown objects, none of these, and all other objects. */
+function probabilityParts(answer) {
   const objects = answer.results.map((match) => ({ kind: "object", match, p: match.probability }));
   if (!objects.length || answer.none_probability === null) return objects;
   const none = { kind: "none", p: answer.none_probability };
   const shown = [...objects, none].sort((one, other) => other.p - one.p);
   const others = (answer.posterior?.objects ?? 0) - objects.length;
-  const rest = answer.unlisted_probability; // absent in answers that a history keeps from before
+  const rest = answer.unlisted_probability; // absent in stored answers of earlier versions
   if (others > 0 && rest !== undefined) shown.push({ kind: "rest", p: rest, others });
   return shown;
 }
 
-function verdictBlock(answer, held) {
-  const said = verdict(answer);
-  const place = held ? answer.results.findIndex((match) => match.object_id === held) : -1;
+function verdictBlock(answer, graspedObject) {
+  const text = verdict(answer);
+  const place = graspedObject ? answer.results.findIndex((match) => match.object_id === graspedObject) : -1;
   const where =
     place === 0
-      ? "the first of the ranking"
+      ? "first in the ranking"
       : place > 0
-        ? `number ${place + 1} of the ranking`
-        : "not among those shown";
+        ? `number ${place + 1} in the ranking`
+        : "not among the shown objects";
   return h(
     "div",
     { class: `verdict ${answer.verdict.replaceAll(" ", "-")}` },
-    h("p", { class: "above" }, said.above),
-    h("h2", { class: "claim" }, said.claim),
-    h("p", { class: "below" }, said.below),
+    h("p", { class: "above" }, text.above),
+    h("h2", { class: "claim" }, text.claim),
+    h("p", { class: "below" }, text.below),
     answer.advice && h("p", { class: "advice" }, answer.advice),
-    held && h("p", { class: "held" }, "The jaws closed on ", h("strong", {}, held), `: ${where}.`),
+    graspedObject &&
+      h("p", { class: "grasped-object" }, "Grasped object: ", h("strong", {}, graspedObject), `, ${where}.`),
   );
 }
 
@@ -71,7 +72,7 @@ function name(part) {
   return part.match.object_id;
 }
 
-/** One bar of the width 1, divided; the numbers stand in the cards. */
+/** One bar, divided by probability; the cards show the numbers. */
 function strip(parts) {
   return h(
     "div",
@@ -101,9 +102,9 @@ function card(part, answer, open) {
     p !== null && h("span", { class: "p" }, percent(p)),
     match?.probability_if_present != null &&
       h("span", { class: "if-present" }, `${percent(match.probability_if_present)} if present`),
-    kind === "object" && p === null && h("span", { class: "p faint" }, `match logit ${match.logit.toFixed(2)}`),
+    kind === "object" && p === null && h("span", { class: "p muted" }, `match logit ${match.logit.toFixed(2)}`),
   ];
-  const given = { class: `photo ${kind}${chosen ? " first" : ""}${p !== null && p < LEAST_SHOWN ? " unlikely" : ""}` };
+  const given = { class: `photo ${kind}${chosen ? " first" : ""}${p !== null && p < MIN_SHOWN ? " unlikely" : ""}` };
   if (kind !== "object") {
     return h(
       "li",
@@ -124,30 +125,30 @@ function card(part, answer, open) {
       "button",
       { type: "button", class: "tile", onclick: () => open(match) },
       image,
-      match.reference?.adds != null && nearestTouch(match.reference),
+      match.reference?.adds != null && nearestTouchThumbnail(match.reference),
       text,
-      h("span", { class: "unseen" }, ", details"),
+      h("span", { class: "visually-hidden" }, ", details"),
     ),
   );
 }
 
-/** The gel images of the nearest reference touch, small in a corner of the photo. */
-function nearestTouch(reference) {
+/** Thumbnails of the nearest reference touch, in a corner of the photo. */
+function nearestTouchThumbnail(reference) {
   const alt = `, its nearest reference touch: ${nearness(reference)}`;
   return h(
     "span",
     { class: "reference", title: nearness(reference) },
     reference.touch.map((path) => picture(thumbnailURL(path, 160), "", { loading: "lazy" })),
-    h("span", { class: "unseen" }, alt),
+    h("span", { class: "visually-hidden" }, alt),
   );
 }
 
-/** How it was found, for those who ask. */
-function found(answer) {
+/** Details of the search, folded. */
+function searchDetails(answer) {
   const rows = [
     ["Index", `${answer.index.generation}, kind ${answer.index.kind}`],
     ["Model", `${answer.index.model.split("/").at(-1)}, trained on: ${answer.index.trained_on}`],
-    ["ShardResult", `${answer.index.scored} of ${count(answer.index.photos, "photo")} by the full classifier`],
+    ["Scored", `${answer.index.scored} of ${count(answer.index.photos, "photo")} by the full classifier`],
     [
       "Time",
       Object.entries(answer.timing_ms)
@@ -158,24 +159,27 @@ function found(answer) {
   const { posterior } = answer;
   if (posterior) {
     rows.push([
-      "Before",
-      `none of these ${percent(posterior.none_prior)}; each of ${count(posterior.objects, "object")} alike`,
+      "Prior",
+      `none of these ${percent(posterior.none_prior)}; the rest equally for each of ${count(posterior.objects, "object")}`,
     ]);
     const { references } = posterior;
     if (references)
       rows.push([
         "Reference touches",
-        `${references.touches.toLocaleString("en")} of ${count(references.objects, "object")}; what they are worth was ` +
-          `fitted on ${count(references.worth.touches, "touch")} of ${count(references.worth.objects, "object")} ` +
+        `${references.touches.toLocaleString("en")} of ${count(references.objects, "object")}; calibrated ` +
+          `on ${count(references.calibration.touches, "touch")} of ${count(references.calibration.objects, "object")} ` +
           `(${references.by})`,
       ]);
-    const left = posterior.objects - posterior.scored_objects;
-    if (left)
-      rows.push(["Not judged", `${count(left, "object")}, which share ${percent(posterior.unscored_probability)}`]);
+    const unscored = posterior.objects - posterior.scored_objects;
+    if (unscored)
+      rows.push([
+        "Not scored",
+        `${count(unscored, "object")}, with a total probability of ${percent(posterior.unscored_probability)}`,
+      ]);
   }
   return h(
     "details",
-    { class: "found" },
+    { class: "search-details" },
     h("summary", {}, "How this was found"),
     h(
       "dl",
@@ -185,9 +189,9 @@ function found(answer) {
     posterior &&
       h(
         "p",
-        { class: "faint" },
+        { class: "muted" },
         "The probabilities of all objects of the catalogue and of none of these add up to 1. ",
-        "\u201cIf present\u201d: the probability given that the catalogue has the object.",
+        "\u201cIf present\u201d: the probability given that the catalogue contains the object.",
       ),
   );
 }

@@ -1,17 +1,17 @@
-// The paths of the service. What it refuses becomes a Problem with its own sentence.
+// The routes of the service. A refused request becomes an HttpProblem with the detail of the service.
 
-export class Problem extends Error {
+export class HttpProblem extends Error {
   constructor(status, title, detail, again_s = null) {
     super(detail);
     Object.assign(this, { status, title, detail, again_s });
   }
 }
 
-let askToken = null;
+let requestToken = null;
 
-/** What is called when the service wants its token; resolves when a session stands. */
-export function onTokenWanted(ask) {
-  askToken = ask;
+/** Set the function that is called when the service requires its token; it resolves when a session exists. */
+export function onTokenRequired(request) {
+  requestToken = request;
 }
 
 async function reply(path, options) {
@@ -20,32 +20,32 @@ async function reply(path, options) {
     response = await fetch(path, options);
   } catch (error) {
     if (error.name === "AbortError") throw error;
-    throw new Problem(0, "The service does not answer", "It may have been stopped; start `retrieve serve` again.");
+    throw new HttpProblem(0, "The service does not answer", "It may have stopped. Start `retrieve serve` again.");
   }
-  if (response.status === 401 && askToken && path !== "/v1/session") {
-    await askToken();
+  if (response.status === 401 && requestToken && path !== "/v1/session") {
+    await requestToken();
     return reply(path, options);
   }
   if (response.ok) return response;
-  const told = await response.json().catch(() => ({}));
+  const document = await response.json().catch(() => ({}));
   const again = Number(response.headers.get("retry-after")) || null;
-  throw new Problem(response.status, told.title ?? `Status ${response.status}`, told.detail ?? "", again);
+  throw new HttpProblem(response.status, document.title ?? `Status ${response.status}`, document.detail ?? "", again);
 }
 
 const json = async (path, options) => (await reply(path, options)).json();
 const encodedPath = (id) => id.split("/").map(encodeURIComponent).join("/");
-const posted = (body) => ({
+const jsonPost = (body) => ({
   method: "POST",
   headers: { "content-type": "application/json" },
   body: JSON.stringify(body),
 });
 
-function withParameters(path, given) {
-  const kept = Object.entries(given).filter(([, value]) => value !== null && value !== undefined && value !== "");
-  return kept.length ? `${path}?${new URLSearchParams(kept)}` : path;
+function withParameters(path, parameters) {
+  const present = Object.entries(parameters).filter(([, value]) => value !== null && value !== undefined && value !== "");
+  return present.length ? `${path}?${new URLSearchParams(present)}` : path;
 }
 
-/** The pictures of a query and its options, as a form. */
+/** The form with the pictures and options of a query. */
 function form(touches, background, options) {
   const body = new FormData();
   touches.flat().forEach((blob, place) => body.append("gelsight", blob, blob.name ?? `touch-${place}.png`));
@@ -59,7 +59,7 @@ async function base64(blob) {
     const reader = new FileReader();
     reader.onload = () => done(reader.result);
     reader.onerror = () =>
-      failed(new Problem(0, "A picture cannot be read", "Its file may have been moved; choose it again."));
+      failed(new HttpProblem(0, "A picture cannot be read", "Its file may have moved. Choose it again."));
     reader.readAsDataURL(blob);
   });
   return text.slice(text.indexOf(",") + 1);
@@ -76,53 +76,53 @@ export const streamURL = (name, rate = 10) => `/v1/sensors/${encodeURIComponent(
 export const EXPORT = "/v1/export.zip";
 
 export const index = () => json("/v1/index");
-export const session = (token) => reply("/v1/session", posted({ token }));
+export const session = (token) => reply("/v1/session", jsonPost({ token }));
 export const blob = async (path) => (await reply(path)).blob();
 export const frame = (name) => blob(`/v1/sensors/${encodeURIComponent(name)}/frame`);
 
-/** The answer to touches, and its name in the history where queries are kept. */
+/** The answer to touches, and its id in the history, null if no history is stored. */
 export async function query(touches, background, options) {
   const response = await reply("/v1/query", form(touches, background, options));
   return { answer: await response.json(), id: response.headers.get("x-query-id") };
 }
 
-export const growing = (touches, background, options) =>
-  json("/v1/query/growing?alone=true", form(touches, background, options));
+export const cumulative = (touches, background, options) =>
+  json("/v1/query/cumulative?per_grasp=true", form(touches, background, options));
 
-/** The simulated jaws close on an object, that one where it is named. */
+/** Grasp an object with the simulated rig: the named one, else a random one. */
 export async function grasp(objectId = null) {
-  const felt = await json(withParameters("/v1/grasp", { object: objectId }), { method: "POST" });
+  const result = await json(withParameters("/v1/grasp", { object: objectId }), { method: "POST" });
   return {
-    objectId: felt.object_id,
-    touches: felt.touches.map(decoded),
-    background: felt.background?.map(decoded) ?? null,
+    objectId: result.object_id,
+    touches: result.touches.map(decoded),
+    background: result.background?.map(decoded) ?? null,
   };
 }
 
 export async function agreement(photo, touches, background, squares = 8) {
   const all = await Promise.all(touches.map((grasp) => Promise.all(grasp.map(base64))));
-  const untouched = background ? await Promise.all(background.map(base64)) : null;
-  return json("/v1/agreement", posted({ photo, touches: all, background: untouched, squares }));
+  const frames = background ? await Promise.all(background.map(base64)) : null;
+  return json("/v1/agreement", jsonPost({ photo, touches: all, background: frames, squares }));
 }
 
-export const catalogue = (given, signal = null) => json(withParameters("/v1/catalogue", given), { signal });
+export const catalogue = (parameters, signal = null) => json(withParameters("/v1/catalogue", parameters), { signal });
 export const nearest = (id, count = 12) => json(withParameters(`/v1/nearest/${encodedPath(id)}`, { count }));
 
-export const history = (given) => json(withParameters("/v1/history", given));
+export const history = (parameters) => json(withParameters("/v1/history", parameters));
 export const entry = (id) => json(`/v1/history/${encodeURIComponent(id)}`);
-/** The no-contact frames that a query was sent with; null where it had none. */
-export const untouched = (id, letters) =>
+/** The no-contact frames of a query; null if it has none. */
+export const noContactFrames = (id, letters) =>
   Promise.all(letters.map((letter) => blob(`/v1/history/${encodeURIComponent(id)}/touches/0/${letter}`))).catch(
     () => null,
   );
 export const nearestTouches = (id, count = 8) =>
   json(withParameters(`/v1/history/${encodeURIComponent(id)}/nearest`, { count }));
-export const feedback = (query, said, objectId = null) =>
-  json("/v1/feedback", posted({ query, said, ...(objectId && { object_id: objectId }) }));
+export const feedback = (query, value, objectId = null) =>
+  json("/v1/feedback", jsonPost({ query, feedback: value, ...(objectId && { object_id: objectId }) }));
 
 export const trials = () => json("/v1/trials");
-export const beginTrials = (count, who) => json("/v1/trials", posted({ count, who }));
+export const beginTrials = (count, participant) => json("/v1/trials", jsonPost({ count, participant }));
 export const series = (id) => json(`/v1/trials/${encodeURIComponent(id)}`);
 export const trial = (id, number) => json(`/v1/trials/${encodeURIComponent(id)}/${number}`);
 export const choose = (id, number, choice) =>
-  json(`/v1/trials/${encodeURIComponent(id)}/${number}`, posted({ choice }));
+  json(`/v1/trials/${encodeURIComponent(id)}/${number}`, jsonPost({ choice }));

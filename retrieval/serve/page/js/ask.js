@@ -1,30 +1,34 @@
-// Asking: gel images in, an answer out.
+// The query view: gel images in, an answer out.
 
 import * as api from "./api.js";
 import { announce, h, problemCard } from "./dom.js";
 import { answerPanel } from "./answer.js";
 import { livePanel } from "./live.js";
 import { Tray, chooser, finger, trayCards } from "./tray.js";
-import { count, verdict } from "./words.js";
+import { count, verdict } from "./wording.js";
 
 const DEFAULTS = { top: 12, candidates: null, none_prior: 0.5 };
 
-/** The view that asks. */
+/** The query view. */
 export function askView(index) {
   const tray = new Tray(index.fingers);
   const options = { ...DEFAULTS };
-  let held = null; // what the simulated jaws closed on
+  let graspedObject = null; // the object that the simulated rig grasped
   let asking = null;
-  const subtracts = index.background !== "none"; // the model takes the untouched gels away from the touch
+  const subtracts = index.background !== "none"; // the model subtracts no-contact frames
 
   const title = h("h1", { tabindex: "-1" }, "Which object is in the hand?");
   const lead = h("p", { class: "lead" }, leadText(index));
   const cards = h("div", { class: "cards" });
-  const refused = h("div", { class: "refused", role: "alert" });
+  const rejected = h("div", { class: "rejected-files", role: "alert" });
   const askButton = h("button", { type: "button", class: "primary", onclick: () => ask() }, "Ask");
   const clearButton = h("button", { type: "button", class: "quiet", onclick: () => start() }, "Start again");
   const live = livePanel(index, tray);
-  const again = h("button", { type: "button", class: "quiet", onclick: () => graspSomething(held) }, "Grasp it again");
+  const again = h(
+    "button",
+    { type: "button", class: "quiet", onclick: () => graspSomething(graspedObject) },
+    "Grasp it again",
+  );
   const graspButton = h(
     "button",
     { type: "button", class: "quiet", onclick: () => graspSomething() },
@@ -48,24 +52,24 @@ export function askView(index) {
     "section",
     { class: "side", "aria-label": "Touch" },
     cards,
-    refused,
+    rejected,
     drop,
     live.element,
     optionsPanel(index, tray, options),
-    h("div", { class: "go" }, askButton, clearButton),
+    h("div", { class: "actions" }, askButton, clearButton),
   );
   const result = h("section", { class: "result", "aria-label": "Answer" });
   const element = h("div", { class: "ask" }, h("div", { class: "intro" }, title, lead), side, result);
 
   function take(files) {
-    held = null;
+    graspedObject = null;
     tray.addFiles(files);
     if (tray.complete) askButton.focus();
   }
 
   function start() {
     asking?.abort();
-    held = null;
+    graspedObject = null;
     tray.clear();
     location.hash = "#/";
     title.focus();
@@ -73,28 +77,28 @@ export function askView(index) {
 
   function update() {
     cards.replaceChildren(...trayCards(tray));
-    refused.replaceChildren(...tray.refused.map((text) => h("p", { class: "notice" }, text)));
-    const some = tray.grasps.length > 0;
-    element.classList.toggle("busy-tray", some);
+    rejected.replaceChildren(...tray.rejected.map((text) => h("p", { class: "notice" }, text)));
+    const hasTouches = tray.grasps.length > 0;
+    element.classList.toggle("has-touches", hasTouches);
     askButton.disabled = !tray.complete;
-    askButton.parentElement.hidden = !some;
-    again.hidden = !held;
-    if (!result.hasAttribute("aria-busy")) result.replaceChildren(some ? waiting(tray) : "");
+    askButton.parentElement.hidden = !hasTouches;
+    again.hidden = !graspedObject;
+    if (!result.hasAttribute("aria-busy")) result.replaceChildren(hasTouches ? waiting(tray) : "");
   }
 
   async function graspSomething(objectId = null) {
     graspButton.disabled = again.disabled = true;
-    announce("The jaws close.");
-    refused.replaceChildren();
+    announce("Grasping ...");
+    rejected.replaceChildren();
     try {
-      const felt = await api.grasp(objectId);
+      const grasp = await api.grasp(objectId);
       if (!objectId) tray.clear();
-      held = felt.objectId;
-      tray.addGrasp(felt.touches);
-      if (subtracts) felt.background?.forEach((blob, place) => tray.putBackground(place, blob));
+      graspedObject = grasp.objectId;
+      tray.addGrasp(grasp.touches);
+      if (subtracts) grasp.background?.forEach((blob, place) => tray.putBackground(place, blob));
       await ask();
     } catch (error) {
-      refused.replaceChildren(problemCard(error, () => graspSomething(objectId)));
+      rejected.replaceChildren(problemCard(error, () => graspSomething(objectId)));
     } finally {
       graspButton.disabled = again.disabled = false;
     }
@@ -105,7 +109,7 @@ export function askView(index) {
     asking?.abort();
     const own = (asking = new AbortController());
     const touches = tray.grasps.map((grasp) => [...grasp]);
-    const background = tray.untouched;
+    const background = tray.noContactFrames;
     askButton.disabled = true;
     result.setAttribute("aria-busy", "true");
     result.replaceChildren(
@@ -121,10 +125,10 @@ export function askView(index) {
       if (own.signal.aborted) return;
       tray.marks = answer.query.grasps;
       cards.replaceChildren(...trayCards(tray));
-      const asked = { touches, background, options: { ...options }, held };
-      result.replaceChildren(answerPanel({ index, answer, id, asked }));
-      const said = verdict(answer);
-      announce(`${said.above}: ${said.claim}. ${said.below}`);
+      const query = { touches, background, options: { ...options }, graspedObject };
+      result.replaceChildren(answerPanel({ index, answer, id, query }));
+      const text = verdict(answer);
+      announce(`${text.above}: ${text.claim}. ${text.below}`);
       const { top } = result.getBoundingClientRect();
       if (top < 0 || top > innerHeight / 2) result.scrollIntoView();
     } catch (error) {
@@ -135,60 +139,60 @@ export function askView(index) {
     }
   }
 
-  async function showKept(id) {
+  async function showStored(id) {
     result.setAttribute("aria-busy", "true");
     try {
-      const kept = await api.entry(id);
-      const touches = await Promise.all(kept.touches.map((grasp) => Promise.all(grasp.map(api.blob))));
-      const background = subtracts ? await api.untouched(id, touches[0].map((_, place) => finger(place))) : null;
+      const stored = await api.entry(id);
+      const touches = await Promise.all(stored.touches.map((grasp) => Promise.all(grasp.map(api.blob))));
+      const background = subtracts ? await api.noContactFrames(id, touches[0].map((_, place) => finger(place))) : null;
       tray.clear();
-      held = null;
+      graspedObject = null;
       touches.forEach((grasp) => tray.addGrasp(grasp));
       background?.forEach((blob, place) => tray.putBackground(place, blob));
-      tray.marks = kept.answer.query.grasps;
+      tray.marks = stored.answer.query.grasps;
       cards.replaceChildren(...trayCards(tray));
-      const none_prior = kept.answer.posterior?.none_prior ?? options.none_prior;
+      const none_prior = stored.answer.posterior?.none_prior ?? options.none_prior;
       result.replaceChildren(
         answerPanel({
           index,
-          answer: kept.answer,
+          answer: stored.answer,
           id,
-          asked: { touches, background, options: { ...options, none_prior }, held: null },
-          kept,
+          query: { touches, background, options: { ...options, none_prior }, graspedObject: null },
+          stored,
         }),
       );
     } catch (error) {
-      result.replaceChildren(problemCard(error, () => showKept(id)));
+      result.replaceChildren(problemCard(error, () => showStored(id)));
     } finally {
       result.removeAttribute("aria-busy");
     }
   }
 
   tray.addEventListener("change", update);
-  dropAnywhere(element, take);
+  acceptDrops(element, take);
   update();
-  return { element, show: (id) => id && showKept(id), hide: live.stop };
+  return { element, show: (id) => id && showStored(id), hide: live.stop };
 }
 
 function leadText(index) {
-  const seen = `${count(index.photos, "photo")} of ${count(index.objects, "object")}`;
-  return `Give the gel images of a grasp; the ${seen} are searched for the one that was felt.`;
+  const photos = `${count(index.photos, "photo")} of ${count(index.objects, "object")}`;
+  return `Add the gel images of a grasp to find the touched object among ${photos}.`;
 }
 
 function dropText(fingers) {
   return fingers > 1
-    ? `${fingers} for each grasp, one of each finger; several grasps tell more`
-    : "One for each grasp; several grasps tell more";
+    ? `${fingers} for each grasp, one of each finger; several grasps improve the answer`
+    : "One for each grasp; several grasps improve the answer";
 }
 
 function waiting(tray) {
   const text = tray.complete
-    ? "Ask, and the catalogue is ranked."
-    : "A picture is missing: each grasp takes one of each finger.";
+    ? "Press \u201cAsk\u201d to rank the catalogue."
+    : "A picture is missing: each grasp needs one of each finger.";
   return h("p", { class: "wait" }, text);
 }
 
-/** What an expert may say beside the touches. */
+/** Options for experts. */
 function optionsPanel(index, tray, options) {
   const number = (name, text, given, read) => {
     const id = `option-${name}`;
@@ -226,32 +230,32 @@ function optionsPanel(index, tray, options) {
     "details",
     { class: "options" },
     h("summary", {}, "Options"),
-    h("p", { class: "faint" }, "No-contact frames: pictures of the untouched gels."),
+    h("p", { class: "muted" }, "No-contact frames: pictures of the gels before contact."),
     frames,
     number("top", "Objects to show", { min: "1", max: "100", step: "1" }, Number),
-    number("candidates", "Photos to judge (empty: as the index needs)", { min: "1", step: "1" }, Number),
+    number("candidates", "Photos to score (empty: the index's own number)", { min: "1", step: "1" }, Number),
     number(
       "none_prior",
-      "Chance, before anything is felt, that the catalogue lacks it",
+      "Prior probability that the catalogue lacks the object",
       { min: "0.001", max: "0.999", step: "any" },
       Number,
     ),
   );
 }
 
-/** Files may be dropped anywhere on the view. */
-function dropAnywhere(element, taken) {
+/** Accept files that are dropped anywhere on the view. */
+function acceptDrops(element, onFiles) {
   const carriesFiles = (event) => event.dataTransfer?.types.includes("Files") && !element.hidden;
   addEventListener("dragover", (event) => {
     if (!carriesFiles(event)) return;
     event.preventDefault();
-    element.classList.add("over");
+    element.classList.add("drag-over");
   });
-  addEventListener("dragleave", (event) => !event.relatedTarget && element.classList.remove("over"));
+  addEventListener("dragleave", (event) => !event.relatedTarget && element.classList.remove("drag-over"));
   addEventListener("drop", (event) => {
     if (!carriesFiles(event)) return;
     event.preventDefault();
-    element.classList.remove("over");
-    taken([...event.dataTransfer.files]);
+    element.classList.remove("drag-over");
+    onFiles([...event.dataTransfer.files]);
   });
 }

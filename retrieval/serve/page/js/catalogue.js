@@ -1,13 +1,13 @@
-// The catalogue: of 100,000 photos only those on the screen are elements, and only their pages are asked for.
+// The catalogue view: only the photos on the screen become elements, and only their pages are requested.
 
 import * as api from "./api.js";
-import { h, picture, problemCard, settled } from "./dom.js";
+import { h, picture, problemCard, debounce } from "./dom.js";
 import { openDetail } from "./detail.js";
-import { count } from "./words.js";
+import { count } from "./wording.js";
 
 const PAGE = 200;
-const MOST_PAGES = 50;
-const LEAST_WIDTH = 170;
+const MAX_PAGES = 50;
+const MIN_WIDTH = 170;
 const LABEL_PX = 46;
 const GAP = 16;
 const SPARE_ROWS = 2;
@@ -19,7 +19,7 @@ export function catalogueView(index) {
     autocomplete: "off",
     placeholder: "Object, file or metadata",
   });
-  const total = h("p", { class: "faint", role: "status" });
+  const total = h("p", { class: "muted", role: "status" });
   const problem = h("div", {});
   const grid = h("ul", { class: "grid", "aria-label": "Photos of the catalogue" });
   const element = h(
@@ -36,14 +36,14 @@ export function catalogueView(index) {
     grid,
   );
   const tiles = new Map(); // place -> element
-  let pages = new Map(); // number -> photos, or the promise of them
-  let found = null; // how many photos there are
+  let pages = new Map(); // number -> photos, or their promise
+  let found = null; // number of matching photos
   let words = "";
   let focused = 0;
 
   function layout() {
     const width = grid.clientWidth;
-    const columns = Math.max(2, Math.floor((width + GAP) / (LEAST_WIDTH + GAP)));
+    const columns = Math.max(2, Math.floor((width + GAP) / (MIN_WIDTH + GAP)));
     const side = (width - GAP * (columns - 1)) / columns;
     return { columns, side, row: side + LABEL_PX + GAP };
   }
@@ -59,7 +59,7 @@ export function catalogueView(index) {
         forget(number);
         if (found !== answer.total) {
           found = answer.total;
-          say();
+          showTotal();
         }
         problem.replaceChildren();
       } catch (error) {
@@ -71,21 +71,21 @@ export function catalogueView(index) {
     }
   }
 
-  /** Keep the pages nearest to the one that came last. */
+  /** Keep only the pages nearest to the newest one. */
   function forget(number) {
     const far = [...pages.keys()].sort((one, other) => Math.abs(one - number) - Math.abs(other - number));
-    far.slice(MOST_PAGES).forEach((each) => pages.delete(each));
+    far.slice(MAX_PAGES).forEach((each) => pages.delete(each));
   }
 
-  function say() {
+  function showTotal() {
     total.textContent = found
       ? words
         ? `${count(found, "photo")} found`
         : `${count(found, "photo")} of ${count(index.objects, "object")}`
-      : "No photo of the catalogue has all these words.";
+      : "No photo of the catalogue matches all these words.";
   }
 
-  /** Elements for the rows on the screen, and for the one that has the focus. */
+  /** Create elements for the rows on the screen, and keep the focused one. */
   function draw() {
     if (element.hidden || found === null) return;
     const { columns, side, row } = layout();
@@ -144,7 +144,7 @@ export function catalogueView(index) {
     await page(0);
   }
 
-  /** The focus goes to a photo, which is drawn first. */
+  /** Draw a photo and focus it. */
   async function focus(place) {
     focused = Math.min(found - 1, Math.max(0, place));
     const { columns, row } = layout();
@@ -175,7 +175,7 @@ export function catalogueView(index) {
     event.preventDefault();
     focus(to);
   });
-  search.addEventListener("input", settled(start));
+  search.addEventListener("input", debounce(start));
   addEventListener("scroll", draw, { passive: true });
   new ResizeObserver(draw).observe(grid);
   return { element, show: () => (found === null ? start() : draw()) };

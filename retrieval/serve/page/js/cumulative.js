@@ -1,52 +1,53 @@
-// How the answer changed grasp by grasp: a line for each object, and one for none of these.
+// The cumulative query: how the answer changes grasp by grasp, with a line for each object and for none of these.
 
 import * as api from "./api.js";
 import { h, problemCard, svg } from "./dom.js";
-import { count, percent } from "./words.js";
+import { count, percent } from "./wording.js";
 
-const MOST_LINES = 5;
+const MAX_LINES = 5;
 const [HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [250, 46, 16, 14, 30];
 
-/** The section; it asks for the answers itself. */
-export function growingPanel(asked) {
+/** The section, which requests its answers itself. */
+export function cumulativePanel(query) {
   const element = h(
     "section",
-    { class: "growing", "aria-label": "Grasp by grasp" },
+    { class: "cumulative", "aria-label": "Grasp by grasp" },
     h("h3", {}, "Grasp by grasp"),
-    h("p", { class: "faint" }, "Looking ..."),
+    h("p", { class: "muted" }, "Computing ..."),
   );
   load();
   return element;
 
   async function load() {
     try {
-      const { answers, alone } = await api.growing(asked.touches, asked.background, { ...asked.options, top: 100 });
-      element.replaceChildren(h("h3", {}, "Grasp by grasp"), ...content(answers, alone));
+      const options = { ...query.options, top: 100 };
+      const { answers, per_grasp: perGrasp } = await api.cumulative(query.touches, query.background, options);
+      element.replaceChildren(h("h3", {}, "Grasp by grasp"), ...content(answers, perGrasp));
     } catch (error) {
       element.replaceChildren(h("h3", {}, "Grasp by grasp"), problemCard(error, load));
     }
   }
 }
 
-function content(answers, alone) {
+function content(answers, perGrasp) {
   if (answers.filter((answer) => answer.none_probability !== null).length < 2)
-    return [h("p", { class: "faint" }, "Fewer than two grasps felt something; there is nothing to compare.")];
+    return [h("p", { class: "muted" }, "Fewer than two grasps have contact, so there is nothing to compare.")];
   const lines = linesOf(answers);
-  const told = alone.map((answer) => answer.information?.gained_bits ?? 0); // null: nothing was felt
+  const gainedBits = perGrasp.map((answer) => answer.information?.gained_bits ?? 0); // null: no contact
   return [
-    h("p", { class: "turn" }, turningPoint(answers, lines)),
-    h("p", { class: "turn" }, mostByItself(alone, told)),
+    h("p", { class: "summary-line" }, turningPoint(answers, lines)),
+    h("p", { class: "summary-line" }, mostInformativeGrasp(perGrasp, gainedBits)),
     plot(answers, lines),
     legend(lines),
-    numbers(answers, lines, told),
+    numbers(answers, lines, gainedBits),
   ];
 }
 
-/** The likeliest objects of the last answer and none of these: name and a probability after each grasp. */
+/** Names, and probabilities after each grasp, of the most likely objects of the last answer and of none of these. */
 function linesOf(answers) {
   const last = answers
     .at(-1)
-    .results.slice(0, MOST_LINES)
+    .results.slice(0, MAX_LINES)
     .map((match) => match.object_id);
   const of = (name) =>
     answers.map((answer) =>
@@ -61,28 +62,28 @@ function linesOf(answers) {
   ];
 }
 
-/** Which grasp would tell most, were it the only one. */
-function mostByItself(alone, told) {
-  const most = told.indexOf(Math.max(...told));
-  const all = alone[most].information.possible_bits;
-  return `By itself, grasp ${most + 1} would tell most: ${told[most].toFixed(1)} of the ${all.toFixed(1)} bits that name an object for certain.`;
+/** A sentence on the grasp that alone gives the most information. */
+function mostInformativeGrasp(perGrasp, gainedBits) {
+  const best = gainedBits.indexOf(Math.max(...gainedBits));
+  const possible = perGrasp[best].information.possible_bits;
+  return `On its own, grasp ${best + 1} gives the most information: ${gainedBits[best].toFixed(1)} of the ${possible.toFixed(1)} bits that identify an object with certainty.`;
 }
 
-/** After which grasp the probabilities moved furthest. */
+/** A sentence on the grasp after which the probabilities changed most. */
 function turningPoint(answers, lines) {
-  let [most, where] = [-1, 1];
+  let [largest, where] = [-1, 1];
   for (let step = 1; step < answers.length; step += 1) {
     const moved =
       lines.reduce((sum, { values }) => sum + Math.abs((values[step] ?? 0) - (values[step - 1] ?? 0)), 0) / 2;
-    if (moved > most) [most, where] = [moved, step];
+    if (moved > largest) [largest, where] = [moved, step];
   }
   const { name, values } = lines[0];
-  const say = (value) => (value === null ? "nothing said" : percent(value));
-  return `After the first grasp, grasp ${where + 1} changed the answer most: ${name} went from ${say(values[where - 1])} to ${say(values[where])}.`;
+  const text = (value) => (value === null ? "no answer" : percent(value));
+  return `After the first grasp, grasp ${where + 1} changed the answer most: ${name} went from ${text(values[where - 1])} to ${text(values[where])}.`;
 }
 
 function plot(answers, lines) {
-  const width = matchMedia("(max-width: 560px)").matches ? 320 : 720; // letters are as large on either
+  const width = matchMedia("(max-width: 560px)").matches ? 320 : 720; // keeps the size of the letters
   const x = (step) => LEFT + (step * (width - LEFT - RIGHT)) / Math.max(1, answers.length - 1);
   const y = (p) => HEIGHT - BOTTOM - p * (HEIGHT - TOP - BOTTOM);
   const grid = [0, 0.5, 1].map((p) => [
@@ -112,7 +113,7 @@ function plot(answers, lines) {
   );
 }
 
-/** The lines by their looks; those of the other objects are told apart as numbers. */
+/** The legend; all other objects share one entry, as the table of numbers distinguishes them. */
 function legend(lines) {
   const following = lines.filter(({ kind }) => kind === "other").length;
   const keys = lines.filter(({ kind }) => kind !== "other").map(({ name, kind }) => h("li", { class: kind }, name));
@@ -120,8 +121,8 @@ function legend(lines) {
   return h("ul", { class: "keys", "aria-hidden": "true" }, keys);
 }
 
-/** The same as numbers, for those who want them or cannot see the plot. */
-function numbers(answers, lines, told) {
+/** The plot as a table of numbers, which screen readers can read. */
+function numbers(answers, lines, gainedBits) {
   const head = h(
     "tr",
     {},
@@ -136,8 +137,8 @@ function numbers(answers, lines, told) {
       values.map((p) => h("td", {}, p === null ? "-" : percent(p))),
     ),
   );
-  const bits = told.map((one) => h("td", {}, `${one.toFixed(2)} bits`));
-  rows.push(h("tr", {}, h("th", { scope: "row" }, "The grasp by itself tells"), bits));
+  const bits = gainedBits.map((one) => h("td", {}, `${one.toFixed(2)} bits`));
+  rows.push(h("tr", {}, h("th", { scope: "row" }, "Information of the grasp on its own"), bits));
   return h(
     "details",
     {},

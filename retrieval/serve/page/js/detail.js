@@ -1,16 +1,16 @@
-// An object in detail: its photos large, the touch beside them, what is known of it, and what looks like it.
+// Details of an object: large photos next to the touch, metadata, and similar photos.
 
 import * as api from "./api.js";
 import { announce, h, picture, problemCard } from "./dom.js";
 import { agreementTool } from "./agreement.js";
 import { blobURL, finger } from "./tray.js";
-import { count, nearness } from "./words.js";
+import { count, nearness } from "./wording.js";
 
-const MOST_PHOTOS = 500;
+const MAX_PHOTOS = 500;
 
-/** Open the dialog on a photo; `asked` holds the touches that were asked about, null in the catalogue; `reference` is
- *  the object's reference touch that is nearest to them, where it has any. */
-export function openDetail({ index, photo, objectId, asked = null, reference = null }) {
+/** Open the dialog on a photo. `query` contains the touches of the query, null in the catalogue view; `reference` is
+ *  the object's nearest reference touch, null if it has none. */
+export function openDetail({ index, photo, objectId, query = null, reference = null }) {
   const dialog = h("dialog", { class: "detail", "aria-labelledby": "detail-title" });
   const close = () => dialog.close();
   const title = h("h2", { id: "detail-title", tabindex: "-1" });
@@ -19,7 +19,7 @@ export function openDetail({ index, photo, objectId, asked = null, reference = n
     "div",
     { class: "detail-head" },
     title,
-    h("button", { type: "button", class: "cross", "aria-label": "Close", onclick: close }, "×"),
+    h("button", { type: "button", class: "close-button", "aria-label": "Close", onclick: close }, "×"),
   );
   dialog.append(head, body);
   dialog.addEventListener("close", () => dialog.remove());
@@ -31,20 +31,20 @@ export function openDetail({ index, photo, objectId, asked = null, reference = n
 
   async function showObject(firstPhoto, name) {
     title.textContent = name;
-    const stage = photoStage(index, asked, name === objectId ? reference : null);
+    const stage = photoStage(index, query, name === objectId ? reference : null);
     const strip = h("ul", { class: "film", "aria-label": "Photos of this object" });
     const facts = h("div", { class: "facts" });
-    const alike = h("div", { class: "alike" });
-    body.replaceChildren(stage.element, strip, facts, alike);
+    const similar = h("div", { class: "similar-photos" });
+    body.replaceChildren(stage.element, strip, facts, similar);
     const select = (each, button) => {
       stage.show(each.id);
       strip.querySelectorAll("button").forEach((other) => other.setAttribute("aria-pressed", String(other === button)));
       facts.replaceChildren(metadata(each));
-      showAlike(alike, each, showObject);
+      showSimilar(similar, each, showObject);
     };
     stage.show(firstPhoto);
     try {
-      const found = await api.catalogue({ object: name, limit: MOST_PHOTOS });
+      const found = await api.catalogue({ object: name, limit: MAX_PHOTOS });
       const buttons = found.items.map((each, place) => {
         const button = h(
           "button",
@@ -67,29 +67,29 @@ export function openDetail({ index, photo, objectId, asked = null, reference = n
   }
 }
 
-/** The photo, the nearest reference touch and the touch beside it; a click enlarges each. */
-function photoStage(index, asked, reference) {
+/** The photo next to the nearest reference touch and the touch; a click enlarges each. */
+function photoStage(index, query, reference) {
   const photos = h("div", { class: "frame" });
   const photoFigure = h("figure", { class: "pane" }, photos);
   const element = h("div", { class: "stage" }, photoFigure);
-  const alone = reference !== null && reference.adds === null; // what is shown is a gel image, and no photo
-  const tool = asked && !alone && agreementTool(asked);
+  const touchOnly = reference !== null && reference.adds === null; // the shown picture is a gel image, not a photo
+  const tool = query && !touchOnly && agreementTool(query);
   const caption = h("figcaption", {});
   photoFigure.append(caption);
   if (reference) element.append(gelPane("the reference touch", referenceGels(index, reference), element));
-  if (asked) element.append(gelPane("the touch", askedGels(index, asked), element));
+  if (query) element.append(gelPane("the touch", queryGels(index, query), element));
 
   function show(id) {
-    const image = picture(api.photoURL(id), alone ? `Gel image ${id}` : `Photo ${id}`);
+    const image = picture(api.photoURL(id), touchOnly ? `Gel image ${id}` : `Photo ${id}`);
     photos.replaceChildren(enlarger(image, "the photo", element, photoFigure));
-    caption.replaceChildren(h("span", { class: "faint" }, id), tool ? tool.of(id, image, photos) : "");
+    caption.replaceChildren(h("span", { class: "muted" }, id), tool ? tool.of(id, image, photos) : "");
   }
   return { element, show };
 }
 
-/** A picture as a button that gives it the whole stage, and takes it back. */
-function enlarger(image, what, stage, pane) {
-  const label = () => `${pane.classList.contains("large") ? "Show smaller" : "Enlarge"} ${what}`;
+/** A picture as a button that toggles its full size. */
+function enlarger(image, name, stage, pane) {
+  const label = () => `${pane.classList.contains("large") ? "Show smaller" : "Enlarge"} ${name}`;
   const button = h(
     "button",
     { type: "button", class: "enlarge", "aria-pressed": "false", "aria-label": label() },
@@ -106,11 +106,11 @@ function enlarger(image, what, stage, pane) {
 
 const ofFinger = (index, place) => (index.fingers > 1 ? `, finger ${finger(place)}` : "");
 
-function askedGels(index, asked) {
-  const gels = asked.touches.flatMap((grasp, number) =>
+function queryGels(index, query) {
+  const gels = query.touches.flatMap((grasp, number) =>
     grasp.map((blob, place) => ({ src: blobURL(blob), name: `Grasp ${number + 1}${ofFinger(index, place)}` })),
   );
-  return { gels, choice: "Touch beside the photo", note: null };
+  return { gels, choice: "Touch next to the photo", note: null };
 }
 
 function referenceGels(index, reference) {
@@ -118,15 +118,15 @@ function referenceGels(index, reference) {
     src: api.photoURL(path),
     name: `Nearest reference touch${ofFinger(index, place)}`,
   }));
-  return { gels, choice: "Reference touch beside the photo", note: nearness(reference) };
+  return { gels, choice: "Reference touch next to the photo", note: nearness(reference) };
 }
 
-/** Gel images, of which one is shown. */
-function gelPane(what, { gels, choice, note }, stage) {
+/** A pane that shows one of several gel images. */
+function gelPane(title, { gels, choice, note }, stage) {
   const frame = h("div", { class: "frame" });
   const pane = h("figure", { class: "pane" }, frame);
   const show = ({ src, name }) =>
-    frame.replaceChildren(enlarger(picture(src, `Gel image: ${name}`), what, stage, pane));
+    frame.replaceChildren(enlarger(picture(src, `Gel image: ${name}`), title, stage, pane));
   const choose = h(
     "select",
     { "aria-label": choice },
@@ -135,29 +135,29 @@ function gelPane(what, { gels, choice, note }, stage) {
   choose.addEventListener("change", () => show(gels[Number(choose.value)]));
   show(gels[0]);
   pane.append(
-    h("figcaption", {}, gels.length > 1 ? choose : gels[0].name, note && h("span", { class: "faint" }, note)),
+    h("figcaption", {}, gels.length > 1 ? choose : gels[0].name, note && h("span", { class: "muted" }, note)),
   );
   return pane;
 }
 
 function metadata(photo) {
   const rows = Object.entries(photo.metadata);
-  if (!rows.length) return h("p", { class: "faint" }, "The catalogue says nothing more of this photo.");
-  const said = (value) => (typeof value === "object" ? JSON.stringify(value) : String(value));
+  if (!rows.length) return h("p", { class: "muted" }, "The catalogue has no metadata for this photo.");
+  const text = (value) => (typeof value === "object" ? JSON.stringify(value) : String(value));
   return h(
     "dl",
     {},
-    rows.map(([term, value]) => [h("dt", {}, term), h("dd", {}, said(value))]),
+    rows.map(([term, value]) => [h("dt", {}, term), h("dd", {}, text(value))]),
   );
 }
 
-async function showAlike(place, photo, showObject) {
+async function showSimilar(place, photo, showObject) {
   place.replaceChildren();
   let found;
   try {
     found = await api.nearest(photo.id);
   } catch {
-    return; // an index without embeddings has none to compare
+    return; // the index has no embeddings
   }
   const items = found.items.map((each) =>
     h(
@@ -173,7 +173,7 @@ async function showAlike(place, photo, showObject) {
   );
   if (items.length)
     place.replaceChildren(
-      h("h3", {}, "Photos that look like this one to the model"),
+      h("h3", {}, "Visually similar photos"),
       h("ul", { class: "film named" }, items),
     );
 }

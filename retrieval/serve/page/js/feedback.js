@@ -1,21 +1,21 @@
-// What a person says of an answer: it was right, it was another object, or none of the catalogue.
+// Feedback on an answer: it is right, it is another object, or the object is not in the catalogue.
 
 import * as api from "./api.js";
-import { announce, h, problemCard, settled } from "./dom.js";
-import { saidWords } from "./words.js";
+import { announce, h, problemCard, debounce } from "./dom.js";
+import { feedbackText } from "./wording.js";
 
-const MOST_NAMES = 30;
+const MAX_NAMES = 30;
 
-/** The row of buttons under a verdict; what was said already is shown instead. */
-export function feedbackPanel(answer, id, kept) {
+/** The row of feedback buttons under a verdict, or the stored feedback. */
+export function feedbackPanel(answer, id, stored) {
   const element = h("section", { class: "feedback", "aria-label": "Was this right?" });
-  if (kept?.said) {
-    element.append(thanks(kept.said, kept.object_id, null));
+  if (stored?.feedback) {
+    element.append(thanks(stored.feedback, stored.object_id, null));
     return element;
   }
-  const sure = ["match", "uncalibrated", "none of these"].includes(answer.verdict);
+  const hasClaim = ["match", "uncalibrated", "none of these"].includes(answer.verdict);
   const problems = h("div", {});
-  const other = otherObject(answer, (name) => say("object", name));
+  const other = otherObject(answer, (name) => sendFeedback("object", name));
   const toggle = h("button", { type: "button", class: "quiet", "aria-expanded": "false" }, "It was another object");
   toggle.addEventListener("click", () => {
     other.element.hidden = !other.element.hidden;
@@ -27,22 +27,22 @@ export function feedbackPanel(answer, id, kept) {
       "div",
       { class: "choices" },
       h("span", { class: "question" }, "Was this right?"),
-      sure && h("button", { type: "button", class: "quiet", onclick: () => say("right") }, "Right"),
+      hasClaim && h("button", { type: "button", class: "quiet", onclick: () => sendFeedback("right") }, "Right"),
       toggle,
       answer.verdict !== "none of these" &&
-        h("button", { type: "button", class: "quiet", onclick: () => say("none") }, "None of the catalogue"),
+        h("button", { type: "button", class: "quiet", onclick: () => sendFeedback("none") }, "Not in the catalogue"),
     ),
     other.element,
     problems,
   );
   return element;
 
-  async function say(said, name = null) {
+  async function sendFeedback(feedback, name = null) {
     element.querySelectorAll("button").forEach((button) => (button.disabled = true));
     try {
-      const told = await api.feedback(id, said, name);
-      element.replaceChildren(thanks(told.said, told.object_id, told.recorded));
-      announce("What you said is kept.");
+      const result = await api.feedback(id, feedback, name);
+      element.replaceChildren(thanks(result.feedback, result.object_id, result.recorded));
+      announce("Feedback stored.");
     } catch (error) {
       problems.replaceChildren(problemCard(error));
       element.querySelectorAll("button").forEach((button) => (button.disabled = false));
@@ -50,13 +50,13 @@ export function feedbackPanel(answer, id, kept) {
   }
 }
 
-function thanks(said, objectId, recorded) {
-  const more = recorded ? "The grasps are in the recording that `retrieve train` reads." : "";
-  return h("p", { class: "said" }, h("strong", {}, `${saidWords(said, objectId)}.`), " ", more);
+function thanks(feedback, objectId, recorded) {
+  const more = recorded ? "The recording for `retrieve train` contains these grasps." : "";
+  return h("p", { class: "feedback-text" }, h("strong", {}, `${feedbackText(feedback, objectId)}.`), " ", more);
 }
 
-/** A list of objects that shrinks as a name is typed. */
-function otherObject(answer, chosen) {
+/** A list of objects, filtered by the typed name. */
+function otherObject(answer, onChoice) {
   const field = h("input", {
     type: "search",
     id: "other-object",
@@ -76,11 +76,11 @@ function otherObject(answer, chosen) {
     list.replaceChildren(
       ...(names.length
         ? names
-            .slice(0, MOST_NAMES)
+            .slice(0, MAX_NAMES)
             .map((name) =>
-              h("li", {}, h("button", { type: "button", class: "quiet", onclick: () => chosen(name) }, name)),
+              h("li", {}, h("button", { type: "button", class: "quiet", onclick: () => onChoice(name) }, name)),
             )
-        : [h("li", { class: "faint" }, "The catalogue has no such object.")]),
+        : [h("li", { class: "muted" }, "The catalogue has no such object.")]),
     );
   }
 
@@ -97,7 +97,7 @@ function otherObject(answer, chosen) {
       list.replaceChildren(h("li", {}, problemCard(error)));
     }
   }
-  field.addEventListener("input", settled(search));
+  field.addEventListener("input", debounce(search));
   const open = () => {
     search();
     field.focus();

@@ -1,33 +1,33 @@
-// The history: what was asked, what was answered, what people said of it.
+// The history view: queries, answers and feedback.
 
 import * as api from "./api.js";
-import { announce, h, picture, problemCard, settled } from "./dom.js";
-import { count, moment, percent, saidWords } from "./words.js";
+import { announce, h, picture, problemCard, debounce } from "./dom.js";
+import { count, moment, percent, feedbackText } from "./wording.js";
 
 const PAGE = 30;
-const SAID = [
-  ["", "Everything"],
-  ["missing", "Nothing said yet"],
-  ["right", "Said to be right"],
-  ["object", "Said to be another object"],
-  ["none", "Said to be none"],
+const FEEDBACK_FILTERS = [
+  ["", "All"],
+  ["missing", "Without feedback"],
+  ["right", "Right"],
+  ["object", "Another object"],
+  ["none", "Not in the catalogue"],
 ];
 
 export function historyView() {
   const search = h("input", { type: "search", id: "history-search", autocomplete: "off" });
-  const said = h(
+  const feedbackSelect = h(
     "select",
-    { id: "history-said" },
-    SAID.map(([value, text]) => h("option", { value }, text)),
+    { id: "history-feedback" },
+    FEEDBACK_FILTERS.map(([value, text]) => h("option", { value }, text)),
   );
-  const total = h("p", { class: "faint", role: "status" });
+  const total = h("p", { class: "muted", role: "status" });
   const list = h("ul", { class: "queries" });
   const more = h(
     "button",
     { type: "button", class: "quiet more", hidden: true, onclick: () => load(list.children.length) },
     "Older",
   );
-  const near = h("section", { class: "near", hidden: true, "aria-label": "Touches that feel alike" });
+  const similar = h("section", { class: "similar-touches", hidden: true, "aria-label": "Similar touches" });
   const element = h(
     "div",
     { class: "history" },
@@ -41,28 +41,28 @@ export function historyView() {
       "div",
       { class: "filters" },
       h("div", { class: "field" }, h("label", { for: "history-search" }, "Search"), search),
-      h("div", { class: "field" }, h("label", { for: "history-said" }, "Show"), said),
+      h("div", { class: "field" }, h("label", { for: "history-feedback" }, "Feedback"), feedbackSelect),
     ),
     total,
-    near,
+    similar,
     list,
     more,
   );
   search.addEventListener(
     "input",
-    settled(() => load()),
+    debounce(() => load()),
   );
-  said.addEventListener("change", () => load());
+  feedbackSelect.addEventListener("change", () => load());
 
   async function load(offset = 0) {
-    const asked = { offset, limit: PAGE, search: search.value.trim(), said: said.value };
+    const filters = { offset, limit: PAGE, search: search.value.trim(), feedback: feedbackSelect.value };
     try {
-      const page = await api.history(asked);
-      const items = page.items.map((item) => entry(item, showNear));
+      const page = await api.history(filters);
+      const items = page.items.map((item) => entry(item, showSimilarTouches));
       if (offset) list.append(...items);
       else list.replaceChildren(...items);
       more.hidden = page.next === null;
-      total.textContent = page.total ? count(page.total, "question") : empty(asked);
+      total.textContent = page.total ? count(page.total, "question") : empty(filters);
     } catch (error) {
       list.replaceChildren(
         h(
@@ -74,47 +74,47 @@ export function historyView() {
     }
   }
 
-  async function showNear(item) {
-    near.hidden = false;
-    const close = h("button", { type: "button", class: "link", onclick: () => (near.hidden = true) }, "Close");
+  async function showSimilarTouches(item) {
+    similar.hidden = false;
+    const close = h("button", { type: "button", class: "link", onclick: () => (similar.hidden = true) }, "Close");
     const head = h(
       "div",
       { class: "live-head" },
-      h("h2", { tabindex: "-1" }, "Touches that feel like this one to the model"),
+      h("h2", { tabindex: "-1" }, "Similar touches"),
       close,
     );
     try {
       const found = await api.nearestTouches(item.id);
-      const items = found.items.map((each) => entry(each, showNear));
-      near.replaceChildren(
+      const items = found.items.map((each) => entry(each, showSimilarTouches));
+      similar.replaceChildren(
         head,
         thumbs(item),
         items.length
           ? h("ul", { class: "queries" }, items)
-          : h("p", { class: "faint" }, "There is no other touch yet."),
+          : h("p", { class: "muted" }, "There are no other touches yet."),
       );
     } catch (error) {
-      near.replaceChildren(head, problemCard(error));
+      similar.replaceChildren(head, problemCard(error));
     }
-    near.scrollIntoView({ block: "nearest" });
+    similar.scrollIntoView({ block: "nearest" });
     head.firstChild.focus();
-    announce("Touches that feel alike are shown.");
+    announce("Similar touches are shown.");
   }
 
   return {
     element,
     show: () => {
-      near.hidden = true;
+      similar.hidden = true;
       load();
     },
   };
 }
 
-function empty({ search, said }) {
-  return search || said ? "Nothing was found." : "Nothing was asked yet. What is asked on the first page is kept here.";
+function empty({ search, feedback }) {
+  return search || feedback ? "No matching questions." : "No questions yet. The questions of the first page appear here.";
 }
 
-function entry(item, showNear) {
+function entry(item, showSimilarTouches) {
   const named = item.verdict === "match" || item.verdict === "uncalibrated";
   const claim = named ? item.best : item.verdict[0].toUpperCase() + item.verdict.slice(1);
   return h(
@@ -124,18 +124,18 @@ function entry(item, showNear) {
       "a",
       { href: `#//${item.id}`, class: "open" },
       thumbs(item),
-      h("span", { class: "what" }, h("strong", {}, claim), h("span", { class: "faint" }, facts(item, named))),
+      h("span", { class: "what" }, h("strong", {}, claim), h("span", { class: "muted" }, facts(item, named))),
     ),
     h(
       "span",
-      { class: `said-mark${item.said ? "" : " faint"}` },
-      item.said ? saidWords(item.said, item.object_id) : "",
+      { class: `feedback-mark${item.feedback ? "" : " muted"}` },
+      item.feedback ? feedbackText(item.feedback, item.object_id) : "",
     ),
     h(
       "button",
-      { type: "button", class: "link", onclick: () => showNear(item) },
-      "Alike",
-      h("span", { class: "unseen" }, ` touches to that of ${moment(item.time)}`),
+      { type: "button", class: "link", onclick: () => showSimilarTouches(item) },
+      "Similar",
+      h("span", { class: "visually-hidden" }, ` touches to that of ${moment(item.time)}`),
     ),
   );
 }

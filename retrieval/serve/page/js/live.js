@@ -1,10 +1,10 @@
-// Live pictures: the browser's camera, or the sensors of the service's rig.
+// Live pictures of the browser's camera, or of the sensors of the service's rig.
 
 import * as api from "./api.js";
 import { h, problemCard } from "./dom.js";
 import { finger } from "./tray.js";
 
-/** Buttons that open a source, the panel that shows it, and `stop`, which lets go of it. */
+/** Buttons that open a source, the panel that shows it, and `stop`, which closes it. */
 export function livePanel(index, tray) {
   const element = h("section", { class: "live", hidden: true, "aria-label": "Live pictures" });
   let release = () => {};
@@ -57,12 +57,12 @@ export function livePanel(index, tray) {
         h("figcaption", {}, names.length > index.fingers ? choose : `Sensor ${name}`),
       );
     });
-    release = () => images.forEach((image) => image.removeAttribute("src")); // else the stream runs on
-    const frames = (taken) => async (event) => {
+    release = () => images.forEach((image) => image.removeAttribute("src")); // ends the stream
+    const frames = (onFrames) => async (event) => {
       const button = event.currentTarget;
       button.disabled = true;
       try {
-        taken(await Promise.all(chosen.map(api.frame)));
+        onFrames(await Promise.all(chosen.map(api.frame)));
       } catch (error) {
         button.after(problemCard(error));
       }
@@ -71,7 +71,7 @@ export function livePanel(index, tray) {
     open("Live sensors", h("div", { class: "fingers" }, figures), [
       h(
         "button",
-        { type: "button", class: "primary", onclick: frames((taken) => tray.addGrasp(taken)) },
+        { type: "button", class: "primary", onclick: frames((pictures) => tray.addGrasp(pictures)) },
         "Take this touch",
       ),
       h(
@@ -79,7 +79,7 @@ export function livePanel(index, tray) {
         {
           type: "button",
           class: "link",
-          onclick: frames((taken) => taken.forEach((blob, place) => tray.putBackground(place, blob))),
+          onclick: frames((pictures) => pictures.forEach((blob, place) => tray.putBackground(place, blob))),
         },
         "Take as no-contact frames",
       ),
@@ -94,13 +94,13 @@ export function livePanel(index, tray) {
         video: deviceId ? { deviceId: { exact: deviceId } } : true,
       });
     } catch (error) {
-      const why =
+      const detail =
         error.name === "NotAllowedError"
-          ? "Allow this page the camera in the browser's settings."
-          : "None is connected, or another program has it.";
+          ? "Allow this page to use the camera in the browser's settings."
+          : "No camera is connected, or another program uses it.";
       open(
         "Camera",
-        problemCard({ title: "The camera cannot be used", detail: why }, () => openCamera(deviceId)),
+        problemCard({ title: "The camera cannot be used", detail }, () => openCamera(deviceId)),
         [],
       );
       return;
@@ -118,27 +118,27 @@ export function livePanel(index, tray) {
     );
     choose.addEventListener("change", () => (stop(), openCamera(choose.value)));
     const take = h("button", { type: "button", class: "primary" });
-    const say = () =>
+    const updateLabel = () =>
       (take.textContent = index.fingers > 1 ? `Take finger ${finger(nextPlace(tray))}` : "Take this touch");
     take.addEventListener("click", async () => {
       const blob = await still(video);
       if (nextPlace(tray) === 0) tray.addGrasp([blob]);
       else tray.put(tray.grasps.length - 1, nextPlace(tray), blob);
-      say();
+      updateLabel();
     });
-    say();
+    updateLabel();
     open("Camera", h("div", {}, video, cameras.length > 1 && choose), [take]);
   }
 
   return { element, buttons, stop };
 }
 
-/** The finger whose picture is missing in the last grasp; 0 begins another. */
+/** The finger whose picture is missing in the last grasp; 0 begins a new grasp. */
 function nextPlace(tray) {
   return Math.max(0, tray.grasps.at(-1)?.indexOf(null) ?? 0);
 }
 
-/** The picture that a video shows now, as a PNG file. */
+/** The current picture of a video, as a PNG file. */
 async function still(video) {
   if (!video.videoWidth) await new Promise((done) => video.addEventListener("loadeddata", done, { once: true }));
   const canvas = h("canvas", { width: video.videoWidth, height: video.videoHeight });

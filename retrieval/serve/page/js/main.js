@@ -1,8 +1,8 @@
-// The views, and which of them this service offers.
+// The views that this service offers, and the routing between them.
 
 import * as api from "./api.js";
 import { h, problemCard } from "./dom.js";
-import { count } from "./words.js";
+import { count } from "./wording.js";
 import { askView } from "./ask.js";
 import { catalogueView } from "./catalogue.js";
 import { historyView } from "./history.js";
@@ -21,7 +21,7 @@ function addView(name, title, view) {
   views.set(name, { ...view, title, link });
 }
 
-/** The address after "#/": the view's name, then what it shows. */
+/** Show the view of the address: "#/", the view's name, then its item. */
 function route() {
   if (!location.hash.startsWith("#/") && location.hash) return; // the skip link
   const [name, ...rest] = location.hash.slice(2).split("/").map(decodeURIComponent);
@@ -43,7 +43,7 @@ function route() {
   }
 }
 
-/** Ask for the token, once for all requests that wait for it. */
+/** Request the token from the user, once for all waiting requests. */
 function tokenDialog() {
   let waiting = null;
   return () => {
@@ -53,12 +53,12 @@ function tokenDialog() {
       const form = h(
         "form",
         { method: "dialog", class: "token" },
-        h("h2", {}, "This service asks for a token"),
-        h("p", {}, "It was set where the service was started. The browser keeps it until it is closed."),
+        h("h2", {}, "This service requires a token"),
+        h("p", {}, "The operator of the service sets it. The browser stores it until you close the browser."),
         h("label", { for: "token" }, "Token"),
         field,
         wrong,
-        h("button", { class: "primary" }, "Go on"),
+        h("button", { class: "primary" }, "Continue"),
       );
       const dialog = h("dialog", { class: "small-dialog", "aria-label": "Token" }, form);
       dialog.addEventListener("cancel", (event) => event.preventDefault());
@@ -93,7 +93,7 @@ function foot(index) {
 }
 
 async function start() {
-  api.onTokenWanted(tokenDialog());
+  api.onTokenRequired(tokenDialog());
   let index;
   try {
     index = await api.index();
@@ -104,8 +104,8 @@ async function start() {
   main.replaceChildren();
   addView("", "Ask", askView(index));
   addView("catalogue", "Catalogue", catalogueView(index));
-  if (index.keeps) addView("history", "History", historyView());
-  if (index.keeps && index.trials) addView("test", "Test", trialsView());
+  if (index.stores_history) addView("history", "History", historyView());
+  if (index.stores_history && index.trials) addView("test", "Test", trialsView());
   nav.hidden = views.size < 2;
   foot(index);
   addEventListener("hashchange", route);

@@ -1,9 +1,9 @@
-// The gel images that are to be asked about: grasps, each with a picture for each finger.
+// The gel images of the next query: grasps, each with a picture for each finger.
 
 import { h, picture } from "./dom.js";
 
-export const MOST_GRASPS = 32;
-const MOST_BYTES = 20_000_000;
+export const MAX_GRASPS = 32;
+const MAX_BYTES = 20_000_000;
 const LETTERS = "abcdefgh";
 const natural = new Intl.Collator("en", { numeric: true });
 const FINGER = /^(?:(.*?)[^a-z0-9]+|.*?\d|)(a|b|1|2|left|right)(\d*)$/i;
@@ -11,8 +11,8 @@ const FINGER = /^(?:(.*?)[^a-z0-9]+|.*?\d|)(a|b|1|2|left|right)(\d*)$/i;
 /** The finger's letter, from 0. */
 export const finger = (place) => LETTERS[place];
 
-/** Files by grasp: by names such as mug_a.png and mug_b.png where all have them, else in the order of their names. */
-export function byGrasp(files, fingers) {
+/** Group files by grasp: by finger names such as mug_a.png and mug_b.png if all files have them, else by name order. */
+export function groupByGrasp(files, fingers) {
   const sorted = [...files].sort((one, other) => natural.compare(one.name, other.name));
   if (fingers === 2 && files.length > 1) {
     const groups = new Map();
@@ -35,10 +35,10 @@ export function byGrasp(files, fingers) {
   return grasps;
 }
 
-/** What is wrong with a file before anyone reads it; null where nothing is. */
-function fault(file) {
-  if (file.type && !file.type.startsWith("image/")) return `${file.name} is no picture.`;
-  if (file.size > MOST_BYTES) return `${file.name} has ${(file.size / 1e6).toFixed(1)} MB; at most 20 MB are taken.`;
+/** A problem of a file that shows without reading it, or null. */
+function fileProblem(file) {
+  if (file.type && !file.type.startsWith("image/")) return `${file.name} is not a picture.`;
+  if (file.size > MAX_BYTES) return `${file.name} has ${(file.size / 1e6).toFixed(1)} MB; the limit is 20 MB.`;
   return null;
 }
 
@@ -49,7 +49,7 @@ export class Tray extends EventTarget {
     this.background = Array(fingers).fill(null);
     this.grasps = [];
     this.marks = [];
-    this.refused = [];
+    this.rejected = [];
   }
 
   /** Whether every grasp has all its pictures. */
@@ -58,39 +58,39 @@ export class Tray extends EventTarget {
   }
 
   /** The no-contact frames; null unless there is one for each finger. */
-  get untouched() {
+  get noContactFrames() {
     return this.background.every(Boolean) ? this.background : null;
   }
 
-  /** Take files: first where pictures are missing, then as new grasps. */
+  /** Add files: one file replaces a missing picture, others become new grasps. */
   addFiles(files) {
-    this.refused = [...files].map(fault).filter(Boolean);
-    const good = [...files].filter((file) => !fault(file));
+    this.rejected = [...files].map(fileProblem).filter(Boolean);
+    const good = [...files].filter((file) => !fileProblem(file));
     const last = this.grasps.at(-1);
     const missing = last?.indexOf(null) ?? -1;
     if (missing >= 0 && good.length === 1) last[missing] = good[0];
-    else byGrasp(good, this.fingers).forEach((grasp) => this._append(grasp));
+    else groupByGrasp(good, this.fingers).forEach((grasp) => this._append(grasp));
     this._changed();
   }
 
-  /** One more grasp, whole or with pictures to come. */
+  /** Add a grasp; missing pictures can follow. */
   addGrasp(pictures) {
-    this.refused = [];
+    this.rejected = [];
     this._append(pictures);
     this._changed();
   }
 
   _append(pictures) {
-    if (this.grasps.length === MOST_GRASPS) {
-      this.refused.push(`At most ${MOST_GRASPS} grasps are asked about at once.`);
+    if (this.grasps.length === MAX_GRASPS) {
+      this.rejected.push(`A query can have at most ${MAX_GRASPS} grasps.`);
       return;
     }
     this.grasps.push(Array.from({ length: this.fingers }, (_, place) => pictures[place] ?? null));
   }
 
   put(grasp, place, blob) {
-    this.refused = [fault(blob)].filter(Boolean);
-    if (!this.refused.length) this.grasps[grasp][place] = blob;
+    this.rejected = [fileProblem(blob)].filter(Boolean);
+    if (!this.rejected.length) this.grasps[grasp][place] = blob;
     this._changed();
   }
 
@@ -99,7 +99,7 @@ export class Tray extends EventTarget {
     this._changed();
   }
 
-  /** Take a picture away, and the grasp with its last one. */
+  /** Remove a picture, and the grasp if it was the last one. */
   remove(grasp, place) {
     this.grasps[grasp][place] = null;
     if (!this.grasps[grasp].some(Boolean)) this.grasps.splice(grasp, 1);
@@ -111,8 +111,8 @@ export class Tray extends EventTarget {
     this._changed();
   }
 
-  /** The other order of the fingers. */
-  turn(grasp) {
+  /** Swap the fingers of a grasp. */
+  swapFingers(grasp) {
     this.grasps[grasp].push(this.grasps[grasp].shift());
     this._changed();
   }
@@ -120,7 +120,7 @@ export class Tray extends EventTarget {
   clear() {
     this.grasps = [];
     this.background = Array(this.fingers).fill(null);
-    this.refused = [];
+    this.rejected = [];
     this._changed();
   }
 
@@ -132,39 +132,39 @@ export class Tray extends EventTarget {
 
 const urls = new WeakMap();
 
-/** An address of a picture in this browser, the same for the same picture. */
+/** The URL of a picture in this browser; the same for the same picture. */
 export function blobURL(blob) {
   if (!urls.has(blob)) urls.set(blob, URL.createObjectURL(blob));
   return urls.get(blob);
 }
 
 /** A button that chooses files. */
-export function chooser(text, taken, given = {}, multiple = true) {
+export function chooser(text, onFiles, attributes = {}, multiple = true) {
   const input = h("input", {
     type: "file",
     accept: "image/*,.heic,.heif,.avif",
     multiple,
-    class: "unseen",
+    class: "visually-hidden",
     tabindex: "-1",
     "aria-hidden": "true",
   });
   input.addEventListener("change", () => {
-    if (input.files.length) taken([...input.files]);
+    if (input.files.length) onFiles([...input.files]);
     input.value = "";
   });
   return h(
     "span",
     { class: "chooser" },
-    h("button", { type: "button", ...given, onclick: () => input.click() }, text),
+    h("button", { type: "button", ...attributes, onclick: () => input.click() }, text),
     input,
   );
 }
 
-/** The grasps as cards; `readOnly` for what was asked long ago. */
+/** The grasps as cards; `readOnly` omits the tools. */
 export function trayCards(tray, readOnly = false) {
   return tray.grasps.map((pictures, number) => {
     const mark = tray.marks[number];
-    const marked = mark && mark !== "contact" && `${mark}, not judged`;
+    const marked = mark && mark !== "contact" && `${mark}, not scored`;
     return h(
       "fieldset",
       { class: `grasp${marked ? " marked" : ""}` },
@@ -178,16 +178,16 @@ export function trayCards(tray, readOnly = false) {
           pictures.every(Boolean) &&
           h(
             "button",
-            { type: "button", class: "link", onclick: () => tray.turn(number) },
+            { type: "button", class: "link", onclick: () => tray.swapFingers(number) },
             "Swap fingers",
-            h("span", { class: "unseen" }, ` of grasp ${number + 1}`),
+            h("span", { class: "visually-hidden" }, ` of grasp ${number + 1}`),
           ),
         !readOnly &&
           h(
             "button",
             { type: "button", class: "link", onclick: () => tray.removeGrasp(number) },
             "Remove",
-            h("span", { class: "unseen" }, ` grasp ${number + 1}`),
+            h("span", { class: "visually-hidden" }, ` grasp ${number + 1}`),
           ),
       ),
       h(
@@ -217,7 +217,7 @@ function slot(tray, number, place, blob, readOnly) {
     !readOnly &&
       h(
         "button",
-        { type: "button", class: "cross", "aria-label": `Remove ${name} of grasp ${number + 1}`, onclick: remove },
+        { type: "button", class: "close-button", "aria-label": `Remove ${name} of grasp ${number + 1}`, onclick: remove },
         "×",
       ),
   );

@@ -1,19 +1,19 @@
-// The human test: a touch is shown, and ten photos; which of them shows the object that was touched?
+// The human baseline: the user sees a touch and ten photos, and chooses the photo of the touched object.
 
 import * as api from "./api.js";
 import { announce, h, picture, problemCard } from "./dom.js";
-import { count } from "./words.js";
+import { count } from "./wording.js";
 
-const whole = (share) => `${Math.round(100 * share)}\u00a0%`;
+const wholePercent = (fraction) => `${Math.round(100 * fraction)}\u00a0%`;
 
 export function trialsView() {
   const element = h("div", { class: "trials" });
-  let state = null; // the series that is done
+  let state = null; // the current series
   let choose = () => {};
 
   async function show(id) {
     try {
-      if (id) await go(id);
+      if (id) await openSeries(id);
       else overview(await api.trials());
     } catch (error) {
       element.replaceChildren(
@@ -33,19 +33,19 @@ export function trialsView() {
       value: "20",
       required: true,
     });
-    const who = h("input", { type: "text", id: "trial-who", maxlength: "200", autocomplete: "name" });
+    const participant = h("input", { type: "text", id: "trial-participant", maxlength: "200", autocomplete: "name" });
     const problems = h("div", {});
     const form = h(
       "form",
       { class: "begin" },
       h("div", { class: "field" }, h("label", { for: "trial-count" }, "Trials"), number),
-      h("div", { class: "field" }, h("label", { for: "trial-who" }, "Your name, if you like"), who),
+      h("div", { class: "field" }, h("label", { for: "trial-participant" }, "Your name (optional)"), participant),
       h("button", { class: "primary" }, "Begin"),
     );
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       try {
-        const series = await api.beginTrials(Number(number.value), who.value);
+        const series = await api.beginTrials(Number(number.value), participant.value);
         location.hash = `#/test/${series.id}`;
       } catch (error) {
         problems.replaceChildren(problemCard(error));
@@ -57,15 +57,15 @@ export function trialsView() {
       h(
         "p",
         { class: "lead" },
-        `The gels of one grasp are shown, and ${known.choices} photos. One of them shows the object that was touched. `,
-        `The model is asked the same; ${count(known.objects, "object")} of ${known.recording} were never shown to it.`,
+        `You see the gel images of one grasp and ${known.choices} photos. One photo shows the touched object. `,
+        `The model does the same trials, with ${count(known.objects, "object")} of ${known.recording} that it was not trained on.`,
       ),
       enough
         ? form
         : h(
             "p",
             { class: "notice" },
-            `A trial takes ${known.choices} objects that the model was not trained on; this recording has ${known.objects}.`,
+            `A trial requires ${known.choices} objects that the model was not trained on; this recording has ${known.objects}.`,
           ),
       problems,
       ...(known.runs.length ? [h("h2", {}, "Series so far")] : []),
@@ -73,9 +73,9 @@ export function trialsView() {
     );
   }
 
-  async function go(id) {
+  async function openSeries(id) {
     state = await api.series(id);
-    if (state.next === null) finished();
+    if (state.next === null) showResult();
     else ask(await api.trial(id, state.next));
   }
 
@@ -91,16 +91,16 @@ export function trialsView() {
         h("span", { class: "name" }, `Photo ${place + 1}`),
       ),
     );
-    const told = h("div", { class: "told" });
+    const trialResult = h("div", { class: "trial-result" });
     choose = async (chosen) => {
       choose = () => {};
       buttons.forEach((button) => (button.disabled = true));
       try {
         const done = await api.choose(state.id, trial.number, chosen);
         state = await api.series(state.id);
-        reveal(done, buttons, told);
+        reveal(done, buttons, trialResult);
       } catch (error) {
-        told.replaceChildren(problemCard(error, () => show(state.id)));
+        trialResult.replaceChildren(problemCard(error, () => show(state.id)));
       }
     };
     element.replaceChildren(
@@ -112,13 +112,13 @@ export function trialsView() {
       ),
       h(
         "p",
-        { class: "faint" },
+        { class: "muted" },
         `Trial ${trial.number} of ${state.count}. Choose a photo, or press its number (0 for the tenth).`,
       ),
       h(
         "div",
         { class: "trial" },
-        h("section", { class: "touched", "aria-label": "The touch" }, fingers, told),
+        h("section", { class: "touched", "aria-label": "The touch" }, fingers, trialResult),
         h(
           "ol",
           { class: "choices-grid", "aria-label": "Photos to choose from" },
@@ -129,13 +129,13 @@ export function trialsView() {
     element.querySelector("h1").focus({ preventScroll: true });
   }
 
-  function reveal(done, buttons, told) {
+  function reveal(done, buttons, trialResult) {
     const right = done.choice === done.truth;
-    const chose = `the model chose photo ${done.model}`;
-    const knew = done.model === done.truth;
+    const modelChoice = `the model chose photo ${done.model}`;
+    const modelRight = done.model === done.truth;
     const text = right
-      ? `Right; ${knew ? "the model too" : chose}.`
-      : `No, it was photo ${done.truth}; ${knew ? "the model knew" : chose}.`;
+      ? `Right; ${modelRight ? "the model was right too" : modelChoice}.`
+      : `Wrong, it was photo ${done.truth}; ${modelRight ? "the model was right" : modelChoice}.`;
     buttons.forEach((button, place) => {
       const number = place + 1;
       const marks = [
@@ -150,22 +150,22 @@ export function trialsView() {
     const next = h(
       "button",
       { type: "button", class: "primary", onclick: () => show(state.id) },
-      state.next === null ? "The result" : "Next",
+      state.next === null ? "Result" : "Next",
     );
-    told.replaceChildren(h("p", { class: "verdict-line" }, text), next, scores(state));
+    trialResult.replaceChildren(h("p", { class: "verdict-line" }, text), next, scores(state));
     announce(text);
     next.focus({ preventScroll: true });
     if (next.getBoundingClientRect().bottom > innerHeight || next.getBoundingClientRect().top < 0)
       next.scrollIntoView({ block: "center" });
   }
 
-  function finished() {
+  function showResult() {
     choose = () => {};
     element.replaceChildren(
-      h("h1", { tabindex: "-1" }, "The result"),
+      h("h1", { tabindex: "-1" }, "Result"),
       h("p", { class: "lead" }, sentence(state)),
       scores(state),
-      h("p", {}, h("a", { href: "#/test" }, "All series, and another one")),
+      h("p", {}, h("a", { href: "#/test" }, "All series")),
     );
     element.querySelector("h1").focus({ preventScroll: true });
   }
@@ -184,54 +184,54 @@ export function trialsView() {
   return { element, show };
 }
 
-function sentence({ human, model, count: trials }) {
-  const apart = human.low > model.high || model.low > human.high;
+function sentence({ human_baseline: human, model, count: trials }) {
+  const differ = human.low > model.high || model.low > human.high;
   const better =
     human.right === model.right
       ? "You and the model were right equally often"
       : human.right > model.right
         ? "You were right more often than the model"
         : "The model was right more often than you";
-  return `${better}: you ${human.right}, the model ${model.right} of ${count(trials, "trial")}.${apart ? "" : " The intervals overlap: this may be chance."}`;
+  return `${better}: you ${human.right}, the model ${model.right} of ${count(trials, "trial")}.${differ ? "" : " The intervals overlap: this may be chance."}`;
 }
 
 function seriesCard(run) {
-  const done = run.next === null ? "done" : `${run.answered} of ${run.count} done`;
+  const done = run.next === null ? "done" : `${run.completed} of ${run.count} done`;
   return h(
     "li",
     {},
     h(
       "div",
       { class: "view-head" },
-      h("strong", {}, run.who || "Nameless"),
-      h("a", { href: `#/test/${run.id}` }, run.next === null ? "The result" : "Go on"),
+      h("strong", {}, run.participant || "Anonymous"),
+      h("a", { href: `#/test/${run.id}` }, run.next === null ? "Result" : "Continue"),
     ),
-    h("p", { class: "faint" }, `${count(run.count, "trial")}, ${done}`),
-    run.answered > 0 && scores(run),
+    h("p", { class: "muted" }, `${count(run.count, "trial")}, ${done}`),
+    run.completed > 0 && scores(run),
   );
 }
 
-/** Shares of right answers with their intervals of 95 %: the person's, the model's, and chance. */
-function scores({ human, model, chance }) {
-  const row = (name, share) =>
+/** Accuracy of the person and of the model with 95 % intervals, and chance. */
+function scores({ human_baseline: human, model, chance }) {
+  const row = (name, result) =>
     h(
       "div",
       { class: `score ${name === "You" ? "you" : ""}` },
-      h("span", { class: "who" }, name),
+      h("span", { class: "row-label" }, name),
       h(
         "span",
         { class: "track", "aria-hidden": "true" },
         h("span", {
           class: "range",
-          style: { left: `${100 * share.low}%`, width: `${100 * (share.high - share.low)}%` },
+          style: { left: `${100 * result.low}%`, width: `${100 * (result.high - result.low)}%` },
         }),
-        h("span", { class: "dot", style: { left: `${100 * share.share}%` } }),
+        h("span", { class: "dot", style: { left: `${100 * result.accuracy}%` } }),
         h("span", { class: "chance", style: { left: `${100 * chance}%` } }),
       ),
       h(
         "span",
         { class: "p" },
-        `${share.right} of ${share.trials}, ${whole(share.share)} [${whole(share.low)}, ${whole(share.high)}]`,
+        `${result.right} of ${result.trials}, ${wholePercent(result.accuracy)} [${wholePercent(result.low)}, ${wholePercent(result.high)}]`,
       ),
     );
   if (!human.trials) return h("p", {});
@@ -240,6 +240,6 @@ function scores({ human, model, chance }) {
     { class: "scores" },
     row("You", human),
     row("Model", model),
-    h("p", { class: "faint" }, `Intervals of 95 %; the line is chance, ${whole(chance)}.`),
+    h("p", { class: "muted" }, `95 % intervals; the line is chance, ${wholePercent(chance)}.`),
   );
 }

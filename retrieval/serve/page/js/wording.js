@@ -1,6 +1,6 @@
-// How numbers and verdicts are said.
+// Texts of numbers, verdicts and feedback.
 
-/** A probability as people read it; number and sign stay on one line. */
+/** A probability in percent; number and sign stay on one line. */
 export function percent(p) {
   if (p > 0.999) return "over 99.9\u00a0%";
   if (p < 0.001) return "under 0.1\u00a0%";
@@ -13,12 +13,12 @@ export function count(number, word) {
   return `${number.toLocaleString("en")} ${word}${number === 1 ? "" : more}`;
 }
 
-/** A date and time of this place, from what the service writes. */
+/** The local date and time of a timestamp. */
 export function moment(text) {
   return new Date(text).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
 }
 
-/** A verdict in words: what stands above, the name or claim, and the sentence below. */
+/** The texts of a verdict: a line above, the name or claim, and a sentence below. */
 export function verdict(answer) {
   const best = answer.results[0];
   switch (answer.verdict) {
@@ -26,7 +26,7 @@ export function verdict(answer) {
       return {
         above: "Most likely",
         claim: best.object_id,
-        below: `Probability ${percent(best.probability)}. That it is none of these: ${percent(answer.none_probability)}.`,
+        below: `Probability ${percent(best.probability)}. None of these: ${percent(answer.none_probability)}.`,
       };
     case "none of these":
       return {
@@ -38,41 +38,41 @@ export function verdict(answer) {
       };
     case "no contact":
       return {
-        above: "Nothing was felt",
+        above: "No object is named",
         claim: "No contact",
-        below: "The gels look untouched, so nothing is named. Press the object and take the picture again.",
+        below: "The gel images show no contact. Press the object and take the pictures again.",
       };
     case "not a gel image":
       return {
-        above: "Nothing is named",
+        above: "No object is named",
         claim: "Not a gel image",
-        below: "What is marked does not look like a gel that the model knows. Is it a photo of the object?",
+        below: "The marked images do not look like the gel images that the model was trained on. Are they photos?",
       };
     default:
       return {
-        above: "Nearest",
+        above: "Best match",
         claim: best.object_id,
-        below: "This model was never calibrated: it ranks the objects and gives no probabilities.",
+        below: "This model is not calibrated: it ranks the objects, but gives no probabilities.",
       };
   }
 }
 
-/** The first object given that the catalogue has it; answers that a history keeps from before do not say. */
+/** A sentence on the first object given that the catalogue contains it; stored answers of earlier versions lack it. */
 function ifPresent(best) {
   if (best.probability_if_present == null) return "The nearest objects are shown.";
-  return `If it has the object, this is ${best.object_id} with probability ${percent(best.probability_if_present)}.`;
+  return `If it contains the object, this is ${best.object_id} with probability ${percent(best.probability_if_present)}.`;
 }
 
-/** How near a reference touch is, and what it did. */
+/** The cosine of a reference touch, and its effect on the logit. */
 export function nearness({ cosine, adds }) {
   const sign = adds < 0 ? "\u2212" : "+";
-  const did = adds === null ? "no photo: found by touches alone" : `references add ${sign}${Math.abs(adds).toFixed(2)} to the logit`;
-  return `cosine ${cosine.toFixed(2)}; ${did}`;
+  const effect = adds === null ? "no photo: scored by its touches only" : `references add ${sign}${Math.abs(adds).toFixed(2)} to the logit`;
+  return `cosine ${cosine.toFixed(2)}; ${effect}`;
 }
 
-/** What was said of an answer, as a sentence. */
-export function saidWords(said, objectId) {
-  if (said === "right") return "Said to be right";
-  if (said === "none") return "Said to be none of these";
-  return `Said to be ${objectId}`;
+/** The feedback on an answer, as text. */
+export function feedbackText(feedback, objectId) {
+  if (feedback === "right") return "Feedback: right";
+  if (feedback === "none") return "Feedback: not in the catalogue";
+  return `Feedback: ${objectId}`;
 }
