@@ -173,7 +173,7 @@ import numpy as np
 from robot.errors import DeviceError
 from robot.real_rig import load_driver
 from robot.readings import Region
-given = {{"workspace": Region((-1, -1, 0), (1, 1, 1)), "extrinsics": np.eye(4)}}
+options = {{"workspace": Region((-1, -1, 0), (1, 1, 1)), "extrinsics": np.eye(4)}}
 device = load_driver({role!r}, {table!r}, "table", **options)
 try:
     device.connect()

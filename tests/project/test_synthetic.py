@@ -98,7 +98,7 @@ def test_more_force_dents_more() -> None:
 def test_appearance_is_independent_of_relief(many: list[DrawnObject]) -> None:
     """2000 objects: independent columns correlate by less than 0.1 (4.5 standard errors)."""
     touchable = np.array([[getattr(obj, name) for name in RELIEF_FIELDS] for obj in many])
-    visible = np.array([[*obj.colour, *obj.paint, obj.paint_share, obj.gloss, *obj.outline] for obj in many])
+    visible = np.array([[*obj.colour, *obj.paint, obj.paint_fraction, obj.gloss, *obj.outline] for obj in many])
     correlation = np.corrcoef(touchable.T, visible.T)[: touchable.shape[1], touchable.shape[1] :]
     assert np.abs(correlation).max() < 0.1
     family = np.array([obj.family for obj in many])
@@ -106,7 +106,7 @@ def test_appearance_is_independent_of_relief(many: list[DrawnObject]) -> None:
         deviation = (visible[family == name].mean(0) - visible.mean(0)) / visible.std(0)
         assert np.abs(deviation).max() < 0.45  # 5.5 standard errors of 154 objects
     assert {field.name for field in fields(DrawnObject)} == {
-        *RELIEF_FIELDS, "object_id", "seed", "family", "colour", "paint", "paint_share", "gloss", "outline",
+        *RELIEF_FIELDS, "object_id", "seed", "family", "colour", "paint", "paint_fraction", "gloss", "outline",
     }  # fmt: skip
 
 
