@@ -30,14 +30,14 @@ class ScriptedFaults(LineFaults):
 
     def __init__(self):
         super().__init__()
-        self.plan, self.seen = {}, {}
+        self.plan, self.packet_counts = {}, {}
 
     def tell(self, plan):
-        self.plan, self.seen = plan, {}
+        self.plan, self.packet_counts = plan, {}
 
     def on(self, packet):
-        self.seen[packet.id] = self.seen.get(packet.id, 0) + 1
-        kind = self.plan.get((packet.id, self.seen[packet.id])) or self.plan.get(packet.id)
+        self.packet_counts[packet.id] = self.packet_counts.get(packet.id, 0) + 1
+        kind = self.plan.get((packet.id, self.packet_counts[packet.id])) or self.plan.get(packet.id)
         plain = encode(packet)
         if kind == "long":  # claims 255 bytes, so the next packets are read as its payload
             return [Piece(plain[:4] + b"\xff\x00" + plain[6:])]

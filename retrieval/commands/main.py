@@ -33,7 +33,7 @@ from retrieval.console.output import checked_stdout, discard_stdout, prepare_str
 from retrieval.version import __version__
 
 MAX_MESSAGE, MESSAGE_TAIL = 500, 150
-"""Maximum characters of a printed message, and how many of these come from its end, where most messages say what to do.
+"""Maximum characters of a printed message, and how many of them come from its end, which usually contains the remedy.
 
 Text from a hostile file can have any length."""
 _BAD_PATH_ERRNOS = {

@@ -91,30 +91,30 @@ class ZarrStore:
             ImporterError: The array is damaged, too large or of another type.
         """
         metadata = self._json(f"{name}/.zarray")
-        where = f"{self.path.name}/{name}"
+        label = f"{self.path.name}/{name}"
         try:
             shape, chunks = ([int(size) for size in metadata[key]] for key in ("shape", "chunks"))
             dtype = np.dtype(metadata["dtype"])
         except (KeyError, TypeError, ValueError) as error:
-            raise ImporterError(f"{where} must define shape, chunks and dtype in its .zarray: {error}") from error
+            raise ImporterError(f"{label} must define shape, chunks and dtype in its .zarray: {error}") from error
         is_accepted = dtype == np.uint8 if kind == "u1" else dtype.kind in kind
         if not is_accepted or (ndim is not None and len(shape) != ndim):
-            raise ImporterError(f"{where} has type {dtype} and {len(shape)} axes, which this importer does not read")
+            raise ImporterError(f"{label} has type {dtype} and {len(shape)} axes, which this importer does not read")
         if min([*shape, *chunks], default=1) < 0 or len(shape) != len(chunks) or 0 in chunks:
-            raise ImporterError(f"{where} has the invalid shape {shape} in chunks of {chunks}")
+            raise ImporterError(f"{label} has the invalid shape {shape} in chunks of {chunks}")
         size = math.prod(chunks) * dtype.itemsize
         total = math.prod(shape) * dtype.itemsize
         if size > _MAX_CHUNK_BYTES or (kind != "u1" and total > _MAX_ARRAY_BYTES):
-            raise ImporterError(f"{where} is too large: chunks of {size} bytes, {total} in total")
+            raise ImporterError(f"{label} is too large: chunks of {size} bytes, {total} in total")
         codec = metadata.get("compressor")
         is_known = codec is None or (isinstance(codec, dict) and codec.get("id") in _CODECS)
         if metadata.get("zarr_format") != 2 or metadata.get("filters") or not is_known:
             raise ImporterError(
-                f"{where} must be zarr version 2 without filters, with one of these codecs: {', '.join(_CODECS)}"
+                f"{label} must be zarr version 2 without filters, with one of these codecs: {', '.join(_CODECS)}"
             )
         separator = "/" if metadata.get("dimension_separator") == "/" else "."
         first = separator.join(["{}", *["0"] * (len(shape) - 1)])
-        return ZarrArray(self._open(name), where, lambda index: self._has(f"{name}/{first.format(index // chunks[0])}"))
+        return ZarrArray(self._open(name), label, lambda index: self._has(f"{name}/{first.format(index // chunks[0])}"))
 
     def _open(self, name: str) -> Any:
         zarr = import_extra("zarr", "zarr stores")
@@ -146,8 +146,8 @@ class ZarrStore:
 class ZarrArray:
     """A checked array, read in parts."""
 
-    def __init__(self, array: Any, where: str, has: Callable[[int], bool]) -> None:
-        self._array, self._where, self._has = array, where, has
+    def __init__(self, array: Any, label: str, has: Callable[[int], bool]) -> None:
+        self._array, self._label, self._has = array, label, has
         self.shape: tuple[int, ...] = tuple(array.shape)
 
     def step(self, index: int) -> NDArray[Any]:
@@ -157,7 +157,7 @@ class ZarrArray:
             ImporterError: The chunk is damaged or missing; zarr would return zeros for a missing one.
         """
         if not self._has(index):
-            raise ImporterError(f"a chunk of {self._where} is missing")
+            raise ImporterError(f"a chunk of {self._label} is missing")
         return self._read(index)
 
     def all(self) -> NDArray[Any]:
@@ -172,4 +172,4 @@ class ZarrArray:
         try:
             return np.asarray(self._array[index])
         except Exception as error:
-            raise ImporterError(f"{self._where} cannot be decoded: {type(error).__name__}") from error
+            raise ImporterError(f"{self._label} cannot be decoded: {type(error).__name__}") from error

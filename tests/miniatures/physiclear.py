@@ -10,8 +10,8 @@ import numpy as np
 
 from tests.miniatures import pixels
 
-PARTS, VIDEOS, FRAMES, KEPT = ("apple", "usb_3_plug"), 3, 12, 5
-GRASPS = len(PARTS) * VIDEOS * KEPT
+PARTS, VIDEOS, FRAMES, IMPORTED = ("apple", "usb_3_plug"), 3, 12, 5
+GRASPS = len(PARTS) * VIDEOS * IMPORTED
 SIZE = (48, 64)
 
 

@@ -35,7 +35,7 @@ def workplace(tmp_path, catalogue, touch, monkeypatch):
 def test_the_two_commands_of_the_readme_work(workplace, capsys):
     """Without a trained model the shipped model is used, and the output names it.
 
-    Drawn pictures are nothing that it knows, and that is output as well, in words and by the exit code.
+    It rejects synthetic pictures, and the verdict and the exit code state this.
     """
     assert main(["build-index", "catalog/"]) == 0
     output = capsys.readouterr()

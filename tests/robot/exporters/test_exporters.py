@@ -26,7 +26,7 @@ def smooth(height, width):
 def source(tmp_path_factory):
     """Three objects with two grasps each: two fingers, before and during; the last photo has another size."""
     folder = tmp_path_factory.mktemp("source") / "recording"
-    info = {"source": "made up", "sensor": "GelSight Mini", "licence": "CC0", "background": "before each grasp"}
+    info = {"source": "synthetic", "sensor": "GelSight Mini", "licence": "CC0", "background": "before each grasp"}
     with RecordingWriter(folder, info) as writer:
         for number in range(6):
             images = {"photo": smooth(30, 40) if number < 5 else smooth(48, 48)}
@@ -131,7 +131,7 @@ def test_an_error_names_the_extra_if_a_package_is_missing(source, tmp_path, monk
 
 
 def test_grasps_with_different_fingers_are_refused_by_formats_with_steps(tmp_path):
-    with RecordingWriter(tmp_path / "r", {"source": "made up", "sensor": "gel"}) as writer:
+    with RecordingWriter(tmp_path / "r", {"source": "synthetic", "sensor": "gel"}) as writer:
         writer.append("1", "mug", {"photo": smooth(9, 9), "touch_a": smooth(9, 9)})
         writer.append("2", "mug", {"photo": smooth(9, 9), "touch_a": smooth(9, 9), "touch_b": smooth(9, 9)})
     for to in ("lerobot", "open-x-tactile"):
