@@ -1,6 +1,6 @@
 """Identify objects by touch: from the gel images of a grasp, find the catalogue photo of the object in the hand.
 
-Public names are imported when they are used, so `import retrieval` costs nothing. The layers run one way:
+Public names are imported on first use, so `import retrieval` is fast. Each layer imports only the layers before it:
 
     errors, version, console, metrics -> data -> model -> training, search -> cluster -> methods -> evaluation -> report
     -> adaptation, frontier, serve -> commands
@@ -95,11 +95,11 @@ _MODULES = {
     "train": "training.train:train",
     "write_report": "report.evaluation:write_report",
 }
-"""Public name -> where it stands in this package."""
+"""Module and attribute of each public name."""
 
 __all__ = list(_MODULES)
 
-if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
+if not TYPE_CHECKING:  # with it, a type checker would accept any name
 
     def __getattr__(name: str) -> Any:
         if name not in _MODULES:

@@ -1,4 +1,4 @@
-"""`python -m retrieval`: the command line, where no script `retrieve` is installed."""
+"""`python -m retrieval`: the command line, if the script `retrieve` is not installed."""
 
 import sys
 

@@ -1,18 +1,18 @@
 """Every error that `retrieval` raises on purpose.
 
-A message says what must hold, what was got and what to do. The command line prints it on one line and
-leaves with `exit_code`; anything that is not one of these errors is a bug.
+A message states the problem, the value and the remedy. The command line prints it on one line and
+exits with `exit_code`; any other error is a bug.
 
     RetrievalError             the job ran and failed (exit code 1)
-    +-- NumericalError         a NaN or infinite value where a number must be
-    +-- TooManyUnreadable             more photos cannot be read than the user allows
-    +-- StorageError           a storage behind a URL goes on refusing, or does not hold what it was given
-    +-- IncompleteSearch             shards did not answer, and more of the catalogue was asked for
-    +-- JobInterrupted            the user stopped the job; what was made is kept
+    +-- NumericalError         a value is NaN or infinite
+    +-- TooManyUnreadable      more photos are unreadable than the user allows
+    +-- RemoteStorageError     storage behind a URL keeps failing, or returns other data than was written
+    +-- IncompleteSearch       shards did not answer, and too little of the catalogue was searched
+    +-- JobInterrupted         the user stopped the job; results so far are stored
     +-- BadInput               wrong use or bad input (exit code 2)
         +-- ImageError         a file is not a readable image
         +-- DatasetError       a recording or catalogue is not usable
-        |   +-- NoReadablePhoto        none of a catalogue's photos can be read
+        |   +-- NoReadablePhoto    no photo of a catalogue is readable
         +-- CheckpointError    a checkpoint is missing, damaged or of another kind
         +-- ConfigError        a setting is unknown or out of range
 """
@@ -36,23 +36,23 @@ class RetrievalError(Exception):
 
 
 class NumericalError(RetrievalError):
-    """A NaN or infinite value stands where a number must be."""
+    """A value is NaN or infinite."""
 
 
 class TooManyUnreadable(RetrievalError):
-    """More of a catalogue's photos cannot be read than the user allows; the index stays as it was."""
+    """More photos of a catalogue are unreadable than the user allows; the index is unchanged."""
 
 
 class RemoteStorageError(RetrievalError):
-    """A storage behind a URL goes on refusing, or does not hold what it was given; the job can go on later."""
+    """Storage behind a URL keeps failing, or returns other data than was written; the job can continue later."""
 
 
 class IncompleteSearch(RetrievalError):
-    """Shards of a cluster did not answer, and less of the catalogue was searched than the user asked for."""
+    """Shards did not answer, and less of the catalogue was searched than the user requires."""
 
 
 class JobInterrupted(RetrievalError):
-    """The user stopped the job; what was made so far is kept."""
+    """The user stopped the job; results so far are stored."""
 
 
 class BadInput(RetrievalError):
@@ -67,7 +67,12 @@ class BadInput(RetrievalError):
 
 
 class ImageError(BadInput):
-    """A file is not a readable image. `path` names the file, `reason` says why."""
+    """A file is not a readable image.
+
+    Attributes:
+        path: The file.
+        reason: The cause, for a person.
+    """
 
     def __init__(self, path: str | Path, reason: str) -> None:
         super().__init__(f"{path}: {reason}")
@@ -83,7 +88,11 @@ class DatasetError(BadInput):
 
 
 class NoReadablePhoto(DatasetError):
-    """None of a catalogue's photos can be read. `skipped` says of each why."""
+    """No photo of a catalogue is readable.
+
+    Attributes:
+        skipped: The reason for each photo.
+    """
 
     def __init__(self, message: str, skipped: Sequence[Any] = ()) -> None:
         super().__init__(message)
@@ -94,7 +103,7 @@ class NoReadablePhoto(DatasetError):
 
 
 class CheckpointError(BadInput):
-    """A checkpoint is missing, damaged, or of another kind than asked for."""
+    """A checkpoint is missing, damaged or of another kind."""
 
 
 class ConfigError(BadInput):

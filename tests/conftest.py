@@ -1,4 +1,4 @@
-"""Pictures and a hastily trained model that several test files share; each is made once a session."""
+"""Pictures and a briefly trained model for several test files; each is created once per session."""
 
 import os
 import shutil
@@ -18,13 +18,13 @@ from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from tests import s3, synthetic
 
-# Of two processes side by side (`-n 2`) each has one thread: two that wait for each other on one core crawl.
+# With `-n 2` each process has one thread: two processes with more threads slow each other down on two cores.
 THREADS = 1 if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1 else 2
 torch.set_num_threads(THREADS)
 faiss.omp_set_num_threads(THREADS)
 cv2.setNumThreads(THREADS)
 
-# Timing decides no test: not how long an example takes, and not how long the first one is drawn on a new machine.
+# No test depends on timing: neither on the time of an example nor on the time to generate the first one.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("untimed")
 
@@ -46,15 +46,15 @@ TINY = Config(
     Preprocessing(touch_px=32, photo_px=48),
 )
 
-# What is made outside of a test, by fixtures of many tests and with settings read at import, is remembered for nobody:
-# it would be the default of the user's commands in this folder, and of the next run's fixtures.
-_REMEMBERED = tempfile.TemporaryDirectory(prefix="touch-retrieval-state-")
-os.environ["XDG_STATE_HOME"] = _REMEMBERED.name
+# Models and indexes that fixtures create outside of a test go to a temporary state folder. Otherwise they would become
+# the defaults of the user's commands in this folder, and of fixtures in the next run.
+_SESSION_STATE = tempfile.TemporaryDirectory(prefix="touch-retrieval-state-")
+os.environ["XDG_STATE_HOME"] = _SESSION_STATE.name
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _state_of_module(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What one file's fixtures make is no other file's default."""
+    """Keep models and indexes of one file's fixtures from becoming defaults of another file."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
@@ -67,35 +67,35 @@ def _state_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _own_state(_state_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """No test reads or writes what the user's commands remember or keep, or what another test's do.
+    """Separate the state and the cache of each test from those of the user and of other tests.
 
-    One folder, emptied after whoever wrote into it: making one for each of thousands of tests takes half a minute.
+    All tests use one folder, which is emptied after each: creating one per test takes half a minute in total.
     """
     cache = _state_folder.with_name(f"{_state_folder.name}-cache")
     monkeypatch.setenv("XDG_STATE_HOME", str(_state_folder))
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     yield
-    for left in _state_folder.iterdir():
-        shutil.rmtree(left)
+    for path in _state_folder.iterdir():
+        shutil.rmtree(path)
     if cache.is_dir():
         shutil.rmtree(cache)
 
 
 @pytest.fixture
 def no_fsync(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For tests that write thousands of small files, and try no crash."""
+    """Disable fsync, for tests that write thousands of small files and do not test crashes."""
     monkeypatch.setattr("os.fsync", lambda descriptor: None)
 
 
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of drawn pictures: 12 objects, 3 grasps each, two fingers, with untouched frames."""
+    """A recording of synthetic pictures: 12 objects, 3 grasps each, two fingers, with no-contact frames."""
     return synthetic.write_recording(tmp_path_factory.mktemp("recording") / "recording", synthetic.make_objects(12), 3)
 
 
 @pytest.fixture(scope="session")
 def catalogue(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A catalogue of 8 objects that the recording does not hold, 3 photos each. Copy it before changing it."""
+    """A catalogue of 8 objects that are not in the recording, 3 photos each. Copy it before changes."""
     return synthetic.write_catalogue(
         tmp_path_factory.mktemp("catalogue") / "catalog", synthetic.make_objects(8, seed=9)
     )
@@ -103,13 +103,13 @@ def catalogue(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def catalogue_copy(catalogue: Path, tmp_path: Path) -> Path:
-    """A copy of the catalogue, to change."""
+    """A copy of the catalogue, for changes."""
     return shutil.copytree(catalogue, tmp_path / "catalog")
 
 
 @pytest.fixture(scope="session")
 def touches(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[Path, ...]]]:
-    """Three touches of each of the catalogue's objects, by object."""
+    """Three touches of each object of the catalogue, by object."""
     return synthetic.write_queries(tmp_path_factory.mktemp("touches"), synthetic.make_objects(8, seed=9), 3)
 
 
@@ -134,7 +134,7 @@ def touch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ...]:
 
 @pytest.fixture(scope="session")
 def model(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A checkpoint after six steps: it works like any other and knows nothing."""
+    """A checkpoint after six training steps: it works like any other, but its scores are nearly random."""
     from retrieval.training.train import train
 
     out = tmp_path_factory.mktemp("model") / "tiny.safetensors"
@@ -144,7 +144,7 @@ def model(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def checkpoint(model: Path) -> Any:
-    """That checkpoint, loaded."""
+    """The loaded checkpoint."""
     from retrieval.model.checkpoint import load_checkpoint
 
     return load_checkpoint(model)
@@ -152,7 +152,7 @@ def checkpoint(model: Path) -> Any:
 
 @pytest.fixture(scope="session")
 def index(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The index over the catalogue: 24 photos of 8 objects. Not to be changed."""
+    """The index of the catalogue: 24 photos of 8 objects. Do not change it."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.search.build.build_index import build_index
 
@@ -163,14 +163,14 @@ def index(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory
 
 @pytest.fixture(scope="session")
 def grasps(tmp_path_factory: pytest.TempPathFactory) -> list[list[tuple[Path, ...]]]:
-    """Files of three grasps of each of the catalogue's first two objects."""
+    """Files of three grasps of each of the first two objects of the catalogue."""
     objects = synthetic.make_objects(2, seed=9)
     return list(synthetic.write_queries(tmp_path_factory.mktemp("grasps"), objects, 3).values())
 
 
 @pytest.fixture(scope="session")
 def cluster(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The catalogue in four shards. Not to be changed."""
+    """The index of the catalogue in four shards. Do not change it."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.search.sharding.build_sharded import build_sharded
 
@@ -181,7 +181,7 @@ def cluster(catalogue: Path, model: Path, tmp_path_factory: pytest.TempPathFacto
 
 @pytest.fixture(scope="module")
 def searcher(index: Path) -> Iterator[Any]:
-    """The index, opened."""
+    """The opened index."""
     from retrieval.search.query.searcher import Searcher
 
     with Searcher.open(index) as opened:
@@ -190,34 +190,34 @@ def searcher(index: Path) -> Iterator[Any]:
 
 @pytest.fixture
 def embedded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """The number of photos in each batch that went through the photo tower in this process."""
+    """Count the photos in each batch that the photo tower encodes in this process."""
     from retrieval.model import photo_encoder
     from retrieval.model.encode import encode_photos
 
     sizes: list[int] = []
 
-    def counted(matcher: Any, photos: Any, batch: int) -> Any:
+    def counting_encode(matcher: Any, photos: Any, batch: int) -> Any:
         photos = list(photos)
         sizes.append(len(photos))
         return encode_photos(matcher, photos, batch)
 
-    monkeypatch.setattr(photo_encoder, "encode_photos", counted)
+    monkeypatch.setattr(photo_encoder, "encode_photos", counting_encode)
     return sizes
 
 
 @pytest.fixture(scope="module")
 def s3_server() -> Iterator[s3.S3Faults]:
-    """A server that speaks S3, without faults until told otherwise; the environment names it."""
+    """An S3 server, without faults until a test sets them; the environment contains its address."""
     with s3.run_server() as faults:
         yield faults
 
 
 def pytest_configure() -> None:
-    """Tools that download nothing say so at once, rather than look for a network; and Ctrl-C is heard.
+    """Make downloads fail at once, and enable Ctrl-C.
 
-    A shell has what it starts with `&` ignore Ctrl-C, and so would every process that a test starts and interrupts.
+    A process that a shell starts with `&` ignores Ctrl-C, and so would every process that a test starts and interrupts.
     """
     os.environ["HF_HUB_OFFLINE"] = "1"
-    os.environ["OMP_NUM_THREADS"] = str(THREADS)  # of the processes that tests start
+    os.environ["OMP_NUM_THREADS"] = str(THREADS)  # for processes that tests start
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -1,4 +1,4 @@
-"""Where real data lie, for the tests that want them."""
+"""Paths of real data, for tests that need them."""
 
 import os
 from pathlib import Path
@@ -7,9 +7,9 @@ import pytest
 
 
 def touch_data(relative: str) -> Path:
-    """A file or folder of the real data, or a skip that says what is missing."""
+    """Return a file or folder of the real data, or skip the test if it is missing."""
     root = Path(os.environ.get("TOUCH_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
     path = root / relative
     if not path.exists():
-        pytest.skip(f"real data are not at hand: no {relative} under TOUCH_DATA")
+        pytest.skip(f"real data are missing: no {relative} under TOUCH_DATA")
     return path

@@ -1,4 +1,4 @@
-"""What takes the place of `serve_pictures` in the processes of `retrieval.serve.decoders`."""
+"""Replacements of `serve_pictures` in the processes of `retrieval.serve.decoders`."""
 
 import os
 import signal
@@ -15,7 +15,7 @@ read_gel_image = decode_process.read_gel_image
 
 
 def die_of_large():
-    """The process is ended by a large picture, as by the system."""
+    """Kill the process at a large picture, as the system would."""
 
     def read(data, name, px, compares_contact, max_pixels):
         if max_pixels == MAX_PIXELS:
@@ -27,7 +27,7 @@ def die_of_large():
 
 
 def hang_on_large():
-    """A large picture, whose name is a file to write the process's id to, is decoded for ever."""
+    """Hang at a large picture; its name is a file for the process id."""
 
     def read(data, name, px, compares_contact, max_pixels):
         if max_pixels == MAX_PIXELS:

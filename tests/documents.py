@@ -1,4 +1,4 @@
-"""README, docs/, CONTRIBUTING and the notebooks as texts with blocks, links and headings."""
+"""Blocks, links and headings in README, docs/, CONTRIBUTING and the notebooks."""
 
 import json
 import re
@@ -7,15 +7,15 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 README, CONTRIBUTING = ROOT / "README.md", ROOT / "CONTRIBUTING.md"
 SITE = tuple(sorted((ROOT / "docs").glob("*.md")))
-"""The pages of docs/, of which `make docs` makes the site."""
+"""The pages of docs/, from which `make docs` builds the site."""
 PAGES = (README, *SITE)
 RUN_TOGETHER = tuple(page for page in PAGES if page.stem != "extending")
-"""The pages whose blocks are run in one folder; tests/project/test_extending.py runs those of the other."""
+"""The pages whose blocks run in one folder; tests/project/test_extending.py runs those of the other page."""
 NOTEBOOKS = tuple(sorted((ROOT / "notebooks").glob("*.ipynb")))
 
 
 def text_of(page):
-    """The Markdown of a page, or of a notebook's cells."""
+    """Return the Markdown of a page, or of the cells of a notebook."""
     text = page.read_text("utf-8")
     if page.suffix != ".ipynb":
         return text
@@ -23,7 +23,7 @@ def text_of(page):
 
 
 def blocks(language, *pages):
-    """The code blocks of pages (of all that run together, where none is named) in one language."""
+    """Return the code blocks of pages in one language; without pages, of all in RUN_TOGETHER."""
     return [
         block
         for page in pages or RUN_TOGETHER
@@ -32,18 +32,18 @@ def blocks(language, *pages):
 
 
 def table_rows(page):
-    """The cells of every line of every table."""
+    """Return the cells of every line of every table."""
     lines = [line for line in text_of(page).splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
 def links(page):
-    """Where links and pictures lead: the text in the parentheses."""
+    """Return the targets of links and pictures."""
     return re.findall(r"\]\(([^)\s]+)\)", _without_blocks(page))
 
 
 def anchors(page):
-    """What may follow "#": headings as both GitHub and Python-Markdown call them, where the two agree."""
+    """Return the anchors of headings that are the same in GitHub and in Python-Markdown."""
     headings = re.findall(r"^#+ (.*)$", _without_blocks(page), re.M)
     plain = [re.sub(r"[^\w\s-]", "", heading).strip().lower() for heading in headings]
     return {re.sub(r"\s", "-", words) for words in plain} & {re.sub(r"[-\s]+", "-", words) for words in plain}

@@ -1,10 +1,10 @@
-"""A rig of the real drivers over emulated devices, in one world: what the hand does, the gels and the camera see.
+"""A rig with the real drivers and emulated devices that have one common state.
 
     python -m tests.emulated_rig --grasps 500 --out faulty/       # with faults in 1 of 50 operations, counted
 
-The gripper's driver speaks to an emulated WSG-50 over TCP or a pseudo-terminal, the gels' driver to cameras of
-arithmetic through OpenCV's interface, and Sawyer's to an emulated one over a websocket, unless an arm of this file
-does, which is at its place at once. The camera is of this file too. Faults can be had at every device, counted by kind.
+The gripper's driver is connected to an emulated WSG-50 over TCP or a pseudo-terminal, the gels' driver to computed
+cameras through OpenCV's interface. The arm is either an emulated Sawyer over a websocket or an arm of this file that
+reaches its target at once. The camera is also from this file. Every device can have faults, counted by kind.
 """
 
 import argparse
@@ -44,9 +44,9 @@ LENS, PX = Intrinsics(120.0, 120.0, 63.5, 53.5), (108, 128)
 HOLDING = 4
 SPEED_UP = 50.0
 FRAMES = 4
-"""Frames on the line for an operation of the gripper: command, pending, state, result. Each may meet a fault."""
+"""Packets per operation of the gripper: command, pending, state, result. Each can have a fault."""
 LOW_WORKSPACE = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
-"""Where the emulated Sawyer reaches."""
+"""Workspace of the emulated Sawyer."""
 QUICK = AttemptSettings(
     GraspSettings(lift_mm=100.0), settle_s=0.1, hold_s=0.1, travel_mm_s=1000.0, closing_mm_s=400.0, retries=4
 )
@@ -54,7 +54,7 @@ SERVERS = {"tcp": serve_tcp, "pty": serve_pty}
 
 
 class EmulatedRigState:
-    """What all devices share. rate: how often an operation of arm, camera or a gel's stream meets a fault."""
+    """State of all devices. `rate` is the fraction of operations of arm, camera and gels with a fault."""
 
     def __init__(self, seed, rate=0.0):
         self.seed, self.rate = seed, rate
@@ -65,7 +65,7 @@ class EmulatedRigState:
         self.pose, self.solid, self.slips, self.noise = Pose(0, 0, 300, 0), None, False, 0
 
     def fault(self, device, *kinds):
-        """The kind of fault that this operation of a device meets, or None."""
+        """Return the kind of fault of this operation of a device, or None."""
         if not kinds or self.rng.uniform() >= self.rate:
             return None
         kind = str(self.rng.choice(kinds))
@@ -74,7 +74,7 @@ class EmulatedRigState:
 
     @property
     def all_counts(self):
-        """Faults so far, by device and kind."""
+        """Counts of faults so far, by device and kind."""
         lines = {"gripper's line": self.line.counts, "arm's line": self.arm_faults.counts if self.arm_faults else {}}
         of_lines = {f"{line}: {kind}": count for line, counts in lines.items() for kind, count in counts.items()}
         return dict(self.counts) | of_lines
@@ -84,7 +84,7 @@ class EmulatedRigState:
         return self.emulator.grasping == HOLDING and self.emulator.object_mm is not None
 
     def hand_at(self, pose):
-        """The hand has been moved, and with it what it holds; else the jaws now stand about what is there."""
+        """Set the pose of the hand. A held object moves along; otherwise the jaws enclose what is at the new pose."""
         lifted, self.pose = pose.z_mm > self.pose.z_mm + 1, pose
         if not self.holding:
             self.emulator.object_mm = self._chord(pose)
@@ -92,7 +92,7 @@ class EmulatedRigState:
             self.emulator.object_mm = None
 
     def _chord(self, pose):
-        """Width of the cylinder between the fingers, None where they meet nothing."""
+        """Return the width of the cylinder between the fingers, None if there is nothing."""
         solid = self.solid
         if solid is None or pose.z_mm > solid.height:
             return None
@@ -101,7 +101,7 @@ class EmulatedRigState:
 
 
 class EmulatedArm(Arm):
-    """At its place at once, unless it fails."""
+    """An arm that reaches its target at once, unless it fails."""
 
     def __init__(self, world):
         super().__init__("emulated arm", WORKSPACE)
@@ -127,7 +127,7 @@ class EmulatedArm(Arm):
 
 
 class TrackedSawyer(Sawyer):
-    """Sawyer's driver; the world learns where it has gone."""
+    """The driver of Sawyer, which reports its pose to the common state."""
 
     def __init__(self, world, port):
         mount = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
@@ -142,7 +142,7 @@ class TrackedSawyer(Sawyer):
 
 
 class WatchedWSG50(WSG50):
-    """The gripper's driver; the world counts how often one of its calls ends, well or badly, with jaws that move."""
+    """The driver of the gripper; the common state counts calls that return or fail with moving jaws."""
 
     def __init__(self, world, **settings):
         super().__init__(**settings)
@@ -184,7 +184,7 @@ ARMS = {"at once": _at_once, "sawyer": _sawyer}
 
 
 class EmulatedCamera(Camera):
-    """Sees the cylinder that stands on the table."""
+    """A camera that shows the cylinder on the table."""
 
     def __init__(self, world):
         super().__init__("emulated camera", views.camera_pose())
@@ -205,7 +205,7 @@ class EmulatedCamera(Camera):
 
 
 class EmulatedGel(FakeVideoDevice):
-    """A gel with a blob where it touches. A trouble lasts a while from when it begins."""
+    """A gel with a blob at the contact. A fault lasts `LASTS_S`."""
 
     LASTS_S = 0.3
 
@@ -215,7 +215,7 @@ class EmulatedGel(FakeVideoDevice):
         self.rng = np.random.default_rng([8, world.seed, ord(finger)])
 
     def begin_trouble(self):
-        """Now and then; called once an attempt for its three pictures."""
+        """Start faults at random; called once per attempt for its three pictures."""
         for _ in range(3):
             if kind := self.world.fault(f"gel {self.finger}", "unplugged", "frozen", "damaged"):
                 self._trouble = (kind, time.monotonic() + self.LASTS_S)
@@ -241,7 +241,7 @@ class EmulatedGel(FakeVideoDevice):
 
 
 class EmulatedRig(Rig):
-    """The rig. Objects are cylinders by name, placed at random for each attempt; now and then one slips."""
+    """The rig. Objects are cylinders by name with a random position for each attempt; some slip."""
 
     def __init__(self, url, world, gels, arm, **gripper):
         self.world, self.gels = world, gels
@@ -271,13 +271,13 @@ class EmulatedRig(Rig):
 
 
 def gel_path(finger):
-    """What stands for a stable name of the finger's camera."""
+    """Return a stable path of the finger's camera."""
     return f"/dev/v4l/by-id/usb-Emulated_Gel_{finger}-video-index0"
 
 
 @contextlib.contextmanager
 def emulated_rig(seed=0, *, port="tcp", arm="at once", rate=0.0, **gripper):
-    """An EmulatedRig, not connected, whose devices are there as long as this is open."""
+    """Yield an EmulatedRig, not connected; its devices exist while the context is open."""
     world = EmulatedRigState(seed, rate)
     gels = {finger: EmulatedGel(world, finger) for finger in "ab"}
     by_path = {gel_path(finger): gel for finger, gel in gels.items()}
@@ -291,7 +291,7 @@ def emulated_rig(seed=0, *, port="tcp", arm="at once", rate=0.0, **gripper):
 
 @dataclass
 class Outcome:
-    """What came of a collection among faults."""
+    """Result of a collection with faults."""
 
     grasps: int
     attempts: int
@@ -301,54 +301,55 @@ class Outcome:
     left_holding: int
 
     def lines(self):
-        yield f"{self.grasps} whole grasps of {self.attempts} attempts; stopped {len(self.stops)} times"
+        """Yield the printed lines."""
+        yield f"{self.grasps} complete grasps in {self.attempts} attempts; stopped {len(self.stops)} times"
         yield from (f"  stopped: {reason}" for reason in self.stops)
-        yield f"jaws left moving: {self.left_moving} times; left closed on something: {self.left_holding} times"
+        yield f"jaws left moving: {self.left_moving} times; left closed on an object: {self.left_holding} times"
         yield from (f"{count:6} {kind}" for kind, count in sorted(self.faults.items()))
 
 
 def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", arm="at once", objects=5):
-    """Collect `grasps` accepted ones with faults at every device; begun again, as a person would, where it stops."""
-    found = Outcome(0, 0, [], Counter(), 0, 0)
+    """Collect `grasps` accepted grasps with faults at every device; start again after each stop, as a person would."""
+    outcome = Outcome(0, 0, [], Counter(), 0, 0)
     names = [f"can-{number}" for number in range(objects)]
-    given = {"objects": names, "seed": seed, "settings": CollectSettings(grasps // objects)}
-    while not found.grasps:
-        with emulated_rig(seed + len(found.stops), port=port, arm=arm, rate=rate) as rig:
+    options = {"objects": names, "seed": seed, "settings": CollectSettings(grasps // objects)}
+    while not outcome.grasps:
+        with emulated_rig(seed + len(outcome.stops), port=port, arm=arm, rate=rate) as rig:
             try:
-                tallies = collect(lambda rig=rig: rig, out, **given)
-                found.grasps = sum(tally.accepted for tally in tallies)
-                found.attempts = sum(tally.attempts for tally in tallies)
+                tallies = collect(lambda rig=rig: rig, out, **options)
+                outcome.grasps = sum(tally.accepted for tally in tallies)
+                outcome.attempts = sum(tally.attempts for tally in tallies)
             except DeviceError as error:
-                found.stops.append(str(error))
-            found.left_moving += rig.world.left_moving
-            found.left_holding += rig.world.emulator.grasping == HOLDING
-            found.faults += Counter(rig.world.all_counts)
-    return found
+                outcome.stops.append(str(error))
+            outcome.left_moving += rig.world.left_moving
+            outcome.left_holding += rig.world.emulator.grasping == HOLDING
+            outcome.faults += Counter(rig.world.all_counts)
+    return outcome
 
 
 def broken_images(folder):
-    """Pictures of a recording that are missing or do not decode."""
+    """Return the pictures of a recording that are missing or damaged."""
     paths = [folder / path for grasp in read_recording(folder).grasps for path in grasp.images().values()]
     return [path for path in paths if not path.is_file() or cv2.imread(str(path)) is None]
 
 
 def main():
-    """Print what was collected and every fault by kind; the recording is read again whole."""
+    """Collect with faults, print the result and all faults by kind, and check the recording."""
     parser = argparse.ArgumentParser(prog="python -m tests.emulated_rig", description=main.__doc__)
     parser.add_argument("--grasps", type=int, default=500)
-    parser.add_argument("--rate", type=float, default=0.02, help="share of operations that meet a fault")
+    parser.add_argument("--rate", type=float, default=0.02, help="fraction of operations with a fault")
     parser.add_argument("--port", choices=sorted(SERVERS), default="tcp")
     parser.add_argument("--arm", choices=sorted(ARMS), default="at once")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="recording folder")
-    given = parser.parse_args()
-    logging.disable(logging.WARNING)  # one for each fault
-    found = collect_among_faults(
-        given.out, given.grasps, rate=given.rate, seed=given.seed, port=given.port, arm=given.arm
+    options = parser.parse_args()
+    logging.disable(logging.WARNING)  # each fault logs a warning
+    outcome = collect_among_faults(
+        options.out, options.grasps, rate=options.rate, seed=options.seed, port=options.port, arm=options.arm
     )
-    print("\n".join(found.lines()))
-    grasps = read_recording(given.out).grasps
-    print(f"{len(grasps)} grasps in {given.out}, {len(broken_images(given.out))} of their pictures broken")
+    print("\n".join(outcome.lines()))
+    grasps = read_recording(options.out).grasps
+    print(f"{len(grasps)} grasps in {options.out}, {len(broken_images(options.out))} damaged pictures")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
-"""A rig of arithmetic: cylinders on a table, one-sided depth, gels with a blob where they touch. Fast and exact.
+"""A computed rig: cylinders on a table, one-sided depth, gels with a blob at the contact. It is fast and exact.
 
-An attempt is a pure function of (seed, object, number). Devices can be told to fail, so that what a collector does
-then can be tested without anybody's hardware.
+An attempt is a pure function of (seed, object, number). Devices can have faults, to test a collector without hardware.
 """
 
 import math
@@ -21,7 +20,7 @@ STROKE_MM, FORCE_N = 110.0, (5.0, 80.0)
 
 
 class FakeRigState:
-    """What the devices share."""
+    """State of all devices."""
 
     def __init__(self, seed):
         self.seed, self.now_s = seed, 0.0
@@ -35,14 +34,14 @@ class FakeRigState:
     def sleep(self, seconds):
         self.now_s += seconds
 
-    def called(self, what):
-        """Note a call, and fail if that has been asked for: `faults` maps a call to the numbers of its failures."""
-        self.calls.append(what)
-        if self.calls.count(what) in self.faults.get(what, ()):
-            raise DeviceError(f"the fake {what} was told to fail")
+    def record_call(self, name):
+        """Record a call and fail on purpose: `faults` maps a call to the numbers of its failures."""
+        self.calls.append(name)
+        if self.calls.count(name) in self.faults.get(name, ()):
+            raise DeviceError(f"the fake {name} was told to fail")
 
     def chord(self):
-        """Width of the cylinder between the fingers, 0 for a miss."""
+        """Return the width of the cylinder between the fingers, 0 for a miss."""
         pose, solid = self.grip_at, self.solid
         across = -math.sin(pose.yaw_rad) * (solid.x - pose.x_mm) + math.cos(pose.yaw_rad) * (solid.y - pose.y_mm)
         if pose.z_mm > solid.height or abs(across) >= solid.radius:
@@ -58,7 +57,7 @@ class FakeRigState:
 
 
 class FakeRig(Rig):
-    """Objects are named by what they are: "round-7", "wide-1" (wider than the stroke), "thin-2" (often missed)."""
+    """The rig. Names set the shape of objects: "round-7", "wide-1" (wider than the stroke), "thin-2" (often missed)."""
 
     can_run_jobs = True
 
@@ -80,11 +79,11 @@ class FakeRig(Rig):
 
     def prepare(self, object_id, number):
         world, kind = self.world, object_id.split("-")[0]
-        look = np.random.default_rng([1, zlib.crc32(object_id.encode())])
-        radius = {"round": look.uniform(18, 40), "wide": 70.0, "thin": 9.0, "none": 1e-3}[kind]
+        shape = np.random.default_rng([1, zlib.crc32(object_id.encode())])
+        radius = {"round": shape.uniform(18, 40), "wide": 70.0, "thin": 9.0, "none": 1e-3}[kind]
         rng = np.random.default_rng([2, world.seed, zlib.crc32(object_id.encode()), number])
         x, y = rng.uniform(-20, 20, 2)
-        world.solid = views.UprightCylinder(radius, look.uniform(60, 140), float(x), float(y))
+        world.solid = views.UprightCylinder(radius, shape.uniform(60, 140), float(x), float(y))
         world.slips, world.noise = bool(rng.uniform() < 0.2), int(rng.integers(2**31))
         world.force, world.now_s = None, 100.0 * number
 
@@ -95,16 +94,16 @@ class FakeArm(Arm):
         self.world = world
 
     def _connect(self):
-        self.world.called("arm.connect")
+        self.world.record_call("arm.connect")
 
     def _close(self):
-        self.world.called("arm.close")
+        self.world.record_call("arm.close")
 
     def _stop(self):
-        self.world.called("arm.stop")
+        self.world.record_call("arm.stop")
 
     def _move_to(self, pose, speed_mm_s):
-        self.world.called("arm")
+        self.world.record_call("arm")
         self.world.sleep(math.dist(self.world.pose.as_tuple()[:3], pose.as_tuple()[:3]) / speed_mm_s)
         self.world.pose = pose
         return pose
@@ -120,13 +119,13 @@ class FakeGripper(Gripper):
         self.world = world
 
     def _connect(self):
-        self.world.called("gripper.connect")
+        self.world.record_call("gripper.connect")
 
     def _close(self):
-        self.world.called("gripper.close")
+        self.world.record_call("gripper.close")
 
     def _stop(self):
-        self.world.called("gripper.stop")
+        self.world.record_call("gripper.stop")
 
     def _settings(self):
         return {"stroke_mm": self.stroke_mm}
@@ -138,12 +137,12 @@ class FakeGripper(Gripper):
         return GripperState(opening, world.force or 0.0, status)
 
     def _open(self, opening_mm):
-        self.world.called("open")
+        self.world.record_call("open")
         self.world.opening, self.world.force = opening_mm, None
         return self._state()
 
     def _grasp(self, force_n, speed_mm_s):
-        self.world.called("grasp")
+        self.world.record_call("grasp")
         self.world.grip_at, self.world.force = self.world.pose, force_n
         self.world.sleep(self.world.opening / speed_mm_s)
         return self._state()
@@ -155,14 +154,14 @@ class FakeSensor(TactileSensor):
         self.world = world
 
     def _connect(self):
-        self.world.called(f"gel {self.finger}.connect")
+        self.world.record_call(f"gel {self.finger}.connect")
 
     def _close(self):
-        self.world.called(f"gel {self.finger}.close")
+        self.world.record_call(f"gel {self.finger}.close")
 
     def _read(self):
         world = self.world
-        world.called(f"gel {self.finger}")
+        world.record_call(f"gel {self.finger}")
         touching = world.status() == "holding"
         rng = np.random.default_rng([3, world.noise, ord(self.finger), touching])
         image = np.full((24, 32, 3), 90.0) + rng.normal(0, 2, (24, 32, 3))
@@ -178,13 +177,13 @@ class FakeCamera(Camera):
         self.world = world
 
     def _connect(self):
-        self.world.called("camera.connect")
+        self.world.record_call("camera.connect")
 
     def _close(self):
-        self.world.called("camera.close")
+        self.world.record_call("camera.close")
 
     def _read(self, depth):
         world = self.world
-        world.called("depth" if depth else "camera")
+        world.record_call("depth" if depth else "camera")
         image = views.view(world.solid, seed=world.noise, lens=LENS, px=PX)
         return type(image)(image.colour, image.depth_m if depth else None, LENS, world.now_s)

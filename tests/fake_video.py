@@ -1,4 +1,4 @@
-"""Cameras without hardware, as OpenCV, pyrealsense2 and pylibfreenect2 would show them, with faults to switch on."""
+"""Fake cameras with the interfaces of OpenCV, pyrealsense2 and pylibfreenect2, and with faults to switch on."""
 
 import threading
 import time
@@ -14,11 +14,18 @@ MISSING = -1.0
 
 
 class FakeVideoDevice:
-    """A USB camera. It counts its pictures; `captures` are opened of it by `open`, which stands for cv2.VideoCapture.
+    """A USB camera that counts its pictures. `open` replaces cv2.VideoCapture and adds to `captures`.
 
-    fps: pictures a second, from `phase_s` on a common clock on. lacks: settings that it does not have. stubborn:
-    settings that stay as they are. Faults: busy, dead, frozen, damaged (pictures that do not decode), hangs (an event
-    that the driver waits for). stamps: its pictures carry their time.
+    Faults are the attributes `busy`, `dead`, `frozen`, `damaged` (number of pictures that do not decode) and `hangs`
+    (an event that the driver waits for).
+
+    Attributes:
+        fps: Pictures per second.
+        size: (width, height).
+        phase_s: Offset of the pictures on a common clock.
+        stamps: Whether pictures have a time stamp.
+        lacks: Settings that it does not have.
+        stubborn: Settings that do not change.
     """
 
     def __init__(self, fps=200.0, size=(8, 6), lacks=(), stubborn=(), phase_s=0.0, stamps=False):
@@ -36,10 +43,10 @@ class FakeVideoDevice:
 
     @property
     def open_captures(self):
-        return [each for each in self.captures if not each.released]
+        return [capture for capture in self.captures if not capture.released]
 
     def picture(self, number):
-        """BGR; the number is in the blue of all pixels, red is 200 in the first row and 100 elsewhere."""
+        """Return a BGR picture: blue is the number, red is 200 in the first row and 100 elsewhere."""
         width, height = self.size
         pixels = np.full((height, width, 3), (number % 256, 50, 100), np.uint8)
         pixels[0, :, 2] = 200
@@ -93,9 +100,9 @@ class FakeCapture:
 
 
 class FakeRealSense:
-    """The module pyrealsense2 with one camera or several: 4 x 3 pixels, depth scale 0.5 mm.
+    """The module pyrealsense2 with one or more cameras: 4 x 3 pixels, depth scale 0.5 mm.
 
-    distortion: coefficients of the colour lens, which shows at pixel x + first coefficient what belongs at x.
+    `distortion` are the coefficients of the colour lens, which shifts pixels along x by the first coefficient.
     """
 
     def __init__(self, serials=("123",), distortion=(0.0,) * 5):
@@ -109,7 +116,7 @@ class FakeRealSense:
         self.format = SimpleNamespace(z16="z16", rgb8="rgb8")
 
     def context(self):
-        found = [SimpleNamespace(get_info={"serial": each, "name": "D435"}.get) for each in self.serials]
+        found = [SimpleNamespace(get_info={"serial": serial, "name": "D435"}.get) for serial in self.serials]
         return SimpleNamespace(query_devices=lambda: found)
 
     def config(self):
@@ -154,7 +161,7 @@ class FakeRealSense:
         self.pictures += 1
         colour = np.zeros((3, 4, 3), np.uint8)
         colour[..., 0] = 10 * np.arange(4)  # red grows to the right
-        colour[..., 2] = self.waiting  # blue: how old it is
+        colour[..., 2] = self.waiting  # blue: its age
         colour[..., 1] = 1
         return self._frames(colour)
 
@@ -169,11 +176,11 @@ class FakeRealSense:
 
 
 class _Freed(SimpleNamespace):
-    """What can be seen to end, and a device that points to it crashes."""
+    """An object that can be freed; a device that still refers to it would crash."""
 
 
 class FakeFreenect2:
-    """The module pylibfreenect2 with one camera or several, and pipelines that this build has and can run."""
+    """The module pylibfreenect2 with one or more cameras; `pipelines` exist in this build, `broken` ones fail."""
 
     def __init__(self, serials=(b"k1",), pipelines=("OpenGLPacketPipeline", "CpuPacketPipeline"), broken=()):
         self.serials, self.events = serials, []
@@ -192,19 +199,19 @@ class FakeFreenect2:
         return name
 
     def Freenect2(self):
-        made = _Freed(
+        device_manager = _Freed(
             enumerateDevices=lambda: len(self.serials),
             getDeviceSerialNumber=self.serials.__getitem__,
             openDevice=self._open,
         )
-        self.needed = [weakref.ref(made)]
-        return made
+        self.needed = [weakref.ref(device_manager)]
+        return device_manager
 
     def _listen(self, listener):
         self.needed.append(weakref.ref(listener))
 
     def _note(self, *event):
-        assert all(each() is not None for each in self.needed), "the package would read memory that is free"
+        assert all(reference() is not None for reference in self.needed), "the package would read freed memory"
         self.events.append(event)
 
     def _open(self, serial, pipeline):
@@ -224,7 +231,7 @@ class FakeFreenect2:
         return _Freed(hasNewFrame=lambda: not self.silent, waitForNewFrame=self._wait, release=self._release)
 
     def _wait(self):
-        assert self.taken == self.released, "none newer comes before the last set is released"
+        assert self.taken == self.released, "a new set requires the release of the last one"
         self.taken += 1
         return {"color": np.zeros((1080, 1920, 4), np.uint8), "depth": self.depth}
 
@@ -236,7 +243,7 @@ class FakeFreenect2:
 
     def _apply(self, colour, depth, undistorted, registered):
         if self.fails:
-            raise ValueError("a mistake of the package")
+            raise ValueError("an error of the package")
         undistorted.array[:] = depth.view(np.uint8).reshape(424, 512, 4)
         registered.array[:] = (10, 20, 30, 0)
         registered.array[0, 0] = (1, 2, 3, 0)
@@ -248,7 +255,7 @@ class FakeFreenect2:
 
 
 def own_threads():
-    """Threads that read cameras."""
+    """Return the threads that read cameras."""
     return [thread for thread in threading.enumerate() if thread.name.startswith("frames of")]
 
 

@@ -1,4 +1,4 @@
-"""One hard case, and how an error of ours is shown."""
+"""A hard case, and the result text of an error."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,9 +10,16 @@ from robot.errors import RobotError
 
 @dataclass(frozen=True)
 class HardCase:
-    """An input of a numerical kernel, what must be true of it, and what came out.
+    """An input of a numerical kernel, its requirement, and the results.
 
-    `holds` says whether `must_hold` is true of `ours`, `naive_holds` whether it is of the obvious formula.
+    Attributes:
+        kernel: Name of the kernel.
+        case: The input.
+        must_hold: Requirement for the result.
+        naive: Result of the naive formula.
+        ours: Result of the kernel.
+        holds: Whether `ours` meets the requirement.
+        naive_holds: Whether `naive` meets it.
     """
 
     kernel: str
@@ -25,7 +32,7 @@ class HardCase:
 
 
 def error_of(work: Callable[[], object], *words: str) -> tuple[str, bool]:
-    """What an error of ours says, and whether it holds all the words; what came out where nothing was refused."""
+    """Return the error of a call, and whether it contains all words; the result and False without an error."""
     try:
         result = work()
     except (RetrievalError, IndexesError, RobotError) as error:

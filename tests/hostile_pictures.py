@@ -1,4 +1,4 @@
-"""Pictures whose files are small or empty and whose decoding is long, for tests and attacks."""
+"""Small or empty picture files that take long to decode, for tests and attacks."""
 
 import io
 import struct
@@ -12,14 +12,14 @@ def png_chunk(kind, content):
 
 
 def png_file(width, height, *chunks, samples=b""):
-    """A PNG file that says it has these sides, with extra chunks before its pixels; RGB, 8 bits."""
+    """Return a PNG file with these sides in its header and extra chunks before its pixels; RGB, 8 bits."""
     header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
     pixels = png_chunk(b"IDAT", zlib.compress(samples, 9))
     return b"\x89PNG\r\n\x1a\n" + header + b"".join(chunks) + pixels + png_chunk(b"IEND", b"")
 
 
 def png_of_zeros(width, height):
-    """A black PNG file, whole."""
+    """Return a complete black PNG file."""
     return png_file(width, height, samples=bytes((3 * width + 1) * height))
 
 
@@ -28,7 +28,7 @@ def jpeg_segment(marker, content):
 
 
 def jpeg_of_scans(side, scans):
-    """A grey progressive JPEG file, whose scans after the first say in a few bytes that no coefficient changes."""
+    """Return a grey progressive JPEG file; scans after the first have a few bytes and change no coefficient."""
     blocks = (-(-side // 8)) ** 2
     file = b"\xff\xd8" + jpeg_segment(0xDB, b"\0" + b"\1" * 64)
     file += jpeg_segment(0xC2, struct.pack(">BHHB", 8, side, side, 1) + b"\1\x11\0")
@@ -49,14 +49,14 @@ def _packed(bits):
 
 
 def jpeg_of_segments(count):
-    """A JPEG file of so many empty comments, then a picture."""
+    """Return a JPEG file with this number of empty comments, then a picture."""
     file = io.BytesIO()
     Image.new("RGB", (8, 8)).save(file, "JPEG")
     return b"\xff\xd8" + b"\xff\xfe\0\2" * count + file.getvalue()[2:]
 
 
 def tiff_of_numbers(tag, count):
-    """A grey TIFF file of 8 x 8 pixels one of whose tags holds so many 32-bit numbers."""
+    """Return a grey TIFF file of 8 x 8 pixels; one tag contains `count` 32-bit numbers."""
     tags = {256: 8, 257: 8, 258: 8, 259: 1, 262: 1, 273: 200, 277: 1, 278: 8, 279: 64, 284: 1}
     entries = {name: (3, 1, value) for name, value in tags.items()} | {tag: (4, count, 300)}
     file = b"II*\0\x08\0\0\0" + struct.pack("<H", len(entries))

@@ -1,4 +1,4 @@
-"""Labelled pictures made of a recording's: each object is a relief of its own, so its touches pair with its photos."""
+"""Labelled pictures from a recording: each object has its own relief label, so its touches pair with its photos."""
 
 import json
 import os
@@ -8,8 +8,11 @@ from retrieval.data.dataset import load_grasps
 
 
 def label_recording(recording: Path, out: Path) -> dict[str, str]:
-    """Write the folders photos and touches under `out`; returns them as settings of a training. The first grasp of each
-    object counts."""
+    """Write the folders photos and touches under `out` from the first grasp of each object.
+
+    Returns:
+        The folders as settings of a training.
+    """
     first = {grasp.object_id: grasp for grasp in reversed(load_grasps(recording))}
     rows: dict[str, list[dict[str, object]]] = {"photos": [], "touches": []}
     for name, grasp in first.items():
@@ -18,8 +21,8 @@ def label_recording(recording: Path, out: Path) -> dict[str, str]:
         rows["photos"].append({**row, "file_name": _from(out / "photos", grasp.photo)})
         for finger, touch, before in zip("ab", grasp.touches, grasp.backgrounds, strict=True):
             files = {"file_name": touch, "before_file_name": before}
-            named = {key: _from(out / "touches", path) for key, path in files.items()}
-            rows["touches"].append({**row, "finger": finger, **named})
+            relative = {key: _from(out / "touches", path) for key, path in files.items()}
+            rows["touches"].append({**row, "finger": finger, **relative})
     for kind, name in (("photo", "photos"), ("touch", "touches")):
         (out / name).mkdir(parents=True)
         (out / name / "pictures.json").write_text(json.dumps({"kind": kind}))

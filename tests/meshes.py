@@ -1,4 +1,4 @@
-"""Meshes by hand, and files of them."""
+"""Meshes from formulas, and mesh files."""
 
 import struct
 
@@ -12,7 +12,7 @@ CUBE = np.array([face for a, b, c, d in QUADS for face in ((a, b, c), (a, c, d))
 
 
 def sphere(count=60):
-    """A sphere of radius 1 on a grid of angles: vertices and faces, poles shared."""
+    """Return vertices and faces of a unit sphere on a grid of angles, with one vertex at each pole."""
     turn, fall = np.meshgrid(2 * np.pi * np.arange(2 * count) / (2 * count), np.pi * np.arange(1, count) / count)
     ring = np.stack([np.cos(turn) * np.sin(fall), np.sin(turn) * np.sin(fall), np.cos(fall)], axis=-1)
     vertices = np.concatenate([ring.reshape(-1, 3), [[0, 0, 1], [0, 0, -1]]])
@@ -26,12 +26,12 @@ def sphere(count=60):
 
 
 def box(x_mm, y_mm, z_mm):
-    """A box about the origin."""
+    """Return a box around the origin."""
     return CORNERS * [x_mm / 2, y_mm / 2, z_mm / 2], CUBE
 
 
 def revolved(profile, count=72):
-    """A solid of revolution about z: profile is a list of (radius, z) upwards, closed by a point at either end."""
+    """Return a solid of revolution about z. `profile` lists (radius, z) upwards; a point closes each end."""
     turn = 2 * np.pi * np.arange(count) / count
     rings = [np.stack([r * np.cos(turn), r * np.sin(turn), np.full(count, z)], 1) for r, z in profile]
     vertices = np.concatenate([*rings, [[0, 0, profile[0][1]], [0, 0, profile[-1][1]]]])
@@ -50,7 +50,7 @@ BOTTLE = [(32, 0), (34, 4), (34, 110), (30, 125), (14, 145), (13, 150), (13, 175
 
 
 def stl(path, vertices, faces):
-    """A binary STL, by hand."""
+    """Write a binary STL file."""
     rows = b"".join(struct.pack("<12fH", 0, 0, 0, *vertices[face].ravel(), 0) for face in faces)
     path.write_bytes(bytes(80) + struct.pack("<I", len(faces)) + rows)
     return path
@@ -73,5 +73,5 @@ def ply(path, vertices, faces):
 
 
 def load_mesh_object(path, seed, **drawn):
-    """The object of a mesh file, which stands as it does in the file."""
+    """Return the object of a mesh file, with the orientation of the file."""
     return mesh_object(path, read_mesh(path), seed, **drawn)

@@ -1,4 +1,4 @@
-"""Whether results are the best there are, by the scores of every pair."""
+"""Check of search results against the scores of all pairs."""
 
 import numpy as np
 
@@ -6,10 +6,10 @@ from indexes.kinds.scores import grid_scores, to_grid
 
 
 def disagreements(vectors, queries, scores, slots, tolerance: float) -> list[str]:
-    """Where results (Q, k) claimed to be the best k differ from the exact search; empty when they hold.
+    """Return differences between results (Q, k) and exact search; empty if there are none.
 
-    Each score must be the exact score of its slot, the scores must be the best k exact scores (so that a tie
-    partner may stand for another), and no slot may come twice; scores are compared within `tolerance`.
+    Each score must be the exact score of its slot, the scores must be the best k exact scores (any of several tied
+    slots is valid), and no slot may occur twice. Scores are compared within `tolerance`.
     """
     table = grid_scores(to_grid(queries), to_grid(vectors))
     best = -np.sort(-table, axis=1)[:, : slots.shape[1]]

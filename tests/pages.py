@@ -1,10 +1,10 @@
-"""An HTML page as its tags and its text, for tests of what a page holds."""
+"""Tags and text of an HTML page."""
 
 from html.parser import HTMLParser
 
 
 class HtmlPage(HTMLParser):
-    """Tags with their attributes, and the text outside `style` and `script`."""
+    """The tags of a page with their attributes, and its text outside `style` and `script`."""
 
     def __init__(self, page):
         super().__init__()

@@ -1,4 +1,4 @@
-"""Processes of a Ray that a test has started: which there are, and on which addresses they listen."""
+"""Processes of a Ray cluster that a test started, and their listening addresses."""
 
 import os
 import re
@@ -6,34 +6,34 @@ from pathlib import Path
 
 
 def parents():
-    """{process: its parent}, of all of this machine that have not ended."""
+    """Return {process: parent} of all running processes of this machine."""
     found = {}
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
-            after = path.read_text().rpartition(")")[2].split()
+            fields = path.read_text().rpartition(")")[2].split()
         except OSError:  # it has ended
             continue
-        if after[0] != "Z":  # nobody has taken note of its end
-            found[int(path.parent.name)] = int(after[1])
+        if fields[0] != "Z":  # a zombie has ended
+            found[int(path.parent.name)] = int(fields[1])
     return found
 
 
 def descendants(root=None):
-    """Processes below `root`, which is this one where None."""
+    """Return all descendants of process `root`; None for this process."""
     parent_of, root = parents(), root or os.getpid()
 
-    def below(process):
+    def is_below(process):
         while process in parent_of:
             process = parent_of[process]
             if process == root:
                 return True
         return False
 
-    return [process for process in parent_of if below(process)]
+    return [process for process in parent_of if is_below(process)]
 
 
 def processes_named(pattern, root=None):
-    """Those of them whose name, as Ray writes it, matches."""
+    """Return the descendants whose name, as set by Ray, matches."""
     found = []
     for process in descendants(root):
         try:
@@ -46,17 +46,17 @@ def processes_named(pattern, root=None):
 
 
 def listening_addresses(root=None):
-    """Addresses, in hexadecimal, on which they listen."""
-    mine = set()
+    """Return the listening addresses of a process and its descendants, in hexadecimal."""
+    sockets = set()
     for process in [*descendants(root), root or os.getpid()]:
         try:
-            mine |= {os.readlink(link) for link in Path(f"/proc/{process}/fd").iterdir()}
+            sockets |= {os.readlink(link) for link in Path(f"/proc/{process}/fd").iterdir()}
         except OSError:
             continue
     found = set()
     for table in ("/proc/net/tcp", "/proc/net/tcp6"):
         for line in Path(table).read_text().splitlines()[1:]:
             words = line.split()
-            if words[3] == "0A" and f"socket:[{words[9]}]" in mine:
+            if words[3] == "0A" and f"socket:[{words[9]}]" in sockets:
                 found.add(words[1].partition(":")[0])
     return found

@@ -1,4 +1,4 @@
-"""Miniatures for `retrieve benchmark real`: its data sets, small, yet with as many objects as protocols ask for."""
+"""Miniatures for `retrieve benchmark real`: small data sets with as many objects as the protocols need."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ CLASSES = ("01_stapler", "02_bottleempty", "03_ball", "04_box", "05_bear", "06_s
 
 def write_vt60(folder: Path, instances: int = 2) -> None:
     names = (*CLASSES, "08_bottlefull")
-    objects = {(kind, f"{n:02}"): f"nick{n}" for kind in names for n in range(1, instances + 1)}
+    objects = {(kind, f"{number:02}"): f"nick{number}" for kind in names for number in range(1, instances + 1)}
     vt60.write(folder, objects, touches=4, photos=2)
 
 

@@ -1,4 +1,4 @@
-"""A model that knows what reference touches are worth, for catalogues such as the fixture `touched`."""
+"""A model with a reference calibration, for catalogues such as the fixture `catalogue_with_touches`."""
 
 import dataclasses
 
@@ -14,22 +14,22 @@ from tests.conftest import TINY
 
 REFERENCE_CALIBRATION = ReferenceCalibration(Posterior(8.0, -3.0, 0.5, 40), 5.0, Posterior(1.5, -2.0, 0.8, 40), 20, 40)
 POSTERIOR = Posterior(0.9, -0.5, 0.7, 40)
-NAMES = sorted(one.object_id for one in synthetic.make_objects(8, seed=9))
-"""Objects of the catalogue that the fixture `catalogue` is."""
+NAMES = sorted(obj.object_id for obj in synthetic.make_objects(8, seed=9))
+"""Objects of the fixture `catalogue`."""
 
 
 def write_reference_model(path, references=REFERENCE_CALIBRATION, posterior=POSTERIOR, cosine=True):
-    """A matcher of random weights whose touches differ."""
+    """Write and load a matcher with random weights; it has different scores for different touches."""
     matcher = dataclasses.replace(TINY.matcher, cosine=cosine)
     config = Config(matcher, TINY.training, TINY.preprocessing)
     torch.manual_seed(0)
-    about = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
+    provenance = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
     save_checkpoint(
         path,
         Matcher(matcher).eval(),
         config,
         split=None,
-        provenance=about,
+        provenance=provenance,
         posterior=posterior,
         references=references,
     )

@@ -1,6 +1,6 @@
-"""A rig from a file: a person's arm, an emulated gripper, recorded gels and recorded depth; nobody needs to be there.
+"""A rig from a file: a manual arm, an emulated gripper, recorded gels and recorded depth. It needs no person.
 
-Its pictures are those of a recording that the arithmetic rig of tests/fake_rig.py makes once.
+Its pictures come from a recording of the fake rig in tests/fake_rig.py.
 """
 
 import contextlib
@@ -63,14 +63,14 @@ hold_s = 0.1
 
 @contextlib.contextmanager
 def replay_rig(emulator=None):
-    """The rig, not connected; whoever is asked to do something has done it."""
+    """The rig, not connected; prompts to a person return at once."""
     with replay_file(emulator) as path:
         yield load_rig(str(path), seed=0)
 
 
 @contextlib.contextmanager
 def replay_file(emulator=None):
-    """The rig's file, whose devices are there as long as this is open."""
+    """The file of the rig; its devices exist while the context is open."""
     emulator = emulator or EmulatedWSG50(speed_up=50.0, referenced=True)
     with (
         tempfile.TemporaryDirectory() as name,
@@ -84,9 +84,9 @@ def replay_file(emulator=None):
 
 
 def record(folder):
-    """A recording, its gels' pictures as folders of their own, and a calibration that tells where its camera stood."""
-    wanted = CollectSettings(grasps=2)
-    collect(lambda: FakeRig(5), folder / "recording", objects=["round-0", "round-1"], seed=5, settings=wanted)
+    """Write a recording, a folder of gel pictures for each finger, and a calibration of the camera."""
+    settings = CollectSettings(grasps=2)
+    collect(lambda: FakeRig(5), folder / "recording", objects=["round-0", "round-1"], seed=5, settings=settings)
     for finger in "ab":
         (folder / finger).mkdir()
         for grasp in read_recording(folder / "recording").grasps:

@@ -1,4 +1,4 @@
-"""A server that speaks S3 (moto), on this machine alone, and faults that it may have."""
+"""A local S3 server (moto) with injected faults."""
 
 import io
 import threading
@@ -8,15 +8,20 @@ import pytest
 
 CREDENTIALS = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_DEFAULT_REGION": "us-east-1"}
 MIN_TORN_BYTES = 200
-"""Bytes of an upload that may be torn."""
+"""Minimum size of an upload that is truncated."""
 
 
 class S3Faults:
-    """In front of the server's application. refuse: every so many-th request; tear: every so many-th upload, of which
-    all but the last half arrives, as if the sender had died. None: none. refused, torn: how many were.
+    """A wrapper of the server's application that injects faults.
 
-    conditions: whether uploads may be made on one ("honoured"), or the server has never heard of it: "unknown" to it,
-    it refuses them as S3 does what it has not; "ignored", it takes them for plain ones. conditional: how many came.
+    Attributes:
+        refuse: Refuse every n-th request; None for none.
+        tear: Truncate every n-th upload to its first half, as if the sender had died; None for none.
+        conditions: Conditional uploads are "honoured", refused as not implemented ("unknown"), or treated as
+            unconditional ("ignored").
+        refused: Number of refused requests.
+        torn: Number of truncated uploads.
+        conditional: Number of conditional uploads.
     """
 
     def __init__(self, application):
@@ -35,18 +40,18 @@ class S3Faults:
             self.uploads += is_upload
             torn = bool(self.tear) and is_upload and self.uploads % self.tear == 0
             self.torn += torn
-        body = environ["wsgi.input"].read(size)  # what is left in the line would be taken for the next request
+        body = environ["wsgi.input"].read(size)  # unread bytes would be parsed as the next request
         environ["wsgi.input"] = io.BytesIO(body)
         if refused:
             start("503 Slow Down", [("Content-Type", "application/xml")])
             return [b"<Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"]
-        if environ["REQUEST_METHOD"] == "PUT" and (asked := CONDITIONS & environ.keys()):
+        if environ["REQUEST_METHOD"] == "PUT" and (headers := CONDITIONS & environ.keys()):
             self.conditional += 1
             if self.conditions == "unknown":
                 start("501 Not Implemented", [("Content-Type", "application/xml")])
                 return [b"<Error><Code>NotImplemented</Code><Message>A header is not implemented.</Message></Error>"]
             if self.conditions == "ignored":
-                for name in asked:
+                for name in headers:
                     del environ[name]
         if torn:
             environ["wsgi.input"], environ["CONTENT_LENGTH"] = io.BytesIO(body[: size // 2]), str(size // 2)
@@ -61,7 +66,7 @@ CONDITIONS = {"HTTP_IF_MATCH", "HTTP_IF_NONE_MATCH"}
 
 @contextmanager
 def run_server():
-    """The server's faults, while it runs; the environment names it to whoever speaks S3."""
+    """Run the server and yield its faults; the environment contains its address for S3 clients."""
     pytest.importorskip("moto.server", reason="needs moto[server]")
     pytest.importorskip("s3fs", reason="needs s3fs")
     import s3fs
@@ -89,12 +94,12 @@ def run_server():
         server.server_close()
 
 
-def put(folder, place):
-    """Put the files of a folder at bucket/place; the bucket is made."""
+def put(folder, target):
+    """Upload the files of a folder to bucket/path; create the bucket."""
     import s3fs
 
     system = s3fs.S3FileSystem()
-    system.makedirs(place.partition("/")[0], exist_ok=True)
+    system.makedirs(target.partition("/")[0], exist_ok=True)
     for path in folder.rglob("*"):
         if path.is_file():
-            system.pipe_file(f"{place}/{path.relative_to(folder)}", path.read_bytes())
+            system.pipe_file(f"{target}/{path.relative_to(folder)}", path.read_bytes())

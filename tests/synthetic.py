@@ -1,9 +1,9 @@
-"""Drawn test pictures, not a simulation of contact: matching photos and gel-like touches of made-up textures.
+"""Synthetic test pictures, not a simulation of contact: matching photos and gel-like touches of random textures.
 
-An object is a relief (family, pitch, depth, ...) and, from another random stream, its looks (colours, paint,
-outline). The SAME relief field shades the photo and dents the gel; nothing else is common to the two, so a
-model that matches them has read the relief. Lengths are in millimetres, pictures are uint8 RGB (height,
-width, 3), `px` is (width, height). Everything is a function of its seeds.
+An object has a relief (family, pitch, depth, ...) and, from another random stream, an appearance (colours, paint,
+outline). The SAME relief field shades the photo and dents the gel. They have nothing else in common, so a model that
+matches them uses the relief. Lengths are in millimetres, pictures are uint8 RGB (height, width, 3), `px` is (width,
+height). Everything is a function of its seeds.
 """
 
 import math
@@ -30,61 +30,61 @@ TOUCH_WIDTH_MM = 20.0
 PHOTO_WIDTH_MM = 44.0
 FORCE_N = (4.0, 15.0)
 _CATALOGUE, _QUERIES = 10**6, 2 * 10**6  # first seeds of pictures outside recordings
-_RELIEF, _LOOKS, _FIELD, _PHOTO, _TOUCH, _SENSOR, _FRAME, _GRASP = range(8)  # one random stream for each purpose
+_RELIEF, _APPEARANCE, _FIELD, _PHOTO, _TOUCH, _SENSOR, _FRAME, _GRASP = range(8)  # one random stream for each purpose
 
 
 @dataclass(frozen=True)
 class DrawnObject:
-    """What can be felt (first group) and what can only be seen (second group) of one made-up object."""
+    """Relief (first group) and appearance (second group) of a synthetic object."""
 
     object_id: str
     seed: int
     family: str
     pitch_mm: float
     depth_mm: float
-    anisotropy: float  # 0 the same in all directions, 1 strongly drawn out
-    regularity: float  # 0 scattered, 1 machine-made
+    anisotropy: float  # 0 isotropic, 1 strongly elongated
+    regularity: float  # 0 scattered, 1 regular
     sharpness: float  # 0 rounded profile, 1 flat-topped
 
     colour: tuple[float, float, float]
     paint: tuple[float, float, float]
-    paint_share: float
+    paint_fraction: float
     gloss: float
-    outline: tuple[float, float, float]  # half width and half height as shares of the photo, corner exponent
+    outline: tuple[float, float, float]  # half width and half height as fractions of the photo, corner exponent
 
 
 def make_object(seed: int) -> DrawnObject:
-    """The object of this seed; consecutive seeds walk through the families."""
-    feel, looks = np.random.default_rng([_RELIEF, seed]), np.random.default_rng([_LOOKS, seed])
+    """Return the object of a seed; consecutive seeds cycle through the families."""
+    relief_rng, appearance_rng = np.random.default_rng([_RELIEF, seed]), np.random.default_rng([_APPEARANCE, seed])
     family = list(FAMILIES)[seed % len(FAMILIES)]
     return DrawnObject(
         object_id=f"{family}-{seed:04d}",
         seed=seed,
         family=family,
-        pitch_mm=float(np.exp(feel.uniform(np.log(1.6), np.log(6.5)))),
-        depth_mm=float(np.exp(feel.uniform(np.log(0.25), np.log(0.9)))),
-        anisotropy=float(feel.uniform()),
-        regularity=float(feel.uniform()),
-        sharpness=float(feel.uniform()),
-        colour=_colour(looks),
-        paint=_colour(looks),
-        paint_share=float(looks.uniform(0.0, 0.35)),
-        gloss=float(looks.uniform(0.0, 0.35)),
+        pitch_mm=float(np.exp(relief_rng.uniform(np.log(1.6), np.log(6.5)))),
+        depth_mm=float(np.exp(relief_rng.uniform(np.log(0.25), np.log(0.9)))),
+        anisotropy=float(relief_rng.uniform()),
+        regularity=float(relief_rng.uniform()),
+        sharpness=float(relief_rng.uniform()),
+        colour=_colour(appearance_rng),
+        paint=_colour(appearance_rng),
+        paint_fraction=float(appearance_rng.uniform(0.0, 0.35)),
+        gloss=float(appearance_rng.uniform(0.0, 0.35)),
         outline=(
-            float(looks.uniform(0.36, 0.47)),
-            float(looks.uniform(0.36, 0.47)),
-            float(looks.uniform(2, 8)),
+            float(appearance_rng.uniform(0.36, 0.47)),
+            float(appearance_rng.uniform(0.36, 0.47)),
+            float(appearance_rng.uniform(2, 8)),
         ),
     )
 
 
 def make_objects(count: int, seed: int = 0) -> list[DrawnObject]:
-    """`count` different objects; other seeds give other objects."""
+    """Return `count` different objects; other seeds give other objects."""
     return [make_object(1000 * seed + number) for number in range(count)]
 
 
 def _colour(rng: np.random.Generator) -> tuple[float, float, float]:
-    """One of the stock colours, a little off: many objects share it, so that colour names none of them."""
+    """Return a stock colour with small noise: many objects have it, so colour does not identify an object."""
     red, green, blue = np.array(_STOCK[int(rng.integers(len(_STOCK)))]) + rng.normal(0, 0.02, 3)
     return float(red), float(green), float(blue)
 
@@ -100,12 +100,12 @@ _STOCK = (
 )
 
 
-# Relief: one field, seen by the eye and felt by the gel -----------------------------------------------------
+# Relief: one field for photo and touch -----------------------------------------------------------------------
 
 
 @lru_cache(maxsize=128)
 def relief(obj: DrawnObject) -> FloatImage:
-    """Height in mm, 0..depth_mm, (FIELD_PX, FIELD_PX)."""
+    """Return the height in mm, 0..depth_mm: (FIELD_PX, FIELD_PX)."""
     rng = np.random.default_rng([_FIELD, obj.seed])
     axis = (np.arange(FIELD_PX, dtype=np.float32) + 0.5) / PX_PER_MM
     x, y = np.meshgrid(axis, axis)
@@ -120,7 +120,7 @@ def relief(obj: DrawnObject) -> FloatImage:
 
 
 def _noise(rng: np.random.Generator, pitch_mm: float, stretch: float = 1.0) -> FloatImage:
-    """Smooth noise of unit deviation with its power around one wavelength; `stretch` draws it out along y."""
+    """Return smooth noise of unit deviation with its power around one wavelength; `stretch` elongates it along y."""
     f = np.fft.fftfreq(FIELD_PX, 1 / PX_PER_MM)
     radius = np.hypot(np.fft.rfftfreq(FIELD_PX, 1 / PX_PER_MM)[None, :], f[:, None] * stretch) * pitch_mm
     band = np.exp(-0.5 * ((radius - 1.0) / 0.35) ** 2)
@@ -129,13 +129,13 @@ def _noise(rng: np.random.Generator, pitch_mm: float, stretch: float = 1.0) -> F
 
 
 def _profile(obj: DrawnObject, phase: FloatImage) -> FloatImage:
-    """One period of a wave, 0..1, from a cosine (sharpness 0) to a flat-topped bar (sharpness 1)."""
+    """Return a wave, 0..1, from a cosine (sharpness 0) to a flat-topped bar (sharpness 1)."""
     steep = 0.4 + 4.0 * obj.sharpness**2
     return 0.5 + 0.5 * np.tanh(steep * np.cos(2 * np.pi * phase)) / np.tanh(steep)
 
 
 def _cells(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> tuple[FloatImage, FloatImage]:
-    """Distances, in pitches, to the nearest and second nearest point of a (scattered) hexagonal lattice."""
+    """Return distances, in pitches, to the nearest and second nearest point of a (scattered) hexagonal lattice."""
     stretch = 1.0 + 0.8 * obj.anisotropy
     rows, columns = np.meshgrid(np.arange(-4, int(70 / obj.pitch_mm)), np.arange(-4, int(70 / obj.pitch_mm)))
     points = np.stack([rows + 0.5 * (columns % 2), 0.87 * columns], -1).reshape(-1, 2).astype(np.float64)
@@ -188,7 +188,7 @@ def _weave(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Genera
 
 
 def _lines(obj: DrawnObject, rng: np.random.Generator, per_pitch: float, width_mm: float) -> FloatImage:
-    """Straight strokes, 0..1, at angles that spread out as anisotropy falls."""
+    """Return straight strokes, 0..1; their angles vary more for lower anisotropy."""
     canvas = np.zeros((FIELD_PX, FIELD_PX), np.float32)
     side = FIELD_PX / PX_PER_MM
     for _ in range(int(per_pitch * side / obj.pitch_mm)):
@@ -206,7 +206,7 @@ def _grain(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Genera
 
 
 def _smooth(obj: DrawnObject, x: FloatImage, y: FloatImage, rng: np.random.Generator) -> FloatImage:
-    """Nearly flat: a few shallow pits."""
+    """Return a nearly flat relief with a few shallow pits."""
     return np.minimum(_noise(rng, 2 * obj.pitch_mm, 1 + obj.anisotropy) + 1.2 + obj.sharpness, 0)
 
 
@@ -229,7 +229,7 @@ FAMILIES: Mapping[str, Family] = {
 
 
 def _patch(obj: DrawnObject, px: tuple[int, int], width_mm: float, angle: float, centre: NDArray[Any]) -> FloatImage:
-    """The relief, in mm, under a turned window whose centre lies at `centre` (mm) of the field."""
+    """Return the relief, in mm, in a rotated window with its centre at `centre` (mm) of the field."""
     scale = width_mm / px[0] * PX_PER_MM
     cos, sin = scale * np.cos(angle), scale * np.sin(angle)
     x0 = centre[0] * PX_PER_MM - cos * px[0] / 2 + sin * px[1] / 2
@@ -240,14 +240,14 @@ def _patch(obj: DrawnObject, px: tuple[int, int], width_mm: float, angle: float,
 
 
 def _slopes(height: FloatImage, mm_per_px: float) -> tuple[FloatImage, FloatImage]:
-    """Central differences along x and y, without unit."""
+    """Return central differences along x and y, without unit."""
     x = cv2.Sobel(height, cv2.CV_32F, 1, 0, ksize=3, scale=1 / (8 * mm_per_px), borderType=cv2.BORDER_REPLICATE)
     y = cv2.Sobel(height, cv2.CV_32F, 0, 1, ksize=3, scale=1 / (8 * mm_per_px), borderType=cv2.BORDER_REPLICATE)
     return x, y
 
 
 def _grid(px: tuple[int, int]) -> tuple[FloatImage, FloatImage]:
-    """x and y of every pixel, -1..1 across the picture's width, square pixels."""
+    """Return x and y of every pixel, -1..1 across the width of the picture, with square pixels."""
     x = (np.arange(px[0], dtype=np.float32) + 0.5) * 2 / px[0] - 1
     y = ((np.arange(px[1], dtype=np.float32) + 0.5) * 2 - px[1]) / px[0]
     x, y = np.meshgrid(x, y)
@@ -260,13 +260,13 @@ def _turned(x: FloatImage, y: FloatImage, angle: float) -> tuple[FloatImage, Flo
 
 
 def _blotches(rng: np.random.Generator, px: tuple[int, int], cells: int) -> FloatImage:
-    """Soft random blotches, 0..1."""
+    """Return soft random blotches, 0..1."""
     coarse = rng.uniform(size=(cells, cells)).astype(np.float32)
     return np.clip(cv2.resize(coarse, px, interpolation=cv2.INTER_CUBIC), 0, 1)
 
 
 def _to_picture(values: FloatImage, rng: np.random.Generator, noise: float) -> Picture:
-    """0..255 with sensor noise of `noise` grey levels, clipped and rounded."""
+    """Return 0..255 with sensor noise of `noise` grey levels, clipped and rounded."""
     row, column = rng.integers(0, 512 - np.array(values.shape[:2]), endpoint=True)
     grain = _grain_tile()[row : row + values.shape[0], column : column + values.shape[1]]
     return np.clip(values + noise * grain + 0.5, 0, 255).astype(np.uint8)
@@ -274,7 +274,7 @@ def _to_picture(values: FloatImage, rng: np.random.Generator, noise: float) -> P
 
 @lru_cache(maxsize=1)
 def _grain_tile() -> FloatImage:
-    """White noise to cut each picture's sensor noise from: drawing it anew would cost half a picture."""
+    """Return white noise, from which sensor noise is cropped: new noise would take half the time of a picture."""
     return np.random.default_rng(0).standard_normal((512, 512, 3), np.float32)
 
 
@@ -282,7 +282,7 @@ def _grain_tile() -> FloatImage:
 
 
 def draw_photo(obj: DrawnObject, seed: int, px: int = 256) -> Picture:
-    """The object lying on a table, turned and lit at random: (px, px, 3)."""
+    """Return a photo of the object on a table, with random rotation and light: (px, px, 3)."""
     rng = np.random.default_rng([_PHOTO, obj.seed, seed])
     size, angle = (px, px), rng.uniform(0, 2 * math.pi)
     width_mm = PHOTO_WIDTH_MM * rng.uniform(0.92, 1.08)
@@ -297,7 +297,7 @@ def draw_photo(obj: DrawnObject, seed: int, px: int = 256) -> Picture:
 def _shading(
     obj: DrawnObject, rng: np.random.Generator, height: FloatImage, mm_per_px: float, mask: FloatImage
 ) -> FloatImage:
-    """Lambert and a highlight under one lamp, valleys darker. The mean over the object is always 0.8."""
+    """Return Lambertian shading with a highlight under one lamp and darker valleys; its mean on the object is 0.8."""
     turn, tilt = rng.uniform(0, 2 * math.pi), rng.uniform(0.6, 1.0)
     sx, sy = _slopes(height, mm_per_px)
     lamp = math.cos(tilt) * math.cos(turn), math.cos(tilt) * math.sin(turn), math.sin(tilt)
@@ -309,18 +309,18 @@ def _shading(
 
 
 def _albedo(obj: DrawnObject, size: tuple[int, int], angle: float) -> FloatImage:
-    """Base colour with painted blotches that have nothing to do with the relief."""
-    blotches = _blotches(np.random.default_rng([_LOOKS, obj.seed, 1]), size, 7)
+    """Return the base colour with painted blotches, independent of the relief."""
+    blotches = _blotches(np.random.default_rng([_APPEARANCE, obj.seed, 1]), size, 7)
     turn = cv2.getRotationMatrix2D((size[0] / 2, size[1] / 2), -float(np.degrees(angle)), 1.0)
     blotches = cv2.warpAffine(blotches, turn, size, borderMode=cv2.BORDER_REFLECT_101)
-    share = np.clip((blotches - 1 + obj.paint_share) * 6, 0, 1)[..., None]
-    return (1 - share) * np.array(obj.colour, np.float32) + share * np.array(obj.paint, np.float32)
+    paint = np.clip((blotches - 1 + obj.paint_fraction) * 6, 0, 1)[..., None]
+    return (1 - paint) * np.array(obj.colour, np.float32) + paint * np.array(obj.paint, np.float32)
 
 
 def _outline(
     obj: DrawnObject, rng: np.random.Generator, size: tuple[int, int], angle: float
 ) -> tuple[FloatImage, FloatImage]:
-    """Where the object is (0..1), and how much light the table keeps beside it (0..1)."""
+    """Return the mask of the object (0..1), and the light on the table with its shadow (0..1)."""
     x, y = _grid(size)
     x, y = x - rng.uniform(-0.06, 0.06), y - rng.uniform(-0.06, 0.06)
     u, v = _turned(x, y, angle)
@@ -343,18 +343,18 @@ def draw_touch(
     force_n: float | None = None,
     sensor: int = 0,
 ) -> dict[str, Picture]:
-    """Gel pictures of one grasp, one for each finger; each finger meets another patch of the relief."""
+    """Return the gel pictures of one grasp by finger; each finger touches another patch of the relief."""
     force = grasp_force(obj, seed) if force_n is None else force_n
     return {finger: _draw_finger(obj, seed, px, finger, force, sensor) for finger in fingers}
 
 
 def grasp_force(obj: DrawnObject, seed: int) -> float:
-    """The closing force that grasp `seed` of the object was drawn with."""
+    """Return the closing force of grasp `seed` of the object."""
     return float(np.random.default_rng([_GRASP, obj.seed, seed]).uniform(*FORCE_N))
 
 
 def draw_background(seed: int, finger: str = "a", px: tuple[int, int] = (160, 120), sensor: int = 0) -> Picture:
-    """The gel with nothing on it: the sensor's own tint, with this frame's noise."""
+    """Return a no-contact frame: the tint of the sensor with the noise of this frame."""
     rng = np.random.default_rng([_FRAME, seed, *finger.encode()])
     return _to_picture(_tint(finger, px, sensor), rng, 1.5)
 
@@ -371,7 +371,7 @@ def _draw_finger(obj: DrawnObject, seed: int, px: tuple[int, int], finger: str, 
 
 
 def _body(rng: np.random.Generator, px: tuple[int, int], mm_per_px: float) -> FloatImage:
-    """How the object's body curves away under the finger: drawn anew for each touch, so it tells nothing."""
+    """Return the curvature of the object under the finger, random for each touch, so it identifies nothing."""
     x, y = (axis * px[0] * mm_per_px / 2 for axis in _grid(px))
     x, y = x - rng.uniform(-2, 2), y - rng.uniform(-2, 2)
     turn, radii = (
@@ -383,7 +383,7 @@ def _body(rng: np.random.Generator, px: tuple[int, int], mm_per_px: float) -> Fl
 
 
 def _indent(surface: FloatImage, force_n: float, mm_per_px: float) -> FloatImage:
-    """How deep (mm) the gel is pushed in: the overlap, and a soft skirt where the gel is stretched."""
+    """Return the indentation (mm) of the gel: the overlap, and a soft skirt where the gel is stretched."""
     if force_n <= 0:
         return np.zeros_like(surface)
     press_mm = 0.9 * (force_n / 10.0) ** (2 / 3)
@@ -395,13 +395,13 @@ def _indent(surface: FloatImage, force_n: float, mm_per_px: float) -> FloatImage
 
 
 def _lamps() -> list[tuple[float, float]]:
-    """Directions of the red, green and blue lamps."""
+    """Return the directions of the red, green and blue lamps."""
     return [(math.cos(angle), math.sin(angle)) for angle in (2.6, 4.7, 0.5)]
 
 
 @lru_cache(maxsize=16)
 def _tint(finger: str, px: tuple[int, int], sensor: int) -> FloatImage:
-    """The untouched gel: each lamp brighter on its own side, darker edges, a mixture of the sensor's own."""
+    """Return the gel without contact: lamps are brighter on their side, edges are darker; it varies with the sensor."""
     rng = np.random.default_rng([_SENSOR, sensor, *finger.encode()])
     base = np.array([142, 124, 134], np.float32) + rng.normal(0, 7, 3).astype(np.float32)
     x, y = _grid(px)
@@ -422,9 +422,9 @@ def write_recording(
     before: bool = True,
     misses: int = 0,
 ) -> Path:
-    """A recording: for each object, `grasps` successes, then `misses` that closed on nothing.
+    """Write a recording: for each object, `grasps` successes, then `misses` that closed on nothing.
 
-    `before` adds the untouched gel to each grasp. Returns the folder.
+    `before` adds no-contact frames to each grasp. Returns the folder.
     """
     info = {"source": "drawn test pictures, not a simulation of contact", "sensor": "drawn gel", "seed": seed}
     with RecordingWriter(folder, info) as writer:
@@ -449,7 +449,7 @@ def _touch_files(obj: DrawnObject, key: int, fingers: Sequence[str], force_n: fl
 
 
 def write_catalogue(folder: Path, objects: Sequence[DrawnObject], photos_per_object: int = 3, seed: int = 0) -> Path:
-    """`<folder>/<object_id>/<n>.jpg`, photos that no recording holds. Returns the folder."""
+    """Write `<folder>/<object_id>/<n>.jpg`, photos that are in no recording. Returns the folder."""
     for obj in objects:
         (Path(folder) / obj.object_id).mkdir(parents=True, exist_ok=True)
         for number in range(photos_per_object):
@@ -459,7 +459,7 @@ def write_catalogue(folder: Path, objects: Sequence[DrawnObject], photos_per_obj
 
 
 def put_touch(catalogue: Path, object_id: str, number: int, files: Sequence[Path]) -> None:
-    """Lay the gel images of a touch beside an object's photos."""
+    """Copy the gel images of a touch next to the photos of an object."""
     (catalogue / object_id).mkdir(exist_ok=True)
     for finger, path in zip("ab", files, strict=True):
         shutil.copy(path, catalogue / object_id / f"touch_{number}_{finger}.png")
@@ -472,7 +472,7 @@ def write_queries(
     seed: int = 0,
     fingers: Sequence[str] = ("a", "b"),
 ) -> dict[str, list[tuple[Path, ...]]]:
-    """`<folder>/<object_id>/<n>_<finger>.png`, new touches. Returns the files of each touch by object_id."""
+    """Write `<folder>/<object_id>/<n>_<finger>.png`, new touches. Returns the files of each touch by object_id."""
     queries: dict[str, list[tuple[Path, ...]]] = {}
     for obj in objects:
         (Path(folder) / obj.object_id).mkdir(parents=True, exist_ok=True)
@@ -494,5 +494,5 @@ def _png(picture: Picture) -> bytes:
 
 
 def _encode(picture: Picture, suffix: str, settings: list[int]) -> bytes:
-    """The file's bytes; OpenCV wants BGR."""
+    """Return the bytes of the file; OpenCV requires BGR."""
     return bytes(cv2.imencode(suffix, picture[..., ::-1], settings)[1])

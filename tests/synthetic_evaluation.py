@@ -1,5 +1,7 @@
-"""A made-up evaluation of a recording: results.json and timings.json as `retrieve evaluate` writes them, drawn from a
-seed. The numbers mean nothing; their shapes and ranges are real."""
+"""A synthetic evaluation of a recording: results.json and timings.json in the format of `retrieve evaluate`.
+
+The numbers are random and mean nothing; their shapes and ranges are realistic.
+"""
 
 import json
 
@@ -27,7 +29,7 @@ RANKS = ("recall_1", "recall_5", "recall_10", "mrr", "map")
 def summary(
     rng, value, chance, *, queries=792, objects=18, gallery="18 unseen objects, 792 photos; own photo left out"
 ):
-    """A summary of results.json around the values (m,)."""
+    """Return a summary of results.json around the values (m,)."""
     value, width = np.atleast_1d(value), rng.uniform(0.02, 0.06)
     by_seed = np.clip(value + rng.normal(0, 0.01, (3, len(value))), 0, 1)
     return {
@@ -43,12 +45,12 @@ def summary(
 
 
 def curve(skill, k):
-    """A guess curve that ends at 1; the diagonal for no skill."""
+    """Return a top-k accuracy curve that ends at 1; the diagonal without skill."""
     return (np.arange(1, k + 1) / k) ** (1 / (1 + 2.2 * skill))
 
 
 def measures(rng, skill):
-    """Every measure of one method."""
+    """Return all measures of one method."""
     flat = {"pair_accuracy": (0.5 + 0.22 * skill, 0.5), "pair_auc": (0.5 + 0.26 * skill, 0.5)}
     for k in (5, 10):
         flat[f"topn_k{k}"] = (curve(skill, k), np.arange(1, k + 1) / k)
@@ -58,33 +60,36 @@ def measures(rng, skill):
         flat[f"topn_k5_p{count}"] = (curve(skill * (1 + 0.1 * np.log(count)), 5), np.arange(1, 6) / 5)
     flat["topn_k5_all_objects"] = (curve(skill * 0.9, 5), np.arange(1, 6) / 5)
     for prefix in ("", "photo_to_touch_"):
-        flat |= {f"{prefix}{key}": (0.06 + 0.2 * skill + 0.05 * at, 0.06 + 0.05 * at) for at, key in enumerate(RANKS)}
+        flat |= {
+            f"{prefix}{key}": (0.06 + 0.2 * skill + 0.05 * index, 0.06 + 0.05 * index)
+            for index, key in enumerate(RANKS)
+        }
     flat |= dict.fromkeys(("objectfolder_touch_to_photo", "objectfolder_photo_to_touch"), (0.08 + 0.2 * skill, 0.07))
     flat |= {"paired_top1": (0.002 + 0.02 * skill, 0.0013), "paired_top5": (0.006 + 0.06 * skill, 0.0063)}
     return {name: summary(rng, value, chance) for name, (value, chance) in flat.items()}
 
 
 def reliability(rng):
-    """A diagram with ten bins, one of them empty."""
+    """Return a reliability diagram with ten bins, one of them empty."""
     centres = np.linspace(0.05, 0.95, 10)
-    shares = np.clip(centres + rng.normal(0, 0.04, 10), 0, 1)
+    fractions = np.clip(centres + rng.normal(0, 0.04, 10), 0, 1)
     counts = rng.integers(5, 5000, 10)
     counts[3] = 0
     bins = [
-        {"probability": float(p), "frequency": float(s) if n else None, "count": int(n)}
-        for p, s, n in zip(centres, shares, counts, strict=True)
+        {"probability": float(probability), "frequency": float(fraction) if count else None, "count": int(count)}
+        for probability, fraction, count in zip(centres, fractions, counts, strict=True)
     ]
-    return {"ece": float(np.abs(centres - shares).mean()), "bins": bins}
+    return {"ece": float(np.abs(centres - fractions).mean()), "bins": bins}
 
 
 def roc(skill):
-    """Hits against false alarms."""
+    """Return true-positive rates against false-positive rates."""
     alarms = np.linspace(0, 1, 60)
     return [[float(x), float(x ** (1 / (1 + skill)))] for x in alarms]
 
 
 def decision(rng, skill):
-    """How well "one of these" and "none of these" are parted."""
+    """Return measures of the separation between in-catalogue and out-of-catalogue objects."""
     return {
         "auroc": summary(rng, min(0.5 + 0.18 * skill, 1), 0.5),
         "false_accepts_at_95": summary(rng, max(0.95 - 0.3 * skill, 0), 0.95),
@@ -92,56 +97,59 @@ def decision(rng, skill):
 
 
 def risk_coverage(skill):
-    """Wrong first guesses against answers: more of them the more are answered, half of them where all are right."""
-    share = np.linspace(0.02, 1, 50)
-    return [[float(x), float((1 - 0.5 * curve(skill, 5)[0]) * x ** (0.5 * skill))] for x in share]
+    """Return top-1 errors against coverage: the error grows with coverage."""
+    coverage = np.linspace(0.02, 1, 50)
+    return [[float(x), float((1 - 0.5 * curve(skill, 5)[0]) * x ** (0.5 * skill))] for x in coverage]
 
 
 def examples(rng, grasps, objects, best):
-    """Six queries with six photos each, mostly right or all wrong."""
-    own = [grasp for grasp in grasps if grasp.object_id in objects]
+    """Return six queries with six photos each, mostly correct or all wrong."""
+    candidates = [grasp for grasp in grasps if grasp.object_id in objects]
     queries = []
-    for at in rng.permutation(len(own))[:6]:
-        same = [grasp.grasp_id for grasp in own if grasp.object_id == own[at].object_id and grasp is not own[at]]
-        other = [grasp.grasp_id for grasp in own if grasp.object_id != own[at].object_id]
+    for index in rng.permutation(len(candidates))[:6]:
+        query = candidates[index]
+        same = [grasp.grasp_id for grasp in candidates if grasp.object_id == query.object_id and grasp is not query]
+        other = [grasp.grasp_id for grasp in candidates if grasp.object_id != query.object_id]
         ranked = rng.permutation(same)[: 3 if best else 0].tolist()
         ranked += rng.permutation(other)[: 6 - len(ranked)].tolist()
         rank = 1 if best else int(rng.integers(60, 500))
-        queries.append(
-            {"grasp_id": own[at].grasp_id, "object_id": own[at].object_id, "true_rank": rank, "ranked": ranked}
-        )
+        queries.append({"grasp_id": query.grasp_id, "object_id": query.object_id, "true_rank": rank, "ranked": ranked})
     return queries
 
 
-def some(rng, grasps, objects):
-    """Two touches of these objects, each with the grasp of a photo that was found for it."""
-    own = [grasp for grasp in grasps if grasp.object_id in objects]
+def example_grasps(rng, grasps, objects):
+    """Return two touches of these objects, each with the grasp of a found photo."""
+    candidates = [grasp for grasp in grasps if grasp.object_id in objects]
     found = [grasp.grasp_id for grasp in grasps]
     return [
-        {"grasp_id": own[at].grasp_id, "object_id": own[at].object_id, "found": str(rng.choice(found))}
-        for at in rng.permutation(len(own))[:2]
+        {
+            "grasp_id": candidates[index].grasp_id,
+            "object_id": candidates[index].object_id,
+            "found": str(rng.choice(found)),
+        }
+        for index in rng.permutation(len(candidates))[:2]
     ]
 
 
 def method(rng, name, grasps, split):
-    """All that results.json says of one method."""
+    """Return the entry of one method in results.json."""
     skill = SKILL.get(name, 0.9)
     test, everyone = split["test"], [*split["train"], *split["validation"], *split["test"]]
-    share = float(curve(skill, 5)[0])
-    draw = {item: float(np.clip(rng.normal(share, 0.2), 0, 1)) for item in everyone}
+    accuracy = float(curve(skill, 5)[0])
+    by_object = {item: float(np.clip(rng.normal(accuracy, 0.2), 0, 1)) for item in everyone}
     pairs = [rng.choice(test, 2, replace=False).tolist() for _ in range(min(12, len(test)))]
-    shares = sorted(rng.uniform(0.1, 0.8, len(pairs)), reverse=True)
+    fractions = sorted(rng.uniform(0.1, 0.8, len(pairs)), reverse=True)
     return {
         "best_params": [{"components": 64, "ridge": 0.1, "p": 2, "seed": seed} for seed in range(3)]
         if skill
         else [{}] * 3,
         "measures": measures(rng, skill),
-        "per_object": {"test_candidates": {item: draw[item] for item in test}, "all_candidates": draw},
+        "per_object": {"test_candidates": {item: by_object[item] for item in test}, "all_candidates": by_object},
         "confusions": [
-            {"object_id": a, "mistaken_for": b, "share": float(s), "grasps": some(rng, grasps, [a])}
-            for (a, b), s in zip(pairs, shares, strict=True)
+            {"object_id": a, "mistaken_for": b, "share": float(fraction), "grasps": example_grasps(rng, grasps, [a])}
+            for (a, b), fraction in zip(pairs, fractions, strict=True)
         ],
-        "examples_by_rank": {str(k): [some(rng, grasps, test) for _ in range(k)] for k in (5, 10)},
+        "examples_by_rank": {str(k): [example_grasps(rng, grasps, test) for _ in range(k)] for k in (5, 10)},
         "reliability": {kind: reliability(rng) for kind in ("pairs", "k5", "k10", "k5_g5")},
         "calibration": {
             "pairs": {"1": {"slope": 0.9, "intercept": -0.1}},
@@ -158,19 +166,19 @@ def method(rng, name, grasps, split):
     }
 
 
-CEILINGS = {"touch_to_touch": "felt twice", "photo_to_photo": "seen twice"}
+CEILINGS = {"touch_to_touch": "two touches of one object", "photo_to_photo": "two photos of one object"}
 CONTROLS = {
-    "no_contact": "the frame before contact stands in for the touch, in fitting and in judging",
-    "low_pass": "each gel image reduced to 8 x 6 pixels, in fitting and in judging",
-    "shuffled": "touches dealt to other training objects before fitting, so that there is nothing to learn",
+    "no_contact": "the no-contact frame replaces the touch in fitting and in scoring",
+    "low_pass": "each gel image is reduced to 8 x 6 pixels in fitting and in scoring",
+    "shuffled": "touches are permuted among training objects before fitting, so there is nothing to learn",
 }
 
 
 def synthetic_results(recording, methods=tuple(SKILL), seed=0):
-    """(results, timings) of an evaluation of the recording."""
+    """Return (results, timings) of an evaluation of the recording."""
     rng, grasps = np.random.default_rng(seed), load_grasps(recording)
     split = make_split(grasps, validation=0.16, test=0.2, seed=seed)
-    found = {name: method(rng, name, grasps, split.to_dict()) for name in methods}
+    entries = {name: method(rng, name, grasps, split.to_dict()) for name in methods}
     results = {
         "schema_version": SCHEMA_VERSION,
         "software": "0.1.0",
@@ -190,26 +198,26 @@ def synthetic_results(recording, methods=tuple(SKILL), seed=0):
             "features": {"touch": 1280, "photo": 1280, "fingers": 2, "digest": "cd" * 32},
         },
         "audit": audit(grasps, split, quiet=True),
-        "methods": found,
+        "methods": entries,
         "controls": {
             name: {
-                "description": what,
+                "description": text,
                 "measures": {
                     "pair_accuracy": summary(rng, 0.5 + 0.05 * (name == "low_pass"), 0.5),
                     "topn_k5": summary(rng, curve(0.3 * (name == "low_pass"), 5), np.arange(1, 6) / 5),
                 },
             }
-            for name, what in CONTROLS.items()
+            for name, text in CONTROLS.items()
         },
         "ceilings": {
             name: {
-                "description": what,
+                "description": text,
                 "measures": {
                     "pair_accuracy": summary(rng, 0.9, 0.5),
                     "topn_k5": summary(rng, curve(0.8, 5), np.arange(1, 6) / 5),
                 },
             }
-            for name, what in CEILINGS.items()
+            for name, text in CEILINGS.items()
         },
         "low_contact": {
             "change": 2.5,
@@ -240,7 +248,7 @@ def synthetic_results(recording, methods=tuple(SKILL), seed=0):
 
 
 def timings(rng, methods):
-    """Times between a microsecond and a minute."""
+    """Return times between a microsecond and a minute."""
     return {
         "machine": {"cpus": 2, "threads": 1},
         "encode": {"touch_ms": 14.2, "photo_ms": 21.8, "where": "towers"},
@@ -258,7 +266,7 @@ def timings(rng, methods):
 
 
 def write_synthetic_results(recording, out, methods=tuple(SKILL), change=None):
-    """Write the evaluation under `out`, after `change(results)` where given; returns `out`."""
+    """Write the evaluation to `out`, after `change(results)` if given; return `out`."""
     results, times = synthetic_results(recording, methods)
     if change:
         change(results)

@@ -1,7 +1,7 @@
-"""One-sided depth pictures of simple solids on a table, as a Kinect 2 in front of and above it takes them.
+"""One-sided depth pictures of simple solids on a table, from a Kinect 2 in front of and above it.
 
-Every ray is met in closed form. Noise is white along the optical axis; outliers are anywhere up to 200 mm before or
-behind the surface, all over the picture.
+Rays are intersected in closed form. Noise is white along the optical axis; outliers are up to 200 mm in front of or
+behind the surface, everywhere in the picture.
 """
 
 import math
@@ -19,7 +19,7 @@ TABLE_COLOUR, OBJECT_COLOUR = (150, 140, 120), (60, 110, 200)
 
 @dataclass(frozen=True)
 class UprightCylinder:
-    """A cylinder that stands."""
+    """A standing cylinder."""
 
     radius: float
     height: float
@@ -102,7 +102,7 @@ def _turn(yaw):
 
 
 def _quadratic(rays, offset, axes, radius):
-    """First distance at which the components `axes` of offset + t ray have this norm."""
+    """Return the first distance t at which the components `axes` of offset + t ray have norm `radius`."""
     rays, offset = rays[:, axes], offset[list(axes)]
     a, b, c = (rays**2).sum(1), rays @ offset, offset @ offset - radius**2
     root = b * b - a * c
@@ -112,7 +112,7 @@ def _quadratic(rays, offset, axes, radius):
 
 
 def camera_pose(distance_mm=900.0, down_deg=35.0, target=(0.0, 0.0, 50.0)):
-    """(4, 4): camera frame to rig frame; the camera stands at -y and looks down on the target."""
+    """Return the (4, 4) transform from camera frame to rig frame; the camera is at -y and points down to the target."""
     down = math.radians(down_deg)
     forward = np.array([0.0, math.cos(down), -math.sin(down)])
     right = np.array([1.0, 0.0, 0.0])
@@ -123,14 +123,14 @@ def camera_pose(distance_mm=900.0, down_deg=35.0, target=(0.0, 0.0, 50.0)):
 
 @lru_cache(maxsize=4)
 def _rays(lens, px, rotation):
-    """(H * W, 3) directions with a depth of 1, in the rig's frame."""
+    """Return (H * W, 3) directions with depth 1, in the rig's frame."""
     v, u = np.mgrid[: px[0], : px[1]].reshape(2, -1)
     local = np.stack([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, np.ones(u.size)], 1)
     return local @ np.frombuffer(rotation).reshape(3, 3).T
 
 
 def view(*solids, noise_mm=1.5, outliers=0.0, seed=0, pose=None, missing=(), lens=KINECT, px=KINECT_PX):
-    """RGBD of solids on the table; `missing` solids have no depth, as glass has none."""
+    """Return an RGBD picture of solids on the table; `missing` solids have no depth, like glass."""
     rng, matrix = np.random.default_rng([5, seed]), camera_pose() if pose is None else pose
     rows, columns = px
     rays, origin = _rays(lens, px, matrix[:3, :3].tobytes()), matrix[:3, 3]
@@ -140,8 +140,8 @@ def view(*solids, noise_mm=1.5, outliers=0.0, seed=0, pose=None, missing=(), len
     depth = hits.min(0)
     depth[hits.argmin(0) > len(solids)] = np.nan
     depth += rng.normal(0.0, noise_mm, depth.shape)
-    wild = rng.uniform(size=depth.shape) < outliers
-    depth[wild] += rng.uniform(-200.0, 200.0, int(wild.sum()))
+    is_outlier = rng.uniform(size=depth.shape) < outliers
+    depth[is_outlier] += rng.uniform(-200.0, 200.0, int(is_outlier.sum()))
     depth[~np.isfinite(depth) | (depth < 50)] = np.nan
     colour = np.where(hits.argmin(0)[:, None] > 0, OBJECT_COLOUR, TABLE_COLOUR) + rng.normal(0, 2, (len(rays), 3))
     return RGBD(

@@ -1,4 +1,4 @@
-"""Waiting for what another thread or process does: every wait ends."""
+"""Waits for other threads and processes, all with a limit."""
 
 import select
 import subprocess
@@ -7,25 +7,25 @@ from contextlib import contextmanager
 
 STARTED = ([], ["sh", "-c", "trap '' INT; exec \"$@\"", "sh"])
 STARTED_IDS = ("from a terminal", "ignoring Ctrl-C")
-"""What stands before a command: nothing, or what has it ignore Ctrl-C as nohup and `&` in a script do."""
+"""Prefixes of a command: none, or one that makes it ignore Ctrl-C like nohup and `&` in a script."""
 
 
 def wait_until(holds, limit_s=10.0):
-    """Wait until something has happened; a failure where it has not within about `limit_s`.
+    """Wait until `holds()` is true; fail after about `limit_s`.
 
-    Not by the clock or time.sleep, which tests replace.
+    It does not use the clock or time.sleep, because tests replace them.
     """
     pause = threading.Event()
     for _ in range(int(limit_s / 0.002)):
         if holds():
             return
         pause.wait(0.002)
-    raise AssertionError("what was waited for did not happen")
+    raise AssertionError(f"the condition was not met within {limit_s:g} s")
 
 
 @contextmanager
 def run_process(command, **options):
-    """A process with its output at hand; killed at the latest when this is left, which would else wait for its end."""
+    """Run a process with captured output; kill it at the end of the block, which would otherwise wait for it."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options) as process:
         try:
             yield process
@@ -34,7 +34,7 @@ def run_process(command, **options):
 
 
 def first_line(process, limit_s=60.0):
-    """The first line that a process prints; empty where it ends without one."""
+    """Return the first line that a process prints; empty if it ends without output."""
     if not select.select([process.stdout], [], [], limit_s)[0]:
         raise AssertionError(f"it printed nothing within {limit_s:g} s: {process.args}")
     return process.stdout.readline()

@@ -1,4 +1,4 @@
-"""A WSG-50's driver on an emulated gripper, for tests: lines that damage the packets they are told to."""
+"""The driver of the WSG-50 with an emulated gripper, and lines that damage chosen packets."""
 
 import contextlib
 from unittest.mock import patch
@@ -22,22 +22,24 @@ PORTS = pytest.mark.parametrize("port", SERVE)
 
 
 class ScriptedFaults(LineFaults):
-    """Does to the packets named by (id, number of the packet with this id) what it is told: the counting starts when
-    told. Commands and replies count together: 1 the command, 2 its first reply. "after a result": a SUCCESS that is
-    none comes before it."""
+    """Damages packets by a plan: (id, number of the packet with this id) -> kind of damage, or id -> kind for all.
+
+    Counting starts when a plan is set. Commands and replies count together: 1 is the command, 2 its first reply.
+    "after a result" sends a false SUCCESS before the packet.
+    """
 
     def __init__(self):
         super().__init__()
-        self.plan, self.seen = {}, {}
+        self.plan, self.packet_counts = {}, {}
 
     def tell(self, plan):
-        self.plan, self.seen = plan, {}
+        self.plan, self.packet_counts = plan, {}
 
     def on(self, packet):
-        self.seen[packet.id] = self.seen.get(packet.id, 0) + 1
-        kind = self.plan.get((packet.id, self.seen[packet.id])) or self.plan.get(packet.id)
+        self.packet_counts[packet.id] = self.packet_counts.get(packet.id, 0) + 1
+        kind = self.plan.get((packet.id, self.packet_counts[packet.id])) or self.plan.get(packet.id)
         plain = encode(packet)
-        if kind == "long":  # claims 255 bytes: what comes next is taken for them
+        if kind == "long":  # claims 255 bytes, so the next packets are read as its payload
             return [Piece(plain[:4] + b"\xff\x00" + plain[6:])]
         if kind == "bad sum":
             return [Piece(plain[:-1] + bytes([plain[-1] ^ 0xFF]))]
@@ -47,13 +49,13 @@ class ScriptedFaults(LineFaults):
 
 
 def quick_close():
-    """pyserial waits 0.3 s after closing a socket."""
+    """Skip the 0.3 s that pyserial waits after closing a socket."""
     return patch.object(protocol_socket, "time", type("NoWait", (), {"sleep": staticmethod(lambda _: None)}))
 
 
 @contextlib.contextmanager
 def gripper_with_emulator(port="tcp", faults=None, connect=True, emulator=None, **settings):
-    """A driver, connected or not, and its emulated gripper."""
+    """Yield a driver, connected or not, and its emulated gripper."""
     emulator = emulator or EmulatedWSG50(referenced=True, speed_up=20.0)
     with SERVE[port](emulator, faults) as address, quick_close():
         gripper = WSG50(port=address, **QUICK | settings)

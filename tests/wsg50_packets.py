@@ -1,7 +1,7 @@
-"""Packets of the WSG-50 as its manual and a public driver's tests print them: the truth both sides share."""
+"""Packets of the WSG-50 as printed in its manual and in the tests of a public driver."""
 
 MANUAL_REPLIES = {
-    # what it is: (bytes, id, payload)
+    # meaning: (bytes, id, payload)
     "empty": ("AA AA AA 01 00 00 E8 10", 0x01, ""),
     "two bytes": ("AA AA AA 01 02 00 12 34 6D 66", 0x01, "12 34"),
     "homing done": ("AA AA AA 20 02 00 00 00 B3 FD", 0x20, "00 00"),
@@ -31,5 +31,5 @@ PACKETS = {**MANUAL_REPLIES, **COMMANDS}
 
 
 def bytes_of(name):
-    """The whole packet."""
+    """Return the bytes of a packet."""
     return bytes.fromhex(PACKETS[name][0])

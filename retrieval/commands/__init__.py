@@ -1,1 +1,1 @@
-"""The command line `retrieve`: one file a command, with its options, what it does and what it prints."""
+"""The command line `retrieve`. One file per command: its options, its action and its output."""

@@ -1,4 +1,4 @@
-"""`retrieve adapt`: a checkpoint for a new sensor and own objects, from a few of them."""
+"""`retrieve adapt`: fit a checkpoint to a new sensor and your own objects, from a few of them."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,30 +15,34 @@ def adapt(
     *,
     out: CheckpointOut,
     model: Annotated[
-        Path | None, typer.Option(help="checkpoint to start from (default: the shipped one of as many fingers)")
+        Path | None,
+        typer.Option(help="checkpoint to start from (default: the shipped one with the same number of fingers)"),
     ] = None,
     init: Annotated[
         str,
-        typer.Option(help="published weights whose tower stands beside those of the model: imagenet, a file, or none"),
+        typer.Option(
+            help="weights of a published tower that is added to those of the model: imagenet, a file, or none"
+        ),
     ] = "imagenet",
-    split: Annotated[Path | None, typer.Option(help=f"{SPLIT}; the test objects are left out")] = None,
+    split: Annotated[Path | None, typer.Option(help=f"{SPLIT}; test objects are not used")] = None,
     report: Annotated[
-        Path | None, typer.Option(help="folder for the learning curve: how many touches of how many objects it takes")
+        Path | None,
+        typer.Option(help="folder for the learning curve: accuracy against the number of touches and objects"),
     ] = None,
     cache: Annotated[
-        Path | None, typer.Option(help="folder where features of images are kept, to go on where it was stopped")
+        Path | None, typer.Option(help="folder that stores image features, to resume a stopped run")
     ] = None,
     seed: Annotated[int, typer.Option(parser=SEED, help="seed of the folds")] = 0,
 ) -> None:
-    """Fit a model to a new sensor and own objects; minutes on two cores."""
+    """Fit a model to a new sensor and your own objects. Takes minutes on two cores."""
     from retrieval.adaptation.recipe import adapt as fit
     from retrieval.search import defaults
 
     if report:
         require_ours(report / "curve.md", TEXT)
-    made = fit(recording, out, model, init=init, split=read_split(split), report=report, cache=cache, seed=seed)
+    result = fit(recording, out, model, init=init, split=read_split(split), report=report, cache=cache, seed=seed)
     defaults.remember("model", out)
-    for line in made.lines():
+    for line in result.lines():
         say(line)
-    if report and not made.report:
-        say(f"{report} is not written: a learning curve, too, is judged on objects that are left out")
+    if report and not result.report:
+        say(f"{report} was not written: there are too few objects to hold some out and measure a learning curve")

@@ -1,4 +1,4 @@
-"""`retrieve benchmark`: what the matcher is worth on real data, by protocols with controls."""
+"""`retrieve benchmark`: accuracy of the matcher on public real data, by protocols with controls."""
 
 import shlex
 from collections.abc import Iterable, Mapping
@@ -25,11 +25,11 @@ from retrieval.errors import BadInput
 from retrieval.evaluation.real import PROTOCOLS
 from retrieval.search.defaults import SHIPPED_NAMES, shipped_model
 
-HELP = "FusionScorer methods on public data sets of real touches, with controls."
+HELP = "Measure methods on public data sets of real touches, with controls."
 PRESET = "real"
 METHODS = "cca_towers,cca_pca,cca,late_fusion,chance"
 PRESET_METHODS = {"adapt": "cca_towers,chance"}
-"""Of presets that are made for one of the methods."""
+"""Default methods of presets that fit only some of the methods."""
 OUTPUT_FILES = {"results.json": RESULTS, "report.md": TEXT, "report.html": PAGE}
 
 app = typer.Typer(name="benchmark", help=HELP, short_help=HELP, subcommand_metavar="DATA_KIND [ARGS]...")
@@ -37,7 +37,7 @@ app = typer.Typer(name="benchmark", help=HELP, short_help=HELP, subcommand_metav
 
 @app.callback()
 def _group() -> None:
-    """A group, though it has one command so far."""
+    """Make `benchmark` a group: typer would otherwise drop the name of its only command."""
 
 
 @app.command(cls=Command)
@@ -45,60 +45,64 @@ def real(
     data: Annotated[
         Path,
         typer.Argument(
-            metavar="DATA", help="folder with vt60/, billets/, ..., or recordings of them", show_default=False
+            metavar="DATA", help="folder with vt60/, billets/, ..., or with recordings of them", show_default=False
         ),
     ],
     *,
     out: ReportOut,
     protocols: Annotated[
         str | None,
-        typer.Option(help=f"which to ask, with commas between: {', '.join(PROTOCOLS)} (default: those with data)"),
+        typer.Option(help=f"protocols to run, separated by commas: {', '.join(PROTOCOLS)} (default: all with data)"),
     ] = None,
     methods: Annotated[
         str | None,
         typer.Option(
-            help=f"methods to fit, with commas between (default: {METHODS}; of preset adapt {PRESET_METHODS['adapt']})"
+            help=f"methods to fit, separated by commas (default: {METHODS}; for preset adapt {PRESET_METHODS['adapt']})"
         ),
     ] = None,
-    preset: Annotated[str, typer.Option(help="towers and heads: preset or TOML file")] = PRESET,
+    preset: Annotated[str, typer.Option(help="configuration of towers and heads: a preset or a TOML file")] = PRESET,
     init: Init = None,
     iterations: Iterations = None,
     model: Annotated[
         OptionValues | None,
         typer.Option(
-            parser=OptionValues.parse, metavar="NAME=FILE...", help="checkpoints to ask as they are, a row each"
+            parser=OptionValues.parse, metavar="NAME=FILE...", help="checkpoints to score without fitting, one row each"
         ),
     ] = None,
-    seeds: Annotated[int, typer.Option(parser=COUNT, help="how often folds are drawn and methods fitted")] = 3,
+    seeds: Annotated[
+        int, typer.Option(parser=COUNT, help="repetitions: each draws new folds and fits the methods again")
+    ] = 3,
     cache: Annotated[
-        Path | None, typer.Option(help="folder of recordings, features and measures (default: OUT/cache)")
+        Path | None, typer.Option(help="folder for recordings, features and measurements (default: OUT/cache)")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Ask protocols of real data, with controls; goes on where it was stopped. Writes a report."""
+    """Run the real-data protocols, with controls, and write a report. Resumes a stopped run."""
     from retrieval.evaluation.real.benchmark import benchmark
     from retrieval.report.real import print_verdicts, write_report
 
     for name, kind in OUTPUT_FILES.items():
         require_ours(out / name, kind)
-    asked = list(dict.fromkeys(protocols.split(","))) if protocols else PROTOCOLS.names()
-    data_set_of = {name: PROTOCOLS.resolve(name).data_set for name in asked}
+    requested = list(dict.fromkeys(protocols.split(","))) if protocols else PROTOCOLS.names()
+    data_set_of = {name: PROTOCOLS.resolve(name).data_set for name in requested}
     config = training_config(preset, iterations, init=init)
     cache = cache or out / "cache"
-    with announce_resume(f"what was made is kept in {cache}"):
+    with announce_resume(f"results so far are stored in {cache}"):
         recordings, missing = _recordings(data, data_set_of.values(), cache / "recordings")
-        skipped = {name: missing[of] for name, of in data_set_of.items() if of in missing}
-        if protocols or len(skipped) < len(asked):
-            for name, why in skipped.items():
-                say(f"{name}: left out, {why}; with it: {_command_with_data(data, out, name, data_set_of[name])}")
-        if len(skipped) == len(asked):
-            raise BadInput(f"{data} must hold data of a protocol; {'; '.join(dict.fromkeys(missing.values()))}")
+        skipped = {name: missing[data_set] for name, data_set in data_set_of.items() if data_set in missing}
+        if protocols or len(skipped) < len(requested):
+            for name, reason in skipped.items():
+                say(f"{name} is skipped: {reason}. To run it: {_command_with_data(data, out, name, data_set_of[name])}")
+        if len(skipped) == len(requested):
+            raise BadInput(
+                f"{data} must contain data of at least one protocol; {'; '.join(dict.fromkeys(missing.values()))}"
+            )
         results = benchmark(
             recordings,
             out,
             config=config,
             preset=Path(preset).stem,
-            protocols=[name for name in asked if name not in skipped],
+            protocols=[name for name in requested if name not in skipped],
             methods=[name for name in (methods or PRESET_METHODS.get(preset, METHODS)).split(",") if name],
             models=_parse_models(model or ()),
             seeds=seeds,
@@ -113,13 +117,22 @@ def real(
     print_verdicts(results)
 
 
-def _recordings(data: Path, names: Iterable[str], made: Path) -> tuple[dict[str, Path], dict[str, str]]:
-    """Recordings by data set, those that are no recordings yet imported below `made`; and what is missing, why."""
+def _recordings(data: Path, names: Iterable[str], imported: Path) -> tuple[dict[str, Path], dict[str, str]]:
+    """Return the recording of each data set, and the reason for each missing one.
+
+    Args:
+        data: Folder with data sets, with recordings of them, or a recording itself.
+        names: Data sets.
+        imported: Folder for the recordings of data sets that must be imported first.
+
+    Raises:
+        BadInput: `data` is not a folder.
+    """
     from retrieval.data.dataset import recording_source
     from robot.importers import data_set_of
 
     if not data.is_dir():
-        raise BadInput(f"{data} must be a folder with data sets in it, such as vt60/ or billets/")
+        raise BadInput(f"{data} must be a folder that contains data sets, such as vt60/ or billets/")
     folders = [path for path in (data, *sorted(data.iterdir())) if (path / "recording.json").is_file()]
     recorded = {recording_source(folder): folder for folder in reversed(folders)}
     found: dict[str, Path] = {}
@@ -129,24 +142,24 @@ def _recordings(data: Path, names: Iterable[str], made: Path) -> tuple[dict[str,
         if about.source in recorded:
             found[name] = recorded[about.source]
         elif (data / name).is_dir():
-            found[name] = run_importer(name, data / name, made / name).folder
+            found[name] = run_importer(name, data / name, imported / name).folder
         else:
-            missing[name] = f"there is no {name}/ with {about.expects.replace('`', '')}, and no recording of it"
+            missing[name] = f"no folder {name}/ with {about.expects.replace('`', '')} and no recording of it was found"
     return found, missing
 
 
-def _parse_models(given: Iterable[str]) -> Mapping[str, Path]:
+def _parse_models(pairs: Iterable[str]) -> Mapping[str, Path]:
     models: dict[str, Path] = {}
-    for word in given:
+    for word in pairs:
         name, equals, file = word.partition("=")
         if not equals or not name or "/" in name:
-            raise BadInput(f"a model is given as NAME=FILE, got {word!r}")
+            raise BadInput(f"--model must have the form NAME=FILE, got {word!r}")
         models[name] = shipped_model(SHIPPED_NAMES[file]) if file in SHIPPED_NAMES else Path(file)
     return models
 
 
 def _command_with_data(data: Path, out: Path, protocol: str, data_set: str) -> str:
-    """What to run who has the data."""
+    """Return the command that runs a protocol once its data is in place."""
     run = f"retrieve benchmark real {shlex.quote(str(data))} --out {shlex.quote(str(out))} --protocols {protocol}"
     if data_set != "rct":
         return run

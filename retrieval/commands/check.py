@@ -1,4 +1,4 @@
-"""`retrieve check`: lint a recording."""
+"""`retrieve check`: report the problems of a recording."""
 
 import dataclasses
 from pathlib import Path
@@ -15,10 +15,10 @@ def check(
     recording: Recording,
     *,
     split: SplitFile = None,
-    model: Annotated[Path | None, typer.Option(help="check the split that this checkpoint was trained with")] = None,
+    model: Annotated[Path | None, typer.Option(help="checkpoint whose training split is checked")] = None,
     json: Json = False,
 ) -> None:
-    """Lint a recording: broken files, duplicates, leakage, swapped folders."""
+    """Check a recording for broken files, duplicates, leakage and swapped folders."""
     from retrieval.data.check.appearance_checks import COMPARED_COPIES
     from retrieval.data.check.recording import check_recording
 
@@ -35,7 +35,7 @@ def check(
     for finding in findings:
         if finding.kind != COMPARED_COPIES:
             say(f"{finding.severity}: {finding.message}")
-    errors, warnings = (sum(one.severity == severity for one in findings) for severity in ("error", "warning"))
+    errors, warnings = (sum(finding.severity == severity for finding in findings) for severity in ("error", "warning"))
     compared = [finding.message for finding in findings if finding.kind == COMPARED_COPIES]
     say("; ".join([f"{recording}: {errors} error(s), {warnings} warning(s)", *compared]))
     if errors:

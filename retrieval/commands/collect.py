@@ -14,38 +14,43 @@ from retrieval.errors import BadInput, RetrievalError
 
 def collect(
     *,
-    rig: Annotated[str, typer.Option(help="which rig, by name or TOML file; sim is the simulated one")] = "sim",
+    rig: Annotated[str, typer.Option(help="rig by name or TOML file; sim is the simulated rig")] = "sim",
     objects: Objects = 98,
-    grasps: Annotated[int, typer.Option(parser=COUNT, help="accepted grasps of each object")] = 44,
-    out: Annotated[Path, typer.Option(help="recording folder to write or to go on with")],
-    seed: Annotated[int, typer.Option(parser=SEED, help="seed of every random choice")] = 0,
+    grasps: Annotated[int, typer.Option(parser=COUNT, help="accepted grasps per object")] = 44,
+    out: Annotated[Path, typer.Option(help="recording folder to write or continue")],
+    seed: Annotated[int, typer.Option(parser=SEED, help="seed of all random choices")] = 0,
     jobs: Jobs = 1,
     gate: Annotated[
-        Path | None, typer.Option(help="grasp-success checkpoint (default: a rule on the area of contact)")
+        Path | None, typer.Option(help="grasp-success checkpoint (default: a rule on the contact area)")
     ] = None,
-    preview: Annotated[bool, typer.Option("--preview", help="write a contact sheet, OUT-preview.png")] = False,
+    preview: Annotated[bool, typer.Option("--preview", help="also write a contact sheet, OUT-preview.png")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="print the motions of one attempt at each object; nothing moves")
+        bool, typer.Option("--dry-run", help="print the motions of one attempt per object; nothing moves")
     ] = False,
     photos_only: Annotated[
         bool,
         typer.Option(
-            "--photos-only", help="instead: a labelled photo of each simulated object, for train --task relief"
+            "--photos-only", help="collect one labelled photo per simulated object instead, for train --task relief"
         ),
     ] = False,
     touches_only: Annotated[
-        bool, typer.Option("--touches-only", help="instead: a labelled press of each simulated object, for the same")
+        bool,
+        typer.Option(
+            "--touches-only", help="collect one labelled press per simulated object instead, for train --task relief"
+        ),
     ] = False,
 ) -> None:
-    """Collect a recording with a rig on its own; goes on where it was stopped."""
+    """Collect a recording with an unattended rig. Resumes a stopped run."""
     if dry_run:
         ignored = {"gate": gate, "preview": preview, "photos_only": photos_only, "touches_only": touches_only}
-        refuse_options("is of a collection; --dry-run moves and records nothing", **ignored)
+        refuse_options("has no effect with --dry-run, which moves and records nothing; leave it out", **ignored)
         _print_motions(rig, objects, seed)
         return
     if photos_only or touches_only:
         if (photos_only and touches_only) or gate or preview:
-            raise BadInput("--photos-only and --touches-only go alone, without --gate and --preview")
+            raise BadInput(
+                "--photos-only and --touches-only cannot be combined with each other, with --gate or with --preview"
+            )
         _collect_pictures("photo" if photos_only else "touch", rig, objects, out, seed, jobs)
         return
     from functools import partial
@@ -55,14 +60,14 @@ def collect(
     from robot.recording.attempt_log import acceptance_table
     from robot.rig import load_rig
 
-    # Beside the recording: every image inside belongs to a grasp. "." and ".." have no name to add something to.
+    # Next to the recording: every image inside belongs to a grasp. "." and ".." have no name to extend.
     folder = out if out.name not in ("", "..") else out.resolve()
     sheet = folder.with_name(f"{folder.name}-preview.png")
     if preview:
         require_ours(sheet, PREVIEW)
     decide, gate_name = _load_gate(gate)
     settings = CollectSettings(grasps=grasps)
-    with announce_resume(f"what was collected is whole in {out}"), CountedBar("collect", "grasps") as bar:
+    with announce_resume(f"the grasps so far are stored in {out}"), CountedBar("collect", "grasps") as bar:
         tallies = collect_grasps(
             partial(load_rig, rig, seed=seed),
             out,
@@ -76,10 +81,10 @@ def collect(
         )
     for line in acceptance_table(tallies, grasps_wanted=settings.grasps).splitlines():
         say(line)
-    accepted = sum(each.accepted for each in tallies)
+    accepted = sum(tally.accepted for tally in tallies)
     if accepted == 0:
-        raise RetrievalError(f"no grasp was accepted; {out}/attempts.jsonl says why")
-    skipped = sum(each.skipped is not None for each in tallies)
+        raise RetrievalError(f"no grasp was accepted; {out}/attempts.jsonl lists the reasons")
+    skipped = sum(tally.skipped is not None for tally in tallies)
     say(
         f"{out}: {accepted} accepted grasps of {len(tallies) - skipped} objects"
         + f", {skipped} skipped" * bool(skipped)
@@ -91,30 +96,30 @@ def collect(
 
 
 def _print_motions(name: str, objects: int, seed: int) -> None:
-    """`--dry-run`: the motions of one attempt at each object, on stdout; nothing moves, nothing is recorded."""
+    """Run `--dry-run`: print the motions of one attempt per object; nothing moves, nothing is recorded."""
     from robot.grasping.attempt import AttemptRunner
     from robot.grasping.dry_run import make_dry_run
     from robot.rig import load_rig
 
     rig = make_dry_run(load_rig(name, seed=seed), show)
     with rig:
-        attempter = AttemptRunner(rig, seed, rig.attempt)
+        runner = AttemptRunner(rig, seed, rig.attempt)
         for object_id in rig.object_ids(objects):
-            attempt = attempter.run(object_id, 0)
-            say(f"{object_id}: {attempt.reason or 'nothing was moved, nothing was recorded'}")
+            attempt = runner.run(object_id, 0)
+            say(f"{object_id}: {attempt.reason or 'nothing moved, nothing was recorded'}")
 
 
 def _collect_pictures(kind: str, rig: str, objects: int, out: Path, seed: int, jobs: int) -> None:
-    """`--photos-only`, `--touches-only`."""
+    """Run `--photos-only` or `--touches-only`."""
     from robot.sim.pictures import collect_pictures
 
-    with announce_resume(f"what was made is whole in {out}"), CountedBar("collect", "objects") as bar:
+    with announce_resume(f"the pictures so far are stored in {out}"), CountedBar("collect", "objects") as bar:
         count = collect_pictures(kind, out, objects=objects, seed=seed, rig=rig, jobs=jobs, progress=bar)
     say(f"{out}: {count} pictures of {objects} objects")
 
 
 def _load_gate(path: Path | None) -> tuple[Any, str | None]:
-    """A learned gate, and a name that is another one for other weights; None for the collector's own rule."""
+    """Return a learned gate and a name that contains the digest of its weights; None, None for the default rule."""
     if path is None:
         return None, None
     from _touch_retrieval.files import file_digest

@@ -1,7 +1,7 @@
 """`retrieve demo`: the whole job on the simulated rig, with the commands that a user would type.
 
-The rig collects grasps of objects that the shipped checkpoint never saw. The photos of each object's first grasps
-make the catalogue, the touches of its last ones are the queries; no grasp gives both.
+The rig collects grasps of objects that the shipped checkpoint was not trained on. The photos of each object's first
+grasps make up the catalogue, the touches of its last grasps are the queries. No grasp provides both.
 """
 
 import os
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from retrieval.data.dataset import Grasp
 
 SEED = 20_000
-"""Of the demo's objects; the shipped checkpoint was trained on other seeds."""
+"""Seed of the demo's objects; the shipped checkpoint was trained on other seeds."""
 PHOTOS, TOUCHES = 3, 3
-"""Grasps of each object that give a photo to the catalogue, and those that give a touch."""
+"""Grasps of each object that provide a catalogue photo, and grasps that provide a query touch."""
 
 
 def demo(
@@ -37,14 +37,16 @@ def demo(
     out: Annotated[Path, typer.Option(help="folder to write")] = Path("demo"),
     objects: Objects = 20,
     jobs: Jobs = 2,
-    serve: Annotated[bool, typer.Option("--serve", help="then open a page that asks the index, until Ctrl-C")] = False,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="then serve the index and open its page, until Ctrl-C")
+    ] = False,
 ) -> None:
-    """The whole job on the simulated rig; ends with an HTML page."""
+    """Run the whole job on the simulated rig and write an HTML page."""
     from retrieval.data.dataset import load_grasps
 
-    ours = {"recording", "recording-preview.png", "catalog", "index", "index-history", "state", "query.html"}
-    if out.exists() and (others := {path.name for path in out.iterdir()} - ours):
-        raise BadInput(f"{out} must be a new folder or an earlier demo's; it holds {sorted(others)[0]}")
+    demo_files = {"recording", "recording-preview.png", "catalog", "index", "index-history", "state", "query.html"}
+    if out.exists() and (others := {path.name for path in out.iterdir()} - demo_files):
+        raise BadInput(f"{out} must be a new folder or that of an earlier demo, but it contains {sorted(others)[0]}")
     with _isolated_state(out / "state"):
         recording, catalogue, index = out / "recording", out / "catalog", out / "index"
         grasps = PHOTOS + TOUCHES
@@ -55,18 +57,18 @@ def demo(
         gelsight = [OptionValues(map(str, grasp.touches)) for grasp in queries[in_hand]]
         _run(query, gelsight=gelsight, index=str(index), html=out / "query.html", top=8)
         say(
-            f"in the hand: {in_hand}, which the model was never trained on; of the objects with {len(gelsight)} grasps "
-            "to query with it is the first of the catalogue"
+            f"in the hand: {in_hand}. The model was not trained on it. It is the first object of the catalogue with "
+            f"{len(gelsight)} query grasps"
         )
         say(f"{TOUCHES} grasps of each object: {_accuracy_summary(index, queries)}")
-        say(f"look at {out / 'query.html'} and {out / 'recording-preview.png'}")
+        say(f"open {out / 'query.html'} and {out / 'recording-preview.png'}")
         if serve:
             _run(serve_index, index=str(index), trials=recording, open_page=True)
 
 
 @contextmanager
 def _isolated_state(folder: Path) -> Iterator[None]:
-    """The demo's model and index do not become the defaults of the user's own commands."""
+    """Keep the demo's model and index from becoming the defaults of the user's own commands."""
     before = os.environ.get("XDG_STATE_HOME")
     os.environ["XDG_STATE_HOME"] = str(folder)
     try:
@@ -79,10 +81,10 @@ def _isolated_state(folder: Path) -> Iterator[None]:
 
 
 def _run(command: Callable[..., object], *arguments: Path, **options: object) -> None:
-    """Say a command as a user would type it, and run it."""
+    """Print a command as a user would type it, and run it."""
     words = [command.__name__.replace("_", "-"), *map(str, arguments)]
-    for name, given in options.items():
-        for value in given if isinstance(given, list) else [given]:
+    for name, option in options.items():
+        for value in option if isinstance(option, list) else [option]:
             words.append(f"--{name.replace('_', '-')}")
             if value is not True:
                 words += value if isinstance(value, OptionValues) else [str(value)]
@@ -91,26 +93,30 @@ def _run(command: Callable[..., object], *arguments: Path, **options: object) ->
 
 
 def _split(grasps: Sequence["Grasp"], catalogue: Path) -> "dict[str, list[Grasp]]":
-    """Copy the photos of each object's first grasps into the catalogue; returns its last grasps, by object."""
+    """Copy the photos of each object's first grasps into the catalogue; return its last grasps by object."""
     by_object: dict[str, list[Grasp]] = defaultdict(list)
     for grasp in grasps:
         by_object[grasp.object_id].append(grasp)
-    for name, own in by_object.items():
+    for name, object_grasps in by_object.items():
         (catalogue / name).mkdir(parents=True, exist_ok=True)
-        for number, grasp in enumerate(own[:PHOTOS], start=1):
+        for number, grasp in enumerate(object_grasps[:PHOTOS], start=1):
             shutil.copyfile(grasp.photo, catalogue / name / f"{number}{grasp.photo.suffix}")
-    return {name: own[PHOTOS : PHOTOS + TOUCHES] for name, own in by_object.items() if len(own) > PHOTOS}
+    return {name: of_name[PHOTOS : PHOTOS + TOUCHES] for name, of_name in by_object.items() if len(of_name) > PHOTOS}
 
 
 def example_object(queries: "Mapping[str, Sequence[Grasp]]") -> str:
-    """The object that the demo's page shows, chosen by name before anything is scored: of the objects with the most
-    grasps to query with, the first in catalogue order.
+    """Return the object on the demo's page: the first by name among those with the most query grasps.
+
+    The choice does not depend on any score.
+
+    Args:
+        queries: Query grasps by object.
     """
     return max(sorted(queries), key=lambda name: len(queries[name]))
 
 
 def _accuracy_summary(index: Path, queries: "dict[str, list[Grasp]]") -> str:
-    """How often the true object comes first, and among the first five; and what the verdicts were worth."""
+    """Return a sentence with top-1 and top-5 accuracy, their chance levels, and the precision of the match verdict."""
     from retrieval.search.query.answer import MATCH
     from retrieval.search.query.searcher import Searcher
 
@@ -119,13 +125,13 @@ def _accuracy_summary(index: Path, queries: "dict[str, list[Grasp]]") -> str:
         touches = [[grasp.touches for grasp in grasps] for grasps in queries.values()]
         answers = searcher.query_many(touches, top=gallery)
     ranked = [[match.object_id for match in answer.results] for answer in answers]
-    # An object that was not felt is not found.
-    places = [names.index(name) if name in names else gallery for name, names in zip(queries, ranked, strict=True)]
-    matched = [place for place, answer in zip(places, answers, strict=True) if answer.verdict == MATCH]
-    count, first, five = len(places), places.count(0), sum(place < 5 for place in places)
+    # Without contact an answer has no results: such a query counts as ranked after all objects.
+    ranks = [names.index(name) if name in names else gallery for name, names in zip(queries, ranked, strict=True)]
+    matched = [rank for rank, answer in zip(ranks, answers, strict=True) if answer.verdict == MATCH]
+    count, first, five = len(ranks), ranks.count(0), sum(rank < 5 for rank in ranks)
     chances = count / gallery, count * min(5, gallery) / gallery
     return (
         f"the true object comes first for {first} of {count} (chance {chances[0]:.1f}), "
         f"among the first five for {five} (chance {chances[1]:.1f}); "
-        f'the verdict is "{MATCH}" for {len(matched)}, of which {matched.count(0)} are right'
+        f'the verdict is "{MATCH}" for {len(matched)}, and {matched.count(0)} of these are right'
     )

@@ -1,4 +1,4 @@
-"""`retrieve evaluate`: methods compared on objects they never saw."""
+"""`retrieve evaluate`: compare methods on unseen objects."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,39 +35,40 @@ def evaluate(
     *,
     out: ReportOut,
     methods: Annotated[
-        str | None, typer.Option(help=f"methods to compare, with commas between: {', '.join(METHODS)} (default: all)")
+        str | None, typer.Option(help=f"methods to compare, separated by commas: {', '.join(METHODS)} (default: all)")
     ] = None,
     preset: Annotated[
         str | None,
-        typer.Option(help="preset, such as tiny, small, mobilenet or relief, or TOML file (default: small)"),
+        typer.Option(help="a preset, such as tiny, small, mobilenet or relief, or a TOML file (default: small)"),
     ] = None,
-    model: Annotated[Path | None, typer.Option(help="checkpoint to judge, instead of one fitted here")] = None,
+    model: Annotated[Path | None, typer.Option(help="checkpoint to evaluate, instead of fitting one")] = None,
     init: Init = None,
     init_photo: InitTower = None,
     init_touch: InitTower = None,
     photos: LabelledPhotos = None,
     touches: LabelledTouches = None,
     iterations: Iterations = None,
-    seeds: Annotated[int, typer.Option(parser=COUNT, help="trainings of each method")] = 1,
+    seeds: Annotated[int, typer.Option(parser=COUNT, help="training runs per method")] = 1,
     seed: Annotated[
-        int | None, typer.Option(parser=SEED, help="seed of split, queries and first training, instead of the preset's")
+        int | None,
+        typer.Option(parser=SEED, help="seed of split, queries and first training (default: that of the preset)"),
     ] = None,
     split: SplitFile = None,
     cache: Annotated[
-        Path | None, typer.Option(help="folder where features of images are kept (default: OUT/features)")
+        Path | None, typer.Option(help="folder that stores image features (default: OUT/features)")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Compare methods on objects they never saw; goes on where it was stopped. Writes a report."""
+    """Compare methods on unseen objects and write a report. Resumes a stopped run."""
     from retrieval.evaluation.evaluate import evaluate as run
     from retrieval.report.evaluation import write_report
 
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch}
     if model and (preset or any(inits.values())):
-        raise BadInput("a model has its towers and its settings; give --model, or --preset and --init")
+        raise BadInput("--model already defines towers and settings; give either --model or --preset and --init")
     for name, kind in OUTPUT_FILES.items():
         require_ours(out / name, kind)
-    with announce_resume(f"what was made is kept in {out}"):
+    with announce_resume(f"results so far are stored in {out}"):
         results = run(
             recording,
             out,

@@ -1,4 +1,4 @@
-"""`retrieve export`: a checkpoint's touch encoder as ONNX."""
+"""`retrieve export`: write a checkpoint's touch encoder as ONNX."""
 
 import dataclasses
 from pathlib import Path
@@ -14,17 +14,17 @@ def export(
     model: Annotated[str | None, typer.Argument(metavar="MODEL", help=f"checkpoint (default: {DEFAULT_MODEL})")] = None,
     *,
     out: Annotated[
-        Path | None, typer.Option(help="file to write (default: beside the checkpoint, ending in .onnx)")
+        Path | None, typer.Option(help="file to write (default: next to the checkpoint, with the suffix .onnx)")
     ] = None,
     json: Json = False,
 ) -> None:
-    """Write a checkpoint's touch encoder as ONNX; `query` finds it beside the checkpoint and does without PyTorch."""
+    """Export a checkpoint's touch encoder to ONNX. With it, `query` runs without PyTorch."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.export import export as write_export
     from retrieval.search import defaults
 
-    path, why = defaults.find_model(model)
-    say(f"model: {path} ({why})")
+    path, reason = defaults.find_model(model)
+    say(f"model: {path} ({reason})")
     result = write_export(load_checkpoint(path), out)
     say(str(result))
     if json:

@@ -1,4 +1,4 @@
-"""`retrieve export-recording`: a recording becomes a data set of another format."""
+"""`retrieve export-recording`: write a recording as a data set of another format."""
 
 from pathlib import Path
 from typing import Annotated
@@ -13,11 +13,13 @@ from retrieval.console.progress import CountedBar
 def export_recording(
     recording: Recording,
     *,
-    to: Annotated[str, typer.Option(help="which format; an unknown name lists the known ones")],
-    out: Annotated[Path, typer.Option(help="new folder to write; it is whole or absent")],
-    split: Annotated[Path | None, typer.Option(help=f"{SPLIT} to tell apart (default: all train)")] = None,
+    to: Annotated[str, typer.Option(help="format; an unknown name lists the available ones")],
+    out: Annotated[Path, typer.Option(help="new folder to write; an export that fails leaves no folder")],
+    split: Annotated[
+        Path | None, typer.Option(help=f"{SPLIT}, exported as separate parts (default: all as train)")
+    ] = None,
 ) -> None:
-    """Write a recording in another format: lerobot, imagefolder, open-x-tactile."""
+    """Write a recording in another format: lerobot, imagefolder or open-x-tactile."""
     from robot.exporters import EXPORTERS
     from robot.recording.folder import read_recording
 
@@ -25,7 +27,7 @@ def export_recording(
     source = read_recording(recording)
     parts = None if objects is None else {part: getattr(objects, part) for part in ("train", "validation", "test")}
     with CountedBar("export", "grasps") as bar:
-        written = export(source, out, parts=parts, progress=bar)
-    for note in (*source.notes, *written.notes):
+        result = export(source, out, parts=parts, progress=bar)
+    for note in (*source.notes, *result.notes):
         say(note)
-    say(f"{out}: {written.grasps} grasps as {to}")
+    say(f"{out}: {result.grasps} grasps as {to}")

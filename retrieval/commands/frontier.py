@@ -1,4 +1,4 @@
-"""`retrieve frontier`: error against run time of every approximation, with the user's model and recording."""
+"""`retrieve frontier`: measure error against run time of every approximation, for one model and recording."""
 
 import os
 from collections.abc import Collection, Mapping, Sequence
@@ -13,26 +13,29 @@ from retrieval.console.output import print_json, say
 from retrieval.frontier import APPROXIMATIONS
 
 SEED = 40_000
-"""Of the objects that are collected; the shipped checkpoint was trained on other seeds."""
+"""Seed of the collected objects; the shipped checkpoint was trained on other seeds."""
 
 
 def frontier(
     *,
     out: Annotated[Path, typer.Option(help="folder for frontier.json, frontier.html and plots")],
     recording: Annotated[
-        Path | None, typer.Option(help="grasps of unseen objects (default: a small one is collected)")
+        Path | None,
+        typer.Option(help="recording of unseen objects (default: collect a small one on the simulated rig)"),
     ] = None,
     model: Model = None,
     only: Annotated[
         OptionValues | None,
-        typer.Option(parser=OptionValues.parse, metavar="NAME...", help=f"only some of {', '.join(APPROXIMATIONS)}"),
+        typer.Option(
+            parser=OptionValues.parse, metavar="NAME...", help=f"measure only these: {', '.join(APPROXIMATIONS)}"
+        ),
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="smallest sizes, to see that it runs; concludes nothing")
+        bool, typer.Option("--quick", help="smallest sizes, to test that the command runs; the results mean nothing")
     ] = False,
     json: Json = False,
 ) -> None:
-    """Error against run time of every approximation; goes on where it was stopped. Writes plots and a page."""
+    """Measure error against run time of every approximation; write plots and a page. Resumes a stopped run."""
     document = run_frontier(out, model=model, recording=recording, only=only or (), quick=quick)
     if json:
         print_json(document)
@@ -48,16 +51,17 @@ def run_frontier(
     table: Mapping[str, str] = APPROXIMATIONS,
     model_free: Collection[str] = (),
 ) -> dict[str, Any]:
-    """Measure and write frontier.json, frontier.html and figures/.
+    """Measure, and write frontier.json, frontier.html and figures/.
 
     Args:
-        out: Folder of the results, which a second run reads.
-        model: As `--model`.
-        recording: Grasps of objects that the model has not seen. None collects a few on the simulated rig, if a row
-            needs them.
-        only: Names of rows; all where empty.
-        quick: Smallest sizes.
-        table: What can be measured, as `retrieval.measure_frontier` takes it; so `model_free`.
+        out: Folder of the results. A second run continues from them.
+        model: The value of `--model`.
+        recording: Grasps of objects that the model was not trained on. None collects a few on the simulated rig, if
+            a row needs them.
+        only: Names of rows; empty for all.
+        quick: Measure the smallest sizes only.
+        table: Rows that can be measured, see `retrieval.measure_frontier`.
+        model_free: Names of rows that need no model, see `retrieval.measure_frontier`.
 
     Returns:
         The content of frontier.json.
@@ -65,25 +69,25 @@ def run_frontier(
     from retrieval.frontier.measure import measure_frontier
     from retrieval.search import defaults
 
-    path, why = defaults.find_model(model)
-    say(f"model: {path} ({why})")
+    path, reason = defaults.find_model(model)
+    say(f"model: {path} ({reason})")
     grasps = partial(_recording, recording, out, quick)
-    with announce_resume(f"what was measured is kept in {out}"):
+    with announce_resume(f"measurements so far are stored in {out}"):
         document = measure_frontier(out, path, grasps, only=only, quick=quick, table=table, model_free=model_free)
     say(f"page: {out / 'frontier.html'}")
     return document
 
 
-def _recording(given: Path | None, out: Path, quick: bool) -> Path:
-    if given is not None:
-        return given
+def _recording(recording: Path | None, out: Path, quick: bool) -> Path:
+    if recording is not None:
+        return recording
     from retrieval.console.progress import CountedBar
     from robot.collection import CollectSettings, collect
     from robot.rig import load_rig
 
     objects, grasps = (6, 2) if quick else (30, 4)
     folder = out / "recording"
-    say(f"collecting {grasps} grasps of each of {objects} simulated objects into {folder}")
+    say(f"collecting {grasps} grasps of each of {objects} simulated objects in {folder}")
     with CountedBar("collect", "grasps") as bar:
         collect(
             partial(load_rig, "sim", seed=SEED),

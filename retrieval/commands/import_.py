@@ -1,4 +1,4 @@
-"""`retrieve import`: a public data set, or pictures of one's own, become a recording."""
+"""`retrieve import`: convert a public data set, or your own pictures, to a recording."""
 
 import shlex
 from pathlib import Path
@@ -18,21 +18,21 @@ if TYPE_CHECKING:
 def import_(
     name: Annotated[
         str | None,
-        typer.Argument(metavar="NAME", help="which data set; without it they are listed", show_default=False),
+        typer.Argument(metavar="NAME", help="data set; leave it out to list all", show_default=False),
     ] = None,
     source: Annotated[
-        Path | None, typer.Argument(metavar="SRC", help="folder with the data set's own files", show_default=False)
+        Path | None, typer.Argument(metavar="SRC", help="folder with the files of the data set", show_default=False)
     ] = None,
     *,
-    out: Annotated[Path | None, typer.Option(help="recording folder to write, or to go on with")] = None,
+    out: Annotated[Path | None, typer.Option(help="recording folder to write or continue")] = None,
     option: Annotated[
         OptionValues | None,
         typer.Option(
-            parser=OptionValues.parse, metavar="NAME=VALUE...", help="options of the data set, as the list has them"
+            parser=OptionValues.parse, metavar="NAME=VALUE...", help="options of the data set; the list shows them"
         ),
     ] = None,
 ) -> None:
-    """Turn a public data set, or pictures of your own, into a recording."""
+    """Convert a public data set, or your own pictures, to a recording."""
     from robot.importers import IMPORTERS, read_options
 
     if name is None:
@@ -41,9 +41,7 @@ def import_(
         return
     options = read_options(IMPORTERS.resolve(name), option or ())
     if source is None or out is None:
-        raise BadInput(
-            f"an import needs a folder to read and one to write: retrieve import {name} SRC --out recording/"
-        )
+        raise BadInput(f"an import needs a source folder and --out; run: retrieve import {name} SRC --out recording/")
     recording = run_importer(name, source, out, **options)
     for note in recording.notes:
         say(note)
@@ -52,7 +50,17 @@ def import_(
 
 
 def run_importer(name: str, source: Path, out: Path, **options: Any) -> "Recording":
-    """Import with a bar on stderr. Raises what the importer raises."""
+    """Import a data set with a progress bar on stderr.
+
+    Args:
+        name: Name of the importer.
+        source: Folder with the files of the data set.
+        out: Recording folder to write or continue.
+        **options: Options of the importer.
+
+    Raises:
+        RobotError: The importer failed.
+    """
     from robot.importers import load_importer
 
     with CountedBar(f"import {name}", "grasps") as bar:
@@ -60,7 +68,7 @@ def run_importer(name: str, source: Path, out: Path, **options: Any) -> "Recordi
 
 
 def _list_importers() -> list[str]:
-    """A line for each data set, and one with its options as they are where nothing is said."""
+    """Return one line for each data set, and one with its options and their defaults."""
     from robot.importers import IMPORTERS, load_importer, options_of, title_of
 
     lines = []
@@ -69,7 +77,7 @@ def _list_importers() -> list[str]:
     for name in names:
         lines.append(f"{name:{width}}{title_of(name)}")
         options = [
-            f"{each}={shlex.quote(str(default))}" for each, (_, default) in options_of(load_importer(name)).items()
+            f"{option}={shlex.quote(str(default))}" for option, (_, default) in options_of(load_importer(name)).items()
         ]
         lines += [f"{'':{width}}--option {' '.join(options)}"] if options else []
     return lines

@@ -1,7 +1,7 @@
-"""The command line `retrieve`: its commands, and what holds for all of them.
+"""The command line `retrieve`: its commands, and the rules for all of them.
 
 Results go to stdout, everything else to stderr. Exit codes: 0 done, 1 the job ran and failed, 2 wrong use or bad input.
-A command's function is what the command line calls and what Python may call; its docstring is its help.
+The function of a command can also be called from Python; its docstring is the help text.
 """
 
 import errno
@@ -33,15 +33,16 @@ from retrieval.console.output import checked_stdout, discard_stdout, prepare_str
 from retrieval.version import __version__
 
 MAX_MESSAGE, MESSAGE_TAIL = 500, 150
-"""Characters of a message, and how many of these are its last: what to do mostly stands at its end. What stands in a
-hostile file may be of any length."""
+"""Maximum characters of a printed message, and how many of them come from its end, which usually contains the remedy.
+
+Text from a hostile file can have any length."""
 _BAD_PATH_ERRNOS = {
     *(errno.ENOENT, errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS),
     *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST),
 }
 
 app = typer.Typer(
-    # Without markup nothing is drawn, and rich is not imported.
+    # Without markup, rich is not imported.
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
@@ -53,8 +54,8 @@ app.add_typer(benchmark.app)
 app.add_typer(rig.app)
 
 
-def _print_version(asked: bool) -> None:
-    if asked:
+def _print_version(is_given: bool) -> None:
+    if is_given:
         show(f"touch-retrieval {__version__}")
         raise typer.Exit
 
@@ -64,7 +65,7 @@ def retrieve(
     *,
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_print_version, is_eager=True, help="show the program's version and exit"),
+        typer.Option("--version", callback=_print_version, is_eager=True, help="show the version and exit"),
     ] = False,
     debug: Annotated[bool, typer.Option("--debug", help="show the traceback of an error")] = False,
 ) -> None:
@@ -72,17 +73,21 @@ def retrieve(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit code."""
-    # A stream that the shell has closed (`2>&-`) is None, and printing to None prints to stdout.
+    """Run one command and return its exit code.
+
+    Args:
+        argv: Words after the program name; None reads `sys.argv`.
+    """
+    # A stream that the shell closed (`2>&-`) is None, and printing to None prints to stdout.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     prepare_streams()
     program = typer.main.get_command(app)
-    if os.environ.get("_RETRIEVE_COMPLETE"):  # set by a shell that asks what may follow
+    if os.environ.get("_RETRIEVE_COMPLETE"):  # set by a shell that completes a command
         program(prog_name="retrieve")
     context: Any = None
     with record_interrupts() as interrupts:
-        # Not program.main(), which has its own ideas of Ctrl-C and of readers that left.
+        # Not program.main(): it handles Ctrl-C and closed pipes in its own way.
         try:
             context = program.make_context("retrieve", list(sys.argv[1:] if argv is None else argv))
             with context:
@@ -90,11 +95,11 @@ def main(argv: Sequence[str] | None = None) -> int:
             with checked_stdout():
                 sys.stdout.flush()
             return code or 0
-        except typer.Exit as leaving:  # after --help or --version
-            return leaving.exit_code
+        except typer.Exit as done:  # after --help or --version
+            return done.exit_code
         except typer.TyperException as wrong:
             return _fail(context, f"{wrong.format_message().rstrip('.')}; see --help", wrong.exit_code)
-        except BrokenPipeError:  # the reader of stdout has left, as `| head` does
+        except BrokenPipeError:  # the reader of stdout closed it, like `| head`
             discard_stdout()
             return 1
         except (Exception, KeyboardInterrupt) as error:
@@ -104,13 +109,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _explain(context: Any, error: BaseException, interrupts: list[int]) -> int:
-    """Say what went wrong in one line; returns the exit code."""
-    code = getattr(error, "exit_code", None)  # every error tree of the project carries one
+    """Print an error in one line; return the exit code."""
+    code = getattr(error, "exit_code", None)  # all errors of the project have one
     if code is not None:
         return _fail(context, str(error), code)
     if interrupts or isinstance(error, KeyboardInterrupt):
         return _fail(context, f"stopped by {'SIGTERM' if signal.SIGTERM in interrupts else 'Ctrl-C'}", 1)
-    if isinstance(error, OSError):  # wrong use where another path would have done
+    if isinstance(error, OSError):  # wrong use if another path would have worked
         message = f"{error.filename or 'a file'}: {error.strerror or error}"
         return _fail(context, message, 2 if error.errno in _BAD_PATH_ERRNOS else 1)
     return _fail(context, f"unexpected {type(error).__name__}: {error} (run with --debug and report it)", 1)

@@ -1,4 +1,4 @@
-"""What several commands share: options, options of several values, and what is read where an option names it."""
+"""Options that several commands have in common, their parsers, and the reading of files that options name."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -19,58 +19,73 @@ if TYPE_CHECKING:
     from retrieval.model.config import Config
 
 DEFAULT_PRESET = "small"
-DEFAULT_MODEL = "that of the index here, else the last one trained from this folder, else the shipped one"
+DEFAULT_MODEL = "that of the index, else the last one trained in this folder, else the shipped one"
 SPLIT = "JSON file with train, validation and test objects"
 
-Json = Annotated[bool, typer.Option("--json", help="print one JSON document")]
+Json = Annotated[bool, typer.Option("--json", help="print one JSON document on stdout")]
 Index = Annotated[
     str | None,
-    typer.Option(help="index folder, or a cluster's URL (default: ./index, else the last one built from this folder)"),
+    typer.Option(
+        help="index folder, or the URL of a sharded index (default: ./index, else the last one built in this folder)"
+    ),
 ]
-IndexModel = Annotated[str | None, typer.Option(help="checkpoint (default: the one the index was built with)")]
-NoVerify = Annotated[bool, typer.Option("--no-verify", help="skip the checksums of a huge index")]
+IndexModel = Annotated[str | None, typer.Option(help="checkpoint (default: that of the index)")]
+NoVerify = Annotated[
+    bool, typer.Option("--no-verify", help="skip the checksums of the index files, for a fast start with a huge index")
+]
 Model = Annotated[
     str | None,
     typer.Option(
-        help=f"checkpoint; shipped and shipped-one-finger name those of the package (default: {DEFAULT_MODEL})"
+        help=f"checkpoint file, or shipped or shipped-one-finger for those of the package (default: {DEFAULT_MODEL})"
     ),
 ]
 Init = Annotated[
-    str | None, typer.Option(help="first weights of the towers: random, imagenet, shipped, or a state dict file")
+    str | None, typer.Option(help="initial weights of the towers: random, imagenet, shipped, or a state dict file")
 ]
 InitTower = Annotated[
-    str | None, typer.Option(help="first weights of one tower alone: a file, as `train --task relief` writes it")
+    str | None, typer.Option(help="initial weights of this tower: a file written by `train --task relief`")
 ]
 LabelledPhotos = Annotated[
     str | None,
-    typer.Option("--photos", help="labelled photos (`collect --photos-only`) to train on too, with --touches"),
+    typer.Option(
+        "--photos", help="additional labelled photos (from `collect --photos-only`) to train on; needs --touches"
+    ),
 ]
 LabelledTouches = Annotated[
     str | None,
-    typer.Option("--touches", help="labelled touches (`collect --touches-only`) to pair with them by labels"),
+    typer.Option("--touches", help="labelled touches (from `collect --touches-only`), paired with --photos by label"),
 ]
 Recording = Annotated[Path, typer.Argument(help="recording folder", show_default=False)]
 SplitFile = Annotated[Path | None, typer.Option(help=SPLIT)]
 CheckpointOut = Annotated[Path, typer.Option(help="checkpoint to write (.safetensors)")]
 ReportOut = Annotated[Path, typer.Option(help="folder for results.json, report.md and report.html")]
 
-_SEPARATOR = "\0"  # which no word of a command line holds
+_SEPARATOR = "\0"  # a command line cannot contain it
 
 
 class OptionValues(tuple[str, ...]):
-    """The values after one option that takes several, such as the gel images of one grasp."""
+    """The values of one option that takes several, such as the gel images of one grasp."""
 
     @classmethod
     def parse(cls, joined: str) -> Self:
-        """As `Command` hands them over."""
+        """Split the values that `Command.parse_args` joined.
+
+        Args:
+            joined: The values, with a null character between them.
+        """
         return cls(joined.split(_SEPARATOR))
 
 
 @dataclasses.dataclass(frozen=True)
 class NumberParser:
-    """Read the number of an option, from `low` to `high`, so that no command begins with another one.
+    """Parser of a number from `low` to `high`, which rejects other values before a command starts.
 
-    kind: int or float. (A range of the library admits nan, and shows its limits in the help.)
+    The range types of typer accept nan, and print their limits in the help.
+
+    Attributes:
+        kind: int or float.
+        low: Smallest value.
+        high: Largest value.
     """
 
     kind: type[int] | type[float]
@@ -79,40 +94,45 @@ class NumberParser:
 
     @property
     def __name__(self) -> str:
-        """As the help names it."""
+        """The name of the type in the help."""
         return self.kind.__name__
 
     def __call__(self, text: str) -> float:
-        """Return the number. Raises BadParameter."""
+        """Return the number.
+
+        Raises:
+            BadParameter: The text is not a number of this kind, or is out of range.
+        """
         try:
             value = self.kind(text)
         except ValueError as error:
             raise typer.BadParameter(f"{text!r} is not a valid {self.__name__}") from error
         if not self.low <= value <= self.high:
-            raise typer.BadParameter(f"{text} is not from {self.low} to {self.high}")
+            raise typer.BadParameter(f"must be from {self.low} to {self.high}, got {text}")
         return value
 
 
 COUNT, SEED, WORKERS = NumberParser(int, 1, 10**9), NumberParser(int, 0, 2**32 - 1), NumberParser(int, 1, 1024)
-SHARE, SECONDS = NumberParser(float, 0, 1), NumberParser(float, 0, 86_400)
-Iterations = Annotated[int | None, typer.Option(parser=COUNT, help="optimiser steps, instead of the preset's")]
-Jobs = Annotated[int, typer.Option(parser=WORKERS, help="simulated rigs that work at once")]
-Objects = Annotated[int, typer.Option(parser=COUNT, help="how many objects")]
+FRACTION, SECONDS = NumberParser(float, 0, 1), NumberParser(float, 0, 86_400)
+Iterations = Annotated[int | None, typer.Option(parser=COUNT, help="optimiser steps (default: those of the preset)")]
+Jobs = Annotated[int, typer.Option(parser=WORKERS, help="simulated rigs that run in parallel")]
+Objects = Annotated[int, typer.Option(parser=COUNT, help="number of objects")]
 
 
 class Command(TyperCommand):
-    """A command whose options of several values, those with a metavar in "...", take the words up to the next option.
+    """A command with options of several values: they take all words up to the next option.
 
-    What is named like an option is no option's value: `--out --preview` has forgotten the folder.
+    Such an option has a metavar that ends in "...". A word with the name of an option is never a value: in
+    `--out --preview` the value of `--out` is missing.
     """
 
     def get_short_help_str(self, limit: int = 0) -> str:
-        """Its help in a list of commands, not cut."""
+        """Return the whole help text for the list of commands; typer would cut it."""
         return self.help or ""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Join the values of such an option to one word; see `OptionValues.parse`."""
-        options = {name: each for each in self.params for name in each.opts if name.startswith("-")}
+        """Join the values of each option of several values to one word; see `OptionValues.parse`."""
+        options = {name: option for option in self.params for name in option.opts if name.startswith("-")}
         joined: list[str] = []
         while args and args[0] != "--":
             word, *args = args
@@ -132,27 +152,44 @@ class Command(TyperCommand):
         return super().parse_args(ctx, joined + args)
 
 
-def refuse_options(why: str, **given: object) -> None:
-    """Raise BadInput for the first of these options that was given: it would be ignored, and `why` says so. An option
-    that was left out is None or False.
+def refuse_options(reason: str, **options: object) -> None:
+    """Reject options that would be ignored.
+
+    Args:
+        reason: Text after the option's name in the message.
+        **options: Value of each option; None or False for an option that was left out.
+
+    Raises:
+        BadInput: An option was given.
     """
-    for name, value in given.items():
+    for name, value in options.items():
         if value is not None and value is not False:
-            raise BadInput(f"--{name.replace('_', '-')} {why}")
+            raise BadInput(f"--{name.replace('_', '-')} {reason}")
 
 
 @contextmanager
-def announce_resume(what: str) -> Iterator[None]:
-    """Say on Ctrl-C what is stored, and that the same command continues from there."""
+def announce_resume(stored: str) -> Iterator[None]:
+    """On Ctrl-C, print a message that the same command continues the job.
+
+    Args:
+        stored: Sentence on the results so far and their folder.
+    """
     try:
         yield
     except KeyboardInterrupt:
-        say(f"{what}; the same command goes on with it")
+        say(f"{stored}; run the same command to continue")
         raise
 
 
 def read_split(path: Path | None) -> "Split | None":
-    """The split of objects that `--split` names. Raises BadInput."""
+    """Read the split of objects from the file of `--split`; None without a file.
+
+    Args:
+        path: JSON file with train, validation and test objects.
+
+    Raises:
+        BadInput: The file is not readable or not a split.
+    """
     if path is None:
         return None
     from retrieval.data.dataset import Split
@@ -163,11 +200,20 @@ def read_split(path: Path | None) -> "Split | None":
         raise BadInput(f"{path} is not a JSON file: {error}") from error
 
 
-def training_config(preset: str | None, iterations: int | None, **instead: str | int | None) -> "Config":
-    """A preset or TOML file, and what options say instead of it, each a setting of training. Raises ConfigError."""
+def training_config(preset: str | None, iterations: int | None, **overrides: str | int | None) -> "Config":
+    """Return a configuration with the settings of training that options override.
+
+    Args:
+        preset: Name of a preset or path of a TOML file; None for the default preset.
+        iterations: Optimiser steps; None for those of the preset.
+        **overrides: Other settings of training; None for those of the preset.
+
+    Raises:
+        ConfigError: The preset is unknown, or a setting is invalid.
+    """
     from retrieval.model.config import load_config
 
     config = load_config(preset or DEFAULT_PRESET)
-    changed: dict[str, Any] = {name: value for name, value in instead.items() if value is not None}
+    changed: dict[str, Any] = {name: value for name, value in overrides.items() if value is not None}
     steps = config.training.iterations if iterations is None else iterations
     return dataclasses.replace(config, training=dataclasses.replace(config.training.with_iterations(steps), **changed))

@@ -1,11 +1,11 @@
-"""`retrieve query`: which object is in the hand."""
+"""`retrieve query`: find the object in the hand."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import COUNT, SHARE, Index, IndexModel, Json, NoVerify, OptionValues
+from retrieval.commands.options import COUNT, FRACTION, Index, IndexModel, Json, NoVerify, OptionValues
 from retrieval.console.files import PAGE, require_folder, require_ours, text_bytes, write_output
 from retrieval.console.output import print_json, say
 
@@ -17,7 +17,7 @@ def query(
         typer.Option(
             parser=OptionValues.parse,
             metavar="IMAGE...",
-            help="gel images of one grasp, one per finger; again for more grasps of the same object",
+            help="gel images of one grasp, one per finger; repeat the option for more grasps of the same object",
         ),
     ],
     background: Annotated[
@@ -25,33 +25,30 @@ def query(
         typer.Option(
             parser=OptionValues.parse,
             metavar="IMAGE...",
-            help="no-contact frames, one per finger: some models subtract them, others see by them if there is a "
-            "contact",
+            help="no-contact frames, one per finger; some models subtract them, others use them to detect contact",
         ),
     ] = None,
     index: Index = None,
     model: IndexModel = None,
-    top: Annotated[int, typer.Option(parser=COUNT, help="objects to return")] = 10,
+    top: Annotated[int, typer.Option(parser=COUNT, help="number of objects to return")] = 10,
     candidates: Annotated[
         int | None,
-        typer.Option(parser=COUNT, help="photos that the full classifier judges (default: what the index needs)"),
+        typer.Option(parser=COUNT, help="number of photos to rerank (default: that of the index)"),
     ] = None,
     none_prior: Annotated[
         float,
-        typer.Option(
-            metavar="P", parser=SHARE, help="probability, before anything is felt, that the catalogue lacks the object"
-        ),
+        typer.Option(metavar="P", parser=FRACTION, help="prior probability that the object is not in the catalogue"),
     ] = 0.5,
     json: Json = False,
-    html: Annotated[Path | None, typer.Option(help="write a page with photos and gel images")] = None,
+    html: Annotated[Path | None, typer.Option(help="also write an HTML page with photos and gel images")] = None,
     no_verify: NoVerify = False,
 ) -> int:
-    """Which object is in the hand?"""
+    """Find the catalogue photo of the object in the hand."""
     from retrieval.search import defaults
 
-    path, why = defaults.find_index(index)
+    path, reason = defaults.find_index(index)
     if index is None:
-        say(f"index: {path} ({why})")
+        say(f"index: {path} ({reason})")
     from retrieval.search.query.answer import EXIT_CODES, verdict_sentence
     from retrieval.search.query.searcher import Searcher
 

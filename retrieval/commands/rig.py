@@ -1,4 +1,4 @@
-"""`retrieve rig`: what a rig of real devices is made of, and where its camera stands."""
+"""`retrieve rig`: check the devices of a rig, and calibrate its camera."""
 
 import dataclasses
 from pathlib import Path
@@ -11,7 +11,7 @@ from retrieval.console.files import HAND_EYE, require_folder, require_ours
 from retrieval.console.output import print_json, say, show
 from retrieval.errors import RetrievalError
 
-HELP = "See what a rig of real devices is made of, and calibrate its camera."
+HELP = "Check the devices of a rig, and calibrate its camera."
 
 app = typer.Typer(name="rig", help=HELP, short_help=HELP, subcommand_metavar="TASK [ARGS]...")
 
@@ -19,11 +19,11 @@ app = typer.Typer(name="rig", help=HELP, short_help=HELP, subcommand_metavar="TA
 @app.command(cls=Command)
 def check(
     *,
-    rig: Annotated[str | None, typer.Option(help="rig by name or TOML file (default: list what is connected)")] = None,
-    no_motion: Annotated[bool, typer.Option("--no-motion", help="leave arm and jaws where they are")] = False,
+    rig: Annotated[str | None, typer.Option(help="rig by name or TOML file (default: list connected devices)")] = None,
+    no_motion: Annotated[bool, typer.Option("--no-motion", help="do not move the arm or the jaws")] = False,
     json: Json = False,
 ) -> None:
-    """List what is connected, or exercise each device of a rig gently."""
+    """List connected devices, or test each device of a rig with small motions."""
     from robot.drivers.discover import discover
     from robot.rig import load_rig
     from robot.rig_check import check_rig
@@ -36,7 +36,7 @@ def check(
         for device in found:
             for line in (f"# {device.kind}: {device.label}", *device.toml.splitlines(), ""):
                 show(line)
-        say(f"{len(found)} device(s) found; the lines above go into a rig's file" if found else "no device was found")
+        say(f"{len(found)} device(s) found; copy the lines above into a rig file" if found else "no device was found")
         return
     rows = []
     for row in check_rig(load_rig(rig, seed=0), motion=not no_motion):
@@ -53,12 +53,14 @@ def check(
 def calibrate(
     points: Annotated[
         Path,
-        typer.Argument(help="CSV: camera_x_mm, camera_y_mm, camera_z_mm, rig_x_mm, rig_y_mm, rig_z_mm"),
+        typer.Argument(
+            help="CSV file with columns camera_x_mm, camera_y_mm, camera_z_mm, rig_x_mm, rig_y_mm, rig_z_mm"
+        ),
     ],
     *,
     out: Annotated[Path, typer.Option(help="file to write")] = Path("hand_eye.json"),
 ) -> None:
-    """Where the camera stands, from points known in its frame and the rig's."""
+    """Compute the camera's pose from points that are known in its frame and in the rig's frame."""
     from robot.sight.hand_eye import SUSPECT_MM, fit_hand_eye, read_pairs
 
     require_ours(out, HAND_EYE)
@@ -69,12 +71,14 @@ def calibrate(
             say(f"{name}: {found.affine_problem}")
             continue
         say(
-            f"{name}: points are {errors.mean_mm:.1f} mm off (at most {errors.max_mm:.1f}); each when left out "
+            f"{name}: mean error {errors.mean_mm:.1f} mm (maximum {errors.max_mm:.1f}), leave-one-out "
             f"{errors.loo_mean_mm:.1f} mm ({errors.loo_max_mm:.1f})"
         )
     if found.warning:
         say(f"warning: {found.warning}")
     if found.rigid_errors.loo_mean_mm > SUSPECT_MM:
-        raise RetrievalError(f"nothing was written: an arm cannot be steered by points {SUSPECT_MM:g} mm off and more")
+        raise RetrievalError(
+            f"nothing was written: the leave-one-out error must be at most {SUSPECT_MM:g} mm; measure the points again"
+        )
     found.save(out)
-    say(f"{out}: written from {len(found.rig_mm)} points; name it as hand_eye under [camera]")
+    say(f"{out}: fitted to {len(found.rig_mm)} points; set hand_eye to this file under [camera]")

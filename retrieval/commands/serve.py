@@ -1,4 +1,4 @@
-"""`retrieve serve`: the answers over HTTP, and a page."""
+"""`retrieve serve`: answer queries over HTTP, with a page."""
 
 import os
 import webbrowser
@@ -11,8 +11,8 @@ import typer
 
 from retrieval.commands.options import (
     COUNT,
+    FRACTION,
     SECONDS,
-    SHARE,
     WORKERS,
     Index,
     IndexModel,
@@ -28,71 +28,84 @@ if TYPE_CHECKING:
     from robot.recording.folder import RecordingWriter
 
 TOKEN_VARIABLE = "RETRIEVE_TOKEN"
-"""Variable of the environment that may hold the token."""
+"""Environment variable with the token, if there is no token file."""
 
 
 def serve(
     *,
     index: Index = None,
     model: IndexModel = None,
-    host: Annotated[str, typer.Option(help="where to listen; other machines reach it only with a token")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(parser=NumberParser(int, 0, 2**16 - 1), help="port; 0 for a free one")] = 8000,
+    host: Annotated[
+        str, typer.Option(help="address to listen on; one that other machines can reach needs a token")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(parser=NumberParser(int, 0, 2**16 - 1), help="port; 0 chooses a free one")
+    ] = 8000,
     token_file: Annotated[
-        Path | None, typer.Option(help=f"file with the token that requests must carry (or variable {TOKEN_VARIABLE})")
+        Path | None,
+        typer.Option(
+            help=f"file with the token that clients must send (default: environment variable {TOKEN_VARIABLE})"
+        ),
     ] = None,
     rig: Annotated[
-        str | None, typer.Option(help="rig by name or TOML file, for live pictures (default: sim for its own objects)")
+        str | None,
+        typer.Option(
+            help="rig by name or TOML file, for live images (default: sim, if the index contains its objects)"
+        ),
     ] = None,
     history: Annotated[
-        Path | None, typer.Option(help="folder for queries and what is said of them (default: INDEX-history)")
+        Path | None, typer.Option(help="folder that stores queries and feedback (default: INDEX-history)")
     ] = None,
-    no_history: Annotated[bool, typer.Option("--no-history", help="keep nothing")] = False,
+    no_history: Annotated[bool, typer.Option("--no-history", help="store no queries and no feedback")] = False,
     trials: Annotated[
-        Path | None, typer.Option(metavar="RECORDING", help="test people with objects the model never saw")
+        Path | None,
+        typer.Option(metavar="RECORDING", help="offer people a test with objects that the model was not trained on"),
     ] = None,
     queue: Annotated[
-        int, typer.Option(parser=COUNT, help="requests that are held at once; more are told to come again")
+        int,
+        typer.Option(parser=COUNT, help="maximum number of waiting and running requests; further ones get status 429"),
     ] = 8,
-    workers: Annotated[int, typer.Option(parser=WORKERS, help="requests in work at once")] = 1,
+    workers: Annotated[int, typer.Option(parser=WORKERS, help="requests that run in parallel")] = 1,
     batch_ms: Annotated[
         float,
-        typer.Option(
-            parser=NumberParser(float, 0, 1000), help="how long a query waits for others to be encoded with it"
-        ),
+        typer.Option(parser=NumberParser(float, 0, 1000), help="time that a query waits for others to share a batch"),
     ] = 0.0,
     deadline: Annotated[
-        float, typer.Option(metavar="SECONDS", parser=SECONDS, help="after which no answer is waited for")
+        float, typer.Option(metavar="SECONDS", parser=SECONDS, help="maximum time for one request")
     ] = 30.0,
     cluster: Annotated[
-        bool, typer.Option("--cluster", help="Ray holds the shards of a cluster: that of RAY_ADDRESS, else one here")
+        bool,
+        typer.Option(
+            "--cluster", help="serve a sharded index on the Ray cluster at RAY_ADDRESS, else on Ray on this machine"
+        ),
     ] = False,
     replicas: Annotated[
-        int | None, typer.Option(parser=WORKERS, help="of --cluster: processes that hold the same shard (default: 1)")
+        int | None, typer.Option(parser=WORKERS, help="with --cluster: processes per shard (default: 1)")
     ] = None,
     max_replicas: Annotated[
         int | None,
         typer.Option(
-            parser=WORKERS, help="of --cluster: to how many they grow while requests wait (default: they do not)"
+            parser=WORKERS, help="with --cluster: maximum processes per shard while requests wait (default: --replicas)"
         ),
     ] = None,
     shard_timeout: Annotated[
         float | None,
         typer.Option(
-            metavar="SECONDS", parser=SECONDS, help="of --cluster: how long a shard is waited for (default: 5)"
+            metavar="SECONDS", parser=SECONDS, help="with --cluster: maximum time to wait for a shard (default: 5)"
         ),
     ] = None,
     min_share: Annotated[
         float | None,
         typer.Option(
-            metavar="SHARE",
-            parser=SHARE,
-            help="of --cluster: of the catalogue, that an answer must have searched (default: 1, all)",
+            metavar="FRACTION",
+            parser=FRACTION,
+            help="with --cluster: fraction of the catalogue that must be searched for an answer (default: 1)",
         ),
     ] = None,
     open_page: Annotated[bool, typer.Option("--open-page", help="open the page in a browser")] = False,
     no_verify: NoVerify = False,
 ) -> None:
-    """Answer over HTTP, and show a page, until Ctrl-C or SIGTERM."""
+    """Answer queries over HTTP and serve a page, until Ctrl-C or SIGTERM."""
     try:
         from retrieval.serve.app import create_app
         from retrieval.serve.server import serve as run
@@ -104,14 +117,19 @@ def serve(
     from retrieval.serve.rig import load_live_rig, simulated_live_rig
 
     if no_history:
-        refuse_options("names where to keep what --no-history keeps nowhere; give one of them", history=history)
-    how = {"replicas": replicas, "max_replicas": max_replicas, "shard_timeout": shard_timeout, "least_share": min_share}
+        refuse_options("contradicts --no-history; give one of them", history=history)
+    cluster_options = {
+        "replicas": replicas,
+        "max_replicas": max_replicas,
+        "shard_timeout": shard_timeout,
+        "min_share": min_share,
+    }
     if not cluster:
-        refuse_options("is for shards that Ray holds; give --cluster too", **how)
-    path, why = defaults.find_index(index)
+        refuse_options("needs --cluster", **cluster_options)
+    path, reason = defaults.find_index(index)
     if index is None:
-        say(f"index: {path} ({why})")
-    kept = Path(PurePosixPath(path).name if is_url(path) else path).resolve()
+        say(f"index: {path} ({reason})")
+    local = Path(PurePosixPath(path).name if is_url(path) else path).resolve()
     settings = ServiceSettings(
         index=path,
         model=Path(model) if model else None,
@@ -123,43 +141,56 @@ def serve(
         workers=workers,
         batch_ms=batch_ms,
         deadline_s=deadline,
-        history=None if no_history else history or kept.with_name(f"{kept.name}-history"),
+        history=None if no_history else history or local.with_name(f"{local.name}-history"),
     )
-    with ExitStack() as closed:
-        recorder = _feedback_writer(settings.history, path, closed) if settings.history else None
-        held = _ray_shards(path, closed, how, not no_verify) if cluster else None
+    with ExitStack() as stack:
+        writer = _feedback_writer(settings.history, path, stack) if settings.history else None
+        open_shards = _ray_shards(path, stack, cluster_options, not no_verify) if cluster else None
         app = create_app(
-            settings, load_live_rig(rig, path) if rig else simulated_live_rig(path), recorder, trials, held
+            settings, load_live_rig(rig, path) if rig else simulated_live_rig(path), writer, trials, open_shards
         )
 
-        def started(bound: int) -> None:
-            address = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
+        def on_start(bound_port: int) -> None:
+            address = f"http://{f'[{host}]' if ':' in host else host}:{bound_port}"
             say(f"listening on {address}")
             if open_page:
                 webbrowser.open(address)
 
-        run(app, started)
+        run(app, on_start)
 
 
-def _ray_shards(index: str | Path, closed: ExitStack, how: Mapping[str, Any], verify: bool) -> "OpenShards":
-    """What opens shards on Ray, which is joined or started. how: options of it by name, None for those left out. Raises
-    BadInput where there is no cluster to hold.
+def _ray_shards(index: str | Path, stack: ExitStack, options: Mapping[str, Any], verify: bool) -> "OpenShards":
+    """Return the function that opens shards on Ray; join or start Ray first.
+
+    Args:
+        index: Folder or URL of the index.
+        stack: Closes the session and the deployments.
+        options: Values of the options of `--cluster`; None for those left out.
+        verify: Whether to check the index files against their checksums.
+
+    Raises:
+        BadInput: The index is not sharded.
     """
     from retrieval.cluster.serving import Deployments, ReplicaSettings
     from retrieval.cluster.session import ray_session
     from retrieval.search.sharding.object_store import is_sharded
 
     if not is_sharded(index):
-        raise BadInput(f"{index} is one index folder; make a cluster by `retrieve build-index --shards`")
-    given = {name.replace("shard_timeout", "wait_s"): value for name, value in how.items() if value is not None}
-    settings = ReplicaSettings(**given)
-    deployments = Deployments(closed.enter_context(ray_session()), settings, verify)
-    closed.callback(deployments.close)
+        raise BadInput(f"{index} has no shards; build a sharded index with `retrieve build-index --shards`")
+    values = {name.replace("shard_timeout", "wait_s"): value for name, value in options.items() if value is not None}
+    settings = ReplicaSettings(**values)
+    deployments = Deployments(stack.enter_context(ray_session()), settings, verify)
+    stack.callback(deployments.close)
     return deployments.open
 
 
-def _feedback_writer(folder: Path, index: str | Path, closed: ExitStack) -> "RecordingWriter":
-    """The writer of the recording of what people say. Raises RobotError."""
+def _feedback_writer(folder: Path, index: str | Path, stack: ExitStack) -> "RecordingWriter":
+    """Open the writer of the recording of people's feedback.
+
+    Raises:
+        BadInput: The history is a file.
+        RobotError: The recording cannot be written.
+    """
     from retrieval.model.checkpoint_info import read_checkpoint_info
     from retrieval.search.defaults import manifest_of, model_of
     from robot.recording.folder import RecordingWriter
@@ -168,8 +199,8 @@ def _feedback_writer(folder: Path, index: str | Path, closed: ExitStack) -> "Rec
         raise BadInput(f"the history must be a folder, but {folder} is a file; name another one with --history")
     stored = read_checkpoint_info(model_of(manifest_of(index)))
     info = {"source": "what people said of queries", "sensor": f"as {stored.provenance.get('source', 'unknown')}"}
-    say(f"queries and what is said of them are kept in {folder}")
-    return closed.enter_context(RecordingWriter(folder / "recording", info))
+    say(f"queries and feedback are stored in {folder}")
+    return stack.enter_context(RecordingWriter(folder / "recording", info))
 
 
 def _read_token(file: Path | None) -> str | None:
@@ -180,4 +211,4 @@ def _read_token(file: Path | None) -> str | None:
     try:
         return read_regular(file).decode("ascii").strip()
     except (OSError, ValueError) as error:
-        raise ConfigError(f"{file} must hold a token in ASCII: {error}") from error
+        raise ConfigError(f"{file} must contain a token in ASCII: {error}") from error

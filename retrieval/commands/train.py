@@ -1,4 +1,4 @@
-"""`retrieve train`: a matcher, a tower that sees relief, or a gate for `retrieve collect`."""
+"""`retrieve train`: train a matcher, pretrain a tower on relief, or train a gate for `retrieve collect`."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -25,20 +25,21 @@ from retrieval.errors import BadInput
 
 def train(
     recording: Annotated[
-        Path, typer.Argument(help="recording folder; for relief the folder of labelled pictures", show_default=False)
+        Path,
+        typer.Argument(help="recording folder; for --task relief, the folder of labelled pictures", show_default=False),
     ],
     *,
     task: Annotated[
         Literal["match", "relief", "grasp-success"],
         typer.Option(
-            help="match: does this touch belong to this photo? relief: which relief does one side's picture show, for "
-            "--init-photo or --init-touch; grasp-success: did the grasp succeed?"
+            help="match: classify whether a touch and a photo show the same object; relief: pretrain one tower to "
+            "classify relief, for --init-photo or --init-touch; grasp-success: classify whether a grasp succeeded"
         ),
     ] = "match",
     out: CheckpointOut,
     config: Annotated[
         str | None,
-        typer.Option(help="preset, such as small, mobilenet, relief or paper, or TOML file (default: small)"),
+        typer.Option(help="a preset, such as small, mobilenet, relief or paper, or a TOML file (default: small)"),
     ] = None,
     init: Init = None,
     init_photo: InitTower = None,
@@ -47,28 +48,32 @@ def train(
     touches: LabelledTouches = None,
     iterations: Iterations = None,
     seed: Annotated[
-        int | None, typer.Option(parser=SEED, help="seed of split, pairs and weights, instead of the configuration's")
+        int | None,
+        typer.Option(parser=SEED, help="seed of split, pairs and weights (default: that of the configuration)"),
     ] = None,
     split: SplitFile = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on with an unfinished training of --out")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="continue an unfinished training of --out")] = False,
     cache: Annotated[
         Path | None,
-        typer.Option(
-            help="folder where decoded images are kept, for towers that are trained: later trainings read them"
-        ),
+        typer.Option(help="folder that stores decoded images for later training runs; for towers that are not frozen"),
     ] = None,
     cluster: Annotated[
-        bool, typer.Option("--cluster", help="Ray Train starts the ranks: that of RAY_ADDRESS, else one here")
+        bool,
+        typer.Option(
+            "--cluster", help="start the ranks with Ray Train, on the Ray cluster at RAY_ADDRESS, else on this machine"
+        ),
     ] = False,
-    workers: Annotated[int | None, typer.Option(parser=WORKERS, help="of --cluster: ranks (default: 2)")] = None,
+    workers: Annotated[
+        int | None, typer.Option(parser=WORKERS, help="with --cluster: number of ranks (default: 2)")
+    ] = None,
 ) -> None:
-    """Train a matcher, a tower that sees relief, or a gate for `collect`."""
+    """Train a matcher, pretrain a tower on relief, or train a grasp-success gate for `collect`."""
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch, "photos": photos, "touches": touches}
     if (cluster and task != "match") or (workers is not None and not cluster):
-        raise BadInput("--cluster trains matchers (--task match), and --workers says on how many ranks")
+        raise BadInput("--cluster needs --task match, and --workers needs --cluster")
     if task == "grasp-success":
         others = {"config": config, "split": split, "resume": resume, "cache": cache, **inits}
-        refuse_options("is of matchers; --task grasp-success takes --iterations and --seed", **others)
+        refuse_options("does not apply to --task grasp-success, which takes --iterations and --seed", **others)
         from retrieval.training.grasp_success import train_gate
 
         numbers = {"iterations": iterations, "seed": seed}
@@ -78,9 +83,7 @@ def train(
         return
     if task == "relief":
         if split or init_photo or init_touch or photos or touches:
-            raise BadInput(
-                "--task relief needs no split and no pairs, and makes what --init-photo and --init-touch take"
-            )
+            raise BadInput("--task relief does not take --split, --photos, --touches, --init-photo or --init-touch")
         from retrieval.training.relief import ITERATIONS, train_relief
 
         settings = training_config(config, None, init=init, seed=seed)
@@ -88,7 +91,7 @@ def train(
         report = train_relief(recording, out, settings, iterations=steps, resume=resume, cache=cache)
         for line in report.lines():
             say(line)
-        say(f"{out}: give it to `retrieve train` or `retrieve evaluate` as --init-{report.kind}")
+        say(f"{out}: pass it to `retrieve train` or `retrieve evaluate` as --init-{report.kind}")
         return
     from retrieval.search import defaults
     from retrieval.training import distributed
@@ -96,13 +99,13 @@ def train(
 
     try:
         settings = training_config(config, iterations, seed=seed, **inits)
-        asked: dict[str, Any] = {"split": read_split(split), "resume": resume, "cache": cache}
+        options: dict[str, Any] = {"split": read_split(split), "resume": resume, "cache": cache}
         if cluster:
             from retrieval.cluster.training import train_on_ray
 
-            checkpoint = train_on_ray(recording, out, settings, workers=2 if workers is None else workers, **asked)
+            checkpoint = train_on_ray(recording, out, settings, workers=2 if workers is None else workers, **options)
         else:
-            checkpoint = train_matcher(recording, out, settings, **asked)
+            checkpoint = train_matcher(recording, out, settings, **options)
         if distributed.rank():
             return
     finally:
@@ -110,4 +113,4 @@ def train(
     defaults.remember("model", out)
     metrics = checkpoint.provenance["metrics"]
     figures = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in metrics.items())
-    say(f"{out}: kept step {checkpoint.provenance['step']}{', ' if figures else ''}{figures}")
+    say(f"{out}: best step {checkpoint.provenance['step']}{', ' if figures else ''}{figures}")

@@ -1,4 +1,4 @@
-"""Exporters: each writes a recording in a format that other programs read, and is loaded when it is asked for."""
+"""Exporters: each writes a recording in a format that other programs read, and is loaded on first use."""
 
 from _touch_retrieval.registry import Registry
 from robot.errors import UnknownName

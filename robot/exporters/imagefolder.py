@@ -1,10 +1,11 @@
 """Hugging Face's imagefolder: `datasets.load_dataset("imagefolder", data_dir=OUT)`.
 
     README.md                     a data set card: source, sensor, licence, citation
-    <part>/metadata.jsonl         a line per grasp; <part> is train, or the split's train, validation, test
+    <part>/metadata.jsonl         a line per grasp; <part> is train, or train, validation and test of the split
     <part>/images/...             the recording's own files, byte for byte
 
-Columns are the recording's: photo, touch_a, touch_a_before, ... are pictures, object_id and the rest as recorded.
+The columns are those of the recording: photo, touch_a, touch_a_before, ... are pictures; object_id and the others are
+as recorded.
 """
 
 import json
@@ -22,12 +23,24 @@ from robot.storage import read_content
 def export_imagefolder(
     recording: Recording, out: Path, *, parts: Parts | None = None, progress: Progress | None = None
 ) -> RecordingExport:
-    """Write an imagefolder; every picture is decoded once, so that a broken one is refused here. Raises RecordingError,
-    StorageError.
+    """Write an imagefolder. Each picture is decoded once to detect damaged ones.
+
+    Args:
+        recording: The recording.
+        out: New or empty folder.
+        parts: Split of the objects; None for all in the training part.
+        progress: Called with (done, total) after each grasp.
+
+    Raises:
+        RecordingError: A picture is damaged, or the split is invalid.
+        StorageError: The folder cannot be written.
     """
     found, notes = grasps_by_part(recording, parts)
     columns, left_out = _common_columns(found.values())
-    notes += [f"left out {name}, which grasps lack: `datasets` wants the same columns throughout" for name in left_out]
+    notes += [
+        f"left out {name}, which some grasps do not have: `datasets` requires the same columns in all rows"
+        for name in left_out
+    ]
     total, done = sum(map(len, found.values())), 0
     with atomic_folder(out) as folder:
         (folder / "README.md").write_text(_card(recording), "utf-8")
@@ -43,18 +56,21 @@ def export_imagefolder(
 
 
 def _common_columns(parts: Collection[Sequence[RecordedGrasp]]) -> tuple[list[str], list[str]]:
-    """Keys of lines that `datasets` can read, and the others: a picture that every grasp has, and of the rest what
-    grasps of every part have.
+    """Return the columns that `datasets` can read, and the other columns.
+
+    A picture must exist for every grasp, another column for at least one grasp of each part.
     """
     counted = [(len(grasps), Counter(key for grasp in grasps for key in grasp.to_row())) for grasps in parts]
-    every = dict.fromkeys(key for _, counts in counted for key in counts)
-    least = {key: [total if key.endswith("_file_name") else 1 for total, _ in counted] for key in every}
-    kept = [key for key in every if all(counts[key] >= n for n, (_, counts) in zip(least[key], counted, strict=True))]
-    return kept, [key.removesuffix("_file_name") for key in every if key not in kept]
+    keys = dict.fromkeys(key for _, counts in counted for key in counts)
+    minimum = {key: [total if key.endswith("_file_name") else 1 for total, _ in counted] for key in keys}
+    common = [
+        key for key in keys if all(counts[key] >= n for n, (_, counts) in zip(minimum[key], counted, strict=True))
+    ]
+    return common, [key.removesuffix("_file_name") for key in keys if key not in common]
 
 
 def _line(recording: Recording, grasp: RecordedGrasp, folder: Path, columns: Sequence[str]) -> dict[str, object]:
-    """Copy the grasp's pictures; return its line. A picture that several grasps share is copied once."""
+    """Copy the pictures of a grasp, each file once; return its line."""
     for column, relative in grasp.images().items():
         source, target = recording.folder / relative, folder / relative
         if f"{column}_file_name" in columns and not target.exists():
@@ -67,10 +83,10 @@ def _line(recording: Recording, grasp: RecordedGrasp, folder: Path, columns: Seq
 
 
 def _card(recording: Recording) -> str:
-    said = {
+    facts = {
         key: recording.info[key]
         for key in ("source", "sensor", "rig", "background", "licence", "citation", "notes")
         if recording.info.get(key)
     }
-    lines = [f"* {key}: {'; '.join(value) if isinstance(value, list) else value}" for key, value in said.items()]
+    lines = [f"* {key}: {'; '.join(value) if isinstance(value, list) else value}" for key, value in facts.items()]
     return "# Touches and photos of the same objects\n\n" + "\n".join(lines) + "\n"

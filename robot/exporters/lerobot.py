@@ -1,17 +1,17 @@
 """LeRobot data set, version 3: `LeRobotDataset("name", root=OUT)`.
 
-Written with pyarrow and PyAV, after the source of lerobot 0.4.4; lerobot itself is not needed.
+Written with pyarrow and PyAV according to the source of lerobot 0.4.4; lerobot itself is not needed.
 
     meta/info.json                                    features, counts, paths; splits as ranges of episodes
-    meta/stats.json                                   of every feature: min, max, mean, std, count
+    meta/stats.json                                   min, max, mean, std and count of each feature
     meta/tasks.parquet                                a task for each object: its object_id
-    meta/episodes/chunk-000/file-000.parquet          an episode for each grasp, and what its line says
+    meta/episodes/chunk-000/file-000.parquet          an episode for each grasp, with its recorded fields
     data/chunk-000/file-000.parquet                   a row for each step: before, during, after the touch
     videos/observation.images.<camera>/chunk-000/file-000.mp4      camera: photo, touch_a, touch_b, ...
 
-`moment` of a step is 0 before, 1 during, 2 after the touch; a photo stands still through its episode. Videos are H.264
-with every frame whole and colours at full resolution, but not lossless: measured on 144 touches of a GelSight Mini, .86
-grey levels in root mean square, at most 1.2.
+`moment` of a step is 0 before, 1 during, 2 after the touch; all steps of an episode have the same photo. Videos are
+H.264 with key frames only and colours at full resolution, but not lossless: on 144 touches of a GelSight Mini the root
+mean square error is 0.86 grey levels, at most 1.2.
 """
 
 import itertools
@@ -37,12 +37,12 @@ from robot.importers.importing import Progress, import_extra
 from robot.recording.folder import RecordedGrasp, Recording
 
 FPS = 1
-"""Steps are no film; a reader wants a whole number."""
+"""Nominal, because steps have no fixed rate; readers require an integer."""
 EPISODES_A_FILE = 500
 FILES_A_CHUNK = 1000
-_PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-_DATA, _VIDEO = f"data/{_PLACE}.parquet", "videos/{video_key}/" + f"{_PLACE}.mp4"
-_EPISODES = f"meta/episodes/{_PLACE}.parquet"
+_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+_DATA, _VIDEO = f"data/{_FILE}.parquet", "videos/{video_key}/" + f"{_FILE}.mp4"
+_EPISODES = f"meta/episodes/{_FILE}.parquet"
 _CODEC = {"crf": "10", "g": "1", "bf": "0", "preset": "fast"}
 _STEP_COLUMNS = ("timestamp", "frame_index", "episode_index", "index", "task_index", "moment")
 _WHAT = "LeRobot's format"
@@ -51,7 +51,19 @@ _WHAT = "LeRobot's format"
 def export_lerobot(
     recording: Recording, out: Path, *, parts: Parts | None = None, progress: Progress | None = None
 ) -> RecordingExport:
-    """Write a LeRobot data set, version 3. Raises RecordingError, ImporterError without pyarrow or av, StorageError."""
+    """Write a LeRobot data set, version 3.
+
+    Args:
+        recording: The recording.
+        out: New or empty folder.
+        parts: Split of the objects; None for all in the training part.
+        progress: Called with (done, total) after each grasp.
+
+    Raises:
+        RecordingError: A picture is damaged, grasps differ in their fingers, or the split is invalid.
+        ImporterError: pyarrow or av is missing.
+        StorageError: The folder cannot be written.
+    """
     import_extra("pyarrow", _WHAT), import_extra("av", _WHAT)
     found, notes = grasps_by_part(recording, parts)
     grasps = [grasp for part in found.values() for grasp in part]
@@ -66,7 +78,7 @@ def export_lerobot(
                     if progress is not None:
                         progress(episode + 1, len(grasps))
         _write_tasks(folder / "meta" / "tasks.parquet", tasks)
-        _write_json(folder / "meta" / "stats.json", {name: each.to_dict() for name, each in stats.items()})
+        _write_json(folder / "meta" / "stats.json", {name: values.to_dict() for name, values in stats.items()})
         _write_json(folder / "meta" / "info.json", _info(recording, steps, len(tasks), found))
     return RecordingExport(out, len(grasps), (*notes, *steps.remarks()))
 
@@ -76,13 +88,13 @@ def _key(camera: str) -> str:
 
 
 class _FileWriter:
-    """The data, videos and episodes of one file number. Closed by `with`, also where something fails."""
+    """The data, videos and episodes of one file number. `with` closes it, also after an error."""
 
     def __init__(
         self, folder: Path, start: int, steps: EpisodeSteps, tasks: Mapping[str, int], stats: Mapping[str, "_Stats"]
     ) -> None:
         chunk, file = divmod(start // EPISODES_A_FILE, FILES_A_CHUNK)
-        self._place = {"chunk_index": chunk, "file_index": file}
+        self._numbers = {"chunk_index": chunk, "file_index": file}
         self._folder, self._start, self._steps, self._tasks, self._stats = folder, start, steps, tasks, stats
         self._rows: list[dict[str, Any]] = []
         self._episodes: list[dict[str, Any]] = []
@@ -90,7 +102,7 @@ class _FileWriter:
 
     def __enter__(self) -> "_FileWriter":
         for camera, size in self._steps.sizes.items():
-            path = self._folder / _VIDEO.format(video_key=_key(camera), **self._place)
+            path = self._folder / _VIDEO.format(video_key=_key(camera), **self._numbers)
             self._videos[camera] = _VideoWriter(path, size)
         return self
 
@@ -111,30 +123,30 @@ class _FileWriter:
 
     def _episode(self, episode: int, grasp: RecordedGrasp, first: int, length: int) -> dict[str, Any]:
         row: dict[str, Any] = {"episode_index": episode, "tasks": [grasp.object_id], "length": length}
-        row |= {f"data/{key}": value for key, value in self._place.items()}
+        row |= {f"data/{key}": value for key, value in self._numbers.items()}
         row |= {"dataset_from_index": first, "dataset_to_index": first + length}
         start = (episode - self._start) * length / FPS
         for camera in self._steps.sizes:
-            row |= {f"videos/{_key(camera)}/{key}": value for key, value in self._place.items()}
+            row |= {f"videos/{_key(camera)}/{key}": value for key, value in self._numbers.items()}
             row[f"videos/{_key(camera)}/from_timestamp"] = float(start)
             row[f"videos/{_key(camera)}/to_timestamp"] = float(start + length / FPS)
-        row |= {f"meta/episodes/{key}": value for key, value in self._place.items()}
-        said = plain_fields(grasp)
-        return row | {key: said.get(key) for key in _PLAIN}
+        row |= {f"meta/episodes/{key}": value for key, value in self._numbers.items()}
+        fields = plain_fields(grasp)
+        return row | {key: fields.get(key) for key in _PLAIN}
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
-        for film in self._videos.values():
-            film.close()
+        for video in self._videos.values():
+            video.close()
         if kind is None:
             pa = import_extra("pyarrow", _WHAT)
             kinds = {"string": pa.string(), "bool": pa.bool_(), "double": pa.float64(), "list": pa.list_(pa.float64())}
             plain = {key: kinds[kind] for key, kind in _PLAIN.items()}
-            _write_table(self._folder / _DATA.format(**self._place), self._rows, {"timestamp": pa.float32()})
-            _write_table(self._folder / _EPISODES.format(**self._place), self._episodes, plain)
+            _write_table(self._folder / _DATA.format(**self._numbers), self._rows, {"timestamp": pa.float32()})
+            _write_table(self._folder / _EPISODES.format(**self._numbers), self._episodes, plain)
 
 
 class _VideoWriter:
-    """A video of pictures of one size, each a key frame."""
+    """A video of pictures of one size, with key frames only."""
 
     def __init__(self, path: Path, size: tuple[int, int]) -> None:
         av = import_extra("av", _WHAT)
@@ -153,27 +165,27 @@ class _VideoWriter:
         self._container.mux(self._stream.encode(frame))
 
     def close(self) -> None:
-        """Write what the encoder still holds."""
+        """Write the buffered frames and close the file."""
         self._container.mux(self._stream.encode())
         self._container.close()
 
 
 class _Stats:
-    """Extremes and moments of what is added, by channel (n, c)."""
+    """Minimum, maximum, mean and standard deviation of each channel."""
 
     def __init__(self) -> None:
         self._count, self._sum, self._squares = 0, np.zeros(1), np.zeros(1)
         self._low, self._high = np.full(1, np.inf), np.full(1, -np.inf)
 
     def add(self, values: np.ndarray[Any, np.dtype[np.float64]]) -> None:
-        """Values (n, c)."""
+        """Add values (n, c)."""
         self._count += len(values)
         self._sum = self._sum + values.sum(axis=0)
         self._squares = self._squares + np.square(values).sum(axis=0)
         self._low, self._high = np.minimum(self._low, values.min(axis=0)), np.maximum(self._high, values.max(axis=0))
 
     def to_dict(self) -> dict[str, Any]:
-        """As LeRobot writes it: of pictures (3, 1, 1) in 0..1."""
+        """Return the statistics in the layout of LeRobot: (3, 1, 1) in 0..1 for pictures."""
         mean = self._sum / self._count
         deviation = np.sqrt(np.maximum(self._squares / self._count - mean**2, 0.0))
         found = {"min": self._low, "max": self._high, "mean": mean, "std": deviation}
@@ -198,7 +210,7 @@ _PLAIN = {
 
 
 def _write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[str, Any]) -> None:
-    """A Parquet file of rows that have the same keys; types: of those that values do not tell."""
+    """Write a Parquet file of rows with the same keys; `types` are those that values do not determine."""
     pa = import_extra("pyarrow", _WHAT)
     columns = {key: pa.array([row[key] for row in rows], types.get(key)) for key in rows[0]}
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -206,7 +218,7 @@ def _write_table(path: Path, rows: Sequence[Mapping[str, Any]], types: Mapping[s
 
 
 def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
-    """As pandas writes a frame with a column task_index whose index are the tasks: so LeRobot reads it."""
+    """Write tasks like a pandas frame with column task_index and the tasks as index, the layout that LeRobot reads."""
     pa = import_extra("pyarrow", _WHAT)
     index = "__index_level_0__"
     columns = [
@@ -216,11 +228,11 @@ def _write_tasks(path: Path, tasks: Mapping[str, int]) -> None:
             (None, index, "unicode", "object"),
         )
     ]
-    about = {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
+    metadata = {"index_columns": [index], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
     table = pa.table(
         {"task_index": pa.array(list(tasks.values()), pa.int64()), index: pa.array(list(tasks), pa.string())}
     )
-    table = table.replace_schema_metadata({b"pandas": json.dumps(about).encode()})
+    table = table.replace_schema_metadata({b"pandas": json.dumps(metadata).encode()})
     import_extra("pyarrow.parquet", _WHAT).write_table(table, path)
 
 
@@ -233,7 +245,7 @@ def _info(
 ) -> dict[str, Any]:
     ends = list(itertools.accumulate(map(len, found.values())))
     episodes = ends[-1]
-    said = ("source", "sensor", "rig", "licence", "citation", "background")
+    keys = ("source", "sensor", "rig", "licence", "citation", "background")
     return {
         "codebase_version": "v3.0",
         "robot_type": None,
@@ -252,13 +264,13 @@ def _info(
             name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
             for name in _STEP_COLUMNS
         },
-        "recording": {key: recording.info.get(key) for key in said},
+        "recording": {key: recording.info.get(key) for key in keys},
     }
 
 
 def _video_feature(size: tuple[int, int]) -> dict[str, Any]:
     height, width = size
-    about = {
+    info = {
         "video.height": height,
         "video.width": width,
         "video.codec": "h264",
@@ -268,4 +280,4 @@ def _video_feature(size: tuple[int, int]) -> dict[str, Any]:
         "video.channels": 3,
         "has_audio": False,
     }
-    return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": about}
+    return {"dtype": "video", "shape": [height, width, 3], "names": ["height", "width", "channels"], "info": info}

@@ -1,16 +1,16 @@
-"""Open-X-Tactile, as FTP-1 reads it: a zarr store of version 2, whose arrays run along time.
+"""Open-X-Tactile in the layout of FTP-1: a zarr store, version 2, with arrays along time.
 
-Written after notes on the published stores, none of which was at hand: names, shapes and types of `data` and
-`meta/episode_ends` are theirs; which strings the siblings of a tactile array take was not verified.
+The layout follows notes on the published stores, not a store: names, shapes and types of `data` and
+`meta/episode_ends` are from these notes; the strings in the arrays for sensor and type are not verified.
 
-    grasps.zarr/meta/episode_ends                (E,) int64: where each episode ends; an episode is a grasp
-    grasps.zarr/data/camera_main_rgb             (T, H, W, 3) uint8: the photo, still through its episode
+    grasps.zarr/meta/episode_ends                (E,) int64: end of each episode; an episode is a grasp
+    grasps.zarr/data/camera_main_rgb             (T, H, W, 3) uint8: the photo, the same in all steps of an episode
     grasps.zarr/data/right_tactile_data_0        (T, fingers, H, W, 3) uint8
-    grasps.zarr/data/right_tactile_{sensor,type,area}_0    the sensor's name, "image", and (fingers,) int64: 0, 1, ...
+    grasps.zarr/data/right_tactile_{sensor,type,area}_0    name of the sensor, "image", and (fingers,) int64: 0, 1, ...
 
-Beside these, of ours: meta/object_id, meta/grasp_id and what else was recorded of a grasp, (E,) each, and meta/moment,
+Our own additions: meta/object_id, meta/grasp_id and further recorded fields of a grasp, (E,) each, and meta/moment,
 (steps of an episode,): "before", "during", "after". Splits are ranges of episodes in the attributes of the store.
-Pictures keep their size, and those of a camera share one.
+All pictures of a camera have the size of the first one.
 """
 
 import warnings
@@ -31,7 +31,19 @@ _INFO_KEYS = ("source", "sensor", "rig", "licence", "citation", "background")
 def export_open_x_tactile(
     recording: Recording, out: Path, *, parts: Parts | None = None, progress: Progress | None = None
 ) -> RecordingExport:
-    """Write a zarr store of version 2. Raises RecordingError, ImporterError without zarr, StorageError."""
+    """Write a zarr store, version 2.
+
+    Args:
+        recording: The recording.
+        out: New or empty folder.
+        parts: Split of the objects; None for all in the training part.
+        progress: Called with (done, total) after each grasp.
+
+    Raises:
+        RecordingError: A picture is damaged, grasps differ in their fingers, or the split is invalid.
+        ImporterError: zarr is missing.
+        StorageError: The folder cannot be written.
+    """
     zarr = import_extra("zarr", _WHAT)
     found, notes = grasps_by_part(recording, parts)
     grasps = [grasp for part in found.values() for grasp in part]
@@ -43,7 +55,7 @@ def export_open_x_tactile(
     with atomic_folder(out) as folder:
         root = zarr.open_group(str(folder / STORE), mode="w", zarr_format=2)
         ends = np.cumsum([0, *map(len, found.values())]).tolist()
-        root.attrs["splits"] = {part: [ends[at], ends[at + 1]] for at, part in enumerate(found)}
+        root.attrs["splits"] = {part: [ends[number], ends[number + 1]] for number, part in enumerate(found)}
         root.attrs["recording"] = {key: recording.info.get(key) for key in _INFO_KEYS}
         data, meta = root.create_group("data"), root.create_group("meta")
         photo, touch = (steps.sizes[name] for name in ("photo", f"touch_{steps.fingers[0]}"))
@@ -54,12 +66,12 @@ def export_open_x_tactile(
         _store(data, "right_tactile_area_0", np.arange(len(steps.fingers), dtype=np.int64))
         for episode, grasp in enumerate(grasps):
             pictures = steps.pictures_of(grasp)
-            at = slice(episode * length, (episode + 1) * length)
-            photos[at] = np.stack(pictures["photo"])
-            touches[at] = np.stack([np.stack(pictures[f"touch_{finger}"]) for finger in steps.fingers], axis=1)
+            span = slice(episode * length, (episode + 1) * length)
+            photos[span] = np.stack(pictures["photo"])
+            touches[span] = np.stack([np.stack(pictures[f"touch_{finger}"]) for finger in steps.fingers], axis=1)
             if progress is not None:
                 progress(episode + 1, len(grasps))
-        for name, values in _lines(grasps).items():
+        for name, values in _field_arrays(grasps).items():
             _store(meta, name, values)
         _store(meta, "moment", np.array(steps.moments))
         _store(meta, "episode_ends", length * np.arange(1, len(grasps) + 1, dtype=np.int64))
@@ -67,20 +79,21 @@ def export_open_x_tactile(
 
 
 def _frames(group: Any, name: str, count: int, shape: tuple[int, ...]) -> Any:
-    """Pictures along time, a file each."""
+    """Create an array of pictures along time, one chunk per step."""
     return group.create_array(name, shape=(count, *shape), chunks=(1, *shape), dtype="uint8")
 
 
 def _store(group: Any, name: str, values: np.ndarray[Any, Any]) -> None:
-    with warnings.catch_warnings():  # of zarr, on strings in stores of version 3
+    with warnings.catch_warnings():  # zarr warns about strings in stores of version 3
         warnings.simplefilter("ignore")
         array = group.create_array(name, shape=values.shape, chunks=values.shape, dtype=values.dtype)
     array[...] = values
 
 
-def _lines(grasps: list[RecordedGrasp]) -> dict[str, np.ndarray[Any, Any]]:
-    """What was recorded of any grasp, by key: (E,) strings, numbers with NaN, and grasped as 1, 0, -1 unknown; poses
-    (E, k).
+def _field_arrays(grasps: list[RecordedGrasp]) -> dict[str, np.ndarray[Any, Any]]:
+    """Return the recorded fields of all grasps as arrays by key.
+
+    Strings and numbers are (E,), with "" or NaN for missing ones; grasped is 1, 0 or -1 (unknown); poses are (E, k).
     """
     rows = [plain_fields(grasp) for grasp in grasps]
     found: dict[str, np.ndarray[Any, Any]] = {}

@@ -1,4 +1,4 @@
-"""Importers: each turns one public data set into a recording, and is loaded when it is asked for."""
+"""Importers: each converts one public data set to a recording, and is loaded on first use."""
 
 import inspect
 import sys
@@ -14,14 +14,26 @@ from robot.recording.folder import Recording
 
 
 class Importer(Protocol):
-    """Reads the data set's own files below `src`, writes or continues the recording `out`.
+    """A function that reads the files of a data set below `src` and writes or continues the recording `out`.
 
-    Its keyword-only parameters after these, each with a default, are its options (`options_of`). Its module's docstring
-    begins with a line on the data set, and holds `DATA_SET`, its facts.
+    Its further keyword-only parameters, each with a default, are its options (`options_of`). The docstring of its
+    module begins with a line on the data set. The module contains `DATA_SET`, the facts of the data set.
     """
 
     def __call__(self, src: Path, out: Path, progress: Progress | None = None, **options: Any) -> Recording:
-        """Raises ImporterError where `src` is not this data set, RecordingError, StorageError."""
+        """Import the data set.
+
+        Args:
+            src: Folder of the data set.
+            out: Recording folder to write or continue.
+            progress: Called with (done, total) after each grasp.
+            **options: Options of this importer.
+
+        Raises:
+            ImporterError: `src` is not this data set, or an option is wrong.
+            RecordingError: The recording cannot be continued.
+            StorageError: The recording cannot be written.
+        """
 
 
 IMPORTERS: "Registry[Importer]" = Registry(
@@ -50,7 +62,13 @@ IMPORTERS: "Registry[Importer]" = Registry(
 
 
 def load_importer(name: str) -> Importer:
-    """Return the importer called `name`. Raises UnknownName, which lists the known ones.
+    """Return the importer with this name.
+
+    Args:
+        name: Name in `IMPORTERS`, or "module:function".
+
+    Raises:
+        UnknownName: There is no such importer; the message lists the known ones.
 
     >>> robot.load_importer("billets").__name__
     'import_billets'
@@ -59,16 +77,25 @@ def load_importer(name: str) -> Importer:
 
 
 def title_of(name: str) -> str:
-    """A line on the data set that the importer called `name` reads. Raises UnknownName."""
+    """Return the line that describes the data set of an importer.
+
+    Raises:
+        UnknownName: There is no such importer.
+    """
     module = sys.modules[load_importer(name).__module__]
     return (module.__doc__ or "").strip().split("\n")[0].rstrip(".")
 
 
 def data_set_of(name: str) -> DataSet:
-    """Return the facts of the data set that the importer called `name` reads. Raises UnknownName."""
+    """Return the facts of the data set of an importer.
+
+    Raises:
+        UnknownName: There is no such importer.
+        ImporterError: Its module has no `DATA_SET`.
+    """
     facts = getattr(sys.modules[load_importer(name).__module__], "DATA_SET", None)
     if not isinstance(facts, DataSet):
-        raise ImporterError(f"the module of the importer {name!r} must hold DATA_SET, a DataSet; got {facts!r}")
+        raise ImporterError(f"the module of the importer {name!r} must contain DATA_SET, a DataSet, got {facts!r}")
     return facts
 
 
@@ -84,7 +111,7 @@ _READERS: Mapping[Any, Callable[[str], _Value]] = {
 
 
 def options_of(importer: Importer) -> dict[str, tuple[type, Any]]:
-    """The options of an importer: name -> (str, int, float or bool; the default)."""
+    """Return the options of an importer: name -> (type, default). The type is str, int, float or bool."""
     hints = typing.get_type_hints(importer)
     return {
         name: (hints[name], parameter.default)
@@ -94,17 +121,30 @@ def options_of(importer: Importer) -> dict[str, tuple[type, Any]]:
 
 
 def read_options(importer: Importer, words: Sequence[str]) -> dict[str, Any]:
-    """Options as a command line gives them, "name=value" each. Raises ImporterError."""
+    """Parse options of the form "name=value".
+
+    Args:
+        importer: The importer that defines the options.
+        words: One option each.
+
+    Returns:
+        Value of each given option, of its type.
+
+    Raises:
+        ImporterError: An option is unknown, or its value has another type.
+    """
     known = options_of(importer)
     found: dict[str, Any] = {}
     for word in words:
         name, equals, value = word.partition("=")
         if name not in known or not equals:
-            names = ", ".join(f"{each}=..." for each in known)
-            raise ImporterError(f"options are name=value, got {word!r}; this importer takes {names or 'none'}")
+            names = ", ".join(f"{option}=..." for option in known)
+            raise ImporterError(
+                f"options must have the form name=value, got {word!r}; this importer takes {names or 'no options'}"
+            )
         kind = known[name][0]
         try:
             found[name] = _READERS[kind](value)
         except (KeyError, ValueError) as error:
-            raise ImporterError(f"the option {name} must be of the kind {kind.__name__}, got {value!r}") from error
+            raise ImporterError(f"option {name} must be of type {kind.__name__}, got {value!r}") from error
     return found

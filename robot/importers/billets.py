@@ -1,12 +1,12 @@
 """Steel billets: GelSight Mini touches and phone photos of the same places.
 
-Of every place there is one touch and one photo:
+There is one touch and one photo of each place:
 
     <billet>/<place>_touch.png     one finger
     <billet>/<place>_photo.jpg
 
-A place is an object (it is what a photo can name) with one grasp; its billet is the sequence, for the places of a
-billet were captured in one go.
+A place is an object with one grasp, because a photo identifies a place. Its billet is the sequence, because the
+places of a billet were captured in one session.
 """
 
 import re
@@ -20,29 +20,34 @@ from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
     source="github.com/rumilog/gelsight-contrastive-learning",
-    licence="GPL-3.0, with its source; the images are not ours to give on under another licence",
+    licence="GPL-3.0, with its source; we may not pass the images on under another licence",
     citation="github.com/rumilog/gelsight-contrastive-learning, no paper",
     sensor="GelSight Mini",
     rig="by hand, phone camera",
     expects="pairs `<billet>/<place>_touch.png`, `<billet>/<place>_photo.jpg`",
     caveats=(
-        "Light and gel drift from billet to billet: on the ground billets an 8 x 6 thumbnail of a blurred touch "
-        "names the billet far above chance. That is the capture leaking, not touch: print that control beside "
-        "every result, split by sequence_id, prefer the welded billets, give exact intervals: 9 billets are few.",
+        "Light and gel drift from billet to billet: on the ground billets a touch low-passed to 8 x 6 identifies the "
+        "billet far above chance. This is leakage from the capture, not touch. Print this low-pass control next to "
+        "every result, split by sequence_id, and prefer the welded billets. There are only 9 billets: state exact "
+        "intervals.",
     ),
 )
 _FILE = re.compile(r"(?P<place>.+)_(?P<kind>touch|photo)\.(png|jpg|jpeg)", re.IGNORECASE)
-_Files = dict[str, Path]  # "photo" and "touch" of one place
+_Files = dict[str, Path]  # "photo" and "touch" -> file, of one place
 
 
 def import_billets(src: Path, out: Path, progress: Progress | None = None) -> Recording:
-    """Import the billets below `src`. Raises ImporterError for a source without any pair."""
+    """Import the billets below `src`.
+
+    Raises:
+        ImporterError: `src` contains no pair of photo and touch.
+    """
     src = Path(src)
-    total, pairs = 0, False
+    total, has_pairs = 0, False
     for item in _places(src):
-        total, pairs = total + 1, pairs or isinstance(item, Item)
-    if not pairs:
-        raise DATA_SET.mismatch_error(src, "it holds no pair")
+        total, has_pairs = total + 1, has_pairs or isinstance(item, Item)
+    if not has_pairs:
+        raise DATA_SET.mismatch_error(src, "it contains no pair")
     return import_items(DATA_SET, _places(src), out, total=total, progress=progress)
 
 
@@ -58,7 +63,7 @@ def _places(src: Path) -> Iterator[Item | Skip]:
 
 
 def _find_files(billet: Path) -> dict[str, _Files]:
-    """The files of one billet by place. Raises ImporterError."""
+    """Return the files of one billet by place."""
     found: dict[str, _Files] = defaultdict(dict)
     try:
         for path in sorted(billet.iterdir()):

@@ -1,9 +1,9 @@
-"""Grasps out of episodes: data sets for robot learning hold films of touching, and no grasp is marked in them.
+"""Grasps from episodes: data sets for robot learning contain videos of contact, without labels for grasps.
 
-Of an episode one grasp is taken: its first step shows the untouched gel and the scene, and the step whose gel images
-differ most from those of the first is the touch. An episode whose steps say what they are (`moments`: before, during,
-after, as `retrieve export-recording` writes it) is taken at its word. Steps come one after the other; only the first
-one and the one that is most pressed so far are held.
+An episode becomes one grasp. Its first step shows the gel without contact and the scene; the step whose gel images
+differ most from the first ones is the touch. If the steps are labelled (`moments`: before, during, after, as `retrieve
+export-recording` writes them), the labels decide instead. Steps are read one by one; only the first step and the step
+of strongest contact so far stay in memory.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -19,26 +19,35 @@ from robot.importers.importing import Images
 Picture = NDArray[np.uint8]
 """(H, W, 3), red first."""
 Step = tuple[Picture, Sequence[Picture]]
-"""The camera's picture, and one gel image a finger."""
+"""The camera picture, and one gel image per finger."""
 
 MOMENT_SUFFIXES = {"before": "_before", "during": "", "after": "_after"}
-"""What the columns of a moment end in."""
+"""Suffix of the columns of each moment."""
 
 
 class Episode:
-    """The pictures of one episode, read when the first of them is asked for.
-
-    steps: reads them. moments: what each of them is, or None where nobody says. Reading raises ImporterError.
-    """
+    """The pictures of one episode, read on first use of any of them."""
 
     def __init__(self, steps: Callable[[], Iterable[Step]], fingers: int, moments: Sequence[str] | None) -> None:
+        """Store how to read the episode; nothing is read yet.
+
+        Args:
+            steps: Reads the steps in order of time.
+            fingers: Gel images per step.
+            moments: Label of each step, or None without labels.
+        """
         self._steps, self._fingers, self._moments = steps, fingers, moments
 
     def images(self) -> Images:
-        """Columns of the grasp, each made when it is its turn."""
+        """Return the images of the grasp by column, each as a function that reads it.
+
+        These functions raise ImporterError for an episode without a usable touch.
+        """
         moments = self._moments or ("before", "during")
         columns = [
-            f"touch_{finger}{MOMENT_SUFFIXES[m]}" for finger in ascii_lowercase[: self._fingers] for m in moments
+            f"touch_{finger}{MOMENT_SUFFIXES[moment]}"
+            for finger in ascii_lowercase[: self._fingers]
+            for moment in moments
         ]
         return {column: partial(self._picture, column) for column in ("photo", *columns)}
 
@@ -64,7 +73,7 @@ class Episode:
 def _labelled_steps(steps: Iterator[Step], moments: Sequence[str]) -> dict[str, Step]:
     found = {moment: _copy_step(step) for moment, step in zip(moments, steps, strict=False)}
     if len(found) < len(moments):
-        raise ImporterError(f"its episode has {len(found)} steps of {len(moments)}")
+        raise ImporterError(f"its episode has only {len(found)} of {len(moments)} steps")
     return found
 
 
@@ -73,19 +82,19 @@ def _peak_contact_steps(steps: Iterator[Step]) -> dict[str, Step]:
     if first is None:
         raise ImporterError("its episode is empty")
     first = _copy_step(first)
-    rest = [touch.astype(np.int16) for touch in first[1]]
-    best, most = first, 0.0
+    no_contact = [touch.astype(np.int16) for touch in first[1]]
+    strongest, largest_change = first, 0.0
     for step in steps:
-        if [touch.shape for touch in step[1]] != [still.shape for still in rest]:
+        if [touch.shape for touch in step[1]] != [frame.shape for frame in no_contact]:
             raise ImporterError("the gel images of its episode differ in size")
-        pressed = sum(float(np.abs(touch - still).mean()) for touch, still in zip(step[1], rest, strict=True))
-        if pressed > most:
-            best, most = _copy_step(step), pressed
-    if not most:
+        change = sum(float(np.abs(touch - frame).mean()) for touch, frame in zip(step[1], no_contact, strict=True))
+        if change > largest_change:
+            strongest, largest_change = _copy_step(step), change
+    if not largest_change:
         raise ImporterError("no gel image of its episode differs from the first")
-    return {"before": first, "during": best}
+    return {"before": first, "during": strongest}
 
 
 def _copy_step(step: Step) -> Step:
-    """Apart from the block of steps that it was read with."""
+    """Copy a step, so that the block of steps that it was read with can be freed."""
     return step[0].copy(), [touch.copy() for touch in step[1]]

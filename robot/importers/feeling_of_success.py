@@ -5,10 +5,10 @@
             kinectA_rgb_before, _during, _after              (H, W, 3) uint8
             gelsightA_before, _during, _after, gelsightB_... (H, W, 3) uint8
 
-The photo is the Kinect's before the grasp; "during" is after closing and before the lift, "before" and "after" are
-kept as the untouched gel and the gel after the lift. `grasped` is what the data set says (`is_gripping`): training
-leaves the others out. Grasps of one object that follow each other are a sequence. Nothing in the files is unpickled,
-and what they link to in other files is not followed.
+The photo is the Kinect picture before the grasp. "during" is after closing and before the lift; "before" and "after"
+become the no-contact frame and the gel after the lift. `grasped` is the data set's `is_gripping`: training leaves
+failed grasps out. Consecutive grasps of one object are a sequence. Nothing in the files is unpickled, and links to
+other files are not followed.
 """
 
 import contextlib
@@ -47,36 +47,40 @@ DATA_SET = DataSet(
     expects="`calandra_corl2017_000.h5` to `calandra_corl2017_037.h5`, or some of them",
     caveats=(
         "The gels of 2017 carry black marks, which move with shear.",
-        "Objects were grasped one after the other, so that light and gel drift with the object: print the control of "
-        "the blurred touch beside every result.",
+        "Objects were grasped one after the other, so light and gel drift with the object: print the low-pass control "
+        "next to every result.",
     ),
     unverified=(
-        "how the published files are compressed: blosc needs pip install hdf5plugin",
+        "the compression of the published files: blosc needs pip install hdf5plugin",
         "that the first colour is red",
-        "that a name stands for one object: earlier files cut names off, so that an object might have two",
+        "that a name identifies one object: earlier files cut names off, so an object might have two",
     ),
 )
 _FILE = re.compile(r".*\.(h5|hdf5)")
 _GRASP = re.compile(r"i(\d+)")
 _COLUMNS = {
     "photo": "kinectA_rgb_before",
-    **{f"touch_{ours}": f"gelsight{theirs}_during" for ours, theirs in (("a", "A"), ("b", "B"))},
-    **{f"touch_{ours}_before": f"gelsight{theirs}_before" for ours, theirs in (("a", "A"), ("b", "B"))},
-    **{f"touch_{ours}_after": f"gelsight{theirs}_after" for ours, theirs in (("a", "A"), ("b", "B"))},
+    **{f"touch_{finger}": f"gelsight{sensor}_during" for finger, sensor in (("a", "A"), ("b", "B"))},
+    **{f"touch_{finger}_before": f"gelsight{sensor}_before" for finger, sensor in (("a", "A"), ("b", "B"))},
+    **{f"touch_{finger}_after": f"gelsight{sensor}_after" for finger, sensor in (("a", "A"), ("b", "B"))},
 }
 _MAX_PIXELS = 50_000_000
 _BROKEN = (OSError, KeyError, ValueError, RuntimeError, TypeError)
-"""What h5py raises for damaged files."""
+"""Errors that h5py raises for damaged files."""
 
 
 def import_feeling_of_success(src: Path, out: Path, progress: Progress | None = None) -> Recording:
-    """Import the HDF5 files in `src`. Raises ImporterError where it holds none, and where h5py is missing."""
+    """Import the HDF5 files in `src`.
+
+    Raises:
+        ImporterError: `src` contains no HDF5 file, or h5py is missing.
+    """
     files = [path for _, path in numbered_files(Path(src), _FILE)]
     if not files:
-        raise DATA_SET.mismatch_error(Path(src), "it holds no HDF5 file")
+        raise DATA_SET.mismatch_error(Path(src), "it contains no HDF5 file")
     h5py = import_extra("h5py", "The Feeling of Success")
     with contextlib.suppress(ImportError):
-        import_module("hdf5plugin")  # which registers its filters
+        import_module("hdf5plugin")  # registers its filters
     total = sum(_count(h5py, path) for path in files)
     return import_items(DATA_SET, _items(h5py, files), out, total=total, progress=progress)
 
@@ -90,12 +94,12 @@ def _count(h5py: Any, path: Path) -> int:
 
 
 def _items(h5py: Any, files: list[Path]) -> Iterator[Item | Skip]:
-    last, run = "", 0
+    last_object, run = "", 0
     for path in files:
         try:
             file = h5py.File(path)
         except OSError:
-            yield Skip("its file is not HDF5, or is cut off", path.name)
+            yield Skip("its file is not HDF5 or is cut off", path.name)
             continue
         with file:
             for group in _groups(h5py, file):
@@ -107,30 +111,30 @@ def _items(h5py: Any, files: list[Path]) -> Iterator[Item | Skip]:
                 if object_id is None or grasped is None:
                     yield Skip("its object_name or is_gripping is missing", name)
                     continue
-                if object_id != last:
-                    last, run = object_id, run + 1
+                if object_id != last_object:
+                    last_object, run = object_id, run + 1
                 images: Images = {column: _reader(h5py, group, dataset) for column, dataset in _COLUMNS.items()}
                 yield Item(name, object_id, images, {"grasped": grasped, "sequence_id": f"{object_id}-{run}"})
 
 
 def _groups(h5py: Any, file: Any) -> Iterator[Any]:
-    """The grasps of a file, in the order of their numbers; or why there are none."""
-    data = _own(h5py, file, "data")
+    """Yield the groups of the grasps in a file, in the order of their numbers, or a `Skip` with the reason."""
+    data = _local(h5py, file, "data")
     if not isinstance(data, h5py.Group):
-        yield Skip("its file has no /data, as files of another version", "")
+        yield Skip("its file has no /data; it may be of another version", "")
         return
     try:
         names = [name for name in data if isinstance(name, str) and _GRASP.fullmatch(name)]
     except _BROKEN:
-        yield Skip("its file is not HDF5, or is cut off", "")
+        yield Skip("its file is not HDF5 or is cut off", "")
         return
     for name in sorted(names, key=natural_sort_key):
-        group = _own(h5py, data, name)
-        yield group if isinstance(group, h5py.Group) else Skip("a grasp is no group", "")
+        group = _local(h5py, data, name)
+        yield group if isinstance(group, h5py.Group) else Skip("a grasp is not a group", "")
 
 
-def _own(h5py: Any, group: Any, name: str) -> Any:
-    """What stands under a name in the file itself; None for nothing, and for links to elsewhere."""
+def _local(h5py: Any, group: Any, name: str) -> Any:
+    """Return the object of this name in the file itself; None if it is missing or a link."""
     try:
         return group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
     except _BROKEN:
@@ -150,16 +154,16 @@ def _attributes(group: Any) -> tuple[str | None, bool | None]:
 
 
 def _reader(h5py: Any, group: Any, name: str) -> Callable[[], npt.NDArray[Any]]:
-    """Reads a picture when it is its turn. It raises ImporterError, which names no file."""
+    """Return a function that reads a picture. It raises ImporterError without the name of the file."""
 
     def read() -> npt.NDArray[Any]:
-        dataset = _own(h5py, group, name)
+        dataset = _local(h5py, group, name)
         try:
             if not isinstance(dataset, h5py.Dataset) or dataset.external or dataset.is_virtual:
                 raise ImporterError(f"its {name} is missing")
             height, width, *colours = (*(dataset.shape or ()), 0, 0)[:3]
             if dataset.dtype != "uint8" or dataset.ndim != 3 or colours != [3] or height * width > _MAX_PIXELS:
-                raise ImporterError(f"its {name} is not a picture of 8-bit colours")
+                raise ImporterError(f"its {name} is not a picture with 8-bit colours")
             return dataset[()]  # type: ignore[no-any-return]
         except _BROKEN as error:
             raise ImporterError(f"its {name} cannot be read; blosc needs pip install hdf5plugin") from error

@@ -3,17 +3,17 @@
     <object>/touch_*.png     by the pattern `touch`
     <object>/photo_*.jpg     by the pattern `photo`
 
-In a pattern `{object}` stands for the name of the object, `{finger}` for that of a finger where a touch has several
-pictures, `{sequence}` for grasps of one sitting, any other word in braces for what tells grasps apart, and `*` for
-what does not matter; none of them crosses a "/". A pattern need not name the ending. Words that two patterns share
-must agree: with `touch={object}/{n}_{finger}` and `photo={object}/{n}_photo` each touch has the photo of its own
-number. Where an object has several photos that agree, its touches are dealt to them in turn. `background`, a pattern
-too, finds the no-contact frames: `rest_{finger}.png` one a finger, `{object}/rest.png` one an object. Links to
-folders elsewhere are followed.
+A pattern is a path with words in braces. `{object}` is the name of the object, `{finger}` the name of a finger if a
+touch has several pictures, `{sequence}` a session of grasps. Any other word in braces distinguishes grasps, and `*`
+matches any text. None of them matches a "/". The suffix of the file name is optional. Words that occur in two patterns
+must have the same value: with `touch={object}/{n}_{finger}` and `photo={object}/{n}_photo` each touch gets the photo
+with its number. If several photos match, the touches of the object are assigned to them in turn. `background` is a
+pattern for the no-contact frames: `rest_{finger}.png` for one per finger, `{object}/rest.png` for one per object.
+Links to folders elsewhere are followed.
 
-`pairs` names a file below the folder instead: CSV with a header, or JSONL, a grasp a line, with `object`, `photo` and
-`touch` (or `touch_a`, `touch_b`), and where they are known `background` (or `touch_a_before`, ...), `sequence`,
-`force_n`, `opening_mm`, `time_s`. Paths are relative to the folder. It is read line by line.
+`pairs` names a file below the folder instead: CSV with a header, or JSONL. Each line is a grasp with `object`, `photo`
+and `touch` (or `touch_a`, `touch_b`), and optionally `background` (or `touch_a_before`, ...), `sequence`, `force_n`,
+`opening_mm` and `time_s`. Paths are relative to the folder. The file is read line by line.
 """
 
 import csv
@@ -34,12 +34,12 @@ from robot.recording.folder import Recording, SharedImage
 from robot.storage import parse_object
 
 DATA_SET = DataSet(
-    source="pictures of one's own",
-    licence="yours to say",
-    citation="yours to say",
-    sensor="yours to say",
+    source="your own pictures",
+    licence="set by you",
+    citation="set by you",
+    sensor="set by you",
     rig="unknown",
-    expects="`<object>/touch_*.png`, `<object>/photo_*.jpg`, or what the patterns say, or a file of pairs",
+    expects="`<object>/touch_*.png` and `<object>/photo_*.jpg`, or files that match the patterns, or a file of pairs",
     fingers=0,
 )
 _ENDINGS = (".png", ".jpg", ".jpeg")
@@ -48,7 +48,7 @@ _COLUMNS = {"object": "object_id", "touch": "touch_a", "background": "touch_a_be
 _NUMBERS = ("force_n", "opening_mm", "time_s")
 _TOUCH = re.compile("touch_[a-z]")
 _LINE = 1 << 20
-"""Characters of a line of a file of pairs; a longer one is broken off."""
+"""Maximum characters of a line in a file of pairs; a longer one is cut."""
 
 Words = Mapping[str, str]
 
@@ -65,10 +65,25 @@ def import_folder(
     sensor: str = "unknown",
     licence: str = "not stated",
 ) -> Recording:
-    """Import pictures below `src`. Raises ImporterError for a wrong pattern, and where none fits."""
+    """Import pictures below `src`.
+
+    Args:
+        src: Folder with the pictures.
+        out: Recording folder to write or continue.
+        progress: Called with (done, total) after each grasp.
+        touch: Pattern of the gel images.
+        photo: Pattern of the photos.
+        background: Pattern of the no-contact frames; empty without any.
+        pairs: File of pairs, relative to `src`, instead of the patterns.
+        sensor: Name of the sensor.
+        licence: Licence of the pictures.
+
+    Raises:
+        ImporterError: A pattern is invalid, or no picture matches.
+    """
     src = Path(src)
     if not src.is_dir():
-        raise ImporterError(f"{src} must be a folder of pictures, and is none")
+        raise ImporterError(f"{src} must be a folder of pictures")
     found: _PairsFile | _PatternMatches = (
         _PairsFile(src, pairs) if pairs else _PatternMatches(src, touch, photo, background)
     )
@@ -77,7 +92,7 @@ def import_folder(
         sensor=sensor,
         licence=licence,
         fingers=len(found.fingers),
-        background="as the pictures say" if found.has_background else "none",
+        background="as in the pictures" if found.has_background else "none",
     )
     return import_items(facts, found.items(), out, total=found.total, progress=progress)
 
@@ -86,37 +101,37 @@ def import_folder(
 
 
 class _Pattern:
-    """A path with words in braces. Raises ImporterError for one that is none."""
+    """A path with words in braces."""
 
     def __init__(self, option: str, text: str) -> None:
         parts: list[str] = []
-        seen: set[str] = set()
+        words: set[str] = set()
         for number, part in enumerate(_WORD.split(text)):
             word = part.strip("{}")
             if number % 2 == 0:
                 if "{" in part or "}" in part:
-                    raise ImporterError(f"braces in the pattern {option} must hold one word each, got {text!r}")
+                    raise ImporterError(f"braces in the pattern {option} must contain one word each, got {text!r}")
                 parts.append(re.escape(part))
             elif part == "*":
                 parts.append(f"(?P<_{number}>[^/]*?)")
             elif not word.isidentifier() or word.startswith("_"):
-                raise ImporterError(f"a word in the braces of the pattern {option} must be letters, got {part}")
-            elif word in seen:
+                raise ImporterError(f"a word in braces in the pattern {option} must consist of letters, got {part}")
+            elif word in words:
                 parts.append(f"(?P={word})")
             else:
-                seen.add(word)
+                words.add(word)
                 parts.append(f"(?P<{word}>[^/]+{'' if word == 'object' else '?'})")
-        self.words = frozenset(seen)
+        self.words = frozenset(words)
         self._expression = re.compile("".join(parts))
 
-    def fit(self, path: str) -> Words | None:
-        """The words of a path that fits, with its ending or without; nameless ones are called _1, _3, ..."""
+    def match(self, path: str) -> Words | None:
+        """Return the words of a path that matches, with or without its suffix; each `*` is a word _1, _3, ..."""
         found = self._expression.fullmatch(os.path.splitext(path)[0]) or self._expression.fullmatch(path)
         return found.groupdict() if found else None
 
 
 class _PatternMatches:
-    """What the patterns find. The names of all files are held in memory, their pictures are not."""
+    """The grasps that the patterns match. The names of all files are in memory, their content is not."""
 
     def __init__(self, src: Path, touch: str, photo: str, background: str) -> None:
         self.src = src
@@ -124,71 +139,71 @@ class _PatternMatches:
         self._background = _Pattern("background", background) if background else None
         for option, pattern in (("touch", self._touch), ("photo", self._photo)):
             if "object" not in pattern.words:
-                raise ImporterError(
-                    f"the pattern {option} must say where {{object}} stands, such as {{object}}/touch_*"
-                )
+                raise ImporterError(f"the pattern {option} must contain {{object}}, such as {{object}}/touch_*")
         self._photos = _MatchingFiles(self._photo, self._touch)
         self._frames = _MatchingFiles(self._background, self._touch)
-        some, touched, names = "", False, set[str]()
+        example, has_touch, names = "", False, set[str]()
         for path in _pictures(src):
-            some = some or path
-            words, seen = self._touch.fit(path), self._photo.fit(path)
-            if words and seen:
-                raise ImporterError(f"{path} fits both patterns; make touch and photo tell them apart")
+            example = example or path
+            words, photo_words = self._touch.match(path), self._photo.match(path)
+            if words and photo_words:
+                raise ImporterError(f"{path} matches both patterns; change touch or photo so that only one matches")
             if words:
-                touched = True
+                has_touch = True
                 names.add(words.get("finger", ""))
             self._photos.add(path)
             self._frames.add(path)
-        for option, text, fits in (("touch", touch, touched), ("photo", photo, bool(self._photos))):
-            if not fits:
-                there = f"such as {some}" if some else "and no picture at all"
+        for option, text, is_found in (("touch", touch, has_touch), ("photo", photo, bool(self._photos))):
+            if not is_found:
+                content = f"only others, such as {example}" if example else "no picture at all"
                 raise ImporterError(
-                    f"{src} must hold a {option} that fits {text!r}, and holds none, {there}; see --option"
+                    f"{src} must contain a {option} that matches {text!r}, but contains {content}; see --option"
                 )
         if len(names) > len(ascii_lowercase):
             first = sorted(names, key=natural_sort_key)[:3]
-            raise ImporterError(f"{{finger}} must name at most 26 fingers, got {len(names)}, such as {first}")
+            raise ImporterError(f"{{finger}} must match at most 26 fingers, got {len(names)}, such as {first}")
         self.fingers = dict(zip(sorted(names, key=natural_sort_key), ascii_lowercase, strict=False))
         self.has_background = bool(self._frames)
         self._repeated: list[str] = []
         self._grasps = self._group_by_words()
 
     def _group_by_words(self) -> dict[tuple[str, ...], list[str]]:
-        """Grasps by their words but the finger's: the path of each finger's picture, empty where it has none."""
+        """Return grasps by their words except the finger: the path of each finger's picture, empty if it is missing."""
         grasps: dict[tuple[str, ...], list[str]] = {}
-        place = {finger: number for number, finger in enumerate(self.fingers)}
+        position = {finger: number for number, finger in enumerate(self.fingers)}
         for path in _pictures(self.src):
-            if (words := self._touch.fit(path)) and words.get("finger", "") in place:
+            if (words := self._touch.match(path)) and words.get("finger", "") in position:
                 others = (value for key, value in words.items() if key not in ("object", "finger"))
-                paths = grasps.setdefault((sys.intern(words["object"]), *others), [""] * len(place))
-                if paths[place[words.get("finger", "")]]:
+                paths = grasps.setdefault((sys.intern(words["object"]), *others), [""] * len(position))
+                if paths[position[words.get("finger", "")]]:
                     self._repeated.append(path)
                 else:
-                    paths[place[words.get("finger", "")]] = path
+                    paths[position[words.get("finger", "")]] = path
         return grasps
 
     @property
     def total(self) -> int:
+        """Number of items."""
         return len(self._grasps) + len(self._repeated)
 
     def items(self) -> Iterator[Item | Skip]:
-        dealt: Counter[tuple[str, ...]] = Counter()
+        """Yield the grasps, and a `Skip` for each unusable touch."""
+        assigned: Counter[tuple[str, ...]] = Counter()
         yield from (Skip("another touch has the same words in its path", path) for path in self._repeated)
         for key, paths in self._grasps.items():
-            name, words = safe_name(*key), self._touch.fit(next(filter(None, paths))) or {}
-            choice, which = self._photos.of(words)
+            name, words = safe_name(*key), self._touch.match(next(filter(None, paths))) or {}
+            photos, group = self._photos.of(words)
             if not all(paths):
                 yield Skip("a finger has no picture", name)
-            elif not choice:
-                yield Skip("no photo agrees with it", name)
+            elif not photos:
+                yield Skip("no photo matches it", name)
             else:
-                photo = choice[dealt[which] % len(choice)]
-                dealt[which] += 1
+                photo = photos[assigned[group] % len(photos)]
+                assigned[group] += 1
                 images: Images = {"photo": _shared(self.src, photo)}
                 for letter, path in zip(self.fingers.values(), paths, strict=True):
                     column = f"touch_{letter}"
-                    before = self._frames.of(self._touch.fit(path) or {})[0]
+                    before = self._frames.of(self._touch.match(path) or {})[0]
                     images = {**images, column: self.src / path}
                     if before:
                         images[f"{column}_before"] = _shared(self.src, before[0])
@@ -196,7 +211,7 @@ class _PatternMatches:
 
 
 class _MatchingFiles:
-    """Files by the words that their pattern shares with that of the touches."""
+    """Files by the words that their pattern has in common with that of the touches."""
 
     def __init__(self, pattern: _Pattern | None, others: _Pattern) -> None:
         self._pattern = pattern
@@ -204,15 +219,15 @@ class _MatchingFiles:
         self._files: dict[tuple[str, ...], list[str]] = defaultdict(list)
 
     def add(self, path: str) -> None:
-        """Take a file, where it fits the pattern."""
-        if self._pattern and (words := self._pattern.fit(path)):
+        """Add a file if it matches the pattern."""
+        if self._pattern and (words := self._pattern.match(path)):
             self._files[self._key(words)].append(path)
 
     def __bool__(self) -> bool:
         return bool(self._files)
 
     def of(self, words: Words) -> tuple[list[str], tuple[str, ...]]:
-        """The files that agree with a touch, and the words by which."""
+        """Return the files that match a touch, and the values of their common words."""
         key = self._key(words)
         return self._files.get(key, []), key
 
@@ -221,8 +236,9 @@ class _MatchingFiles:
 
 
 def _pictures(src: Path) -> Iterator[str]:
-    """The pictures below a folder, by path from it, hidden ones left out, in the order of their numbers. A link to a
-    folder is followed where it leads out of `src`, and each target once. Raises ImporterError.
+    """Yield the pictures below a folder as relative paths, without hidden ones, in natural order.
+
+    A link to a folder is followed if it leads out of `src`, and each target only once.
     """
     root, followed = Path(os.path.realpath(src)), set[Path]()
 
@@ -244,7 +260,7 @@ def _pictures(src: Path) -> Iterator[str]:
 
 
 def _raise_unlistable(error: OSError) -> NoReturn:
-    """A folder that cannot be listed would be an object that is silently missing."""
+    """Raise an error for a folder that cannot be listed; otherwise an object would be missing silently."""
     raise ImporterError(f"{error.filename} cannot be listed: {error.strerror}") from error
 
 
@@ -256,33 +272,34 @@ def _shared(src: Path, path: str) -> SharedImage:
 
 
 class _PairsFile:
-    """What a file of pairs lists, read line by line."""
+    """The grasps in a file of pairs, read line by line."""
 
     def __init__(self, src: Path, pairs: str) -> None:
         self.src, self._file = src, src / pairs
         if not os.path.isfile(self._file):
-            raise ImporterError(f"{self._file} must be a CSV or JSONL file of pairs, and is not there")
+            raise ImporterError(f"{self._file} must be a CSV or JSONL file of pairs, but does not exist")
         first = next((row for row in self._rows() if isinstance(row, dict)), None)
         if first is None or not (self._fingers(first) and {"object_id", "photo"} <= first.keys()):
             raise ImporterError(
-                f"{self._file} must name object, photo and touch (or touch_a, touch_b, ...) in each line"
+                f"{self._file} must contain object, photo and touch (or touch_a, touch_b, ...) in each line"
             )
         self.fingers = self._fingers(first)
         self.has_background = any(column.endswith("_before") for column in first)
         self.total = sum(1 for _ in self._rows())
 
     def items(self) -> Iterator[Item | Skip]:
+        """Yield a grasp for each line, and a `Skip` for each unusable one."""
         for number, row in enumerate(self._rows(), start=1):
             if isinstance(row, str):
                 yield Skip(row, f"number {number}")
                 continue
             name = safe_name(row.get("object_id") or "", str(number))
-            columns = ("photo", *self.fingers, *(f"{each}_before" for each in self.fingers))
+            columns = ("photo", *self.fingers, *(f"{finger}_before" for finger in self.fingers))
             paths = {column: row[column] for column in columns if row.get(column)}
             if self._fingers(row) != self.fingers or not paths.get("photo") or not row.get("object_id"):
-                yield Skip("its line lacks its object, its photo or a touch", name)
+                yield Skip("its line has no object, no photo or not all touches", name)
             elif any(not _is_inside(path) for path in paths.values()):
-                yield Skip("a path must lead to a file below the folder, from there on", name)
+                yield Skip("a path must be relative to the folder and lead to a file below it", name)
             elif (numbers := _numbers(row)) is None:
                 yield Skip(f"{', '.join(_NUMBERS)} must be numbers", name)
             else:
@@ -296,7 +313,7 @@ class _PairsFile:
         return sorted(column for column in row if _TOUCH.fullmatch(column) and row[column])
 
     def _rows(self) -> Iterator[dict[str, Any] | str]:
-        """Rows by column name, or why one cannot be had."""
+        """Yield rows by column name, or the reason why a row is unusable."""
         try:
             with open(self._file, encoding="utf-8-sig", newline="") as file:
                 lines = iter(lambda: file.readline(_LINE), "")
@@ -317,7 +334,7 @@ def _documents(lines: Iterator[str]) -> Iterator[dict[str, Any] | str]:
 
 
 def _rename_columns(row: Mapping[Any, Any]) -> dict[str, Any]:
-    """Columns by the recording's names; values that are no plain text or number count as absent."""
+    """Rename columns as in a recording. Values other than text and numbers count as missing."""
     plain = {str(key).removesuffix("_file_name"): value for key, value in row.items() if key is not None}
     return {
         _COLUMNS.get(key, key): value

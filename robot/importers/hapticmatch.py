@@ -1,11 +1,11 @@
 """HapticMatch: height maps of a GelSight Mini on surfaces of materials, each with a close photo of the same patch.
 
     Texture/<material>/<k>.jpg    the photo of the patch, 320 x 240
-    Texture/<material>/<k>.pkl    the height map, a pickled NumPy array, which is read without unpickling
+    Texture/<material>/<k>.pkl    the height map, a pickled NumPy array, read without unpickling
 
-A material is an object and a sequence; a sample is a grasp. There is no gel image: the touch is made of the height map,
-a picture of its normals. Red is the slope across, green the slope down, blue the rest; a flat surface is (128, 128,
-255). Slopes are of heights in pixels; the option `scale` multiplies them.
+A material is an object and a sequence; a sample is a grasp. There is no gel image: the touch is a picture of the
+normals of the height map. Red is the horizontal slope, green the vertical slope, blue the remaining component; a flat
+surface is (128, 128, 255). Slopes assume heights in pixels; the option `scale` multiplies the heights.
 """
 
 import re
@@ -30,17 +30,17 @@ DATA_SET = DataSet(
     "Simulation and Interaction, arXiv 2601.16639",
     sensor="GelSight Mini, height maps",
     rig="by hand; a camera at the same patch",
-    expects="`Texture/<material>/<k>.jpg` and `<k>.pkl`, or be `Texture` itself",
+    expects="`Texture/<material>/<k>.jpg` and `<k>.pkl`, or be the folder `Texture` itself",
     caveats=(
-        "The touch is a picture of the normals of a height map, not a gel image: a model that is trained on gel images "
-        "does not know it.",
-        "The samples of a material were captured in one sitting, and there is no no-contact frame: drift of the sensor "
-        "may name the material. Print the low-pass control and the order of capture beside every result.",
+        "The touch is a picture of the normals of a height map, not a gel image: a model trained on gel images does "
+        "not fit it.",
+        "The samples of a material were captured in one session, and there is no no-contact frame: drift of the sensor "
+        "may identify the material. Print the low-pass control and the order of capture next to every result.",
     ),
     unverified=(
-        "everything but the names of the files and the authors' program that saved them: this importer was not run on "
+        "everything except the file names and the authors' program that saved the files: this importer was not run on "
         "the real data",
-        "the unit of the heights; slopes take them for pixels",
+        "the unit of the heights; slopes assume pixels",
         "that a photo and its height map show the same patch in the same direction",
     ),
 )
@@ -49,16 +49,26 @@ _MAX_SIDE = 4096
 
 
 def import_hapticmatch(src: Path, out: Path, progress: Progress | None = None, *, scale: float = 1.0) -> Recording:
-    """Import the samples below `src`. Raises ImporterError where there is none."""
+    """Import the samples below `src`.
+
+    Args:
+        src: Folder of the data set.
+        out: Recording folder to write or continue.
+        progress: Called with (done, total) after each grasp.
+        scale: Factor of the heights.
+
+    Raises:
+        ImporterError: There is no sample, or `scale` is invalid.
+    """
     src = Path(src)
     if not 0 < scale < float("inf"):
         raise ImporterError(f"scale must be above 0 and finite, got {scale:g}")
     root = src / "Texture" if (src / "Texture").is_dir() else src
     if not root.is_dir():
-        raise DATA_SET.mismatch_error(src, "it is no folder")
+        raise DATA_SET.mismatch_error(src, "it is not a folder")
     materials = [(folder, numbered_files(folder, _HEIGHTS)) for folder in subfolders(root)]
     if not (total := sum(len(samples) for _, samples in materials)):
-        raise DATA_SET.mismatch_error(src, "it holds no such height map")
+        raise DATA_SET.mismatch_error(src, "it contains no such height map")
     items = (item for folder, samples in materials for item in _items(folder.name, samples, scale))
     return import_items(DATA_SET, items, out, total=total, progress=progress)
 
@@ -71,7 +81,7 @@ def _items(material: str, samples: Any, scale: float) -> Iterator[Item | Skip]:
 
 
 def _touch(path: Path, scale: float) -> NDArray[np.uint8]:
-    """The picture of a height map. Raises ImporterError, which says no file's name."""
+    """Return the picture of a height map. Errors do not name the file."""
     try:
         too_large = path.stat().st_size > MAX_BYTES
         data = b"" if too_large else read_content(path, ImporterError)
@@ -90,19 +100,19 @@ def normals(heights: NDArray[Any], scale: float = 1.0) -> NDArray[np.uint8]:
     """Return the normals of a height map as a picture.
 
     Args:
-        heights: (H, W), in pixels, downwards first.
-        scale: What the heights are multiplied by.
+        heights: (H, W), in pixels.
+        scale: Factor of the heights.
 
     Returns:
-        (H, W, 3) uint8; 128 in red and green where the surface is flat.
+        (H, W, 3) uint8; red and green are 128 where the surface is flat.
 
     Raises:
-        ImporterError: For another shape, and for heights that are not finite.
+        ImporterError: The shape is wrong, or heights are not finite.
     """
     if heights.ndim != 2 or min(heights.shape) < 2 or max(heights.shape) > _MAX_SIDE:
         raise ImporterError(f"its height map must have two sides of 2 to {_MAX_SIDE} pixels")
     if heights.dtype.kind not in "fiu" or not np.isfinite(heights).all():
-        raise ImporterError("its height map must hold finite numbers")
+        raise ImporterError("its height map must contain finite numbers")
     with np.errstate(over="ignore"):
         down, across = np.gradient(np.clip(heights.astype(np.float64), -1e12, 1e12) * scale)
     steep = np.sqrt(1 + down**2 + across**2)

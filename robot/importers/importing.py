@@ -1,11 +1,11 @@
-"""What importers share: the facts of a data set, and the loop that writes its grasps into a recording.
+"""The common part of all importers: the facts of a data set, and the loop that writes its grasps to a recording.
 
-An importer finds the grasps of its data set one after the other and hands them over as `Item`, or as `Skip` where one
-cannot be had; `import_items` does the rest. Only the item at hand is in memory. A grasp that the recording holds is
-passed over unread, so an import that was stopped goes on where it stopped.
+An importer yields the grasps of its data set one by one as `Item`, or as `Skip` for one that is not available;
+`import_items` does the rest. Only the current item is in memory. Grasps that the recording already contains are not
+read again, so a stopped import resumes where it stopped.
 
-    recording.json        also: licence, citation, fingers, notes (traps, and what of the layout was never verified),
-                          objects (object_id -> what the data set says of it), skipped (reason -> how many)
+    recording.json        also: licence, citation, fingers, notes (caveats, and unverified parts of the layout),
+                          objects (object_id -> metadata of the data set), skipped (reason -> count)
     splits/<name>.json    a published split: {"seed": 0, "train": [object ids], "validation": [...], "test": [...]}
 """
 
@@ -26,30 +26,38 @@ from robot.recording.folder import GRASP_ID, Recording, RecordingWriter, SharedI
 from robot.storage import ImageSource, file_content, storage_errors
 
 Progress = Callable[[int, int], None]
-"""Called with (done, total) after each grasp, whether it was read, held already or skipped."""
+"""Called with (done, total) after each grasp, whether it was read, already stored or skipped."""
 
 Source = ImageSource | Callable[[], ImageSource]
-"""An image, or what makes it when it is its turn."""
+"""An image, or a function that returns it."""
 
 Images = Mapping[str, Source | SharedImage]
-"""As RecordingWriter takes them: column without `_file_name` to image. A `SharedImage` one is read and kept once."""
+"""Column without `_file_name` -> image, as for `RecordingWriter`. A `SharedImage` is read and stored once."""
 
 SPLITS_FOLDER = "splits"
 _MAX_REASONS, _EXAMPLES = 20, 3
 _END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9"}
 _DIGITS = re.compile(r"[0-9]{1,4000}")
 _TAIL = 65536
-"""Bytes after the end of a JPEG that a camera may have put there."""
+"""Bytes that a camera may write after the end of a JPEG."""
 _MAX_VIDEO_PIXELS = 50_000_000
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """What is known of a data set before its files are opened.
+    """Facts of a data set that are known before its files are opened.
 
-    expects: what its folder must hold, in Markdown. fingers: gel images of a touch, 0 where that differs.
-    background: when no-contact frames were taken, or "none". traps: what spoils a result, a sentence each.
-    unverified: what of the layout was not seen on the data itself.
+    Attributes:
+        source: Name or address of the data set.
+        licence: Licence of the data.
+        citation: Publication to cite.
+        sensor: Tactile sensor.
+        rig: Robot, camera and other devices.
+        expects: Required content of its folder, in Markdown.
+        fingers: Gel images per touch; 0 if that varies.
+        background: When no-contact frames were taken, or "none".
+        caveats: Risks for results, one sentence each.
+        unverified: Parts of the layout that were not verified on the data itself.
     """
 
     source: str
@@ -64,22 +72,34 @@ class DataSet:
     unverified: tuple[str, ...] = ()
 
     def notes(self) -> list[str]:
-        """Sentences for who imports it."""
-        return [*self.caveats, *(f"not verified on the data itself: {each}" for each in self.unverified)]
+        """Return caveats and unverified parts as sentences for the user."""
+        return [*self.caveats, *(f"not verified on the data itself: {part}" for part in self.unverified)]
 
     def info(self) -> dict[str, Any]:
-        """What recording.json says of it."""
-        plain = {key: value for key, value in vars(self).items() if key not in ("expects", "traps", "unverified")}
+        """Return the entries of recording.json on the data set."""
+        plain = {key: value for key, value in vars(self).items() if key not in ("expects", "caveats", "unverified")}
         return {**plain, "notes": self.notes()}
 
     def mismatch_error(self, src: Path, lacking: str) -> ImporterError:
-        """The error for a source that is not this data set: what it must hold, and what it lacks."""
-        return ImporterError(f"{src} must hold {self.expects.replace('`', '')}; {lacking}")
+        """Return the error for a source that is not this data set.
+
+        Args:
+            src: The source.
+            lacking: Sentence on the missing part.
+        """
+        return ImporterError(f"{src} must contain {self.expects.replace('`', '')}; {lacking}")
 
 
 @dataclass(frozen=True)
 class Item:
-    """One grasp to append. fields: sequence_id, grasped and what else RecordingWriter.append takes."""
+    """One grasp to append.
+
+    Attributes:
+        grasp_id: Unique id.
+        object_id: Its object.
+        images: Its images by column.
+        fields: sequence_id, grasped and further arguments of `RecordingWriter.append`.
+    """
 
     grasp_id: str
     object_id: str
@@ -89,7 +109,12 @@ class Item:
 
 @dataclass(frozen=True)
 class Skip:
-    """One grasp that cannot be had. `reason` completes "skipped 3: ..." and is what they are counted by."""
+    """One grasp that is not available.
+
+    Attributes:
+        reason: Completes "skipped 3: ..."; grasps are counted by reason.
+        name: Name of the grasp or its file.
+    """
 
     reason: str
     name: str
@@ -97,8 +122,11 @@ class Skip:
 
 @dataclass(frozen=True)
 class DataSetMetadata:
-    """What a data set says beside its grasps. objects: object_id -> plain JSON. splits: name -> part (train,
-    validation, test) -> object ids.
+    """Metadata of a data set besides its grasps.
+
+    Attributes:
+        objects: object_id -> plain JSON.
+        splits: Name -> part (train, validation, test) -> object ids.
     """
 
     objects: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
@@ -114,34 +142,49 @@ def import_items(
     progress: Progress | None = None,
     metadata: DataSetMetadata | None = None,
 ) -> Recording:
-    """Write the items into the recording `out`, or continue it. `total`: how many items there are, for the progress.
+    """Write items to the recording `out`, or continue it.
 
-    The notes of the returned recording say what was skipped and why, and the traps of the data set. Raises
-    ImporterError where nothing can be imported, RecordingError, StorageError.
+    Args:
+        data_set: Facts of the data set.
+        items: Grasps, read one by one.
+        out: Recording folder to write or continue.
+        total: Number of items, for the progress.
+        progress: Called with (done, total) after each item.
+        metadata: Metadata of objects, and published splits.
+
+    Returns:
+        The recording. Its notes list skipped grasps with reasons, and the caveats of the data set.
+
+    Raises:
+        ImporterError: No grasp can be imported.
+        RecordingError: The recording cannot be continued.
+        StorageError: The recording cannot be written.
     """
-    said = metadata or DataSetMetadata()
+    metadata = metadata or DataSetMetadata()
     skipped = _SkipCounts()
     notes = data_set.notes()
     with RecordingWriter(out, data_set.info()) as writer:
-        seen: set[str] = set()
+        names: set[str] = set()
         for done, item in enumerate(_readable(items), start=1):
             if isinstance(item, Skip):
                 skipped.add(item)
-            elif item.grasp_id in seen:
-                skipped.add(Skip("another grasp has its name", item.grasp_id))
+            elif item.grasp_id in names:
+                skipped.add(Skip("another grasp has the same name", item.grasp_id))
             else:
-                seen.add(item.grasp_id)
+                names.add(item.grasp_id)
                 if item.grasp_id not in writer.grasp_ids:
                     skipped.add(_append(writer, item))
             if progress is not None:
                 progress(done, max(total, done))
         if not writer.grasp_ids:
-            raise ImporterError(f"no grasp could be imported: {'; '.join(skipped.notes()) or 'the source holds none'}")
-        splits, refused = _split_disjoint(said.splits)
-        writer.update_info(objects=dict(said.objects), skipped=dict(skipped.counts), notes=[*notes, *refused])
+            raise ImporterError(
+                f"no grasp could be imported: {'; '.join(skipped.notes()) or 'the source contains none'}"
+            )
+        splits, rejected = _split_disjoint(metadata.splits)
+        writer.update_info(objects=dict(metadata.objects), skipped=dict(skipped.counts), notes=[*notes, *rejected])
         _write_splits(out, splits)
     recording = read_recording(out)
-    return replace(recording, notes=(*recording.notes, *skipped.notes(), *refused, *notes))
+    return replace(recording, notes=(*recording.notes, *skipped.notes(), *rejected, *notes))
 
 
 def _readable(items: Iterable[Item | Skip]) -> Iterator[Item | Skip]:
@@ -152,17 +195,17 @@ def _readable(items: Iterable[Item | Skip]) -> Iterator[Item | Skip]:
 
 
 def _append(writer: RecordingWriter, item: Item) -> Skip | None:
-    """Append one grasp; return why it was skipped, if it was."""
+    """Append one grasp, or return why it was skipped."""
     images: dict[str, ImageSource | SharedImage] = {}
     for column, source in item.images.items():
         if isinstance(source, SharedImage) and writer.has_shared(source.name):
             images[column] = source
             continue
         try:
-            whole = picture_bytes(column, source.source if isinstance(source, SharedImage) else source)
+            data = picture_bytes(column, source.source if isinstance(source, SharedImage) else source)
         except ImporterError as error:
             return Skip(str(error), item.grasp_id)
-        images[column] = SharedImage(source.name, whole) if isinstance(source, SharedImage) else whole
+        images[column] = SharedImage(source.name, data) if isinstance(source, SharedImage) else data
     try:
         writer.append(item.grasp_id, item.object_id, images, **item.fields)
     except RecordingError as error:
@@ -171,25 +214,32 @@ def _append(writer: RecordingWriter, item: Item) -> Skip | None:
 
 
 def picture_bytes(column: str, source: Source) -> bytes:
-    """The content of a PNG or JPEG file that is there to its end. Raises ImporterError, which says no file's name."""
-    what = column.replace("_", " ")
-    made = source() if callable(source) else source
-    if isinstance(made, str | Path) and not os.path.isfile(made):
-        raise ImporterError(f"its {what} is missing")
+    """Return the content of a complete PNG or JPEG file.
+
+    Args:
+        column: Column of the image, for errors.
+        source: The image, or a function that returns it.
+
+    Raises:
+        ImporterError: The image is missing, cut off or not a picture. The message does not name the file.
+    """
+    label = column.replace("_", " ")
+    image = source() if callable(source) else source
+    if isinstance(image, str | Path) and not os.path.isfile(image):
+        raise ImporterError(f"its {label} is missing")
     try:
-        data, suffix = file_content(column, made)
+        data, suffix = file_content(column, image)
     except RecordingError as error:
-        readable = (
-            "a readable PNG or JPEG file" if isinstance(made, str | Path | bytes) else "a picture of 8-bit colours"
-        )
-        raise ImporterError(f"its {what} is not {readable}") from error
+        is_file = isinstance(image, str | Path | bytes)
+        required = "a readable PNG or JPEG file" if is_file else "a picture with 8-bit colours"
+        raise ImporterError(f"its {label} is not {required}") from error
     if _END_MARKERS[suffix] not in data[-_TAIL:]:
-        raise ImporterError(f"its {what} is cut off")
+        raise ImporterError(f"its {label} is cut off")
     return data
 
 
 class _SkipCounts:
-    """How many were skipped, by reason, with the first names; of a hostile source at most so many reasons."""
+    """Counts of skipped grasps by reason, with the first names; at most `_MAX_REASONS` reasons."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
@@ -213,18 +263,18 @@ _Splits = Mapping[str, Mapping[str, Sequence[str]]]
 
 
 def _split_disjoint(splits: _Splits) -> tuple[_Splits, list[str]]:
-    """Those that part objects, and a sentence on each of the others: it judges no unseen object."""
-    kept, refused = {}, []
+    """Return the splits with disjoint objects, and a sentence on each other split: it does not test unseen objects."""
+    disjoint, rejected = {}, []
     for name, parts in splits.items():
         counts = Counter(object_id for part in parts.values() for object_id in set(part))
         if shared := sum(count > 1 for count in counts.values()):
-            refused.append(
-                f"the published split {name!r} has grasps of {shared} object(s) on two sides, so that it judges no "
-                "unseen object; it is not kept, draw one by objects"
+            rejected.append(
+                f"the published split {name!r} has grasps of {shared} object(s) in two parts, so it does not test "
+                "unseen objects; it is not stored, draw a split by objects"
             )
         else:
-            kept[name] = parts
-    return kept, refused
+            disjoint[name] = parts
+    return disjoint, rejected
 
 
 def _write_splits(out: Path, splits: _Splits) -> None:
@@ -238,11 +288,13 @@ def _write_splits(out: Path, splits: _Splits) -> None:
             write_atomically(folder / f"{name}.json", json.dumps(split, indent=1).encode() + b"\n")
 
 
-# What importers need of their source -----------------------------------------------------------------------
+# Files and names of a source --------------------------------------------------------------------------------
 
 
 def safe_name(*parts: str) -> str:
-    """The parts as a grasp_id, joined by "-"; where that is none, what differs is told by a digest at the end.
+    """Return the parts as a grasp_id, joined by "-".
+
+    If the result is not a valid grasp_id, invalid characters are replaced and a digest of the parts is appended.
 
     >>> safe_name("mug", "01"), safe_name("my mug", "01")
     ('mug-01', 'my-mug-01-b68d33c2')
@@ -251,13 +303,19 @@ def safe_name(*parts: str) -> str:
     if GRASP_ID.fullmatch(joined):
         return joined
     plain = re.sub(r"[^A-Za-z0-9._-]", "-", joined)[:100].lstrip("._-") or "grasp"
-    # Names of unknown coding and what JSON escapes may hold what UTF-8 cannot.
+    # Names of unknown encoding and JSON escapes can contain surrogates.
     return f"{plain}-{sha256('/'.join(parts).encode(errors='surrogatepass')).hexdigest()[:8]}"
 
 
 @dataclass(frozen=True)
 class NumberedFiles:
-    """Files of a folder whose names fit a pattern, in the order of their numbers. Only their names are in memory."""
+    """Files of a folder whose names match a pattern, in the order of their numbers. Only names are in memory.
+
+    Attributes:
+        folder: The folder.
+        pattern: Pattern of the file names.
+        names: File names in order.
+    """
 
     folder: Path
     pattern: re.Pattern[str]
@@ -274,13 +332,17 @@ class NumberedFiles:
 
 
 def numbered_files(folder: Path, pattern: re.Pattern[str]) -> NumberedFiles:
-    """The files of a folder whose names fit, sorted by their numbers as numbers; none where there is no folder."""
+    """Return the files of a folder whose names match, in natural order; none if the folder does not exist."""
     names = os.listdir(folder) if folder.is_dir() else []
     return NumberedFiles(folder, pattern, sorted(filter(pattern.fullmatch, names), key=natural_sort_key))
 
 
 def subfolders(parent: Path) -> list[Path]:
-    """The folders in `parent`, hidden ones left out, sorted by their numbers as numbers. Raises ImporterError."""
+    """Return the folders in `parent` except hidden ones, in natural order.
+
+    Raises:
+        ImporterError: `parent` cannot be read.
+    """
     try:
         return sorted(
             (path for path in parent.iterdir() if path.is_dir() and not path.name.startswith(".")),
@@ -291,24 +353,36 @@ def subfolders(parent: Path) -> list[Path]:
 
 
 def natural_sort_key(name: str) -> str:
-    """A key by which digits compare as numbers, after all text: the number of their digits goes before them."""
+    """Return a sort key that compares digits as numbers: each number is preceded by its count of digits."""
     key = _DIGITS.sub(lambda digits: f"\0{len(number := str(int(digits[0]))):04}{number}", name)
     return f"{key}\0{name}"
 
 
-def import_extra(name: str, what: str) -> Any:
-    """A package of the extra `importers`. Raises ImporterError where it is missing."""
+def import_extra(name: str, purpose: str) -> Any:
+    """Import a package of the extra `importers`.
+
+    Args:
+        name: Package or module.
+        purpose: The format that needs it, for the error.
+
+    Raises:
+        ImporterError: The package is missing.
+    """
     try:
         return import_module(name)
     except ImportError as error:
         raise ImporterError(
-            f"{what} needs {name}, which is missing; run pip install 'touch-retrieval[importers]'"
+            f"{purpose} needs {name}, which is missing; run pip install 'touch-retrieval[importers]'"
         ) from error
 
 
-def video_stream(film: Any) -> Any:
-    """Return the video stream of a film that PyAV opened. Raises ImporterError for too many pixels."""
-    stream = film.streams.video[0]
+def video_stream(container: Any) -> Any:
+    """Return the video stream of a container that PyAV opened.
+
+    Raises:
+        ImporterError: A frame has too many pixels.
+    """
+    stream = container.streams.video[0]
     if stream.codec_context.width * stream.codec_context.height > _MAX_VIDEO_PIXELS:
         raise ImporterError(f"its video has more than {_MAX_VIDEO_PIXELS} pixels")
     return stream

@@ -1,16 +1,16 @@
 """LeRobot data sets, version 3: robot episodes with gel cameras among their cameras; and our own exports.
 
-Read with pyarrow and PyAV, without lerobot; checked on a data set that lerobot 0.4.4 wrote.
+They are read with pyarrow and PyAV, without lerobot. This was checked on a data set that lerobot 0.4.4 wrote.
 
     meta/info.json    meta/tasks.parquet    meta/episodes/chunk-000/file-000.parquet
-    data/chunk-000/file-000.parquet         rows of steps; pictures too where a camera is not a video
+    data/chunk-000/file-000.parquet         rows of steps; with pictures if a camera is not a video
     videos/<key>/chunk-000/file-000.mp4     a camera, the episodes of a file one after the other
 
-The option `touch` names the gel cameras, comma between them, `photo` the camera that sees the object; without them gel
-cameras are those called so (touch, tactile, gel, digit), and the photo is of the first other one. An episode gives one
-grasp: its first step is the untouched gel and the photo, the step whose gel images differ most from it is the touch.
-Its task counts as its object, and an episode is a sequence, unless the episodes say otherwise, as those that
-`retrieve export-recording` writes, whose fields are taken back.
+The option `touch` names the gel cameras, separated by commas, and `photo` the camera that shows the object. By default
+cameras with touch, tactile, gel or digit in their name are gel cameras, and the first other camera takes the photo. An
+episode becomes one grasp: its first step provides the no-contact frame and the photo, and the step whose gel images
+differ most from the first is the touch. Its task counts as its object, and an episode is a sequence, unless the
+episodes have fields for these, like the exports of `retrieve export-recording`. Those fields are imported.
 """
 
 import json
@@ -43,23 +43,23 @@ from robot.storage import decode_picture, read_json_object
 
 DATA_SET = DataSet(
     source="LeRobot data set",
-    licence="as the data set's card says",
+    licence="see the data set's own card",
     citation="see the data set's own card",
-    sensor="as the cameras are called",
-    rig="as info.json says",
+    sensor="names of the cameras",
+    rig="see info.json",
     expects="`meta/info.json` of a LeRobot data set, version 3",
     fingers=0,
     background="the first step of each episode",
     caveats=(
-        "A task counts as one object unless the episodes name objects; a task that names several objects does not tell "
-        "them apart.",
-        "The touch of an episode is its step that differs most from the first, which a change of light may be too.",
-        "Videos are not lossless: fine relief may be gone.",
+        "A task counts as one object unless the episodes name objects; a task with several objects does not "
+        "distinguish them.",
+        "The touch of an episode is the step that differs most from the first; a change of light can cause this too.",
+        "Videos are not lossless: fine relief may be lost.",
     ),
     unverified=("that the first step of an episode is without contact",),
 )
-_PLACE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
-_PATHS = {"data_path": f"data/{_PLACE}.parquet", "video_path": "videos/{video_key}/" + f"{_PLACE}.mp4"}
+_FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+_PATHS = {"data_path": f"data/{_FILE}.parquet", "video_path": "videos/{video_key}/" + f"{_FILE}.mp4"}
 _GEL = re.compile("touch|tactile|gel|digit", re.IGNORECASE)
 _FIELDS = ("force_n", "opening_mm", "touch_skew_s", "time_s", "outcome", "grasped", "pose")
 _MOMENTS = tuple(MOMENT_SUFFIXES)
@@ -71,7 +71,18 @@ _Row = dict[str, Any]
 def import_lerobot(
     src: Path, out: Path, progress: Progress | None = None, *, touch: str = "", photo: str = ""
 ) -> Recording:
-    """Import the episodes below `src`. Raises ImporterError without pyarrow or av, and for another version."""
+    """Import the episodes below `src`.
+
+    Args:
+        src: Folder of the data set.
+        out: Recording folder to write or continue.
+        progress: Called with (done, total) after each grasp.
+        touch: Gel cameras, separated by commas; empty for those with such a name.
+        photo: Camera of the photo; empty for the first other camera.
+
+    Raises:
+        ImporterError: pyarrow or av is missing, or `src` is not a data set of version 3.
+    """
     src = Path(src)
     if not (src / "meta" / "info.json").is_file():
         raise DATA_SET.mismatch_error(src, "there is no such file")
@@ -80,7 +91,7 @@ def import_lerobot(
     source = _LeRobotSource(src, touch, photo)
     total = sum(1 for _ in source.episodes(("episode_index",)))
     return import_items(
-        replace(DATA_SET, fingers=len(source.touch), **source.said()),
+        replace(DATA_SET, fingers=len(source.touch), **source.stored_facts()),
         source.items(),
         out,
         total=total,
@@ -97,7 +108,7 @@ class _LeRobotSource:
         self.info = read_json_object(src / "meta" / "info.json", ImporterError)
         version = str(self.info.get("codebase_version"))
         if not re.fullmatch(r"v3(\.\d+)*", version):
-            raise ImporterError(f"{src} must be of LeRobot's version 3, and is of {version}; convert it with lerobot")
+            raise ImporterError(f"{src} must have LeRobot version 3, got {version}; convert it with lerobot")
         for key, known in _PATHS.items():
             if self.info.get(key) not in (known, None):
                 raise ImporterError(f"{src}: {key} of info.json must be {known}, got {str(self.info[key])[:80]!r}")
@@ -112,51 +123,58 @@ class _LeRobotSource:
         self.photo = photo or next((name for name in kinds if name not in self.touch), "")
         if not self.touch or any(name not in kinds for name in (*self.touch, self.photo)):
             raise ImporterError(
-                f"{src} must have a camera for the photo and gel cameras; say which by --option photo=... touch=..., "
-                f"of these: {', '.join(kinds) or 'none'}"
+                f"{src} must have a camera for the photo and gel cameras; choose them with --option photo=... "
+                f"touch=... from: {', '.join(kinds) or 'none'}"
             )
         if len(self.touch) > 26 or any("/" in name or ".." in name for name in kinds):
-            raise ImporterError(f"{src} must have at most 26 gel cameras, and no camera with a path for a name")
+            raise ImporterError(f"{src} must have at most 26 gel cameras, and no camera name that is a path")
         try:
             self._fps = float(self.info["fps"])
         except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise ImporterError(f"{src}: info.json must say fps") from error
+            raise ImporterError(f"{src}: info.json must contain fps") from error
         if not 0 < self._fps < math.inf:
             raise ImporterError(f"{src}: fps of info.json must be above 0 and finite, got {self._fps:g}")
         self._has_moments = isinstance(features, dict) and "moment" in features
         self._videos: dict[str, tuple[Path, Any]] = {}
 
-    def said(self) -> dict[str, Any]:
-        """What our own export, or the data set, says of where it comes from, and of its sensors."""
-        found = self.info.get("recording")
-        own = found if isinstance(found, dict) else {"rig": self.info.get("robot_type")}
-        texts = {key: own.get(key) for key in ("source", "licence", "citation", "rig", "sensor")}
+    def stored_facts(self) -> dict[str, Any]:
+        """Return source, licence, citation, rig and sensor from info.json, as far as it contains them."""
+        recording = self.info.get("recording")
+        facts = recording if isinstance(recording, dict) else {"rig": self.info.get("robot_type")}
+        texts = {key: facts.get(key) for key in ("source", "licence", "citation", "rig", "sensor")}
         return {"sensor": ", ".join(self.touch)} | {key: text for key, text in texts.items() if isinstance(text, str)}
 
     def splits(self) -> dict[str, dict[str, list[str]]]:
-        """The split of info.json, "0:80" for each part, where it has several parts."""
-        said = self.info.get("splits")
+        """Return the split of info.json ("0:80" for each part) if it has several parts."""
+        published = self.info.get("splits")
         ranges = {
             str(part): (int(found[1]), int(found[2]))
-            for part, text in (said.items() if isinstance(said, dict) else ())
+            for part, text in (published.items() if isinstance(published, dict) else ())
             if (found := re.fullmatch(r"(\d{1,9}):(\d{1,9})", str(text)))
         }
         if len(ranges) < 2:
             return {}
         parts: dict[str, set[str]] = {part: set() for part in ranges}
-        for place, row in enumerate(self.episodes(("object_id", "tasks"))):
+        for number, row in enumerate(self.episodes(("object_id", "tasks"))):
             for part, (start, stop) in ranges.items():
-                if start <= place < stop:
+                if start <= number < stop:
                     parts[part].add(_object(row))
         return {"published": {part: sorted(objects) for part, objects in parts.items()}}
 
     # Episodes ----------------------------------------------------------------------------------------------
 
     def episodes(self, columns: Sequence[str]) -> Iterator[_Row]:
-        """Rows of meta/episodes, those of `columns` that are there; a few in memory. Raises ImporterError."""
+        """Yield the rows of meta/episodes; only a few are in memory.
+
+        Args:
+            columns: Columns to read; missing ones are left out.
+
+        Raises:
+            ImporterError: A file is missing or damaged.
+        """
         paths = sorted((self.src / "meta" / "episodes").glob("*/*.parquet"))
         if not paths:
-            raise ImporterError(f"{self.src} must hold meta/episodes/chunk-000/file-000.parquet")
+            raise ImporterError(f"{self.src} must contain meta/episodes/chunk-000/file-000.parquet")
         for path in paths:
             with _readable(path):
                 file = import_extra("pyarrow.parquet", _WHAT).ParquetFile(path)
@@ -165,12 +183,12 @@ class _LeRobotSource:
                     yield from batch.to_pylist()
 
     def items(self) -> Iterator[Item | Skip]:
-        """A grasp of each episode."""
+        """Yield one grasp for each episode."""
         keys = (self.photo, *self.touch)
-        columns = [f"videos/{key}/{what}" for key in keys for what in ("chunk_index", "file_index", "from_timestamp")]
-        own = ("grasp_id", "object_id", "sequence_id", *_FIELDS)
+        columns = [f"videos/{key}/{field}" for key in keys for field in ("chunk_index", "file_index", "from_timestamp")]
+        ids = ("grasp_id", "object_id", "sequence_id", *_FIELDS)
         for row in self.episodes(
-            ("episode_index", "tasks", "length", "data/chunk_index", "data/file_index", *own, *columns)
+            ("episode_index", "tasks", "length", "data/chunk_index", "data/file_index", *ids, *columns)
         ):
             number = row.get("episode_index")
             name = safe_name(str(row.get("grasp_id") or f"episode-{number}"))
@@ -186,27 +204,27 @@ class _LeRobotSource:
         if not self._has_moments:
             return None
         try:
-            said = [
-                moment for episode, moment in self._steps_of(_place(row, "data")) if episode == row["episode_index"]
+            moments = [
+                moment for episode, moment in self._steps_of(_file_of(row, "data")) if episode == row["episode_index"]
             ]
         except ImporterError:
             return None
-        if not all(isinstance(moment, int) for moment in said):
+        if not all(isinstance(moment, int) for moment in moments):
             return None
-        known = len(set(said)) == len(said) == row["length"] and set(said) <= set(range(len(_MOMENTS)))
-        return [_MOMENTS[moment] for moment in said] if known and 1 in said else None
+        valid = len(set(moments)) == len(moments) == row["length"] and set(moments) <= set(range(len(_MOMENTS)))
+        return [_MOMENTS[moment] for moment in moments] if valid and 1 in moments else None
 
-    def _steps_of(self, place: str) -> list[tuple[int, int]]:
-        """(episode_index, moment) of the steps of one file, of which the last is kept."""
-        if self._file[0] != place:
-            path = self.src / f"data/{place}.parquet"
+    def _steps_of(self, file: str) -> list[tuple[int, int]]:
+        """Return (episode_index, moment) of the steps in one file. The last file stays in memory."""
+        if self._last_file[0] != file:
+            path = self.src / f"data/{file}.parquet"
             with _readable(path):
                 table = import_extra("pyarrow.parquet", _WHAT).read_table(path, columns=["episode_index", "moment"])
-                self._file = (place, list(zip(*(column.to_pylist() for column in table.columns), strict=True)))
-        return self._file[1]
+                self._last_file = (file, list(zip(*(column.to_pylist() for column in table.columns), strict=True)))
+        return self._last_file[1]
 
     @cached_property
-    def _file(self) -> tuple[str, list[tuple[int, int]]]:
+    def _last_file(self) -> tuple[str, list[tuple[int, int]]]:
         return "", []
 
     # Pictures ----------------------------------------------------------------------------------------------
@@ -217,23 +235,23 @@ class _LeRobotSource:
             yield pictures[0], pictures[1:]
 
     def _frames(self, key: str, row: _Row) -> Iterator[Picture]:
-        """The pictures of one camera through an episode. Raises ImporterError."""
+        """Yield the pictures of one camera in an episode."""
         if self._kinds[key] == "image":
             return self._image_frames(key, row)
         return self._video_frames(key, row)
 
     def _video_frames(self, key: str, row: _Row) -> Iterator[Picture]:
         av = import_extra("av", _WHAT)
-        path = self.src / f"videos/{key}/{_place(row, f'videos/{key}')}.mp4"
+        path = self.src / f"videos/{key}/{_file_of(row, f'videos/{key}')}.mp4"
         start = row.get(f"videos/{key}/from_timestamp")
         if not isinstance(start, float) or not path.is_file():
             raise ImporterError("its video is missing")
         end = start + (row["length"] - 0.5) / self._fps
         try:
-            film = self._open_video(key, path)
-            stream = video_stream(film)
-            film.seek(int(start / stream.time_base), stream=stream)
-            for frame in film.decode(stream):
+            video = self._open_video(key, path)
+            stream = video_stream(video)
+            video.seek(int(start / stream.time_base), stream=stream)
+            for frame in video.decode(stream):
                 if frame.time is not None and frame.time >= start - 0.5 / self._fps:
                     if frame.time >= end:
                         return
@@ -243,21 +261,22 @@ class _LeRobotSource:
             raise ImporterError("its video cannot be decoded") from error
 
     def _open_video(self, key: str, path: Path) -> Any:
-        """The film of one camera, which holds many episodes and stays open until another is wanted. Opened for each,
-        its buffers leave holes in the heap between the names of grasps, several kB an episode.
+        """Open the video of one camera. It contains many episodes and stays open until another file is needed.
+
+        If it were opened for each episode, its buffers would fragment the heap by several kB per episode.
         """
         if self._videos.get(key, (None, None))[0] != path:
             self._videos[key] = (path, import_extra("av", _WHAT).open(str(path)))
         return self._videos[key][1]
 
     def _image_frames(self, key: str, row: _Row) -> Iterator[Picture]:
-        """Pictures that stand in the rows of steps as PNG or JPEG."""
-        path = self.src / f"data/{_place(row, 'data')}.parquet"
+        """Yield the pictures that the rows of steps contain as PNG or JPEG."""
+        path = self.src / f"data/{_file_of(row, 'data')}.parquet"
         dataset = import_extra("pyarrow.dataset", _WHAT)
         with _readable(path):
-            wanted = dataset.field("episode_index") == row["episode_index"]
+            is_of_episode = dataset.field("episode_index") == row["episode_index"]
             for batch in dataset.dataset(path).to_batches(
-                columns=[key], filter=wanted, batch_size=16, batch_readahead=1
+                columns=[key], filter=is_of_episode, batch_size=16, batch_readahead=1
             ):
                 for cell in batch.column(0).to_pylist():
                     data = cell.get("bytes") if isinstance(cell, dict) else None
@@ -269,21 +288,21 @@ class _LeRobotSource:
 
 def _object(row: _Row) -> str:
     tasks = row.get("tasks")
-    said = row.get("object_id") or ((tasks[0] if tasks else None) if isinstance(tasks, list) else tasks)
-    return str(said or "unknown")
+    name = row.get("object_id") or ((tasks[0] if tasks else None) if isinstance(tasks, list) else tasks)
+    return str(name or "unknown")
 
 
-def _place(row: _Row, what: str) -> str:
-    """The chunk and file of an episode's data or video. Raises ImporterError."""
-    place = {key: row.get(f"{what}/{key}") for key in ("chunk_index", "file_index")}
-    if not all(isinstance(number, int) and number >= 0 for number in place.values()):
-        raise ImporterError(f"its episode does not say in which file its {what.split('/')[0]} stand")
-    return _PLACE.format(**place)
+def _file_of(row: _Row, kind: str) -> str:
+    """Return the chunk and file of an episode's data or video."""
+    numbers = {key: row.get(f"{kind}/{key}") for key in ("chunk_index", "file_index")}
+    if not all(isinstance(number, int) and number >= 0 for number in numbers.values()):
+        raise ImporterError(f"its episode does not name the file of its {kind.split('/')[0]}")
+    return _FILE.format(**numbers)
 
 
 @contextmanager
 def _readable(path: Path) -> Iterator[None]:
-    """Turn what pyarrow says of a damaged file into an ImporterError."""
+    """Convert errors of pyarrow for a damaged file to ImporterError."""
     pa = import_extra("pyarrow", _WHAT)
     try:
         yield

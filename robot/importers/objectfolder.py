@@ -6,10 +6,10 @@
     touch/<object>/<instance>.png
     split.json                                      {"train": {"<object>": [instances]}, "val": ..., "test": ...}
 
-An object is its number: names occur twice in the public list. Where `objectfolder_real_metadata.csv` (Index, Name,
-Material) lies beside the folders, names and materials stand in recording.json under `objects`. A touch is written
-with the photo of its own number; where there is none, touches are dealt to the photos of their object in turn. The
-split of a pack is kept where it parts objects. Audio is passed over.
+The id of an object is its number, because names occur twice in the public list. If `objectfolder_real_metadata.csv`
+(Index, Name, Material) is next to the folders, recording.json lists names and materials under `objects`. A touch gets
+the photo with its own number; without one, touches are assigned to the photos of their object in turn. The split of a
+pack is stored if its parts have different objects. Audio is ignored.
 """
 
 import csv
@@ -44,12 +44,12 @@ DATA_SET = DataSet(
     rig="robot arm; photos of the object alone",
     expects="`<index>/visual/0.png` and `<index>/tactile/0.png`, or `vision/<object>/` and `touch/<object>/`",
     caveats=(
-        "In the benchmark a query counts as right when any picture of its object is found (mAP), and some published "
-        "numbers on real objects are on objects that were trained on.",
+        "In the benchmark a query is correct if any picture of its object is found (mAP), and some published numbers "
+        "on real objects are on training objects.",
     ),
     unverified=(
-        "that a picture of the simulated packs is 160 pixels wide, by which they are told from the real ones",
-        "whether the split of each pack parts objects or their pictures",
+        "that pictures of the simulated packs are 160 pixels wide, which distinguishes them from the real ones",
+        "whether the split of each pack divides objects or their pictures",
     ),
 )
 _SIMULATED = "GelSight, simulated (Taxim)"
@@ -60,26 +60,30 @@ _PARTS = {"train": "train", "val": "validation", "test": "test"}
 
 
 def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) -> Recording:
-    """Import the samples or the pack in `src`. Raises ImporterError where it is neither."""
+    """Import the samples or the pack in `src`.
+
+    Raises:
+        ImporterError: `src` contains neither.
+    """
     src = Path(src)
     if not src.is_dir():
-        raise DATA_SET.mismatch_error(src, "it is no folder")
+        raise DATA_SET.mismatch_error(src, "it is not a folder")
     is_pack = (src / "vision").is_dir() and (src / "touch").is_dir()
     if is_pack:
-        objects = [(each.name, each, src / "vision" / each.name) for each in subfolders(src / "touch")]
+        objects = [(folder.name, folder, src / "vision" / folder.name) for folder in subfolders(src / "touch")]
     else:
-        objects = [(each.name, each / "tactile", each / "visual") for each in subfolders(src)]
-    objects = [each for each in objects if each[0].isdecimal() and each[1].is_dir()]
-    touched = [touch for _, touch, _ in objects for _, touch in islice(numbered_files(touch, _PICTURE), 1)]
-    if not touched:
-        raw = any((each / "tactile_data").is_dir() for each in subfolders(src))
+        objects = [(folder.name, folder / "tactile", folder / "visual") for folder in subfolders(src)]
+    objects = [(name, touch, photo) for name, touch, photo in objects if name.isdecimal() and touch.is_dir()]
+    examples = [touch for _, touch, _ in objects for _, touch in islice(numbered_files(touch, _PICTURE), 1)]
+    if not examples:
+        is_raw = any((folder / "tactile_data").is_dir() for folder in subfolders(src))
         raise DATA_SET.mismatch_error(
-            src, "it holds raw videos, without photos" if raw else "it holds no touch of that kind"
+            src, "it contains raw videos without photos" if is_raw else "it contains no touch of that kind"
         )
-    facts = replace(DATA_SET, sensor=_SIMULATED) if _width(touched[0]) == _SIMULATED_WIDTH else DATA_SET
-    about = _names(src / _NAMES)
+    facts = replace(DATA_SET, sensor=_SIMULATED) if _width(examples[0]) == _SIMULATED_WIDTH else DATA_SET
+    names = _names(src / _NAMES)
     metadata = DataSetMetadata(
-        {name: about.get(name, {}) for name, _, _ in objects}, _split(src / "split.json") if is_pack else {}
+        {name: names.get(name, {}) for name, _, _ in objects}, _split(src / "split.json") if is_pack else {}
     )
     total = sum(len(numbered_files(touch, _PICTURE)) for _, touch, _ in objects)
     return import_items(facts, _items(objects), out, total=total, progress=progress, metadata=metadata)
@@ -98,14 +102,14 @@ def _items(objects: Sequence[tuple[str, Path, Path]]) -> Iterator[Item | Skip]:
 
 
 def _width(path: Path) -> int:
-    """Of a PNG, by its header; 0 for another file."""
+    """Return the width of a PNG from its header; 0 for another file."""
     with open(path, "rb") as file:
-        head = file.read(24)
-    return int.from_bytes(head[16:20], "big") if head[12:16] == b"IHDR" else 0
+        header = file.read(24)
+    return int.from_bytes(header[16:20], "big") if header[12:16] == b"IHDR" else 0
 
 
 def _names(path: Path) -> Mapping[str, Mapping[str, Any]]:
-    """Name and material of each object, where the table is there."""
+    """Return name and material of each object; nothing without the table."""
     if not path.is_file():
         return {}
     try:
@@ -120,15 +124,15 @@ def _names(path: Path) -> Mapping[str, Mapping[str, Any]]:
 
 
 def _split(path: Path) -> Mapping[str, Mapping[str, Sequence[str]]]:
-    """The objects of each part: of {"<object>": [instances]}, or of [["<object>", instance], ...]."""
+    """Return the objects of each part, from {"<object>": [instances]} or [["<object>", instance], ...]."""
     if not path.is_file():
         return {}
     document = read_json_object(path, ImporterError)
     parts: dict[str, list[str]] = {}
-    for theirs, ours in _PARTS.items():
-        listed = document.get(theirs, {})
+    for key, part in _PARTS.items():
+        listed = document.get(key, {})
         if not isinstance(listed, dict | list):
-            raise ImporterError(f"{path} must list objects under {theirs!r}, got {str(listed)[:40]}")
+            raise ImporterError(f"{path} must list objects under {key!r}, got {str(listed)[:40]}")
         names = listed if isinstance(listed, dict) else [row[0] for row in listed if isinstance(row, list) and row]
-        parts[ours] = sorted({str(name) for name in names})
+        parts[part] = sorted({str(name) for name in names})
     return {"published": parts}

@@ -1,12 +1,12 @@
 """PhysiCLeAR: GelSight Mini videos of presses on named object parts, without photos.
 
-    <part>_<k>.mov    320 x 240, about 110 frames; the first one shows the untouched gel (extra `importers`)
+    <part>_<k>.mov    320 x 240, about 110 frames; the first one is without contact (extra `importers`)
 
-Also `dataset/<part>_<k>.mov` below the folder. A part is an object, a video a sequence. Of a video `frames` grasps are
-kept (5): the frames that differ most from the first one, in order of time; the first frame is their no-contact frame.
-Nobody took a photo: the gel image itself stands in its place, so the recording is for touch-to-touch search only
-(`retrieve benchmark real`), and `retrieve check` calls each of its grasps an error. The order of the recording is that
-of the file names, part by part.
+The videos can also be in `dataset/`. A part is an object, a video a sequence. A video provides `frames` grasps
+(default 5): the frames that differ most from the first one, in order of time. The first frame is their no-contact
+frame. There are no photos: the gel image itself replaces the photo, so the recording is for touch-to-touch search only
+(`retrieve benchmark real`), and `retrieve check` reports each of its grasps as an error. The recording has the order of
+the file names, part by part.
 """
 
 import heapq
@@ -34,18 +34,19 @@ from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="PhysiCLeAR",
-    licence="none stated; the videos are not ours to give on",
+    licence="none stated; we may not pass the videos on",
     citation="Yu, Lin, Xiao, Duan, Soh, Octopi: Object Property Reasoning with Large Tactile-Language Models, RSS 2024",
     sensor="GelSight Mini",
     rig="by hand",
-    expects="`<part>_<k>.mov`, or `dataset/` with them in it",
+    expects="`<part>_<k>.mov`, or `dataset/` with these files",
     background="the first frame of each video",
     caveats=(
-        "There are no photos: the gel image itself stands in place of each photo. Do not train a matcher on it.",
-        "The videos of a part were made one after the other, and light and gel drift: the no-contact frame alone names "
-        "the part far above chance. Print that control, and the contact difference on one common no-contact frame.",
-        "Videos were made in two sittings: those of 50 frames show another light than those of 126 frames.",
-        "Frames of one video are nearly alike: leave whole videos out, which are the sequences.",
+        "There are no photos: the gel image itself replaces each photo. Do not train a matcher on it.",
+        "The videos of a part were made one after the other, and light and gel drift: the no-contact frame alone "
+        "identifies the part far above chance. Print this control, and the contact difference on one common "
+        "no-contact frame.",
+        "Videos were made in two sessions: those of 50 frames have another light than those of 126 frames.",
+        "Frames of one video are nearly the same: hold out whole videos, which are the sequences.",
     ),
     unverified=("that the first frame of every video is without contact",),
 )
@@ -56,15 +57,23 @@ Frame = NDArray[np.uint8]
 
 
 def import_physiclear(src: Path, out: Path, progress: Progress | None = None, *, frames: int = 5) -> Recording:
-    """Import the frames of strongest contact of the videos in `src`. Raises ImporterError where there is no video, and
-    without av.
+    """Import the frames of strongest contact from the videos in `src`.
+
+    Args:
+        src: Folder of the data set.
+        out: Recording folder to write or continue.
+        progress: Called with (done, total) after each grasp.
+        frames: Grasps per video.
+
+    Raises:
+        ImporterError: There is no video, or av is missing.
     """
     src = Path(src)
     if frames < 1:
         raise ImporterError(f"frames must be at least 1, got {frames}")
     videos = numbered_files(src / "dataset" if (src / "dataset").is_dir() else src, _VIDEO)
     if not len(videos):
-        raise DATA_SET.mismatch_error(src, "it holds no such video")
+        raise DATA_SET.mismatch_error(src, "it contains no such video")
     import_extra("av", _WHAT)
     items = (item for match, path in videos for item in _items(match["part"], path, frames))
     return import_items(DATA_SET, items, out, total=len(videos) * frames, progress=progress)
@@ -72,58 +81,68 @@ def import_physiclear(src: Path, out: Path, progress: Progress | None = None, *,
 
 def _items(part: str, path: Path, frames: int) -> Iterator[Item | Skip]:
     sequence = safe_name(path.stem)
-    press = StrongestFrames(path, frames)
-    before = SharedImage(safe_name(sequence, "no_contact"), press.no_contact)  # type: ignore[arg-type]  # import_items calls it
-    for place in range(frames):
-        name = safe_name(sequence, str(place + 1))
-        touch = SharedImage(name, partial(press.frame, place))  # type: ignore[arg-type]
+    video = StrongestFrames(path, frames)
+    before = SharedImage(safe_name(sequence, "no_contact"), video.no_contact)  # type: ignore[arg-type]  # import_items calls it
+    for number in range(frames):
+        name = safe_name(sequence, str(number + 1))
+        touch = SharedImage(name, partial(video.frame, number))  # type: ignore[arg-type]
         images = {"photo": touch, "touch_a": touch, "touch_a_before": before}
         yield Item(name, part, images, {"sequence_id": sequence})
 
 
 class StrongestFrames:
-    """The frames of strongest contact of one video, which is decoded once, when the first of them is asked for.
+    """The frames of strongest contact in one video, which is decoded once, on first use.
 
-    path: of the video. count: how many frames are kept. Reading raises ImporterError.
+    Reading raises ImporterError.
     """
 
     def __init__(self, path: Path, count: int) -> None:
+        """Store the path; nothing is decoded yet.
+
+        Args:
+            path: The video.
+            count: Number of frames.
+        """
         self._path, self._count = path, count
 
     def no_contact(self) -> Frame:
-        """The first frame, (H, W, 3), red first."""
+        """Return the first frame: (H, W, 3) uint8, RGB."""
         return self._read[0]
 
-    def frame(self, place: int) -> Frame:
-        """One of the frames of strongest contact, in order of time."""
-        return self._read[1 + place]
+    def frame(self, number: int) -> Frame:
+        """Return one of the frames of strongest contact: (H, W, 3) uint8, RGB.
+
+        Args:
+            number: Its number in order of time, from 0.
+        """
+        return self._read[1 + number]
 
     @cached_property
     def _read(self) -> list[Frame]:
         decoded = self._decoded()
         first = next(decoded, None)
         if first is None:
-            raise ImporterError("its video holds no frame")
+            raise ImporterError("its video contains no frame")
         strongest: list[tuple[float, int, Frame]] = []
-        for place, frame in enumerate(decoded):
+        for number, frame in enumerate(decoded):
             if frame.shape != first.shape:
                 raise ImporterError("the frames of its video differ in size")
             change = float(np.abs(frame.astype(np.int16) - first).mean())
-            # Of equal changes the earlier frame is kept; places differ, so frames are never compared.
-            heapq.heappush(strongest, (change, -place, frame))
+            # Among equal changes the earlier frame stays. Numbers differ, so frames are never compared.
+            heapq.heappush(strongest, (change, -number, frame))
             if len(strongest) > self._count:
                 heapq.heappop(strongest)
         if len(strongest) < self._count:
-            raise ImporterError(f"its video has {1 + len(strongest)} frames, fewer than {1 + self._count}")
+            raise ImporterError(f"its video must have at least {1 + self._count} frames, got {1 + len(strongest)}")
         if not strongest[0][0]:
             raise ImporterError("its video has too few frames that differ from the first one")
-        return [first, *(frame for _, _, frame in sorted(strongest, key=lambda each: -each[1]))]
+        return [first, *(frame for _, _, frame in sorted(strongest, key=lambda entry: -entry[1]))]
 
     def _decoded(self) -> Iterator[Frame]:
         av = import_extra("av", _WHAT)
         try:
-            with av.open(str(self._path)) as film:
-                for frame in film.decode(video_stream(film)):
+            with av.open(str(self._path)) as video:
+                for frame in video.decode(video_stream(video)):
                     yield frame.to_ndarray(format="rgb24")
         except (av.error.FFmpegError, OSError, ValueError, IndexError) as error:
             raise ImporterError("its video cannot be decoded") from error

@@ -1,8 +1,8 @@
-"""NumPy arrays out of pickle files, without unpickling: the opcodes are read, and nothing but arrays is made of them.
+"""NumPy arrays from pickle files, without unpickling: the opcodes are parsed, and only arrays are created.
 
-A pickle is a program. `read_array` walks through its opcodes (`pickletools.genops`), knows the dozen that NumPy writes
-for an array (protocols 3 to 5), and refuses every other one. No name in the file is imported and nothing is called:
-"numpy.ndarray" is a word that tells what the next tuple means.
+A pickle is a program. `read_array` goes through its opcodes (`pickletools.genops`), accepts the dozen that NumPy writes
+for an array (protocols 3 to 5), and rejects every other one. No name in the file is imported and nothing is called:
+"numpy.ndarray" is a string that defines the meaning of the next tuple.
 """
 
 import math
@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from robot.errors import ImporterError
 
 MAX_BYTES = 64 * 2**20
-"""Of a file. What is read from it takes a small multiple of that."""
+"""Maximum size of a file. Reading it takes a small multiple of that memory."""
 MAX_OPCODES = 200
-"""NumPy writes about 40 for an array."""
+"""Maximum number of opcodes; NumPy writes about 40 for an array."""
 _MAX_DIMENSIONS = 4
 _ARRAY_MODULES = ("numpy.core.multiarray", "numpy._core.multiarray")
 _BUFFER_MODULES = ("numpy.core.numeric", "numpy._core.numeric")
@@ -44,18 +44,18 @@ _PUTS, _GETS = {"BINPUT", "LONG_BINPUT"}, {"BINGET", "LONG_BINGET"}
 
 @dataclass(frozen=True)
 class _Name:
-    """A name that the pickle would import; here a word."""
+    """A name that unpickling would import; here only a string."""
 
     word: str
 
 
 class _Mark:
-    """Where a tuple begins."""
+    """The start of a tuple on the stack."""
 
 
 @dataclass(eq=False)
 class _Dtype:
-    """A type of numbers: "f8", and the order of its bytes once BUILD says it."""
+    """A number type such as "f8", with its byte order after BUILD."""
 
     text: str
     order: str | None = None
@@ -66,40 +66,40 @@ class _Dtype:
 
 @dataclass(eq=False)
 class _PickledArray:
-    """An array, empty until BUILD fills it."""
+    """An array, None until BUILD fills it."""
 
     value: NDArray[Any] | None = None
 
 
 def read_array(data: bytes) -> NDArray[Any]:
-    """Return the array that a pickle holds, which must be one array of numbers and nothing else.
+    """Return the array in a pickle, which must contain one array of numbers and nothing else.
 
     Args:
         data: The content of the file, at most 64 MiB.
 
     Returns:
-        The array, of up to 4 dimensions: floating, integer or boolean numbers. It cannot be written to.
+        The array, with up to 4 dimensions: floating, integer or boolean numbers. It is read-only.
 
     Raises:
-        ImporterError: For anything else, in one line.
+        ImporterError: The pickle contains anything else; a message of one line.
     """
     if len(data) > MAX_BYTES:
-        raise _refusal(f"it has {len(data):,} bytes, more than {MAX_BYTES:,}")
+        raise _invalid(f"it has {len(data):,} bytes, more than {MAX_BYTES:,}")
     reader = _Reader()
     for count, (name, argument) in enumerate(_opcodes(data)):
         if count >= MAX_OPCODES:
-            raise _refusal(f"it has more than {MAX_OPCODES} opcodes")
+            raise _invalid(f"it has more than {MAX_OPCODES} opcodes")
         if name == "STOP":
             return reader.result()
         try:
-            reader.take(name, argument)
+            reader.execute(name, argument)
         except (IndexError, KeyError) as error:
             raise ImporterError(f"it is not a pickled NumPy array: {name} refers to nothing") from error
-    raise _refusal("it has no end")
+    raise _invalid("it has no end")
 
 
 def _opcodes(data: bytes) -> Iterator[tuple[str, Any]]:
-    """The opcodes and their arguments. Raises ImporterError for bytes that are none."""
+    """Yield the opcodes with their arguments. Raises ImporterError for invalid bytes."""
     try:
         for opcode, argument, _ in pickletools.genops(data):
             yield opcode.name, argument
@@ -107,25 +107,32 @@ def _opcodes(data: bytes) -> Iterator[tuple[str, Any]]:
         raise ImporterError("it is not a pickled NumPy array: its bytes are damaged or cut off") from error
 
 
-def _refusal(why: str) -> ImporterError:
-    return ImporterError(f"it is not a pickled NumPy array: {why}")
+def _invalid(reason: str) -> ImporterError:
+    return ImporterError(f"it is not a pickled NumPy array: {reason}")
 
 
 class _Reader:
-    """The stack and the memo of a pickle, on which nothing but arrays and their parts can lie."""
+    """The stack and the memo of a pickle, which can contain only arrays and their parts."""
 
     def __init__(self) -> None:
         self._stack: list[Any] = []
         self._memo: dict[int, Any] = {}
 
     def result(self) -> NDArray[Any]:
+        """Return the array on the stack. Raises ImporterError if there is none."""
         found = self._stack[0].value if len(self._stack) == 1 and isinstance(self._stack[0], _PickledArray) else None
         if found is None:
-            raise _refusal("it holds something else")
+            raise _invalid("it contains something else")
         return found
 
-    def take(self, name: str, argument: Any) -> None:
-        """Do what one opcode says. Raises ImporterError, IndexError, KeyError."""
+    def execute(self, name: str, argument: Any) -> None:
+        """Execute one opcode.
+
+        Raises:
+            ImporterError: An array does not have this opcode or argument.
+            IndexError: The stack is empty.
+            KeyError: The memo has no such entry.
+        """
         stack = self._stack
         if name in _IGNORED:
             return
@@ -136,7 +143,7 @@ class _Reader:
         elif name == "MARK":
             stack.append(_Mark())
         elif name == "TUPLE":
-            marks = [place for place, each in enumerate(stack) if isinstance(each, _Mark)]
+            marks = [position for position, value in enumerate(stack) if isinstance(value, _Mark)]
             stack[marks[-1] :] = [tuple(stack[marks[-1] + 1 :])]
         elif name in _TUPLES:
             parts = self._pop(_TUPLES[name])
@@ -152,17 +159,17 @@ class _Reader:
         elif name == "STACK_GLOBAL":
             stack.append(_checked_name(*self._pop(2)))
         elif name == "REDUCE":
-            what, arguments = self._pop(2)
-            stack.append(_call_result(what, arguments))
+            function, arguments = self._pop(2)
+            stack.append(_call_result(function, arguments))
         elif name == "BUILD":
             (state,) = self._pop(1)
             _fill(stack[-1], state)
         else:
-            raise _refusal(f"an array has no opcode {name}")
+            raise _invalid(f"an array does not have the opcode {name}")
 
     def _pop(self, count: int) -> list[Any]:
         if len(self._stack) < count:
-            raise _refusal("its stack is empty")
+            raise _invalid("its stack is empty")
         found = self._stack[-count:]
         del self._stack[-count:]
         return found
@@ -170,57 +177,58 @@ class _Reader:
 
 def _checked_name(module: Any, name: Any) -> _Name:
     if not (isinstance(module, str) and isinstance(name, str)) or (module, name) not in _NAMES:
-        raise _refusal(f"it asks for {_word(module)} {_word(name)}")
+        raise _invalid(f"it refers to {_word(module)} {_word(name)}")
     return _Name(_NAMES[module, name])
 
 
 def _word(part: Any) -> str:
-    """A part of a pickle for an error. Of a tuple only its kind: written out, one that holds another twice, and so on,
-    has no end.
+    """Return a part of a pickle for an error; only the type of a tuple.
+
+    The text of nested tuples, each with its predecessor twice, would have exponential length.
     """
     return repr(part[:40]) if isinstance(part, str) else f"a {type(part).__name__}"
 
 
-def _call_result(what: Any, arguments: Any) -> _Dtype | _PickledArray:
-    """What NumPy would make by calling a name."""
-    word = what.word if isinstance(what, _Name) else None
+def _call_result(function: Any, arguments: Any) -> _Dtype | _PickledArray:
+    """Return the result of a call by NumPy's unpickling, without the call."""
+    word = function.word if isinstance(function, _Name) else None
     if not isinstance(arguments, tuple):
-        raise _refusal("a call has no arguments")
+        raise _invalid("a call has no arguments")
     if word == "dtype" and len(arguments) == 3:
         if arguments[0] not in _TYPES:
-            raise _refusal(f"its numbers are of the type {_word(arguments[0])}")
+            raise _invalid(f"its numbers have the type {_word(arguments[0])}")
         return _Dtype(arguments[0])
     if word == _RECONSTRUCT and len(arguments) == 3 and arguments[0] == _Name("ndarray"):
         return _PickledArray()
     if word == _FROM_BUFFER and len(arguments) == 4:
         data, dtype, shape, order = arguments
         return _PickledArray(_array(shape, dtype, order == "F", data))
-    raise _refusal("it calls something else than what makes an array")
+    raise _invalid("it calls a function that does not make an array")
 
 
-def _fill(what: Any, state: Any) -> None:
-    """BUILD: the order of a type's bytes, or the content of an array."""
+def _fill(target: Any, state: Any) -> None:
+    """Execute BUILD: set the byte order of a type, or the content of an array."""
     if not isinstance(state, tuple):
-        raise _refusal("a state is no tuple")
-    if isinstance(what, _Dtype) and what.order is None and len(state) in (8, 9):
+        raise _invalid("a state is not a tuple")
+    if isinstance(target, _Dtype) and target.order is None and len(state) in (8, 9):
         if state[1] not in ("<", ">", "=", "|") or any(part is not None for part in state[2:5]):
-            raise _refusal("its numbers have fields, or no order of bytes")
-        what.order = state[1]
-    elif isinstance(what, _PickledArray) and what.value is None and len(state) == 5:
+            raise _invalid("its numbers have fields or no byte order")
+        target.order = state[1]
+    elif isinstance(target, _PickledArray) and target.value is None and len(state) == 5:
         _, shape, dtype, is_fortran, data = state
-        what.value = _array(shape, dtype, is_fortran is True, data)
+        target.value = _array(shape, dtype, is_fortran is True, data)
     else:
-        raise _refusal("a state is of something else, or given twice")
+        raise _invalid("a state belongs to something else or occurs twice")
 
 
 def _array(shape: Any, dtype: Any, is_fortran: bool, data: Any) -> NDArray[Any]:
-    sizes = isinstance(shape, tuple) and all(type(size) is int and 0 < size <= MAX_BYTES for size in shape)
-    if not sizes or not 0 < len(shape) <= _MAX_DIMENSIONS:
-        raise _refusal(f"its shape must be 1 to {_MAX_DIMENSIONS} sizes above 0")
+    has_sizes = isinstance(shape, tuple) and all(type(size) is int and 0 < size <= MAX_BYTES for size in shape)
+    if not has_sizes or not 0 < len(shape) <= _MAX_DIMENSIONS:
+        raise _invalid(f"its shape must have 1 to {_MAX_DIMENSIONS} sizes above 0")
     if not isinstance(dtype, _Dtype) or not isinstance(data, bytes | bytearray):
-        raise _refusal("it lacks the type or the bytes of its numbers")
+        raise _invalid("the type or the bytes of its numbers are missing")
     kind = dtype.numpy()
-    if (wanted := math.prod(shape) * kind.itemsize) != len(data):
-        raise _refusal(f"its shape asks for {wanted:,} bytes, and there are {len(data):,}")
+    if (expected := math.prod(shape) * kind.itemsize) != len(data):
+        raise _invalid(f"its shape needs {expected:,} bytes, got {len(data):,}")
     found = np.frombuffer(bytes(data), kind).reshape(shape, order="F" if is_fortran else "C")
     return found.astype(kind.newbyteorder("="), copy=False)

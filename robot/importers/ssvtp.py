@@ -1,14 +1,14 @@
 """SSVTP: touches of a DIGIT on a robot and photos of the same places, on cloths, ropes and other soft things.
 
-As TVL (tactile-vlm.github.io) ships it, with captions.
+In the layout of TVL (tactile-vlm.github.io), with captions.
 
     ssvtp/
         images_tac/image_<n>_tac.jpg    images_rgb/image_<n>_rgb.jpg    text/labels_<n>.txt
         train.csv (url,tactile,caption)    test.csv (url,caption)
 
-A pair is an object of its own: nothing says which pairs are of one thing. Pairs were taken one after the other, so
-`block` of them in a row are one sequence, a surrogate. `tac_background.png`, which stands in TVL's code and not in the
-data set, is the untouched gel of all pairs where it was put beside the folders.
+Each pair is its own object, because the data set does not state which pairs show one thing. Pairs were taken one
+after the other, so `block` consecutive pairs are one sequence, as a surrogate. `tac_background.png` is part of TVL's
+code, not of the data set. If it is copied next to the folders, it is the no-contact frame of all pairs.
 """
 
 import re
@@ -40,27 +40,38 @@ DATA_SET = DataSet(
     "Locate and Follow Garment Features, RSS 2023",
     sensor="DIGIT",
     rig="robot arm, camera and sensor on its wrist",
-    expects="`images_tac/image_<n>_tac.jpg` and `images_rgb/image_<n>_rgb.jpg`, or `ssvtp` with them in it",
+    expects="`images_tac/image_<n>_tac.jpg` and `images_rgb/image_<n>_rgb.jpg`, or `ssvtp` with these files",
     background="one frame for all grasps",
     caveats=(
-        "Each pair counts as an object, with one grasp; neighbouring pairs may show overlapping places of one thing. "
-        "Blocks of pairs in a row are one sequence: a surrogate, for nothing says where a thing begins.",
-        "The one frame of the untouched gel is older than most touches: what drifted since stays in the difference.",
+        "Each pair counts as an object with one grasp; neighbouring pairs may show overlapping places of one thing. "
+        "Blocks of consecutive pairs are one sequence: a surrogate, because the data set does not mark where a thing "
+        "begins.",
+        "The single no-contact frame is older than most touches: later drift remains in the difference.",
     ),
-    unverified=("that pairs are numbered in the order in which they were taken", "sizes of the photos"),
+    unverified=("that pairs are numbered in the order of capture", "sizes of the photos"),
 )
 _TOUCH = re.compile(r"image_(\d{1,9})_tac\.(jpg|jpeg|png)", re.IGNORECASE)
 _URL = re.compile(r".*image_(\d{1,9})_rgb\.\w+")
 
 
 def import_ssvtp(src: Path, out: Path, progress: Progress | None = None, *, block: int = 50) -> Recording:
-    """Import the pairs below `src`. Raises ImporterError where there is none."""
+    """Import the pairs below `src`.
+
+    Args:
+        src: Folder of the data set.
+        out: Recording folder to write or continue.
+        progress: Called with (done, total) after each grasp.
+        block: Consecutive pairs per sequence.
+
+    Raises:
+        ImporterError: There is no pair, or `block` is invalid.
+    """
     if block < 1:
-        raise ImporterError(f"block must be 1 or more pairs, got {block}")
+        raise ImporterError(f"block must be at least 1, got {block}")
     root = Path(src) / "ssvtp" if (Path(src) / "ssvtp").is_dir() else Path(src)
     touches = numbered_files(root / "images_tac", _TOUCH)
     if not len(touches):
-        raise DATA_SET.mismatch_error(Path(src), "images_tac/ has no such file, or is not there")
+        raise DATA_SET.mismatch_error(Path(src), "images_tac/ is missing or contains no such file")
     known = {int(match[1]) for match, _ in touches}
     split, captions = RowSplit("published"), dict[str, dict[str, Any]]()
     same: dict[str | None, dict[str, Any]] = {}  # many pairs share a caption
@@ -73,9 +84,9 @@ def import_ssvtp(src: Path, out: Path, progress: Progress | None = None, *, bloc
                 caption = row.get("caption")
                 captions[_object(number)] = same.setdefault(caption, {"caption": caption})
     del known
-    splits, said = split.object_splits()
+    splits, leaks = split.object_splits()
     background = root / "tac_background.png"
-    facts = replace(DATA_SET, caveats=(*DATA_SET.caveats, *said))
+    facts = replace(DATA_SET, caveats=(*DATA_SET.caveats, *leaks))
     return import_items(
         facts if background.is_file() else replace(facts, background="none"),
         _items(root, touches, background, block),

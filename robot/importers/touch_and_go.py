@@ -1,14 +1,14 @@
-"""Touch and Go: GelSight videos of people touching things indoors and outdoors, with egocentric videos.
+"""Touch and Go: GelSight videos of people who touch things indoors and outdoors, with egocentric videos.
 
     label.txt                                     a line per frame in contact: "20220601_182052/0000033833.jpg,3"
     category_reference.txt                        "Name: id"
-    dataset/<sequence>/{video_frame,gelsight_frame}/<frame>.jpg     the same name in both is one moment
+    dataset/<sequence>/{video_frame,gelsight_frame}/<frame>.jpg     the same name is the same moment
     train.txt, test.txt                           published splits, of the authors' code; lines as in label.txt
 
-The frames are there once the authors' extract_frame.py has cut the videos up.
-The data set names materials, not objects. An unbroken run of frames in contact with one material is taken for one
-object, `<sequence>-<first frame>`, and `frames` of it, evenly spread, for its grasps (0: all). A video is a sequence:
-no split of objects may part its runs. The untouched gel of a video is its first frame that no line names.
+The authors' extract_frame.py extracts the frames from the videos.
+The data set names materials, not objects. An unbroken run of frames in contact with one material counts as one object,
+`<sequence>-<first frame>`, and `frames` evenly spread frames of it are its grasps (0: all). A video is a sequence: a
+split must not divide its runs. The no-contact frame of a video is the first frame that label.txt does not list.
 """
 
 import re
@@ -24,20 +24,20 @@ from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="touch-and-go.github.io",
-    licence="as touch-and-go.github.io says",
+    licence="see touch-and-go.github.io",
     citation="Yang, Ma, Zhang, Zhu, Yuan, Owens, Touch and Go: Learning from Human-Collected Vision and Touch, NeurIPS "
     "2022 Datasets and Benchmarks",
     sensor="GelSight",
     rig="by hand, camera on the head",
     expects="`label.txt` and `dataset/<sequence>/{video_frame,gelsight_frame}/<frame>.jpg`",
-    background="one frame a video",
+    background="one frame per video",
     caveats=(
-        "An object here is a run of frames in contact with one material: a surrogate, for the data set names no "
+        "An object is a run of frames in contact with one material: a surrogate, because the data set names no "
         "instances. Two runs of a video may touch one thing, so split by sequence_id.",
-        "Each photo is of the moment of the touch: hand and sensor are in it, and frames of a run are nearly alike.",
+        "Each photo shows the moment of the touch, with hand and sensor, and frames of a run are nearly the same.",
     ),
     unverified=(
-        "that frames which label.txt does not name are without contact, of which the first serves as the untouched gel",
+        "that frames that label.txt does not list are without contact; the first of them is the no-contact frame",
         "sizes of the photos",
     ),
 )
@@ -58,38 +58,48 @@ class _ContactRun:
     def object_id(self) -> str:
         return f"{self.sequence}-{self.first:010d}"
 
-    def frames(self, wanted: int) -> list[int]:
-        """So many of its frames, evenly spread from its first to its last; all of them for 0."""
+    def frames(self, number: int) -> list[int]:
+        """Return this number of frames, evenly spread from its first to its last; all of them for 0."""
         count = self.last - self.first + 1
-        if not wanted or wanted >= count:
+        if not number or number >= count:
             return list(range(self.first, self.last + 1))
-        return [self.first + round((number + 0.5) * count / wanted - 0.5) for number in range(wanted)]
+        return [self.first + round((index + 0.5) * count / number - 0.5) for index in range(number)]
 
 
 def import_touch_and_go(src: Path, out: Path, progress: Progress | None = None, *, frames: int = 5) -> Recording:
-    """Import the labelled frames below `src`. Raises ImporterError where label.txt names none."""
+    """Import the labelled frames below `src`.
+
+    Args:
+        src: Folder of the data set.
+        out: Recording folder to write or continue.
+        progress: Called with (done, total) after each grasp.
+        frames: Grasps per run; 0 for all frames.
+
+    Raises:
+        ImporterError: label.txt is missing or lists no frame, or `frames` is invalid.
+    """
     if frames < 0:
-        raise ImporterError(f"frames must be 1 or more of each run, or 0 for all, got {frames}")
+        raise ImporterError(f"frames must be at least 1, or 0 for all, got {frames}")
     src = Path(src)
     labels = src / "label.txt"
     if not labels.is_file():
         raise DATA_SET.mismatch_error(src, "it has no label.txt")
     runs, skipped = _runs(labels)
     if not runs:
-        raise DATA_SET.mismatch_error(src, "its label.txt names no frame, such as 20220601_182052/0000033833.jpg,3")
+        raise DATA_SET.mismatch_error(src, "its label.txt lists no frame, such as 20220601_182052/0000033833.jpg,3")
     first = src / "dataset" / runs[0].sequence
     if first.is_dir() and not (first / "gelsight_frame").is_dir():
         raise DATA_SET.mismatch_error(
             src, f"{first.name} has no gelsight_frame/; run the authors' extract_frame.py first"
         )
-    splits, said = _read_splits(src, runs)
+    splits, leaks = _read_splits(src, runs)
     materials = _materials(src / "category_reference.txt")
     objects = {
         run.object_id: {"label": run.label, "material": materials.get(run.label, "unknown"), "sequence": run.sequence}
         for run in runs
     }
     return import_items(
-        replace(DATA_SET, caveats=(*DATA_SET.caveats, *said)),
+        replace(DATA_SET, caveats=(*DATA_SET.caveats, *leaks)),
         _items(src / "dataset", runs, skipped, frames),
         out,
         total=len(skipped) + sum(len(run.frames(frames)) for run in runs),
@@ -99,7 +109,7 @@ def import_touch_and_go(src: Path, out: Path, progress: Progress | None = None, 
 
 
 def _lines(path: Path) -> Iterator[tuple[str, int, int] | None]:
-    """(sequence, frame, label) of each line, None for one that is none. Raises ImporterError."""
+    """Yield (sequence, frame, label) of each line, or None for an invalid one."""
     try:
         with open(path, encoding="utf-8", errors="replace") as file:
             for line in file:
@@ -113,7 +123,7 @@ def _lines(path: Path) -> Iterator[tuple[str, int, int] | None]:
 
 
 def _runs(path: Path) -> tuple[list[_ContactRun], list[Skip]]:
-    """Runs of the frames that label.txt names, in its order, and its lines that cannot be used."""
+    """Return the runs of frames in label.txt, in its order, and a `Skip` for each unusable line."""
     runs: list[_ContactRun] = []
     skipped = []
     for number, line in enumerate(_lines(path), start=1):
@@ -134,18 +144,18 @@ def _items(folder: Path, runs: list[_ContactRun], skipped: list[Skip], frames: i
     yield from skipped
     no_contact = _NoContactFrames(folder, runs)
     for run in runs:
-        at = folder / run.sequence
+        video = folder / run.sequence
         before = no_contact.of(run.sequence)
         for frame in run.frames(frames):
             name = f"{frame:010d}.jpg"
-            images: Images = {"photo": at / "video_frame" / name, "touch_a": at / "gelsight_frame" / name}
+            images: Images = {"photo": video / "video_frame" / name, "touch_a": video / "gelsight_frame" / name}
             if before is not None:
                 images = {**images, "touch_a_before": SharedImage(safe_name(run.sequence, "no_contact"), before)}
             yield Item(safe_name(run.sequence, f"{frame:010d}"), run.object_id, images, {"sequence_id": run.sequence})
 
 
 class _NoContactFrames:
-    """The first frame of each video that no line names."""
+    """The first frame of each video that label.txt does not list."""
 
     def __init__(self, folder: Path, runs: list[_ContactRun]) -> None:
         self._folder = folder
@@ -155,7 +165,7 @@ class _NoContactFrames:
         self._found: dict[str, Path | None] = {}
 
     def of(self, sequence: str) -> Path | None:
-        """Its file, None where there is none."""
+        """Return the file of this frame; None if it is missing."""
         if sequence not in self._found:
             frame = 0
             for run in sorted(self._runs[sequence], key=lambda run: run.first):
@@ -166,7 +176,7 @@ class _NoContactFrames:
 
 
 def _materials(path: Path) -> dict[int, str]:
-    """Names of the labels; none where the file is not there."""
+    """Return the names of the labels; none if the file is missing."""
     try:
         lines = path.read_text("utf-8", "replace").splitlines()
     except OSError:
@@ -175,7 +185,7 @@ def _materials(path: Path) -> dict[int, str]:
 
 
 def _read_splits(src: Path, runs: list[_ContactRun]) -> tuple[dict[str, Split], list[str]]:
-    """Splits by whole runs and videos of train.txt and test.txt, where both are there, and what is to be said."""
+    """Return the splits of train.txt and test.txt by whole videos, and notes; nothing if a file is missing."""
     files = {part: src / f"{part}.txt" for part in ("train", "test")}
     if not all(path.is_file() for path in files.values()):
         return {}, []
@@ -185,8 +195,8 @@ def _read_splits(src: Path, runs: list[_ContactRun]) -> tuple[dict[str, Split], 
     split = RowSplit("published")
     for part, path in files.items():
         for line in _lines(path):
-            known = by_sequence.get(line[0], []) if line else []
-            at = bisect_right(known, line[1], key=lambda run: run.first) - 1 if line else -1
-            if line and at >= 0 and line[1] <= known[at].last:
-                split.add(part, known[at].object_id, line[0])
+            candidates = by_sequence.get(line[0], []) if line else []
+            index = bisect_right(candidates, line[1], key=lambda run: run.first) - 1 if line else -1
+            if line and index >= 0 and line[1] <= candidates[index].last:
+                split.add(part, candidates[index].object_id, line[0])
     return split.object_splits()

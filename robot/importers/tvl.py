@@ -1,13 +1,13 @@
-"""TVL, the part HCT: touches of a DIGIT and photos, both held by hand, outdoors and indoors, with captions.
+"""TVL, the part HCT: DIGIT touches and photos from hand-held devices, outdoors and indoors, with captions.
 
     hct/data1|data2|data3/
         train.csv  test.csv  contact.json  not_contact.json
-        <k>-<time>/tactile/<frame>.jpg  vision/<frame>.jpg        the same name is one moment
-        <k>-<time>/tactile_bg_latent.jpg                          the untouched gel of this folder
+        <k>-<time>/tactile/<frame>.jpg  vision/<frame>.jpg        the same name is the same moment
+        <k>-<time>/tactile_bg_latent.jpg                          the no-contact frame of this folder
 
-A timestamp folder is one contact with one thing: object and sequence, `<data>-<k>-<time>`. Frames are those that
-contact.json names, or all that stand in both folders where there is none. A frame that not_contact.json names, such
-as one whose gel is in the air, is no grasp.
+A timestamp folder is one contact with one thing: object and sequence, `<data>-<k>-<time>`. Its frames are those in
+contact.json; without this file, all in `tactile`. A frame in not_contact.json, such as one with the gel in the air, is
+not a grasp.
 """
 
 import csv
@@ -36,35 +36,41 @@ CITATION = (
     "Fu, Datta, Huang, Panitch, Drake, Ortiz, Mukadam, Lambeta, Calandra, Goldberg, A Touch, Vision, and Language "
     "Dataset for Multimodal Alignment, ICML 2024"
 )
-LICENCE = "as the data set's card on Hugging Face says (mlfu7/Touch-Vision-Language-Dataset)"
+LICENCE = "see the data set's card on Hugging Face (mlfu7/Touch-Vision-Language-Dataset)"
 DATA_SET = DataSet(
     source="tactile-vlm.github.io, HCT",
     licence=LICENCE,
     citation=CITATION,
     sensor="DIGIT",
-    rig="by hand, webcam beside the sensor",
-    expects="`hct/data1/<k>-<time>/{tactile,vision}/<frame>.jpg`, or be `hct` itself",
-    background="one frame a contact",
+    rig="by hand, webcam next to the sensor",
+    expects="`hct/data1/<k>-<time>/{tactile,vision}/<frame>.jpg`, or be the folder `hct` itself",
+    background="one frame per contact",
     caveats=(
-        "Frames of one timestamp folder are neighbours in a video, and the authors' validation rows are drawn from the "
-        "training rows frame by frame: the nearest neighbour by raw pixels names the folder. Here a folder is one "
-        "object and one sequence, so that no split of objects parts it.",
-        "In the first upload `tactile` and `vision` were exchanged in some folders: run `retrieve check`, which names "
-        "them.",
-        "The photo is of the moment of the touch, with the sensor in it.",
+        "Frames of one timestamp folder are neighbours in a video, and the authors drew validation rows from the "
+        "training rows frame by frame: the nearest neighbour by raw pixels identifies the folder. Here a folder is one "
+        "object and one sequence, so a split by object does not divide it.",
+        "In the first upload `tactile` and `vision` were exchanged in some folders: `retrieve check` lists them.",
+        "The photo shows the moment of the touch, with the sensor.",
     ),
-    unverified=("sizes of the photos", "that the paths of contact.json and of the CSV files begin at their own folder"),
+    unverified=(
+        "sizes of the photos",
+        "that the paths in contact.json and in the CSV files are relative to their own folder",
+    ),
 )
 _MAX_JSON_BYTES = 256 * 2**20
 
 
 def import_tvl(src: Path, out: Path, progress: Progress | None = None) -> Recording:
-    """Import the contacts below `src`. Raises ImporterError where there is none."""
+    """Import the contacts below `src`.
+
+    Raises:
+        ImporterError: There is no contact.
+    """
     root = Path(src) / "hct" if (Path(src) / "hct").is_dir() else Path(src)
     parts = [part for part in (subfolders(root) if root.is_dir() else []) if part.name.startswith("data")]
     contacts = [contact for part in parts for contact in subfolders(part) if (contact / "tactile").is_dir()]
     if not contacts:
-        raise DATA_SET.mismatch_error(Path(src), "no folder with tactile/ in it was found")
+        raise DATA_SET.mismatch_error(Path(src), "no folder with tactile/ was found")
     split, objects = RowSplit("published"), dict[str, dict[str, Any]]()
     known = {_name(contact) for contact in contacts}
     for part in parts:
@@ -74,13 +80,13 @@ def import_tvl(src: Path, out: Path, progress: Progress | None = None) -> Record
                 if object_id in known:
                     split.add(side, object_id, object_id)
                     objects.setdefault(object_id, {"caption": row.get("caption")})
-    splits, said = split.object_splits()
-    named = _ContactFrames(parts)
+    splits, leaks = split.object_splits()
+    contact_frames = _ContactFrames(parts)
     return import_items(
-        replace(DATA_SET, caveats=(*DATA_SET.caveats, *said)),
-        _items(contacts, named),
+        replace(DATA_SET, caveats=(*DATA_SET.caveats, *leaks)),
+        _items(contacts, contact_frames),
         out,
-        total=sum(len(named.frames(contact)) for contact in contacts),
+        total=sum(len(contact_frames.frames(contact)) for contact in contacts),
         progress=progress,
         metadata=DataSetMetadata(objects, splits),
     )
@@ -90,11 +96,11 @@ def _name(contact: Path) -> str:
     return f"{contact.parent.name}-{contact.name}"
 
 
-def _items(contacts: list[Path], named: "_ContactFrames") -> Iterator[Item | Skip]:
+def _items(contacts: list[Path], contact_frames: "_ContactFrames") -> Iterator[Item | Skip]:
     for contact in contacts:
         background = contact / "tactile_bg_latent.jpg"
         no_contact = SharedImage(safe_name(contact.parent.name, contact.name, "no_contact"), background)
-        for frame in named.frames(contact):
+        for frame in contact_frames.frames(contact):
             images: Images = {"photo": contact / "vision" / frame, "touch_a": contact / "tactile" / frame}
             if background.is_file():
                 images = {**images, "touch_a_before": no_contact}
@@ -103,18 +109,18 @@ def _items(contacts: list[Path], named: "_ContactFrames") -> Iterator[Item | Ski
 
 
 class _ContactFrames:
-    """The frames that contact.json names, or else all that both folders of a contact hold."""
+    """The frames in contact.json; without this file, all frames of a contact."""
 
     def __init__(self, parts: list[Path]) -> None:
         self._contact = {part: _read_frame_lists(part / "contact.json") for part in parts}
         self._other = {part: _read_frame_lists(part / "not_contact.json") or {} for part in parts}
 
     def frames(self, contact: Path) -> list[str]:
-        """File names, in order of their frame numbers."""
+        """Return the file names of a contact, in order of their frame numbers."""
         listed = self._contact[contact.parent]
         found = {path.name for path in (contact / "tactile").iterdir() if path.suffix.lower() in (".jpg", ".png")}
-        wanted = found if listed is None else listed.get(contact.name, set())
-        return sorted(wanted - self._other[contact.parent].get(contact.name, set()), key=_number)
+        names = found if listed is None else listed.get(contact.name, set())
+        return sorted(names - self._other[contact.parent].get(contact.name, set()), key=_number)
 
 
 def _number(name: str) -> tuple[int, str]:
@@ -123,7 +129,7 @@ def _number(name: str) -> tuple[int, str]:
 
 
 def _read_frame_lists(path: Path) -> dict[str, set[str]] | None:
-    """contact.json: folder -> names of its tactile files; None where there is no such file. Raises ImporterError."""
+    """Read contact.json: folder -> names of its tactile files; None if the file is missing."""
     if not path.exists():
         return None
     try:
@@ -132,17 +138,21 @@ def _read_frame_lists(path: Path) -> dict[str, set[str]] | None:
     except (OSError, ValueError) as error:
         raise ImporterError(f"{path} cannot be read: {error}") from error
     tactile = found.get("tactile") if isinstance(found, dict) else None
-    if not isinstance(tactile, list) or not all(isinstance(each, str) for each in tactile):
-        raise ImporterError(f"{path} must hold lists of paths under vision, tactile and background")
+    if not isinstance(tactile, list) or not all(isinstance(entry, str) for entry in tactile):
+        raise ImporterError(f"{path} must contain lists of paths under vision, tactile and background")
     names: dict[str, set[str]] = {}
-    for each in tactile:
-        folder, _, name = ["", "", *each.split("/")][-3:]
+    for entry in tactile:
+        folder, _, name = ["", "", *entry.split("/")][-3:]
         names.setdefault(folder, set()).add(name)
     return names
 
 
 def csv_rows(path: Path) -> Iterator[dict[str, str | None]]:
-    """Rows of a CSV file with a header, one after the other; none where there is no such file. Raises ImporterError."""
+    """Yield the rows of a CSV file with a header; none if the file is missing.
+
+    Raises:
+        ImporterError: The file cannot be read.
+    """
     if not path.exists():
         return
     try:

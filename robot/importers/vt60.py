@@ -1,15 +1,15 @@
 """VT60: grey touches of one optical finger and turntable photos of 60 everyday objects, ten classes.
 
-    touch/<NN_class>/<II>/touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg    about 125 an object, grey
-    touch/baselineForCalibration.jpg                                                       the untouched finger
-    vision/<NN_class>/<II>/IMG_inst_<II>_img_<k>_validframeID_<f>.jpg                      about 40 an object
+    touch/<NN_class>/<II>/touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg    about 125 per object, grey
+    touch/baselineForCalibration.jpg                                                       the finger without contact
+    vision/<NN_class>/<II>/IMG_inst_<II>_img_<k>_validframeID_<f>.jpg                      about 40 per object
 
-An object is `<NN_class>-<II>`; class, instance and nickname stand in recording.json under `objects`. Nobody took a
-photo at the moment of a touch: touch number i of an object, in order of k, is written with its photo number i modulo
-the number of its photos, so that all photos are used equally often. Any photo of the object would do as well.
+An object is `<NN_class>-<II>`; recording.json lists class, instance and nickname under `objects`. There are no photos
+of the moment of a touch: touch number i of an object, in order of k, gets photo number i modulo the number of photos,
+so all photos are used equally often. Any photo of the object would be equivalent.
 
-An object was touched in one sitting, which is its sequence; a bottle that is there twice, empty and full, has one
-sequence for both, so that no split of objects tears it apart.
+An object was touched in one session, which is its sequence. A bottle that occurs twice, empty and full, has one
+sequence for both, so a split by sequence does not divide it.
 """
 
 import filecmp
@@ -35,7 +35,7 @@ from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="github.com/Exhor/deep_visuotactile_classification",
-    licence="none stated; the images are not ours to give on",
+    licence="none stated; we may not pass the images on",
     citation="Corradi, Hall, Iravani, Object recognition combining vision and touch, Robotics and Biomimetics 4:2 "
     "(2017), doi 10.1186/s40638-017-0058-2",
     sensor="hemispherical optical finger (VT60)",
@@ -43,57 +43,63 @@ DATA_SET = DataSet(
     expects="`touch/<NN_class>/<II>/`, `vision/<NN_class>/<II>/`, `touch/baselineForCalibration.jpg`",
     background="one frame for all grasps",
     caveats=(
-        "08_bottlefull and 02_bottleempty are the same bottles, full and empty: no photo tells them apart. They share "
-        "a sequence_id, so that drawn splits keep them together; of a gallery leave one of the classes out.",
+        "08_bottlefull and 02_bottleempty are the same bottles, full and empty: photos cannot distinguish them. They "
+        "have the same sequence_id, so drawn splits do not separate them; leave one of the classes out of a gallery.",
         "The no-contact frame is touch 4 of the first stapler, byte for byte (that touch is skipped), and the finger's "
-        "light drifts: the least difference of an object's touches from it is 3 grey levels for that stapler and 17 "
-        "for a ball. So the difference from it names the object, pressed or not; it ranks how hard a touch is pressed "
-        "only within an object.",
-        "Objects were touched class by class, so that drift of the finger may name the class, and a touch blurred to "
-        "8 x 6 names much of what a whole one does: print that control beside every result.",
+        "light drifts: the smallest difference of an object's touches from it is 3 grey levels for that stapler and 17 "
+        "for a ball. So the difference identifies the object even without contact; it ranks contact strength only "
+        "within an object.",
+        "Objects were touched class by class, so drift of the finger may identify the class, and a touch low-passed to "
+        "8 x 6 identifies nearly as much as the whole touch: print this low-pass control next to every result.",
     ),
 )
 _TOUCH = re.compile(r"touch_(\d+)_img_(\d+)_name_(?P<class>[^_]+)_(?P<nickname>.+)_at_.*\.jpe?g", re.IGNORECASE)
 _PHOTO = re.compile(r"IMG_inst_(\d+)_img_(\d+)_.*\.jpe?g", re.IGNORECASE)
 _CLASS = re.compile(r"\d+_(.+)")
 _SAME_OBJECTS = {"bottleempty": "bottle", "bottlefull": "bottle"}
-"""Classes of the same things."""
+"""Classes that contain the same objects."""
 
 
 @dataclass(frozen=True)
 class _Instance:
-    """The folders of one instance, and how many files of touches lie there."""
+    """The folders of one instance, and its number of touches."""
 
     object_id: str
     touch: Path
     vision: Path
     count: int
-    about: dict[str, Any]
+    metadata: dict[str, Any]
 
 
 def import_vt60(src: Path, out: Path, progress: Progress | None = None) -> Recording:
-    """Import the objects below `src`. Raises ImporterError where it has no touch/ and vision/ with classes in them."""
+    """Import the objects below `src`.
+
+    Raises:
+        ImporterError: `src` has no touch/ or vision/ with classes.
+    """
     src = Path(src)
     for part in ("touch", "vision"):
         if not (src / part).is_dir():
             raise DATA_SET.mismatch_error(src, f"it has no {part}/ (the folder is code/data/vt60 of the repository)")
-    objects = [each for each in map(_read_instance, _instances(src)) if each.count]
+    objects = [instance for instance in map(_read_instance, _instances(src)) if instance.count]
     if not objects:
-        raise DATA_SET.mismatch_error(src, "it holds no touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg")
+        raise DATA_SET.mismatch_error(
+            src, "it contains no touch_<id>_img_<k>_name_<class>_<nickname>_at_<x>_<y>_<z>.jpg"
+        )
     no_contact = src / "touch" / "baselineForCalibration.jpg"
     has_frame = no_contact.is_file()
     return import_items(
         DATA_SET if has_frame else replace(DATA_SET, background="none"),
         _items(src, objects, no_contact if has_frame else None),
         out,
-        total=sum(each.count for each in objects),
+        total=sum(instance.count for instance in objects),
         progress=progress,
-        metadata=DataSetMetadata({each.object_id: each.about for each in objects}),
+        metadata=DataSetMetadata({instance.object_id: instance.metadata for instance in objects}),
     )
 
 
 def _instances(src: Path) -> Iterator[Path]:
-    """The folders touch/<NN_class>/<II>."""
+    """Yield the folders touch/<NN_class>/<II>."""
     for kind in subfolders(src / "touch"):
         if _CLASS.fullmatch(kind.name):
             yield from subfolders(kind)
@@ -103,23 +109,23 @@ def _read_instance(folder: Path) -> _Instance:
     kind, instance = folder.parent.name, folder.name
     found = numbered_files(folder, _TOUCH)
     name = kind.partition("_")[2]
-    about = {"class": name, "instance": instance, "nickname": next((match["nickname"] for match, _ in found), None)}
+    metadata = {"class": name, "instance": instance, "nickname": next((match["nickname"] for match, _ in found), None)}
     vision = folder.parents[2] / "vision" / kind / instance
-    return _Instance(safe_name(kind, instance), folder, vision, len(found), about)
+    return _Instance(safe_name(kind, instance), folder, vision, len(found), metadata)
 
 
 def _items(src: Path, objects: list[_Instance], no_contact: Path | None) -> Iterator[Item | Skip]:
     background = {"touch_a_before": SharedImage("no_contact", no_contact)} if no_contact else {}
-    touched = {each.vision for each in objects}
-    for shown in (instance for kind in subfolders(src / "vision") for instance in subfolders(kind)):
-        if shown not in touched:
-            yield Skip("photos of an object that was not touched", f"{shown.parent.name}/{shown.name}")
-    for each in objects:
-        photos = [path for _, path in numbered_files(each.vision, _PHOTO)]
-        thing = _SAME_OBJECTS.get(each.about["class"])
-        sequence = f"{thing}-{each.about['nickname']}" if thing else each.object_id
-        for number, (match, touch) in enumerate(numbered_files(each.touch, _TOUCH)):
-            name = safe_name(each.object_id, match[2])
+    touched = {instance.vision for instance in objects}
+    for photographed in (instance for kind in subfolders(src / "vision") for instance in subfolders(kind)):
+        if photographed not in touched:
+            yield Skip("photos of an object without touches", f"{photographed.parent.name}/{photographed.name}")
+    for instance in objects:
+        photos = [path for _, path in numbered_files(instance.vision, _PHOTO)]
+        common = _SAME_OBJECTS.get(instance.metadata["class"])
+        sequence = f"{common}-{instance.metadata['nickname']}" if common else instance.object_id
+        for number, (match, touch) in enumerate(numbered_files(instance.touch, _TOUCH)):
+            name = safe_name(instance.object_id, match[2])
             if not photos:
                 yield Skip("its object has no photo", name)
                 continue
@@ -127,6 +133,6 @@ def _items(src: Path, objects: list[_Instance], no_contact: Path | None) -> Iter
                 yield Skip("its touch is the no-contact frame itself", name)
                 continue
             photo = photos[number % len(photos)]
-            shared = SharedImage(safe_name(each.object_id, photo.stem), photo)
+            shared = SharedImage(safe_name(instance.object_id, photo.stem), photo)
             images: Images = {"photo": shared, "touch_a": touch, **background}
-            yield Item(name, each.object_id, images, {"sequence_id": sequence})
+            yield Item(name, instance.object_id, images, {"sequence_id": sequence})

@@ -4,9 +4,8 @@
     <object>/<point>/<point>_10N_tactile.png     the touch, at 10 N
     <object>/<point>/<point>_depth.png           depth at the camera
 
-An object is a folder, a point a grasp; the points of an object are one sequence. The force of a touch is the one in its
-file's name. The readings of force, acceleration and sound are not opened. Depth is kept where it is a picture of 16
-bits.
+An object is a folder, a point is a grasp; the points of an object are one sequence. The force of a touch comes from its
+file name. The readings of force, acceleration and sound are not read. Depth is imported if it is a 16-bit picture.
 """
 
 import re
@@ -32,33 +31,37 @@ from robot.storage import decode_picture, read_content
 
 DATA_SET = DataSet(
     source="X-Capture",
-    licence="as xcapture.github.io says",
+    licence="see xcapture.github.io",
     citation="X-Capture: An Open-Source Portable Device for Multi-Sensory Learning, ICCV 2025",
     sensor="DIGIT-like",
     rig="by hand, a portable device",
     expects="`<object>/<point>/<point>_<force>N_tactile.png` and `<point>_rgb.png`",
     caveats=(
-        "No no-contact frame is there, and an object was captured in one sitting: light and gel of it may name the "
-        "object. Print the order of capture and the low-pass control beside every result.",
+        "There is no no-contact frame, and an object was captured in one session: its light and gel may identify the "
+        "object. Print the order of capture and the low-pass control next to every result.",
     ),
     unverified=(
-        "everything but the names of the files of a few published example objects: this importer was not run on the "
+        "everything except the file names of a few published example objects: this importer was not run on the "
         "real data",
-        "that depth is in millimetre",
-        "that the photo of a point is taken before its touch",
+        "that depth is in millimetres",
+        "that the photo of a point was taken before its touch",
     ),
 )
 _TOUCH = re.compile(r"(?P<point>.+)_(?P<force>\d{1,3})N_tactile\.png", re.IGNORECASE)
 
 
 def import_x_capture(src: Path, out: Path, progress: Progress | None = None) -> Recording:
-    """Import the points below `src`. Raises ImporterError where there is none."""
+    """Import the points below `src`.
+
+    Raises:
+        ImporterError: There is no point with a touch.
+    """
     src = Path(src)
     if not src.is_dir():
-        raise DATA_SET.mismatch_error(src, "it is no folder")
-    points = [point for each in subfolders(src) for point in subfolders(each) if len(numbered_files(point, _TOUCH))]
+        raise DATA_SET.mismatch_error(src, "it is not a folder")
+    points = [point for folder in subfolders(src) for point in subfolders(folder) if len(numbered_files(point, _TOUCH))]
     if not points:
-        raise DATA_SET.mismatch_error(src, "it holds no such touch")
+        raise DATA_SET.mismatch_error(src, "it contains no such touch")
     total = sum(len(numbered_files(point, _TOUCH)) for point in points)
     return import_items(DATA_SET, _items(points), out, total=total, progress=progress)
 
@@ -74,7 +77,7 @@ def _items(points: list[Path]) -> Iterator[Item | Skip]:
 
 
 def _depth(path: Path) -> Images:
-    """The depth picture where it is one of 16 bits and one channel; a grasp without depth is as good."""
+    """Return the depth picture if it has 16 bits and one channel. A grasp without depth is also imported."""
     import cv2
 
     if not path.is_file():

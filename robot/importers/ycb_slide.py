@@ -1,11 +1,11 @@
-"""YCB-Slide: a DIGIT slid by hand over ten YCB objects, with a webcam that shows it.
+"""YCB-Slide: a DIGIT that slides by hand over ten YCB objects, with a webcam.
 
     real/<object>/dataset_<k>/frames/frame_0000000.jpg           the gel, 60 s at 30 Hz
     real/<object>/dataset_<k>/webcam_frames/frame_0000000.jpg    the scene
-    real/<object>/dataset_<k>/*.npy                              poses, pickled: they are never opened
+    real/<object>/dataset_<k>/*.npy                              poses, pickled: not opened
 
-Frames a few thirtieths of a second apart show nearly the same, so one in `every` is imported (30: one a second), with
-the webcam's frame of the same number. A log is a sequence. Simulated logs have no photos and are not imported.
+Consecutive frames are nearly the same, so one in `every` is imported (30: one per second), with the webcam frame of the
+same number. A log is a sequence. Simulated logs have no photos and are not imported.
 """
 
 import re
@@ -25,12 +25,12 @@ DATA_SET = DataSet(
     rig="by hand, the object in a vise; webcam",
     expects="`real/<object>/dataset_<k>/frames/` and `webcam_frames/`",
     caveats=(
-        "Ten objects are few, and the webcam shows the vise, the hand and one place: print the control of the photo's "
-        "background beside every result.",
+        "There are only ten objects, and the webcam shows the vise, the hand and one place: print the control with the "
+        "photo's background next to every result.",
     ),
     unverified=(
-        "that frames of the same number were taken at the same time: the pickled tables that say so are not opened",
-        "whether a log has a frame without contact: none is kept as background",
+        "that frames of the same number were taken at the same time: the pickled tables of times are not opened",
+        "whether a log has a no-contact frame: none is imported",
     ),
 )
 _FRAME = re.compile(r"frame_(\d+)\.jpe?g")
@@ -38,23 +38,33 @@ _LOG = re.compile(r"dataset_\d+")
 
 
 def import_ycb_slide(src: Path, out: Path, progress: Progress | None = None, *, every: int = 30) -> Recording:
-    """Import one frame in `every` of the logs below `src`. Raises ImporterError where there is none."""
+    """Import one frame in `every` of the logs below `src`.
+
+    Args:
+        src: Folder of the data set.
+        out: Recording folder to write or continue.
+        progress: Called with (done, total) after each grasp.
+        every: Distance of imported frames.
+
+    Raises:
+        ImporterError: There is no frame, or `every` is invalid.
+    """
     src = Path(src)
     if every < 1:
         raise ImporterError(f"every must be at least 1, got {every}")
     if not src.is_dir():
-        raise DATA_SET.mismatch_error(src, "it is no folder")
+        raise DATA_SET.mismatch_error(src, "it is not a folder")
     root = src / "real" if (src / "real").is_dir() else src
-    logs = [log for each in subfolders(root) for log in subfolders(each) if _LOG.fullmatch(log.name)]
+    logs = [log for folder in subfolders(root) for log in subfolders(folder) if _LOG.fullmatch(log.name)]
     counts = [len(_frames(log, every)) for log in logs]
     if not sum(counts):
-        simulated = (src / "sim").is_dir() or any(root.glob("*/*/tactile_images"))
-        raise DATA_SET.mismatch_error(src, "simulated logs have no photos" if simulated else "it holds no frame")
+        is_simulated = (src / "sim").is_dir() or any(root.glob("*/*/tactile_images"))
+        raise DATA_SET.mismatch_error(src, "simulated logs have no photos" if is_simulated else "it contains no frame")
     return import_items(DATA_SET, _items(logs, every), out, total=sum(counts), progress=progress)
 
 
 def _frames(log: Path, every: int) -> list[str]:
-    """Names of the frames to import, in order; the folder is listed, no file is opened."""
+    """Return the names of the frames to import, in order, without opening a file."""
     folder = log / "frames"
     if not folder.is_dir():
         return []

@@ -1,1 +1,1 @@
-"""Devices that are programs: written from the same facts as the drivers, but not from the drivers."""
+"""Emulated devices: programs based on the same facts as the drivers, but not on the drivers."""

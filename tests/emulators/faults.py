@@ -1,4 +1,4 @@
-"""Faults that an emulator makes on purpose: how often, which, and how many so far."""
+"""Faults that an emulator injects: their rate, their kinds and their counts."""
 
 import random
 import threading
@@ -10,9 +10,9 @@ from robot.settings import check_range
 
 
 class FaultInjector:
-    """Something goes wrong in a share `rate` of the operations, of `kinds` drawn evenly; `counts` says how often what.
+    """Inject faults into a fraction `rate` of the operations, with uniformly drawn `kinds`; `counts` counts them.
 
-    A subclass says in KINDS what can go wrong. Safe in several threads. Raises RobotConfigError.
+    A subclass lists the possible kinds in KINDS. The class is thread-safe. Raises RobotConfigError.
     """
 
     KINDS: ClassVar[tuple[str, ...]]
@@ -26,7 +26,7 @@ class FaultInjector:
         self._random, self._lock = random.Random(seed), threading.Lock()
 
     def draw(self, possible: Sequence[str]) -> str | None:
-        """The fault of this operation, of those possible, or None."""
+        """Return the fault of this operation, one of the possible ones, or None."""
         kinds = [kind for kind in possible if kind in self.kinds]
         with self._lock:
             if not kinds or self._random.random() >= self.rate:

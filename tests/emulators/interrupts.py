@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM, for programs that serve until one of them comes."""
+"""Ctrl-C and SIGTERM, for programs that serve until one of them arrives."""
 
 import signal
 from collections.abc import Iterator
@@ -7,9 +7,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def until_interrupted() -> Iterator[None]:
-    """Ctrl-C or SIGTERM leaves what is inside, and the program goes on after it. For the main thread.
+    """Leave the block on Ctrl-C or SIGTERM and continue after it. For the main thread.
 
-    Also where it was started to ignore Ctrl-C, as a shell does with what it starts by `&`.
+    This also works if the process ignores Ctrl-C, as a shell sets it for processes started with `&`.
     """
     before = {number: signal.signal(number, signal.default_int_handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -1,7 +1,6 @@
-"""Miniatures of public data sets, for their importers: the published layout with small drawn pictures.
+"""Miniatures of public data sets, for their importers: the published layout with small synthetic pictures.
 
-Each module has `write(folder)`, which lays the data set below a folder that it makes, and `GRASPS`, how many grasps can
-be had of it.
+Each module has `write(folder)`, which creates the data set in a new folder, and `GRASPS`, its number of grasps.
 """
 
 from pathlib import Path
@@ -12,19 +11,19 @@ import numpy as np
 
 
 def picture(path: Path, seed: int, size: tuple[int, int] = (12, 16), **changes: Any) -> Path:
-    """Write a drawn picture of (H, W), other for another seed; `grey`: one channel, `noise`: of every pixel."""
+    """Write a synthetic picture of size (H, W) for a seed. `grey`: one channel; `noise`: independent pixels."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(encoded(path.suffix, seed, size, **changes))
     return path
 
 
 def encoded(suffix: str, seed: int, size: tuple[int, int] = (12, 16), grey: bool = False, noise: bool = False) -> bytes:
-    """The content of such a file."""
-    drawn = pixels(seed, size, noise)
-    return bytes(cv2.imencode(suffix, drawn[..., 0] if grey else drawn)[1].tobytes())
+    """Return the content of such a file."""
+    image = pixels(seed, size, noise)
+    return bytes(cv2.imencode(suffix, image[..., 0] if grey else image)[1].tobytes())
 
 
 def pixels(seed: int, size: tuple[int, int] = (12, 16), noise: bool = False) -> Any:
-    """(H, W, 3) uint8, smooth or noise."""
+    """Return (H, W, 3) uint8, smooth or noise."""
     small = np.random.default_rng(seed).integers(0, 256, (*(size if noise else (3, 4)), 3), dtype=np.uint8)
     return cv2.resize(small, size[::-1], interpolation=cv2.INTER_LINEAR)

@@ -1,4 +1,4 @@
-"""Three places of two billets, and what lies beside them."""
+"""Three places of two billets, and a licence file."""
 
 from collections.abc import Sequence
 from pathlib import Path

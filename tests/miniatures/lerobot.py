@@ -1,5 +1,8 @@
-"""A LeRobot data set as a robot makes it: four episodes of two tasks, a wrist camera as a video, one gel camera as a
-video and one in the rows of steps; the touch is the third step of an episode."""
+"""A LeRobot data set like one of a robot: four episodes of two tasks.
+
+The wrist camera and one gel camera are videos, another gel camera is in the rows of steps. The touch is the third step
+of an episode.
+"""
 
 import json
 from fractions import Fraction
@@ -22,7 +25,7 @@ SIZE = (48, 64)
 
 
 def pictures(episode: int, step: int) -> dict[str, int]:
-    """The seed of each camera's picture."""
+    """Return the seed of each camera's picture."""
     pressed = step == PRESSED
     return {WRIST: 100 * episode + step, LEFT: 1000 + 10 * episode + pressed, RIGHT: 2000 + 10 * episode + pressed}
 
@@ -31,16 +34,16 @@ def write(folder: Path) -> None:
     for name in ("meta/episodes/chunk-000", "data/chunk-000"):
         (folder / name).mkdir(parents=True)
     for key in (WRIST, LEFT):
-        film(folder / f"videos/{key}/chunk-000/file-000.mp4", key)
+        write_video(folder / f"videos/{key}/chunk-000/file-000.mp4", key)
     steps, episodes = [], []
     for episode, length in enumerate(LENGTHS):
         first = sum(LENGTHS[:episode])
-        place = {"chunk_index": 0, "file_index": 0}
+        numbers = {"chunk_index": 0, "file_index": 0}
         row: dict[str, Any] = {"episode_index": episode, "tasks": [TASKS[episode % 2]], "length": length}
-        row |= {f"data/{key}": value for key, value in place.items()}
+        row |= {f"data/{key}": value for key, value in numbers.items()}
         row |= {"dataset_from_index": first, "dataset_to_index": first + length}
         for key in (WRIST, LEFT):
-            row |= {f"videos/{key}/{name}": value for name, value in place.items()}
+            row |= {f"videos/{key}/{name}": value for name, value in numbers.items()}
             row |= {f"videos/{key}/from_timestamp": first / FPS, f"videos/{key}/to_timestamp": (first + length) / FPS}
         episodes.append(row | {"stats/action/mean": [0.0]})
         for step in range(length):
@@ -63,8 +66,8 @@ def write(folder: Path) -> None:
     (folder / "meta/info.json").write_text(json.dumps(info))
 
 
-def film(path: Path, key: str) -> None:
-    """All episodes of a camera, one after the other, with frames that build on each other."""
+def write_video(path: Path, key: str) -> None:
+    """Write all episodes of a camera to one video, with frames that depend on each other."""
     path.parent.mkdir(parents=True)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=FPS, options={"crf": "5", "g": "5"})

@@ -1,5 +1,7 @@
-"""Open-X-Tactile: a task as a .zarr.zip with implicit groups and one unpacked; three and two episodes of a few steps,
-two areas each; the touch is the third step of an episode."""
+"""Open-X-Tactile: a task as a .zarr.zip with implicit groups, and one unpacked.
+
+They have three and two episodes of a few steps with two areas each. The touch is the third step of an episode.
+"""
 
 import shutil
 from pathlib import Path
@@ -28,7 +30,7 @@ def write(folder: Path) -> None:
 
 
 def write_store(path: Path, lengths: tuple[int, ...], seed: int = 0, **more: Any) -> None:
-    """A store of version 2. more: further arrays by their path."""
+    """Write a store of version 2; `more` are further arrays by path."""
     root = zarr.open_group(str(path), mode="w", zarr_format=2)
     steps = [frame for episode, length in enumerate(lengths) for frame in episode_steps(seed + 100 * episode, length)]
     arrays = {
@@ -49,7 +51,10 @@ def write_store(path: Path, lengths: tuple[int, ...], seed: int = 0, **more: Any
 
 
 def episode_steps(seed: int, length: int) -> list[tuple[Any, Any]]:
-    """(camera, (2, H, W, 3)) of each step: the gels at rest, with a little noise, but at the one that is pressed."""
+    """Return (camera, (2, H, W, 3)) of each step: gels without contact and with a little noise, except at PRESSED."""
     rest = np.stack([pixels(seed + finger) for finger in (1, 2)])
     pressed = np.stack([pixels(seed + finger) for finger in (3, 4)])
-    return [(pixels(seed + 10 + at, (20, 30)), pressed if at == PRESSED else rest ^ (at & 1)) for at in range(length)]
+    return [
+        (pixels(seed + 10 + step, (20, 30)), pressed if step == PRESSED else rest ^ (step & 1))
+        for step in range(length)
+    ]

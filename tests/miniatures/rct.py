@@ -1,5 +1,7 @@
-"""RCT: three materials, two positions, two sensors, three frames of each press; pictures where the options say by
-themselves; one row without a picture, one without a sensor."""
+"""RCT: three materials, two positions, two sensors, three frames of each press; pictures at the default paths.
+
+One row has no picture, one has no sensor.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""SSVTP: pairs with gaps in their numbers, test.csv without a column for the touch, and TVL's untouched gel."""
+"""SSVTP: pairs with gaps in their numbers, test.csv without a column for the touch, and TVL's no-contact frame."""
 
 from pathlib import Path
 

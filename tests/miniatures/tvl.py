@@ -1,5 +1,7 @@
-"""HCT: data1 with three timestamp folders, data2 with one, three frames in contact each and one that is none; rows of
-one folder stand on both sides of the published split."""
+"""HCT: data1 with three timestamp folders, data2 with one, each with three frames in contact and one without.
+
+Rows of one folder are in both parts of the published split.
+"""
 
 import json
 from pathlib import Path
@@ -10,7 +12,7 @@ CONTACTS = {"data1": ("0-1702507215.615537", "1-1702507300.1", "10-1702507400.2"
 FRAMES = ("9-0.025303125381469727", "165-0.0253", "170-0.03534817695617676")
 AWAY = "225-0.01"
 TEST = {"data1/1-1702507300.1": (0, 1, 2), "data1/10-1702507400.2": (2,)}
-"""Frames of test.csv; all others stand in train.csv."""
+"""Frames in test.csv; all others are in train.csv."""
 GRASPS = 4 * 3
 
 

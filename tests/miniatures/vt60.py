@@ -1,4 +1,4 @@
-"""Two bottles that are there empty and full, and a ball; two more balls have photos alone. Numbers are not padded."""
+"""Two bottles, both empty and full, and a ball; another ball has photos only. Numbers are not padded."""
 
 from collections.abc import Mapping
 from pathlib import Path

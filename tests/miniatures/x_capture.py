@@ -1,4 +1,4 @@
-"""X-Capture: two objects of three points, one touch without its photo, and the files that the importer passes over."""
+"""X-Capture: two objects with three points, one touch without its photo, and files that the importer ignores."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,13 +14,13 @@ GRASPS = len(OBJECTS) * len(POINTS)
 
 def write(folder: Path, objects: Sequence[str] = OBJECTS) -> None:
     for number, name in enumerate(objects):
-        for place, point in enumerate(POINTS):
-            at = folder / name / point
-            seed = 100 * number + 10 * place
-            picture(at / f"{point}_rgb.png", seed, (20, 24))
-            picture(at / f"{point}_10N_tactile.png", seed + 1, (24, 18))
+        for index, point in enumerate(POINTS):
+            path = folder / name / point
+            seed = 100 * number + 10 * index
+            picture(path / f"{point}_rgb.png", seed, (20, 24))
+            picture(path / f"{point}_10N_tactile.png", seed + 1, (24, 18))
             depth = np.full((20, 24), 400 + seed, np.uint16)
-            (at / f"{point}_depth.png").write_bytes(cv2.imencode(".png", depth)[1].tobytes())
-            (at / f"{point}_15N_force.npy").write_bytes(b"\x93NUMPY")
-            picture(at / "pointcloud" / f"{point}_mask_0.png", seed + 2)
+            (path / f"{point}_depth.png").write_bytes(cv2.imencode(".png", depth)[1].tobytes())
+            (path / f"{point}_15N_force.npy").write_bytes(b"\x93NUMPY")
+            picture(path / "pointcloud" / f"{point}_mask_0.png", seed + 2)
     picture(folder / objects[0] / "003" / "003_10N_tactile.png", 9)

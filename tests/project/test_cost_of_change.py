@@ -1,4 +1,4 @@
-"""CONTRIBUTING's table kept true: each thing that it says can be added is added here, by what it says is enough."""
+"""Check CONTRIBUTING's table of extensions: each one is added here by the steps that the table lists."""
 
 import dataclasses
 import re
@@ -53,10 +53,10 @@ TINY = MatcherConfig(tower="small", tower_output="pooled", fingers=1, hidden=4, 
 
 
 def add_a_command(monkeypatch):
-    written = {path.stem.strip("_").replace("_", "-") for path in (ROOT / "retrieval/commands").glob("*.py")}
-    listed = {command.name for command in command_line.app.registered_commands}
-    listed |= {group.typer_instance.info.name for group in command_line.app.registered_groups}
-    assert written - {"init", "main", "options"} == listed
+    files = {path.stem.strip("_").replace("_", "-") for path in (ROOT / "retrieval/commands").glob("*.py")}
+    registered = {command.name for command in command_line.app.registered_commands}
+    registered |= {group.typer_instance.info.name for group in command_line.app.registered_groups}
+    assert files - {"init", "main", "options"} == registered
 
 
 def add_a_tower(monkeypatch):
@@ -175,7 +175,7 @@ def add_a_shape_relief_or_material(monkeypatch):
     tables = {shapes.families: "SHAPES", relief: "RELIEFS", materials: "MATERIALS"}
     for module, name in tables.items():
         table = getattr(module, name)
-        assert all(f'"{each}"' in Path(module.__file__).read_text() or hasattr(module, each) for each in table)
+        assert all(f'"{entry}"' in Path(module.__file__).read_text() or hasattr(module, entry) for entry in table)
     for name in relief.RELIEFS:
         assert draw.draw_object(0, 0, relief=name).relief.name == name
 
@@ -240,7 +240,7 @@ def add_a_page(monkeypatch):
 
 
 def rows():
-    """What can be added, and the cells that say what is enough."""
+    """Return the possible extensions, and the cells with their steps."""
     return {cells[0]: cells[1:] for cells in table_rows(CONTRIBUTING) if re.match("an? ", cells[0])}
 
 
@@ -251,19 +251,19 @@ def words(row):
     return row.replace(",", "").replace(" ", "_")
 
 
-def test_every_row_of_the_table_is_walked_here_and_no_other():
+def test_every_row_of_the_table_is_tested_here_and_no_other():
     assert {words(row) for row in rows()} == set(ADDED)
 
 
 @pytest.mark.parametrize("row", rows())
-def test_what_the_table_says_is_enough(row, monkeypatch, tmp_path):
+def test_the_steps_in_the_table_are_sufficient(row, monkeypatch, tmp_path):
     add = ADDED[words(row)]
     add(monkeypatch, *([tmp_path] if "tmp_path" in add.__code__.co_varnames else []))
 
 
 @pytest.mark.parametrize("row", rows())
-def test_at_most_two_places_are_named(row):
-    """A file to write and a row beside it; three places where one row names three things."""
+def test_a_row_names_few_files(row):
+    """A file to write and a registration; three files if one row describes three extensions."""
     named = re.findall(r"`((?:retrieval|robot|indexes|docs|tests|benchmarks)/[\w/.]*)`", " ".join(rows()[row]))
     assert len(named) <= 3
     assert all((ROOT / name).exists() for name in named)

@@ -1,4 +1,4 @@
-"""What README and docs/ tell people to run does run; the notebooks have tests/project/test_notebooks.py."""
+"""Commands and programs in README and docs/ run; tests/project/test_notebooks.py tests the notebooks."""
 
 import json
 import re
@@ -41,15 +41,15 @@ SHORTER = {
     "export": [],
     "export-recording": [],
     "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
-    "frontier": ["--quick", "--only", "halves", "--recording", "recording"],
+    "frontier": ["--quick", "--only", "partials", "--recording", "recording"],
     "serve": ["--port", "0"],
     "benchmark": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "cca_pca"],
 }
-"""The commands, and what makes each of them quick."""
+"""Options that make each command fast."""
 
 
 def commands(*pages):
-    """Lines of shell blocks as words, comments taken off."""
+    """Return the lines of shell blocks as words, without comments."""
     lines = [line for block in blocks("sh", *pages) for line in block.replace("\\\n", " ").splitlines()]
     return [words for line in lines if (words := shlex.split(line, comments=True))]
 
@@ -60,7 +60,7 @@ def of_program(name, *pages):
 
 @pytest.fixture
 def home(tmp_path, recording, catalogue, model, monkeypatch):
-    """Everything that the commands name: catalog/, gel images, recording/, billets/, data/, pictures/,
+    """A folder with all files that the commands name: catalog/, gel images, recording/, billets/, data/, pictures/,
     model.safetensors, rig.toml, mobilenet_v2.pth, benchmarks/models/shipped_rig.toml."""
     shutil.copytree(recording, tmp_path / "recording")
     shutil.copytree(catalogue, tmp_path / "catalog")
@@ -70,10 +70,10 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
     for number, pair in enumerate(pairs):
         for finger, path in zip("ab", pair, strict=True):
             shutil.copy(path, tmp_path / f"{finger}{'' if number == 0 else number + 1}.png")
-    for place in ("welded1/01", "welded1/02"):
-        (tmp_path / "billets" / place).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(pairs[0][0], tmp_path / "billets" / f"{place}_touch.png")
-        shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "billets" / f"{place}_photo.jpg")
+    for path in ("welded1/01", "welded1/02"):
+        (tmp_path / "billets" / path).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(pairs[0][0], tmp_path / "billets" / f"{path}_touch.png")
+        shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "billets" / f"{path}_photo.jpg")
     for name in ("mug", "tin"):
         (tmp_path / "pictures" / name).mkdir(parents=True)
         shutil.copy(pairs[0][0], tmp_path / "pictures" / name / "touch_1.png")
@@ -97,25 +97,25 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
 )
 def test_every_retrieve_command_of_a_page_runs_from_top_to_bottom(page, home):
     for line in of_program("retrieve", page):
-        if line[1] == "serve":  # until it is told to end
+        if line[1] == "serve":  # runs until SIGTERM
             with serving.command(*line[2:], *SHORTER["serve"], cwd=home) as (process, _, _):
                 process.terminate()
                 assert process.wait(60) == 0
             continue
-        # An export that is not the faster one on this machine is refused, with exit code 1.
+        # An export that is not faster on this machine is refused with exit code 1.
         accepted = {"export": {0, 1}, "query": set(EXIT_CODES.values())}.get(line[1], {0})
         assert main([*line[1:], *SHORTER[line[1]]]) in accepted, line
 
 
-def test_every_retrieve_command_stands_in_a_block_that_is_run():
+def test_every_retrieve_command_is_in_a_tested_block():
     assert {line[1] for line in of_program("retrieve")} == set(SHORTER)
 
 
-def test_nothing_stands_in_a_shell_block_that_no_test_runs():
+def test_shell_blocks_contain_only_tested_programs():
     assert {line[0] for line in commands()} == {"make", "retrieve", "python", "pip"}
 
 
-def test_the_settings_of_the_pages_make_a_rig_or_a_training(tmp_path, monkeypatch):
+def test_the_toml_blocks_define_a_rig_or_a_training(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "points.csv").write_text(POINTS)
     assert main(["rig", "calibrate", "points.csv"]) == 0
@@ -142,22 +142,24 @@ def test_the_make_commands_exist_and_the_first_lines_name_two_of_them():
 def test_every_python_command_exists():
     for line in of_program("python"):
         module = line[line.index("-m") + 1]
-        asked = [sys.executable, "-m", module, "--help"]
-        assert subprocess.run(asked, cwd=ROOT, capture_output=True, check=False).returncode == 0, line
+        command = [sys.executable, "-m", module, "--help"]
+        assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0, line
 
 
-@pytest.mark.skipif(typer.__version__ != pins("constraints.txt")["typer"], reason="typers lay help out differently")
-def test_the_help_of_every_command_stands_in_its_page(monkeypatch, capsys):
+@pytest.mark.skipif(
+    typer.__version__ != pins("constraints.txt")["typer"], reason="versions of typer format help differently"
+)
+def test_the_page_of_commands_contains_their_help(monkeypatch, capsys):
     assert text_of(COMMANDS) == commands_page(), "run `python -m benchmarks.reference`"
     monkeypatch.setenv("COLUMNS", "100")
-    for asked in re.findall("^## retrieve ?(.*)$", text_of(COMMANDS), re.M):
-        assert main([*asked.split(), "--help"]) == 0
+    for words in re.findall("^## retrieve ?(.*)$", text_of(COMMANDS), re.M):
+        assert main([*words.split(), "--help"]) == 0
         assert capsys.readouterr().out.strip() in text_of(COMMANDS)
     assert set(SHORTER) <= set(re.findall(r"^## retrieve (\S+)$", text_of(COMMANDS), re.M))
 
 
 class FakeGel:
-    """A camera that shows one picture, blue first."""
+    """A camera that returns one picture (BGR)."""
 
     def __init__(self, device):
         self.picture = cv2.imread({"/dev/gel-a": "a.png", "/dev/gel-b": "b.png"}[device])
@@ -166,8 +168,8 @@ class FakeGel:
         return True, self.picture
 
 
-def test_the_resident_program_of_the_readme_answers_as_the_command_does(home, model, monkeypatch, capsys):
-    """Two grasps, the next object, one grasp of it."""
+def test_the_program_of_the_readme_gives_the_same_answers_as_the_command(home, model, monkeypatch, capsys):
+    """Two grasps, then the next object with one grasp."""
     (program,) = blocks("python", README)
     assert main(["build-index", "catalog", "--out", "demo/index", "--model", str(model)]) == 0
     keys = iter(["", "", "n", "", "q"])
@@ -175,14 +177,14 @@ def test_the_resident_program_of_the_readme_answers_as_the_command_does(home, mo
     monkeypatch.setattr("builtins.input", lambda prompt: next(keys))
     capsys.readouterr()
     exec(compile(program, "README.md", "exec"), {})
-    said = capsys.readouterr().out.splitlines()
+    output = capsys.readouterr().out.splitlines()
     grasp = ["--gelsight", "a.png", "b.png"]
-    for grasps, line in zip((1, 2, 1), said, strict=True):
+    for grasps, line in zip((1, 2, 1), output, strict=True):
         main(["query", *grasp * grasps, "--index", "demo/index", "--json"])
         document = json.loads(capsys.readouterr().out)
         best = document["results"][0]
         assert line == f"{document['verdict']} {best['object_id']}, {best['probability']:.2f}"
 
 
-def test_programs_stand_in_the_readme_and_in_the_reference_whose_examples_run():
+def test_all_programs_are_in_pages_that_are_tested():
     assert {page.stem for page in PAGES if blocks("python", page)} == {"README", "reference", "extending"}

@@ -1,4 +1,4 @@
-"""docs/formats.md names the keys that are written, all of them and no others."""
+"""docs/formats.md lists all keys of the files on disk, and no others."""
 
 import json
 import re
@@ -21,22 +21,22 @@ PAGE = ROOT / "docs" / "formats.md"
 
 
 def documented_keys(table):
-    """The keys in the first column of the n-th table of the page."""
+    """Return the keys in the first column of a table of the page, by its number."""
     tables = re.findall(r"^\| key \|.*\n\|.*\n((?:\|.*\n)+)", text_of(PAGE), re.M)
     return {key for row in tables[table].splitlines() for key in re.findall(r"`([\w.]+)`", row.split("|")[1])}
 
 
-def keys_of(document, said):
-    """The keys of a document, of what `said` looks into with those inside."""
-    inside = {key.partition(".")[0] for key in said if "." in key}
-    return {key for key in document if key not in inside} | {
-        f"{key}.{own}" for key in inside & set(document) for own in document[key]
+def keys_of(document, documented):
+    """Return the keys of a document; nested keys, such as "a.b", where the documented keys are nested."""
+    nested = {key.partition(".")[0] for key in documented if "." in key}
+    return {key for key in document if key not in nested} | {
+        f"{key}.{inner}" for key in nested & set(document) for inner in document[key]
     }
 
 
 def check(table, document):
-    said = documented_keys(table)
-    assert said == keys_of(document, said)
+    documented = documented_keys(table)
+    assert documented == keys_of(document, documented)
 
 
 def test_a_recording(tmp_path, recording):
@@ -57,8 +57,8 @@ def test_an_index_and_the_answer_to_a_query(tmp_path, catalogue, model, touch, c
     generation = index / (index / "CURRENT").read_text().strip()
     check(2, json.loads((generation / "manifest.json").read_text()))
     check(3, json.loads((generation / "rows.jsonl").read_text().splitlines()[0]))
-    named = {path.name for path in generation.iterdir()}
-    assert named <= set(re.findall(r"^ {0,2}(\S+\.\w+) ", text_of(PAGE), re.M))
+    names = {path.name for path in generation.iterdir()}
+    assert names <= set(re.findall(r"^ {0,2}(\S+\.\w+) ", text_of(PAGE), re.M))
     capsys.readouterr()
     main(["query", "--gelsight", *map(str, touch), "--index", str(index), "--json"])
     document = json.loads(capsys.readouterr().out)
@@ -72,7 +72,7 @@ def test_a_checkpoint(model):
 
 def test_the_exit_codes_of_a_query():
     rows = re.findall(r"^\| (\d) \| (.*) \|$", text_of(PAGE), re.M)
-    assert {verdict: int(code) for code, said in rows for verdict in re.findall("`(.*?)`", said)} == EXIT_CODES
+    assert {verdict: int(code) for code, text in rows for verdict in re.findall("`(.*?)`", text)} == EXIT_CODES
 
 
 @pytest.mark.slow
@@ -83,8 +83,8 @@ def test_the_results_of_an_evaluation(tmp_path, recording):
     check(7, results)
     method = results["methods"]["late_fusion"]
     check(8, method)
-    said = re.search(r"^\| `measures` .*$", text_of(PAGE), re.M)[0]
-    assert set(re.findall(r"`(\w+)`", said)) - {"measures"} == set(method["measures"]["pair_auc"])
+    row = re.search(r"^\| `measures` .*$", text_of(PAGE), re.M)[0]
+    assert set(re.findall(r"`(\w+)`", row)) - {"measures"} == set(method["measures"]["pair_auc"])
 
 
 @pytest.mark.slow
@@ -100,21 +100,21 @@ def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     check(10, entry)
     row, control = entry["rows"]["cca_pca"], entry["controls"]["permuted"]
     page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
-    said = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}
+    documented = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}
     touch_to_touch = next(iter(results["protocols"]["physiclear"]["rows"].values()))
     keys = {*row, *row["verdict"], *row["differences"]["pair_auc"], *touch_to_touch}
-    assert keys == set(re.findall(r"`(\w+)`", said["rows"])) - {"rows"}
-    assert set(control) == set(re.findall(r"`(\w+)`", said["controls"])) - {"controls"}
+    assert keys == set(re.findall(r"`(\w+)`", documented["rows"])) - {"rows"}
+    assert set(control) == set(re.findall(r"`(\w+)`", documented["controls"])) - {"controls"}
 
 
-def test_what_a_service_keeps(tmp_path):
+def test_the_history_of_a_service(tmp_path):
     store = HistoryStore(tmp_path / "history.sqlite", 1, 1)
     store.close()
     with closing(sqlite3.connect(tmp_path / "history.sqlite")) as database:
-        made = {
+        columns = {
             name: {row[1] for row in database.execute(f"PRAGMA table_info({name})")}
             for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         }
     section = text_of(PAGE).partition("## What a service keeps")[2]
     rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", section, re.M)
-    assert {name: set(re.findall(r"`(\w+)`", said)) for name, said in rows} == made
+    assert {name: set(re.findall(r"`(\w+)`", text)) for name, text in rows} == columns

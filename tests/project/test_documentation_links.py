@@ -1,4 +1,4 @@
-"""What README, docs/, CONTRIBUTING and the notebooks name and link to is there."""
+"""Links and names in README, docs/, CONTRIBUTING and the notebooks exist."""
 
 import pkgutil
 import re
@@ -28,7 +28,7 @@ def test_pages_of_the_site_link_within_the_site():
         assert not [link for link in links(page) if link.startswith("..")], page.name
 
 
-def test_every_page_and_every_picture_is_reached_from_the_readme_or_the_first_page():
+def test_every_page_and_picture_is_linked():
     reached = {(page.parent / link.partition("#")[0]).resolve() for page in LINKED for link in links(page)}
     assert {*SITE, *(ROOT / "docs" / "images").iterdir()} - {ROOT / "docs" / "index.md"} <= reached
 
@@ -37,17 +37,17 @@ def test_the_readme_is_short():
     assert len(text_of(README).splitlines()) <= MAX_README_LINES
 
 
-def test_the_readmes_tables_are_parts_of_those_in_the_pages():
-    """Every row stands in a page with the same first cell, and its cells there in the same order."""
-    kept = [row for page in SITE for row in table_rows(page)]
+def test_the_tables_of_the_readme_are_parts_of_those_in_the_pages():
+    """Each row occurs in a page with the same first cell and its other cells in the same order."""
+    documented = [row for page in SITE for row in table_rows(page)]
     shown = table_rows(README)
     assert len(shown) > 15
     for first, *cells in shown:
-        candidates = [iter(row[1:]) for row in kept if row[0] == first]
+        candidates = [iter(row[1:]) for row in documented if row[0] == first]
         assert any(all(cell in rest for cell in cells) for rest in candidates), first
 
 
-def test_every_module_that_is_named_to_be_run_is_there():
+def test_every_module_in_a_command_exists():
     folders = ("retrieval", "robot", "indexes", "tests", "benchmarks")
     code = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
     named = {
@@ -57,23 +57,23 @@ def test_every_module_that_is_named_to_be_run_is_there():
     }
     assert len(named) > 20
     for path, module in named:
-        place = ROOT / module.replace(".", "/")
-        assert place.with_suffix(".py").is_file() or (place / "__main__.py").is_file(), (path, module)
+        target = ROOT / module.replace(".", "/")
+        assert target.with_suffix(".py").is_file() or (target / "__main__.py").is_file(), (path, module)
 
 
-def test_every_file_of_ours_that_a_page_names_is_there():
+def test_every_project_file_that_a_page_names_exists():
     for page in (*PAGES, CONTRIBUTING):
         for name in re.findall(rf"(?<![\w/]){OURS}/[\w./*-]*(?:\.\w+|/)", text_of(page)):
             assert list(ROOT.glob(name.rstrip("/"))), (page.name, name)
 
 
-def test_every_module_and_name_of_ours_that_a_page_names_is_there():
+def test_every_project_name_in_a_page_exists():
     for page in (*PAGES, CONTRIBUTING):
         for name in re.findall(r"`((?:retrieval|robot|indexes)(?:\.[A-Za-z_]\w*)+)`", text_of(page)):
             assert pkgutil.resolve_name(name), (page.name, name)
 
 
-def test_every_extra_that_a_page_names_can_be_installed():
+def test_every_extra_that_a_page_names_exists():
     known = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     named = [extra for page in PAGES for extra in re.findall(r"touch-retrieval\[([\w,]+)\]", text_of(page))]
     assert named

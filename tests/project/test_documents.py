@@ -1,4 +1,4 @@
-"""Plain documents as typed values, and what is said of those that do not fit."""
+"""Conversion of plain documents to typed values, and errors for invalid ones."""
 
 import re
 from dataclasses import dataclass, field
@@ -28,14 +28,14 @@ class Sensor:
     by_name: dict[str, Gel] = field(default_factory=dict)
 
 
-def test_tables_become_dataclasses_lists_tuples_and_whole_numbers_floats():
+def test_tables_become_dataclasses_lists_become_tuples_and_integers_become_floats():
     sensor = typed({"gel": {"pitch_mm": 2, "markers": 4}, "sides": [3, 4.5]}, Sensor)
     assert sensor == Sensor(Gel(2.0, 4), (3.0, 4.5))
     assert type(sensor.gel.pitch_mm) is float
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changes", "message"),
     [
         ({"gel": {"pitch_mm": "2"}}, "[sensor].gel.pitch_mm must be a number, got '2'"),
         ({"gel": {"pitch_mm": 2, "markers": -1}}, "[sensor].gel.markers must be a whole number >= 0, got -1"),
@@ -54,12 +54,12 @@ def test_tables_become_dataclasses_lists_tuples_and_whole_numbers_floats():
         ({"gel": {"pitch_mm": 2**63}}, "[sensor].gel.pitch_mm must fit into 64 bits, got 92233"),
     ],
 )
-def test_a_value_that_does_not_fit_is_refused_with_its_place_and_what_it_must_be(changed, said):
-    with pytest.raises(ValueError, match="^" + re.escape(said)):
-        typed({"gel": {"pitch_mm": 2}} | changed, Sensor, "[sensor]")
+def test_an_invalid_value_is_refused_with_its_path_and_its_type(changes, message):
+    with pytest.raises(ValueError, match="^" + re.escape(message)):
+        typed({"gel": {"pitch_mm": 2}} | changes, Sensor, "[sensor]")
 
 
-class Refused(Exception):
+class LampError(Exception):
     pass
 
 
@@ -69,20 +69,20 @@ class Lamp:
     gel: Gel | None = None
 
     def __post_init__(self):
-        check_fields(self, "lamp", Refused)
+        check_fields(self, "lamp", LampError)
 
 
-def test_fields_given_in_python_are_checked_and_converted_as_those_of_a_document():
+def test_fields_set_in_python_are_checked_and_converted_like_those_of_a_document():
     lamp = Lamp(np.int64(3), Gel(2.0))
     assert (lamp, type(lamp.watts)) == (Lamp(3.0, Gel(2.0)), float)
-    for make in (lambda watts: Lamp(watts), lambda watts: typed({"watts": watts}, Lamp, "lamp", error=Refused)):
-        with pytest.raises(Refused, match=r"^lamp\.watts must be a number > 0\.0, got -1$"):
+    for make in (lambda watts: Lamp(watts), lambda watts: typed({"watts": watts}, Lamp, "lamp", error=LampError)):
+        with pytest.raises(LampError, match=r"^lamp\.watts must be a number > 0\.0, got -1$"):
             make(-1)
-        with pytest.raises(Refused, match=r"^lamp\.watts must be a finite number"):
+        with pytest.raises(LampError, match=r"^lamp\.watts must be a finite number"):
             make(float("nan"))
 
 
-def test_a_table_may_have_to_be_complete_down_to_the_tables_in_it():
+def test_a_table_and_its_inner_tables_can_be_required_to_be_complete():
     gel = {"pitch_mm": 2, "markers": 0}
     assert typed({"watts": 1, "gel": gel}, Lamp, "lamp", complete=True) == Lamp(1.0, Gel(2.0))
     with pytest.raises(ValueError, match=r"^lamp must hold watts, gel; gel is missing$"):

@@ -1,4 +1,4 @@
-"""Who may import whom, and what a command may load: by reading the imports, and by running with modules blocked."""
+"""Import rules between packages, tested by reading the imports and by running with blocked modules."""
 
 import ast
 import subprocess
@@ -12,9 +12,9 @@ from tests.documents import CONTRIBUTING, table_rows
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("indexes", "robot", "retrieval")
 SHARED = "_touch_retrieval"
-# Only these know the rigs: the reader of recordings, what shows a rig on the page, and the commands around a rig.
+# Only these import `robot`: the reader of recordings, the live rig of the service, and the commands.
 MAY_IMPORT_ROBOT = ("retrieval/data/dataset.py", "retrieval/serve/rig.py", "retrieval/commands/")
-# In `retrieval` the layers run one way; a module may import those of its own layer and of layers before it.
+# A module of `retrieval` may import modules of its own layer and of the layers before it.
 LAYERS = (
     ("errors", "version", "console", "metrics"),
     ("data",),
@@ -35,7 +35,7 @@ def modules(package):
 
 
 def imported(path):
-    """Names of the modules that a file imports anywhere, functions included."""
+    """Return the names of all modules that a file imports, also inside functions."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
@@ -50,36 +50,36 @@ def packages_of(path):
 
 
 @pytest.mark.parametrize("package", ["indexes", "robot"])
-def test_indexes_and_robot_know_nothing_of_anyone(package):
+def test_indexes_and_robot_import_no_other_package(package):
     others = set(PACKAGES) - {package} | {"tests", "benchmarks", "notebooks"}
     for path in modules(package):
         assert not packages_of(path) & others, path
 
 
-def test_retrieval_knows_neither_tests_nor_benchmarks():
+def test_retrieval_does_not_import_tests_or_benchmarks():
     for path in modules("retrieval"):
         assert not packages_of(path) & {"tests", "benchmarks", "notebooks"}, path
 
 
-def test_what_the_packages_share_knows_none_of_them_and_needs_python_and_msgspec_alone():
+def test_the_common_package_imports_only_python_and_msgspec():
     for path in modules(SHARED):
         assert packages_of(path) <= {*sys.stdlib_module_names, SHARED, "msgspec"}, path
 
 
-def test_robot_needs_neither_torch_nor_faiss_and_indexes_neither_torch_nor_images():
+def test_robot_does_not_import_torch_or_faiss_and_indexes_does_not_import_torch_or_images():
     for path in modules("robot"):
         assert not packages_of(path) & {"torch", "faiss"}, path
     for path in modules("indexes"):
         assert not packages_of(path) & {"torch", "cv2", "PIL"}, path
 
 
-def test_only_the_dataset_reader_the_rig_of_the_service_and_the_commands_touch_robot():
-    touching = {str(path.relative_to(ROOT)) for path in modules("retrieval") if "robot" in packages_of(path)}
-    assert not [path for path in touching if not path.startswith(MAY_IMPORT_ROBOT)]
-    assert "retrieval/data/dataset.py" in touching
+def test_only_the_dataset_reader_the_rig_of_the_service_and_the_commands_import_robot():
+    importing = {str(path.relative_to(ROOT)) for path in modules("retrieval") if "robot" in packages_of(path)}
+    assert not [path for path in importing if not path.startswith(MAY_IMPORT_ROBOT)]
+    assert "retrieval/data/dataset.py" in importing
 
 
-def test_the_layers_of_retrieval_run_one_way():
+def test_modules_of_retrieval_import_only_earlier_layers():
     layer_of = {name: number for number, names in enumerate(LAYERS) for name in names}
     for path in modules("retrieval"):
         own = path.relative_to(ROOT / "retrieval").parts[0].removesuffix(".py")
@@ -92,29 +92,35 @@ def test_the_layers_of_retrieval_run_one_way():
                 assert layer_of[parts[1]] <= layer_of[own], f"{path} imports {name}"
 
 
-def test_the_rooms_of_search_run_one_way():
-    """A query needs nothing of a build, nor a build of a query; one module opens what lies in shards."""
+def test_the_folders_of_search_do_not_import_each_other():
+    """`query` and `build` are independent; only opening.py opens sharded indexes."""
     search = ROOT / "retrieval" / "search"
-    for room, others in (("build", ("query", "sharding")), ("query", ("build", "sharding")), ("sharding", ("query",))):
-        for path in sorted((search / room).glob("*.py")):
-            barred = tuple(f"retrieval.search.{other}" for other in others)
-            met = [name for name in imported(path) if name.startswith(barred)]
-            assert not met or path.name == "opening.py", f"{path} imports {met}"
+    for folder, others in (
+        ("build", ("query", "sharding")),
+        ("query", ("build", "sharding")),
+        ("sharding", ("query",)),
+    ):
+        for path in sorted((search / folder).glob("*.py")):
+            forbidden = tuple(f"retrieval.search.{other}" for other in others)
+            found = [name for name in imported(path) if name.startswith(forbidden)]
+            assert not found or path.name == "opening.py", f"{path} imports {found}"
 
 
-def test_the_layers_are_as_contributing_and_the_package_say():
+def test_contributing_and_the_package_document_the_layers():
     rows = table_rows(CONTRIBUTING)
     first = next(number for number, row in enumerate(rows) if row[0] == "layers of `retrieval/`") + 2
-    told = [tuple(cell.strip("`") for cell in row[0].split(", ")) for row in rows[first : first + len(LAYERS) - 1]]
-    assert told == [*LAYERS[:-1]]  # but for __main__, which only starts the command line
+    documented = [
+        tuple(cell.strip("`") for cell in row[0].split(", ")) for row in rows[first : first + len(LAYERS) - 1]
+    ]
+    assert documented == [*LAYERS[:-1]]  # without __main__, which only starts the command line
     in_package = ast.get_docstring(ast.parse((ROOT / "retrieval/__init__.py").read_text("utf-8")))
-    assert " -> ".join(", ".join(names) for names in told) in " ".join(in_package.split())
-    for place in MAY_IMPORT_ROBOT:
-        assert f"`{place}`" in CONTRIBUTING.read_text("utf-8")
+    assert " -> ".join(", ".join(names) for names in documented) in " ".join(in_package.split())
+    for path in MAY_IMPORT_ROBOT:
+        assert f"`{path}`" in CONTRIBUTING.read_text("utf-8")
 
 
 def run_blocked(code, blocked):
-    """Run code in a process where importing a blocked module fails."""
+    """Run code in a process in which imports of blocked modules fail."""
     guard = (
         "import sys\n"
         "class Guard:\n"
@@ -131,25 +137,25 @@ SERVE = ("fastapi", "starlette", "uvicorn", "pydantic", "prometheus_client", "ht
 HEAVY = ("torch", "faiss", "cv2", "sklearn", "matplotlib", "serial", "numpy", "PIL", "scipy", "rich", "jinja2", *SERVE)
 
 
-def test_robot_imports_without_torch():
+def test_robot_can_be_imported_without_torch():
     code = "import robot, robot.recording.folder, robot.importers, robot.importers.billets, robot.collection, robot.rig"
     done = run_blocked(code, ("torch", "faiss"))
     assert done.returncode == 0, done.stderr
 
 
-OF_DEVICES = ("serial", "websockets", "pyrealsense2", "pylibfreenect2", "roslibpy", "trimesh", "torch", "faiss")
+DEVICE_PACKAGES = ("serial", "websockets", "pyrealsense2", "pylibfreenect2", "roslibpy", "trimesh", "torch", "faiss")
 
 
-def test_every_module_of_robot_imports_without_the_packages_of_devices():
+def test_every_module_of_robot_can_be_imported_without_the_packages_of_devices():
     names = [str(path.relative_to(ROOT).with_suffix("")).replace("/", ".") for path in modules("robot")]
     plain = [name.removesuffix(".__init__") for name in names]
     assert "robot.drivers.wsg50.driver" in plain
-    done = run_blocked("import " + ", ".join(plain), OF_DEVICES)
+    done = run_blocked("import " + ", ".join(plain), DEVICE_PACKAGES)
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(
-    ("role", "table", "said"),
+    ("role", "table", "message"),
     [
         ("gripper", {"driver": "wsg50", "port": "/dev/null"}, "pip install 'touch-retrieval[gripper]'"),
         (
@@ -161,31 +167,31 @@ def test_every_module_of_robot_imports_without_the_packages_of_devices():
         ("camera", {"driver": "kinect2"}, "pylibfreenect2"),
     ],
 )
-def test_a_driver_without_its_package_says_what_to_install(role, table, said):
+def test_a_driver_without_its_package_prints_how_to_install_it(role, table, message):
     code = f"""
 import numpy as np
 from robot.errors import DeviceError
 from robot.real_rig import load_driver
 from robot.readings import Region
-given = {{"workspace": Region((-1, -1, 0), (1, 1, 1)), "extrinsics": np.eye(4)}}
-device = load_driver({role!r}, {table!r}, "table", **given)
+options = {{"workspace": Region((-1, -1, 0), (1, 1, 1)), "extrinsics": np.eye(4)}}
+device = load_driver({role!r}, {table!r}, "table", **options)
 try:
     device.connect()
 except DeviceError as error:
     print(error)
 """
-    done = run_blocked(code, OF_DEVICES)
-    assert said in done.stdout, done.stderr
+    done = run_blocked(code, DEVICE_PACKAGES)
+    assert message in done.stdout, done.stderr
     assert "missing" in done.stdout
 
 
-def test_robot_imports_without_the_packages_of_its_extras_and_without_opencv():
+def test_robot_can_be_imported_without_its_extras_and_without_opencv():
     code = "import robot; print(robot.read_recording, robot.RecordingWriter, robot.load_importer, robot.RobotError)"
-    done = run_blocked(code, ("numba", "cv2", *OF_DEVICES))
+    done = run_blocked(code, ("numba", "cv2", *DEVICE_PACKAGES))
     assert done.returncode == 0, done.stderr
 
 
-def test_a_real_rig_is_built_and_served_without_numba():
+def test_modules_of_real_rigs_can_be_imported_without_numba():
     names = [str(path.relative_to(ROOT).with_suffix("")).replace("/", ".") for path in modules("robot")]
     real = [name.removesuffix(".__init__") for name in names if not name.startswith("robot.sim.")]
     done = run_blocked(f"import retrieval.serve.rig, {', '.join(real)}", ("numba",))
@@ -193,7 +199,7 @@ def test_a_real_rig_is_built_and_served_without_numba():
 
 
 @pytest.mark.parametrize("command", [["collect", "--rig", "sim", "--out", "grasps"], ["demo", "--out", "demo"]])
-def test_the_simulated_rig_without_numba_says_in_one_line_what_to_install(command, tmp_path):
+def test_the_simulated_rig_without_numba_prints_in_one_line_what_to_install(command, tmp_path):
     code = f"import os, sys; os.chdir({str(tmp_path)!r}); sys.path.insert(0, {str(ROOT)!r})\n"
     done = run_blocked(f"{code}from retrieval.commands.main import main; sys.exit(main({command!r}))", ("numba",))
     assert done.returncode == 2, done.stderr
@@ -202,14 +208,16 @@ def test_the_simulated_rig_without_numba_says_in_one_line_what_to_install(comman
     assert "Traceback" not in done.stderr
 
 
-def test_the_collector_knows_the_contract_and_no_rig():
-    """A rig is imported when it is asked for by name."""
-    code = "import sys, robot.collection, robot.rig; print([one for one in sys.modules if one.startswith('robot.sim')])"
+def test_the_collector_does_not_import_a_rig():
+    """A rig is imported when it is loaded by name."""
+    code = (
+        "import sys, robot.collection, robot.rig; print([name for name in sys.modules if name.startswith('robot.sim')])"
+    )
     done = run_blocked(code, ("torch", "faiss", "scipy", "trimesh"))
     assert (done.stdout.strip(), done.stderr) == ("[]", "")
 
 
-def test_indexes_import_with_numpy_alone():
+def test_indexes_can_be_imported_with_numpy_only():
     code = "import indexes, indexes.store.folder, indexes.kinds.exact, indexes.kinds.measure"
     done = run_blocked(code, ("torch", "faiss", "cv2", "PIL", "scipy", "sklearn"))
     assert done.returncode == 0, done.stderr
@@ -237,24 +245,24 @@ def test_indexes_import_with_numpy_alone():
         ["rig", "calibrate"],
     ],
 )
-def test_help_loads_nothing_heavy(command):
+def test_help_imports_no_large_packages(command):
     code = f"import sys\nfrom retrieval.commands.main import main\nsys.exit(main({[*command, '--help']!r}))"
     done = run_blocked(code, HEAVY)
     assert done.returncode == 0, done.stderr
     assert "Usage: retrieve" in done.stdout
 
 
-def test_the_guard_does_block():
+def test_the_guard_blocks_imports():
     assert "blocked: torch" in run_blocked("import torch", ("torch",)).stderr
 
 
-def test_robot_is_our_package_and_not_another_one_of_that_name():
+def test_robot_is_our_package():
     """The PyPI package robotframework installs a top-level `robot` too; the two cannot share an environment."""
     import robot
 
     assert Path(robot.__file__).parent == ROOT / "robot"
 
 
-def test_no_file_outgrows_what_a_stranger_can_read():
+def test_files_have_at_most_400_lines():
     long = [str(path) for package in PACKAGES for path in modules(package) if len(path.read_text().splitlines()) > 400]
     assert not long

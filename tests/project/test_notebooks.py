@@ -1,4 +1,4 @@
-"""The notebooks run from top to bottom on tiny data, and the outputs that they are committed with are whole."""
+"""The notebooks run from top to bottom on tiny data, and their committed outputs are complete."""
 
 import ast
 import json
@@ -74,8 +74,8 @@ def committed(name):
 
 
 @pytest.fixture
-def beside(tmp_path, monkeypatch):
-    """What notebooks find beside their folder: a recording and a catalogue in the demo's sizes, and nothing else."""
+def demo_folder(tmp_path, monkeypatch):
+    """A folder next to the notebooks with a recording and a catalogue in the demo's sizes."""
     monkeypatch.setenv("MPLBACKEND", "Agg")
     synthetic.write_recording(tmp_path / "demo" / "recording", synthetic.make_objects(24), 3)
     synthetic.write_catalogue(tmp_path / "demo" / "catalog", synthetic.make_objects(4), photos_per_object=2)
@@ -85,17 +85,17 @@ def beside(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @every_notebook
-def test_a_notebook_runs_from_top_to_bottom_and_was_committed_with_what_every_cell_shows(name, beside, monkeypatch):
-    # Drawn pictures stand for the demo's touches; the shipped checkpoint would say that they are no gel images.
-    monkeypatch.setattr(GelCheck, "judge", lambda self, readings, levels=None: [CONTACT] * len(readings))
+def test_a_notebook_runs_and_its_committed_outputs_have_the_same_kinds(name, demo_folder, monkeypatch):
+    # Synthetic pictures replace the demo's touches; the shipped checkpoint would reject them as gel images.
+    monkeypatch.setattr(GelCheck, "classify", lambda self, readings, levels=None: [CONTACT] * len(readings))
     tiny = "\n".join(f"{key} = {value!r}" for key, value in TINY[name].items())
-    shown = [kinds(outputs) for outputs in execute(notebook(name), parameters=tiny)]
-    assert shown == [kinds(outputs) for outputs in committed(name)]
-    assert any("picture" in kind for kind in shown)
+    found = [kinds(outputs) for outputs in execute(notebook(name), parameters=tiny)]
+    assert found == [kinds(outputs) for outputs in committed(name)]
+    assert any("picture" in kind for kind in found)
 
 
 @every_notebook
-def test_the_first_code_cell_holds_the_parameters_and_nothing_else(name):
+def test_the_first_code_cell_contains_only_the_parameters(name):
     first, *others = code_cells(name)
     assert first["metadata"] == {"tags": ["parameters"]}
     assert not any(cell["metadata"] for cell in others)
@@ -108,17 +108,17 @@ def test_the_first_code_cell_holds_the_parameters_and_nothing_else(name):
 
 
 @every_notebook
-def test_committed_outputs_are_small_without_errors_and_name_no_folder_of_a_machine(name):
+def test_committed_outputs_are_small_without_errors_and_without_local_paths(name):
     outputs = [output for outputs in committed(name) for output in outputs]
     assert {output["output_type"] for output in outputs} <= {"stream", "execute_result", "display_data"}
     assert not any(output.get("name") == "stderr" for output in outputs)
-    told = json.dumps([output.get("text", output.get("data", {}).get("text/plain")) for output in outputs])
-    assert not re.search(r"(?<![\w.])/(home|root|tmp|work|Users|var|mnt)\b|[A-Z]:\\\\", told)
+    texts = json.dumps([output.get("text", output.get("data", {}).get("text/plain")) for output in outputs])
+    assert not re.search(r"(?<![\w.])/(home|root|tmp|work|Users|var|mnt)\b|[A-Z]:\\\\", texts)
     assert (FOLDER / f"{name}.ipynb").stat().st_size < MAX_OUTPUT_BYTES
 
 
 @every_notebook
-def test_a_notebook_holds_no_logic_and_says_what_it_does(name):
+def test_a_notebook_contains_no_logic_and_has_a_title(name):
     document = notebook(name)
     headings = [cell["source"][0] for cell in document["cells"] if cell["cell_type"] == "markdown"]
     assert document["cells"][0]["source"][0] == headings[0]
@@ -127,8 +127,8 @@ def test_a_notebook_holds_no_logic_and_says_what_it_does(name):
     for cell in code_cells(name)[2:]:  # after parameters and imports
         lines = "".join(cell["source"]).splitlines()
         assert len(lines) <= MAX_CELL_LINES, lines[0]
-        built = [type(node) for node in ast.walk(ast.parse("\n".join(lines)))]
-        assert not {ast.FunctionDef, ast.ClassDef, ast.While, ast.Try} & set(built)
+        types = [type(node) for node in ast.walk(ast.parse("\n".join(lines)))]
+        assert not {ast.FunctionDef, ast.ClassDef, ast.While, ast.Try} & set(types)
     assert not set(document["metadata"]) - {"kernelspec", "language_info"}
 
 
@@ -137,14 +137,14 @@ def _readme_blocks():
     return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
-def test_notebooks_and_the_readme_import_public_names_of_the_packages_alone():
+def test_notebooks_and_the_readme_use_only_public_names_of_the_packages():
     for name in sorted(TINY):
         _require_public(name, *("".join(cell["source"]) for cell in code_cells(name)))
     _require_public("README.md", *_readme_blocks())
 
 
 def _require_public(where, *sources):
-    """Of our packages only the roots are imported, and only public names of these are used."""
+    """Check that sources import only the root packages and use only their public names."""
     for tree in map(ast.parse, sources):
         for node in ast.walk(tree):
             modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
@@ -154,7 +154,7 @@ def _require_public(where, *sources):
                 assert node.attr in import_module(node.value.id).__all__, f"{where}: {node.value.id}.{node.attr}"
 
 
-def test_a_cell_shows_what_it_prints_its_last_line_and_its_figures(monkeypatch):
+def test_the_outputs_of_a_cell_are_its_text_its_last_value_and_its_figures(monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "Agg")
     cells = [
         "a = 2",
@@ -165,13 +165,13 @@ def test_a_cell_shows_what_it_prints_its_last_line_and_its_figures(monkeypatch):
     ]
     document = {"cells": [{"cell_type": "code", "source": [cell]} for cell in cells]}
     outputs = list(execute(document))
-    assert [kinds(each) for each in outputs] == [set(), {"text", "value"}, {"picture"}, {"picture"}, set()]
+    assert [kinds(output) for output in outputs] == [set(), {"text", "value"}, {"picture"}, {"picture"}, set()]
     assert outputs[1][0]["text"] == ["b\n"]
     assert outputs[1][1]["data"] == {"text/plain": ["2"]}
     assert len(outputs[2]) == 2
 
 
-def test_given_parameters_stand_in_for_the_first_cell_and_a_failing_cell_is_named():
+def test_parameters_replace_the_first_cell_and_an_error_names_its_cell():
     document = {"cells": [{"cell_type": "code", "source": [cell]} for cell in ("a = 2", "a", "1 / 0")]}
     outputs = execute(document, parameters="a = 3")
     assert next(outputs) == []

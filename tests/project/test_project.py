@@ -1,4 +1,4 @@
-"""The project's own files: dependencies, the oldest versions, and what `make` promises."""
+"""Files of the project: dependencies, oldest versions, packages."""
 
 import re
 import tomllib
@@ -12,12 +12,12 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
 def bounds():
-    """Lower bound of every requirement, extras included."""
+    """Return the lower bound of every requirement, including extras."""
     listed = [*PROJECT["project"]["dependencies"], *chain(*PROJECT["project"]["optional-dependencies"].values())]
     return {re.split(r"[<>=\[]", item)[0].lower(): re.search(r">=([\w.]+)", item)[1] for item in listed}
 
 
-def test_what_a_query_needs_is_bounded_as_it_is_for_everything_else():
+def test_requirements_of_a_query_have_the_same_bounds():
     listed = {*PROJECT["project"]["dependencies"], *chain(*PROJECT["project"]["optional-dependencies"].values())}
     assert set(PROJECT["dependency-groups"]["query"]) <= listed
 
@@ -27,14 +27,14 @@ def pins(name):
     return dict(line.lower().split("==") for line in lines if line and not line.startswith("#"))
 
 
-def test_the_oldest_versions_that_are_tested_are_the_lower_bounds():
+def test_the_oldest_tested_versions_are_the_lower_bounds():
     lowest = pins("lowest.txt")
     assert set(lowest) == set(bounds())
     for name, bound in bounds().items():
         assert lowest[name].startswith(bound), name
 
 
-def test_everything_is_pinned_for_the_tests():
+def test_all_requirements_are_pinned_for_the_tests():
     assert set(pins("constraints.txt")) == set(bounds())
 
 
@@ -48,13 +48,13 @@ def test_only_our_packages_are_installed():
     }
 
 
-def test_every_folder_of_modules_is_a_package_and_thus_installed():
+def test_every_folder_with_modules_is_a_package():
     folders = {path.parent for name in ("retrieval", "robot", "indexes") for path in (ROOT / name).rglob("*.py")}
     assert [folder for folder in sorted(folders) if not (folder / "__init__.py").exists()] == []
 
 
 def test_test_helpers_are_listed():
-    there = {
+    names = {
         path.stem for path in (ROOT / "tests").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
     }
-    assert {name for name in there if not name.startswith(("test_", "__"))} <= set(re.findall(r"\w+", tests.__doc__))
+    assert {name for name in names if not name.startswith(("test_", "__"))} <= set(re.findall(r"\w+", tests.__doc__))

@@ -1,4 +1,4 @@
-"""The public names: what they cost, that their examples run, and that the reference page is theirs."""
+"""Public names: imports are fast, examples run, and the reference page is up to date."""
 
 import doctest
 import inspect
@@ -21,13 +21,13 @@ from tests.project.test_imports import HEAVY, run_blocked
 
 @pytest.fixture(scope="module")
 def folder(catalogue, touch, model, tmp_path_factory):
-    """What the examples name, of two objects. The examples write into it."""
+    """The files that the examples name, for two objects. The examples write to this folder."""
     root = tmp_path_factory.mktemp("examples")
     objects = synthetic.make_objects(2, seed=9)
     photos = sorted(catalogue.rglob("*.jpg"))
-    for name, own in (("mug", photos[:2]), ("tin", photos[3:5])):
+    for name, of_object in (("mug", photos[:2]), ("tin", photos[3:5])):
         (root / "catalog" / name).mkdir(parents=True)
-        for number, photo in enumerate(own, start=1):
+        for number, photo in enumerate(of_object, start=1):
             shutil.copy(photo, root / "catalog" / name / f"{number}.jpg")
     for number, grasp in enumerate(synthetic.write_queries(root / "drawn", objects[:1], 2)[objects[0].object_id]):
         for finger, path in zip("ab", grasp, strict=True):
@@ -43,7 +43,7 @@ def folder(catalogue, touch, model, tmp_path_factory):
 
 
 def examples():
-    """(name, what carries the docstring) of every public function and class, and of the packages."""
+    """Return (name, object) of every package and of its public functions and classes."""
     named = [(package.__name__, package) for package in PACKAGES]
     for package in PACKAGES:
         things = [(name, getattr(package, name)) for name in package.__all__]
@@ -73,7 +73,7 @@ def test_the_sections_of_a_docstring_become_lists():
     )
 
 
-def test_importing_the_packages_and_naming_what_they_have_imports_nothing_heavy():
+def test_importing_the_packages_and_listing_their_names_imports_no_large_packages():
     code = "import retrieval, robot, indexes\nprint(dir(retrieval), dir(robot), dir(indexes), indexes.load_kind)"
     done = run_blocked(code, HEAVY)
     assert done.returncode == 0, done.stderr
@@ -81,7 +81,7 @@ def test_importing_the_packages_and_naming_what_they_have_imports_nothing_heavy(
         assert f"'{name}'" in done.stdout
 
 
-def test_all_names_what_there_is_and_nothing_else_is_got():
+def test_all_lists_every_public_name():
     for package in PACKAGES:
         assert len(set(package.__all__)) == len(package.__all__)
         assert set(package.__all__) <= set(dir(package))
@@ -90,15 +90,15 @@ def test_all_names_what_there_is_and_nothing_else_is_got():
             _ = package.absent
 
 
-def test_a_public_name_is_no_module_of_its_package():
-    """`import robot.collection` would put the module in the name's place."""
+def test_a_public_name_is_not_a_module_of_its_package():
+    """`import robot.collection` would replace a public name `collection` by the module."""
     for package in PACKAGES:
         modules = {path.stem for path in Path(package.__file__).parent.iterdir()}
         assert not modules & set(package.__all__), package
 
 
 @pytest.mark.slow
-def test_type_checkers_see_the_public_names_and_no_others(tmp_path):
+def test_type_checkers_find_the_public_names_and_no_others(tmp_path):
     lines = [f"import {package.__name__}" for package in PACKAGES]
     lines += [f"reveal_type({package.__name__}.{name})" for package in PACKAGES for name in package.__all__]
     program = tmp_path / "program.py"
@@ -110,10 +110,10 @@ def test_type_checkers_see_the_public_names_and_no_others(tmp_path):
     assert 'Revealed type is "Any"' not in done.stdout
 
 
-def test_every_package_says_that_it_is_typed():
+def test_every_package_is_marked_as_typed():
     for package in PACKAGES:
         assert (Path(package.__file__).parent / "py.typed").is_file()
 
 
-def test_opening_is_the_searchers_own():
+def test_open_is_the_method_of_the_searcher():
     assert retrieval.open == retrieval.Searcher.open

@@ -1,4 +1,4 @@
-"""Things by name: built in, of installed packages, and of a user's own module; what a file may name is less."""
+"""Registry entries by name: built in, from installed packages, from a user's module; files may name fewer."""
 
 import json
 import re
@@ -39,7 +39,7 @@ def test_a_built_in_name_is_imported_when_it_is_loaded():
     assert registry.load("decoder") is json.decoder.JSONDecoder
 
 
-def test_an_unknown_name_lists_the_known_ones_and_says_how_to_add_one(tmp_path, monkeypatch):
+def test_an_unknown_name_lists_the_known_ones_and_how_to_add_one(tmp_path, monkeypatch):
     plugins.install(tmp_path, monkeypatch, shapes={"square": f"{HERE}:Square"})
     words = (
         "shape must be one of shape, square; got 'blob'. Give module:Class for your own, or install a package that "
@@ -50,7 +50,7 @@ def test_an_unknown_name_lists_the_known_ones_and_says_how_to_add_one(tmp_path, 
             find("blob")
 
 
-def test_an_installed_package_adds_a_name_and_takes_none_of_ours(tmp_path, monkeypatch):
+def test_an_installed_package_adds_a_name_and_cannot_replace_ours(tmp_path, monkeypatch):
     plugins.install(tmp_path, monkeypatch, shapes={"square": f"{HERE}:Square", "shape": f"{HERE}:Stone"})
     registry = make()
     assert registry.names() == ["shape", "square"]
@@ -59,7 +59,7 @@ def test_an_installed_package_adds_a_name_and_takes_none_of_ours(tmp_path, monke
     assert registry.name_of("square") == "square"
 
 
-def test_a_user_may_name_any_module_and_a_file_only_one_that_is_imported(tmp_path, monkeypatch):
+def test_a_user_can_name_any_module_and_a_file_only_an_imported_one(tmp_path, monkeypatch):
     (tmp_path / "shapes_of_mine.py").write_text(f"from {HERE} import Shape\nclass Mine(Shape): ...\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(LookupError, match="of a module that is not imported, and a file may not choose what is"):
@@ -69,7 +69,7 @@ def test_a_user_may_name_any_module_and_a_file_only_one_that_is_imported(tmp_pat
     assert make().load("shapes_of_mine:Mine").__name__ == "Mine"
 
 
-def test_the_thing_itself_has_the_name_that_leads_back_to_it(tmp_path, monkeypatch):
+def test_an_object_has_a_name_that_resolves_to_it(tmp_path, monkeypatch):
     registry = make()
     assert registry.name_of(Shape) == "shape"
     assert registry.name_of(Square) == f"{HERE}:Square"
@@ -87,30 +87,30 @@ def test_a_class_in_a_function_has_no_name():
 
 
 @pytest.mark.parametrize("place", [f"{HERE}:Stone", "json:dumps", f"{HERE}:__doc__"])
-def test_what_is_not_of_the_kind_is_refused(place):
+def test_an_object_of_another_type_is_refused(place):
     with pytest.raises(LookupError, match=f"shape {place!r} must be a Shape; got "):
         make().name_of(place)
     with pytest.raises(LookupError, match="must be a Shape"):
         make().name_of(Stone)
 
 
-def test_an_instance_is_of_the_kind_too():
+def test_an_instance_is_accepted():
     assert make().resolve(f"{HERE}:ROUND") is ROUND
 
 
 @pytest.mark.parametrize("place", ["no_such_package:Thing", f"{HERE}:Thing", f"{HERE}:"])
-def test_what_cannot_be_imported_is_one_clear_error(place):
+def test_a_failed_import_is_one_clear_error(place):
     with pytest.raises(LookupError, match=r"cannot be imported|must be one of shape"):
         make().name_of(place)
 
 
-def test_a_broken_package_is_named(tmp_path, monkeypatch):
+def test_an_error_names_a_broken_package(tmp_path, monkeypatch):
     plugins.install(tmp_path, monkeypatch, shapes={"broken": "no_such_package:Thing"})
     with pytest.raises(LookupError, match="shape 'broken' cannot be imported: No module named 'no_such_package'"):
         make().load("broken")
 
 
-def test_functions_are_a_kind_without_a_base():
+def test_a_registry_without_a_base_contains_functions():
     registry = make({}, base=None)
     assert registry.resolve("json:dumps") is json.dumps
     assert registry.name_of(json.dumps) == "json:dumps"

@@ -1,4 +1,4 @@
-"""`make docs`: a site of every page of docs/, whole, that asks nothing of other hosts."""
+"""`make docs` builds a complete site from docs/ that loads nothing from other hosts."""
 
 import shutil
 import subprocess
@@ -15,19 +15,19 @@ SETTINGS = ROOT / "zensical.toml"
 
 
 def leaves(entry):
-    """The files that an entry of the navigation names."""
+    """Return the files in an entry of the navigation."""
     if isinstance(entry, str):
         return [entry]
     return [name for part in (entry.values() if isinstance(entry, dict) else entry) for name in leaves(part)]
 
 
-def test_the_navigation_names_every_page_once():
+def test_the_navigation_contains_every_page_once():
     assert sorted(leaves(tomllib.loads(SETTINGS.read_text())["project"]["nav"])) == [page.name for page in SITE]
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The site, built as `make docs` builds it. By name, its pages."""
+    """The site that `make docs` builds, and its pages by name."""
     root = tmp_path_factory.mktemp("site")
     shutil.copy(SETTINGS, root)
     shutil.copytree(ROOT / "docs", root / "docs")
@@ -39,12 +39,17 @@ def site(tmp_path_factory):
     }
 
 
-def test_every_link_of_the_site_leads_to_a_file_and_to_a_place_in_it(site):
+def test_every_link_of_the_site_leads_to_a_file_and_to_an_anchor_in_it(site):
     folder, pages = site
-    names = {stem: {own.get("id") for _, own in page.tags} for stem, page in pages.items()}
+    names = {stem: {attributes.get("id") for _, attributes in page.tags} for stem, page in pages.items()}
     for stem, page in pages.items():
-        leads = [own[key] for tag, key in (("a", "href"), ("img", "src")) for own in page.all(tag) if key in own]
-        for link in leads:
+        links = [
+            attributes[key]
+            for tag, key in (("a", "href"), ("img", "src"))
+            for attributes in page.all(tag)
+            if key in attributes
+        ]
+        for link in links:
             if not link.startswith("https:"):
                 name, _, anchor = link.partition("#")
                 target = folder / (name or f"{stem}.html")
@@ -54,7 +59,7 @@ def test_every_link_of_the_site_leads_to_a_file_and_to_a_place_in_it(site):
 
 def test_a_page_loads_nothing_from_another_host(site):
     for stem, page in site[1].items():
-        loaded = [own.get("src", "") for tag in ("script", "img", "iframe") for own in page.all(tag)]
-        loaded += [own.get("href", "") for own in page.all("link")]
+        loaded = [attributes.get("src", "") for tag in ("script", "img", "iframe") for attributes in page.all(tag)]
+        loaded += [attributes.get("href", "") for attributes in page.all("link")]
         assert loaded
         assert not [name for name in loaded if "//" in name], stem

@@ -1,4 +1,4 @@
-"""The drawn test pictures: seeded, of the promised shape, only relief common to photo and touch."""
+"""Synthetic test pictures: seeded, with the documented shapes; photo and touch have only the relief in common."""
 
 import json
 from dataclasses import fields, replace
@@ -32,7 +32,7 @@ def _tree(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_pictures_have_the_promised_shape_and_type() -> None:
+def test_pictures_have_the_documented_shape_and_type() -> None:
     obj = make_object(3)
     touch = draw_touch(obj, 0)
     pictures = {(256, 256, 3): draw_photo(obj, 0), (96, 96, 3): draw_photo(obj, 0, px=96)}
@@ -81,7 +81,7 @@ def test_every_family_fills_its_depth_and_dents_the_gel(number: int) -> None:
 
 
 def test_a_finger_without_force_shows_the_no_contact_frame() -> None:
-    """The two differ by their sensor noise alone, of deviation 1.5 each."""
+    """The two differ only by sensor noise with a deviation of 1.5 each."""
     empty = draw_touch(make_object(1), 0, force_n=0.0)["b"].astype(float) - draw_background(0, "b").astype(float)
     assert abs(empty.mean()) < 0.1
     assert 1.5 < empty.std() < 3
@@ -97,20 +97,20 @@ def test_more_force_dents_more() -> None:
 
 def test_appearance_is_independent_of_relief(many: list[DrawnObject]) -> None:
     """2000 objects: independent columns correlate by less than 0.1 (4.5 standard errors)."""
-    felt = np.array([[getattr(obj, name) for name in RELIEF_FIELDS] for obj in many])
-    looks = np.array([[*obj.colour, *obj.paint, obj.paint_share, obj.gloss, *obj.outline] for obj in many])
-    correlation = np.corrcoef(felt.T, looks.T)[: felt.shape[1], felt.shape[1] :]
+    touchable = np.array([[getattr(obj, name) for name in RELIEF_FIELDS] for obj in many])
+    visible = np.array([[*obj.colour, *obj.paint, obj.paint_fraction, obj.gloss, *obj.outline] for obj in many])
+    correlation = np.corrcoef(touchable.T, visible.T)[: touchable.shape[1], touchable.shape[1] :]
     assert np.abs(correlation).max() < 0.1
     family = np.array([obj.family for obj in many])
     for name in synthetic.FAMILIES:
-        off = (looks[family == name].mean(0) - looks.mean(0)) / looks.std(0)
-        assert np.abs(off).max() < 0.45  # 5.5 standard errors of 154 objects
+        deviation = (visible[family == name].mean(0) - visible.mean(0)) / visible.std(0)
+        assert np.abs(deviation).max() < 0.45  # 5.5 standard errors of 154 objects
     assert {field.name for field in fields(DrawnObject)} == {
-        *RELIEF_FIELDS, "object_id", "seed", "family", "colour", "paint", "paint_share", "gloss", "outline",
+        *RELIEF_FIELDS, "object_id", "seed", "family", "colour", "paint", "paint_fraction", "gloss", "outline",
     }  # fmt: skip
 
 
-def test_relief_does_not_set_the_photos_mean_colour_nor_appearance_the_touch() -> None:
+def test_relief_does_not_change_the_mean_colour_of_the_photo_and_appearance_does_not_change_the_touch() -> None:
     obj = make_object(3)
     deep = replace(obj, depth_mm=2 * obj.depth_mm)
     repainted = replace(obj, colour=(0.9, 0.2, 0.2), paint=(0.1, 0.1, 0.1))

@@ -1,1 +1,1 @@
-"""A made-up arm behind a rosbridge server."""
+"""An emulated arm behind a rosbridge server."""

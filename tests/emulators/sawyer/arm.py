@@ -1,9 +1,9 @@
-"""A made-up arm for the rosbridge emulator: seven joints, of which four carry the hand and one turns it.
+"""An arm for the rosbridge emulator: seven joints, of which four move the hand and one turns it.
 
-It is no Sawyer: link lengths are roundish, right_j2 and right_j4 stay at zero, and only poses with the hand hanging
-straight down have an inverse. What it shares with the robot is what a driver can see: joint names, joint speeds scaled
-by a ratio, first-order motion towards the last command, which a time-out ends, and a kinematics that can say no.
-Lengths in m, angles in rad. Written without the driver's own mathematics, so that the two can disagree.
+It is not a Sawyer: link lengths are rounded, right_j2 and right_j4 stay at zero, and only poses with the hand straight
+down have an inverse. It has the properties that a driver depends on: joint names, joint speeds scaled by a ratio,
+first-order motion towards the last command until a time-out, and kinematics that can fail. Lengths are in m, angles in
+rad. It does not use the driver's mathematics, so the two can disagree.
 """
 
 import math
@@ -19,11 +19,11 @@ FASTEST_RAD_S = np.array([1.74, 1.33, 1.96, 1.96, 3.49, 3.49, 4.55])
 LIMITS_RAD = np.array([3.05, 3.8, 3.04, 3.04, 2.98, 2.98, 4.71])
 TAU_S = 0.03
 READY = (0.0, 0.9, 0.0, -1.8, 0.0, -math.pi / 2 + 0.9, 0.0)
-"""Hand down in front of the base: the angles of shoulder, elbow and wrist add up to -pi / 2."""
+"""Hand down in front of the base: the angles of shoulder, elbow and wrist sum to -pi / 2."""
 
 
 class SawyerModel:
-    """Joints that move in time. `advance` is told the seconds passed since the last call."""
+    """Joints that move in time. `advance` gets the seconds since its last call."""
 
     def __init__(self, joints: Sequence[float] = READY) -> None:
         self.joints = np.array(joints, dtype=np.float64)
@@ -36,11 +36,11 @@ class SawyerModel:
         self._command_age_s = 0.0
 
     def command(self, target: Sequence[float]) -> None:
-        """Take a command in position mode; it holds until the time-out."""
+        """Accept a command in position mode; it is valid until the time-out."""
         self._target, self._command_age_s = np.clip(np.array(target, dtype=np.float64), -LIMITS_RAD, LIMITS_RAD), 0.0
 
     def advance(self, seconds: float) -> None:
-        """Move for this long, in steps small against TAU_S."""
+        """Move for this time, in steps much smaller than TAU_S."""
         steps = max(1, math.ceil(seconds / 0.005))
         before = self.joints.copy()
         for _ in range(steps):
@@ -53,13 +53,13 @@ class SawyerModel:
             self._target = None
         if self._target is None:
             return
-        most = FASTEST_RAD_S * self.speed_ratio * seconds
-        wanted = (self._target - self.joints) * (1.0 - math.exp(-seconds / TAU_S))
-        self.joints = self.joints + np.clip(wanted, -most, most)
+        maximum = FASTEST_RAD_S * self.speed_ratio * seconds
+        step = (self._target - self.joints) * (1.0 - math.exp(-seconds / TAU_S))
+        self.joints = self.joints + np.clip(step, -maximum, maximum)
 
 
 def forward(joints: Sequence[float] | Joints) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-    """Position (m) of the tip and its quaternion (x, y, z, w)."""
+    """Return the position (m) of the tip and its quaternion (x, y, z, w)."""
     base, shoulder, elbow, wrist, turn = (float(joints[index]) for index in (0, 1, 3, 5, 6))
     lean = shoulder
     out, up = UPPER_M * math.cos(lean), SHOULDER_M + UPPER_M * math.sin(lean)
@@ -68,7 +68,7 @@ def forward(joints: Sequence[float] | Joints) -> tuple[tuple[float, float, float
     lean += wrist
     out, up = out + HAND_M * math.cos(lean), up + HAND_M * math.sin(lean)
     position = (out * math.cos(base), out * math.sin(base), up)
-    # the tip's z is the direction of the hand: tilted by pi / 2 - lean from straight up, about y
+    # The tip's z axis is the direction of the hand, tilted by pi / 2 - lean from vertical, about y.
     quaternion = _times(_times(_about(base, "z"), _about(math.pi / 2 - lean, "y")), _about(turn, "z"))
     return position, quaternion
 
@@ -76,7 +76,7 @@ def forward(joints: Sequence[float] | Joints) -> tuple[tuple[float, float, float
 def inverse(
     position: Sequence[float], quaternion: Sequence[float], seed: Sequence[float] | Joints
 ) -> tuple[float, ...] | None:
-    """Joints for a tip that hangs straight down, nearest to the seed; None where there are none."""
+    """Return the joints nearest to the seed for a tip that points straight down; None if there are none."""
     x, y, z = position
     turned = np.array(quaternion, dtype=np.float64)
     norm = float(np.linalg.norm(turned))
@@ -92,14 +92,14 @@ def inverse(
         return None
     shoulder, elbow = chain
     wrist = -math.pi / 2 - shoulder - elbow
-    # hanging down, the tip's x axis points to base + pi - turn
+    # With the tip down, its x axis points to base + pi - turn.
     found = np.array([base, shoulder, 0.0, elbow, 0.0, wrist, base + math.pi - heading])
     found[[0, 5, 6]] += _whole_turns(np.array(seed, dtype=np.float64)[[0, 5, 6]] - found[[0, 5, 6]])
     return tuple(found.tolist()) if (np.abs(found) <= LIMITS_RAD).all() else None
 
 
 def _two_links(out: float, up: float, *, elbow_up: bool) -> tuple[float, float] | None:
-    """Angles of shoulder and elbow that put the wrist at (out, up) from the shoulder; None where it is out of reach."""
+    """Return angles of shoulder and elbow for a wrist at (out, up) from the shoulder; None if it is out of reach."""
     cosine = (out * out + up * up - UPPER_M**2 - FORE_M**2) / (2 * UPPER_M * FORE_M)
     if not -0.98 < cosine < 0.998:
         return None
@@ -120,7 +120,7 @@ def _about(angle: float, axis: str) -> tuple[float, float, float, float]:
 def _times(
     p: tuple[float, float, float, float], q: tuple[float, float, float, float]
 ) -> tuple[float, float, float, float]:
-    """Product of two quaternions (x, y, z, w)."""
+    """Return the product of two quaternions (x, y, z, w)."""
     px, py, pz, pw = p
     qx, qy, qz, qw = q
     return (

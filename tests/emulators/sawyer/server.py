@@ -1,8 +1,8 @@
-"""A rosbridge server with a made-up arm behind it: a real websocket, the robot's topics and its IK service, and faults.
+"""A rosbridge server with an emulated arm: a real websocket, the robot's topics and IK service, and faults.
 
     python -m tests.emulators.sawyer.server --port 9090 [--faults 0.02 --seed 0]
 
-It parses and builds messages on its own, so that the driver's reading of them is tested and not shared.
+It does not use the driver's code for messages, so tests check that code independently.
 """
 
 import argparse
@@ -29,14 +29,17 @@ REPLY_FAULTS = (*MESSAGE_FAULTS, "delayed", "wrong_id", "ik_failed", "disconnect
 
 
 class MessageFaults(FaultInjector):
-    """What the server sends is dropped, duplicated, corrupted (cut short); a reply of a service is besides delayed,
-    sent with a wrong_id, ik_failed, or the connection is disconnected instead; a command is command_dropped."""
+    """Faults of messages.
+
+    A message is dropped, duplicated or corrupted (truncated). A reply of a service can also be delayed, have a
+    wrong_id, be ik_failed, or be replaced by a disconnected connection. A command can be command_dropped.
+    """
 
     KINDS = (*REPLY_FAULTS, "command_dropped")
 
 
 class RosbridgeClient:
-    """One connection: what it subscribed to and advertised, and how to send to it."""
+    """One connection, with its subscribed and advertised topics."""
 
     def __init__(self, connection: Any) -> None:
         self.connection = connection
@@ -44,20 +47,24 @@ class RosbridgeClient:
         self.advertised: set[str] = set()
 
     def send(self, text: str) -> None:
-        """Send, or do nothing where the other side is gone."""
+        """Send a message; do nothing after a disconnection."""
         with contextlib.suppress(Exception):
             self.connection.send(text)
 
     def drop(self) -> None:
-        """Cut the connection without a goodbye."""
+        """Cut the connection without a closing handshake."""
         with contextlib.suppress(OSError):
             self.connection.socket.shutdown(socket.SHUT_RDWR)
 
 
 class EmulatedSawyer:
-    """The robot's side. Switches: `silent` topics are not sent, `refuse_ik` that many IK calls, `reply_delay_s`.
+    """The robot.
 
-    commands: the joint commands received, newest last, as (time_s, positions).
+    Attributes:
+        silent: Topics that are not sent.
+        refuse_ik: Number of IK calls to refuse.
+        reply_delay_s: Delay of replies.
+        commands: Received joint commands as (time_s, positions), newest last.
     """
 
     def __init__(
@@ -79,20 +86,20 @@ class EmulatedSawyer:
         self._now = time.monotonic()
 
     def press_estop(self) -> None:
-        """A person presses the red button."""
+        """Press the red button."""
         with self._lock:
             self.model.stopped, self.model.enabled = True, False
             self.model.estop_button, self.model.estop_source = 1, 1
 
     def release_estop(self) -> None:
-        """A person turns the button and resets the robot."""
+        """Release the button and reset the robot."""
         with self._lock:
             self.model.stopped, self.model.enabled = False, True
             self.model.estop_button = self.model.estop_source = 0
 
     def drop_connections(self) -> None:
-        """Every connection breaks without a goodbye."""
-        for client in tuple(self._clients):  # without the lock: a sender may hold it and wait for this very break
+        """Cut all connections without a closing handshake."""
+        for client in tuple(self._clients):  # without the lock: a sender may hold it while it waits for this cut
             client.drop()
 
     def handle(self, connection: Any) -> None:
@@ -102,21 +109,21 @@ class EmulatedSawyer:
             self._clients.add(client)
         try:
             for text in connection:
-                self._take(client, text)
-        except Exception:  # a connection that breaks is what this is for
+                self._handle(client, text)
+        except Exception:  # broken connections are expected
             pass
         finally:
             with self._lock:
                 self._clients.discard(client)
 
     def run(self) -> None:
-        """Move the arm and publish its state until `end`."""
+        """Move the arm and publish its state until `end` is called."""
         while not self._ended.wait(1.0 / self.rate_hz):
             with self._lock:
                 self._advance()
                 self._publish_all()
-                due = [each for each in self._later if each[0] <= self._now]
-                self._later = [each for each in self._later if each[0] > self._now]
+                due = [reply for reply in self._later if reply[0] <= self._now]
+                self._later = [reply for reply in self._later if reply[0] > self._now]
             for _, client, text in due:
                 client.send(text)
 
@@ -149,7 +156,7 @@ class EmulatedSawyer:
         }
 
     def _joint_states(self) -> Mapping[str, Any]:
-        """As the robot's: the head's pan stands among the arm's joints."""
+        """Return joint states like the robot's, with the head's pan among the joints of the arm."""
         return {
             "header": _header(),
             "name": ["head_pan", *JOINT_NAMES],
@@ -175,21 +182,21 @@ class EmulatedSawyer:
         pose = {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
         return {"header": _header(), "names": [TIP], "states": [{"header": _header(), "pose": pose}]}
 
-    def _take(self, client: RosbridgeClient, text: str | bytes) -> None:
+    def _handle(self, client: RosbridgeClient, text: str | bytes) -> None:
         try:
             operation = json.loads(text)
             name = operation["op"]
             with self._lock:
                 {
                     "subscribe": self._subscribe,
-                    "unsubscribe": lambda who, what: who.subscribed.discard(what["topic"]),
-                    "advertise": lambda who, what: who.advertised.add(what["topic"]),
-                    "unadvertise": lambda who, what: who.advertised.discard(what["topic"]),
-                    "publish": self._published,
-                    "call_service": self._called,
+                    "unsubscribe": lambda client, operation: client.subscribed.discard(operation["topic"]),
+                    "advertise": lambda client, operation: client.advertised.add(operation["topic"]),
+                    "unadvertise": lambda client, operation: client.advertised.discard(operation["topic"]),
+                    "publish": self._publish,
+                    "call_service": self._call_service,
                 }[name](client, operation)
         except (KeyError, TypeError, ValueError, IndexError) as error:
-            client.send(json.dumps({"op": "status", "level": "error", "msg": f"not understood: {error!r}"}))
+            client.send(json.dumps({"op": "status", "level": "error", "msg": f"invalid message: {error!r}"}))
 
     def _subscribe(self, client: RosbridgeClient, operation: Mapping[str, Any]) -> None:
         topic = operation["topic"]
@@ -197,13 +204,13 @@ class EmulatedSawyer:
         if topic in self._latched:
             client.send(json.dumps({"op": "publish", "topic": topic, "msg": self._latched[topic]}))
 
-    def _published(self, client: RosbridgeClient, operation: Mapping[str, Any]) -> None:
-        """Act on what is published and pass it on to who subscribed to it."""
+    def _publish(self, client: RosbridgeClient, operation: Mapping[str, Any]) -> None:
+        """Apply a published message and forward it to subscribers."""
         topic, message = operation["topic"], operation["msg"]
         if topic not in client.advertised:
             raise ValueError(f"{topic} was not advertised")
         if topic == LIMB + "joint_command":
-            self._commanded(message)
+            self._command(message)
             return
         if topic == LIMB + "set_speed_ratio":
             self.model.speed_ratio = min(1.0, max(0.0, float(message["data"])))
@@ -216,21 +223,21 @@ class EmulatedSawyer:
             if topic in other.subscribed and topic not in self.silent:
                 other.send(json.dumps({"op": "publish", "topic": topic, "msg": message}))
 
-    def _commanded(self, message: Mapping[str, Any]) -> None:
+    def _command(self, message: Mapping[str, Any]) -> None:
         if message["mode"] != 1:
             raise ValueError(f"only position mode, 1, is emulated, got {message['mode']}")
-        places = dict(zip(message["names"], message["position"], strict=True))
-        target = [float(places[name]) for name in JOINT_NAMES]
+        positions = dict(zip(message["names"], message["position"], strict=True))
+        target = [float(positions[name]) for name in JOINT_NAMES]
         if self.faults.draw(["command_dropped"]) is None:
             self._advance()
             self.model.command(target)
             self.commands.append((self._now, target))
 
-    def _called(self, client: RosbridgeClient, operation: Mapping[str, Any]) -> None:
+    def _call_service(self, client: RosbridgeClient, operation: Mapping[str, Any]) -> None:
         self.calls += 1
-        good = operation["service"] == IK_SERVICE
-        values = self._solve(operation["args"]) if good else f"Service {operation['service']} does not exist"
-        reply = {"op": "service_response", "service": operation["service"], "values": values, "result": good}
+        exists = operation["service"] == IK_SERVICE
+        values = self._solve(operation["args"]) if exists else f"Service {operation['service']} does not exist"
+        reply = {"op": "service_response", "service": operation["service"], "values": values, "result": exists}
         self._reply(client, reply | {"id": operation.get("id")})
 
     def _reply(self, client: RosbridgeClient, reply: dict[str, Any]) -> None:
@@ -250,7 +257,7 @@ class EmulatedSawyer:
                 client.send(text)
 
     def _solve(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
-        """Positions for each asked pose, seeded as asked; result_type -1: none, -3: the tip does not exist."""
+        """Return joint positions for each pose and seed; result_type -1: no solution, -3: the tip does not exist."""
         answer: dict[str, Any] = {"joints": [], "result_type": []}
         for index, stamped in enumerate(arguments["pose_stamp"]):
             joints, kind = None, -3
@@ -266,16 +273,16 @@ class EmulatedSawyer:
         if self.refuse_ik > 0:
             self.refuse_ik -= 1
             return None, -1
-        place, turn = pose["position"], pose["orientation"]
-        found = inverse([place[a] for a in "xyz"], [turn[a] for a in "xyzw"], seed)
+        position, orientation = pose["position"], pose["orientation"]
+        found = inverse([position[axis] for axis in "xyz"], [orientation[axis] for axis in "xyzw"], seed)
         return (None, -1) if found is None else (list(found), 1)
 
     def _seed(self, arguments: Mapping[str, Any], index: int) -> list[float]:
         if arguments["seed_mode"] != 1:  # SEED_USER
             return [float(angle) for angle in self.model.joints]
         seed = arguments["seed_angles"][index]
-        places = dict(zip(seed["name"], seed["position"], strict=True))
-        return [float(places[name]) for name in JOINT_NAMES]
+        positions = dict(zip(seed["name"], seed["position"], strict=True))
+        return [float(positions[name]) for name in JOINT_NAMES]
 
     def _send(self, client: RosbridgeClient, text: str, possible: Sequence[str]) -> None:
         for part in _damaged(text, self.faults.draw(possible)):
@@ -283,23 +290,23 @@ class EmulatedSawyer:
 
 
 def _damaged(text: str, fault: str | None) -> list[str]:
-    """What is sent in place of a message."""
+    """Return the texts that replace a message."""
     return {"dropped": [], "duplicated": [text, text], "corrupted": [text[: len(text) // 2]]}.get(fault or "", [text])
 
 
 def _header() -> dict[str, Any]:
-    """A ROS time stamp by the robot's own clock."""
+    """Return a ROS header with the time of the robot's clock."""
     now = time.time_ns()
     return {"seq": 0, "stamp": {"secs": now // 10**9, "nsecs": now % 10**9}, "frame_id": "base"}
 
 
 @contextlib.contextmanager
 def serve(emulator: EmulatedSawyer, host: str = "127.0.0.1", port: int = 0) -> Iterator[str]:
-    """Serve in threads, port 0 a free one; gives the address, "ws://127.0.0.1:54321". Needs `websockets`."""
+    """Serve in threads and yield the address, "ws://127.0.0.1:54321"; port 0 chooses one. Needs `websockets`."""
     from websockets.sync.server import serve as listen
 
     server = listen(emulator.handle, host, port, compression=None, ping_interval=None, close_timeout=0.5)
-    threads = [threading.Thread(target=each, daemon=True) for each in (server.serve_forever, emulator.run)]
+    threads = [threading.Thread(target=work, daemon=True) for work in (server.serve_forever, emulator.run)]
     for thread in threads:
         thread.start()
     try:
@@ -317,12 +324,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--host", default="127.0.0.1")
     parser.add_argument("--port", type=int, default=9090)
-    parser.add_argument("--faults", type=float, default=0.0, help="share of operations that go wrong")
+    parser.add_argument("--faults", type=float, default=0.0, help="fraction of operations with a fault")
     parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args()
-    emulator = EmulatedSawyer(faults=MessageFaults(asked.faults, seed=asked.seed))
-    with until_interrupted(), serve(emulator, asked.host, asked.port) as url:
-        print(f"a made-up arm behind rosbridge at {url}; Ctrl-C ends it", flush=True)
+    options = parser.parse_args()
+    emulator = EmulatedSawyer(faults=MessageFaults(options.faults, seed=options.seed))
+    with until_interrupted(), serve(emulator, options.host, options.port) as url:
+        print(f"emulated arm behind rosbridge at {url}; press Ctrl-C to stop", flush=True)
         threading.Event().wait()
     for kind, count in sorted(emulator.faults.counts.items()):
         if count:

@@ -1,6 +1,6 @@
-"""Faults for the line of an emulated WSG-50: packets lost, doubled, damaged, late, in pieces, misnamed; the line cut.
+"""Faults of the line of an emulated WSG-50: lost, duplicated, damaged, late, split and misnamed packets, and cuts.
 
-A line is a stream: what is late keeps everything behind it waiting, and nothing overtakes.
+A line is a stream: a late packet delays all packets behind it, and the order never changes.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,14 +12,14 @@ from tests.emulators.faults import FaultInjector
 
 @dataclass(frozen=True)
 class Piece:
-    """Bytes for the line, after a pause; None cuts it."""
+    """Bytes for the line after a pause; None cuts the line."""
 
     data: bytes | None
     pause_s: float = 0.0
 
 
 class LineFaults(FaultInjector):
-    """Damages packets. delay_s: how late a delayed packet is, and the pause within a split one."""
+    """Damages packets. `delay_s` is the delay of a delayed packet, and the pause within a split one."""
 
     KINDS = ("dropped", "duplicated", "corrupted", "delayed", "split", "wrong id", "disconnect")
 
@@ -30,7 +30,7 @@ class LineFaults(FaultInjector):
         self.delay_s = delay_s
 
     def on(self, packet: Packet) -> Iterator[Piece]:
-        """What becomes of a packet on the line."""
+        """Yield the pieces of a packet on the line."""
         kind, data = self.draw(self.KINDS), encode(packet)
         yield from self._damaged(kind, packet, data) if kind else [Piece(data)]
 
@@ -53,7 +53,7 @@ class LineFaults(FaultInjector):
             yield Piece(None)
 
     def _misnamed(self, packet: Packet) -> bytes:
-        """The same packet with another id, and a check sum that fits."""
+        """Return the same packet with another id and a valid checksum."""
         while True:
             try:
                 other = Packet(self._random.randrange(256), packet.payload)

@@ -1,8 +1,8 @@
-"""What an emulated WSG-50 does with commands, in time. No I/O: tests.emulators.wsg50.server gives it ports.
+"""The behaviour of an emulated WSG-50 in time. It has no I/O: tests.emulators.wsg50.server provides ports.
 
-Written from the protocol's facts (robot.drivers.wsg50.codec names them) with its own packing and numbers, so that it
-and the driver cannot share a misreading; they share framing and check sum, which are tested against printed packets.
-Where the facts are silent it does the least convenient thing that they allow: it denies what it is not known to allow.
+It is based on the protocol (see robot.drivers.wsg50.codec) with its own packing and numbers, so that it and the driver
+do not have the same misreadings. Both use the same framing and checksum, which are tested against printed packets.
+If the protocol leaves behaviour open, the emulator does the least convenient thing: it denies what may be denied.
 """
 
 import struct
@@ -35,21 +35,31 @@ LENGTHS = {0x20: 1, 0x21: 9, 0x24: 3, 0x25: 8, 0x26: 8, 0x30: 4, 0x32: 4, 0x34: 
 _MAX_RECEIVED = 100_000
 _HOMING_MM_S = 100.0
 _CLAMPING_MM = 3.0
-"""Clamping travel: how far beyond the nominal width the fingers look for a part."""
+"""Clamping travel: the distance beyond the nominal width in which the fingers detect a part."""
 
 Answer = int | bytes
-"""A status alone, or the parameters of a success."""
+"""A status without parameters, or the parameters of a success."""
 
 
 class EmulatedWSG50:
-    """A WSG-50. `receive` takes a command, `tick` lets time pass; both return what it says, in order.
+    """A WSG-50. `receive` accepts a command, `tick` lets time pass; both return its packets in order. Thread-safe.
 
-    object_mm: width of the rigid object between the jaws, or None; may be set at any time, and a held part is lost by
-    it. speed_up: its time runs so many times faster than `clock`. referenced: False needs homing first. Switches:
-    has_force_fingers (else it cannot be tared), keeps_force_n (the force limit it has whatever it is told), jammed (the
-    jaws move and no motion ends), silent (hears, and says nothing), mute_updates (says nothing unasked),
-    answers_bad_checksum (says so when a command is damaged, else nothing). next_status: by id, what the next command
-    of this id is answered with instead of being done. heard: ids of the last commands. Safe in several threads.
+    Attributes:
+        object_mm: Width of the rigid object between the jaws, or None. It can change at any time; a held part is then
+            lost.
+        speed_up: Factor by which its time runs faster than `clock`.
+        has_force_fingers: Whether it can be tared.
+        keeps_force_n: A fixed force limit that ignores commands, or None.
+        jammed: The jaws move and no motion ends.
+        silent: It receives commands and sends nothing.
+        mute_updates: It sends no automatic updates.
+        answers_bad_checksum: It answers damaged commands with an error instead of nothing.
+        error_on_disconnect: A lost client raises a FAST STOP.
+        next_status: Status by id that answers the next command of this id instead of its execution.
+        received: Ids of the last commands.
+        grasping: Grasping state of the protocol.
+        force_limit_n: Force limit.
+        soft_limits: Soft limits of the opening (mm), or None.
     """
 
     def __init__(
@@ -74,14 +84,14 @@ class EmulatedWSG50:
         self.soft_limits: tuple[float, float] | None = None
         self._running: tuple[int, Callable[[], int | None]] | None = None
         self._updates: dict[int, tuple[float, float]] = {}
-        """Of each command that updates itself: period and next time (s)."""
-        self._owed: list[Packet] = []
+        """Period and next time (s) of each automatic update."""
+        self._outgoing: list[Packet] = []
         self._announced = False
         self._now = clock()
 
     @property
     def object_mm(self) -> float | None:
-        """Width of what is between the jaws, or None."""
+        """Width of the object between the jaws, or None."""
         return self._jaws.object_mm
 
     @object_mm.setter
@@ -91,21 +101,21 @@ class EmulatedWSG50:
 
     @property
     def opening_mm(self) -> float:
-        """Where the jaws are now."""
+        """Current opening of the jaws."""
         with self._lock:
             self._advance()
             return self._jaws.opening_mm
 
     @property
     def moves(self) -> bool:
-        """Whether the jaws are on their way."""
+        """Whether the jaws move."""
         with self._lock:
             self._advance()
             return self._jaws.moves
 
     @property
     def is_closing(self) -> bool:
-        """Whether the jaws are on their way to close on something."""
+        """Whether the jaws close for a grasp."""
         return self.moves and self.grasping == GRASPING
 
     @property
@@ -114,38 +124,38 @@ class EmulatedWSG50:
         return FAST_STOP_BIT in self._bits
 
     def warn(self, fault: str) -> None:
-        """Raise the flag of a fault of FAULT_BITS, and no more."""
+        """Set only the flag of a fault of FAULT_BITS."""
         with self._lock:
             self._bits.add(FAULT_BITS[fault])
 
     def fail(self, fault: str | None = None) -> None:
-        """Raise a FAST STOP, with the flag of a fault of FAULT_BITS."""
+        """Raise a FAST STOP and set the flag of a fault of FAULT_BITS."""
         with self._lock:
             self._bits |= {FAST_STOP_BIT} | ({FAULT_BITS[fault]} if fault else set())
             self._stand()
             self.grasping = ERROR
 
     def lose_reference(self) -> None:
-        """As after a loss of power."""
+        """Require homing, as after a loss of power."""
         with self._lock:
             self._bits.discard(REFERENCED_BIT)
 
     def connected(self) -> None:
-        """A client has come."""
+        """Handle a new client."""
         with self._lock:
             self._announced = False
             self._updates.clear()
 
     def disconnected(self) -> None:
-        """The client has gone: a FAST STOP, unless it said so before."""
+        """Handle the loss of the client: a FAST STOP, unless the client announced it."""
         with self._lock:
             self._updates.clear()
             if self.error_on_disconnect and not self._announced:
                 self.fail()
-            self._owed.clear()
+            self._outgoing.clear()
 
     def receive(self, packet: Packet) -> list[Packet]:
-        """Do a command; returns what it answers at once."""
+        """Execute a command and return the immediate answers."""
         with self._lock:
             self._advance()
             self.received.append(packet.id)
@@ -153,39 +163,41 @@ class EmulatedWSG50:
             forced = self.next_status.pop(packet.id, None)
             answer = self._answer(packet.id, packet.payload) if forced is None else forced
             if not isinstance(answer, int) and len(answer) > MAX_PAYLOAD - 2:
-                answer = RANGE  # no room for it beside the status
-            self._owed.append(Packet(packet.id, _status(answer) if isinstance(answer, int) else _status(OK) + answer))
-            return self._say()
+                answer = RANGE  # too long for a packet with the status
+            self._outgoing.append(
+                Packet(packet.id, _status(answer) if isinstance(answer, int) else _status(OK) + answer)
+            )
+            return self._take_packets()
 
     def receive_damaged(self, command: int) -> list[Packet]:
-        """What it says to a command whose check sum does not hold."""
+        """Return the answers to a command with a wrong checksum."""
         with self._lock:
             if self.answers_bad_checksum:
-                self._owed.append(Packet(command, _status(DAMAGED)))
-            return self._say()
+                self._outgoing.append(Packet(command, _status(DAMAGED)))
+            return self._take_packets()
 
     def tick(self) -> list[Packet]:
-        """Let time pass up to now; returns results of motions, and automatic updates."""
+        """Let time pass up to now; return results of motions and automatic updates."""
         with self._lock:
             self._advance()
-            self._owed += self._ended()
+            self._outgoing += self._ended()
             for command, (period_s, next_s) in self._updates.items():
                 if self._now >= next_s:
                     self._updates[command] = period_s, max(next_s + period_s, self._now)
                     if not self.mute_updates:
-                        self._owed.append(Packet(command, _status(OK) + self._value(command)))
-            return self._say()
+                        self._outgoing.append(Packet(command, _status(OK) + self._value(command)))
+            return self._take_packets()
 
-    def _say(self) -> list[Packet]:
-        said, self._owed = self._owed, []
-        return [] if self.silent else said
+    def _take_packets(self) -> list[Packet]:
+        packets, self._outgoing = self._outgoing, []
+        return [] if self.silent else packets
 
     def _stand(self) -> None:
-        """Stop dead; a motion that was running is answered as aborted."""
+        """Stop immediately; a running motion is answered as aborted."""
         self._jaws.stand()
         self._bits.discard(FORCE_BIT)
         if self._running:
-            self._owed.append(Packet(self._running[0], _status(ABORTED)))
+            self._outgoing.append(Packet(self._running[0], _status(ABORTED)))
             self._running = None
 
     def _advance(self) -> None:
@@ -195,7 +207,7 @@ class EmulatedWSG50:
             self._jaws.advance(passed * self.speed_up)
 
     def _ended(self) -> Iterator[Packet]:
-        """The result of a motion that has ended; a held part that is gone."""
+        """Yield the result of an ended motion; detect the loss of a held part."""
         if self._running and (status := self._running[1]()) is not None:
             command, self._running = self._running[0], None
             yield Packet(command, _status(status))
@@ -206,13 +218,13 @@ class EmulatedWSG50:
     def _answer(self, command: int, payload: bytes) -> Answer:
         if command not in _ACTIONS and command not in UPDATES:
             return UNKNOWN
-        want = 3 if command in UPDATES else LENGTHS.get(command, 0)
-        if command != 0x06 and len(payload) != want:
-            return FEW_PARAMS if len(payload) < want else FORMAT if want else NO_PARAM
+        expected = 3 if command in UPDATES else LENGTHS.get(command, 0)
+        if command != 0x06 and len(payload) != expected:
+            return FEW_PARAMS if len(payload) < expected else FORMAT if expected else NO_PARAM
         return self._update(command, payload) if command in UPDATES else _ACTIONS[command](self, payload)
 
     def _update(self, command: int, payload: bytes) -> Answer:
-        """Begin or end what flags u8 and period u16 (ms) ask for."""
+        """Start or stop automatic updates: flags u8, period u16 (ms)."""
         flags, period_s = payload[0], (payload[1] | payload[2] << 8) / 1000
         self._updates.pop(command, None)
         if flags > 1 or (flags and not period_s):
@@ -230,12 +242,12 @@ class EmulatedWSG50:
         return struct.pack("<f", self._jaws.opening_mm if command == 0x43 else force)
 
     def _flags(self) -> set[int]:
-        now = {
+        states = {
             MOVING_BIT: self._jaws.moves,
             MINUS_BIT: self._jaws.blocked < 0,
             PLUS_BIT: self._jaws.blocked > 0,
         }
-        return self._bits | {bit for bit, on in now.items() if on}
+        return self._bits | {bit for bit, is_set in states.items() if is_set}
 
     def _begin(self, command: int, state: int, to_mm: float, speed: float, ended: Callable[[], int | None]) -> int:
         self._bits -= {STOPPED_BIT, REACHED_BIT, FORCE_BIT}
@@ -244,7 +256,7 @@ class EmulatedWSG50:
         return PENDING
 
     def _refusal(self, states: Sequence[int], width: float, speed: float) -> int | None:
-        """Why a motion cannot be begun now."""
+        """Return the status that refuses a motion now, or None."""
         if FAST_STOP_BIT in self._bits:
             return DENIED
         if self._running:
@@ -354,7 +366,7 @@ class EmulatedWSG50:
         return refused
 
     def _unsettable(self, in_range: bool) -> int:
-        """Changing parameters while it moves raises a FAST STOP."""
+        """Return the status of a change of parameters; a change during a motion raises a FAST STOP."""
         if self._jaws.moves:
             self.fail()
             return DENIED
@@ -381,11 +393,11 @@ _ACTIONS: dict[int, Callable[[EmulatedWSG50, bytes], Answer]] = {
     0x25: EmulatedWSG50._grasp,
     0x26: EmulatedWSG50._release,
     0x30: EmulatedWSG50._set_acceleration,
-    0x31: lambda own, _: struct.pack("<f", own._jaws.acceleration_mm_s2),
+    0x31: lambda gripper, _: struct.pack("<f", gripper._jaws.acceleration_mm_s2),
     0x32: EmulatedWSG50._set_force,
-    0x33: lambda own, _: struct.pack("<f", own.force_limit_n),
+    0x33: lambda gripper, _: struct.pack("<f", gripper.force_limit_n),
     0x34: EmulatedWSG50._set_soft_limits,
-    0x35: lambda own, _: struct.pack("<ff", *own.soft_limits) if own.soft_limits else NOT_AVAILABLE,
+    0x35: lambda gripper, _: struct.pack("<ff", *gripper.soft_limits) if gripper.soft_limits else NOT_AVAILABLE,
     0x38: EmulatedWSG50._tare,
     0x50: lambda _, payload: struct.pack("<BBHI", 1, 6, 0x4000, 20260101),
     0x53: lambda _, payload: struct.pack("<8f", STROKE_MM, *SPEEDS, *ACCELERATIONS, *FORCES, 120.0),

@@ -1,4 +1,4 @@
-"""An emulated WSG-50 on a real port, TCP or pseudo-terminal, with faults on the line.
+"""An emulated WSG-50 on a real port, TCP or pseudo-terminal, with line faults.
 
     python -m tests.emulators.wsg50.server --tcp 10000 --object-mm 40 [--faults 0.02 --seed 0]
     python -m tests.emulators.wsg50.server --pty
@@ -34,12 +34,12 @@ _CHUNK = 4096
 
 
 class _Cut(Exception):
-    """The line is gone."""
+    """The line was cut."""
 
 
 @contextlib.contextmanager
 def serve_tcp(emulator: EmulatedWSG50, faults: LineFaults | None = None, *, port: int = 0) -> Iterator[str]:
-    """Serve one client at a time on 127.0.0.1; gives the URL for the driver. port 0: any free one."""
+    """Serve one client at a time on 127.0.0.1 and yield the URL for the driver. Port 0 chooses a free port."""
     with socket.create_server(("127.0.0.1", port)) as server:
         server.settimeout(0.02)
 
@@ -57,8 +57,10 @@ def serve_tcp(emulator: EmulatedWSG50, faults: LineFaults | None = None, *, port
 
 @contextlib.contextmanager
 def serve_pty(emulator: EmulatedWSG50, faults: LineFaults | None = None) -> Iterator[str]:
-    """Serve a pseudo-terminal; gives a path that stays the same when the line was cut. A serial line that is cut or
-    closed raises no FAST STOP: the gripper does not notice."""
+    """Serve a pseudo-terminal and yield its path, which stays the same after a cut.
+
+    A cut or closed serial line does not raise a FAST STOP, because the gripper does not notice it.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "wsg50"
         first = [_Terminal(path)]
@@ -92,11 +94,11 @@ class _Socket:
 
 
 class _Terminal:
-    """The gripper's end of a pseudo-terminal; `path` leads to the other end."""
+    """The gripper's end of a pseudo-terminal; `path` is a link to the other end."""
 
     def __init__(self, path: Path) -> None:
         self._own, self._other = os.openpty()
-        tty.setraw(self._other)  # kept open, so that clients may come and go
+        tty.setraw(self._other)  # stays open, so that clients can reconnect
         os.set_blocking(self._own, False)
         fresh = path.with_suffix(".new")
         fresh.symlink_to(os.ttyname(self._other))
@@ -109,7 +111,7 @@ class _Terminal:
         return os.read(self._own, _CHUNK)
 
     def write(self, data: bytes) -> None:
-        with contextlib.suppress(BlockingIOError):  # nobody reads: as on a wire, it is lost
+        with contextlib.suppress(BlockingIOError):  # without a reader the bytes are lost, as on a wire
             os.write(self._own, data)
 
     def close(self) -> None:
@@ -118,7 +120,7 @@ class _Terminal:
 
 
 _Line = _Socket | _Terminal
-"""Bytes to and from one client; reading and writing raise OSError where it is gone."""
+"""Bytes to and from one client; reading and writing raise OSError after it disconnected."""
 
 
 @contextlib.contextmanager
@@ -139,13 +141,13 @@ def _serve(
     wait_for_client: Callable[[threading.Event], _Line | None],
     stop: threading.Event,
 ) -> None:
-    """Client after client, whatever one of them has sent."""
+    """Serve one client after another, whatever they send."""
     while (line := wait_for_client(stop)) is not None:
         emulator.connected()
         try:
             _Session(emulator, faults, line).run(stop)
         except (OSError, _Cut):
-            pass  # the client has gone
+            pass  # the client disconnected
         except Exception:
             _log.exception("the emulated gripper failed on what a client sent; the next client is served")
         line.close()
@@ -154,45 +156,45 @@ def _serve(
 
 
 class _Session:
-    """One client's time with the gripper."""
+    """The connection of one client."""
 
     def __init__(self, emulator: EmulatedWSG50, faults: LineFaults, line: _Line) -> None:
         self.emulator, self.faults, self.line = emulator, faults, line
-        self._arrived, self._heard = bytearray(), bytearray()
+        self._arrived, self._received = bytearray(), bytearray()
 
     def run(self, stop: threading.Event) -> None:
-        """Until told to stop, or the client goes."""
+        """Serve until `stop` is set or the client disconnects."""
         while not stop.is_set():
             if select.select([self.line.fileno()], [], [], _TICK_S)[0]:
-                self._hear()
+                self._receive()
             for packet in self.emulator.tick():
-                if packet.id in UPDATES:  # faults are for commands and what answers them
+                if packet.id in UPDATES:  # faults apply to commands and their replies only
                     self.line.write(encode(packet))
                 else:
-                    self._say(packet)
+                    self._send(packet)
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         data = self.line.read()
         if not data:
             raise _Cut
         self._arrived += data
         for noise, command in _packets(self._arrived):
-            self._take(noise)
+            self._handle(noise)
             for piece in self.faults.on(command) if command else ():
                 time.sleep(piece.pause_s)
                 if piece.data is None:
                     raise _Cut
-                self._take(piece.data)
+                self._handle(piece.data)
 
-    def _take(self, data: bytes) -> None:
-        """What is left of what was sent, after its faults."""
-        self._heard += data
-        for noise, command in _packets(self._heard):
-            answers = [answer for each in _damaged(noise) for answer in self.emulator.receive_damaged(each)]
+    def _handle(self, data: bytes) -> None:
+        """Handle the bytes that remain of the sent ones after faults."""
+        self._received += data
+        for noise, command in _packets(self._received):
+            answers = [answer for command_id in _damaged(noise) for answer in self.emulator.receive_damaged(command_id)]
             for answer in answers + (self.emulator.receive(command) if command else []):
-                self._say(answer)
+                self._send(answer)
 
-    def _say(self, packet: Packet) -> None:
+    def _send(self, packet: Packet) -> None:
         for piece in self.faults.on(packet):
             time.sleep(piece.pause_s)
             if piece.data is None:
@@ -201,7 +203,7 @@ class _Session:
 
 
 def _packets(buffer: bytearray) -> Iterator[tuple[bytes, Packet | None]]:
-    """Take the whole packets out of a buffer, each with the noise before it; at last the noise behind them."""
+    """Remove the complete packets from a buffer, each with the noise before it; finally the noise behind them."""
     while True:
         used, packet = decode(buffer)
         noise = bytes(buffer[: used - len(encode(packet))] if packet else buffer[:used])
@@ -212,20 +214,20 @@ def _packets(buffer: bytearray) -> Iterator[tuple[bytes, Packet | None]]:
 
 
 def _damaged(noise: bytes) -> Iterator[int]:
-    """Ids of the packets that have begun in noise."""
-    for begun in noise.split(PREAMBLE)[1:]:
-        yield from begun.lstrip(PREAMBLE)[:1]
+    """Yield the ids of packets that start in the noise."""
+    for start in noise.split(PREAMBLE)[1:]:
+        yield from start.lstrip(PREAMBLE)[:1]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Serve until interrupted; the address to connect to is the first line printed."""
+    """Serve until interrupted; the first printed line is the address for clients."""
     parser = argparse.ArgumentParser(description="An emulated WSG-50 gripper.")
     port = parser.add_mutually_exclusive_group(required=True)
     port.add_argument("--tcp", type=int, metavar="PORT", help="listen on 127.0.0.1 (0: any free port)")
-    port.add_argument("--pty", action="store_true", help="make a pseudo-terminal")
+    port.add_argument("--pty", action="store_true", help="create a pseudo-terminal")
     parser.add_argument("--object-mm", type=float, help="width of an object between the jaws")
-    parser.add_argument("--speed-up", type=float, default=1.0, help="how much faster its time runs")
-    parser.add_argument("--faults", type=float, default=0.0, metavar="RATE", help="share of packets that meet a fault")
+    parser.add_argument("--speed-up", type=float, default=1.0, help="factor by which its time runs faster")
+    parser.add_argument("--faults", type=float, default=0.0, metavar="RATE", help="fraction of packets with a fault")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
     emulator = EmulatedWSG50(object_mm=options.object_mm, speed_up=options.speed_up)
@@ -236,7 +238,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(address, flush=True)
             threading.Event().wait()
     except OSError as error:
-        parser.error(f"it must be served somewhere, and cannot be: {error.strerror}; try another port, --tcp 0 for any")
+        parser.error(f"the address cannot be served: {error.strerror}; try another port, or --tcp 0 for a free one")
     print(f"faults: {faults.counts}", file=sys.stderr)
 
 

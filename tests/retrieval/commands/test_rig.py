@@ -1,4 +1,4 @@
-"""`retrieve rig` and the dry run, as a user meets them."""
+"""`retrieve rig` and the dry run, for users."""
 
 import json
 import signal
@@ -24,28 +24,28 @@ def test_a_check_prints_a_line_for_each_device(capsys, monkeypatch):
     ]
 
 
-def test_a_check_with_a_device_that_fails_leaves_with_1_and_names_it(capsys, monkeypatch):
+def test_a_check_with_a_failing_device_exits_with_1_and_names_it(capsys, monkeypatch):
     def missing(self):
         raise OSError(2, "No such file or directory")
 
     monkeypatch.setattr("tests.fake_rig.FakeCamera._connect", missing)
     assert main(["rig", "check", "--rig", "tests.fake_rig:FakeRig", "--json"]) == 1
-    said = capsys.readouterr()
-    rows = json.loads(said.out)["devices"]
+    output = capsys.readouterr()
+    rows = json.loads(output.out)["devices"]
     assert rows[4]["failure"] == "fake camera cannot be connected: No such file or directory"
     assert [row["failure"] for row in rows].count(None) == 5
-    assert "1 of 6 checks failed" in said.err
+    assert "1 of 6 checks failed" in output.err
 
 
-def test_without_a_rig_what_is_connected_is_listed_as_lines_for_its_file(capsys, monkeypatch):
+def test_without_a_rig_connected_devices_are_listed_as_lines_for_a_rig_file(capsys, monkeypatch):
     found = [
         DiscoveredDevice("camera", "/dev/v4l/by-id/x", "GelSight Mini R0B", '[sensors.a]\ndriver = "gelsight_mini"')
     ]
     monkeypatch.setattr("robot.drivers.discover.discover", lambda: found)
     assert main(["rig", "check"]) == 0
-    said = capsys.readouterr()
-    assert said.out == '# camera: GelSight Mini R0B\n[sensors.a]\ndriver = "gelsight_mini"\n\n'
-    assert "1 device(s) found" in said.err
+    output = capsys.readouterr()
+    assert output.out == '# camera: GelSight Mini R0B\n[sensors.a]\ndriver = "gelsight_mini"\n\n'
+    assert "1 device(s) found" in output.err
     assert main(["rig", "check", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["found"][0]["device"] == "/dev/v4l/by-id/x"
     monkeypatch.setattr("robot.drivers.discover.discover", list)
@@ -63,18 +63,18 @@ POINTS = """camera_x_mm,camera_y_mm,camera_z_mm,rig_x_mm,rig_y_mm,rig_z_mm
 """
 
 
-def test_a_calibration_is_fitted_told_and_written(here, capsys):
+def test_a_calibration_is_fitted_printed_and_written(here, capsys):
     (here / "points.csv").write_text(POINTS)
     assert main(["rig", "calibrate", "points.csv"]) == 0
-    said = capsys.readouterr().err.splitlines()
-    assert said[0].startswith("rigid: ")
-    assert said[1].startswith("affine: ")
-    assert said[-1] == "hand_eye.json: written from 6 points; name it as hand_eye under [camera]"
+    output = capsys.readouterr().err.splitlines()
+    assert output[0].startswith("rigid: ")
+    assert output[1].startswith("affine: ")
+    assert output[-1] == "hand_eye.json: fitted to 6 points; set hand_eye to this file under [camera]"
     rigid = json.loads((here / "hand_eye.json").read_text())["rigid"]
     assert [row[3] for row in rigid] == pytest.approx([0, 0, 800, 1], abs=1e-6)
 
 
-def test_a_calibration_is_written_over_an_earlier_one_and_over_nothing_else(here, capsys):
+def test_a_calibration_overwrites_only_an_earlier_calibration(here, capsys):
     (here / "points.csv").write_text(POINTS)
     for _ in range(2):
         assert main(["rig", "calibrate", "points.csv"]) == 0
@@ -84,15 +84,15 @@ def test_a_calibration_is_written_over_an_earlier_one_and_over_nothing_else(here
     assert (here / "photo.png").read_bytes() == b"\x89PNG"
 
 
-def test_a_calibration_by_which_no_arm_can_be_steered_is_not_written(here, capsys):
+def test_a_calibration_with_large_errors_is_not_written(here, capsys):
     lines = POINTS.splitlines()
     rows = [[float(value) for value in line.split(",")] for line in lines[1:]]
-    in_metres = [",".join(map(str, [each / 1000 for each in row[:3]] + row[3:])) for row in rows]
+    in_metres = [",".join(map(str, [value / 1000 for value in row[:3]] + row[3:])) for row in rows]
     (here / "points.csv").write_text("\n".join([lines[0], *in_metres]))
     assert main(["rig", "calibrate", "points.csv"]) == 1
-    said = capsys.readouterr().err
-    assert "metre" in said
-    assert "nothing was written" in said
+    output = capsys.readouterr().err
+    assert "metre" in output
+    assert "nothing was written" in output
     assert not (here / "hand_eye.json").exists()
 
 
@@ -105,13 +105,13 @@ def test_a_file_without_points_is_wrong_use(here, capsys):
 
 def test_a_dry_run_prints_motions_and_writes_nothing(here, capsys):
     assert main(["collect", "--rig", "tests.fake_rig:FakeRig", "--objects", "2", "--out", "rec", "--dry-run"]) == 0
-    said = capsys.readouterr()
-    assert said.out.count("jaws: close with") == 2
-    assert "round-1: nothing was moved, nothing was recorded" in said.err
+    output = capsys.readouterr()
+    assert output.out.count("jaws: close with") == 2
+    assert "round-1: nothing moved, nothing was recorded" in output.err
     assert not (here / "rec").exists()
 
 
-def test_a_collection_that_is_told_to_end_opens_its_jaws_closes_its_rig_and_leaves_a_whole_recording(
+def test_a_collection_ended_by_sigterm_opens_its_jaws_closes_its_rig_and_leaves_a_complete_recording(
     here, capsys, monkeypatch
 ):
     from tests.fake_rig import FakeGripper, FakeRig
@@ -120,14 +120,14 @@ def test_a_collection_that_is_told_to_end_opens_its_jaws_closes_its_rig_and_leav
     collect += ["--seed", "3", "--out", "rec"]
     rigs, real_prepare, real_grasp = [], FakeRig.prepare, FakeGripper._grasp
 
-    def ended(self, force_n, speed_mm_s):
+    def interrupted_grasp(self, force_n, speed_mm_s):
         state = real_grasp(self, force_n, speed_mm_s)
         if self.world.calls.count("grasp") == 3:
             signal.raise_signal(signal.SIGTERM)
         return state
 
-    monkeypatch.setattr(FakeGripper, "_grasp", ended)
-    monkeypatch.setattr(FakeRig, "prepare", lambda self, *which: (rigs.append(self), real_prepare(self, *which))[1])
+    monkeypatch.setattr(FakeGripper, "_grasp", interrupted_grasp)
+    monkeypatch.setattr(FakeRig, "prepare", lambda self, *attempt: (rigs.append(self), real_prepare(self, *attempt))[1])
     before = signal.getsignal(signal.SIGTERM)
     assert main(collect) == 1
     assert capsys.readouterr().err.endswith("retrieve collect: stopped by SIGTERM\n")

@@ -1,4 +1,4 @@
-"""Exporters: what other programs read, opened by their own readers where they are installed."""
+"""Exporters: their output is opened with the readers of other programs if these are installed."""
 
 import json
 import shutil
@@ -18,15 +18,15 @@ RNG = np.random.default_rng(0)
 
 
 def smooth(height, width):
-    """A picture like a gel's: soft colours."""
+    """Return a picture with smooth colours, like a gel."""
     return cv2.resize(RNG.integers(40, 215, (4, 4, 3), dtype=np.uint8), (width, height), interpolation=cv2.INTER_CUBIC)
 
 
 @pytest.fixture(scope="module")
 def source(tmp_path_factory):
-    """Three objects with two grasps each, two fingers, before and during; photos of another size in the last grasp."""
+    """Three objects with two grasps each: two fingers, before and during; the last photo has another size."""
     folder = tmp_path_factory.mktemp("source") / "recording"
-    info = {"source": "made up", "sensor": "GelSight Mini", "licence": "CC0", "background": "before each grasp"}
+    info = {"source": "synthetic", "sensor": "GelSight Mini", "licence": "CC0", "background": "before each grasp"}
     with RecordingWriter(folder, info) as writer:
         for number in range(6):
             images = {"photo": smooth(30, 40) if number < 5 else smooth(48, 48)}
@@ -59,7 +59,7 @@ def rms(one, other):
     return float(np.sqrt(np.mean((one.astype(float) - other.astype(float)) ** 2)))
 
 
-# What holds for each ---------------------------------------------------------------------------------------
+# Common behaviour -------------------------------------------------------------------------------------------
 
 
 def test_an_unknown_format_lists_the_known_ones():
@@ -67,20 +67,20 @@ def test_an_unknown_format_lists_the_known_ones():
         EXPORTERS.load("zarr")
 
 
-def test_an_export_is_there_when_it_is_whole_and_tells_how_far_it_is(name, source, tmp_path):
-    told = []
+def test_an_export_appears_when_it_is_complete_and_reports_progress(name, source, tmp_path):
+    calls = []
     out = tmp_path / "out"
 
-    def look(done, total):
-        told.append((done, total, out.exists()))
+    def progress(done, total):
+        calls.append((done, total, out.exists()))
 
-    written = EXPORTERS.load(name)(source, out, progress=look)
-    assert told == [(done, 6, False) for done in range(1, 7)]
-    assert written.grasps == 6
+    result = EXPORTERS.load(name)(source, out, progress=progress)
+    assert calls == [(done, 6, False) for done in range(1, 7)]
+    assert result.grasps == 6
     assert {path.name for path in tmp_path.iterdir()} == {"out"}
 
 
-def test_an_export_that_is_stopped_leaves_nothing_and_is_made_anew(name, source, tmp_path):
+def test_a_stopped_export_leaves_no_output_and_starts_again(name, source, tmp_path):
     def stop(done, total):
         if done == 4:
             raise KeyboardInterrupt
@@ -88,13 +88,13 @@ def test_an_export_that_is_stopped_leaves_nothing_and_is_made_anew(name, source,
     with pytest.raises(KeyboardInterrupt):
         EXPORTERS.load(name)(source, tmp_path / "out", progress=stop)
     assert not (tmp_path / "out").exists()
-    (tmp_path / "out.part" / "rest of it").write_text("half")
+    (tmp_path / "out.part" / "old file").write_text("old")
     EXPORTERS.load(name)(source, tmp_path / "out")
     assert {path.name for path in tmp_path.iterdir()} == {"out"}
-    assert not list((tmp_path / "out").rglob("rest of it"))
+    assert not list((tmp_path / "out").rglob("old file"))
 
 
-def test_a_folder_with_something_in_it_is_refused_and_an_empty_one_is_used(name, source, tmp_path):
+def test_a_folder_with_files_is_refused_and_an_empty_one_is_used(name, source, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine.txt").write_text("mine")
     with pytest.raises(RecordingError, match="must be a new or an empty folder"):
@@ -104,7 +104,7 @@ def test_a_folder_with_something_in_it_is_refused_and_an_empty_one_is_used(name,
     assert EXPORTERS.load(name)(source, tmp_path / "out").grasps == 6
 
 
-def test_a_broken_picture_is_named_and_nothing_stands_there(name, source, tmp_path):
+def test_an_error_names_a_damaged_picture_and_nothing_is_written(name, source, tmp_path):
     shutil.copytree(source.folder, tmp_path / "r")
     recording = read_recording(tmp_path / "r")
     path = tmp_path / "r" / recording.grasps[4].touches["b"]
@@ -114,14 +114,14 @@ def test_a_broken_picture_is_named_and_nothing_stands_there(name, source, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
-def test_a_split_with_an_object_on_two_sides_or_of_other_objects_is_refused(name, source, tmp_path):
+def test_a_split_with_an_object_in_two_parts_or_with_other_objects_is_refused(name, source, tmp_path):
     with pytest.raises(RecordingError, match="has object 0 in two parts"):
         EXPORTERS.load(name)(source, tmp_path / "out", parts={"train": ["object 0"], "test": ["object 0"]})
-    with pytest.raises(RecordingError, match="names no object of the recording"):
+    with pytest.raises(RecordingError, match="contains no object of the recording"):
         EXPORTERS.load(name)(source, tmp_path / "out", parts={"train": ["mug"]})
 
 
-def test_a_missing_package_is_a_sentence_with_the_extra(source, tmp_path, monkeypatch):
+def test_an_error_names_the_extra_if_a_package_is_missing(source, tmp_path, monkeypatch):
     for package, to in (("pyarrow", "lerobot"), ("av", "lerobot"), ("zarr", "open-x-tactile")):
         with monkeypatch.context() as patch:
             patch.setitem(__import__("sys").modules, package, None)
@@ -130,8 +130,8 @@ def test_a_missing_package_is_a_sentence_with_the_extra(source, tmp_path, monkey
     assert not (tmp_path / "out").exists()
 
 
-def test_grasps_that_differ_in_their_fingers_are_refused_where_steps_are_written(tmp_path):
-    with RecordingWriter(tmp_path / "r", {"source": "made up", "sensor": "gel"}) as writer:
+def test_grasps_with_different_fingers_are_refused_by_formats_with_steps(tmp_path):
+    with RecordingWriter(tmp_path / "r", {"source": "synthetic", "sensor": "gel"}) as writer:
         writer.append("1", "mug", {"photo": smooth(9, 9), "touch_a": smooth(9, 9)})
         writer.append("2", "mug", {"photo": smooth(9, 9), "touch_a": smooth(9, 9), "touch_b": smooth(9, 9)})
     for to in ("lerobot", "open-x-tactile"):
@@ -150,15 +150,18 @@ def test_two_exports_to_one_folder_do_not_mix(tmp_path):
     assert (tmp_path / "out").is_dir()
 
 
-def test_what_stands_where_the_half_made_folder_goes_is_not_touched(tmp_path):
+def test_a_foreign_folder_with_the_temporary_name_is_not_changed(tmp_path):
     (tmp_path / "out.part").mkdir()
     (tmp_path / "out.part" / "mine.txt").write_text("mine")
-    with pytest.raises(RecordingError, match="in the way and no export made it"), atomic_folder(tmp_path / "out"):
+    with (
+        pytest.raises(RecordingError, match="already exists and is not from an export"),
+        atomic_folder(tmp_path / "out"),
+    ):
         pass
     assert (tmp_path / "out.part" / "mine.txt").read_text() == "mine"
 
 
-def test_a_picture_is_fitted_whole_into_the_middle():
+def test_a_picture_is_scaled_into_the_middle():
     found = letterbox(np.full((10, 20, 3), 200, np.uint8), (40, 40))
     assert found.shape == (40, 40, 3)
     assert (found[10:30] == 200).all()
@@ -171,7 +174,7 @@ def test_a_picture_is_fitted_whole_into_the_middle():
 
 def test_datasets_opens_an_imagefolder_with_its_parts(source, tmp_path):
     datasets = pytest.importorskip("datasets")
-    written = EXPORTERS.load("imagefolder")(source, tmp_path / "out", parts=SPLIT)
+    result = EXPORTERS.load("imagefolder")(source, tmp_path / "out", parts=SPLIT)
     found = datasets.load_dataset("imagefolder", data_dir=str(tmp_path / "out"), cache_dir=str(tmp_path / "cache"))
     assert {part: rows.num_rows for part, rows in found.items()} == {"train": 2, "test": 2}
     row, grasp = found["test"][1], source.grasps[5]
@@ -179,12 +182,14 @@ def test_datasets_opens_an_imagefolder_with_its_parts(source, tmp_path):
     for column in ("photo", "touch_a", "touch_b", "touch_a_before"):
         assert np.array_equal(np.asarray(row[column]), picture(source, grasp, column))
     assert "touch_a_after" not in row
-    assert any(note.startswith("left out touch_a_after, which grasps lack") for note in written.notes)
+    assert any(note.startswith("left out touch_a_after, which some grasps do not have") for note in result.notes)
 
 
-def test_datasets_opens_a_recording_as_it_is(source, tmp_path):
+def test_datasets_opens_a_recording_directly(source, tmp_path):
     datasets = pytest.importorskip("datasets")
-    lines = (source.folder / "metadata.jsonl").read_text().splitlines()[1:]  # the first has pictures after the touch
+    lines = (
+        (source.folder / "metadata.jsonl").read_text().splitlines()[1:]
+    )  # the first line has pictures after the touch
     shutil.copytree(source.folder, tmp_path / "r")
     (tmp_path / "r/metadata.jsonl").write_text("\n".join(lines))
     found = datasets.load_dataset("imagefolder", data_dir=str(tmp_path / "r"), cache_dir=str(tmp_path / "cache"))
@@ -194,7 +199,7 @@ def test_datasets_opens_a_recording_as_it_is(source, tmp_path):
     assert found["train"]["force_n"] == [None, 3.5, 4.5, 5.5, 6.5, 7.5]
 
 
-def test_an_imagefolder_copies_files_byte_for_byte_and_says_the_licence(source, tmp_path):
+def test_an_imagefolder_copies_files_byte_for_byte_and_states_the_licence(source, tmp_path):
     EXPORTERS.load("imagefolder")(source, tmp_path / "out")
     name = source.grasps[2].photo
     assert (tmp_path / "out" / "train" / name).read_bytes() == (source.folder / name).read_bytes()
@@ -204,9 +209,9 @@ def test_an_imagefolder_copies_files_byte_for_byte_and_says_the_licence(source, 
 # open-x-tactile --------------------------------------------------------------------------------------------
 
 
-def test_zarr_opens_what_open_x_tactile_reads(source, tmp_path):
+def test_zarr_opens_an_open_x_tactile_export(source, tmp_path):
     zarr = pytest.importorskip("zarr")
-    written = EXPORTERS.load("open-x-tactile")(source, tmp_path / "out")
+    result = EXPORTERS.load("open-x-tactile")(source, tmp_path / "out")
     store = zarr.open_group(str(tmp_path / "out" / "grasps.zarr"), mode="r")
     assert store.metadata.zarr_format == 2
     assert store["meta/episode_ends"][:].tolist() == [2, 4, 6, 8, 10, 12]
@@ -223,19 +228,19 @@ def test_zarr_opens_what_open_x_tactile_reads(source, tmp_path):
     assert store["meta/grasped"][:].tolist() == [1, 1, 1, 0, 1, 1]
     assert np.isnan(store["meta/force_n"][0])
     assert store["meta/pose"][1].tolist() == [1.0, 2.0, 3.0, 0.5]
-    assert written.notes == (
-        "frames after the touch are left out: not every grasp has them",
-        "photo: 1 grasp(s) had another size, and were fitted into 40 x 30 before black",
+    assert result.notes == (
+        "frames after the touch are left out because some grasps do not have them",
+        "photo: 1 grasp(s) had another size and were resized to 40 x 30 with black borders",
     )
 
 
-def test_open_x_tactile_keeps_a_split_as_ranges_of_episodes(source, tmp_path):
+def test_open_x_tactile_stores_a_split_as_ranges_of_episodes(source, tmp_path):
     zarr = pytest.importorskip("zarr")
-    written = EXPORTERS.load("open-x-tactile")(source, tmp_path / "out", parts=SPLIT)
+    result = EXPORTERS.load("open-x-tactile")(source, tmp_path / "out", parts=SPLIT)
     store = zarr.open_group(str(tmp_path / "out" / "grasps.zarr"), mode="r")
     assert store.attrs["splits"] == {"train": [0, 2], "test": [2, 4]}
     assert store["meta/object_id"][:].tolist() == ["object 0"] * 2 + ["object 2"] * 2
-    assert written.notes[0] == "left out 2 grasp(s) of objects that the split does not name"
+    assert result.notes[0] == "left out 2 grasp(s) of objects that are not in the split"
 
 
 # LeRobot ---------------------------------------------------------------------------------------------------
@@ -254,8 +259,8 @@ def rows(parquet, paths):
 def frames_of(path):
     import av
 
-    with av.open(str(path)) as film:
-        return [(float(frame.time), frame.to_ndarray(format="rgb24")) for frame in film.decode(video=0)]
+    with av.open(str(path)) as video:
+        return [(float(frame.time), frame.to_ndarray(format="rgb24")) for frame in video.decode(video=0)]
 
 
 def test_pyarrow_and_av_open_a_lerobot_data_set(source, tmp_path, parquet, monkeypatch):
@@ -279,8 +284,8 @@ def test_pyarrow_and_av_open_a_lerobot_data_set(source, tmp_path, parquet, monke
         assert steps[episode["dataset_from_index"]]["episode_index"] == episode["episode_index"]
         for camera in ("touch_a", "touch_b"):
             key = f"observation.images.{camera}"
-            place = {name: episode[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
-            frames = dict(frames_of(out / info["video_path"].format(video_key=key, **place)))
+            numbers = {name: episode[f"videos/{key}/{name}"] for name in ("chunk_index", "file_index")}
+            frames = dict(frames_of(out / info["video_path"].format(video_key=key, **numbers)))
             start = episode[f"videos/{key}/from_timestamp"]
             assert rms(frames[start], picture(source, grasp, f"{camera}_before")) < 2.5
             assert rms(frames[start + 1], picture(source, grasp, camera)) < 2.5
@@ -309,16 +314,16 @@ def test_pandas_reads_the_tasks_as_lerobot_does(source, tmp_path, parquet):
 # The command -----------------------------------------------------------------------------------------------
 
 
-def test_the_command_writes_says_what_it_left_out_and_refuses_a_second_time(source, tmp_path, capsys):
+def test_the_command_writes_reports_left_out_grasps_and_refuses_a_second_run(source, tmp_path, capsys):
     options = ["export-recording", str(source.folder), "--to", "imagefolder", "--out", str(tmp_path / "out")]
     (tmp_path / "split.json").write_text(
-        json.dumps({"seed": 0, **{part: list(those) for part, those in SPLIT.items()}})
+        json.dumps({"seed": 0, **{part: list(objects) for part, objects in SPLIT.items()}})
     )
     assert main([*options, "--split", str(tmp_path / "split.json")]) == 0
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert "left out 2 grasp(s)" in said.err
-    assert f"{tmp_path / 'out'}: 4 grasps as imagefolder" in said.err
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert "left out 2 grasp(s)" in output.err
+    assert f"{tmp_path / 'out'}: 4 grasps as imagefolder" in output.err
     assert main(options) == 2
     assert "must be a new or an empty folder" in capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""Billets: what is theirs alone; what holds of every importer stands in test_robot_importers."""
+"""Importer of billets; test_importers.py tests the common behaviour."""
 
 import cv2
 import pytest
@@ -32,13 +32,13 @@ def test_the_files_are_copied_byte_for_byte(source, tmp_path):
     assert photo.read_bytes() == (source / "welded1/01_photo.jpg").read_bytes()
 
 
-def test_the_recording_names_the_licence_and_the_trap(source, tmp_path):
+def test_the_recording_states_the_licence_and_the_caveat(source, tmp_path):
     recording = import_billets(source, tmp_path / "out")
     assert "GPL-3.0" in recording.info["licence"]
-    assert "capture leaking" in recording.info["notes"][0]
+    assert "leakage from the capture" in recording.info["notes"][0]
 
 
-def test_incomplete_and_damaged_places_are_skipped_and_told(source, tmp_path):
+def test_incomplete_and_damaged_places_are_skipped_with_a_note(source, tmp_path):
     (source / "welded1/01_photo.jpg").unlink()
     (source / "welded1/02_touch.png").write_bytes(b"no picture")
     recording = import_billets(source, tmp_path / "out")
@@ -49,29 +49,29 @@ def test_incomplete_and_damaged_places_are_skipped_and_told(source, tmp_path):
     )
 
 
-def test_two_places_that_would_have_one_name_are_not_mixed(source, tmp_path):
+def test_two_places_with_the_same_grasp_id_are_not_mixed(source, tmp_path):
     for folder, place in (("a-b", "c"), ("a", "b-c")):
         picture(source / folder / f"{place}_touch.png", 1)
         picture(source / folder / f"{place}_photo.jpg", 2)
     recording = import_billets(source, tmp_path / "out")
     assert [grasp.sequence_id for grasp in recording.grasps if grasp.grasp_id == "a-b-c"] == ["a"]
-    assert any("another grasp has its name, such as a-b-c" in note for note in recording.notes)
+    assert any("another grasp has the same name, such as a-b-c" in note for note in recording.notes)
 
 
 def test_a_source_without_a_pair_is_a_clear_error(tmp_path):
     picture(tmp_path / "src/welded1/01_touch.png", 1)
-    with pytest.raises(ImporterError, match=r"must hold pairs <billet>/<place>_touch\.png"):
+    with pytest.raises(ImporterError, match=r"must contain pairs <billet>/<place>_touch\.png"):
         import_billets(tmp_path / "src", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_an_import_does_not_mix_with_another_recording(source, tmp_path):
+def test_an_import_into_another_recording_is_refused(source, tmp_path):
     RecordingWriter(tmp_path / "out", {"source": "sim", "sensor": "GelSight"}).close()
     with pytest.raises(RecordingError, match="was recorded with source 'sim'"):
         import_billets(source, tmp_path / "out")
 
 
-def test_the_real_billets_import_whole(tmp_path):
+def test_the_real_billets_are_imported_completely(tmp_path):
     recording = import_billets(touch_data("billets"), tmp_path / "out")
     assert len(recording.grasps) == 9 * 16
     assert len({grasp.sequence_id for grasp in recording.grasps}) == 9

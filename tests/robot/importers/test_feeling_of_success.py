@@ -1,4 +1,4 @@
-"""The Feeling of Success: HDF5 and what may be wrong with it; the rest stands in test_robot_importers."""
+"""Importer of The Feeling of Success, with damaged HDF5 files; test_importers.py tests the common behaviour."""
 
 import tempfile
 from pathlib import Path
@@ -29,7 +29,7 @@ def source(tmp_path):
 
 @pytest.fixture
 def data(source):
-    """/data of the first file, to be changed."""
+    """Open /data of the first file for changes."""
     with h5py.File(source / f"{FIRST}.h5", "r+") as file:
         yield file["data"]
 
@@ -38,31 +38,31 @@ def rgb(path):
     return cv2.imread(str(path))[..., ::-1]
 
 
-def test_the_tenth_grasp_comes_after_the_ninth_and_pictures_are_kept_as_they_are(source, tmp_path):
+def test_grasps_are_in_the_order_of_their_numbers_and_pictures_are_unchanged(source, tmp_path):
     recording = import_feeling_of_success(source, tmp_path / "out")
     assert [grasp.grasp_id for grasp in recording.grasps][9:11] == [f"{FIRST}-i9", f"{FIRST}-i10"]
     grasp = recording.grasps[3]
-    want = {"photo": 60, "touch_a": 66, "touch_b": 71, "touch_a_before": 65, "touch_b_after": 72}
-    for column, seed in want.items():
+    seeds = {"photo": 60, "touch_a": 66, "touch_b": 71, "touch_a_before": 65, "touch_b_after": 72}
+    for column, seed in seeds.items():
         size = (18, 32) if column == "photo" else (32, 24)
         np.testing.assert_array_equal(rgb(tmp_path / "out" / grasp.images()[column]), pixels(seed, size))
 
 
-def test_what_slipped_is_told_and_no_matcher_is_trained_on_it(source, tmp_path):
-    """Of the seeds 0, 20, ... 220 and 1000, 100 divides 0, 100, 200 and 1000."""
+def test_failed_grasps_are_marked_and_left_out_of_training(source, tmp_path):
+    """Seeds divisible by 100 fail: 0, 100, 200 and 1000 among 0, 20, ... 220 and 1000."""
     import_feeling_of_success(source, tmp_path / "out")
-    failed = [one.grasp.grasp_id for one in load_attempts(tmp_path / "out") if not one.held]
+    failed = [attempt.grasp.grasp_id for attempt in load_attempts(tmp_path / "out") if not attempt.held]
     assert failed == [f"{FIRST}-i0", f"{FIRST}-i5", f"{FIRST}-i10", "calandra_corl2017_001-i0"]
     assert len(load_grasps(tmp_path / "out")) == 9
 
 
-def test_grasps_of_one_object_in_a_row_are_a_sequence(source, tmp_path):
+def test_consecutive_grasps_of_one_object_are_a_sequence(source, tmp_path):
     recording = import_feeling_of_success(source, tmp_path / "out")
     assert [grasp.sequence_id for grasp in recording.grasps] == ["soda_can-1"] * 10 + ["lemon-2"] * 2 + ["soda_can-3"]
 
 
-def changed(source, tmp_path):
-    """What is skipped of the first file."""
+def skip_counts(source, tmp_path):
+    """Import, and return the counts of skipped grasps by reason."""
     return import_feeling_of_success(source, tmp_path / "out").info["skipped"]
 
 
@@ -70,44 +70,44 @@ def test_a_grasp_that_lacks_a_picture_or_a_name_is_skipped(source, data, tmp_pat
     del data["i3"]["gelsightB_during"]
     del data["i4"].attrs["is_gripping"]
     data.file.close()
-    assert changed(source, tmp_path) == {
+    assert skip_counts(source, tmp_path) == {
         "its gelsightB_during is missing": 1,
         "its object_name or is_gripping is missing": 1,
     }
 
 
-def test_what_says_neither_yes_nor_no_is_not_taken_for_a_yes(source, data, tmp_path):
+def test_an_invalid_is_gripping_does_not_count_as_success(source, data, tmp_path):
     for name, value in (("i1", "False"), ("i3", np.nan), ("i4", np.array([1, 0]))):
         data[name].attrs["is_gripping"] = value
     data.file.close()
-    assert changed(source, tmp_path) == {"its object_name or is_gripping is missing": 3}
+    assert skip_counts(source, tmp_path) == {"its object_name or is_gripping is missing": 3}
 
 
-def test_a_number_longer_than_python_reads_is_a_name_like_others(source, data, tmp_path):
+def test_a_number_too_long_for_python_is_a_name_like_others(source, data, tmp_path):
     data.create_group("i" + "9" * 5000)
     data.file.close()
-    assert changed(source, tmp_path) == {"its object_name or is_gripping is missing": 1}
+    assert skip_counts(source, tmp_path) == {"its object_name or is_gripping is missing": 1}
 
 
 @pytest.mark.parametrize(
     "wrong", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3), np.float32), np.zeros((4, 4, 4), np.uint8), 3]
 )
-def test_what_is_no_picture_is_skipped(source, data, tmp_path, wrong):
+def test_an_array_that_is_not_a_picture_is_skipped(source, data, tmp_path, wrong):
     del data["i3"]["kinectA_rgb_before"]
     data["i3"]["kinectA_rgb_before"] = wrong
     data.file.close()
-    assert changed(source, tmp_path) == {"its kinectA_rgb_before is not a picture of 8-bit colours": 1}
+    assert skip_counts(source, tmp_path) == {"its kinectA_rgb_before is not a picture with 8-bit colours": 1}
 
 
 def test_a_picture_of_absurd_size_is_not_read(source, data, tmp_path):
     del data["i3"]["kinectA_rgb_before"]
     data["i3"].create_dataset("kinectA_rgb_before", (1_000_000, 1_000_000, 3), np.uint8, chunks=(64, 64, 3))
     data.file.close()
-    assert changed(source, tmp_path) == {"its kinectA_rgb_before is not a picture of 8-bit colours": 1}
+    assert skip_counts(source, tmp_path) == {"its kinectA_rgb_before is not a picture with 8-bit colours": 1}
 
 
 @pytest.mark.parametrize("how", ["link", "external", "soft"])
-def test_what_lies_in_other_files_is_not_followed(source, data, tmp_path, how):
+def test_links_to_other_files_are_not_followed(source, data, tmp_path, how):
     (tmp_path / "secret").write_bytes(bytes(range(48)))
     del data["i3"]["kinectA_rgb_before"]
     if how == "link":
@@ -119,7 +119,7 @@ def test_what_lies_in_other_files_is_not_followed(source, data, tmp_path, how):
             "kinectA_rgb_before", (4, 4, 3), np.uint8, external=[(str(tmp_path / "secret"), 0, 48)]
         )
     data.file.close()
-    assert changed(source, tmp_path) == {"its kinectA_rgb_before is missing": 1}
+    assert skip_counts(source, tmp_path) == {"its kinectA_rgb_before is missing": 1}
 
 
 @pytest.mark.slow
@@ -129,8 +129,8 @@ def test_a_damaged_file_costs_grasps_and_no_traceback(source, tmp_path, changes,
     path = source / "calandra_corl2017_001.h5"
     whole = path.read_bytes()
     damaged = bytearray(whole)
-    for share, value in changes:
-        damaged[int(share * (min(len(whole), 4096) if at_its_head else len(whole))) - 1] = value
+    for fraction, value in changes:
+        damaged[int(fraction * (min(len(whole), 4096) if at_its_head else len(whole))) - 1] = value
     path.write_bytes(damaged)
     with tempfile.TemporaryDirectory(dir=tmp_path) as out:
         recording = import_feeling_of_success(source, Path(out) / "out")
@@ -138,15 +138,15 @@ def test_a_damaged_file_costs_grasps_and_no_traceback(source, tmp_path, changes,
     assert 12 <= len(recording.grasps) <= feeling_of_success.GRASPS
 
 
-def test_a_file_of_another_version_is_skipped_and_alone_refused(tmp_path):
+def test_a_file_of_another_version_is_skipped_and_refused_if_it_is_the_only_one(tmp_path):
     (tmp_path / "src").mkdir()
     with h5py.File(tmp_path / "src/2016-06-30.hdf5", "w") as file:
         file["GelSightA_image"] = np.zeros(4, np.uint8)
-    with pytest.raises(ImporterError, match=r"no /data, as files of another version, such as 2016-06-30\.hdf5"):
+    with pytest.raises(ImporterError, match=r"no /data; it may be of another version, such as 2016-06-30\.hdf5"):
         import_feeling_of_success(tmp_path / "src", tmp_path / "out")
 
 
-def test_without_h5py_the_extra_is_named(source, tmp_path, monkeypatch):
+def test_an_error_names_the_extra_if_h5py_is_missing(source, tmp_path, monkeypatch):
     def missing(name):
         raise ImportError(name)
 

@@ -1,4 +1,4 @@
-"""Pictures of one's own, by patterns and by files of pairs; what holds of every importer is in test_robot_importers."""
+"""Importer of your own pictures, by patterns and by files of pairs; test_importers.py tests the common behaviour."""
 
 import json
 import os
@@ -20,13 +20,13 @@ def source(tmp_path):
     return tmp_path / "src"
 
 
-def notes_of(recording):
-    """(grasp, object, name of the photo's drawing) in order."""
+def ids_of(recording):
+    """Return (grasp, object) in order."""
     return [(grasp.grasp_id, grasp.object_id) for grasp in recording.grasps]
 
 
 def photo_of(recording, source, number):
-    """The path in the source of a grasp's photo."""
+    """Return the path of a grasp's photo in the source."""
     data = (recording.folder / recording.grasps[number].photo).read_bytes()
     (path,) = [path for path in source.rglob("*.jpg") if path.read_bytes() == data]
     return path.relative_to(source).as_posix()
@@ -35,9 +35,9 @@ def photo_of(recording, source, number):
 # Patterns ------------------------------------------------------------------------------------------------------
 
 
-def test_the_folder_names_the_object_and_the_ninth_comes_before_the_tenth(source, tmp_path):
+def test_the_folder_names_the_object_and_touches_are_in_the_order_of_their_numbers(source, tmp_path):
     recording = import_folder(source, tmp_path / "out")
-    assert notes_of(recording)[:3] == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-10", "mug")]
+    assert ids_of(recording)[:3] == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-10", "mug")]
     assert {grasp.object_id for grasp in recording.grasps} == {"mug", "tin can"}
 
 
@@ -48,20 +48,20 @@ def test_touches_are_assigned_to_the_photos_of_their_object_in_turn(source, tmp_
     assert len(list((tmp_path / "out/images").iterdir())) == 6 + 4
 
 
-def test_words_that_both_patterns_have_must_agree(tmp_path):
+def test_words_in_both_patterns_must_have_the_same_value(tmp_path):
     for number in (1, 2, 3):
         picture(tmp_path / f"src/day1/mug/{number}_touch.png", number)
         picture(tmp_path / f"src/day1/mug/{number}_photo.jpg", 10 + number)
     (tmp_path / "src/day1/mug/2_photo.jpg").unlink()
     options = {"touch": "{sequence}/{object}/{n}_touch", "photo": "{sequence}/{object}/{n}_photo"}
     recording = import_folder(tmp_path / "src", tmp_path / "out", **options)
-    assert notes_of(recording) == [("mug-day1-1", "mug"), ("mug-day1-3", "mug")]
+    assert ids_of(recording) == [("mug-day1-1", "mug"), ("mug-day1-3", "mug")]
     assert photo_of(recording, tmp_path / "src", 1) == "day1/mug/3_photo.jpg"
     assert {grasp.sequence_id for grasp in recording.grasps} == {"day1"}
-    assert recording.info["skipped"] == {"no photo agrees with it": 1}
+    assert recording.info["skipped"] == {"no photo matches it": 1}
 
 
-def test_fingers_are_put_together_and_a_grasp_that_lacks_one_is_told(tmp_path):
+def test_fingers_are_combined_and_a_grasp_with_a_missing_finger_is_skipped(tmp_path):
     for finger in ("left", "right"):
         picture(tmp_path / f"src/rest_{finger}.png", len(finger))
         for number in (1, 2):
@@ -81,14 +81,14 @@ def test_fingers_are_put_together_and_a_grasp_that_lacks_one_is_told(tmp_path):
     assert recording.info["background"] != "none"
 
 
-def test_of_two_touches_with_the_same_words_the_first_is_taken_and_the_other_told(source, tmp_path):
+def test_the_second_touch_with_the_same_words_is_skipped(source, tmp_path):
     picture(source / "mug/touch_1.jpg", 77)
     recording = import_folder(source, tmp_path / "out")
-    assert notes_of(recording)[0] == ("mug-1", "mug")
+    assert ids_of(recording)[0] == ("mug-1", "mug")
     assert recording.info["skipped"] == {"another touch has the same words in its path": 1}
 
 
-def test_objects_on_another_disk_are_found_through_links_and_no_link_is_followed_in_a_circle(source, tmp_path):
+def test_links_to_other_folders_are_followed_without_cycles(source, tmp_path):
     picture(tmp_path / "disk/cup/touch_1.png", 5)
     picture(tmp_path / "disk/cup/photo_1.jpg", 6)
     (tmp_path / "disk/back").symlink_to(tmp_path / "disk")
@@ -98,20 +98,20 @@ def test_objects_on_another_disk_are_found_through_links_and_no_link_is_followed
     assert {grasp.object_id for grasp in recording.grasps} == {"mug", "tin can", "cup"}
 
 
-def test_a_folder_that_cannot_be_listed_is_told_and_no_object_is_missing_in_silence(source, tmp_path, monkeypatch):
+def test_a_folder_that_cannot_be_listed_is_an_error(source, tmp_path, monkeypatch):
     scandir = os.scandir
 
-    def refused(folder):
+    def refusing_scandir(folder):
         if os.fspath(folder).endswith("tin can"):
             raise PermissionError(13, "Permission denied", folder)
         return scandir(folder)
 
-    monkeypatch.setattr(os, "scandir", refused)
+    monkeypatch.setattr(os, "scandir", refusing_scandir)
     with pytest.raises(ImporterError, match="tin can cannot be listed: Permission denied"):
         import_folder(source, tmp_path / "out")
 
 
-def test_a_folder_whose_name_is_no_utf8_costs_its_own_grasps(source, tmp_path):
+def test_a_folder_whose_name_is_not_utf8_costs_its_own_grasps(source, tmp_path):
     strange = os.fsdecode(b"caf\xe9")
     picture(source / strange / "touch_1.png", 5)
     picture(source / strange / "photo_1.jpg", 6)
@@ -121,31 +121,31 @@ def test_a_folder_whose_name_is_no_utf8_costs_its_own_grasps(source, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
-        ({"touch": "{object}/felt_*"}, r"must hold a touch that fits '\{object\}/felt_\*'.*such as mug/notes\.png"),
-        ({"photo": "{object}/seen_*"}, "must hold a photo that fits"),
-        ({"touch": "touch_*"}, r"must say where \{object\} stands"),
-        ({"touch": "{object}/{"}, "must hold one word each"),
-        ({"touch": "{object}/{1}"}, "must be letters"),
-        ({"touch": "{object}/*", "photo": "{object}/*"}, "fits both patterns"),
-        ({"pairs": "gone.csv"}, "is not there"),
-        ({"pairs": "g" * 5000}, "is not there"),
+        ({"touch": "{object}/gel_*"}, r"must contain a touch that matches '\{object\}/gel_\*'.*such as mug/notes\.png"),
+        ({"photo": "{object}/camera_*"}, "must contain a photo that matches"),
+        ({"touch": "touch_*"}, r"must contain \{object\}"),
+        ({"touch": "{object}/{"}, "must contain one word each"),
+        ({"touch": "{object}/{1}"}, "must consist of letters"),
+        ({"touch": "{object}/*", "photo": "{object}/*"}, "matches both patterns"),
+        ({"pairs": "gone.csv"}, "does not exist"),
+        ({"pairs": "g" * 5000}, "does not exist"),
     ],
 )
-def test_wrong_patterns_are_refused_in_a_sentence(source, tmp_path, options, said):
-    with pytest.raises(ImporterError, match=said):
+def test_invalid_patterns_are_refused(source, tmp_path, options, message):
+    with pytest.raises(ImporterError, match=message):
         import_folder(source, tmp_path / "out", **options)
     assert not (tmp_path / "out").exists()
 
 
 @given(st.text("ab/*{}nobject_.", max_size=30), st.text("ab/_.n", max_size=20))
-def test_any_pattern_is_taken_or_refused(text, path):
+def test_any_pattern_is_accepted_or_refused(text, path):
     try:
         pattern = _Pattern("touch", text)
     except ImporterError:
         return
-    words = pattern.fit(path)
+    words = pattern.match(path)
     assert words is None or all(value in path for value in words.values())
 
 
@@ -169,10 +169,10 @@ def row(number, **changes):
 
 
 @pytest.mark.parametrize("kind", ["csv", "jsonl"])
-def test_a_file_of_pairs_is_a_grasp_a_line(source, tmp_path, kind):
+def test_each_line_of_a_file_of_pairs_is_a_grasp(source, tmp_path, kind):
     name = write_pairs(source, kind, [row(1), row(10, background="mug/touch_2.png"), row(2)])
     recording = import_folder(source, tmp_path / "out", pairs=name)
-    assert notes_of(recording) == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-3", "mug")]
+    assert ids_of(recording) == [("mug-1", "mug"), ("mug-2", "mug"), ("mug-3", "mug")]
     touch = (tmp_path / "out" / recording.grasps[1].touches["a"]).read_bytes()
     assert touch == (source / "mug/touch_10.png").read_bytes()
     assert {(grasp.sequence_id, grasp.force_n) for grasp in recording.grasps} == {("monday", 2.5)}
@@ -180,40 +180,40 @@ def test_a_file_of_pairs_is_a_grasp_a_line(source, tmp_path, kind):
 
 
 @pytest.mark.parametrize("kind", ["csv", "jsonl"])
-def test_lines_that_are_wrong_are_skipped_by_reason(source, tmp_path, kind):
+def test_invalid_lines_are_skipped_by_reason(source, tmp_path, kind):
     wrong = [row(2, photo=""), row(2, touch="../../etc/touch.png"), row(2, force_n="much"), row(3)]
     name = write_pairs(source, kind, [row(1), *wrong])
     recording = import_folder(source, tmp_path / "out", pairs=name)
-    assert notes_of(recording) == [("mug-1", "mug")]
+    assert ids_of(recording) == [("mug-1", "mug")]
     assert recording.info["skipped"] == {
-        "its line lacks its object, its photo or a touch": 1,
-        "a path must lead to a file below the folder, from there on": 1,
+        "its line has no object, no photo or not all touches": 1,
+        "a path must be relative to the folder and lead to a file below it": 1,
         "force_n, opening_mm, time_s must be numbers": 1,
         "its touch a is missing": 1,
     }
 
 
-def test_a_line_that_is_no_json_costs_its_own_grasp(source, tmp_path):
+def test_a_line_that_is_not_json_costs_its_own_grasp(source, tmp_path):
     name = write_pairs(source, "jsonl", [row(1), row(2)])
     (source / name).write_text((source / name).read_text().replace("\n", "\n{half\n[1]\n"))
     recording = import_folder(source, tmp_path / "out", pairs=name)
-    assert notes_of(recording) == [("mug-1", "mug"), ("mug-4", "mug")]
+    assert ids_of(recording) == [("mug-1", "mug"), ("mug-4", "mug")]
     assert recording.info["skipped"] == {"its line is not a JSON object": 2}
 
 
-def test_what_json_alone_can_say_costs_its_own_grasp(source, tmp_path):
-    """A number beyond every float, half of a character, a name too long for a disk."""
+def test_values_that_only_json_can_represent_cost_their_own_grasp(source, tmp_path):
+    """A number above all floats, a lone surrogate, a name too long for a disk."""
     wrong = [row(2, force_n=10**400), row(2, object="\ud800"), row(2, photo="a" * 5000)]
     name = write_pairs(source, "jsonl", [row(1), *wrong, row(10)])
     recording = import_folder(source, tmp_path / "out", pairs=name)
-    assert notes_of(recording) == [("mug-1", "mug"), ("mug-5", "mug")]
+    assert ids_of(recording) == [("mug-1", "mug"), ("mug-5", "mug")]
     assert recording.info["skipped"]["force_n, opening_mm, time_s must be numbers"] == 1
     assert recording.info["skipped"]["its photo is missing"] == 1
 
 
 @pytest.mark.parametrize("content", [b"", b"object,photo\nmug,x.jpg\n", b"\xff\xfe\x00", b"object\x00,photo", b"[]\n"])
 @pytest.mark.parametrize("kind", ["csv", "jsonl"])
-def test_a_file_that_lists_no_pairs_is_refused(source, tmp_path, kind, content):
+def test_a_file_without_pairs_is_refused(source, tmp_path, kind, content):
     (source / f"pairs.{kind}").write_bytes(content)
     with pytest.raises(ImporterError, match=r"pairs\.(csv|jsonl)"):
         import_folder(source, tmp_path / "out", pairs=f"pairs.{kind}")

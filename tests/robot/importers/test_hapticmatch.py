@@ -1,4 +1,4 @@
-"""HapticMatch: what is its own; what holds of every importer stands in test_importers."""
+"""Importer of HapticMatch; test_importers.py tests the common behaviour."""
 
 import pickle
 
@@ -20,7 +20,7 @@ def source(tmp_path):
 
 
 class Trap:
-    """Would make a file if it were unpickled."""
+    """An object that creates a file if it is unpickled."""
 
     def __reduce__(self):
         return open, ("unpickled", "w")
@@ -36,13 +36,13 @@ def test_a_material_is_an_object_and_its_samples_come_in_the_order_of_their_numb
 
 def test_the_touch_is_the_picture_of_the_normals_of_its_own_height_map(source, tmp_path):
     recording = import_hapticmatch(source, tmp_path / "out")
-    (grasp,) = (one for one in recording.grasps if one.grasp_id == "Denim-2")
+    (grasp,) = (grasp for grasp in recording.grasps if grasp.grasp_id == "Denim-2")
     stored = cv2.imread(str(recording.folder / grasp.touches["a"]))[..., ::-1]
     np.testing.assert_array_equal(stored, normals(hapticmatch.heights(102)))
 
 
-def test_a_plane_that_rises_across_by_one_pixel_a_pixel_leans_by_45_degrees():
-    """Its normal is (-1, 0, 1) / sqrt(2): 127.5 (1 - .7071) = 37.3, 127.5, 127.5 (1 + .7071) = 217.7."""
+def test_the_normal_of_a_plane_with_slope_1_has_45_degrees():
+    """The normal is (-1, 0, 1) / sqrt(2): 127.5 (1 - 0.7071) = 37.3, 127.5, 127.5 (1 + 0.7071) = 217.7."""
     plane = np.tile(np.arange(6.0), (5, 1))
     assert (normals(plane) == (37, 128, 218)).all()
     assert (normals(plane.T)[..., 1] == 37).all()
@@ -61,7 +61,7 @@ def test_a_plane_that_rises_across_by_one_pixel_a_pixel_leans_by_45_degrees():
         np.zeros((4, 4), bool),
     ],
 )
-def test_what_is_no_height_map_is_refused(heights):
+def test_an_array_that_is_not_a_height_map_is_refused(heights):
     with pytest.raises(ImporterError, match="its height map must"):
         normals(heights)
 
@@ -71,13 +71,13 @@ def test_heights_of_any_size_make_a_picture():
     assert normals(np.array([[0, 65535], [0, 65535]], np.uint16))[0, 0, 0] == 0
 
 
-def test_a_height_map_that_would_run_something_runs_nothing_and_costs_its_own_grasp(source, tmp_path, monkeypatch):
+def test_a_program_in_a_height_map_does_not_run_and_costs_its_own_grasp(source, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (source / "Texture/Denim/1.pkl").write_bytes(pickle.dumps(Trap()))
     recording = import_hapticmatch(source, tmp_path / "out")
     assert len(recording.grasps) == hapticmatch.GRASPS - 1
     assert not (tmp_path / "unpickled").exists()
-    assert any("Denim-1" in note and "it asks for" in note for note in recording.notes)
+    assert any("Denim-1" in note and "it refers to" in note for note in recording.notes)
 
 
 def test_an_infinite_or_negative_scale_is_refused(source, tmp_path):

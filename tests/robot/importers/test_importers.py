@@ -1,4 +1,4 @@
-"""What holds of every importer, on a miniature of its data set; test_robot_importers_<name> has what is its own."""
+"""Common behaviour of all importers, on a miniature of each data set; test_<name>.py tests each importer."""
 
 import re
 from hashlib import sha256
@@ -31,7 +31,7 @@ from tests.miniatures import encoded, picture, pixels
 
 PICTURES = {".png", ".jpg"}
 SOURCE_FACTS = ("folder", "lerobot", "open-x-tactile")
-"""Which sensor it was, and the like, differs from source to source."""
+"""Importers whose facts, such as the sensor, depend on the source."""
 
 pytestmark = pytest.mark.usefixtures("no_fsync")
 
@@ -52,7 +52,7 @@ def source(name, tmp_path):
 
 
 def content(folder):
-    """Every file of a folder by path and digest."""
+    """Return the digest of every file in a folder, by path."""
     return {
         path.relative_to(folder): sha256(path.read_bytes()).digest() for path in folder.rglob("*") if path.is_file()
     }
@@ -61,7 +61,7 @@ def content(folder):
 # Every importer ------------------------------------------------------------------------------------------------
 
 
-def test_a_data_set_becomes_a_recording_that_says_what_it_is(name, source, tmp_path):
+def test_a_data_set_becomes_a_recording_with_its_facts(name, source, tmp_path):
     recording = load_importer(name)(source, tmp_path / "out")
     assert len(recording.grasps) == miniature(name).GRASPS
     facts = data_set_of(name)
@@ -91,7 +91,7 @@ def test_a_second_import_reads_no_grasp_again_and_changes_no_byte(name, source, 
     assert content(tmp_path / "out") == before
 
 
-def test_an_import_that_was_stopped_goes_on_and_ends_with_the_same_bytes(name, source, tmp_path):
+def test_a_stopped_import_resumes_and_ends_with_the_same_bytes(name, source, tmp_path):
     def stop(done, total):
         if done == total // 2 + 1:
             raise KeyboardInterrupt
@@ -99,23 +99,23 @@ def test_an_import_that_was_stopped_goes_on_and_ends_with_the_same_bytes(name, s
     importer = load_importer(name)
     with pytest.raises(KeyboardInterrupt):
         importer(source, tmp_path / "out", stop)
-    held = len(read_recording(tmp_path / "out").grasps)
-    assert 0 < held < miniature(name).GRASPS
+    stored = len(read_recording(tmp_path / "out").grasps)
+    assert 0 < stored < miniature(name).GRASPS
     assert len(importer(source, tmp_path / "out").grasps) == miniature(name).GRASPS
     importer(source, tmp_path / "whole")
     assert content(tmp_path / "out") == content(tmp_path / "whole")
 
 
-def test_progress_is_told_after_each_grasp_and_ends_at_the_total(name, source, tmp_path):
+def test_progress_is_reported_after_each_grasp_and_ends_at_the_total(name, source, tmp_path):
     calls = []
     load_importer(name)(source, tmp_path / "out", lambda done, total: calls.append((done, total)))
     assert [done for done, _ in calls] == list(range(1, len(calls) + 1))
     assert calls[-1][0] == calls[-1][1] >= miniature(name).GRASPS
 
 
-@pytest.mark.parametrize("there", [False, True])
-def test_a_folder_that_is_not_the_data_set_is_refused_in_a_sentence_and_nothing_is_made(name, there, tmp_path):
-    if there:
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_folder_that_is_not_the_data_set_is_refused_and_nothing_is_written(name, exists, tmp_path):
+    if exists:
         picture(tmp_path / "src/holiday/beach.jpg", 1)
         (tmp_path / "src/notes.txt").write_text("nothing of the kind")
     with pytest.raises(ImporterError) as caught:
@@ -124,9 +124,9 @@ def test_a_folder_that_is_not_the_data_set_is_refused_in_a_sentence_and_nothing_
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("harm", ["empty", "garbage", "half", "folder", "gone"])
+@pytest.mark.parametrize("harm", ["empty", "garbage", "truncated", "folder", "gone"])
 def test_broken_files_cost_their_own_grasps_and_no_traceback(name, source, tmp_path, harm):
-    """Each kind of file in turn, the first and the last of it."""
+    """Damage the first and the last file of each kind in turn."""
     by_kind = {}
     for path in sorted(path for path in source.rglob("*") if path.is_file()):
         by_kind.setdefault((path.suffix, len(path.relative_to(source).parts)), []).append(path)
@@ -154,8 +154,8 @@ def damage(path, whole, harm):
         path.unlink()
     if harm == "folder":
         path.mkdir()
-    if harm in ("empty", "garbage", "half"):
-        path.write_bytes({"empty": b"", "garbage": b"\x00garbage" * 9, "half": whole[: len(whole) // 2]}[harm])
+    if harm in ("empty", "garbage", "truncated"):
+        path.write_bytes({"empty": b"", "garbage": b"\x00garbage" * 9, "truncated": whole[: len(whole) // 2]}[harm])
 
 
 def repair(path, whole):
@@ -169,8 +169,8 @@ def test_published_splits_leak_no_object_and_no_sequence(name, source, tmp_path)
     grasps = load_grasps(tmp_path / "out")
     for path in (tmp_path / "out" / SPLITS_FOLDER).glob("*.json"):
         split = Split.from_dict(parse_object(path.read_bytes(), RecordingError))
-        assert not [each for each in check_split(grasps, split) if each.severity == "error"]
-        assert {each for part in (split.train, split.validation, split.test) for each in part} <= {
+        assert not [finding for finding in check_split(grasps, split) if finding.severity == "error"]
+        assert {object_id for part in (split.train, split.validation, split.test) for object_id in part} <= {
             grasp.object_id for grasp in recording.grasps
         }
 
@@ -187,12 +187,12 @@ def test_the_command_imports_it_and_lists_it(name, source, tmp_path, capsys):
 # The table, and options ------------------------------------------------------------------------------------------
 
 
-def test_every_miniature_has_its_importer():
+def test_every_importer_has_a_miniature():
     files = {path.stem for path in (Path(__file__).parents[2] / "miniatures").glob("[!_]*.py")}
     assert files == {name.replace("-", "_") for name in IMPORTERS}
 
 
-def test_the_page_of_data_sets_is_that_of_the_importers():
+def test_the_page_of_data_sets_is_generated_from_the_importers():
     assert text_of(DATA_SETS) == data_sets(), "run `python -m benchmarks.reference`"
 
 
@@ -201,35 +201,35 @@ def test_an_unknown_name_lists_the_known_ones(capsys):
         load_importer("bilets")
     assert caught.value.exit_code == 2
     assert main(["import", "bilets", "src", "--out", "out"]) == 2
-    (said,) = capsys.readouterr().err.splitlines()
-    assert all(name in said for name in IMPORTERS)
+    (message,) = capsys.readouterr().err.splitlines()
+    assert all(name in message for name in IMPORTERS)
 
 
-def test_an_import_without_a_folder_says_what_it_needs(capsys):
+def test_an_import_without_folders_prints_the_usage(capsys):
     assert main(["import", "billets"]) == 2
     assert "retrieve import billets SRC --out recording/" in capsys.readouterr().err
 
 
 def with_options(
-    src, out, progress=None, *, sensor: str = "mine", every: int = 1, share: float = 0.5, all: bool = True
+    src, out, progress=None, *, sensor: str = "mine", every: int = 1, ratio: float = 0.5, all: bool = True
 ):
     """An importer."""
 
 
-def test_options_are_read_by_the_kind_that_the_importer_names():
+def test_options_are_parsed_by_the_type_that_the_importer_declares():
     assert options_of(with_options)["every"] == (int, 1)
-    words = ["sensor=GelSight = Mini", "every=3", "share=0.25", "all=false"]
-    assert read_options(with_options, words) == {"sensor": "GelSight = Mini", "every": 3, "share": 0.25, "all": False}
+    words = ["sensor=GelSight = Mini", "every=3", "ratio=0.25", "all=false"]
+    assert read_options(with_options, words) == {"sensor": "GelSight = Mini", "every": 3, "ratio": 0.25, "all": False}
 
 
 @pytest.mark.parametrize("word", ["every=many", "every=", "all=no", "nonsense=1", "every", "=3", ""])
-def test_other_options_are_refused_in_a_sentence(word):
+def test_other_options_are_refused(word):
     with pytest.raises(ImporterError, match="every") as caught:
         read_options(with_options, [word]) if word != "all=no" else read_options(with_options, ["every=all=no"])
     assert caught.value.exit_code == 2
 
 
-# The loop they share -----------------------------------------------------------------------------------------------
+# The common loop ---------------------------------------------------------------------------------------------------
 
 FACTS = DataSet("here", "none", "nobody", "gel", "by hand", "nothing", caveats=("beware",), unverified=("its size",))
 
@@ -256,13 +256,13 @@ def test_skips_are_counted_by_reason_with_the_first_names(tmp_path):
     assert read_recording(tmp_path / "out").info["skipped"] == {"it is dark": 5, "its touch a is missing": 1}
 
 
-def test_of_a_hostile_source_not_every_reason_is_kept(tmp_path):
+def test_the_number_of_reasons_is_limited(tmp_path):
     recording = run([item(0), *(Skip(f"reason {n}", "x") for n in range(1000))], tmp_path / "out")
     assert len(recording.info["skipped"]) == 21
     assert recording.info["skipped"]["another reason"] == 980
 
 
-def test_a_path_longer_than_a_disk_takes_costs_its_own_grasp(tmp_path):
+def test_a_path_too_long_for_the_disk_costs_its_own_grasp(tmp_path):
     recording = run([item(0), item(1, photo=tmp_path / ("a" * 5000))], tmp_path / "out")
     assert recording.info["skipped"] == {"its photo is missing": 1}
 
@@ -274,21 +274,21 @@ def test_a_picture_that_is_cut_off_is_not_imported(tmp_path, suffix):
     assert recording.info["skipped"] == {"its photo is cut off": 1}
 
 
-def test_what_makes_a_picture_is_called_when_it_is_its_turn_and_not_for_grasps_that_are_held(tmp_path):
+def test_a_function_that_returns_a_picture_is_called_late_and_not_for_stored_grasps(tmp_path):
     calls = []
 
-    def made(number):
+    def make_picture(number):
         calls.append(number)
         return pixels(number)
 
-    items = [item(n, touch_a=lambda n=n: made(n)) for n in range(3)]
+    items = [item(n, touch_a=lambda n=n: make_picture(n)) for n in range(3)]
     run(items[:2], tmp_path / "out")
     assert calls == [0, 1]
     run(items, tmp_path / "out")
     assert calls == [0, 1, 2]
 
 
-def test_one_frame_of_many_grasps_is_read_and_kept_once(tmp_path):
+def test_a_frame_of_many_grasps_is_read_and_stored_once(tmp_path):
     calls = []
 
     def frame():
@@ -300,18 +300,18 @@ def test_one_frame_of_many_grasps_is_read_and_kept_once(tmp_path):
     assert {grasp.touches_before["a"] for grasp in recording.grasps} == {"images/rest_shared.png"}
 
 
-def test_two_grasps_of_one_name_are_not_mixed(tmp_path):
+def test_two_grasps_with_the_same_name_are_not_mixed(tmp_path):
     recording = run([item(0), item(0, photo=encoded(".jpg", 50))], tmp_path / "out")
     assert len(recording.grasps) == 1
-    assert recording.info["skipped"] == {"another grasp has its name": 1}
+    assert recording.info["skipped"] == {"another grasp has the same name": 1}
 
 
-def test_a_source_of_which_nothing_can_be_imported_is_an_error_that_says_why(tmp_path):
+def test_an_error_states_why_nothing_can_be_imported(tmp_path):
     with pytest.raises(ImporterError, match=r"no grasp could be imported: skipped 1: it is dark, such as n"):
         run([Skip("it is dark", "n")], tmp_path / "out")
 
 
-def test_what_the_disk_refuses_to_read_is_an_error_that_names_the_file(tmp_path):
+def test_a_read_error_names_the_file(tmp_path):
     def broken():
         yield item(0)
         (tmp_path / "gone").read_bytes()
@@ -320,21 +320,21 @@ def test_what_the_disk_refuses_to_read_is_an_error_that_names_the_file(tmp_path)
         import_items(FACTS, broken(), tmp_path / "out", total=1)
 
 
-def test_a_published_split_is_kept_and_one_that_tears_objects_apart_is_told(tmp_path):
+def test_a_published_split_is_stored_unless_its_parts_have_objects_in_common(tmp_path):
     splits = {
         "good": {"train": ["object0"], "test": ["object1"]},
         "bad": {"train": ["object0", "object1"], "test": ["object1"]},
     }
     metadata = DataSetMetadata({"object0": {"material": "wood"}}, splits)
     recording = run([item(0), item(1)], tmp_path / "out", metadata=metadata)
-    kept = tmp_path / "out" / SPLITS_FOLDER / "good.json"
-    assert Split.from_dict(parse_object(kept.read_bytes(), RecordingError)) == Split(0, ("object0",), (), ("object1",))
-    assert not kept.with_name("bad.json").exists()
-    assert any("'bad' has grasps of 1 object(s) on two sides" in note for note in recording.notes)
+    path = tmp_path / "out" / SPLITS_FOLDER / "good.json"
+    assert Split.from_dict(parse_object(path.read_bytes(), RecordingError)) == Split(0, ("object0",), (), ("object1",))
+    assert not path.with_name("bad.json").exists()
+    assert any("'bad' has grasps of 1 object(s) in two parts" in note for note in recording.notes)
     assert recording.info["objects"] == {"object0": {"material": "wood"}}
 
 
-def test_a_name_is_a_grasp_id_whatever_it_is_made_of():
+def test_any_parts_become_a_valid_grasp_id():
     assert safe_name("mug", "01") == "mug-01"
     strange = [
         safe_name("my mug", "1"),
@@ -343,9 +343,12 @@ def test_a_name_is_a_grasp_id_whatever_it_is_made_of():
         safe_name("é" * 300),
         safe_name("", ""),
     ]
-    strange += [safe_name("caf\udce9"), safe_name("caf\ud800")]  # a file's name that is no UTF-8; what JSON may escape
+    strange += [
+        safe_name("caf\udce9"),
+        safe_name("caf\ud800"),
+    ]  # a file name that is not UTF-8; a surrogate that JSON can escape
     assert len(set(strange)) == len(strange)
-    assert all(each[0].isalnum() and len(each) <= 128 for each in strange)
+    assert all(name[0].isalnum() and len(name) <= 128 for name in strange)
 
 
 def test_files_are_in_the_order_of_their_numbers(tmp_path):

@@ -1,4 +1,4 @@
-"""LeRobot: what is its own; what holds of every importer stands in test_robot_importers."""
+"""Importer of LeRobot data sets; test_importers.py tests the common behaviour."""
 
 import json
 import sys
@@ -58,8 +58,8 @@ def test_an_episode_is_a_sequence_its_task_the_object_and_gel_cameras_are_the_fi
     assert recording.info["sensor"] == "observation.images.left_tactile, observation.images.right_tactile"
 
 
-def test_each_episode_has_its_own_pictures_of_films_and_of_rows(source, tmp_path):
-    """Videos that hold several episodes, whose frames build on each other."""
+def test_each_episode_gets_its_own_pictures_from_videos_and_from_rows(source, tmp_path):
+    """A video contains several episodes, and its frames depend on each other."""
     recording = import_lerobot(source, tmp_path / "out")
     for episode, grasp in enumerate(recording.grasps):
         first, pressed = (lerobot.pictures(episode, step) for step in (0, lerobot.PRESSED))
@@ -73,25 +73,25 @@ def test_each_episode_has_its_own_pictures_of_films_and_of_rows(source, tmp_path
             assert rms(picture(recording, path), pixels(seed[lerobot.RIGHT], lerobot.SIZE).astype(float)) == 0
 
 
-def test_a_film_is_opened_once_for_the_episodes_that_it_holds(source, tmp_path, monkeypatch):
-    """Opened for each of 100,000 episodes, its buffers had left holes in the heap, and half of the import's time."""
+def test_a_video_is_opened_once_for_all_its_episodes(source, tmp_path, monkeypatch):
+    """Opening it for each of 100,000 episodes fragmented the heap and took half of the time."""
     import av
 
-    opened, films = av.open, []
-    monkeypatch.setattr(av, "open", lambda path: films.append(path) or opened(path))
+    av_open, paths = av.open, []
+    monkeypatch.setattr(av, "open", lambda path: paths.append(path) or av_open(path))
     import_lerobot(source, tmp_path / "out")
-    assert sorted(films) == sorted(str(path) for path in source.glob("videos/*/*/*.mp4"))
+    assert sorted(paths) == sorted(str(path) for path in source.glob("videos/*/*/*.mp4"))
 
 
-def test_cameras_are_taken_by_name_and_wrong_ones_list_those_there(source, tmp_path):
+def test_cameras_are_chosen_by_name_and_unknown_ones_list_the_known(source, tmp_path):
     recording = import_lerobot(source, tmp_path / "one", touch=lerobot.LEFT, photo=lerobot.WRIST)
     assert recording.info["fingers"] == 1
     for options in ({"touch": "left"}, {"photo": "front"}):
-        with pytest.raises(ImporterError, match=r"of these: observation\.images\.wrist, observation"):
+        with pytest.raises(ImporterError, match=r"from: observation\.images\.wrist, observation"):
             import_lerobot(source, tmp_path / "out", **options)
 
 
-def test_a_recording_comes_back_from_its_export(tmp_path, monkeypatch):
+def test_an_export_can_be_imported_again(tmp_path, monkeypatch):
     monkeypatch.setattr("robot.exporters.lerobot.EPISODES_A_FILE", 4)
     synthetic.write_recording(tmp_path / "r", synthetic.make_objects(3), 2)
     first = read_recording(tmp_path / "r")
@@ -114,32 +114,32 @@ def test_a_recording_comes_back_from_its_export(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
-        ({"codebase_version": "v2.1"}, "must be of LeRobot's version 3, and is of v2.1; convert it with lerobot"),
+        ({"codebase_version": "v2.1"}, "must have LeRobot version 3, got v2.1; convert it with lerobot"),
         ({"video_path": "/etc/{video_key:999999999}"}, "video_path of info.json must be videos/"),
-        ({"fps": None}, "must say fps"),
-        ({"fps": 10**400}, "must say fps"),
+        ({"fps": None}, "must contain fps"),
+        ({"fps": 10**400}, "must contain fps"),
         ({"fps": 0}, "fps of info.json must be above 0 and finite, got 0"),
-        ({"features": []}, "of these: none"),
-        ({"features": {"../touch": {"dtype": "video"}, "photo": {"dtype": "video"}}}, "no camera with a path"),
+        ({"features": []}, "from: none"),
+        ({"features": {"../touch": {"dtype": "video"}, "photo": {"dtype": "video"}}}, "no camera name that is a path"),
     ],
 )
-def test_what_info_json_says_is_checked(source, tmp_path, changes, said):
+def test_info_json_is_checked(source, tmp_path, changes, message):
     change(source, **changes)
-    with pytest.raises(ImporterError, match=said):
+    with pytest.raises(ImporterError, match=message):
         import_lerobot(source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-def test_a_video_that_is_missing_costs_its_episodes_and_is_told(source, tmp_path):
+def test_a_missing_video_costs_its_episodes(source, tmp_path):
     (source / f"videos/{lerobot.LEFT}/chunk-000/file-000.mp4").unlink()
     with pytest.raises(ImporterError, match="no grasp could be imported: skipped 4: its video is missing"):
         import_lerobot(source, tmp_path / "out")
 
 
 def rewrite(path, change):
-    """Every row of a Parquet file as `change` makes it of its number and itself."""
+    """Replace each row of a Parquet file by change(number, row)."""
     rows = pq.read_table(path).to_pylist()
     pq.write_table(pa.Table.from_pylist([change(number, row) for number, row in enumerate(rows)]), path)
 
@@ -156,9 +156,9 @@ def of_absurd_size(number):
 
 
 @pytest.mark.parametrize(
-    ("picture", "said"), [(of_size(20, 30), "differ in size"), (of_absurd_size, "cannot be decoded")]
+    ("picture", "message"), [(of_size(20, 30), "differ in size"), (of_absurd_size, "cannot be decoded")]
 )
-def test_stored_pictures_that_make_no_film_cost_their_episode(source, tmp_path, picture, said):
+def test_unusable_stored_pictures_cost_their_episode(source, tmp_path, picture, message):
     rewrite(
         source / "data/chunk-000/file-000.parquet",
         lambda number, row: (
@@ -166,11 +166,11 @@ def test_stored_pictures_that_make_no_film_cost_their_episode(source, tmp_path, 
         ),
     )
     (reason,) = import_lerobot(source, tmp_path / "out").info["skipped"]
-    assert said in reason
+    assert message in reason
 
 
 @pytest.mark.parametrize("start", [float("inf"), -1e30])
-def test_an_episode_that_begins_at_no_time_is_skipped(source, tmp_path, start):
+def test_an_episode_with_an_invalid_start_time_is_skipped(source, tmp_path, start):
     key = f"videos/{lerobot.LEFT}/from_timestamp"
     rewrite(
         source / "meta/episodes/chunk-000/file-000.parquet",
@@ -179,7 +179,7 @@ def test_an_episode_that_begins_at_no_time_is_skipped(source, tmp_path, start):
     assert import_lerobot(source, tmp_path / "out").info["skipped"] == {"its video cannot be decoded": 1}
 
 
-def test_moments_that_are_no_numbers_count_as_unsaid(source, tmp_path):
+def test_moments_that_are_not_numbers_are_ignored(source, tmp_path):
     features = json.loads((source / "meta/info.json").read_text())["features"]
     change(source, features=features | {"moment": {"dtype": "int64"}})
     rewrite(source / "data/chunk-000/file-000.parquet", lambda number, row: row | {"moment": [1]})
@@ -187,23 +187,23 @@ def test_moments_that_are_no_numbers_count_as_unsaid(source, tmp_path):
 
 
 @pytest.mark.parametrize("package", ["pyarrow", "av"])
-def test_a_missing_package_is_a_sentence_with_the_extra(source, tmp_path, monkeypatch, package):
+def test_an_error_names_the_extra_if_a_package_is_missing(source, tmp_path, monkeypatch, package):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ImporterError, match=rf"needs {package}, .*pip install 'touch-retrieval\[importers\]'"):
         import_lerobot(source, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
-# Grasps out of episodes ----------------------------------------------------------------------------------------
+# Grasps from episodes ------------------------------------------------------------------------------------------
 
 
 def steps(count, pressed):
-    for at in range(count):
-        gel = np.full((300, 400, 3), 200 if at == pressed else 100 + at % 3, np.uint8)
-        yield np.full((300, 400, 3), at % 256, np.uint8), [gel]
+    for number in range(count):
+        gel = np.full((300, 400, 3), 200 if number == pressed else 100 + number % 3, np.uint8)
+        yield np.full((300, 400, 3), number % 256, np.uint8), [gel]
 
 
-def test_steps_are_looked_at_one_by_one_whatever_the_length_of_an_episode():
+def test_steps_of_a_long_episode_are_read_one_by_one():
     episode = Episode(lambda: steps(500, 321), 1, None)
     tracemalloc.start()
     try:
@@ -213,10 +213,10 @@ def test_steps_are_looked_at_one_by_one_whatever_the_length_of_an_episode():
         tracemalloc.stop()
     assert images["touch_a"][0, 0, 0] == 200
     assert (images["touch_a_before"][0, 0, 0], images["photo"][0, 0, 0]) == (100, 0)
-    assert peak < 20 * 360_000  # a picture has 360,000 bytes, the episode 1,000 of them
+    assert peak < 20 * 360_000  # a picture has 360,000 bytes, the episode 1,000 pictures
 
 
-def test_an_episode_is_read_when_its_first_picture_is_asked_for_and_once():
+def test_an_episode_is_read_once_on_first_use():
     calls = []
 
     def read():
@@ -230,17 +230,21 @@ def test_an_episode_is_read_when_its_first_picture_is_asked_for_and_once():
     assert calls == [1]
 
 
-def test_moments_that_are_said_are_taken_at_their_word():
+def test_labelled_moments_define_the_columns():
     images = Episode(lambda: steps(3, 0), 1, ["before", "during", "after"]).images()
     assert sorted(images) == ["photo", "touch_a", "touch_a_after", "touch_a_before"]
     assert [images[column]()[0, 0, 0] for column in ("touch_a_before", "touch_a", "touch_a_after")] == [200, 101, 102]
 
 
 @pytest.mark.parametrize(
-    ("count", "moments", "said"),
-    [(0, None, "its episode is empty"), (1, None, "differs from the first"), (1, ["before", "during"], "1 steps of 2")],
+    ("count", "moments", "message"),
+    [
+        (0, None, "its episode is empty"),
+        (1, None, "differs from the first"),
+        (1, ["before", "during"], "only 1 of 2 steps"),
+    ],
 )
-def test_an_episode_without_a_touch_is_an_error(count, moments, said):
+def test_an_episode_without_a_touch_is_an_error(count, moments, message):
     images = Episode(lambda: steps(count, 9), 1, moments).images()
-    with pytest.raises(ImporterError, match=said):
+    with pytest.raises(ImporterError, match=message):
         images["photo"]()

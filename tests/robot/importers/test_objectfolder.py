@@ -1,4 +1,4 @@
-"""ObjectFolder: samples, packs and splits; what holds of every importer stands in test_robot_importers."""
+"""Importer of ObjectFolder: samples, packs and splits; test_importers.py tests the common behaviour."""
 
 import json
 
@@ -28,34 +28,34 @@ def test_a_touch_of_a_pack_has_the_photo_of_its_own_number(pack, tmp_path):
         assert (tmp_path / "out" / grasp.photo).read_bytes() == photo.read_bytes()
 
 
-def test_the_published_split_is_kept_by_objects(pack, tmp_path):
+def test_the_published_split_is_stored_by_objects(pack, tmp_path):
     import_objectfolder(pack, tmp_path / "out")
     split = parse_object((tmp_path / "out" / SPLITS_FOLDER / "published.json").read_bytes(), RecordingError)
     assert split == {"seed": 0, "train": ["2", "31"], "validation": ["10"], "test": ["100"]}
 
 
-def test_a_split_by_pictures_is_told_and_not_kept(pack, tmp_path):
+def test_a_split_by_pictures_is_not_stored_and_gets_a_note(pack, tmp_path):
     rows = {"train": [["2", 1], ["10", 1]], "val": [], "test": [["2", 2], ["100", 1]]}
     (pack / "split.json").write_text(json.dumps(rows))
     recording = import_objectfolder(pack, tmp_path / "out")
-    assert any("'published' has grasps of 1 object(s) on two sides" in note for note in recording.notes)
+    assert any("'published' has grasps of 1 object(s) in two parts" in note for note in recording.notes)
     assert not (tmp_path / "out" / SPLITS_FOLDER).exists()
 
 
 @pytest.mark.parametrize("content", ["[1]", "{", '{"train": "2"}', '{"train": 3}'])
-def test_a_split_that_is_none_is_refused(pack, tmp_path, content):
+def test_an_invalid_split_is_refused(pack, tmp_path, content):
     (pack / "split.json").write_text(content)
     with pytest.raises(ImporterError, match=r"split\.json"):
         import_objectfolder(pack, tmp_path / "out")
 
 
 @pytest.mark.parametrize(("width", "sensor"), [(160, "GelSight, simulated (Taxim)"), (320, "GelSight")])
-def test_simulated_packs_are_told_from_real_ones(tmp_path, width, sensor):
+def test_simulated_packs_are_distinguished_from_real_ones(tmp_path, width, sensor):
     objectfolder.write(tmp_path / "src", width)
     assert import_objectfolder(tmp_path / "src", tmp_path / "out").info["sensor"] == sensor
 
 
-def test_the_samples_of_real_are_an_object_each_with_their_names(tmp_path):
+def test_each_sample_of_real_is_an_object_with_its_name(tmp_path):
     objectfolder.write_samples(tmp_path / "src")
     recording = import_objectfolder(tmp_path / "src", tmp_path / "out")
     assert [(grasp.grasp_id, grasp.object_id) for grasp in recording.grasps] == [("3-0", "3"), ("20-0", "20")]
@@ -69,7 +69,7 @@ def test_touches_without_a_photo_of_their_number_are_assigned_to_the_others(pack
     assert photos["31-2"] == photos["31-10"] != photos["31-1"]
 
 
-def test_raw_videos_are_refused_by_name(tmp_path):
+def test_raw_videos_are_refused(tmp_path):
     picture(tmp_path / "src/1/tactile_data/3/0/gelsight/0.png", 1)
-    with pytest.raises(ImporterError, match="it holds raw videos, without photos"):
+    with pytest.raises(ImporterError, match="it contains raw videos without photos"):
         import_objectfolder(tmp_path / "src", tmp_path / "out")

@@ -1,4 +1,4 @@
-"""Open-X-Tactile: what is its own; what holds of every importer stands in test_robot_importers."""
+"""Importer of Open-X-Tactile; test_importers.py tests the common behaviour."""
 
 import json
 import re
@@ -64,7 +64,7 @@ def test_the_touch_is_the_step_of_strongest_contact_and_the_first_step_is_the_no
         assert np.array_equal(picture(recording, grasp.touches_before[finger]), steps[0][1][area])
 
 
-def test_a_recording_comes_back_from_its_export_as_it_was(tmp_path):
+def test_an_export_can_be_imported_again_without_loss(tmp_path):
     synthetic.write_recording(tmp_path / "r", synthetic.make_objects(3), 2)
     first = read_recording(tmp_path / "r")
     objects = sorted({grasp.object_id for grasp in first.grasps})
@@ -85,20 +85,22 @@ def test_a_recording_comes_back_from_its_export_as_it_was(tmp_path):
     assert (again.info["sensor"], again.info["source"]) == (first.info["sensor"], first.info["source"])
 
 
-def test_another_camera_is_taken_by_its_name_and_an_unknown_one_lists_those_there(store, tmp_path):
-    with pytest.raises(ImporterError, match=r"has no data/camera_ego_rgb; --option camera= one of camera_main_rgb"):
+def test_a_camera_is_chosen_by_name_and_an_unknown_one_lists_the_known(store, tmp_path):
+    with pytest.raises(
+        ImporterError, match=r"has no data/camera_ego_rgb; set --option camera= to one of: camera_main_rgb"
+    ):
         import_open_x_tactile(store.parent, tmp_path / "out", camera="camera_ego_rgb")
     assert len(import_open_x_tactile(store, tmp_path / "out", camera="camera_main_rgb").grasps) == 2
 
 
-def test_a_chunk_that_is_missing_costs_its_episode_and_is_no_black_picture(store, tmp_path):
+def test_a_missing_chunk_costs_its_episode_and_is_not_a_black_picture(store, tmp_path):
     (store / "data/camera_main_rgb/4.0.0.0").unlink()  # the first step of the second episode
     recording = import_open_x_tactile(store, tmp_path / "out")
     assert [grasp.grasp_id for grasp in recording.grasps] == ["wipe-000000"]
     assert recording.info["skipped"] == {"a chunk of wipe.zarr/data/camera_main_rgb is missing": 1}
 
 
-def test_an_episode_in_which_nothing_is_touched_is_no_grasp(store, tmp_path):
+def test_an_episode_without_contact_is_not_a_grasp(store, tmp_path):
     for path in (store / "data/right_tactile_data_0").glob("[456].*"):
         path.write_bytes((store / "data/right_tactile_data_0/4.0.0.0.0").read_bytes())
     assert import_open_x_tactile(store, tmp_path / "out").info["skipped"] == {
@@ -107,28 +109,28 @@ def test_an_episode_in_which_nothing_is_touched_is_no_grasp(store, tmp_path):
 
 
 def forge(store, name, **changes):
-    about = json.loads((store / name / ".zarray").read_text())
-    (store / name / ".zarray").write_text(json.dumps(about | changes))
+    metadata = json.loads((store / name / ".zarray").read_text())
+    (store / name / ".zarray").write_text(json.dumps(metadata | changes))
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"filters": [{"id": "pickle"}]}, "without filters"),
-        ({"compressor": {"id": "pickle"}}, "without filters, in one of"),
+        ({"compressor": {"id": "pickle"}}, "without filters, with one of"),
         ({"dtype": "|O"}, "which this importer does not read"),
         ({"dtype": "<f8"}, "which this importer does not read"),
         ({"chunks": [10**6, 20, 30, 3]}, "too large"),
-        ({"chunks": [0, 20, 30, 3]}, "which is none"),
+        ({"chunks": [0, 20, 30, 3]}, "has the invalid shape"),
         ({"shape": [7, 20, 30]}, "3 axes"),
-        ({"shape": [-7, 20, 30, 3]}, "which is none"),
-        ({"shape": "all"}, "must say shape, chunks and dtype"),
-        ({"zarr_format": 3}, "must be zarr of version 2"),
+        ({"shape": [-7, 20, 30, 3]}, "has the invalid shape"),
+        ({"shape": "all"}, "must define shape, chunks and dtype"),
+        ({"zarr_format": 3}, "must be zarr version 2"),
     ],
 )
-def test_what_an_array_says_of_itself_is_checked_before_zarr_sees_it(store, tmp_path, changes, said):
+def test_the_metadata_of_an_array_is_checked_before_zarr_reads_it(store, tmp_path, changes, message):
     forge(store, "data/camera_main_rgb", **changes)
-    with pytest.raises(ImporterError, match=said):
+    with pytest.raises(ImporterError, match=message):
         import_open_x_tactile(store, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -152,7 +154,7 @@ WHOLE = st.integers(-(10**12), 10**12)
         },
     )
 )
-def test_whatever_an_array_says_it_is_read_or_refused_in_a_sentence(store, changes):
+def test_an_array_with_any_metadata_is_read_or_refused(store, changes):
     before = (store / "data/camera_main_rgb/.zarray").read_text()
     try:
         forge(store, "data/camera_main_rgb", **changes)
@@ -165,15 +167,15 @@ def test_whatever_an_array_says_it_is_read_or_refused_in_a_sentence(store, chang
 
 
 @pytest.mark.parametrize("ends", [[3, 3], [5, 4], [4, 99], [0, 4], [-1, 4]])
-def test_ends_of_episodes_that_do_not_rise_within_the_steps_are_refused(tmp_path, ends):
+def test_episode_ends_that_do_not_increase_within_the_steps_are_refused(tmp_path, ends):
     (tmp_path / "src").mkdir()
     more = {"meta/episode_ends": np.array(ends, dtype=np.int64)}
     open_x_tactile.write_store(tmp_path / "src/wipe.zarr", (4, 3), **more)
-    with pytest.raises(ImporterError, match="episode_ends must rise to at most 7, the number of steps"):
+    with pytest.raises(ImporterError, match="episode_ends must increase up to at most 7, the number of steps"):
         import_open_x_tactile(tmp_path / "src", tmp_path / "out")
 
 
-def test_names_that_a_store_holds_as_bytes_are_text(tmp_path):
+def test_names_stored_as_bytes_become_text(tmp_path):
     (tmp_path / "src").mkdir()
     more = {"meta/object_id": np.array([b"mug", "n\u00e4gel".encode()]), "meta/outcome": np.array([b"held", b""])}
     open_x_tactile.write_store(tmp_path / "src/wipe.zarr", (4, 3), **more)
@@ -182,31 +184,31 @@ def test_names_that_a_store_holds_as_bytes_are_text(tmp_path):
 
 
 @pytest.mark.parametrize("key", ["force_n", "pose", "grasped"])
-def test_numbers_that_a_store_holds_as_text_are_refused(tmp_path, key):
+def test_numbers_stored_as_text_are_refused(tmp_path, key):
     (tmp_path / "src").mkdir()
     values = np.array([["1"], ["2"]] if key == "pose" else ["1", "2"])
     open_x_tactile.write_store(tmp_path / "src/wipe.zarr", (4, 3), **{f"meta/{key}": values})
-    with pytest.raises(ImporterError, match=f"meta/{key} has the type <U1"):
+    with pytest.raises(ImporterError, match=f"meta/{key} has type <U1"):
         import_open_x_tactile(tmp_path / "src", tmp_path / "out")
 
 
-@pytest.mark.parametrize(("at", "value"), [(6, 1), (8, 99)])
-def test_a_zip_that_is_locked_or_packed_in_a_way_that_nobody_knows_is_refused(store, tmp_path, at, value):
-    """Byte 6 of a file's header says whether it is encrypted, byte 8 how it is packed."""
+@pytest.mark.parametrize(("offset", "value"), [(6, 1), (8, 99)])
+def test_a_zip_with_encryption_or_an_unknown_compression_is_refused(store, tmp_path, offset, value):
+    """Byte 6 of a file header is the encryption flag, byte 8 the compression method."""
     path = Path(shutil.make_archive(str(tmp_path / "zip" / "wipe.zarr"), "zip", store))
     data = bytearray(path.read_bytes())
     for head, shift in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):
         for found in re.finditer(re.escape(head), bytes(data)):
-            data[found.start() + at + shift] = value
+            data[found.start() + offset + shift] = value
     path.write_bytes(data)
     with pytest.raises(ImporterError, match=r"cannot be (read|opened)"):
         import_open_x_tactile(path.parent, tmp_path / "out")
 
 
-def test_a_zip_whose_packed_bytes_are_damaged_is_refused(store, tmp_path):
+def test_a_zip_with_damaged_content_is_refused(store, tmp_path):
     path = Path(shutil.make_archive(str(tmp_path / "zip" / "wipe.zarr"), "zip", store))
     with zipfile.ZipFile(path) as archive:
-        (info,) = [each for each in archive.infolist() if each.filename == "meta/episode_ends/.zarray"]
+        (info,) = [entry for entry in archive.infolist() if entry.filename == "meta/episode_ends/.zarray"]
     data = bytearray(path.read_bytes())
     start = info.header_offset + 30 + len(info.filename)
     data[start : start + info.compress_size] = b"\xff" * info.compress_size
@@ -215,7 +217,7 @@ def test_a_zip_whose_packed_bytes_are_damaged_is_refused(store, tmp_path):
         import_open_x_tactile(path.parent, tmp_path / "out")
 
 
-def test_a_tar_is_to_be_unpacked_and_zarr_to_be_installed(source, tmp_path, monkeypatch):
+def test_errors_tell_to_unpack_a_tar_file_and_to_install_zarr(source, tmp_path, monkeypatch):
     (tmp_path / "tars").mkdir()
     (tmp_path / "tars/insert_plug.tar").write_bytes(b"tar")
     with pytest.raises(ImporterError, match=r"unpack insert_plug\.tar first"):
@@ -228,6 +230,6 @@ def test_a_tar_is_to_be_unpacked_and_zarr_to_be_installed(source, tmp_path, monk
     assert not (tmp_path / "out").exists()
 
 
-def test_a_zip_of_the_folder_itself_is_read_too(store, tmp_path):
+def test_a_zip_with_the_folder_itself_is_read(store, tmp_path):
     shutil.make_archive(str(tmp_path / "zip" / "wipe.zarr"), "zip", store.parent, store.name)
     assert len(import_open_x_tactile(tmp_path / "zip", tmp_path / "out").grasps) == 2

@@ -1,4 +1,4 @@
-"""PhysiCLeAR: what is its own; what holds of every importer stands in test_importers."""
+"""Importer of PhysiCLeAR; test_importers.py tests the common behaviour."""
 
 import cv2
 import numpy as np
@@ -31,21 +31,21 @@ def test_a_part_is_an_object_and_a_video_a_sequence_of_five_frames(source, tmp_p
     assert {name for _, name, _ in found} == set(physiclear.PARTS)
 
 
-def test_the_frames_of_strongest_contact_are_kept_in_order_of_time_with_the_first_frame_as_no_contact_frame(tmp_path):
+def test_the_frames_of_strongest_contact_are_in_order_of_time_and_the_first_frame_is_the_no_contact_frame(tmp_path):
     """Contact rises to frame 6 of 12 and falls: frames 4 to 8 differ most from frame 0."""
     physiclear.write_video(tmp_path / "pen_0.mov", physiclear.presses(0, 0))
-    press = StrongestFrames(tmp_path / "pen_0.mov", 5)
-    made = physiclear.presses(0, 0)
+    strongest = StrongestFrames(tmp_path / "pen_0.mov", 5)
+    frames = physiclear.presses(0, 0)
     for place, frame in enumerate((4, 5, 6, 7, 8)):
-        assert np.abs(press.frame(place).astype(float) - made[frame]).mean() < 3  # the codec's loss
+        assert np.abs(strongest.frame(place).astype(float) - frames[frame]).mean() < 3  # the codec's loss
         others = [
-            np.abs(press.frame(place).astype(float) - made[other]).mean() for other in (3, 6, 9) if other != frame
+            np.abs(strongest.frame(place).astype(float) - frames[other]).mean() for other in (3, 6, 9) if other != frame
         ]
-        assert min(others) > np.abs(press.frame(place).astype(float) - made[frame]).mean() or frame in (4, 8)
-    assert np.abs(press.no_contact().astype(float) - made[0]).mean() < 3
+        assert min(others) > np.abs(strongest.frame(place).astype(float) - frames[frame]).mean() or frame in (4, 8)
+    assert np.abs(strongest.no_contact().astype(float) - frames[0]).mean() < 3
 
 
-def test_the_no_contact_frame_of_a_video_is_kept_once_and_is_not_that_of_another(source, tmp_path):
+def test_each_video_has_its_own_no_contact_frame_stored_once(source, tmp_path):
     recording = import_physiclear(source, tmp_path / "out")
     before = {grasp.sequence_id: grasp.touches_before["a"] for grasp in recording.grasps}
     assert len(set(before.values())) == len(before) == 6
@@ -55,14 +55,14 @@ def test_the_no_contact_frame_of_a_video_is_kept_once_and_is_not_that_of_another
     assert np.median(other - one) == pytest.approx(8, abs=2)
 
 
-def test_without_photos_the_gel_image_stands_in_its_place_as_one_file(source, tmp_path):
+def test_the_gel_image_replaces_the_photo_as_one_file(source, tmp_path):
     recording = import_physiclear(source, tmp_path / "out")
     assert all(grasp.photo == grasp.touches["a"] for grasp in recording.grasps)
     assert len(list((recording.folder / "images").iterdir())) == physiclear.GRASPS + 6
     assert any("no photos" in note for note in recording.notes)
 
 
-def test_the_repositorys_own_folder_is_found_and_the_option_says_how_many_frames(source, tmp_path):
+def test_the_folder_of_the_repository_is_found_and_an_option_sets_the_number_of_frames(source, tmp_path):
     (tmp_path / "clone").mkdir()
     source.rename(tmp_path / "clone" / "dataset")
     recording = import_physiclear(tmp_path / "clone", tmp_path / "out", frames=2)
@@ -76,13 +76,13 @@ def test_a_video_too_short_or_without_change_costs_its_own_grasps(source, tmp_pa
     physiclear.write_video(source / "apple_1.mov", [np.full((48, 64, 3), 90, np.uint8)] * 8)
     recording = import_physiclear(source, tmp_path / "out")
     assert recording.info["skipped"] == {
-        "its video has 4 frames, fewer than 6": 5,
+        "its video must have at least 6 frames, got 4": 5,
         "its video has too few frames that differ from the first one": 5,
     }
 
 
 @pytest.mark.slow
-def test_the_real_videos_import_whole(tmp_path):
+def test_the_real_videos_are_imported_completely(tmp_path):
     recording = import_physiclear(touch_data("physiclear"), tmp_path / "out")
     assert len(recording.grasps) == 241 * 5
     assert len({grasp.object_id for grasp in recording.grasps}) == 44

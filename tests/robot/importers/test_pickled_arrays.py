@@ -1,4 +1,4 @@
-"""Arrays out of pickles: those that NumPy wrote come out equal, and everything else is refused in one line."""
+"""Arrays from pickles: arrays that NumPy wrote are equal after reading, everything else is refused in one line."""
 
 import ast
 import inspect
@@ -22,26 +22,26 @@ PROTOCOLS = (3, 4, 5)
 HEIGHTS = np.random.default_rng(5).normal(size=(24, 32))
 
 
-def refusal(data):
-    """The one line with which bytes are refused."""
+def error_line(data):
+    """Return the error for invalid bytes, which must be one line."""
     with pytest.raises(ImporterError) as caught:
         read_array(data)
-    said = str(caught.value)
-    assert said.startswith("it ")
-    assert len(said.splitlines()) == 1
-    assert len(said) < 200
-    return said
+    message = str(caught.value)
+    assert message.startswith("it ")
+    assert len(message.splitlines()) == 1
+    assert len(message) < 200
+    return message
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("array", ARRAYS, ids=lambda array: f"{array.dtype.str}-{array.ndim}")
-def test_an_array_comes_out_as_it_was_pickled(array, protocol):
+def test_a_pickled_array_is_read_unchanged(array, protocol):
     found = read_array(pickle.dumps(array, protocol=protocol))
     np.testing.assert_array_equal(found, array)
     assert found.dtype == array.dtype.newbyteorder("=")
 
 
-def test_the_module_never_imports_pickle_nor_calls_what_a_file_names():
+def test_the_module_does_not_import_pickle_or_call_functions_by_name():
     tree = ast.parse(inspect.getsource(pickled_arrays))
     imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
@@ -78,30 +78,30 @@ def test_the_module_never_imports_pickle_nor_calls_what_a_file_names():
     ids=lambda thing: type(thing).__name__,
 )
 @pytest.mark.parametrize("protocol", [0, 2, *PROTOCOLS])
-def test_everything_but_an_array_of_numbers_is_refused(thing, protocol):
-    refusal(pickle.dumps(thing, protocol=protocol))
+def test_everything_except_an_array_of_numbers_is_refused(thing, protocol):
+    error_line(pickle.dumps(thing, protocol=protocol))
 
 
 class Calls:
-    """What a pickle calls when it is loaded."""
+    """An object whose pickle calls a function when it is loaded."""
 
-    def __init__(self, what, *arguments):
-        self.what, self.arguments = what, arguments
+    def __init__(self, function, *arguments):
+        self.function, self.arguments = function, arguments
 
     def __reduce__(self):
-        return self.what, self.arguments
+        return self.function, self.arguments
 
 
 @pytest.mark.parametrize("protocol", [0, 1, 2, *PROTOCOLS])
-def test_a_program_in_the_place_of_the_array_of_its_type_or_of_its_bytes_does_not_run(protocol, tmp_path):
+def test_a_program_instead_of_the_array_or_of_a_part_of_it_does_not_run(protocol, tmp_path):
     target = tmp_path / "made"
     for hidden in (Calls(open, str(target), "w"), [HEIGHTS, Calls(open, str(target), "w")]):
-        refusal(pickle.dumps(hidden, protocol=protocol))
+        error_line(pickle.dumps(hidden, protocol=protocol))
         assert not target.exists()
     rebuild, arguments, state = HEIGHTS.__reduce__()[:3]
     for place in range(5):
         forged = (*state[:place], Calls(open, str(target), "w"), *state[place + 1 :])
-        refusal(pickle.dumps(Rebuilt(rebuild, arguments, forged), protocol=protocol))
+        error_line(pickle.dumps(Rebuilt(rebuild, arguments, forged), protocol=protocol))
         assert not target.exists()
 
 
@@ -114,30 +114,30 @@ class Rebuilt:
 
 
 def forged(**changes):
-    """The pickle of HEIGHTS with other parts of its state."""
+    """Return the pickle of HEIGHTS with changes of its state."""
     rebuild, arguments, (version, shape, dtype, fortran, data) = HEIGHTS.__reduce__()[:3]
     state = {"version": version, "shape": shape, "dtype": dtype, "fortran": fortran, "data": data} | changes
     return pickle.dumps(Rebuilt(rebuild, arguments, tuple(state.values())), protocol=4)
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
-        ({"shape": (24, 33)}, "its shape asks for 6,336 bytes, and there are 6,144"),
-        ({"shape": (2**62, 2**62)}, "its shape must be"),
-        ({"shape": (-24, -32)}, "its shape must be"),
-        ({"shape": (24, True)}, "its shape must be"),
-        ({"shape": 768}, "its shape must be"),
-        ({"shape": ()}, "its shape must be"),
-        ({"shape": (MAX_BYTES, MAX_BYTES, MAX_BYTES)}, "its shape asks for"),
-        ({"dtype": "f8"}, "lacks the type"),
-        ({"data": "text"}, "lacks the type"),
-        ({"data": None}, "lacks the type"),
-        ({"dtype": np.dtype("f4")}, "its shape asks for 3,072"),
+        ({"shape": (24, 33)}, "its shape needs 6,336 bytes, got 6,144"),
+        ({"shape": (2**62, 2**62)}, "its shape must have"),
+        ({"shape": (-24, -32)}, "its shape must have"),
+        ({"shape": (24, True)}, "its shape must have"),
+        ({"shape": 768}, "its shape must have"),
+        ({"shape": ()}, "its shape must have"),
+        ({"shape": (MAX_BYTES, MAX_BYTES, MAX_BYTES)}, "its shape needs"),
+        ({"dtype": "f8"}, "the type or the bytes of its numbers are missing"),
+        ({"data": "text"}, "the type or the bytes of its numbers are missing"),
+        ({"data": None}, "the type or the bytes of its numbers are missing"),
+        ({"dtype": np.dtype("f4")}, "its shape needs 3,072"),
     ],
 )
-def test_a_state_that_does_not_fit_is_refused_with_what_does_not(changes, said):
-    assert said in refusal(forged(**changes))
+def test_an_invalid_state_is_refused_with_the_reason(changes, message):
+    assert message in error_line(forged(**changes))
 
 
 def array_or_line(data):
@@ -153,11 +153,11 @@ ARRAY = pickle.dumps(HEIGHTS, protocol=4)
 
 
 @pytest.mark.parametrize(
-    ("data", "said"),
+    ("data", "message"),
     [
         (b"", "damaged or cut off"),
         (b"\x80\x04", "damaged or cut off"),
-        (b".", "holds something else"),
+        (b".", "contains something else"),
         (b"\x80\x04h\x05.", "BINGET refers to nothing"),
         (b"\x80\x04\x94.", "MEMOIZE refers to nothing"),
         (b"\x80\x04t.", "TUPLE refers to nothing"),
@@ -165,21 +165,21 @@ ARRAY = pickle.dumps(HEIGHTS, protocol=4)
         (b"\x80\x04R.", "its stack is empty"),
         (b"\x80\x04b.", "its stack is empty"),
         (b"\x80\x04K\x01b.", "BUILD refers to nothing"),
-        (b"\x80\x04K\x01K\x01b.", "a state is no tuple"),
-        (b"\x80\x04))b.", "a state is of something else"),
+        (b"\x80\x04K\x01K\x01b.", "a state is not a tuple"),
+        (b"\x80\x04))b.", "a state belongs to something else"),
         (b"\x80\x04)R.", "its stack is empty"),
-        (b"\x80\x04))R.", "it calls something else"),
-        (b"\x80\x04K\x012.", "no opcode DUP"),
-        (b"\x80\x04}.", "no opcode EMPTY_DICT"),
-        (b"\x80\x04]2a.", "no opcode EMPTY_LIST"),
-        (b"cos\nsystem\n(S'true'\ntR.", "it asks for 'os' 'system'"),
-        (b"\x80\x04\x8c\x08builtins\x8c\x04eval\x93.", "it asks for 'builtins' 'eval'"),
-        (b"\x80\x04K\x01K\x02\x93.", "it asks for"),
-        (b"\x80\x04))\x93.", "it asks for"),
-        (b"(dp0\n.", "no opcode DICT"),
-        (b"\x80\x04\x8c\x01aQ.", "no opcode BINPERSID"),
-        (b"\x80\x05\x97.", "no opcode NEXT_BUFFER"),
-        (b"\x80\x02\x82\x01.", "no opcode EXT1"),
+        (b"\x80\x04))R.", "it calls a function that does not make an array"),
+        (b"\x80\x04K\x012.", "does not have the opcode DUP"),
+        (b"\x80\x04}.", "not have the opcode EMPTY_DICT"),
+        (b"\x80\x04]2a.", "not have the opcode EMPTY_LIST"),
+        (b"cos\nsystem\n(S'true'\ntR.", "it refers to 'os' 'system'"),
+        (b"\x80\x04\x8c\x08builtins\x8c\x04eval\x93.", "it refers to 'builtins' 'eval'"),
+        (b"\x80\x04K\x01K\x02\x93.", "it refers to"),
+        (b"\x80\x04))\x93.", "it refers to"),
+        (b"(dp0\n.", "not have the opcode DICT"),
+        (b"\x80\x04\x8c\x01aQ.", "not have the opcode BINPERSID"),
+        (b"\x80\x05\x97.", "not have the opcode NEXT_BUFFER"),
+        (b"\x80\x02\x82\x01.", "not have the opcode EXT1"),
         (b"I" + b"9" * 100_000 + b"\n.", ""),
         (b"L" + b"9" * 100_000 + b"L\n.", ""),
         (b"\x8b" + struct.pack("<i", 2**31 - 1) + b"\x00" * 9, "damaged or cut off"),
@@ -193,40 +193,40 @@ ARRAY = pickle.dumps(HEIGHTS, protocol=4)
     ],
     ids=lambda value: repr(value)[:24],
 )
-def test_forged_opcodes_are_refused_in_one_line(data, said):
-    assert said in refusal(data)
+def test_forged_opcodes_are_refused_in_one_line(data, message):
+    assert message in error_line(data)
 
 
 def test_a_memo_cannot_make_a_small_file_large():
-    """Each tuple holds the one before it twice: as a tree 2 ** 60 parts, as references 60."""
+    """Each tuple contains its predecessor twice: 2 ** 40 parts as a tree, 40 as references."""
     data = b"\x80\x04)\x94" + b"".join(b"h%ch%c\x86\x94" % (place, place) for place in range(40)) + b"."
     tracemalloc.start()
-    said = refusal(data)
+    message = error_line(data)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert "holds something else" in said
+    assert "contains something else" in message
     assert peak < 2**20
 
 
-def test_a_tuple_of_tuples_in_the_place_of_a_name_or_a_type_is_not_written_out():
+def test_a_tuple_of_tuples_instead_of_a_name_or_a_type_is_not_printed():
     nested = b")\x94" + b"".join(b"h%ch%c\x86\x94" % (place, place) for place in range(30))
     tracemalloc.start()
-    refusal(b"\x80\x04" + nested + b"\x8c\x01a\x93.")
-    refusal(b"\x80\x04cnumpy\ndtype\n" + nested + b"NN\x87R.")
+    error_line(b"\x80\x04" + nested + b"\x8c\x01a\x93.")
+    error_line(b"\x80\x04cnumpy\ndtype\n" + nested + b"NN\x87R.")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 2**20
 
 
-def test_an_array_cannot_hold_itself_nor_be_filled_twice():
+def test_an_array_cannot_contain_itself_or_be_filled_twice():
     empty = b"\x80\x04cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85C\x01b\x87R\x94"
-    assert "a state is no tuple" in refusal(empty + b"h\x00b.")
-    assert "lacks the type" in refusal(empty + b"(K\x01K\x01\x85h\x00Nh\x00tb.")
-    assert "given twice" in refusal(ARRAY[:-1] + b"(NNNNNtb.")
+    assert "a state is not a tuple" in error_line(empty + b"h\x00b.")
+    assert "the type or the bytes of its numbers are missing" in error_line(empty + b"(K\x01K\x01\x85h\x00Nh\x00tb.")
+    assert "occurs twice" in error_line(ARRAY[:-1] + b"(NNNNNtb.")
 
 
-def test_what_pickletools_can_read_and_numpy_did_not_write_never_makes_an_array():
-    """Every opcode that there is, with an argument of zeros, before and within the pickle of an array."""
+def test_other_opcodes_never_make_another_array():
+    """Every opcode, with an argument of zeros, before and within the pickle of an array."""
     for opcode in pickletools.opcodes:
         for tail in (b"", b"\x00" * 16, b"0\n", b"\x01a\n"):
             code = opcode.code.encode("latin-1")
@@ -242,11 +242,11 @@ def test_what_pickletools_can_read_and_numpy_did_not_write_never_makes_an_array(
 def test_a_pickle_cut_anywhere_is_refused(protocol):
     data = pickle.dumps(np.arange(6.0).reshape(2, 3), protocol=protocol)
     for end in range(len(data)):
-        refusal(data[:end])
+        error_line(data[:end])
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_random_damage_gives_an_array_of_the_files_own_bytes_or_one_line_and_bounded_memory(protocol):
+def test_random_damage_gives_an_array_or_an_error_line_with_bounded_memory(protocol):
     whole = pickle.dumps(np.arange(6.0).reshape(2, 3), protocol=protocol)
     rng = np.random.default_rng(protocol)
     codes = [opcode.code.encode("latin-1") for opcode in pickletools.opcodes]
@@ -286,12 +286,12 @@ def test_a_large_array_takes_a_small_multiple_of_its_file():
     assert peak < 5 * len(data)
 
 
-def test_damage_among_the_bytes_of_the_numbers_changes_just_these_numbers():
+def test_damage_in_the_bytes_of_numbers_changes_only_these_numbers():
     array = np.arange(6.0).reshape(2, 3)
     whole = pickle.dumps(array, protocol=4)
     start = whole.index(array.tobytes())
     for place in range(start, start + array.nbytes):
         data = bytearray(whole)
         data[place] ^= 0xFF
-        wanted = np.frombuffer(bytes(data[start : start + array.nbytes])).reshape(2, 3)
-        np.testing.assert_array_equal(read_array(bytes(data)), wanted)
+        expected = np.frombuffer(bytes(data[start : start + array.nbytes])).reshape(2, 3)
+        np.testing.assert_array_equal(read_array(bytes(data)), expected)

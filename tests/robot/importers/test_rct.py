@@ -1,4 +1,4 @@
-"""RCT: what is its own; what holds of every importer stands in test_robot_importers."""
+"""Importer of RCT; test_importers.py tests the common behaviour."""
 
 import pytest
 
@@ -27,46 +27,46 @@ def test_a_material_is_an_object_a_press_a_sequence_and_a_row_a_grasp_with_its_f
     assert (recording.folder / grasp.touches["a"]).read_bytes() == picture.read_bytes()
 
 
-def test_the_photo_of_a_material_is_kept_once(source, tmp_path):
+def test_the_photo_of_a_material_is_stored_once(source, tmp_path):
     recording = import_rct(source, tmp_path / "out")
     assert len({grasp.photo for grasp in recording.grasps}) == len(rct.MATERIALS)
 
 
 def test_rows_without_a_picture_or_a_sensor_are_counted(source, tmp_path):
     assert import_rct(source, tmp_path / "out").info["skipped"] == {
-        "no picture lies where the option touch says": 1,
-        "a row of force_metadata.csv lacks material_id, position, sensor, z_frame, or has a strange name there": 1,
+        "no picture matches the option touch": 1,
+        "a row of force_metadata.csv lacks material_id, position, sensor, z_frame, or has an invalid name there": 1,
     }
 
 
-def test_one_sensor_alone_makes_a_recording_of_that_sensor(source, tmp_path):
+def test_an_option_selects_one_sensor(source, tmp_path):
     recording = import_rct(source, tmp_path / "out", sensor="D20045")
     assert recording.info["sensor"] == "DIGIT D20045"
     assert len(recording.grasps) == rct.GRASPS / 2
     assert {grasp.sequence_id.split("-")[-1] for grasp in recording.grasps} == {"D20045"}
 
 
-def test_pictures_that_lie_elsewhere_are_found_where_the_options_say(source, tmp_path):
+def test_options_define_the_paths_of_pictures(source, tmp_path):
     (source / "tactile").rename(source / "digit_images")
     with pytest.raises(
-        ImporterError, match=r"there are: digit_images, metadata, rgb\); say where they lie by --option"
+        ImporterError, match=r"the folder contains: digit_images, metadata, rgb\); set the paths with --option"
     ):
         import_rct(source, tmp_path / "out")
     recording = import_rct(source, tmp_path / "out", touch="digit_images/{material_id}/*/{sensor}/{z_frame}.png")
-    assert len(recording.grasps) == rct.GRASPS + 1  # the row of a position without a folder has another's picture
+    assert len(recording.grasps) == rct.GRASPS + 1  # the row without a folder gets the picture of another position
 
 
 @pytest.mark.parametrize("pattern", ["tactile/{material}/{z_frame}", "/etc/{sensor}", "../{sensor}", "", "a**b", "."])
-def test_a_pattern_of_other_words_or_out_of_the_folder_is_refused(source, tmp_path, pattern):
+def test_a_pattern_with_other_words_or_outside_the_folder_is_refused(source, tmp_path, pattern):
     with pytest.raises(
-        ImporterError, match=r"braces of touch may hold|touch must be a path below|a pattern must be a path"
+        ImporterError, match=r"braces of touch must contain|touch must be a path below|a pattern must be a path"
     ):
         import_rct(source, tmp_path / "out", touch=pattern)
 
 
 @pytest.mark.parametrize("name", ["..", "../../secret", "a*", "[a]", "", "x" * 100, "a\x00b"])
-def test_a_hostile_name_in_the_table_reaches_no_path(source, tmp_path, name):
+def test_a_hostile_name_in_the_table_is_not_used_as_a_path(source, tmp_path, name):
     with open(source / "metadata/force_metadata.csv", "a") as file:
         file.write(f"{name},0,D20011,3,-1.0\n")
     recording = import_rct(source, tmp_path / "out")
-    assert sum(count for reason, count in recording.info["skipped"].items() if "strange name" in reason) == 2
+    assert sum(count for reason, count in recording.info["skipped"].items() if "invalid name" in reason) == 2

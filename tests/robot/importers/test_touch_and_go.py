@@ -1,4 +1,4 @@
-"""Touch and Go: what is its own; what holds of every importer stands in test_robot_importers."""
+"""Importer of Touch and Go; test_importers.py tests the common behaviour."""
 
 import json
 import tracemalloc
@@ -31,7 +31,7 @@ def test_an_unbroken_run_of_contact_with_one_material_is_an_object_and_its_video
     assert recording.info["objects"][f"{FIRST}-0000000010"]["material"] == "Plastic"
 
 
-def test_frames_of_a_run_are_evenly_spread_and_all_of_them_are_taken_for_0(source, tmp_path):
+def test_frames_of_a_run_are_evenly_spread_and_0_imports_all(source, tmp_path):
     def frames(recording):
         return [int(grasp.grasp_id[-10:]) for grasp in recording.grasps if grasp.object_id == f"{FIRST}-0000000002"]
 
@@ -41,11 +41,11 @@ def test_frames_of_a_run_are_evenly_spread_and_all_of_them_are_taken_for_0(sourc
 
 
 def test_a_negative_number_of_frames_is_refused(source, tmp_path):
-    with pytest.raises(ImporterError, match="frames must be 1 or more of each run, or 0 for all, got -1"):
+    with pytest.raises(ImporterError, match="frames must be at least 1, or 0 for all, got -1"):
         import_touch_and_go(source, tmp_path / "out", frames=-1)
 
 
-def test_photo_and_touch_are_of_one_moment_and_the_no_contact_frame_is_one_that_no_line_names(source, tmp_path):
+def test_photo_and_touch_are_of_one_moment_and_the_no_contact_frame_is_not_in_label_txt(source, tmp_path):
     recording = import_touch_and_go(source, tmp_path / "out")
     grasp = next(grasp for grasp in recording.grasps if grasp.grasp_id == f"{SECOND}-0000000011")
     video = source / "dataset" / SECOND
@@ -61,8 +61,8 @@ def test_a_video_that_begins_in_contact_has_a_later_no_contact_frame(source, tmp
     lines = [f"{FIRST}/{frame:010d}.jpg,3" for frame in range(3)] + [f"{FIRST}/0000000003.jpg,1"]
     (source / "label.txt").write_text("\n".join(lines))
     recording = import_touch_and_go(source, tmp_path / "out")
-    still = (source / "dataset" / FIRST / "gelsight_frame" / "0000000004.jpg").read_bytes()
-    assert (recording.folder / recording.grasps[0].touches_before["a"]).read_bytes() == still
+    no_contact = (source / "dataset" / FIRST / "gelsight_frame" / "0000000004.jpg").read_bytes()
+    assert (recording.folder / recording.grasps[0].touches_before["a"]).read_bytes() == no_contact
 
 
 def test_negative_labels_and_lines_of_another_form_are_counted(source, tmp_path):
@@ -75,34 +75,34 @@ def test_negative_labels_and_lines_of_another_form_are_counted(source, tmp_path)
     }
 
 
-def test_the_published_split_is_kept_where_it_parts_whole_videos(source, tmp_path):
+def test_the_published_split_is_stored_if_it_divides_whole_videos(source, tmp_path):
     import_touch_and_go(source, tmp_path / "out")
     split = json.loads((tmp_path / "out/splits/published.json").read_text())
     assert split["test"] == [f"{THIRD}-0000000002", f"{THIRD}-0000000010"]
     assert len(split["train"]) == 4
 
 
-def test_a_split_of_frames_is_told_as_a_leak_with_its_share_and_what_is_left_of_it_is_kept(source, tmp_path):
-    """Of 18 test lines, 9 of a video that is tested alone, 9 of a video that stands in both files."""
+def test_a_split_of_frames_gets_a_leak_note_and_is_replaced_by_one_of_whole_videos(source, tmp_path):
+    """9 of 18 test lines belong to a video in the test part only, 9 to a video in both files."""
     train, test = (source / f"{part}.txt" for part in ("train", "test"))
     test.write_text(test.read_text() + "\n" + "\n".join(train.read_text().split("\n")[9:]))
     recording = import_touch_and_go(source, tmp_path / "out")
     (leak,) = [note for note in recording.info["notes"] if note.startswith("LEAK")]
-    assert "has 1 of 3 sequences on two sides, and 50% of its test rows are frames" in leak
+    assert "has 1 of 3 sequences in two parts, and 50% of its test rows are frames" in leak
     assert not (tmp_path / "out/splits/published.json").exists()
-    left = json.loads((tmp_path / "out/splits/published-whole.json").read_text())
-    assert {name.rpartition("-")[0] for name in left["test"]} == {THIRD}
-    assert {name.rpartition("-")[0] for name in left["train"]} == {FIRST, SECOND}
+    whole = json.loads((tmp_path / "out/splits/published-whole.json").read_text())
+    assert {name.rpartition("-")[0] for name in whole["test"]} == {THIRD}
+    assert {name.rpartition("-")[0] for name in whole["train"]} == {FIRST, SECOND}
 
 
-def test_videos_that_were_not_extracted_are_told_with_what_to_run(source, tmp_path):
+def test_an_error_tells_how_to_extract_frames(source, tmp_path):
     (source / "dataset" / FIRST / "gelsight_frame").rename(source / "elsewhere")
     with pytest.raises(ImporterError, match=r"has no gelsight_frame/; run the authors' extract_frame\.py first"):
         import_touch_and_go(source, tmp_path / "out")
 
 
 @given(st.text(alphabet="0123456789_/.jpg,- \n", max_size=200))
-def test_any_text_makes_runs_or_skips_of_its_lines(text):
+def test_lines_of_any_text_become_runs_or_skips(text):
     with TemporaryDirectory() as folder:
         (Path(folder) / "label.txt").write_text(text)
         runs, skipped = _runs(Path(folder) / "label.txt")
@@ -111,9 +111,9 @@ def test_any_text_makes_runs_or_skips_of_its_lines(text):
 
 
 @pytest.mark.slow
-def test_a_hundred_thousand_labels_take_the_memory_of_their_runs(tmp_path):
+def test_memory_for_100000_labels_grows_with_their_runs_only(tmp_path):
     with open(tmp_path / "label.txt", "w") as file:
-        file.writelines(f"20220601_{at // 5000:06d}/{at % 5000:010d}.jpg,3\n" for at in range(100_000))
+        file.writelines(f"20220601_{number // 5000:06d}/{number % 5000:010d}.jpg,3\n" for number in range(100_000))
     tracemalloc.start()
     try:
         runs, _ = _runs(tmp_path / "label.txt")

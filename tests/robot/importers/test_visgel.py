@@ -1,4 +1,4 @@
-"""VisGel: which frame, which object; what holds of every importer stands in test_robot_importers."""
+"""Importer of VisGel: choice of frame and object; test_importers.py tests the common behaviour."""
 
 import pytest
 
@@ -15,8 +15,8 @@ def source(tmp_path):
     return tmp_path / "src"
 
 
-def test_of_each_recording_the_frame_that_is_pressed_most_is_taken(source, tmp_path):
-    """Frame 15 of 31 is among the 16 that are looked at, frames 1 + 29 k / 15 rounded: k = 7 gives 14.53."""
+def test_the_frame_of_strongest_contact_is_the_touch(source, tmp_path):
+    """Frame 15 of 31 is among the 16 compared frames, 1 + 29 k / 15 rounded: k = 7 gives 14.53."""
     recording = import_visgel(source, tmp_path / "out")
     assert [grasp.object_id for grasp in recording.grasps] == [
         "seen-1-rec_00000",
@@ -24,18 +24,18 @@ def test_of_each_recording_the_frame_that_is_pressed_most_is_taken(source, tmp_p
         "seen-12-rec_00000",
         "unseen-3-rec_00000",
     ]
-    for grasp, (part, sitting, name) in zip(recording.grasps, visgel.RECORDINGS + visgel.UNSEEN, strict=True):
+    for grasp, (part, session, name) in zip(recording.grasps, visgel.RECORDINGS + visgel.UNSEEN, strict=True):
         root = source / f"data_{part}/images"
-        where, frame = f"{sitting}/{name}", f"frame{visgel.PRESSED:04}.jpg"
-        assert (tmp_path / "out" / grasp.touches["a"]).read_bytes() == (root / "touch" / where / frame).read_bytes()
-        assert (tmp_path / "out" / grasp.photo).read_bytes() == (root / "vision" / where / frame).read_bytes()
-        no_contact = root / "touch" / where / "frame0000.jpg"
+        path, frame = f"{session}/{name}", f"frame{visgel.PRESSED:04}.jpg"
+        assert (tmp_path / "out" / grasp.touches["a"]).read_bytes() == (root / "touch" / path / frame).read_bytes()
+        assert (tmp_path / "out" / grasp.photo).read_bytes() == (root / "vision" / path / frame).read_bytes()
+        no_contact = root / "touch" / path / "frame0000.jpg"
         assert (tmp_path / "out" / grasp.touches_before["a"]).read_bytes() == no_contact.read_bytes()
-        assert grasp.sequence_id == f"{part}-{sitting}"
+        assert grasp.sequence_id == f"{part}-{session}"
 
 
 @pytest.mark.parametrize("between", ["", "images", "a/b"])
-def test_the_folders_between_are_found(tmp_path, between):
+def test_folders_in_between_are_searched(tmp_path, between):
     visgel.write(tmp_path / "src", between)
     assert len(import_visgel(tmp_path / "src", tmp_path / "out").grasps) == visgel.GRASPS
 
@@ -46,13 +46,13 @@ def test_what_the_authors_held_out_is_the_test_part(source, tmp_path):
     assert '"test": [\n  "unseen-3-rec_00000"\n ]' in (tmp_path / "out" / SPLITS_FOLDER / "unseen.json").read_text()
 
 
-def test_a_copy_of_the_seen_part_alone_has_no_split(source, tmp_path):
+def test_a_copy_without_the_unseen_part_has_no_split(source, tmp_path):
     (source / "data_unseen").rename(tmp_path / "elsewhere")
     assert len(import_visgel(source, tmp_path / "out").grasps) == 3
     assert not (tmp_path / "out" / SPLITS_FOLDER).exists()
 
 
-def test_a_pressed_frame_that_cannot_be_read_gives_way_to_another(source, tmp_path):
+def test_an_unreadable_frame_is_replaced_by_another(source, tmp_path):
     (source / f"data_seen/images/touch/1/rec_00000/frame{visgel.PRESSED:04}.jpg").write_bytes(b"broken")
     recording = import_visgel(source, tmp_path / "out")
     assert len(recording.grasps) == visgel.GRASPS
@@ -63,4 +63,4 @@ def test_a_recording_of_one_frame_is_skipped(source, tmp_path):
     for frame in sorted(folder.iterdir())[1:]:
         frame.unlink()
     recording = import_visgel(source, tmp_path / "out")
-    assert recording.info["skipped"] == {"it has no two frames": 1}
+    assert recording.info["skipped"] == {"it has fewer than two frames": 1}

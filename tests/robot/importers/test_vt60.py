@@ -1,4 +1,4 @@
-"""VT60: what is its own; what holds of every importer stands in test_robot_importers."""
+"""Importer of VT60; test_importers.py tests the common behaviour."""
 
 from collections import Counter
 
@@ -24,8 +24,8 @@ def recording(source, tmp_path):
     return import_vt60(source, tmp_path / "out")
 
 
-def test_an_object_is_a_class_and_an_instance_which_the_recording_tells(recording):
-    assert {grasp.object_id for grasp in recording.grasps} == {"-".join(each) for each in vt60.OBJECTS}
+def test_an_object_is_a_class_and_an_instance(recording):
+    assert {grasp.object_id for grasp in recording.grasps} == {"-".join(names) for names in vt60.OBJECTS}
     assert recording.info["objects"]["03_ball-01"] == {
         "class": "ball",
         "instance": "01",
@@ -33,13 +33,13 @@ def test_an_object_is_a_class_and_an_instance_which_the_recording_tells(recordin
     }
 
 
-def test_the_ninth_touch_comes_before_the_tenth(recording):
+def test_touches_are_in_the_order_of_their_numbers(recording):
     ball = [grasp.grasp_id for grasp in recording.grasps if grasp.object_id == "03_ball-01"]
     assert ball == [f"03_ball-01-{k}" for k in range(1, 13)]
 
 
 def test_touches_are_assigned_to_the_photos_of_their_own_object_in_turn(recording):
-    """12 touches and 5 photos: no photo is used more than once oftener than another."""
+    """12 touches and 5 photos: the numbers of uses differ by at most 1."""
     ball = [grasp for grasp in recording.grasps if grasp.object_id == "03_ball-01"]
     assert [grasp.photo.split("_img_")[1].split("_")[0] for grasp in ball] == list("123451234512")
     assert all(grasp.photo.startswith("images/03_ball-01-") for grasp in ball)
@@ -47,12 +47,12 @@ def test_touches_are_assigned_to_the_photos_of_their_own_object_in_turn(recordin
 
 
 def test_every_photo_and_the_no_contact_frame_are_stored_once(recording):
-    assert {grasp.touches_before["a"] for grasp in recording.grasps} == {"images/untouched_shared.jpg"}
+    assert {grasp.touches_before["a"] for grasp in recording.grasps} == {"images/no_contact_shared.jpg"}
     files = list((recording.folder / "images").iterdir())
     assert len(files) == vt60.GRASPS + vt60.PHOTOS * len(vt60.OBJECTS) + 1
 
 
-def test_a_bottle_empty_and_full_is_one_sequence_which_no_drawn_split_tears(recording):
+def test_a_bottle_empty_and_full_is_one_sequence_and_drawn_splits_do_not_divide_it(recording):
     sequence = {grasp.object_id: grasp.sequence_id for grasp in recording.grasps}
     assert sequence["02_bottleempty-01"] == sequence["08_bottlefull-01"] == "bottle-buxton"
     assert sequence["02_bottleempty-02"] == sequence["08_bottlefull-02"] == "bottle-volvic"
@@ -63,7 +63,7 @@ def test_a_bottle_empty_and_full_is_one_sequence_which_no_drawn_split_tears(reco
 
 
 def test_the_touch_that_is_the_no_contact_frame_itself_is_skipped(source, tmp_path):
-    """As in the published data: `retrieve check` calls such a grasp an error."""
+    """The published data has one; `retrieve check` reports such a grasp as an error."""
     (touch,) = (source / "touch/03_ball/01").glob("touch_1_img_4_*")
     touch.write_bytes((source / "touch/baselineForCalibration.jpg").read_bytes())
     recording = import_vt60(source, tmp_path / "out")
@@ -71,15 +71,15 @@ def test_the_touch_that_is_the_no_contact_frame_itself_is_skipped(source, tmp_pa
     assert "skipped 1: its touch is the no-contact frame itself, such as 03_ball-01-4" in recording.notes
 
 
-def test_a_touch_that_is_a_link_to_nowhere_costs_its_own_grasp(source, tmp_path):
+def test_a_touch_that_is_a_broken_link_costs_its_own_grasp(source, tmp_path):
     touch = next((source / "touch/03_ball").rglob("touch_*.jpg"))
     touch.unlink()
     touch.symlink_to("nowhere")
     assert import_vt60(source, tmp_path / "out").info["skipped"]["its touch a is missing"] == 1
 
 
-def test_photos_without_touches_are_told(recording):
-    assert "skipped 1: photos of an object that was not touched, such as 03_ball/07" in recording.notes
+def test_photos_without_touches_are_skipped_with_a_note(recording):
+    assert "skipped 1: photos of an object without touches, such as 03_ball/07" in recording.notes
 
 
 def test_a_data_set_without_its_no_contact_frame_is_imported_without(source, tmp_path):
@@ -89,19 +89,19 @@ def test_a_data_set_without_its_no_contact_frame_is_imported_without(source, tmp
     assert recording.info["background"] == "none"
 
 
-def test_half_of_the_data_set_is_refused_with_what_is_missing(source, tmp_path):
+def test_an_incomplete_data_set_is_refused_with_the_missing_folder(source, tmp_path):
     (source / "vision").rename(source / "elsewhere")
     with pytest.raises(ImporterError, match="it has no vision/"):
         import_vt60(source, tmp_path / "out")
 
 
 @pytest.mark.slow
-def test_the_real_data_import_whole(tmp_path):
+def test_the_real_data_are_imported_completely(tmp_path):
     recording = import_vt60(touch_data("vt60"), tmp_path / "out")
     assert len(recording.grasps) == 4991
     assert len({grasp.object_id for grasp in recording.grasps}) == 40
     assert len({grasp.sequence_id for grasp in recording.grasps}) == 36
     assert recording.info["skipped"] == {
-        "photos of an object that was not touched": 3,
+        "photos of an object without touches": 3,
         "its touch is the no-contact frame itself": 1,
     }

@@ -1,4 +1,4 @@
-"""X-Capture: what is its own; what holds of every importer stands in test_importers."""
+"""Importer of X-Capture; test_importers.py tests the common behaviour."""
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ def source(tmp_path):
     return tmp_path / "src"
 
 
-def test_a_point_is_a_grasp_of_its_object_with_the_force_of_its_files_name(source, tmp_path):
+def test_a_point_is_a_grasp_of_its_object_with_the_force_from_its_file_name(source, tmp_path):
     recording = import_x_capture(source, tmp_path / "out")
     first = recording.grasps[0]
     assert (first.grasp_id, first.object_id, first.sequence_id) == ("00071-000-10N", "00071", "00071")
@@ -26,7 +26,7 @@ def test_a_point_is_a_grasp_of_its_object_with_the_force_of_its_files_name(sourc
     assert (recording.folder / first.touches["a"]).read_bytes() == touch
 
 
-def test_depth_is_kept_where_it_is_a_picture_of_16_bits(source, tmp_path):
+def test_depth_is_imported_if_it_is_a_16_bit_picture(source, tmp_path):
     picture(source / "00071/001/001_depth.png", 3)
     (source / "00071/002/002_depth.png").write_bytes(b"nothing")
     by_id = {grasp.grasp_id: grasp for grasp in import_x_capture(source, tmp_path / "out").grasps}
