@@ -188,7 +188,5 @@ def _above(pose: Pose, fit: CylinderFit, settings: GraspSettings, workspace: Reg
     if not (workspace.contains(pose) and workspace.contains(above)):
         raise PlanError(f"the grasp is out of the workspace {workspace.lower} to {workspace.upper}: {pose}")
     if above.z_mm < fit.height_mm + settings.floor_mm:
-        raise PlanError(
-            f"the object is too high: {fit.height_mm:.0f} mm, but the arm rises only to {above.z_mm:.0f} mm"
-        )
+        raise PlanError(f"the object is too high: {fit.height_mm:.0f} mm, and the arm rises to {above.z_mm:.0f} mm")
     return above

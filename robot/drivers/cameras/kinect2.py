@@ -124,7 +124,7 @@ class Kinect2(VendorCamera):
 
     @contextlib.contextmanager
     def _frames(self) -> Iterator[Any]:
-        """Yield a set of frames and release it; the wait is a loop here, as old versions of the package lack timeouts."""
+        """Yield a set of frames and release it; poll, because some versions of the package have no timeout."""
         if self._device is None:
             raise DeviceError("kinect2 was stopped by a failed recovery; call recover() again")
         deadline = time.monotonic() + self._options.timeout_s

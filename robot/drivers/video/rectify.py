@@ -173,8 +173,7 @@ def _check_corners(corners: tuple[tuple[float, float], ...], image_px: tuple[int
     after = np.roll(sides, -1, axis=0)
     if not (sides[:, 0] * after[:, 1] - sides[:, 1] * after[:, 0] > 0).all():
         raise RobotConfigError(
-            "corners_px must be top left, top right, bottom right, bottom left of a convex shape, "
-            f"got {list(corners)}"
+            f"corners_px must be top left, top right, bottom right, bottom left of a convex shape, got {list(corners)}"
         )
     if not image_px or not ((points >= -0.5) & (points <= np.array(image_px) - 0.5)).all():
         raise RobotConfigError(f"corners_px must lie inside image_px {list(image_px)}, got {list(corners)}")
