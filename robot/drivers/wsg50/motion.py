@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 _STOP, _FAST_STOP = Packet(CommandId.STOP), Packet(CommandId.FAST_STOP)
 _UPDATED = (CommandId.SYSTEM_STATE, CommandId.GRASPING_STATE)
 UPDATE_BYTES = 25
-"""Size of one update of both states: twice 10 bytes of frame and status, and values of 4 and 1 bytes."""
+"""Size of one update of both states: frames of 8 bytes, and payloads (status and value) of 6 and 3 bytes."""
 
 _MOVING = {GraspingState.GRASPING, GraspingState.RELEASING, GraspingState.POSITIONING}
 _FAULTS = (
