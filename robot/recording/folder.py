@@ -377,7 +377,7 @@ def _check_no_other_files(folder: Path) -> None:
     if (folder / INFO_FILE).is_file() or not folder.exists():
         return
     if not folder.is_dir():
-        raise RecordingError(f"a recording must be a folder, but {folder} is a file")
+        raise RecordingError(f"a recording must be a folder, and {folder} is a file")
     with storage_errors(folder):
         names = sorted(path.name for path in folder.iterdir() if not path.name.startswith(f".{INFO_FILE}."))
         grasps = METADATA_FILE in names and (folder / METADATA_FILE).stat().st_size > 0
