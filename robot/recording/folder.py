@@ -170,7 +170,7 @@ def _check_info(info: Mapping[str, Any], path: str | Path = INFO_FILE) -> None:
     version = info.get("schema_version")
     if type(version) is not int or version not in KNOWN_VERSIONS:
         known = ", ".join(map(str, KNOWN_VERSIONS))
-        raise RecordingError(f"{path}: schema_version must be one of {known}, got {version!r}")
+        raise RecordingError(f"{path}: schema_version must be a supported one ({known}), got {version!r}")
     for key in ("source", "sensor"):
         check_name(f"{path}: {key}", info.get(key))
 

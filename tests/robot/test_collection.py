@@ -554,7 +554,7 @@ def test_a_recording_of_another_version_is_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"was collected with software version '0\.0\.1', not"):
         run(tmp_path / "r")
     path.write_text(json.dumps({**info, "schema_version": 2}))
-    with pytest.raises(RecordingError, match=r"schema_version must be one of 1, got 2"):
+    with pytest.raises(RecordingError, match=r"schema_version must be a supported one \(1\), got 2"):
         run(tmp_path / "r")
 
 

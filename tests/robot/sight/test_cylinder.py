@@ -248,7 +248,7 @@ def test_a_table_at_another_height_than_calibrated_is_found_and_noted():
     pose = views.camera_pose()
     pose[2, 3] += 20.0
     fit = fit_cylinder(view(UprightCylinder(33, 120, X, Y)), pose)
-    assert "the table is 20 mm high" in fit.notes[0]
+    assert "a table 20 mm high" in fit.notes[0]
     assert fit.height_mm == pytest.approx(120, abs=2)
 
 
