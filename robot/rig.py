@@ -18,7 +18,7 @@ from robot.sight.cylinder import CylinderFit
 from robot.storage import read_content
 
 RIGS: "Registry[type[Rig]]" = Registry(
-    "rig, where it is not a .toml file,",
+    "a rig that is not a .toml file",
     "rigs",
     {"real": "robot.real_rig:RealRig", "sim": "robot.sim.rig:SimRig"},
     error=UnknownName,
@@ -192,7 +192,7 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
     dict_keys(['a'])
     >>> robot.load_rig("juggler", seed=0)
     Traceback (most recent call last):
-    robot.errors.UnknownName: rig, where it is not a .toml file, must be one of real, sim; got 'juggler'. ...
+    robot.errors.UnknownName: a rig that is not a .toml file must be one of real, sim; got 'juggler'. ...
     """
     name = spec
     if spec.endswith(".toml"):

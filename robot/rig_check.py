@@ -174,4 +174,4 @@ def _check_skew(rig: Rig) -> dict[str, str]:
     for _ in range(_REPEATS):
         skews.append(read_together(rig.sensors)[1])
         rig.sleep(0.05)
-    return {"apart": f"{1000 * median(skews):.1f} ms (most {1000 * max(skews):.1f})"}
+    return {"apart": f"{1000 * median(skews):.1f} ms (max {1000 * max(skews):.1f})"}

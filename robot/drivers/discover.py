@@ -20,7 +20,7 @@ DEV, SYS = Path("/dev"), Path("/sys")
 _GEL_SENSORS = {"digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": "gelsight"}
 """Words in a camera's name and the driver for it; the first match is used."""
 SHARED_NAME_NOTE = (
-    "a camera has no name of its own in by-id: identical cameras may share one, which may lead to the other camera "
+    "a camera has no name of its own in by-id: identical cameras may share a name, which may lead to the other camera "
     "after a restart; name these cameras by their sockets, in by-path"
 )
 

@@ -45,7 +45,7 @@ def working_folder(tmp_path, monkeypatch):
 
 
 def points(tmp_path, days=0):
-    """Write a calibration file `days` old, of a camera 800 mm above the table that looks down."""
+    """Write a calibration file `days` old, of a camera 800 mm above the table that points down."""
     camera = np.array([[0, 0, 800], [100, 0, 800], [0, 100, 800], [0, 0, 700], [90, 80, 650]], float)
     rig = camera * [1, -1, -1] + [0, 0, 800]
     when = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=days)

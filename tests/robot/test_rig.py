@@ -119,9 +119,7 @@ def test_a_rig_is_built_from_a_toml_file(tmp_path):
 
 
 def test_an_unknown_rig_lists_the_known_ones():
-    with pytest.raises(
-        UnknownName, match=r"rig, where it is not a \.toml file, must be one of real, sim; got 'sawyer'"
-    ):
+    with pytest.raises(UnknownName, match=r"a rig that is not a \.toml file must be one of real, sim; got 'sawyer'"):
         load_rig("sawyer", seed=0)
 
 

@@ -151,7 +151,7 @@ def test_the_camera_returns_colour_and_depth_of_one_size_from_above_the_table(ri
     assert rig.camera.extrinsics[2, 3] > 0
     columns = image.depth_m.shape[1]
     ray = np.array([(columns / 2 - image.intrinsics.cx) / image.intrinsics.fx, 0, 1.0])
-    assert (rig.camera.extrinsics[:3, :3] @ ray)[2] < 0  # it looks down
+    assert (rig.camera.extrinsics[:3, :3] @ ray)[2] < 0  # it points down
 
 
 def test_depth_and_extrinsics_put_the_table_near_zero(rig: Rig):

@@ -33,7 +33,7 @@ def test_every_device_is_checked_moved_back_and_closed(rig):
     assert rows[1].measured["moved"] == "5 mm, off by 0.00 mm"
     assert rows[2].measured["size"] == "32 x 24"
     assert rows[4].measured["depth known"].endswith(" m")
-    assert rows[5].measured["apart"] == "0.0 ms (most 0.0)"
+    assert rows[5].measured["apart"] == "0.0 ms (max 0.0)"
     assert not any(device.is_connected for device in rig.devices)
     assert rig.world.pose == Pose(0, 0, 300, 0)
     assert rig.world.opening == 110.0

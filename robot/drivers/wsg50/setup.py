@@ -143,10 +143,10 @@ class GripperSetup:
         """Apply all settings over an open link; home if the reference is lost, or raise if `may_home` is false."""
         self.limits = self.link.query(commands.query(CommandId.LIMITS), commands.limits)
         force, speed = self.settings.max_force_n, self.settings.max_speed_mm_s
-        least = self.settings.to_finger_force(self.limits.min_force_n)
-        if force < least or speed < self.limits.min_speed_mm_s:
+        lowest = self.settings.to_finger_force(self.limits.min_force_n)
+        if force < lowest or speed < self.limits.min_speed_mm_s:
             raise RobotConfigError(
-                f"{self.name}: the limits must allow its smallest force on a finger, {least:g} N, and speed, "
+                f"{self.name}: the limits must allow its smallest force on a finger, {lowest:g} N, and speed, "
                 f"{self.limits.min_speed_mm_s:g} mm/s; got {force:g} N and {speed:g} mm/s"
             )
         self.stop_if_moving(self.motions.stop)
@@ -207,9 +207,9 @@ class GripperSetup:
 
     def set_force(self, force_n: float) -> None:
         """Set the force limit and read it back; raise DeviceError if the gripper would clamp harder."""
-        settings, least = self.settings, self.limits.min_force_n
+        settings, lowest = self.settings, self.limits.min_force_n
         force_limit_n, ceiling = (
-            max(settings.to_gripper_force(each), least) for each in (force_n, settings.max_force_n)
+            max(settings.to_gripper_force(each), lowest) for each in (force_n, settings.max_force_n)
         )
         self.link.send(commands.packet(CommandId.SET_FORCE_LIMIT, force_limit_n))
         has = self.link.query(commands.query(CommandId.GET_FORCE_LIMIT), commands.number)
@@ -263,8 +263,8 @@ class GripperSetup:
         if not is_holding:  # a smaller force would drop the held object
             self.set_force(settings.to_finger_force(self.limits.min_force_n))
         if requested := settings.acceleration_mm_s2:
-            least, most = self.limits.min_acceleration_mm_s2, self.limits.max_acceleration_mm_s2
-            self._require("acceleration_mm_s2", requested, least, most)
+            lowest, highest = self.limits.min_acceleration_mm_s2, self.limits.max_acceleration_mm_s2
+            self._require("acceleration_mm_s2", requested, lowest, highest)
             link.send(commands.packet(CommandId.SET_ACCELERATION, requested))
             has = link.query(commands.query(CommandId.GET_ACCELERATION), commands.number)
             self._note("acceleration_mm_s2", requested, has)
@@ -290,8 +290,8 @@ class GripperSetup:
         self.refused.pop("soft_limits_mm", None)
         if requested and (has is None or not all(map(_is_close, requested, has))):
             self.refused["soft_limits_mm"] = f"requested {tuple(requested)}, has {has}"
-        least, greatest = has or (0.0, self.limits.stroke_mm)
-        self.opening_range = max(0.0, least), min(greatest, self.limits.stroke_mm)
+        lowest, highest = has or (0.0, self.limits.stroke_mm)
+        self.opening_range = max(0.0, lowest), min(highest, self.limits.stroke_mm)
         self._check_grasp_width(self.opening_range[1])
 
     def _soft_limits(self) -> tuple[float, float] | None:
@@ -308,9 +308,9 @@ class GripperSetup:
                 f"{self.settings.grasp_width_mm:g}; reduce it, or widen the soft limits"
             )
 
-    def _require(self, name: str, value: float, least: float, most: float) -> None:
-        if not least <= value <= most:
-            raise DeviceError(f"{self.name}: {name} must be from {least:g} to {most:g}, got {value:g}")
+    def _require(self, name: str, value: float, lowest: float, highest: float) -> None:
+        if not lowest <= value <= highest:
+            raise DeviceError(f"{self.name}: {name} must be from {lowest:g} to {highest:g}, got {value:g}")
 
     def _note(self, name: str, requested: float, has: float) -> None:
         self.refused.pop(name, None)

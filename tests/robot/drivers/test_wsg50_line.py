@@ -157,7 +157,7 @@ def test_a_doubled_result_does_not_end_the_next_motion():
         assert state.opening_mm == pytest.approx(40.0, abs=0.1)
 
 
-def test_a_result_that_is_none_is_not_believed_while_the_jaws_move():
+def test_a_false_result_does_not_end_a_motion():
     script = ScriptedFaults()
     slow = EmulatedWSG50(referenced=True, opening_mm=50.0)
     with gripper_with_emulator(faults=script, emulator=slow, opening_speed_mm_s=50.0) as (gripper, _):
