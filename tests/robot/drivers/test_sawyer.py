@@ -517,7 +517,6 @@ def test_ctrl_c_leaves_the_arm_still():
 PROGRAM = """
 from robot.drivers.sawyer.driver import Sawyer
 from robot.readings import Region, Pose
-from tests.waiting import until
 box = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
 place = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
 with Sawyer(workspace=box, host="127.0.0.1", port=PORT, **place) as arm:
