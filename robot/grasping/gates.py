@@ -1,8 +1,8 @@
 """Gates: decide from the gel images of a grasp whether it is accepted.
 
 A gate is a callable from {finger: GraspFrames} to a decision or to the probability of success; a grasp is accepted
-from 1/2. A learned gate is trained in `retrieval` and passed to the collector. A gate selects easy contacts, because
-it uses the images on which a matcher is trained later; therefore rejected grasps are recorded too.
+if this is at least 1/2. A learned gate is trained in `retrieval` and passed to the collector. A gate selects easy
+contacts, because it uses the images on which a matcher is trained later; therefore rejected grasps are recorded too.
 """
 
 from collections.abc import Callable, Mapping

@@ -53,10 +53,17 @@ _MARGIN_MM = 20.0
 class SawyerSettings(TypedSettings):
     """Settings of a Sawyer's right arm through rosbridge at host:port.
 
-    base_xyz_mm, base_yaw_deg: the rig's frame in the robot's base frame. tool_mm: distance from the origin of `tip`
-    along its z axis to the point between the fingertips. tool_yaw_deg: angle about z from the tip's x axis to the
-    closing direction of finger a. enable: whether this driver may enable the motors (never during an emergency stop).
-    max_state_age_s: an older joint state stops the arm; an older robot or collision state does if it exceeds 2 s too.
+    Attributes:
+        base_xyz_mm: Origin of the rig's frame in the robot's base frame.
+        base_yaw_deg: Yaw of the rig's frame in the robot's base frame.
+        tool_mm: Distance from the origin of `tip` along its z axis to the point between the fingertips.
+        tool_yaw_deg: Angle about z from the tip's x axis to the closing direction of finger a.
+        ramp_s: Duration of the acceleration to full speed.
+        arrival_rad: Tolerance of every joint at the goal.
+        settle_s: Time to arrive after the last command.
+        command_timeout_s: Time without commands after which the robot ends the motion.
+        enable: Whether this driver may enable the motors (never during an emergency stop).
+        max_state_age_s: An older joint state stops the arm; an older robot or collision state too, but only above 2 s.
     """
 
     host: str
