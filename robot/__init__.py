@@ -1,6 +1,6 @@
-"""Rigs and what they write: the recording format and importers of public data. Knows nothing of torch or faiss.
+"""Robot rigs, the recordings that they write, and importers of public data sets. Imports neither torch nor faiss.
 
-Public names are imported when they are used, so `import robot` costs nothing.
+Public names are imported on first use, so `import robot` is cheap.
 
 >>> import robot
 >>> rig = robot.load_rig("sim", seed=0)
@@ -65,7 +65,7 @@ _MODULES = {
 
 __all__ = list(_MODULES)
 
-if not TYPE_CHECKING:  # a type checker would take it for leave to ask for anything
+if not TYPE_CHECKING:  # with __getattr__, a type checker accepts every attribute name
 
     def __getattr__(name: str) -> Any:
         if name not in _MODULES:

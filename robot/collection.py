@@ -1,13 +1,12 @@
-"""Collect a recording with a rig on its own, as in the paper; a person only changes objects where the rig is real.
+"""Autonomous collection of a recording with a rig, as in the paper; with a real rig, a person changes the objects.
 
-Object by object and attempt by attempt: photo, cylinder, random grasp, gel images before, during and after, lift, what
-the gripper felt, and the gate, which decides what training keeps. What it rejects is recorded too, and attempts that
-came to no grasp are logged (robot.recording.attempt_log). `grasps` accepted ones are wanted of each object, in a
-bounded number of attempts: an object that is not grasped is reported, not tried for ever. One that cannot be grasped
-at all is skipped, and recording.json says why; the others are collected.
+Each attempt takes a photo, fits a cylinder, draws a random grasp, reads gel images before, during and after, lifts,
+and reads the gripper's outcome. The gate then decides whether training uses the grasp. Rejected grasps are recorded
+too, and attempts without a grasp are logged (robot.recording.attempt_log). Each object needs `grasps` accepted grasps
+within a limited number of attempts. An ungraspable object is skipped, with the reason in recording.json.
 
-A recording is written by one writer in one order, so that it is the same whatever the number of jobs, and a
-collection that was stopped or killed goes on where it was when it is started again.
+One writer writes all grasps in a fixed order, so the recording does not depend on the number of jobs. A collection
+that was stopped or killed continues at the same point when it is started again.
 """
 
 import atexit
@@ -38,7 +37,7 @@ from robot.storage import decode_picture
 from robot.workers import Work, WorkerPool
 
 RigMaker = Callable[[], Rig]
-"""Builds a rig, unconnected; for several jobs picklable, as functools.partial(load_rig, "sim", seed=0) is."""
+"""Builds an unconnected rig. For several jobs it must be picklable, like functools.partial(load_rig, "sim", seed=0)."""
 
 _ATTEMPTS_PER_GRASP, _SPARE_ATTEMPTS = 4, 10
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]")
@@ -47,9 +46,12 @@ _TOUCH = re.compile(r"touch_([a-z])")
 
 @dataclass(frozen=True)
 class CollectSettings:
-    """Accepted grasps of each object, and the most attempts (None: 4 a grasp and 10).
+    """Settings of a collection.
 
-    attempt: how they are made (None: as the rig has it).
+    Attributes:
+        grasps: Accepted grasps of each object.
+        most_attempts: Upper limit of attempts at each object; None: 4 for each grasp, plus 10.
+        attempt: How attempts are made; None: the rig's own settings.
 
     >>> robot.CollectSettings(grasps=2).limit
     18
@@ -60,20 +62,30 @@ class CollectSettings:
     attempt: AttemptSettings | None = None
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a number below 1."""
+        """Raise RobotConfigError for a number below 1."""
         if self.grasps < 1 or self.limit < 1:
             raise RobotConfigError(f"grasps and most_attempts must be at least 1, got {self.grasps} and {self.limit}")
 
     @property
     def limit(self) -> int:
-        """Most attempts at one object."""
+        """Largest number of attempts at one object."""
         default = _ATTEMPTS_PER_GRASP * self.grasps + _SPARE_ATTEMPTS
         return default if self.most_attempts is None else self.most_attempts
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a collection is. settled: accepted grasps, and those that objects given up will never have."""
+    """Progress of a collection.
+
+    Attributes:
+        objects: Number of objects.
+        objects_done: Objects that need no further attempt.
+        grasps_wanted: Number of accepted grasps to collect, over all objects.
+        grasps_done: Accepted grasps, plus the missing grasps of objects that need no further attempt.
+        accepted: Accepted grasps.
+        attempts: Attempts made.
+        seconds_left: Estimated time left; None: unknown.
+    """
 
     objects: int
     objects_done: int
@@ -85,7 +97,7 @@ class Progress:
 
     @property
     def accept_rate(self) -> float:
-        """Share of the attempts that gave an accepted grasp."""
+        """Fraction of the attempts that gave an accepted grasp."""
         return self.accepted / self.attempts if self.attempts else 0.0
 
     def __str__(self) -> str:
@@ -105,29 +117,30 @@ def collect(
     jobs: int = 1,
     progress: Callable[[Progress], None] | None = None,
 ) -> list[Tally]:
-    """Collect grasps into a recording, or go on with the one that is there.
+    """Collect grasps into a recording, or continue an existing one.
 
     Args:
         make_rig: Builds the rig. It is called once, and with jobs > 1 in every process too.
         out: Folder of the recording.
-        objects: Names, or how many of the rig's objects.
-        seed: Of the planner's and the rig's random choices.
-        settings: How many grasps of each object, in how many attempts.
+        objects: Names, or the number of the rig's objects.
+        seed: Seed of the planner's and the rig's random choices.
+        settings: Grasps and attempts for each object.
         gate: Decides which grasps are accepted (`robot.grasping.gates`).
-        gate_name: Which gate it is; it must be the same when a collection goes on.
-        jobs: Processes, each with a rig of its own.
+        gate_name: Name of the gate; it must be the same when a collection continues.
+        jobs: Processes, each with its own rig.
         progress: Called after each attempt.
 
     Returns:
-        What came of every object.
+        The counts of each object.
 
     Raises:
         RobotConfigError: An argument is out of range.
-        RecordingError: The folder holds something else, or was collected otherwise.
+        RecordingError: The folder contains other files, or was collected with other settings.
         DeviceError: A device failed too often.
-        StorageError: The disk refused.
-        What was recorded before is whole, and the rig is closed with its jaws open, unless the error says that they
-        could not be opened. After Ctrl-C, too.
+        StorageError: The disk refused a write.
+
+    After any exception, Ctrl-C included, recorded grasps are complete and the rig is closed with open jaws. The
+    message of an exception states when the jaws could not be opened.
 
     >>> import functools
     >>> rig, settings = functools.partial(robot.load_rig, "sim", seed=3), robot.CollectSettings(grasps=1)
@@ -139,12 +152,12 @@ def collect(
     if jobs < 1:
         raise RobotConfigError(f"jobs must be at least 1, got {jobs}")
     if jobs > 1 and not rig.can_run_jobs:
-        raise RobotConfigError(f"there is one such rig ({type(rig).__name__}), so jobs must be 1, got {jobs}")
+        raise RobotConfigError(f"{type(rig).__name__} can run only once, so jobs must be 1, got {jobs}")
     names = rig.object_ids(objects) if isinstance(objects, int) else list(objects)
     if not names:
-        raise RobotConfigError("at least one object must be collected, got none")
+        raise RobotConfigError("objects must name at least one object, got none")
     if len(set(names)) != len(names):
-        raise RobotConfigError("objects must have different names; one was given twice")
+        raise RobotConfigError("objects must have different names, got a name twice")
     for name in names:
         check_name("an object's name", name)
     with rig:
@@ -166,11 +179,11 @@ def _make_work(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> Work
     return AttemptRunner(rig, seed, settings).run
 
 
-# What the recording says of its collection ------------------------------------------------------------------
+# Entries of recording.json ----------------------------------------------------------------------------------
 
 
 def _recording_info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dict[str, Any]:
-    """recording.json: the rig's own, and all that a collection depends on."""
+    """Return the content of recording.json: the rig's info and all settings of the collection."""
     info = {
         **rig.info,
         "seed": seed,
@@ -181,27 +194,30 @@ def _recording_info(rig: Rig, seed: int, settings: CollectSettings, gate_name: s
     try:
         return dict(json.loads(json.dumps(info, allow_nan=False)))
     except (TypeError, ValueError) as error:
-        raise RobotConfigError(f"what the rig says of itself must be plain JSON: {error}") from error
+        raise RobotConfigError(f"the rig's info and device settings must be plain JSON: {error}") from error
 
 
-def _check_can_continue(folder: Path, grasps_wanted: Mapping[str, Any], strict: bool) -> None:
-    """Raise RecordingError where a recording that exists was collected otherwise.
+def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool) -> None:
+    """Raise RecordingError if an existing recording was collected with other settings.
 
-    strict: simulated attempts depend on the software and on what their devices say. Those of a real rig go on after it
-    was brought up to date, and with devices that read back another exposure: what was asked of them must be the same.
+    Args:
+        folder: The recording.
+        expected: Content of recording.json for this collection.
+        strict: Whether the software version and the settings read back from devices must be equal too. Simulated
+            attempts depend on them. With a real rig, only the requested settings must be equal.
     """
     if not (folder / INFO_FILE).is_file():
         return
     found = read_info(folder)
     if "collection" not in found:
-        raise RecordingError(f"{folder} holds a recording that was not collected by a rig; give another folder")
+        raise RecordingError(f"{folder} contains a recording that was not collected by a rig; give another folder")
     if strict:
-        grasps_wanted = {**grasps_wanted, "software_version": software_version()}
+        expected = {**expected, "software_version": software_version()}
     else:
-        grasps_wanted = {name: value for name, value in grasps_wanted.items() if name != "devices"}
-    if "gels" not in found:  # older software did not say them
-        grasps_wanted = {name: value for name, value in grasps_wanted.items() if name != "gels"}
-    for name, value in _flatten(grasps_wanted).items():
+        expected = {name: value for name, value in expected.items() if name != "devices"}
+    if "gels" not in found:  # recordings of older versions
+        expected = {name: value for name, value in expected.items() if name != "gels"}
+    for name, value in _flatten(expected).items():
         old = _flatten(found).get(name)
         if old != value:
             what = name.replace("collection.", "").replace("_", " ")
@@ -211,7 +227,7 @@ def _check_can_continue(folder: Path, grasps_wanted: Mapping[str, Any], strict: 
 
 
 def _flatten(info: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested keys joined by dots."""
+    """Join nested keys by dots."""
     flat: dict[str, Any] = {}
     for key, value in info.items():
         flat |= _flatten(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
@@ -222,7 +238,7 @@ def _flatten(info: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 class _Collection:
-    """Decides which attempts are made, and writes down what came of them."""
+    """Chooses the attempts and records their results."""
 
     def __init__(
         self,
@@ -242,18 +258,18 @@ class _Collection:
         self._start, self._done_at_start = time.monotonic(), self._count_done()
 
     def run(self, workers: WorkerPool[GraspAttempt]) -> None:
-        """Attempts are recorded object by object; workers may be ahead, but never make one that is not wanted."""
-        self._record_skipped_objects()  # a crash may have come between a line of the log and this
+        """Make and record all attempts, object by object; workers may run ahead, but only with needed attempts."""
+        self._record_skipped_objects()  # a crash may have happened between the log's line and this entry
         self._report()
         for name in self.names:
             while self._needs_attempt(name):
                 self._submit_ahead(workers, name)
                 self._record(self._pending[name].popleft()())
                 self._report()
-            self._pending.pop(name, None)  # of an object that turned out to be ungraspable
+            self._pending.pop(name, None)  # attempts left over when an object is ungraspable
 
     def _submit_ahead(self, workers: WorkerPool[GraspAttempt], name: str) -> None:
-        """Give out the attempts that are wanted next, this object's first."""
+        """Submit the attempts that are needed next, this object's first."""
         later = self.names[self.names.index(name) :]
         for each in later:
             while self._needs_attempt(each, ahead=True):
@@ -263,14 +279,14 @@ class _Collection:
                 self._pending[each].append(workers.submit(each, number))
 
     def _needs_attempt(self, name: str, ahead: bool = False) -> bool:
-        """Whether another attempt is needed, if all that are under way are going to be accepted."""
-        under_way, so_far = len(self._pending[name]) if ahead else 0, self.tallies[name]
-        if so_far.skipped is not None:
+        """Return whether another attempt is needed; with `ahead`, if all pending attempts will be accepted."""
+        pending, counts = len(self._pending[name]) if ahead else 0, self.tallies[name]
+        if counts.skipped is not None:
             return False
-        return so_far.accepted + under_way < self.settings.grasps and so_far.attempts + under_way < self.settings.limit
+        return counts.accepted + pending < self.settings.grasps and counts.attempts + pending < self.settings.limit
 
     def _record(self, attempt: GraspAttempt) -> None:
-        """Ask the gate, write the attempt's line and then its grasp."""
+        """Apply the gate, then write the attempt's log line and its grasp."""
         began, self._seconds = self._seconds, round(self._seconds + attempt.duration_s, 3)
         logged = self._log_entry(attempt)
         self.log.append(logged)
@@ -290,8 +306,8 @@ class _Collection:
             self._record_skipped_objects()
 
     def _record_skipped_objects(self) -> None:
-        """Have recording.json name the objects that cannot be grasped, where there are any."""
-        if skipped := {name: why for name in self.names if (why := self.tallies[name].skipped) is not None}:
+        """Write the ungraspable objects, if any, to recording.json."""
+        if skipped := {name: reason for name in self.names if (reason := self.tallies[name].skipped) is not None}:
             self.writer.update_info(skipped_objects=skipped)
 
     def _log_entry(self, attempt: GraspAttempt) -> LoggedAttempt:
@@ -329,7 +345,7 @@ class _Collection:
 
 
 def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str]) -> None:
-    """The log must tell of every grasp, in the order in which this collection makes its attempts."""
+    """Raise RecordingError unless the log contains every grasp, in the order of this collection."""
     logged = {attempt.grasp_id for attempt in log.attempts} - {None}
     if lost := writer.grasp_ids - logged:
         raise RecordingError(f"{log.folder}: attempts.jsonl lacks grasp {min(lost)}; restore it or give a new folder")
@@ -341,7 +357,7 @@ def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str]) -
 
 
 def grasp_id_of(object_id: str, number: int) -> str:
-    """The grasp's id: object and number of the attempt, in characters that file names may have."""
+    """Return the grasp id: object and attempt number, in characters that are valid in file names."""
     plain = _UNSAFE_CHARACTERS.sub("_", object_id)[:100]
     if plain != object_id or not plain[0].isalnum():
         plain = f"x{zlib.crc32(object_id.encode()):08x}_{plain}"
@@ -349,7 +365,7 @@ def grasp_id_of(object_id: str, number: int) -> str:
 
 
 class RecordedTouches(Mapping[str, GraspFrames]):
-    """Each finger's frames as they are recorded, for the gate judges what training will see; decoded when it looks."""
+    """Each finger's frames as recorded, so the gate gets the same pixels as training; decoded on access."""
 
     def __init__(self, images: Mapping[str, bytes]) -> None:
         self._images = images

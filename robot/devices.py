@@ -1,13 +1,13 @@
-"""What the collector asks of arm, gripper, tactile sensors and camera: the contract that every driver honours.
+"""Base classes of arm, gripper, tactile sensor and camera: the contract between the collector and every driver.
 
-Lengths in mm, forces in N, angles in rad, times in s. The rig's frame has z up, z = 0 the table and its origin at the
-centre of the workspace; the camera looks on from the -y side. A force of the gripper is what clamps the object, which
-is the force on each finger. Images are uint8 RGB, row 0 on top.
+Lengths in mm, forces in N, angles in rad, times in s. The rig's frame has its origin on the table at the centre of the
+workspace, z up; the camera stands on the -y side. A gripper force is the clamping force, equal to the force on each
+finger. Images are uint8 RGB, row 0 on top.
 
-The base classes check what goes in and what comes out and raise DeviceError, so that nothing out of range reaches a
-driver and nothing stale reaches a recording; a driver writes `_connect`, `_close` and the few methods that its base
-class names with an underscore. It may raise DeviceError or OSError there. A device connects whole or not at all;
-closing works at any time, twice, and after a failure. What moves is stopped when a call ends with an exception.
+The base classes check arguments and results and raise DeviceError: no value out of range reaches a driver, and no
+stale frame reaches a recording. A driver implements `_connect`, `_close` and the abstract methods of its base class;
+they may raise DeviceError or OSError. A device connects completely or not at all; `close` works at any time, twice,
+and after a failure. An actuator is stopped when a call ends with an exception.
 """
 
 import contextlib
@@ -27,15 +27,18 @@ from robot.settings import TypedSettings
 
 MAX_AGE_S = 0.5
 _CLOCK_SLACK_S = 0.05
-"""A frame may carry a time this far ahead of the clock: two clocks never agree better."""
+"""A frame's time may be this far ahead of the clock, because two clocks never agree exactly."""
 
 Clock = Callable[[], float]
 
 
 class Device(ABC):
-    """Something that is connected, used and closed. `clock` counts seconds, the same for all devices of a rig.
+    """A device that is connected, used and closed.
 
-    Settings: the dataclass of a driver's settings, whose fields are keywords of the driver beside those it names.
+    Attributes:
+        clock: Time in s, the same for all devices of a rig.
+        refused: Settings that the device refused, each with the requested and the actual value.
+        Settings: Dataclass of a driver's settings; its fields are keywords of the driver.
     """
 
     Settings: ClassVar[type[TypedSettings] | None] = None
@@ -43,7 +46,6 @@ class Device(ABC):
     def __init__(self, name: str, *, clock: Clock = time.monotonic) -> None:
         self.name, self.clock = name, clock
         self.refused: dict[str, str] = {}
-        """Settings that the device did not take, each with what it was asked and what it has instead."""
         self._connected = False
 
     @property
@@ -52,7 +54,7 @@ class Device(ABC):
         return self._connected
 
     def connect(self) -> None:
-        """Connect whole or not at all; a second call does nothing. Raises DeviceError."""
+        """Connect completely or raise DeviceError; a second call does nothing."""
         if self._connected:
             return
         try:
@@ -67,7 +69,7 @@ class Device(ABC):
         self._connected = True
 
     def close(self) -> None:
-        """Let go of the device; does nothing where it is not connected. Raises DeviceError, and counts as closed."""
+        """Close the device if it is connected; after a DeviceError it counts as closed."""
         if not self._connected:
             return
         self._connected = False
@@ -75,16 +77,13 @@ class Device(ABC):
             self._close()
 
     def settings(self) -> dict[str, Any]:
-        """What the device itself reports of its settings, read back from it, as plain JSON. Raises DeviceError."""
-        with self._use("cannot say its settings"):
+        """Return the settings read back from the device, as plain JSON; raise DeviceError if this fails."""
+        with self._use("cannot report its settings"):
             return self._settings()
 
     def recover(self) -> None:
-        """Make the device usable again after a DeviceError, as far as that is safe with nobody near.
-
-        A driver says aloud (logging) what it does. Raises DeviceError where a person must see to it first.
-        """
-        with self._use("cannot be brought back"):
+        """Make the device usable again where this is safe without a person, else raise DeviceError; log each action."""
+        with self._use("cannot recover"):
             self._recover()
 
     def __enter__(self) -> Self:
@@ -96,17 +95,17 @@ class Device(ABC):
 
     @abstractmethod
     def _connect(self) -> None:
-        """Connect; where this raises, `_close` is called next."""
+        """Connect; if this raises, `_close` is called next."""
 
     @abstractmethod
     def _close(self) -> None:
-        """Let go of whatever `_connect` has got hold of, also after it stopped half-way."""
+        """Release all resources of `_connect`, also after it failed midway."""
 
     def _settings(self) -> dict[str, Any]:
         return {}
 
     def _recover(self) -> None:  # noqa: B027
-        """Nothing by default: a device that keeps no fault."""
+        """Do nothing by default, for a device without persistent faults."""
 
     @contextlib.contextmanager
     def _use(self, failure: str) -> Iterator[None]:
@@ -117,14 +116,14 @@ class Device(ABC):
 
     @contextlib.contextmanager
     def _named_errors(self, failure: str) -> Iterator[None]:
-        """A DeviceError for what the operating system raises."""
+        """Convert each OSError into a DeviceError."""
         try:
             yield
         except OSError as error:
             raise DeviceError(f"{self.name} {failure}: {error.strerror or error or type(error).__name__}") from error
 
     def _check(self, what: str, value: float, low: float, high: float, unit: str) -> float:
-        if not low <= value <= high:  # also refuses NaN
+        if not low <= value <= high:  # also rejects NaN
             raise DeviceError(f"{self.name}: {what} must be from {low:g} to {high:g} {unit}, got {value:g}")
         return float(value)
 
@@ -132,12 +131,12 @@ class Device(ABC):
         age = self.clock() - time_s
         if not -_CLOCK_SLACK_S <= age <= max_age_s:
             raise DeviceError(
-                f"{self.name}: the frame must be at most {max_age_s:g} s old, it is {age:.3g} s; is the stream frozen?"
+                f"{self.name}: the frame must be at most {max_age_s:g} s old, got {age:.3g} s; is the stream frozen?"
             )
 
 
 class VirtualDevice(Device):
-    """A device that is not there: nothing is to be connected, closed, or stopped where it moves."""
+    """A simulated device: connect, close and stop do nothing."""
 
     def _connect(self) -> None: ...
 
@@ -147,9 +146,9 @@ class VirtualDevice(Device):
 
 
 class Actuator(Device):
-    """Something that moves, at most at `max_speed_mm_s`. An exception, Ctrl-C included, leaves it standing still.
+    """A device that moves, at most at `max_speed_mm_s`; any exception, Ctrl-C included, stops it.
 
-    may_move: whether connecting may move it (to find its reference, say) or let it move (enable its motors).
+    `may_move`: whether connecting may move it (a reference run) or enable its motors.
     """
 
     may_move: bool = True
@@ -159,17 +158,17 @@ class Actuator(Device):
         self.max_speed_mm_s = max_speed_mm_s
 
     def stop(self) -> None:
-        """Stand still now and stay usable. Raises DeviceError."""
+        """Stop now and stay usable; raise DeviceError if this fails."""
         with self._use("cannot be stopped"):
             self._stop()
 
     @abstractmethod
     def _stop(self) -> None:
-        """Also called when it stands still already, and after a command that failed half-way."""
+        """Stop; also called when the device is still already, and after a command that failed midway."""
 
     @contextlib.contextmanager
     def _moving(self, failure: str) -> Iterator[None]:
-        """As `_use`, and stops on any exception; what that itself raises is added to it as a note."""
+        """Do as `_use`, and stop on any exception; an exception of the stop itself is added as a note."""
         with self._use(failure):
             try:
                 yield
@@ -182,10 +181,11 @@ class Actuator(Device):
 
 
 class Arm(Actuator):
-    """Moves the gripper inside `workspace` (limits of the point between the fingertips).
+    """An arm that moves the gripper inside `workspace`, the limits of the point between the fingertips.
 
-    by_hand: a person moves it when asked to; no speed is kept then. can_tilt: whether the fingers may point elsewhere
-    than straight down.
+    Attributes:
+        is_manual: Whether a person moves it on request; speeds are not enforced then.
+        can_tilt: Whether the fingers may point in other directions than straight down.
 
     >>> with robot.load_rig("sim", seed=0) as rig:
     ...     rig.arm.move_to(rig.home, speed_mm_s=100) == rig.home
@@ -202,38 +202,38 @@ class Arm(Actuator):
         self.workspace = workspace
 
     def move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
-        """Go there and return the pose reached. Raises DeviceError, also for a pose outside the workspace."""
+        """Move to `pose` and return the pose reached; raise DeviceError, also for a pose outside the workspace."""
         if not self.workspace.contains(pose) or not math.isfinite(pose.yaw_rad):
             lower, upper = self.workspace.lower, self.workspace.upper
             raise DeviceError(f"{self.name}: a pose must be in the workspace {lower} to {upper}, got {pose}")
         if pose.tilt_rad and not self.can_tilt:
-            raise DeviceError(f"{self.name} keeps the fingers pointing straight down: tilt must be 0, got {pose}")
+            raise DeviceError(f"{self.name}: tilt must be 0, because its fingers always point down, got {pose}")
         self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot move"):
             return self._check_reported(self._move_to(pose, speed_mm_s))
 
     def pose(self) -> Pose:
-        """Where the arm is now. Raises DeviceError."""
-        with self._use("cannot say where it is"):
+        """Return the current pose; raise DeviceError if this fails."""
+        with self._use("cannot report its pose"):
             return self._check_reported(self._pose())
 
     def _check_reported(self, pose: Pose) -> Pose:
         if not all(map(math.isfinite, pose.as_tuple())):
-            raise DeviceError(f"{self.name}: the pose that an arm reports must be finite, got {pose}")
+            raise DeviceError(f"{self.name}: the reported pose must be finite, got {pose}")
         return pose
 
     @abstractmethod
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
-        """Return when the arm is there."""
+        """Move, and return the pose when the arm has arrived."""
 
     @abstractmethod
     def _pose(self) -> Pose: ...
 
 
 class Gripper(Actuator):
-    """Two parallel jaws, `stroke_mm` apart at most, that clamp with `min_force_n` to `max_force_n`.
+    """A gripper with two parallel jaws, at most `stroke_mm` apart, that clamps with `min_force_n` to `max_force_n`.
 
-    A driver may learn these limits when it connects; they never rise above what it was given.
+    A driver may read these limits from the device when it connects; they never rise above the given ones.
 
     >>> with robot.load_rig("sim", seed=0) as rig:
     ...     rig.gripper.grasp(force_n=1e6)
@@ -257,18 +257,18 @@ class Gripper(Actuator):
         self.min_force_n, self.max_force_n = min_force_n, max_force_n
 
     def state(self) -> GripperState:
-        """What the gripper reports now. Raises DeviceError."""
-        with self._use("cannot say its state"):
+        """Return the current state; raise DeviceError if this fails."""
+        with self._use("cannot report its state"):
             return self._state()
 
     def open(self, opening_mm: float) -> GripperState:
-        """Move the jaws apart to `opening_mm`, at most the stroke; lets go of what is held. Raises DeviceError."""
+        """Open the jaws to `opening_mm`, release a held object and return the state; raise DeviceError on failure."""
         self._check("opening", opening_mm, self.min_opening_mm, self.stroke_mm, "mm")
         with self._moving("cannot open"):
             return self._open(float(opening_mm))
 
     def grasp(self, force_n: float, speed_mm_s: float = 80.0) -> GripperState:
-        """Close until `force_n` is reached or nothing is met; returns when the jaws stand. Raises DeviceError."""
+        """Close the jaws until `force_n` or full closure, wait, and return the state; raise DeviceError on failure."""
         self._check("force", force_n, self.min_force_n, self.max_force_n, "N")
         self._check("speed", speed_mm_s, self.min_speed_mm_s, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot grasp"):
@@ -285,10 +285,10 @@ class Gripper(Actuator):
 
 
 class TactileSensor(Device):
-    """The gel of one finger, "a" or "b".
+    """The tactile sensor (gel) of one finger, "a" or "b".
 
     >>> import numpy as np
-    >>> class Grey(robot.TactileSensor):  # a driver writes the methods whose names begin with an underscore
+    >>> class Grey(robot.TactileSensor):  # a driver implements the methods that begin with an underscore
     ...     def _connect(self): ...
     ...     def _close(self): ...
     ...     def _read(self):
@@ -303,10 +303,7 @@ class TactileSensor(Device):
         self.finger = finger
 
     def read(self, max_age_s: float = MAX_AGE_S, near_s: float | None = None) -> Frame:
-        """The newest picture, or of those it still has the one taken nearest to `near_s`.
-
-        Raises DeviceError, also for one older than `max_age_s`.
-        """
+        """Return the newest frame, or the buffered one nearest to `near_s`; raise DeviceError if it is too old."""
         with self._use("cannot be read"):
             frame = self._read() if near_s is None else self._read_near(near_s)
             _check_colour(self.name, frame.pixels)
@@ -317,14 +314,14 @@ class TactileSensor(Device):
     def _read(self) -> Frame: ...
 
     def _read_near(self, time_s: float) -> Frame:
-        """The newest by default: a sensor that keeps no older ones."""
+        """Return the newest frame by default, for a sensor that buffers no older ones."""
         return self._read()
 
 
 def read_together(sensors: Mapping[str, TactileSensor], max_age_s: float = MAX_AGE_S) -> tuple[dict[str, Frame], float]:
-    """A picture of every finger taken as nearly at once as they allow, and how far apart in time they are (s).
+    """Read one frame of each sensor, as close in time as possible; return the frames by finger and their skew in s.
 
-    Each is the one nearest to the oldest of the newest. Raises DeviceError.
+    Each frame is the one nearest to the oldest of the newest frames. A failing sensor raises DeviceError.
     """
     newest = {finger: sensor.read(max_age_s) for finger, sensor in sensors.items()}
     common = min(frame.time_s for frame in newest.values())
@@ -337,8 +334,12 @@ def read_together(sensors: Mapping[str, TactileSensor], max_age_s: float = MAX_A
 
 
 class Camera(Device):
-    """Looks at the table. `extrinsics` (4, 4): camera frame (x right, y down, z forward; mm) to the rig's frame, as
-    calibrated, which may be 5 to 10 mm off. has_depth: without it a grasp cannot be planned from the picture.
+    """The camera of the table.
+
+    Attributes:
+        extrinsics: (4, 4) calibrated transform from the camera frame (x right, y down, z forward; mm) to the rig's
+            frame; its error may be 5 to 10 mm.
+        has_depth: Whether it measures depth.
 
     >>> with robot.load_rig("sim", seed=0) as rig:
     ...     rig.prepare(rig.object_ids(1)[0], 0)
@@ -353,10 +354,14 @@ class Camera(Device):
         self.extrinsics = _check_rigid(extrinsics)
 
     def read(self, depth: bool = True, max_age_s: float = MAX_AGE_S) -> RGBD:
-        """The newest picture; without `depth` none is computed or returned. Raises DeviceError, also when stale."""
+        """Return the newest picture; compute depth only if `depth` is true.
+
+        Raises:
+            DeviceError: Reading failed, the picture is older than `max_age_s`, or the camera has no depth.
+        """
         with self._use("cannot be read"):
             if depth and not self.has_depth:
-                raise DeviceError(f"{self.name} sees colour only: ask it with depth=False")
+                raise DeviceError(f"{self.name} has no depth: read it with depth=False")
             image = self._read(depth)
             _check_colour(self.name, image.colour)
             self._check_age(image.time_s, max_age_s)
@@ -384,11 +389,11 @@ def _check_depth(name: str, image: RGBD) -> None:
 
 
 def _check_rigid(matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Check a rotation and translation; 1e-6 is what a rotation typed with seven digits is off."""
+    """Check a rigid transform, with the tolerance 1e-6 of a rotation typed with seven digits."""
     found = np.asarray(matrix, dtype=np.float64)
     if found.shape != (4, 4) or not np.isfinite(found).all() or not np.array_equal(found[3], [0, 0, 0, 1]):
         raise RobotConfigError(f"extrinsics must be a 4 x 4 rigid transform with last row 0 0 0 1, got {found}")
     rotation = found[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-6) or np.linalg.det(rotation) < 0:
-        raise RobotConfigError(f"extrinsics must hold a rotation, got {rotation}")
+        raise RobotConfigError(f"extrinsics must contain a rotation, got {rotation}")
     return found

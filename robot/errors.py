@@ -1,16 +1,16 @@
 """Every error that `robot` raises on purpose.
 
-A message says what must hold, what was got and what to do. The command line prints it on one line and
-leaves with `exit_code`; anything that is not one of these errors is a bug.
+A message names the requirement, the actual value and the remedy. The command line prints it on one line and
+exits with `exit_code`. Any other exception is a bug.
 
     RobotError                 the job ran and failed (exit code 1)
-    +-- DeviceError            a device is missing, went away, answers late, stale or out of range
-    +-- PlanError              nothing to grasp is seen, or no grasp of it is possible
-    |   +-- UngraspableError   no attempt at this object can succeed; the collection goes on with the next one
+    +-- DeviceError            a device is missing or disconnected, or its answer is late, stale or out of range
+    +-- PlanError              no object is visible, or no grasp of it is possible
+    |   +-- UngraspableError   no attempt at this object can succeed; the collection continues with the next one
     +-- StorageError           a recording could not be written: disk full, no permission, folder in use
     +-- BadRobotInput          wrong use or bad input (exit code 2)
         +-- RecordingError     a recording is not usable. For example: a line that is not JSON
-        +-- ImporterError      a data set to import is not what its importer reads
+        +-- ImporterError      a data set does not have the layout that its importer reads
         +-- UnknownName        no driver or importer has this name
         +-- RobotConfigError   a setting is unknown or out of range
         +-- SceneError         a scene is impossible. For example: a mesh that is not closed
@@ -31,19 +31,19 @@ class RobotError(Exception):
 
 
 class DeviceError(RobotError):
-    """A device is missing, went away, or its answer is late, stale or out of range."""
+    """A device is missing or disconnected, or its answer is late, stale or out of range."""
 
 
 class PlanError(RobotError):
-    """Nothing to grasp is seen, or no grasp of it is possible with this gripper; another attempt may do better."""
+    """No object is visible, or this gripper cannot grasp it in this pose. Another attempt may succeed."""
 
 
 class UngraspableError(PlanError):
-    """The gripper cannot grasp this object at all, however often it is tried."""
+    """The gripper cannot grasp this object in any attempt."""
 
 
 class StorageError(RobotError):
-    """A recording could not be written; what was appended before is whole."""
+    """A recording could not be written. The grasps appended before are complete."""
 
 
 class BadRobotInput(RobotError):
@@ -53,11 +53,11 @@ class BadRobotInput(RobotError):
 
 
 class RecordingError(BadRobotInput):
-    """A recording is not usable, or does not fit what is to be appended."""
+    """A recording is not usable, or the data to append does not fit it."""
 
 
 class ImporterError(BadRobotInput):
-    """A data set to import is not what its importer reads."""
+    """A data set does not have the layout that its importer reads."""
 
 
 class UnknownName(BadRobotInput):
@@ -69,4 +69,4 @@ class RobotConfigError(BadRobotInput):
 
 
 class SceneError(BadRobotInput):
-    """A scene is impossible: what is asked of the simulation cannot be on a rig."""
+    """A scene is impossible: no real rig could contain it."""

@@ -1,5 +1,6 @@
-"""What devices say: poses, pictures, states. Lengths in mm, forces in N, angles in rad, times in s; frames as in
-robot.devices.
+"""Readings of devices: poses, pictures and gripper states.
+
+Lengths in mm, forces in N, angles in rad, times in s; coordinate frames as in robot.devices.
 """
 
 import math
@@ -18,10 +19,10 @@ GRIPPER_STATUSES: tuple[GripperStatus, ...] = ("idle", "moving", "holding", "no_
 
 @dataclass(frozen=True)
 class Pose:
-    """The point between the fingertips, and the direction (cos yaw, sin yaw) in which the jaws close.
+    """Pose of the gripper: the point between the fingertips and the closing direction (cos yaw, sin yaw) of the jaws.
 
-    Finger a pushes along this direction, finger b against it: yaw and yaw + pi swap the fingers. The fingers point
-    straight down; tilt turns them about the closing direction, pi / 2 until they point along (-sin yaw, cos yaw).
+    Finger a pushes along the closing direction, finger b against it; yaw + pi swaps the fingers. At tilt 0 the fingers
+    point straight down. Tilt turns them about the closing direction; at pi / 2 they point along (-sin yaw, cos yaw).
 
     >>> robot.Pose(120.0, 0.0, 40.0, yaw_rad=0.0).as_tuple()
     (120.0, 0.0, 40.0, 0.0)
@@ -34,31 +35,31 @@ class Pose:
     tilt_rad: float = 0.0
 
     def as_tuple(self) -> tuple[float, ...]:
-        """x, y, z in mm and yaw in rad, then the tilt in rad unless it is 0, as a recording holds them."""
+        """Return x, y, z in mm, yaw in rad and, unless it is 0, tilt in rad, as a recording stores them."""
         upright = self.x_mm, self.y_mm, self.z_mm, self.yaw_rad
         return (*upright, self.tilt_rad) if self.tilt_rad else upright
 
     def rotation(self) -> npt.NDArray[np.float64]:
-        """(3, 3): gripper frame to rig frame. Jaws close along the gripper's x, and its fingers point along -z."""
+        """Return the (3, 3) rotation from the gripper frame (jaws close along x, fingers along -z) to the rig frame."""
         (c, s), (up, aside) = ((math.cos(angle), math.sin(angle)) for angle in (self.yaw_rad, self.tilt_rad))
         return np.array([[c, -s * up, s * aside], [s, c * up, -c * aside], [0.0, aside, up]])
 
 
 @dataclass(frozen=True)
 class Region:
-    """An upright box (mm) in the rig's frame, its faces included."""
+    """A closed axis-aligned box in the rig's frame, in mm."""
 
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError unless lower < upper, all finite."""
+        """Raise RobotConfigError unless lower < upper and all numbers are finite."""
         numbers = [*self.lower, *self.upper]
         if len(numbers) != 6 or not all(map(math.isfinite, numbers)) or not np.less(self.lower, self.upper).all():
             raise RobotConfigError(f"a region must have lower < upper in x, y and z, got {self.lower} and {self.upper}")
 
     def contains(self, pose: Pose, margin_mm: float = 0.0) -> bool:
-        """Whether the point of the pose lies in the box, or at most so far beyond each face."""
+        """Return whether the point of the pose lies in the box, or at most `margin_mm` beyond each face."""
         point = pose.as_tuple()[:3]
         sides = zip(self.lower, point, self.upper, strict=True)
         return all(low - margin_mm <= value <= high + margin_mm for low, value, high in sides)
@@ -66,7 +67,7 @@ class Region:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture of a tactile sensor: (H, W, 3) uint8 RGB, and when it was taken.
+    """One picture of a tactile sensor: (H, W, 3) uint8 RGB, and the time of exposure in s.
 
     >>> import numpy as np
     >>> robot.Frame(np.zeros((240, 320, 3), np.uint8), time_s=1.5).pixels.shape
@@ -87,9 +88,9 @@ class Intrinsics:
     cy: float
 
     def __post_init__(self) -> None:
-        """Raises DeviceError for focal lengths that are not above 0, or numbers that no camera has."""
+        """Raise DeviceError unless focal lengths are above 0 and all numbers are at most a million pixels."""
         numbers = (self.fx, self.fy, self.cx, self.cy)
-        if not (min(self.fx, self.fy) > 0 and all(abs(each) <= _MAX_PX for each in numbers)):  # also refuses NaN
+        if not (min(self.fx, self.fy) > 0 and all(abs(each) <= _MAX_PX for each in numbers)):  # also rejects NaN
             raise DeviceError(
                 f"intrinsics must be finite, up to a million pixels, with focal lengths above 0, got {self}"
             )
@@ -97,9 +98,13 @@ class Intrinsics:
 
 @dataclass(frozen=True, eq=False)
 class RGBD:
-    """Colour (H, W, 3) uint8, and depth along the optical axis (H, W) float32 in METRE, NaN where unknown, or None.
+    """A camera picture with or without depth.
 
-    A camera without depth need not know its intrinsics.
+    Attributes:
+        colour: (H, W, 3) uint8 RGB.
+        depth_m: (H, W) float32 depth along the optical axis in METRES, NaN where unknown; None: no depth.
+        intrinsics: Required with depth; None if unknown.
+        time_s: Time of exposure.
     """
 
     colour: npt.NDArray[np.uint8]
@@ -110,9 +115,13 @@ class RGBD:
 
 @dataclass(frozen=True)
 class GripperState:
-    """Distance between the fingers, clamping force, and what the gripper makes of it.
+    """State of the gripper.
 
-    holding: something is clamped. no_part: the jaws closed and met nothing. part_lost: what was held is gone.
+    Attributes:
+        opening_mm: Distance between the fingers.
+        force_n: Clamping force.
+        status: "holding": an object is clamped. "no_part": the jaws closed without contact. "part_lost": the clamped
+            object has slipped out. Else "idle" or "moving".
     """
 
     opening_mm: float
@@ -120,7 +129,7 @@ class GripperState:
     status: GripperStatus
 
     def __post_init__(self) -> None:
-        """Raises DeviceError for a status that is not of the contract, or numbers that are not finite."""
+        """Raise DeviceError for an unknown status or numbers that are not finite."""
         if self.status not in GRIPPER_STATUSES:
             raise DeviceError(f"a gripper's status must be one of {', '.join(GRIPPER_STATUSES)}, got {self.status!r}")
         if not (math.isfinite(self.opening_mm) and math.isfinite(self.force_n)):

@@ -1,16 +1,16 @@
-"""A rig of real devices, put together from the tables of a file; a device is a row of DRIVERS and a table.
+"""The rig of real devices, built from the tables of a TOML file; DRIVERS lists the drivers.
 
     rig = "real"
-    source = "bench 3"                        # said in recording.json
+    source = "bench 3"                        # written into recording.json
     sensor = "gelsight mini"
 
-    [limits]                                  # ceilings that no call exceeds, whatever asks
+    [limits]                                  # upper limits that no call exceeds
     workspace_lower_mm = [-150, -150, 10]     # of the point between the fingertips; z = 0 is the table
     workspace_upper_mm = [150, 150, 400]
     arm_speed_mm_s = 200
     force_n = 20                              # on each finger
     jaw_speed_mm_s = 60
-    state_age_s = 0.5                         # what moves is stopped when its state is older
+    state_age_s = 0.5                         # an actuator is stopped when its state is older
 
     [arm]
     driver = "manual"                         # a person moves the hand
@@ -26,21 +26,21 @@
     driver = "realsense"
     hand_eye = "hand_eye.json"                # made by `retrieve rig calibrate`
 
-    [gel.a]                                   # what it is made of, as far as is known (robot.gel_settings)
+    [gel.a]                                   # known material constants (robot.gel_settings)
     thickness_mm = 3.0
     modulus_mpa = 0.35
     [grasp]                                   # how grasps are drawn (robot.grasping.settings.GraspSettings)
     force_n = [5, 15]
-    [attempt]                                 # how they are made (robot.grasping.settings.AttemptSettings)
+    [attempt]                                 # how attempts are made (robot.grasping.settings.AttemptSettings)
     settle_s = 1.0
-    [object]                                  # instead of depth: every object stands here and is so large
+    [object]                                  # instead of depth: place and size of every object
     x_mm = 0
     ...
     [planner]                                 # where the jaws close (robot.grasping.planner)
     name = "cylinder"                         # its other keys are the planner's settings
 
-Homing jaws keep their own speed, and Sawyer's slow /robot/state may be 2 s old whatever `state_age_s`.
-Paths are those of the process that reads the file. Unknown keys are refused everywhere.
+Homing jaws move at their own speed, and Sawyer's slow /robot/state may be 2 s old whatever `state_age_s` is.
+Paths are relative to the working directory of the process that reads the file. Unknown keys are errors.
 """
 
 import time
@@ -93,20 +93,22 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
         replay="robot.drivers.replay:ReplayCamera",
     ),
 }
-"""Drivers by role and name, imported when used. A new device is a subclass of its role's base class (robot.devices),
-whose keywords are the keys of its table. An installed package names drivers of every role in one group of entry
-points."""
+"""Drivers by role and name, imported on first use.
+
+A driver is a subclass of its role's base class (robot.devices); its keywords are the keys of its table. An installed
+package registers drivers of all roles in one group of entry points.
+"""
 
 MAX_HAND_EYE_AGE_DAYS = 30.0
-"""A calibration older than this is refused unless the camera's table says `hand_eye_days`: things get moved."""
+"""Oldest accepted calibration, unless the camera's table sets `hand_eye_days`; a camera may be moved over time."""
 
 MIN_WAIT_S = 0.1
-"""Between a motion and the picture of what came of it: three frames of a gel at 30 a second."""
+"""Shortest wait between a motion and the picture of its result: three frames of a gel at 30 frames/s."""
 
 
 @dataclass(frozen=True)
 class Limits(TypedSettings):
-    """Ceilings: workspace (mm), speeds (mm/s), force on each finger (N), age of the state of what moves (s)."""
+    """Upper limits: workspace (mm), speeds (mm/s), force on each finger (N), age of an actuator's state (s)."""
 
     workspace_lower_mm: tuple[float, float, float]
     workspace_upper_mm: tuple[float, float, float]
@@ -118,7 +120,7 @@ class Limits(TypedSettings):
 
 @dataclass(frozen=True)
 class ObjectSettings(TypedSettings):
-    """Where every object is put and how large it is (mm), for a rig that cannot see it; error_mm: of the place."""
+    """Place and size of every object (mm), for a rig without depth; error_mm: standard error of the place."""
 
     x_mm: float
     y_mm: float
@@ -127,15 +129,15 @@ class ObjectSettings(TypedSettings):
     error_mm: float = bounded(0, 1e6, 5.0)
 
     def fit(self) -> CylinderFit:
-        """As what a camera would have found."""
-        around = (self.radius_mm, self.radius_mm)
+        """Return the fit that a depth camera would have measured."""
+        half = (self.radius_mm, self.radius_mm)
         return CylinderFit(
-            self.x_mm, self.y_mm, self.height_mm, self.radius_mm, self.error_mm, method="given", half_mm=around
+            self.x_mm, self.y_mm, self.height_mm, self.radius_mm, self.error_mm, method="given", half_mm=half
         )
 
 
 class RealRig(Rig):
-    """Arm, gripper, gels and camera of the given tables, under the ceilings of [limits]."""
+    """Arm, gripper, gels and camera of the given tables, under the upper limits of [limits]."""
 
     def __init__(
         self,
@@ -153,7 +155,7 @@ class RealRig(Rig):
         source: str = "real rig",
         sensor: str = "gelsight",
     ) -> None:
-        """Raises RobotConfigError, UnknownName for a driver; connects nothing."""
+        """Build the devices without connecting them; raise RobotConfigError, or UnknownName for a driver."""
         ceilings = build(Limits, limits, where="[limits]")
         state_age = {"max_state_age_s": ceilings.state_age_s}
         moving: dict[str, Any] = {
@@ -179,7 +181,12 @@ class RealRig(Rig):
         )
 
     def connect(self) -> None:
-        """As any rig; a camera may turn out to have no depth only now. Raises RobotConfigError then."""
+        """Connect all devices, then check the planner's requirements, because only now is the camera's depth known.
+
+        Raises:
+            DeviceError: A device cannot be connected.
+            RobotConfigError: The planner requires depth and the camera has none.
+        """
         super().connect()
         try:
             self.planner.check(self)
@@ -188,9 +195,20 @@ class RealRig(Rig):
             raise
 
 
-def load_driver(role: str, table: Mapping[str, Any], where: str, **object_fit: Any) -> Any:
-    """The device, unconnected, that `table` of a file describes. Raises RobotConfigError, UnknownName."""
-    return build_named(DRIVERS[role], table, "driver", where=where, clock=time.monotonic, **object_fit)
+def load_driver(role: str, table: Mapping[str, Any], where: str, **arguments: Any) -> Any:
+    """Return the unconnected device that a table of a rig's file describes.
+
+    Args:
+        role: Key of DRIVERS.
+        table: The table.
+        where: Name of the table in messages.
+        arguments: Further keywords of the driver.
+
+    Raises:
+        UnknownName: No driver has the table's `driver` name.
+        RobotConfigError: A setting is invalid.
+    """
+    return build_named(DRIVERS[role], table, "driver", where=where, clock=time.monotonic, **arguments)
 
 
 def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
@@ -198,7 +216,7 @@ def _sensors(tables: Mapping[str, Any]) -> dict[str, TactileSensor]:
         if finger not in ("a", "b") or not isinstance(table, Mapping):
             raise RobotConfigError(f"sensors must be the tables [sensors.a] and [sensors.b], or one; got {finger!r}")
     if not tables:
-        raise RobotConfigError("a rig must have a gel: [sensors.a], [sensors.b] or both")
+        raise RobotConfigError("a rig requires a gel: [sensors.a], [sensors.b] or both")
     return {
         finger: load_driver("sensors", table, f"[sensors.{finger}]", finger=finger) for finger, table in tables.items()
     }
@@ -213,13 +231,13 @@ def _camera(table: Mapping[str, Any]) -> Camera:
     camera: Camera = load_driver("camera", settings, "[camera]", extrinsics=extrinsics)
     if camera.has_depth and file is None:
         raise RobotConfigError(
-            "[camera]: a camera with depth must say where it stands: hand_eye = FILE, made by `retrieve rig calibrate`"
+            "[camera]: a camera with depth requires hand_eye = FILE, the calibration of `retrieve rig calibrate`"
         )
     return camera
 
 
 def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limits) -> AttemptSettings:
-    """How attempts are made: as said, else as by default but within the ceilings. Raises RobotConfigError."""
+    """Return the attempt settings: the given values, or defaults capped by [limits]; raise RobotConfigError."""
     low, high = GraspSettings.force_n
     force_n = (min(low, limits.force_n), min(high, limits.force_n))
     capped = {
@@ -228,16 +246,16 @@ def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limit
         "closing_mm_s": min(AttemptSettings.closing_mm_s, limits.jaw_speed_mm_s),
     }
     settings = parse_attempt_settings({**capped, **attempt}, {"force_n": force_n, **grasp})
-    asked = {
+    requested = {
         "[grasp]: force_n": (settings.grasp.force_n[1], limits.force_n, "force_n"),
         "[attempt]: travel_mm_s": (settings.travel_mm_s, limits.arm_speed_mm_s, "arm_speed_mm_s"),
         "[attempt]: approach_mm_s": (settings.approach_mm_s, limits.arm_speed_mm_s, "arm_speed_mm_s"),
         "[attempt]: closing_mm_s": (settings.closing_mm_s, limits.jaw_speed_mm_s, "jaw_speed_mm_s"),
     }
-    for name, (value, ceiling, limit) in asked.items():
+    for name, (value, ceiling, limit) in requested.items():
         if value > ceiling:
             raise RobotConfigError(f"{name} must be at most {limit} = {ceiling:g} of [limits], got {value:g}")
     for name in ("settle_s", "hold_s"):
         if getattr(settings, name) < MIN_WAIT_S:
-            raise RobotConfigError(f"[attempt]: {name} must be at least {MIN_WAIT_S:g} s, for gels to see what is then")
+            raise RobotConfigError(f"[attempt]: {name} must be at least {MIN_WAIT_S:g} s, for a fresh gel frame")
     return settings

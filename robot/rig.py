@@ -1,4 +1,4 @@
-"""A rig: arm, gripper, tactile sensors and camera that connect all or nothing and always close; and rigs by name."""
+"""The rig: arm, gripper, tactile sensors and camera, connected and closed together; and the registry of rigs."""
 
 import sys
 import time
@@ -18,28 +18,36 @@ from robot.sight.cylinder import CylinderFit
 from robot.storage import read_content
 
 RIGS: "Registry[type[Rig]]" = Registry(
-    "rig, where it is not a .toml file,",
+    "a rig that is not a .toml file",
     "rigs",
     {"real": "robot.real_rig:RealRig", "sim": "robot.sim.rig:SimRig"},
     error=UnknownName,
     base="robot.rig:Rig",
 )
-"""Rigs by name, imported when asked for."""
+"""Rigs by name, imported on first use."""
 
 
 def ask_on_terminal(sentence: str) -> None:
-    """Show a person what to do, and wait for Enter; stdout stays free for results. Raises EOFError."""
+    """Print a request to the user on stderr and wait for Enter; raise EOFError if there is no terminal."""
     print(sentence, end=" ", file=sys.stderr, flush=True)
     input()
 
 
 class Rig:
-    """The devices of one rig, and what a recording says of it.
+    """The devices of one rig and its description for recordings.
 
-    `info` goes into recording.json: source and sensor at least. `clock` and `sleep` keep the rig's time, in which
-    frames are stamped; a simulated rig gives its own. `ask` shows a person a sentence and returns when it is done.
-    `attempt`: how attempts are made with this rig unless said otherwise. `object_fit`: where every object stands and how
-    large it is, for a rig whose camera cannot tell. `planner`: where its jaws close.
+    Args:
+        arm: Moves the gripper.
+        gripper: Closes the jaws.
+        sensors: Tactile sensors by finger, "a" or "b".
+        camera: Photographs the table.
+        info: Entries of recording.json; at least source and sensor.
+        clock: Time in s, on the scale of the frames' time stamps; a simulated rig has its own.
+        sleep: Waits on the same scale.
+        ask: Shows a request to a person and returns when it is done.
+        attempt: Default attempt settings of this rig.
+        object_fit: Place and size of every object, for a rig whose camera cannot measure them.
+        planner: Chooses the grasps; a CylinderPlanner by default.
 
     >>> with robot.load_rig("sim", seed=0) as rig:
     ...     sorted(rig.sensors), rig.arm.is_connected
@@ -49,7 +57,7 @@ class Rig:
     """
 
     can_run_jobs: ClassVar[bool] = False
-    """Whether several of this rig can exist at once, each in its own process."""
+    """Whether several instances of this rig can exist at once, each in its own process."""
 
     def __init__(
         self,
@@ -77,24 +85,31 @@ class Rig:
 
     @property
     def devices(self) -> tuple[Device, ...]:
-        """All devices in the order in which they are connected."""
+        """All devices in the order of connection."""
         return self.arm, self.gripper, *self.sensors.values(), self.camera
 
     @property
     def home(self) -> Pose:
-        """Behind the table, out of the camera's picture."""
+        """Pose behind the table, outside the camera's picture."""
         lower, upper = self.arm.workspace.lower, self.arm.workspace.upper
         return Pose((lower[0] + upper[0]) / 2, upper[1], upper[2], 0.0)
 
     def object_ids(self, count: int) -> list[str]:
-        """Names for `count` objects to collect; a simulated rig says which objects it has."""
+        """Return names for `count` objects to collect; a simulated rig returns its own objects."""
         return [f"object-{number:04}" for number in range(1, count + 1)]
 
     def prepare(self, object_id: str, number: int) -> None:
-        """Have this object on the table for attempt `number`: asks a person when the object changes, and each time
-        where it must stand at a given place, for a grasp that slipped has moved it.
+        """Put this object on the table for attempt `number`, by a request to a person.
 
-        Raises RobotConfigError where nobody can answer.
+        The request appears when the object changes. With `object_fit` it appears for every attempt, because a slipped
+        grasp has moved the object from its given place.
+
+        Args:
+            object_id: The object.
+            number: Number of the attempt.
+
+        Raises:
+            RobotConfigError: There is no terminal for the request.
         """
         if object_id != self._object_on_table or self.object_fit is not None:
             place = (
@@ -105,20 +120,20 @@ class Rig:
             try:
                 self.ask(f"Put {object_id} {place}, alone, and press Enter.")
             except EOFError as error:
-                raise RobotConfigError("a person must change the objects of this rig: run it in a terminal") from error
+                raise RobotConfigError("this rig needs a person to change objects: run it in a terminal") from error
             self._object_on_table = object_id
 
     def settings(self) -> dict[str, dict[str, Any]]:
-        """What each device reports of its settings, by its name. Raises DeviceError."""
+        """Return the settings that each device reports, by device name; raise DeviceError if one fails."""
         return {device.name: device.settings() for device in self.devices}
 
     def recover(self) -> None:
-        """Make every device usable again after one has failed. Raises DeviceError where that takes a person."""
+        """Make every device usable again after a failure; raise DeviceError if that requires a person."""
         for device in self.devices:
             device.recover()
 
     def connect(self) -> None:
-        """Connect all devices or none: where one fails, those before it are closed again and its error is raised."""
+        """Connect all devices or none: when one fails, close those before it and raise its error."""
         connected: list[Device] = []
         try:
             for device in self.devices:
@@ -129,7 +144,7 @@ class Rig:
             raise
 
     def close(self) -> None:
-        """Close every device, the last one first, whatever fails, then raise the first failure; twice does nothing."""
+        """Close every device, the last one first, then raise the first failure; a second call does nothing."""
         if failure := _close_all(self.devices):
             raise failure
 
@@ -146,7 +161,7 @@ class Rig:
 
 
 def _close_all(devices: tuple[Device, ...] | list[Device]) -> BaseException | None:
-    """Close from the last to the first; returns the first failure."""
+    """Close all devices from the last to the first and return the first failure."""
     failure: BaseException | None = None
     for device in reversed(devices):
         try:
@@ -160,16 +175,24 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
     """Build, without connecting it, the rig that `spec` names: a name of RIGS, or a TOML file.
 
         rig = "sim"
-        fingers = ["a", "b"]   # all else are settings of that rig; `settings` given here override them
+        fingers = ["a", "b"]   # the other keys are settings of that rig
 
-    The recording's `info` says name and settings, so that the rig can be built again. Raises UnknownName, which
-    lists the known ones, and RobotConfigError.
+    The rig's `info` contains its name and settings, so that it can be built again.
+
+    Args:
+        spec: Name or file.
+        seed: Seed of the rig's random choices.
+        settings: Settings of the rig; they override those of the file.
+
+    Raises:
+        UnknownName: No rig has this name; the message lists the known ones.
+        RobotConfigError: The file cannot be read, or a setting is invalid.
 
     >>> robot.load_rig("sim", seed=0, fingers=["a"]).sensors.keys()
     dict_keys(['a'])
     >>> robot.load_rig("juggler", seed=0)
     Traceback (most recent call last):
-    robot.errors.UnknownName: rig, where it is not a .toml file, must be one of real, sim; got 'juggler'. ...
+    robot.errors.UnknownName: a rig that is not a .toml file must be one of real, sim; got 'juggler'. ...
     """
     name = spec
     if spec.endswith(".toml"):
@@ -180,18 +203,18 @@ def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
 
 
 def check_seed(seed: int) -> None:
-    """Raise RobotConfigError unless random numbers can be drawn from `seed`."""
+    """Raise RobotConfigError unless `seed` is an integer of at least 0."""
     if not isinstance(seed, int) or seed < 0:
         raise RobotConfigError(f"seed must be a whole number from 0, got {seed!r}")
 
 
 def _read_toml(path: Path, over: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Name of the rig and its settings."""
+    """Return the name of the rig and its settings."""
     try:
         document = tomllib.loads(read_content(path, RobotConfigError).decode())
     except ValueError as error:
         raise RobotConfigError(f"{path} is not TOML: {error}") from error
     name = document.pop("rig", None)
     if not isinstance(name, str):
-        raise RobotConfigError(f'{path} must say which rig it is for, as in rig = "sim"; got {name!r}')
+        raise RobotConfigError(f'{path} must name its rig, as in rig = "sim"; got {name!r}')
     return name, {**document, **over}

@@ -1,7 +1,7 @@
-"""`retrieve rig check`: connect each device of a rig on its own, exercise it gently, and say what was measured.
+"""`retrieve rig check`: connect each device of a rig on its own, move it a little, and report measurements.
 
-A device that fails does not keep the others from being checked. Nothing is grasped: the jaws move by `JAW_MM`, the arm
-rises by `ARM_MM`, and both come back.
+All devices are checked, also after one has failed. Nothing is grasped: the jaws move by `JAW_MM`, the arm
+rises by `ARM_MM`, and both return.
 """
 
 import contextlib
@@ -21,16 +21,24 @@ from robot.rig import Rig
 
 JAW_MM, ARM_MM, ARM_MM_S = 5.0, 10.0, 20.0
 MEASURE_S = 2.0
-"""How long frames are counted."""
+"""Duration of the frame rate measurement in s."""
 
 _POLL_S = 0.002
 _REPEATS = 20
-"""How often a state is asked for, and both gels are read, to measure how long that takes and how far apart they are."""
+"""Number of state queries for the response time, and of paired gel reads for the skew."""
 
 
 @dataclass(frozen=True)
 class DeviceReport:
-    """What came of one device: measured figures with their units in words, settings it refused, or the failure."""
+    """Result of the check of one device.
+
+    Attributes:
+        device: Name of the device.
+        role: "arm", "gripper", "gel", "camera" or "skew".
+        measured: Measured figures by name, as text with units.
+        refused: Settings that the device refused, each with the requested and the actual value.
+        failure: Error message, or None if the device works.
+    """
 
     device: str
     role: str
@@ -39,19 +47,23 @@ class DeviceReport:
     failure: str | None = None
 
     def line(self) -> str:
-        """The row of the table."""
+        """Return the row of the table."""
         result = self.failure or ", ".join(f"{name} {value}" for name, value in self.measured.items())
         refused = "".join(f"; refused {name}: {value}" for name, value in self.refused.items())
         return f"{'ok  ' if self.failure is None else 'FAIL'}  {self.role:9} {self.device}: {result}{refused}"
 
 
 def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[DeviceReport]:
-    """Check every device, each as soon as it is asked for, then how far apart in time the fingers are seen.
+    """Check each device, then the time skew between the fingers' frames; yield one report for each.
 
-    `motion`: whether arm and jaws may move a little. Raises nothing of a device: its failure is a row.
+    A device error becomes the `failure` of its report.
+
+    Args:
+        rig: The rig, not connected.
+        motion: Whether arm and jaws may move a little.
     """
     rig.arm.may_move = rig.gripper.may_move = motion
-    if rig.can_run_jobs:  # simulated: an object can be had for nothing, and without one its gels see nothing
+    if rig.can_run_jobs:  # a simulated rig needs an object for its gel images
         rig.prepare(rig.object_ids(1)[0], 0)
     yield _check_device([rig.arm], "arm", lambda: _check_arm(rig, motion))
     yield _check_device([rig.gripper], "gripper", lambda: _check_gripper(rig, motion))
@@ -70,13 +82,13 @@ def _check_device(devices: Sequence[Device], role: str, check: Callable[[], dict
                 connected.enter_context(device)
             refused = dict(devices[0].refused) if len(devices) == 1 else {}
             row = replace(row, measured=check(), refused=refused)
-    except RobotError as error:  # also what wants a person where there is no terminal
+    except RobotError as error:  # includes a request to a person without a terminal
         return replace(row, failure=str(error))
     return row
 
 
 def _check_arm(rig: Rig, motion: bool) -> dict[str, str]:
-    """Up a little and back."""
+    """Raise the arm a little and return."""
     arm = rig.arm
     if arm.is_manual:
         return {"moved": "by a person"}
@@ -108,11 +120,11 @@ def _check_gripper(rig: Rig, motion: bool) -> dict[str, str]:
     return measured
 
 
-def _round_trip(rig: Rig, ask: Callable[[], Any]) -> dict[str, str]:
+def _round_trip(rig: Rig, query: Callable[[], Any]) -> dict[str, str]:
     times = []
     for _ in range(_REPEATS):
         began = rig.clock()
-        ask()
+        query()
         times.append(rig.clock() - began)
     return {"state in": f"{1000 * median(times):.2f} ms (slowest {1000 * max(times):.2f})"}
 
@@ -141,7 +153,7 @@ _Picture = TypeVar("_Picture", Frame, RGBD)
 
 
 def _measure_frames(rig: Rig, read: Callable[[], _Picture]) -> tuple[_Picture, dict[str, str]]:
-    """The last frame of `MEASURE_S`, how many different ones there were, and how old they were when they were read."""
+    """Read frames for `MEASURE_S`; return the last one, with the rate of new frames and their median age."""
     times, ages, began = set(), [], rig.clock()
     while True:
         frame = read()
@@ -151,15 +163,15 @@ def _measure_frames(rig: Rig, read: Callable[[], _Picture]) -> tuple[_Picture, d
             break
         rig.sleep(_POLL_S)
     rate = f"{len(times)} frame(s) in {MEASURE_S:g} s"
-    if len(times) > 1:  # from the first to the last, so that where the watch began and ended does not count
+    if len(times) > 1:  # from the first frame to the last, so the phase of the measurement does not count
         rate = f"{(len(times) - 1) / (max(times) - min(times)):.1f} frames/s"
     return frame, {"rate": rate, "age": f"{1000 * median(ages):.0f} ms"}
 
 
 def _check_skew(rig: Rig) -> dict[str, str]:
-    """All gels at once, as the collector reads them."""
+    """Measure the skew between all gels, read as the collector reads them."""
     skews = []
     for _ in range(_REPEATS):
         skews.append(read_together(rig.sensors)[1])
         rig.sleep(0.05)
-    return {"apart": f"{1000 * median(skews):.1f} ms (most {1000 * max(skews):.1f})"}
+    return {"apart": f"{1000 * median(skews):.1f} ms (max {1000 * max(skews):.1f})"}

@@ -1,6 +1,6 @@
-"""Plain settings, as TOML gives them, to the keywords of a class: checked by name, annotated type and range.
+"""Objects from plain TOML settings: each setting is checked by name, annotated type and range.
 
-Settings of one thing are one frozen dataclass of `TypedSettings`; a number's range stands next to its default.
+A group of settings is a frozen dataclass derived from `TypedSettings`; a number's range is given with its default.
 """
 
 import functools
@@ -19,42 +19,47 @@ _T = TypeVar("_T")
 
 
 def bounded(lowest: float, highest: float, default: Any = MISSING, *, unit: str = "") -> Any:
-    """A field of `TypedSettings` that must be from `lowest` to `highest`; without a default it must be said."""
+    """Return a field of `TypedSettings` with values from `lowest` to `highest`; without a default it is required."""
     return field(default=default, metadata={"range": (lowest, highest, unit)})
 
 
 @dataclass(frozen=True)
 class TypedSettings:
-    """Base of dataclasses of settings: each value is of its annotated type (a list becomes a tuple), and in range."""
+    """Base of settings dataclasses: checks each value's annotated type (a list becomes a tuple) and range."""
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError."""
+        """Raise RobotConfigError for a value of another type or out of range."""
         check_fields(self, "", RobotConfigError)
         for each in fields(self):
             if (value := getattr(self, each.name)) is not None and "range" in each.metadata:
                 check_range(each.name, value, *each.metadata["range"])
 
 
-def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **given: Any) -> _T:
-    """An object of `cls` from plain `settings`, and from what the program gives: those that the class takes.
+def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **arguments: Any) -> _T:
+    """Return an object of `cls` from plain `settings` and the program's own arguments.
 
-    A class with an attribute `Settings` takes what that dataclass does, too. where: what a message begins with, such as
-    the table of a file. Raises RobotConfigError for an unknown setting, a missing one, or one of another type than is
-    annotated; the class itself checks ranges.
+    Args:
+        cls: The class. If it has an attribute `Settings`, the fields of that dataclass are keywords too.
+        settings: Plain values by keyword.
+        where: Prefix of messages, such as the table of a file.
+        arguments: Values from the program; those that the class does not accept are dropped.
+
+    Raises:
+        RobotConfigError: A setting is unknown, missing, of another type than annotated, or out of the class's range.
     """
     accepted = _keywords(cls)  # type: ignore[arg-type]  # a class is hashable
-    keywords = {name: each for name, each in accepted.items() if name not in given}
+    keywords = {name: each for name, each in accepted.items() if name not in arguments}
     known = ", ".join(sorted(keywords))
     if unknown := sorted(set(settings) - set(keywords)):
-        raise RobotConfigError(f"{where or cls.__name__} has no setting {unknown[0]!r}; it knows {known}")
+        raise RobotConfigError(f"{where or cls.__name__} has no setting {unknown[0]!r}; known settings: {known}")
     required = {name for name, (_, is_required) in keywords.items() if is_required}
     if missing := sorted(required - set(settings)):
-        raise RobotConfigError(f"{where or cls.__name__} must say {missing[0]!r}; it knows {known}")
+        raise RobotConfigError(f"{where or cls.__name__} requires {missing[0]!r}; known settings: {known}")
     try:
         checked = {
             name: typed(value, keywords[name][0], name, error=RobotConfigError) for name, value in settings.items()
         }
-        return cls(**checked, **{name: value for name, value in given.items() if name in accepted})
+        return cls(**checked, **{name: value for name, value in arguments.items() if name in accepted})
     except RobotConfigError as error:
         raise RobotConfigError(f"{where}: {error}" if where else str(error)) from error
 
@@ -66,32 +71,32 @@ def build_named(
     *,
     where: str,
     default: str | None = None,
-    **given: Any,
+    **arguments: Any,
 ) -> _T:
-    """Return an object of the class that `key` of a table names in a registry, built from the table's other keys.
+    """Return an object of the class that a table names, built from the table's other keys.
 
     Args:
         registry: Classes by name.
         table: A table of a rig's file.
-        key: The key that holds the name.
-        where: What messages call the table.
-        default: The name where the table has none; None: it must have one.
-        given: As `build` takes it.
+        key: The key whose value is the name of the class.
+        where: Name of the table in messages.
+        default: The name if the table has none; None: the key is required.
+        arguments: Passed to `build`.
 
     Raises:
-        UnknownName: Nothing has this name; lists the known ones.
-        RobotConfigError: As `build`.
+        UnknownName: The registry lacks this name; the message lists the known ones.
+        RobotConfigError: A setting is invalid; see `build`.
     """
     settings = dict(table)
     name = settings.pop(key, default)
     if not isinstance(name, str):
         raise UnknownName(f"{where}: {key} must be one of {', '.join(registry.names())}; got {name!r}")
-    return build(registry.resolve(name), settings, where=where, **given)
+    return build(registry.resolve(name), settings, where=where, **arguments)
 
 
 @functools.cache
 def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
-    """The keywords that a class takes: annotated type, and whether it must be said."""
+    """Return the keywords of a class, each with its annotated type and whether it is required."""
     found: dict[str, tuple[Any, bool]] = {}
     settings: type | None = getattr(cls, "Settings", None)
     for each in (settings, cls):
@@ -105,5 +110,5 @@ def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
 
 def check_range(name: str, value: float, lowest: float, highest: float, unit: str = "") -> None:
     """Raise RobotConfigError unless a setting is a finite number from `lowest` to `highest`."""
-    if not lowest <= value <= highest or math.isinf(value):  # also refuses NaN
+    if not lowest <= value <= highest or math.isinf(value):  # also rejects NaN
         raise RobotConfigError(f"{name} must be from {lowest:g} to {highest:g}{unit and ' '}{unit}, got {value!r}")

@@ -1,4 +1,4 @@
-"""Pictures as PNG or JPEG content, appended lines, and refusals of the disk as errors of `robot`."""
+"""File access for recordings: PNG and JPEG content, appended lines, JSON objects, and disk errors as StorageError."""
 
 import contextlib
 import os
@@ -23,7 +23,7 @@ _SUFFIXES = {b"\x89PNG\r\n\x1a\n": ".png", b"\xff\xd8\xff": ".jpg"}
 
 @contextlib.contextmanager
 def storage_errors(folder: Path) -> Iterator[None]:
-    """Turn what the disk refuses into a StorageError that names the file, or the folder."""
+    """Convert each OSError into a StorageError that names the file or the folder."""
     try:
         yield
     except BlockingIOError as error:
@@ -31,13 +31,17 @@ def storage_errors(folder: Path) -> Iterator[None]:
     except OSError as error:
         reason = (error.strerror or str(error)).removeprefix("cannot be written: ")
         where = error.filename or folder
-        raise StorageError(f"{where} could not be written: {reason}; what was appended before is whole") from error
+        raise StorageError(f"{where} could not be written: {reason}; earlier grasps are complete") from error
 
 
 def write_files(contents: Mapping[Path, bytes]) -> None:
-    """Write each file so that it holds all of its bytes or is untouched; sync their folder then, and their names last.
+    """Write each file completely or leave it untouched: write a temporary file, sync it, then rename it.
 
-    The disk is asked to keep them when all are written: it takes fewer turns for it than file by file.
+    All files are written before the first is synced, which needs fewer disk operations than file by file. The caller
+    syncs the folder.
+
+    Raises:
+        OSError: A file could not be written; the error names it.
     """
     parts = {path: path.with_name(path.name + PART_SUFFIX) for path in contents}
     path: Path | None = None
@@ -56,13 +60,13 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
         for part in parts.values():
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
-        if isinstance(error, OSError):  # a write alone does not tell its file
+        if isinstance(error, OSError):  # the error of a write lacks the file name
             raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         raise
 
 
 def append_line(file: FileIO, end: int, line: bytes) -> int:
-    """Write `line` at offset `end` and sync it; returns the new end. Whatever fails, no half of the line stays."""
+    """Write `line` at offset `end`, sync the file and return the new end; on failure, remove the partial line."""
     rest = line
     try:
         file.seek(end)
@@ -77,7 +81,15 @@ def append_line(file: FileIO, end: int, line: bytes) -> int:
 
 
 def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
-    """Return (file content, suffix): pixels as PNG, a file's own bytes as they are. Raises RecordingError."""
+    """Return the file content and its suffix: pixels encoded as PNG, PNG and JPEG files unchanged.
+
+    Args:
+        column: Name of the image column, for messages; "depth" requires uint16 pixels.
+        source: The image.
+
+    Raises:
+        RecordingError: The source is neither valid pixels nor a PNG or JPEG file.
+    """
     if isinstance(source, np.ndarray):
         return _png(column, source), ".png"
     if not isinstance(source, bytes | str | Path):
@@ -96,28 +108,31 @@ def file_content(column: str, source: ImageSource) -> tuple[bytes, str]:
 
 
 def decode_picture(data: bytes, flags: int | None = None) -> npt.NDArray[Any] | None:
-    """The pixels of a picture file's content, colours blue first; None for what is no picture. way: as cv2.imdecode
-    takes it, colours with 8 bits each where it is left out.
+    """Return the pixels of an image file's content in OpenCV's BGR order, or None if it cannot be decoded.
+
+    Args:
+        data: Content of the file.
+        flags: Flags of `cv2.imdecode`; None decodes to 8-bit colour.
     """
     import cv2
 
     pixels: npt.NDArray[Any] | None = None
-    with contextlib.suppress(cv2.error):  # of no bytes at all, and of a header that claims too many pixels
+    with contextlib.suppress(cv2.error):  # empty data, or a header that claims too many pixels
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR if flags is None else flags)
     return pixels
 
 
 def read_content(path: str | Path, error_type: type[RobotError]) -> bytes:
-    """The bytes of a regular file. Raises `error_type`, which names it and what keeps it from being read."""
+    """Return the bytes of a regular file; raise `error_type` with its name and the reason if it cannot be read."""
     try:
         with open_regular(path) as file:
             return file.read()
-    except (OSError, ValueError) as error:  # ValueError of a name that holds a zero
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         raise error_type(f"{path!s} cannot be read: {getattr(error, 'strerror', error)}") from error
 
 
 def parse_object(text: bytes, error_type: type[RobotError]) -> dict[str, Any]:
-    """The JSON object of a line or file. Raises `error_type` for anything else, NaN and infinity too."""
+    """Parse the JSON object of a line or file; raise `error_type` for anything else, NaN and infinity included."""
     try:
         return msgspec.json.decode(text, type=dict[str, Any])
     except msgspec.ValidationError as error:
@@ -127,7 +142,7 @@ def parse_object(text: bytes, error_type: type[RobotError]) -> dict[str, Any]:
 
 
 def read_json_object(path: str | Path, error_type: type[RobotError]) -> dict[str, Any]:
-    """The JSON object that a file holds. Raises `error_type`, which names the file."""
+    """Read the JSON object of a file; raise `error_type` with the file's name if this fails."""
     data = read_content(path, error_type)
     try:
         return parse_object(data, error_type)
@@ -141,7 +156,7 @@ def _png(column: str, pixels: npt.NDArray[Any]) -> bytes:
     colour = column != "depth"
     good = pixels.dtype == (np.uint8 if colour else np.uint16) and pixels.size > 0
     if not good or (pixels.ndim != 3 or pixels.shape[2] != 3 if colour else pixels.ndim != 2):
-        shape = "H x W x 3 uint8 RGB" if colour else "H x W uint16 in millimetre"
+        shape = "H x W x 3 uint8 RGB" if colour else "H x W uint16 in millimetres"
         raise RecordingError(f"{column} must be {shape}, got {pixels.shape} {pixels.dtype}")
     try:
         plain = np.ascontiguousarray(pixels)

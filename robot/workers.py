@@ -1,4 +1,4 @@
-"""Work on objects, by this process or by several at once, each with a rig of its own."""
+"""Work on objects in this process or in several worker processes, each with its own rig."""
 
 import functools
 import multiprocessing
@@ -18,18 +18,25 @@ from robot.errors import RobotError
 
 T = TypeVar("T")
 Work = Callable[[str, int], T]
-"""What is done with an object, by its id, for the time of this number."""
+"""A function of object id and attempt number."""
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class WorkerPool(Generic[T]):
-    """Does work: here and now with one job, by `local_work`; else in processes that are started afresh ("spawn"), by what
-    the picklable `make` gives each of them.
+    """Runs work in this process with one job, else in spawned worker processes.
 
-    A forked copy of a process with OpenCV's or BLAS's threads may hang, a spawned one does not. `window` pieces of work
-    should be under way at a time. With one job, too, OpenCV works in one thread while this is open: some of its
-    filters give other last digits in several, and a recording must be the same whatever the jobs.
+    Workers are spawned, not forked: a forked copy of a process with OpenCV or BLAS threads may hang. OpenCV is limited
+    to one thread while the pool is open, with one job too. Some of its filters give other last digits in several
+    threads, and a recording must not depend on the number of jobs.
+
+    Args:
+        jobs: Number of processes; 1 runs `local_work` when its result is requested.
+        local_work: The work for one job.
+        make: Returns the work; called once in each worker process, so it must be picklable.
+
+    Attributes:
+        window: Recommended number of pieces of work in progress at a time.
     """
 
     def __init__(self, jobs: int, local_work: Work[T], make: Callable[[], Work[T]]) -> None:
@@ -48,12 +55,18 @@ class WorkerPool(Generic[T]):
             )
 
     def submit(self, object_id: str, number: int) -> Callable[[], T]:
-        """Begin a piece of work; the callable waits for it. It raises the work's own RobotError, and a RobotError for
-        any other failure in another process.
+        """Start a piece of work; return a callable that waits for its result.
+
+        Args:
+            object_id: The object.
+            number: Number of the attempt.
+
+        Raises:
+            RobotError: A worker process died. The callable raises it too, for any failure in a worker.
         """
         if self._pool is None:
             return functools.partial(self._local_work, object_id, number)
-        os.environ.update(dict.fromkeys(_THREADS, "1"))  # read by the processes that a submission may start
+        os.environ.update(dict.fromkeys(_THREADS, "1"))  # inherited by processes that `submit` may start
         try:
             future = self._pool.submit(_run_work, object_id, number)
         except BrokenProcessPool as error:
@@ -67,17 +80,17 @@ class WorkerPool(Generic[T]):
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Waits for the work that has begun; the other is not done."""
+        """Wait for the work in progress and cancel the rest."""
         cv2.setNumThreads(self._threads)
         if self._pool is not None:
             _shut_down(self._pool, set(multiprocessing.active_children()) - self._before)
 
 
 def _shut_down(pool: ProcessPoolExecutor, workers: Iterable[BaseProcess]) -> None:
-    """Tell the workers to leave and wait until they have; Ctrl-C does not break that off, but is raised afterwards.
+    """Stop the workers and wait until they have exited; raise a KeyboardInterrupt only afterwards.
 
-    A pool whose shutdown(wait=True) is broken off hangs when Python ends: the interrupted join of its thread makes that
-    thread look finished (CPython issue 90882), so nobody waits until it has told the workers.
+    An interrupted `shutdown(wait=True)` makes Python hang at exit. The interrupted join marks the pool's thread as
+    finished (CPython issue 90882), so Python does not wait until that thread has stopped the workers.
     """
     again: KeyboardInterrupt | None = None
     while True:
@@ -109,13 +122,13 @@ def _result(future: Future[T], object_id: str, number: int) -> T:
         raise _worker_died() from error
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
-        raise RobotError(f"attempt {number} at {object_id} broke off in a worker process: {reason}") from error
+        raise RobotError(f"attempt {number} at {object_id} failed in a worker process: {reason}") from error
 
 
 def _worker_died() -> RobotError:
     return RobotError(
-        "a worker process died: it was killed, or memory ran out. What was recorded is whole; start again to go on, "
-        "with fewer jobs if memory is short"
+        "a worker process died: it was killed, or memory ran out. The recorded grasps are complete; run the command "
+        "again to continue, with fewer jobs if memory is short"
     )
 
 
@@ -126,7 +139,7 @@ _make_work: list[Callable[[], Work[Any]]] = []
 
 
 def _start_worker(make: Callable[[], Work[Any]]) -> None:
-    """Runs first. Nothing here may fail: a pool does not say why. Ctrl-C is the parent's business."""
+    """Initialise a worker; must not fail, because the pool hides the reason. Ctrl-C is left to the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
@@ -134,7 +147,7 @@ def _start_worker(make: Callable[[], Work[Any]]) -> None:
 
 
 def _exit_with_parent() -> None:
-    """A parent that is killed cannot end its workers, which would wait for ever."""
+    """Exit when the parent dies; a killed parent cannot stop its workers, which would wait for ever."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     wait([parent.sentinel])

@@ -1,1 +1,1 @@
-"""Drivers of real devices. Each file imports what it needs beyond the package only when it connects."""
+"""Drivers of real devices. A driver imports optional packages only when it connects."""

@@ -1,9 +1,9 @@
-"""What is connected to this computer, found with what is installed, each with the lines that name it in a rig's file.
+"""Discovery of connected devices, each with the lines that name it in a rig's file.
 
-Cameras: /dev/v4l/by-id holds a link for each, named by maker, model and serial number, which stays the same wherever it
-is plugged in; "-video-index0" gives the pictures, higher numbers only data about them. /sys/class/video4linux/*/name is
-what a camera calls itself. Serial ports: /dev/serial/by-id, and what pyserial lists. RealSense and Kinect 2 are asked
-through their packages where these are installed.
+Cameras: /dev/v4l/by-id contains a link for each, named by maker, model and serial number, independent of the socket;
+"-video-index0" gives the pictures, higher numbers only metadata. /sys/class/video4linux/*/name is the camera's own
+name. Serial ports: /dev/serial/by-id, and the ports that pyserial lists. RealSense and Kinect 2 cameras are listed
+by their packages if these are installed.
 """
 
 import logging
@@ -18,17 +18,22 @@ from robot.drivers.vendor import missing_library
 log = logging.getLogger(__name__)
 DEV, SYS = Path("/dev"), Path("/sys")
 _GEL_SENSORS = {"digit": "digit", "gelsight mini": "gelsight_mini", "gelsight": "gelsight"}
-"""Words in a camera's name, and the driver for it; the first that fits."""
+"""Words in a camera's name and the driver for it; the first match is used."""
 SHARED_NAME_NOTE = (
-    "a camera here has no name of its own in by-id: where equal cameras share one, it may lead to the other camera "
-    "tomorrow; name those by their sockets, in by-path"
+    "a camera has no name of its own in by-id: identical cameras may share a name, which may lead to the other camera "
+    "after a restart; name these cameras by their sockets, in by-path"
 )
 
 
 @dataclass(frozen=True)
 class DiscoveredDevice:
-    """kind: camera, serial port, realsense or kinect2. device: its stable name. label: what it calls itself.
-    toml: lines for the rig's file, under the table of that device.
+    """A connected device.
+
+    Attributes:
+        kind: "camera", "serial port", "realsense" or "kinect2".
+        device: Stable name.
+        label: The device's own name.
+        toml: Lines for the device's table in a rig's file.
     """
 
     kind: str
@@ -38,12 +43,12 @@ class DiscoveredDevice:
 
 
 def discover(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
-    """Everything found, cameras first. `dev`, `sys`: where the system keeps its devices."""
+    """Return all connected devices, cameras first; `dev` and `sys` are the system's device folders."""
     return [*find_cameras(dev, sys), *find_serial_ports(dev), *find_realsenses(), *find_kinects()]
 
 
 def camera_names(dev: Path = DEV) -> list[str]:
-    """Stable names of the cameras, as paths: by-id, and by-path (which socket) for those without one."""
+    """Return the stable names of the cameras as paths: by-id, or by-path (the socket) for those without one."""
     found = {path.resolve(): str(path) for path in reversed(_pictures(dev / "v4l" / "by-path"))}
     by_id = _pictures(dev / "v4l" / "by-id")
     for path in by_id:
@@ -52,7 +57,7 @@ def camera_names(dev: Path = DEV) -> list[str]:
 
 
 def shared_name_note(names: Iterable[str]) -> str:
-    """What must be known of such names, or nothing."""
+    """Return a note if some cameras have a name only in by-path, else ""."""
     kinds = {Path(name).parent.name for name in names}
     return SHARED_NAME_NOTE if kinds >= {"by-id", "by-path"} else ""
 
@@ -62,7 +67,7 @@ def _pictures(folder: Path) -> list[Path]:
 
 
 def find_cameras(dev: Path = DEV, sys: Path = SYS) -> list[DiscoveredDevice]:
-    """Cameras by stable name; by number where the system makes no stable names."""
+    """Return cameras by stable name, or by number on a system without stable names."""
     found, names = [], camera_names(dev)
     note = f"# {shared_name_note(names)}\n" if shared_name_note(names) else ""
     for name in names:
@@ -94,7 +99,7 @@ def _camera_toml(device: str, words: str) -> str:
 
 
 def find_serial_ports(dev: Path = DEV) -> list[DiscoveredDevice]:
-    """Serial ports by stable name, then those that only pyserial knows. Which of them is the gripper, nobody says."""
+    """Return serial ports by stable name, then the other ports of pyserial; any of them may be the gripper."""
     stable = _entries(dev / "serial" / "by-id")
     found = [_port(str(path), path.name) for path in stable]
     known = {path.resolve() for path in stable}
@@ -106,7 +111,7 @@ def _port(device: str, label: str) -> DiscoveredDevice:
 
 
 def _listed_ports() -> list[tuple[str, str]]:
-    """USB and built-in ports that answer to something; a bare ttyS0 without hardware behind it is left out."""
+    """Return the ports with hardware; a ttyS0 without hardware is left out."""
     try:
         from serial.tools import list_ports
     except ImportError:
@@ -115,7 +120,7 @@ def _listed_ports() -> list[tuple[str, str]]:
 
 
 def find_realsenses() -> list[DiscoveredDevice]:
-    """RealSense cameras, where pyrealsense2 is installed."""
+    """Return RealSense cameras if pyrealsense2 is installed."""
 
     def list_cameras(rs: Any) -> list[DiscoveredDevice]:
         known = rs.camera_info
@@ -128,7 +133,7 @@ def find_realsenses() -> list[DiscoveredDevice]:
 
 
 def find_kinects() -> list[DiscoveredDevice]:
-    """Kinect 2 cameras, where pylibfreenect2 is installed."""
+    """Return Kinect 2 cameras if pylibfreenect2 is installed."""
 
     def list_cameras(package: Any) -> list[DiscoveredDevice]:
         freenect = package.Freenect2()
@@ -141,19 +146,19 @@ def find_kinects() -> list[DiscoveredDevice]:
 def _list_with_package(
     camera: str, package: str, list_cameras: Callable[[Any], list[DiscoveredDevice]]
 ) -> list[DiscoveredDevice]:
-    """List cameras through their maker's package; nothing where it is not installed, and a warning where it fails."""
+    """List cameras with the vendor's package; return [] if it is not installed, and log a warning if it fails."""
     try:
         return list_cameras(import_module(package))
     except ImportError as error:
         if need := missing_library(package, error):
-            log.warning("%s cameras could not be listed: that needs %s", camera, need)
-    except Exception as error:  # a maker's package that fails must not hide the other devices
+            log.warning("%s cameras could not be listed: this requires %s", camera, need)
+    except Exception as error:  # a failing vendor package must not hide the other devices
         log.warning("%s cameras could not be listed: %s", camera, error)
     return []
 
 
 def decode_serial(serial: str | bytes) -> str:
-    """pylibfreenect2 gives serial numbers as bytes or text, by its version."""
+    """Return a serial number as text; pylibfreenect2 returns bytes or text, depending on its version."""
     return serial.decode("ascii", "replace") if isinstance(serial, bytes) else serial
 
 

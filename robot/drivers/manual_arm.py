@@ -1,4 +1,4 @@
-"""An arm that is a person: each pose is asked for in words, so that a gripper alone can collect data."""
+"""An arm moved by a person, who is asked for each pose, so that data can be collected with a gripper alone."""
 
 import math
 import time
@@ -9,11 +9,18 @@ from robot.errors import DeviceError, RobotConfigError
 from robot.readings import Pose, Region
 
 NEAR_MM, NEAR_RAD = 1.0, math.radians(1.0)
-"""Poses this near to each other are one to a person's hand: it is not asked again."""
+"""A person is not asked again for a pose this close to the current one."""
 
 
 class ManualArm(Arm):
-    """Asks a person to bring the hand to each pose, and believes them. `ask` shows a sentence and returns when done."""
+    """Asks a person to move the hand to each pose and assumes it reached.
+
+    Args:
+        workspace: Limits of the point between the fingertips.
+        max_speed_mm_s: Upper limit of requested speeds.
+        ask: Shows a request and returns when it is done.
+        clock: The rig's clock.
+    """
 
     is_manual = True
 
@@ -36,35 +43,35 @@ class ManualArm(Arm):
         self._at = None
 
     def _stop(self) -> None:
-        """A person who is interrupted stands somewhere: the next pose is asked for again."""
+        """Forget the pose: after an interruption, the next pose is requested again."""
         self._at = None
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
-        """Raises RobotConfigError where nobody can answer."""
+        """Ask for the pose; raise RobotConfigError without a terminal."""
         if self._at is not None and is_near(self._at, pose):
             return self._at
         self._at = None
         try:
             self._ask(describe_pose(pose))
         except EOFError as error:
-            raise RobotConfigError("a person must move the hand of this rig: run it in a terminal") from error
+            raise RobotConfigError("this rig needs a person to move the hand: run it in a terminal") from error
         self._at = pose
         return pose
 
     def _pose(self) -> Pose:
         if self._at is None:
-            raise DeviceError(f"{self.name}: nobody has been asked to bring the hand anywhere yet; call move_to first")
+            raise DeviceError(f"{self.name}: the pose is unknown before the first motion; call move_to first")
         return self._at
 
 
 def is_near(here: Pose, there: Pose) -> bool:
-    """Whether a person need not move: within 1 mm, and within 1 degree of a whole turn's angle."""
+    """Return whether two poses are equal to a person: within 1 mm and 1 degree."""
     turn = math.remainder(there.yaw_rad - here.yaw_rad, math.tau)
     return math.dist(here.as_tuple()[:3], there.as_tuple()[:3]) <= NEAR_MM and abs(turn) <= NEAR_RAD
 
 
 def describe_pose(pose: Pose) -> str:
-    """What a person is asked to do; right and away are as the camera sees them, which looks on from the -y side."""
+    """Return the request for a pose; right and away are as in the picture of the camera on the -y side."""
     sideways = f"{abs(pose.x_mm):.0f} mm to the {'right' if pose.x_mm >= 0 else 'left'} of the middle of the workspace"
     along = f"{abs(pose.y_mm):.0f} mm {'away from' if pose.y_mm >= 0 else 'towards'} the camera"
     turned = f"{math.degrees(math.remainder(pose.yaw_rad, math.tau)):.0f} deg"

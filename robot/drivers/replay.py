@@ -1,9 +1,8 @@
-"""Films and folders of pictures as gel sensors, and pictures with depth as a camera: to repeat, rehearse and test.
+"""Replay of recorded pictures: videos and image folders as gel sensors, pictures with depth as a camera.
 
-A sensor counts its pictures by the clock, from when it was connected: picture n is the newest from n / fps on. Below
-MIN_RATE_HZ pictures a second each is shown several times, each time as a new one, as a camera would see it on a screen:
-else a slow film would be a sensor whose pictures are too old. Nothing runs between two reads. A camera goes one picture
-further each time it is read, however long that takes.
+A sensor selects its picture by the clock: picture n is the newest from n / fps seconds after connecting. Below
+MIN_RATE_HZ pictures/s, each picture is shown several times as a new frame, because frames of a slow video would be
+rejected as stale. Nothing runs between two reads. A camera advances by one picture with each read.
 """
 
 import math
@@ -30,7 +29,7 @@ from robot.storage import decode_picture, parse_object
 _CACHE_SIZE = 8
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
 MIN_RATE_HZ = 10.0
-"""So often a sensor shows a picture at least: 0.1 s is well below the age at which one is refused."""
+"""Lowest frame rate of a replay sensor; 0.1 s is well below the age at which a frame is stale."""
 
 _FPS = (0.01, 1000.0)
 INTRINSICS_FILE, DEPTH_SUFFIX = "intrinsics.json", "_depth.png"
@@ -38,14 +37,20 @@ INTRINSICS_FILE, DEPTH_SUFFIX = "intrinsics.json", "_depth.png"
 
 @dataclass(frozen=True, kw_only=True)
 class VideoSettings(CropSettings):
-    """path: the film or folder. fps: pictures a second, 0 for the file's own. loop: again and again."""
+    """Settings of a video.
+
+    Attributes:
+        path: The video or folder.
+        fps: Pictures/s; 0: the file's own rate.
+        loop: Whether to start again at the end.
+    """
 
     path: str
     fps: float = 0.0
     loop: bool = True
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting out of range."""
+        """Raise RobotConfigError for a setting out of range."""
         super().__post_init__()
         if self.fps != 0 and not _FPS[0] <= self.fps <= _FPS[1]:
             raise RobotConfigError(f"fps must be from {_FPS[0]:g} to {_FPS[1]:g}, or 0 for the file's, got {self.fps}")
@@ -53,21 +58,21 @@ class VideoSettings(CropSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class ImageFolderSettings(VideoSettings):
-    """A folder of pictures does not know their rate."""
+    """Settings of an image folder, which has no rate of its own."""
 
     fps: float = 30.0
 
 
 class _ReplaySensor(TactileSensor):
-    """Shows picture n of `_count` from n / fps seconds after connecting, again from the start where it loops.
+    """Base of replay sensors: shows picture n of `_count` from n / fps seconds after connecting.
 
-    `_repeats`: how often each is shown, at the `_rate_hz` that comes of it.
+    Each picture is shown `_repeats` times, at the rate `_rate_hz`.
     """
 
     Settings: ClassVar[type[VideoSettings]] = VideoSettings
 
     def __init__(self, *, finger: str, clock: Clock = time.monotonic, **settings: Any) -> None:
-        """Raises RobotConfigError for a setting out of range; opens nothing."""
+        """Check the settings without opening the file; raise RobotConfigError for one out of range."""
         super().__init__(f"gel {finger}", finger, clock=clock)
         options = self._options = self.Settings(**settings)
         self.path, self.fps = Path(options.path), options.fps
@@ -78,19 +83,19 @@ class _ReplaySensor(TactileSensor):
 
     @abstractmethod
     def _open(self) -> tuple[int, float]:
-        """Return the number of pictures and their rate, 0 where unknown. Raises DeviceError or OSError."""
+        """Return the number of pictures and their rate (0: unknown); raise DeviceError or OSError."""
 
     @abstractmethod
     def _decode(self, number: int) -> npt.NDArray[np.uint8]:
-        """Picture `number`, BGR. Raises DeviceError."""
+        """Return picture `number` in BGR; raise DeviceError if it cannot be decoded."""
 
     def _connect(self) -> None:
         self._count, rate = self._open()
         self.fps = self._options.fps or rate
         if self._count < 1 or not _FPS[0] <= self.fps <= _FPS[1]:
             raise DeviceError(
-                f"{self.path} must hold pictures and say how many a second, got {self._count}, {rate:g}; if only the "
-                "rate is wrong, set fps"
+                f"{self.path} must contain pictures and have a frame rate, got {self._count} pictures at {rate:g} "
+                "frames/s; if only the rate is wrong, set fps"
             )
         self._repeats = max(1, math.ceil(MIN_RATE_HZ / self.fps))
         self._rate_hz = self._repeats * self.fps
@@ -110,12 +115,12 @@ class _ReplaySensor(TactileSensor):
         return self._frame(min(self._shown_count(), max(0, round((time_s - self._start_s) * self._rate_hz))))
 
     def _shown_count(self) -> int:
-        """How many pictures were shown before the one of now, repeated ones counted each time."""
+        """Return the number of frames before the current one, repetitions included."""
         shown = math.floor((self.clock() - self._start_s) * self._rate_hz)
         if shown >= self._count * self._repeats and not self._options.loop:
             raise DeviceError(
                 f"{self.path} ended: its {self._count} pictures lasted {self._count / self.fps:.3g} s; "
-                "set loop = true to see it again and again"
+                "set loop = true to repeat it"
             )
         return shown
 
@@ -131,7 +136,7 @@ class _ReplaySensor(TactileSensor):
 
 
 class VideoSensor(_ReplaySensor):
-    """A film file as a sensor; its keywords are those of VideoSettings."""
+    """A video file as a sensor; its keywords are those of VideoSettings."""
 
     _video: Any = None
     _next = 0
@@ -147,29 +152,29 @@ class VideoSensor(_ReplaySensor):
             self._video = None
 
     def _rewind(self) -> None:
-        """Open it again: looking for a picture by number lands beside it in many kinds of film."""
+        """Open the file again, because seeking by number is inexact in many video formats."""
         if self._video is not None:
             self._video.release()
         if not self.path.is_file():
-            raise DeviceError(f"film {self.path} must be there, but is not")
+            raise DeviceError(f"video {self.path} does not exist")
         self._video, self._next = cv2.VideoCapture(str(self.path)), 0
         if not self._video.isOpened():
-            raise DeviceError(f"film {self.path} cannot be opened; OpenCV must know its format")
+            raise DeviceError(f"video {self.path} cannot be opened; OpenCV must support its format")
 
     def _decode(self, number: int) -> npt.NDArray[np.uint8]:
         if number < self._next:
             self._rewind()
         while self._next < number and self._video.grab():
             self._next += 1
-        whole, pixels = self._video.read()
-        if not whole or self._next != number:
-            raise DeviceError(f"film {self.path} must have {self._count} pictures, it ends after {self._next}")
+        complete, pixels = self._video.read()
+        if not complete or self._next != number:
+            raise DeviceError(f"video {self.path} must have {self._count} pictures, but ends after {self._next}")
         self._next += 1
         return np.asarray(pixels, dtype=np.uint8)
 
 
 class ImageFolderSensor(_ReplaySensor):
-    """The pictures of a folder as a sensor, in the order of their names; its keywords are those of ImageFolderSettings."""
+    """The pictures of a folder as a sensor, ordered by name; its keywords are those of ImageFolderSettings."""
 
     Settings = ImageFolderSettings
     _files: Sequence[Path] = ()
@@ -184,18 +189,18 @@ class ImageFolderSensor(_ReplaySensor):
 
 @dataclass(frozen=True)
 class _ImagePair:
-    """Files of one picture of a camera."""
+    """Colour file and depth file of one picture."""
 
     colour: Path
     depth: Path | None
 
 
 class ReplayCamera(Camera):
-    """Pictures with depth from a folder, the next one at each read, from the first again after the last.
+    """A camera that returns the next picture of a folder at each read, and the first again after the last.
 
-    The folder is a recording of this project, or holds NAME.jpg (or .png) with NAME_depth.png, 16-bit in mm with 0
-    where unknown, and intrinsics.json: {"fx": ..., "fy": ..., "cx": ..., "cy": ...} in pixels. A recording does not say
-    them: give fx, fy, cx and cy here, which also count before the file's.
+    The folder is a recording of this project, or contains NAME.jpg (or .png) with NAME_depth.png (16-bit in mm, 0 where
+    unknown) and intrinsics.json: {"fx": ..., "fy": ..., "cx": ..., "cy": ...} in pixels. A recording has no intrinsics:
+    give fx, fy, cx and cy as arguments; they override those of the file.
     """
 
     def __init__(
@@ -209,7 +214,7 @@ class ReplayCamera(Camera):
         cy: float | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
-        """Raises RobotConfigError for fx, fy, cx and cy that are not all given, or out of range; opens nothing."""
+        """Check fx, fy, cx and cy, given all or none, without opening the folder; raise RobotConfigError if invalid."""
         super().__init__("replay camera", extrinsics, clock=clock)
         self.path = Path(path)
         lens = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
@@ -223,18 +228,18 @@ class ReplayCamera(Camera):
         self._next = 0
 
     def seek(self, number: int) -> None:
-        """Have the next read give picture `number`, counted from 0; beyond the last they begin again."""
+        """Make the next read return picture `number` from 0, modulo the number of pictures."""
         self._next = number
 
     def _connect(self) -> None:
         is_recording = (self.path / INFO_FILE).is_file()
         self._pairs = _recorded_pairs(self.path) if is_recording else _named_pairs(self.path)
         if not self._pairs:
-            raise DeviceError(f"{self.path} must hold pictures, NAME.jpg with NAME{DEPTH_SUFFIX}, or a recording's")
+            raise DeviceError(f"{self.path} must contain pictures, NAME.jpg with NAME{DEPTH_SUFFIX}, or a recording")
         self._intrinsics = self._given_intrinsics or _intrinsics(self.path / INTRINSICS_FILE)
         self.has_depth = all(pair.depth is not None for pair in self._pairs)
         if self.has_depth and self._intrinsics is None:
-            raise DeviceError(f"{self.path} holds depth: give fx, fy, cx and cy, or write {INTRINSICS_FILE} there")
+            raise DeviceError(f"{self.path} contains depth: give fx, fy, cx and cy, or write {INTRINSICS_FILE} there")
         self._next = 0
 
     def _close(self) -> None:
@@ -269,7 +274,7 @@ def _named_pairs(folder: Path) -> list[_ImagePair]:
 
 
 def _visible_files(folder: Path) -> list[Path]:
-    """What lies there, sorted; hidden files, such as other systems put beside pictures, are left out."""
+    """Return the files of a folder, sorted, without hidden files."""
     return sorted(each for each in folder.iterdir() if not each.name.startswith("."))
 
 
@@ -279,7 +284,7 @@ def _intrinsics(path: Path) -> Intrinsics | None:
     try:
         return build(Intrinsics, parse_object(path.read_bytes(), RobotConfigError))
     except (RobotConfigError, DeviceError) as error:
-        raise DeviceError(f"{path} must hold fx, fy, cx and cy in pixels, and nothing else: {error}") from error
+        raise DeviceError(f"{path} must contain only fx, fy, cx and cy in pixels: {error}") from error
 
 
 def _depth_m(path: Path) -> npt.NDArray[np.float32]:
@@ -290,8 +295,8 @@ def _depth_m(path: Path) -> npt.NDArray[np.float32]:
 
 
 def _pixels(path: Path, flags: int) -> npt.NDArray[Any]:
-    if not path.is_file():  # to read from a pipe, say, might never end
-        raise DeviceError(f"{path} must be a picture, but is no file")
+    if not path.is_file():  # reading a pipe might never end
+        raise DeviceError(f"{path} must be a picture, but is not a file")
     pixels = decode_picture(path.read_bytes(), flags)
     if pixels is None:
         raise DeviceError(f"{path} must be a picture, but cannot be decoded")

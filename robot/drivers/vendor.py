@@ -1,4 +1,4 @@
-"""What drivers over a maker's package share: loading it, its exceptions, its numbers, and starting again."""
+"""Common parts of drivers over a vendor's package: import, exceptions, checks of numbers, and recovery."""
 
 import contextlib
 import math
@@ -14,7 +14,7 @@ from robot.errors import DeviceError
 from robot.settings import TypedSettings, bounded
 
 _LIBRARY = re.compile(r"(lib[^\s:/]+\.(?:so|dylib)[.\d]*)")
-"""As the loaders of Linux and macOS name what they do not find."""
+"""The library's name in the loader's error message on Linux and macOS."""
 
 _INSTALL_COMMANDS = {
     "libfreenect2": "ldconfig after building libfreenect2 with shared libraries (github.com/OpenKinect/libfreenect2)",
@@ -24,28 +24,40 @@ _INSTALL_COMMANDS = {
 
 
 def import_package(package: str, device: str, install: str) -> Any:
-    """The maker's package, imported. Raises DeviceError that says what is missing: it, or a library of the system."""
+    """Import a vendor's package; raise DeviceError if it or a system library is missing.
+
+    Args:
+        package: Name of the package.
+        device: Name of the device, for the message.
+        install: How to install the package.
+    """
     try:
         return import_module(package)
     except ImportError as error:
         need = missing_library(package, error) or f"{package}, which is missing; {install}"
-        raise DeviceError(f"{device} needs {need}") from error
+        raise DeviceError(f"{device} requires {need}") from error
 
 
 def missing_library(package: str, error: ImportError) -> str | None:
-    """In words, where the package is there and a library of the system that it needs is not; else None."""
+    """Return a description of the system library that an installed package lacks, or None."""
     found = None if isinstance(error, ModuleNotFoundError) else _LIBRARY.search(str(error))
     if found is None:
         return None
     library = found[1]
     run = next((run for name, run in _INSTALL_COMMANDS.items() if library.startswith(name)), None)
-    cure = f"run {run}" if run else "install the package of your system that brings it"
-    return f"{library}, a library of the system that {package} cannot find; {cure}"
+    remedy = f"run {run}" if run else "install the package of your system that contains it"
+    return f"{library}, a library of the system that {package} cannot find; {remedy}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class VendorSettings(TypedSettings):
-    """serial: which camera, where several are connected. warmup_frames: dropped at first. timeout_s: of a picture."""
+    """Settings of a camera behind a vendor's package.
+
+    Attributes:
+        serial: Serial number of the camera, required if several are connected.
+        warmup_frames: Frames dropped after connecting.
+        timeout_s: Longest wait for a picture.
+    """
 
     serial: str = ""
     warmup_frames: int = bounded(0, 1000, 5)
@@ -53,7 +65,7 @@ class VendorSettings(TypedSettings):
 
 
 def check_finite(what: str, numbers: Iterable[float]) -> list[float]:
-    """What a camera says of itself. Raises DeviceError for NaN or infinity."""
+    """Return numbers that a camera reports as floats; raise DeviceError for NaN or infinity."""
     found = [float(each) for each in numbers]
     if not all(map(math.isfinite, found)):
         raise DeviceError(f"{what} must be finite numbers, got {found}; plug the camera in again")
@@ -62,7 +74,7 @@ def check_finite(what: str, numbers: Iterable[float]) -> list[float]:
 
 @contextlib.contextmanager
 def vendor_errors(failure: str) -> Iterator[None]:
-    """A DeviceError that begins with `failure` for whatever a maker's package raises; OSError and ours pass."""
+    """Convert exceptions of a vendor's package into a DeviceError that begins with `failure`; OSError passes."""
     try:
         yield
     except (DeviceError, OSError):
@@ -72,7 +84,7 @@ def vendor_errors(failure: str) -> Iterator[None]:
 
 
 class VendorCamera(Camera):
-    """A camera behind its maker's package. `_reported`: what it says of its settings."""
+    """A camera behind its vendor's package; `_reported` contains the settings that it reports."""
 
     _reported: Mapping[str, Any] = {}
 
@@ -80,7 +92,7 @@ class VendorCamera(Camera):
         return dict(self._reported)
 
     def _recover(self) -> None:
-        """Close whatever can be closed, then connect whole or not at all."""
+        """Close the device despite errors, then connect completely or not at all."""
         with contextlib.suppress(DeviceError, OSError):
             self._close()
         try:
@@ -91,10 +103,10 @@ class VendorCamera(Camera):
             raise
 
     def _choose_camera(self, requested: str, connected: Sequence[str]) -> int:
-        """Return the place of the camera to open among the serial numbers of those connected. Raises DeviceError."""
+        """Return the index of the camera to open among connected serial numbers; raise DeviceError if not unique."""
         if requested in connected or (not requested and len(connected) == 1):
             return connected.index(requested) if requested else 0
         known = ", ".join(connected) or "none"
         if requested:
-            raise DeviceError(f"{self.name} {requested} must be connected; connected: {known}")
-        raise DeviceError(f"one {self.name} must be connected, or its serial number given; connected: {known}")
+            raise DeviceError(f"{self.name} {requested} is not connected; connected: {known}")
+        raise DeviceError(f"connect exactly one {self.name}, or set its serial number; connected: {known}")

@@ -1,7 +1,7 @@
-"""One attempt at a grasp, over the contract alone: look, fit, plan, close, lift, put down.
+"""One grasp attempt with any rig: photograph, plan, close, lift, put down.
 
-Every random number of an attempt comes from (seed, object, number). With a rig that prepares its objects from the same
-three, an attempt is a pure function of them: it can be done again, in another process or after a crash.
+All random numbers of an attempt derive from (seed, object, number). If the rig prepares its objects from the same
+three, an attempt is a pure function of them: it can be repeated in another process or after a crash.
 """
 
 import contextlib
@@ -28,11 +28,19 @@ _OUTCOME_FROM = {"holding": "held", "no_part": "missed", "part_lost": "slipped"}
 
 @dataclass(frozen=True)
 class GraspAttempt:
-    """What came of an attempt, as it travels between processes: images are the content of JPEG and PNG files.
+    """Result of one attempt, picklable.
 
-    outcome: "held", "missed", "slipped" by the gripper after the lift, or for the `reason` given "no_plan", or
-    "ungraspable" where further attempts are useless; then there are no images. touch_time_s, lasted_s: from the photo to the
-    picture of the closed jaws, and to the end.
+    Attributes:
+        object_id: The object.
+        number: Number of the attempt at this object.
+        outcome: "held", "missed" or "slipped" as the gripper reports after the lift; "no_plan" or "ungraspable" (no
+            further attempt can succeed) without images, for the `reason` given.
+        images: Content of JPEG and PNG files by column.
+        fields: Further fields of the recorded grasp.
+        fit: The plan's description of the object, for the log.
+        reason: Message of the PlanError, if any.
+        touch_time_s: Time from the photo to the gel images of the closed jaws.
+        duration_s: Time from the photo to the end.
     """
 
     object_id: str
@@ -47,7 +55,16 @@ class GraspAttempt:
 
 
 class AttemptRunner:
-    """Makes attempts with a connected rig."""
+    """Makes attempts with a connected rig.
+
+    Args:
+        rig: The rig.
+        seed: Seed of the planner's random choices.
+        settings: How attempts are made.
+
+    Raises:
+        RobotConfigError: A setting is outside the limits of the rig.
+    """
 
     def __init__(self, rig: Rig, seed: int, settings: AttemptSettings) -> None:
         check_seed(seed)
@@ -55,9 +72,16 @@ class AttemptRunner:
         self.rig, self.seed, self.settings = rig, seed, settings
 
     def run(self, object_id: str, number: int) -> GraspAttempt:
-        """Make one attempt, again from the start when a device fails. Raises DeviceError when it fails once too often.
+        """Make one attempt; after a DeviceError, recover the rig and try again.
 
-        Whatever happens, Ctrl-C included, the jaws are opened, or the error says that they could not be.
+        After any exception, Ctrl-C included, the jaws are opened. If this fails, the exception's message states it.
+
+        Args:
+            object_id: The object.
+            number: Number of the attempt.
+
+        Raises:
+            DeviceError: All retries failed.
         """
         for trial in range(self.settings.retries + 1):
             try:
@@ -77,9 +101,7 @@ class AttemptRunner:
         raise AssertionError("the loop returns or raises")
 
     def _open_jaws(self) -> str:
-        """Open the jaws, of a gripper that is brought back first where it must be; returns what to add to the error at
-        hand where that fails too.
-        """
+        """Open the jaws, after recovery if necessary; return "" or a note about the failure."""
         gripper = self.rig.gripper
         try:
             with contextlib.suppress(DeviceError):
@@ -105,10 +127,10 @@ class AttemptRunner:
             plan = rig.planner.plan(rig, image, self.settings.grasp, rng)
         except PlanError as error:
             outcome = "ungraspable" if isinstance(error, UngraspableError) else "no_plan"
-            lasted = round(rig.clock() - start, 3)
-            return GraspAttempt(object_id, number, outcome, reason=str(error), duration_s=lasted)
+            duration_s = round(rig.clock() - start, 3)
+            return GraspAttempt(object_id, number, outcome, reason=str(error), duration_s=duration_s)
         images = self._pictures(image)
-        touches, fields, at = self._grasp(plan)
+        touches, fields, touch_time = self._grasp(plan)
         outcome = self._outcome()
         if "after" in self.settings.outputs:
             touches |= self._read_touches("_after", self.settings.hold_s)[0]
@@ -120,12 +142,12 @@ class AttemptRunner:
             {**images, **touches},
             fields,
             plan.fit,
-            touch_time_s=round(at - start, 3),
+            touch_time_s=round(touch_time - start, 3),
             duration_s=round(rig.clock() - start, 3),
         )
 
     def _rise(self) -> None:
-        """Straight up from wherever the hand is: on a slant, open jaws would sweep over what stands between them."""
+        """Move straight up from the current pose; on a slant, the open jaws would hit an object between them."""
         arm = self.rig.arm
         if arm.is_manual:
             return
@@ -134,7 +156,7 @@ class AttemptRunner:
             arm.move_to(replace(here, z_mm=top), self.settings.approach_mm_s)
 
     def _grasp(self, plan: GraspPlan) -> tuple[dict[str, bytes], dict[str, Any], float]:
-        """Go there, close and lift; returns touches, what is recorded of the grasp, and when the jaws were closed."""
+        """Approach, close and lift; return touches, fields of the recorded grasp, and the time of the touch."""
         rig, settings = self.rig, self.settings
         for pose in plan.approach or (plan.above,):
             rig.arm.move_to(pose, settings.travel_mm_s)
@@ -143,7 +165,7 @@ class AttemptRunner:
         touches = self._read_touches("_before", MAX_AGE_S)[0] if "before" in settings.outputs else {}
         closed = rig.gripper.grasp(plan.force_n, settings.closing_mm_s)
         rig.sleep(settings.settle_s)
-        at = rig.clock()
+        touch_time = rig.clock()
         during, skew_s = self._read_touches("", settings.settle_s)
         rig.arm.move_to(plan.above, settings.approach_mm_s)
         rig.sleep(settings.hold_s)
@@ -153,11 +175,12 @@ class AttemptRunner:
             "pose": reached.as_tuple(),
             "touch_skew_s": round(skew_s, 6),
         }
-        return touches | during, fields, at
+        return touches | during, fields, touch_time
 
     def _read_touches(self, moment: str, since_s: float) -> tuple[dict[str, bytes], float]:
-        """Gel images by column, and how far apart in time they were taken (s); none older than what has just been
-        waited for, which may have been before it.
+        """Read gel images by column, at most `since_s` old, and their skew in s.
+
+        `since_s` is the wait just before; an older frame may show the previous state.
         """
         frames, skew_s = read_together(self.rig.sensors, max_age_s=min(MAX_AGE_S, since_s))
         return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}, skew_s
@@ -166,13 +189,15 @@ class AttemptRunner:
         status = self.rig.gripper.state().status
         if status not in _OUTCOME_FROM:
             raise DeviceError(
-                f"{self.rig.gripper.name} must be holding, no_part or part_lost after a lift; it says {status}"
+                f"{self.rig.gripper.name} must report holding, no_part or part_lost after a lift, got {status}"
             )
         return _OUTCOME_FROM[status]
 
     def _put_down(self, plan: GraspPlan, held: bool, rng: np.random.Generator) -> None:
-        """Let go: of a held object on the table, at a random place and turned at random; where it was given, or where a
-        tilted hand took it and has room to withdraw.
+        """Release a held object on the table at a random place and yaw, and open the jaws.
+
+        With a given `object_fit`, or after a tilted grasp, the object is put back where it was grasped; a tilted
+        hand has room to withdraw there.
         """
         rig, settings = self.rig, self.settings
         low, high = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)
@@ -204,7 +229,7 @@ class AttemptRunner:
 
 
 def depth_in_mm(depth_m: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16]:
-    """Whole millimetres as a recording keeps them, 0 where unknown or beyond 65 m."""
+    """Return depth in whole millimetres as a recording stores it, 0 where unknown or beyond 65 m."""
     depth = np.rint(depth_m.astype(np.float64) * 1000)
     known = np.isfinite(depth) & (depth > 0) & (depth < 65536)
     return np.where(known, depth, 0).astype(np.uint16)

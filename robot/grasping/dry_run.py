@@ -1,4 +1,4 @@
-"""A rehearsal without motion: the rig's own sensors and camera, with an arm and jaws that say what they would do."""
+"""Dry run of a rig: its own sensors and camera, with an arm and a gripper that report motions instead of moving."""
 
 from collections.abc import Callable
 
@@ -10,9 +10,13 @@ Report = Callable[[str], object]
 
 
 def make_dry_run(rig: Rig, report: Report) -> Rig:
-    """`rig`, unconnected, with its arm and gripper replaced: nothing of these two is connected or moved.
+    """Replace the arm and the gripper of an unconnected rig, so that neither is connected or moved; return the rig.
 
-    `report` takes a sentence for each motion. The limits are those of the rig, so that what they refuse is refused here.
+    The limits are those of the rig, so a dry run raises for every motion that the rig would refuse.
+
+    Args:
+        rig: The rig.
+        report: Called with a sentence for each motion.
     """
     rig.arm = DryRunArm(rig.arm, report)
     rig.gripper = DryRunGripper(rig.gripper, report)
@@ -20,7 +24,7 @@ def make_dry_run(rig: Rig, report: Report) -> Rig:
 
 
 class DryRunArm(VirtualDevice, Arm):
-    """Says where it would go, and is there."""
+    """An arm that reports each motion and is at its goal at once."""
 
     def __init__(self, arm: Arm, report: Report) -> None:
         super().__init__(f"{arm.name} (dry run)", arm.workspace, max_speed_mm_s=arm.max_speed_mm_s, clock=arm.clock)
@@ -43,7 +47,7 @@ class DryRunArm(VirtualDevice, Arm):
 
 
 class DryRunGripper(VirtualDevice, Gripper):
-    """Says how it would move its jaws; whatever it closes on, it holds."""
+    """A gripper that reports each motion; every grasp holds an object."""
 
     def __init__(self, gripper: Gripper, report: Report) -> None:
         super().__init__(

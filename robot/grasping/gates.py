@@ -1,8 +1,8 @@
-"""Gates: from the gel images of a grasp to whether it is kept.
+"""Gates: decide from the gel images of a grasp whether it is accepted.
 
-A gate is a callable that takes {finger: GraspFrames} and returns whether the grasp succeeded, or the probability that
-it did, which must be 1/2 or more. A learned one is trained elsewhere and handed to the collector like this one here. A
-gate that looks at the images on which a matcher is trained later chooses easy contacts: what it rejects is logged.
+A gate is a callable from {finger: GraspFrames} to a decision or to the probability of success; a grasp is accepted
+if this is at least 1/2. A learned gate is trained in `retrieval` and passed to the collector. A gate selects easy
+contacts, because it uses the images on which a matcher is trained later; therefore rejected grasps are recorded too.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ Picture = npt.NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class GraspFrames:
-    """What one finger saw, (H, W, 3) uint8 RGB: the untouched gel, the closed jaws, and after the lift."""
+    """Frames of one finger, (H, W, 3) uint8 RGB: without contact, with closed jaws, and after the lift."""
 
     before: Picture | None
     during: Picture
@@ -30,25 +30,39 @@ Gate = Callable[[Mapping[str, GraspFrames]], bool | float]
 
 
 def apply_gate(gate: Gate, touches: Mapping[str, GraspFrames]) -> tuple[bool, float]:
-    """Ask a gate; returns its decision, and its answer as a number. Raises RobotError for an answer that is none."""
-    answer = float(gate(touches))
-    if not 0.0 <= answer <= 1.0:  # also refuses NaN
-        raise RobotError(f"a gate must answer true, false or a probability, got {answer}")
-    return answer >= 0.5, answer
+    """Return the decision of a gate and its score, 0 to 1.
+
+    Args:
+        gate: The gate.
+        touches: Frames by finger.
+
+    Raises:
+        RobotError: The score is not between 0 and 1.
+    """
+    score = float(gate(touches))
+    if not 0.0 <= score <= 1.0:  # also rejects NaN
+        raise RobotError(f"a gate must return true, false or a probability, got {score}")
+    return score >= 0.5, score
 
 
 def difference(frame: Picture, before: Picture) -> npt.NDArray[np.float32]:
-    """Signed change of colour in grey levels, (H, W, 3) float32: uint8 would wrap round below 0."""
+    """Return the signed change of colour in grey levels, (H, W, 3) float32; uint8 would wrap round below 0."""
     return np.subtract(frame, before, dtype=np.float32)
 
 
 @dataclass(frozen=True)
 class ContactAreaGate:
-    """A grasp is kept when the gel of any finger (or of all) has changed its colour over a large enough area.
+    """A gate that accepts a grasp when the gel of any finger (or of all) changed its colour over a large enough area.
 
-    A pixel has changed when some channel, averaged over `blur_px` x `blur_px`, differs from the untouched gel by more
-    than `noise_levels` grey levels; at least the share `least_share` of the pixels must have. It looks at the frame
-    after the lift where there is one, because what has slipped leaves an untouched gel, else at the frame during.
+    It compares the frame after the lift, if recorded, with the no-contact frame, because the gel has no contact after
+    the object has slipped. Else it compares the frame with closed jaws.
+
+    Attributes:
+        noise_levels: A pixel has changed if some channel, averaged over `blur_px` x `blur_px`, differs by more than
+            this number of grey levels.
+        least_share: Smallest fraction of changed pixels, 0 to 1.
+        blur_px: Side of the average.
+        every_finger: Whether every finger's gel must have changed.
     """
 
     noise_levels: float = 8.0
@@ -57,27 +71,27 @@ class ContactAreaGate:
     every_finger: bool = False
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting out of range."""
+        """Raise RobotConfigError for a setting out of range."""
         if not 0 < self.noise_levels < 255:
-            raise RobotConfigError(f"noise_levels must lie between 0 and 255, got {self.noise_levels}")
+            raise RobotConfigError(f"noise_levels must be between 0 and 255, got {self.noise_levels}")
         if not 0 < self.least_share <= 1:
-            raise RobotConfigError(f"least_share must lie above 0 and at most at 1, got {self.least_share}")
+            raise RobotConfigError(f"least_share must be above 0 and at most 1, got {self.least_share}")
         if self.blur_px < 1:
             raise RobotConfigError(f"blur_px must be at least 1, got {self.blur_px}")
 
     def __call__(self, touches: Mapping[str, GraspFrames]) -> bool:
-        """Raises RobotConfigError without frames of the untouched gel."""
+        """Return whether the grasp is accepted; raise RobotConfigError if a no-contact frame is missing."""
         enough = (self._changed_fraction(finger, frames) >= self.least_share for finger, frames in touches.items())
-        return (all if self.every_finger else any)(enough)  # which look no further than they must
+        return (all if self.every_finger else any)(enough)  # stops at the first finger that decides
 
     def changed_fractions(self, touches: Mapping[str, GraspFrames]) -> dict[str, float]:
-        """Share of changed pixels, 0 to 1, by finger."""
+        """Return the fraction of changed pixels, 0 to 1, by finger."""
         return {finger: self._changed_fraction(finger, frames) for finger, frames in touches.items()}
 
     def _changed_fraction(self, finger: str, frames: GraspFrames) -> float:
         if frames.before is None:
             raise RobotConfigError(
-                f"the contact-area gate compares with the untouched gel: record frames before the grasp; finger "
+                f"the contact-area gate requires no-contact frames: record frames before the grasp; finger "
                 f"{finger} has none"
             )
         change = difference(frames.during if frames.after is None else frames.after, frames.before)

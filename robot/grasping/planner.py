@@ -1,13 +1,13 @@
-"""Grasp planners: where a rig closes its jaws on what stands before its camera.
+"""Grasp planners: choose the grasp of the object in the camera's picture.
 
-A new planner is a subclass of GraspPlanner. A rig's file chooses one by name, or by `module:Class`; the other keys of
-the table are the planner's keywords:
+A planner is a subclass of GraspPlanner. A rig's file names it, or gives `module:Class`; the other keys of the table
+are the planner's keywords:
 
     [planner]
     name = "cylinder"
     search_margin_mm = 100
 
-In Python a rig is given one: `Rig(..., planner=MyPlanner())`.
+In Python: `Rig(..., planner=MyPlanner())`.
 """
 
 import math
@@ -35,15 +35,20 @@ PLANNERS: "Registry[type[GraspPlanner]]" = Registry(
     error=UnknownName,
     base="robot.grasping.planner:GraspPlanner",
 )
-"""Grasp planners by name, imported when used. The keywords of a planner are the keys of its table."""
+"""Grasp planners by name, imported on first use. A planner's keywords are the keys of its table."""
 
 
 @dataclass(frozen=True)
 class GraspPlan:
-    """Where to close, where to lift to, how far to open before, and how hard to close.
+    """One planned grasp.
 
-    approach: poses to pass on the way there, the last one clear of the object; `above` where none are given. fit: what
-    the attempt's log says of the object as it was seen.
+    Attributes:
+        pose: Where the jaws close.
+        above: Pose after the lift.
+        opening_mm: Opening before the grasp.
+        force_n: Clamping force.
+        approach: Poses on the way to `pose`, the last one clear of the object; if empty, `above`.
+        fit: Description of the object, for the attempt log.
 
     >>> pose, above = robot.Pose(0.0, 0.0, 60.0, yaw_rad=1.0), robot.Pose(0.0, 0.0, 240.0, yaw_rad=1.0)
     >>> robot.GraspPlan(pose, above, opening_mm=110.0, force_n=10.0).approach
@@ -61,7 +66,8 @@ class GraspPlan:
 class GraspPlanner(ABC):
     """Plans one grasp from one picture.
 
-    needs_depth: whether the picture must have depth. Where it need not, none is taken for the plan's sake.
+    Attributes:
+        needs_depth: Whether the picture must have depth; if not, depth is read only to be recorded.
 
     >>> class OnTheMark(robot.GraspPlanner):
     ...     needs_depth = False
@@ -75,27 +81,35 @@ class GraspPlanner(ABC):
     needs_depth: ClassVar[bool] = True
 
     def check(self, rig: "Rig") -> None:
-        """Raise RobotConfigError where this planner cannot plan for `rig`."""
+        """Raise RobotConfigError if this planner cannot plan for `rig`."""
         if self.needs_depth and rig.object_fit is None and not rig.camera.has_depth:
             raise RobotConfigError(
-                f"{rig.camera.name} has no depth: say where every object stands and how large it is, in [object]"
+                f"{rig.camera.name} has no depth: give the place and size of every object in [object]"
             )
 
     @abstractmethod
     def plan(self, rig: "Rig", image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
         """Draw one grasp of the object in `image`, taken by the rig's camera.
 
+        Args:
+            rig: The rig, connected.
+            image: The picture; with depth if `needs_depth`.
+            settings: How grasps are drawn.
+            rng: Source of all random choices.
+
         Raises:
-            UngraspableError: where no other attempt at this object can do better.
-            PlanError: where this one cannot be made.
+            UngraspableError: No attempt at this object can succeed.
+            PlanError: This attempt is impossible.
         """
 
 
 class CylinderPlanner(GraspPlanner):
-    """As in the paper: fit a cylinder to the depth picture, or take the one that the rig was given, and pinch it from
-    above about its axis (`plan_grasp`).
+    """The planner of the paper: fit a cylinder to the depth picture and pinch it from above (`plan_grasp`).
 
-    search_margin_mm: an object may stand so far outside the workspace and still be found.
+    A given `object_fit` of the rig replaces the fit.
+
+    Args:
+        search_margin_mm: Width of the border around the workspace in which objects are still found.
     """
 
     def __init__(self, *, search_margin_mm: float = 150.0) -> None:
@@ -103,11 +117,12 @@ class CylinderPlanner(GraspPlanner):
         self.search_margin_mm = search_margin_mm
 
     def plan(self, rig: "Rig", image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
+        """Fit the cylinder and draw one grasp of it; raise PlanError if this is impossible."""
         workspace = rig.arm.workspace
         lower, upper = workspace.lower, workspace.upper
-        beyond = self.search_margin_mm
-        sight = Region((lower[0] - beyond, lower[1] - beyond, -1.0), (upper[0] + beyond, upper[1] + beyond, upper[2]))
-        fit = rig.object_fit or fit_cylinder(image, rig.camera.extrinsics, sight)
+        margin = self.search_margin_mm
+        region = Region((lower[0] - margin, lower[1] - margin, -1.0), (upper[0] + margin, upper[1] + margin, upper[2]))
+        fit = rig.object_fit or fit_cylinder(image, rig.camera.extrinsics, region)
         plan = plan_grasp(fit, settings, workspace, rig.gripper.stroke_mm, rng)
         return replace(plan, fit=fit.to_dict())
 
@@ -117,10 +132,10 @@ def load_planner(table: Mapping[str, Any], default: str = "cylinder") -> GraspPl
 
     Args:
         table: `name`, and the planner's settings.
-        default: The name, where the table has none.
+        default: The name if the table has none.
 
     Raises:
-        UnknownName: No planner has this name; lists the known ones.
+        UnknownName: No planner has this name; the message lists the known ones.
         RobotConfigError: A setting is unknown, missing, or of another type.
     """
     return build_named(PLANNERS, table, "name", where="[planner]", default=default)
@@ -129,37 +144,46 @@ def load_planner(table: Mapping[str, Any], default: str = "cylinder") -> GraspPl
 def plan_grasp(
     fit: CylinderFit, settings: GraspSettings, workspace: Region, stroke_mm: float, rng: np.random.Generator
 ) -> GraspPlan:
-    """Draw one grasp: a random top-down pinch about the middle of the fitted cylinder.
+    """Draw one grasp: a random top-down pinch of the fitted cylinder.
 
-    The point between the fingertips lies at the cylinder's axis but for a jitter, at a random height within the object.
-    The jaws close in a direction that is uniform over the half turn that tells closing directions apart, with a
-    uniformly drawn force. All numbers are drawn before any is checked: what one plan draws never depends on how another
-    one fared. Raises PlanError, with the reason, for a grasp that this rig cannot do.
+    The point between the fingertips lies on the cylinder's axis plus a jitter, at a random height within the object.
+    The closing direction is uniform over half a turn, and the force is uniform over its range. All numbers are drawn
+    before the first check, so that failures of other attempts do not change a draw.
+
+    Args:
+        fit: The cylinder.
+        settings: How grasps are drawn.
+        workspace: Limits of the point between the fingertips.
+        stroke_mm: Largest opening of the jaws.
+        rng: Source of the random choices.
+
+    Raises:
+        PlanError: The rig cannot make this grasp; the message gives the reason.
     """
     dx, dy = rng.uniform(-settings.jitter_mm, settings.jitter_mm, 2)
-    share, yaw = float(rng.uniform()), float(rng.uniform(0.0, math.pi))
+    fraction, yaw = float(rng.uniform()), float(rng.uniform(0.0, math.pi))
     force = round(float(rng.uniform(*settings.force_n)), 3)
     floor = max(settings.floor_mm, workspace.lower[2])
     if fit.height_mm < floor:
         raise PlanError(
-            f"the object is {fit.height_mm:.0f} mm high, and the fingers reach no lower than {floor:.0f} mm"
+            f"the object is {fit.height_mm:.0f} mm high, but the lowest height of the fingers is {floor:.0f} mm"
         )
     low = max(floor, fit.height_mm - settings.reach_mm)
     high = max(low, fit.height_mm - settings.top_margin_mm)
-    # To a micrometre and a microradian: the last bits of a fit may depend on how many threads computed it.
-    x, y, z = fit.x_mm + float(dx), fit.y_mm + float(dy), low + share * (high - low)
+    # Rounded to a micrometre and a microradian: the last bits of a fit may depend on the number of threads.
+    x, y, z = fit.x_mm + float(dx), fit.y_mm + float(dy), low + fraction * (high - low)
     pose = Pose(round(x, 3), round(y, 3), round(z, 3), math.floor(yaw * 1e6) / 1e6)
     width = fit.width_mm(yaw, settings.finger_mm) + 2 * settings.clearance_mm
     if width > stroke_mm:
         raise PlanError(
-            f"the object is wider than the stroke: jaws closing at {math.degrees(yaw):.0f} degrees must open "
-            f"{width:.0f} mm, and they open {stroke_mm:.0f} mm"
+            f"the object is wider than the stroke: at {math.degrees(yaw):.0f} degrees the jaws must open "
+            f"{width:.0f} mm, but they open only {stroke_mm:.0f} mm"
         )
     return GraspPlan(pose, _above(pose, fit, settings, workspace), stroke_mm, force)
 
 
 def _above(pose: Pose, fit: CylinderFit, settings: GraspSettings, workspace: Region) -> Pose:
-    """Where the descent begins: inside the workspace, and the fingers clear of the object."""
+    """Return the start of the descent, inside the workspace and clear of the object; raise PlanError otherwise."""
     above = Pose(pose.x_mm, pose.y_mm, min(pose.z_mm + settings.lift_mm, workspace.upper[2]), pose.yaw_rad)
     if not (workspace.contains(pose) and workspace.contains(above)):
         raise PlanError(f"the grasp is out of the workspace {workspace.lower} to {workspace.upper}: {pose}")

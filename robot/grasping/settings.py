@@ -1,4 +1,4 @@
-"""How grasps are drawn, and how attempts at them are made: forces, places, speeds, waits, and what is recorded."""
+"""Settings of grasps and of attempts: forces, places, speeds, waits and recorded outputs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,17 +9,22 @@ from robot.errors import RobotConfigError
 from robot.settings import TypedSettings, bounded, build
 
 OUTPUTS = ("depth", "before", "after")
-"""What may be left out of a recording: the depth picture, and gel images of the moments before and after a grasp."""
+"""Optional outputs of an attempt: the depth picture, and gel images before and after the grasp."""
 
 
 @dataclass(frozen=True)
 class GraspSettings(TypedSettings):
     """How grasps are drawn. Lengths in mm, forces in N.
 
-    force_n: range of the clamping force. jitter_mm: the pose strays so far from the axis in x and in y.
-    floor_mm: lowest point between the fingertips, above the table. top_margin_mm, reach_mm: that point lies at least
-    and at most so far below the object's top. finger_mm: width of a finger. clearance_mm: room on either side of the
-    object when the jaws are open. lift_mm: how high an object is lifted, and how far above its grasp a plan begins.
+    Attributes:
+        force_n: Range of the clamping force.
+        jitter_mm: Largest offset of the pose from the axis, in x and in y.
+        floor_mm: Smallest height of the fingertips above the table.
+        top_margin_mm: Smallest distance of the fingertips below the object's top.
+        reach_mm: Largest distance of the fingertips below the object's top.
+        finger_mm: Width of a finger.
+        clearance_mm: Room on either side of the object when the jaws are open.
+        lift_mm: Height of the lift, and of the approach pose above the grasp.
     """
 
     force_n: tuple[float, float] = (5.0, 25.0)
@@ -32,13 +37,13 @@ class GraspSettings(TypedSettings):
     lift_mm: float = bounded(1, 1e6, 180.0)
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting of the wrong type or out of range."""
+        """Raise RobotConfigError for a setting of another type or out of range."""
         super().__post_init__()
         if not 0 < self.force_n[0] <= self.force_n[1]:
             raise RobotConfigError(f"force_n must be a range of forces above 0, lower first, got {self.force_n}")
 
     def check(self, arm: Arm, gripper: Gripper) -> None:
-        """Raise RobotConfigError where this rig cannot do what is asked."""
+        """Raise RobotConfigError if the settings exceed the limits of this arm and gripper."""
         low, high = self.force_n
         if low < gripper.min_force_n or high > gripper.max_force_n:
             raise RobotConfigError(
@@ -51,11 +56,20 @@ class GraspSettings(TypedSettings):
 
 @dataclass(frozen=True)
 class AttemptSettings(TypedSettings):
-    """How attempts are made. outputs: which of OUTPUTS are recorded; nothing is asked of a device for the others.
+    """How attempts are made.
 
-    settle_s: wait between closing and the picture. hold_s: wait between lifting and judging. release_mm: an object is
-    let go so far above where it was grasped, on the inner `table_share` of the workspace. retries: how often an attempt
-    is begun again after a device has failed. jpeg_quality: of colour pictures, 0 to 100; depth is kept exactly.
+    Attributes:
+        grasp: How grasps are drawn.
+        outputs: Members of OUTPUTS to record; devices are not read for the others.
+        travel_mm_s: Speed of the arm between objects.
+        approach_mm_s: Speed of the arm near the object.
+        closing_mm_s: Speed of the closing jaws.
+        settle_s: Wait between closing and the gel images.
+        hold_s: Wait between the lift and the gripper's outcome.
+        release_mm: Height of the release above the height of the grasp.
+        table_share: Inner fraction of the workspace in which objects are put down.
+        retries: Number of repetitions after device failures.
+        jpeg_quality: Quality of colour pictures, 0 to 100; depth is stored exactly.
     """
 
     grasp: GraspSettings = field(default_factory=GraspSettings)
@@ -71,12 +85,12 @@ class AttemptSettings(TypedSettings):
     jpeg_quality: int = bounded(0, 100, 95)
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting of the wrong type or out of range."""
+        """Raise RobotConfigError for a setting of another type or out of range."""
         super().__post_init__()
         if unknown := sorted(set(self.outputs) - set(OUTPUTS)):
-            raise RobotConfigError(f"outputs must be of {', '.join(OUTPUTS)}; got {unknown[0]!r}")
+            raise RobotConfigError(f"outputs must be among {', '.join(OUTPUTS)}; got {unknown[0]!r}")
 
 
 def parse_attempt_settings(attempt: Mapping[str, Any], grasp: Mapping[str, Any]) -> AttemptSettings:
-    """From the tables [attempt] and [grasp] of a rig's file. Raises RobotConfigError."""
+    """Return the settings of the tables [attempt] and [grasp] of a rig's file; raise RobotConfigError if invalid."""
     return build(AttemptSettings, attempt, where="[attempt]", grasp=build(GraspSettings, grasp, where="[grasp]"))

@@ -1,10 +1,9 @@
-"""attempts.jsonl: what came of every attempt at a grasp, those without a grasp included, and acceptance by object.
+"""attempts.jsonl: the result of every attempt, with or without a grasp, and the acceptance of each object.
 
-It lies beside the recording, a line for each attempt: object_id, number, outcome, accepted, ended_s (second since the
-recording began, while the rig worked), and where there was a grasp its grasp_id, the gate's score and fit (method and
-error of the cylinder), else the reason. The outcome "ungraspable" ends the attempts at its object. A line is written
-before its grasp is appended to the recording: after a crash at most the last line is half or has no grasp, and then it
-does not count.
+The file lies in the recording's folder. A line contains object_id, number, outcome, accepted and ended_s (seconds of
+rig time since the recording began). If there was a grasp, it adds grasp_id, the gate's score and fit (method and error
+of the cylinder); else it adds the reason. The outcome "ungraspable" ends the attempts at its object. A line is written
+before its grasp. After a crash, only the last line may be incomplete or without its grasp; such a line is ignored.
 """
 
 import contextlib
@@ -24,12 +23,12 @@ from robot.storage import append_line, parse_object, read_content, storage_error
 
 ATTEMPTS_FILE = "attempts.jsonl"
 UNGRASPABLE = "ungraspable"
-"""Outcome of an attempt after which no other one at the same object is made."""
+"""Outcome of the last attempt at an object that cannot be grasped."""
 
 
 @dataclass(frozen=True)
 class LoggedAttempt:
-    """One line."""
+    """One line of attempts.jsonl."""
 
     object_id: str
     number: int
@@ -42,23 +41,23 @@ class LoggedAttempt:
     reason: str | None = None
 
     def to_row(self) -> dict[str, Any]:
-        """The JSON object; what there is not is left out."""
+        """Return the JSON object without its None values."""
         return {key: value for key, value in vars(self).items() if value is not None}
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Self:
-        """Raises RecordingError for what `to_row` never writes."""
+        """Parse a row; raise RecordingError for a row that `to_row` cannot have written."""
         try:
             attempt = build(cls, row)
         except RobotConfigError as error:
-            raise RecordingError(f"is no attempt: {error}") from error
+            raise RecordingError(f"not an attempt: {error}") from error
         if attempt.outcome not in (known := (*OUTCOMES, UNGRASPABLE)):
-            raise RecordingError(f"is no attempt: outcome must be one of {', '.join(known)}, got {attempt.outcome!r}")
+            raise RecordingError(f"not an attempt: outcome must be one of {', '.join(known)}, got {attempt.outcome!r}")
         return attempt
 
 
 def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
-    """The attempts whose grasps, if any, are in the recording. Raises RecordingError for a damaged file."""
+    """Read the attempts whose grasps, if any, are in the recording; raise RecordingError for a damaged file."""
     return [attempt for attempt, _ in _read(folder / ATTEMPTS_FILE, grasp_ids)]
 
 
@@ -84,8 +83,8 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
             raise RecordingError(f"{path}, line {number}: its grasp {attempt.grasp_id} is not in the recording")
         if attempt.number != made[attempt.object_id]:
             raise RecordingError(
-                f"{path}, line {number}: attempts must be in order and there once, so that number "
-                f"{made[attempt.object_id]} is next for {attempt.object_id}, got {attempt.number}; restore the file"
+                f"{path}, line {number}: attempts must be numbered in order, the next of {attempt.object_id} is "
+                f"{made[attempt.object_id]}, got {attempt.number}; restore the file"
             )
         made[attempt.object_id] += 1
         end += len(line)
@@ -94,7 +93,7 @@ def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
 
 
 class AttemptLog(contextlib.AbstractContextManager["AttemptLog"]):
-    """Appends to attempts.jsonl, of which only what counts is kept. The recording's writer holds the folder's lock."""
+    """Appends to attempts.jsonl, after removing an invalid last line; the recording's writer locks the folder."""
 
     def __init__(self, folder: Path, grasp_ids: Set[str]) -> None:
         self.folder = folder
@@ -107,14 +106,14 @@ class AttemptLog(contextlib.AbstractContextManager["AttemptLog"]):
             self._file.truncate(self._end)
 
     def append(self, attempt: LoggedAttempt) -> None:
-        """Write one line to the disk; whatever fails, no half of it stays. Raises StorageError."""
+        """Write one line and sync it; on failure, remove the partial line and raise StorageError."""
         data = json.dumps(attempt.to_row(), ensure_ascii=False, allow_nan=False).encode() + b"\n"
         with storage_errors(self.folder):
             self._end = append_line(self._file, self._end, data)
         self.attempts.append(attempt)
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._file.close()
 
     def __exit__(self, *_: object) -> None:
@@ -126,7 +125,16 @@ class AttemptLog(contextlib.AbstractContextManager["AttemptLog"]):
 
 @dataclass
 class Tally:
-    """What came of the attempts at one object. skipped: why it cannot be grasped at all."""
+    """Counts of the attempts at one object.
+
+    Attributes:
+        object_id: The object.
+        attempts: Attempts made.
+        accepted: Accepted grasps.
+        outcomes: Number of attempts by outcome.
+        reasons: Number of attempts by the reason why there was no grasp.
+        skipped: Reason why the object is ungraspable; None: it is not.
+    """
 
     object_id: str
     attempts: int = 0
@@ -136,7 +144,7 @@ class Tally:
     skipped: str | None = None
 
     def add(self, attempt: LoggedAttempt) -> None:
-        """Count one more; what is ungraspable was not attempted."""
+        """Count one attempt; an ungraspable one sets `skipped` and is not counted."""
         if attempt.outcome == UNGRASPABLE:
             self.skipped = attempt.reason
             return
@@ -148,7 +156,7 @@ class Tally:
 
 
 def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
-    """By object, in order of first appearance."""
+    """Count the attempts by object, in order of first appearance."""
     tallies: dict[str, Tally] = {}
     for attempt in attempts:
         tallies.setdefault(attempt.object_id, Tally(attempt.object_id)).add(attempt)
@@ -156,8 +164,12 @@ def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
 
 
 def acceptance_table(tallies: Sequence[Tally], grasps_wanted: int | None = None) -> str:
-    """Plain text, a line an object and one for all; marked are objects that have fewer than `grasps_wanted`, and why those
-    were skipped that cannot be grasped.
+    """Return a plain-text table with a line for each object and one for all.
+
+    Args:
+        tallies: Counts by object.
+        grasps_wanted: Objects with fewer accepted grasps are marked "gave up"; None: no marks. Ungraspable objects show
+            their reason.
     """
     width = max([len(each.object_id) for each in tallies] + [6])
     lines = [f"{'object':{width}}  accepted  of  {'  '.join(OUTCOMES)}"]

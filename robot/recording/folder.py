@@ -1,20 +1,19 @@
 """The recording: a folder of grasps, appended one at a time and read by training.
 
     recording.json    schema_version, source, sensor, rig, units, seed, software_version, background, gels (for each
-                      pair that served: thickness_mm, modulus_mpa, poisson by finger, or "unknown"), and what else
-                      the writer wants to say
-    metadata.jsonl    one JSON object a line for each grasp
-    images/           PNG or JPEG files; one may belong to several grasps
-    attempts.jsonl    where a rig collected it: every attempt, those without a grasp included
-    (robot.recording.attempt_log)
+                      pair used: thickness_mm, modulus_mpa, poisson by finger, or "unknown"), and the writer's own keys
+    metadata.jsonl    one line with a JSON object for each grasp
+    images/           PNG or JPEG files; several grasps may share one
+    attempts.jsonl    only if a rig collected it: all attempts, those without a grasp included
+                      (robot.recording.attempt_log)
 
-A line holds grasp_id, object_id and, where recorded, force_n, opening_mm, pose, grasped (what the success gate
-decided; training leaves out false), outcome (what the gripper felt: held, missed, slipped), sequence_id, time_s.
-Its images are paths relative to the folder: photo_file_name, depth_file_name and for each finger (a, b, ...)
-touch_a_file_name, touch_a_before_file_name (the untouched gel) and touch_a_after_file_name. What was not
-recorded is left out. The folder opens as it is with Hugging Face datasets ("imagefolder").
+A line contains grasp_id, object_id and, where recorded, force_n, opening_mm, pose, grasped (decision of the gate;
+training leaves out false), outcome (reported by the gripper: held, missed, slipped), sequence_id and time_s. Images
+are paths relative to the folder: photo_file_name, depth_file_name and for each finger (a, b, ...) touch_a_file_name,
+touch_a_before_file_name (no contact) and touch_a_after_file_name. Values that were not recorded are left out. Hugging
+Face datasets ("imagefolder") opens the folder as it is.
 
-A line is written when its images are on the disk: a crash leaves whole grasps; half a last line is dropped.
+A line is written after its images are on disk, so a crash leaves complete grasps; an incomplete last line is dropped.
 """
 
 import contextlib
@@ -63,8 +62,12 @@ GRASP_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 
 @dataclass(frozen=True)
 class SharedImage:
-    """An image of several grasps, such as one no-contact frame for all: kept once. `name`, a grasp_id in form, tells it
-    from the other shared ones of the recording; of the same name the first is kept.
+    """An image of several grasps, such as one no-contact frame for all, stored once.
+
+    Attributes:
+        name: Unique name within the recording, with the characters of a grasp id. A later image of the same name is
+            ignored.
+        source: The image.
 
     >>> from pathlib import Path
     >>> photo = robot.SharedImage("mug-front", Path("catalog/mug/1.jpg"))
@@ -81,7 +84,13 @@ class SharedImage:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording as read: `info` is recording.json, `notes` are remarks for the user.
+    """A recording as read.
+
+    Attributes:
+        folder: Its folder.
+        info: Content of recording.json.
+        grasps: Its grasps, in order.
+        notes: Remarks for the user.
 
     >>> recording = robot.read_recording("recording")
     >>> len({grasp.object_id for grasp in recording.grasps})
@@ -100,9 +109,15 @@ class Recording:
 
 
 def read_recording(folder: str | Path) -> Recording:
-    """Read and check a recording; images are not opened.
+    """Read and check a recording without opening its images.
 
-    Raises RecordingError with the file and line; half a last line, left by a crash, is dropped with a note.
+    An incomplete last line, left by a crash, is dropped with a note.
+
+    Args:
+        folder: The recording.
+
+    Raises:
+        RecordingError: The recording is invalid; the message names the file and the line.
 
     >>> [grasp.object_id for grasp in robot.read_recording("recording").grasps]
     ['mug', 'mug', 'tin', 'tin']
@@ -116,35 +131,35 @@ def read_recording(folder: str | Path) -> Recording:
     data = read_content(path, RecordingError)
     ignored: set[str] = set()
     grasps = tuple(_grasps(path, data, ignored))
-    torn = len(_incomplete_last_line(data))
-    notes = [f"{path}: dropped a half-written last line ({torn} bytes) that a crash left"] if torn else []
+    dropped = len(_incomplete_last_line(data))
+    notes = [f"{path}: dropped an incomplete last line ({dropped} bytes), left by a crash"] if dropped else []
     if ignored:
-        notes.append(f"{path}: passed over keys that are not of the format: {', '.join(sorted(ignored))}")
+        notes.append(f"{path}: ignored keys that the format does not define: {', '.join(sorted(ignored))}")
     return Recording(root, info, grasps, tuple(notes))
 
 
 def _grasps(path: Path, data: bytes, ignored: set[str]) -> Iterator[RecordedGrasp]:
-    """The grasps of a metadata.jsonl, line by line; keys that mean nothing go to `ignored`. Raises RecordingError."""
-    seen: set[str] = set()
+    """Yield the grasps of metadata.jsonl and add unknown keys to `ignored`; raise RecordingError if invalid."""
+    grasp_ids: set[str] = set()
     for number, line in enumerate(io.BytesIO(data.removesuffix(_incomplete_last_line(data))), start=1):
         if not line.strip():
             continue
         try:
             row = parse_object(line, RecordingError)
             grasp = RecordedGrasp.from_row(row)
-            if grasp.grasp_id in seen:
-                raise RecordingError(f"grasp_id {grasp.grasp_id!r} has a line already; each must be its own")
+            if grasp.grasp_id in grasp_ids:
+                raise RecordingError(f"grasp_id must be unique, got {grasp.grasp_id!r} twice")
         except RecordingError as error:
             raise RecordingError(f"{path}, line {number}: {error}") from error
-        seen.add(grasp.grasp_id)
+        grasp_ids.add(grasp.grasp_id)
         ignored |= unknown_keys(row)
         yield grasp
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """Read and check recording.json alone. Raises RecordingError."""
+    """Read and check recording.json alone; raise RecordingError if it is missing or invalid."""
     path = root / INFO_FILE
-    if not os.path.exists(path):  # False, and no error, for a name that no disk takes
+    if not os.path.exists(path):  # also False for a name that the file system cannot store
         raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")
     info = read_json_object(path, RecordingError)
     _check_info(info, path)
@@ -155,13 +170,13 @@ def _check_info(info: Mapping[str, Any], path: str | Path = INFO_FILE) -> None:
     version = info.get("schema_version")
     if type(version) is not int or version not in KNOWN_VERSIONS:
         known = ", ".join(map(str, KNOWN_VERSIONS))
-        raise RecordingError(f"{path}: schema_version must be one this software knows ({known}), got {version!r}")
+        raise RecordingError(f"{path}: schema_version must be a supported one ({known}), got {version!r}")
     for key in ("source", "sensor"):
         check_name(f"{path}: {key}", info.get(key))
 
 
 def _incomplete_last_line(data: bytes) -> bytes:
-    """What a crash left of a last line; one that only lacks its newline is whole."""
+    """Return the incomplete last line, if any; a line that lacks only its newline is complete."""
     last = _after_last_newline(data)
     try:
         json.loads(last)
@@ -183,10 +198,18 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         with RecordingWriter(folder, {"source": "sim", "sensor": "GelSight", "seed": 0}) as writer:
             writer.append("000001", "mug", {"photo": photo, "touch_a": touch}, force_n=12.0)
 
-    `info` must name source and sensor; rig, units, seed, gels and background have defaults, other keys are kept. A
-    recording that exists is continued if its source, sensor, units and background agree (its recording.json
-    stays); half a last line is cut off. Raises RecordingError for wrong input, StorageError when the disk
-    refuses or another writer has the folder; what was appended before stays whole, and appending may go on.
+    An existing recording is continued if its source, sensor, units and background agree; its recording.json is not
+    changed. An incomplete last line is removed.
+
+    Args:
+        folder: The recording.
+        info: Content of recording.json. It must name source and sensor; rig, units, seed, gels and background have
+            defaults, and other keys are stored too.
+
+    Raises:
+        RecordingError: The input is invalid, or the folder contains other files.
+        StorageError: The disk refused a write, or another process is writing the recording. Grasps appended before
+            are complete, and appending may continue.
 
     >>> from pathlib import Path
     >>> photo, a, b = (Path(name) for name in ("catalog/mug/1.jpg", "a.png", "b.png"))
@@ -198,7 +221,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
 
     def __init__(self, folder: str | Path, info: Mapping[str, Any]) -> None:
         self.folder = Path(folder)
-        wanted = _full_info(info)
+        expected = _full_info(info)
         _check_no_other_files(self.folder)
         with storage_errors(self.folder):
             (self.folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
@@ -207,18 +230,18 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
             try:
                 open_regular(self.folder / METADATA_FILE).close()
                 fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                self._start(wanted)
+                self._start(expected)
             except BaseException:
                 self._file.close()
                 raise
 
-    def _start(self, wanted: dict[str, Any]) -> None:
-        """Create recording.json unless it is there, and cut metadata.jsonl after its last whole line."""
+    def _start(self, expected: dict[str, Any]) -> None:
+        """Create recording.json unless it exists, and truncate metadata.jsonl after its last complete line."""
         if not (self.folder / INFO_FILE).exists():
-            write_atomically(self.folder / INFO_FILE, _encode_info(wanted))
+            write_atomically(self.folder / INFO_FILE, _encode_info(expected))
         self.info = read_info(self.folder)
         for key in _FIXED_KEYS:
-            if (old := self.info.get(key)) != (new := wanted.get(key)):
+            if (old := self.info.get(key)) != (new := expected.get(key)):
                 raise RecordingError(f"{self.folder} was recorded with {key} {old!r}, not {new!r}; give another folder")
         self._shared: dict[str, str] = {}
         data = self._file.read()
@@ -231,24 +254,30 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
 
     @property
     def grasp_ids(self) -> Set[str]:
-        """The grasps that the recording holds so far, in order."""
+        """Ids of the grasps in the recording so far, in order."""
         return self._grasp_ids.keys()
 
     def append(
         self, grasp_id: str, object_id: str, images: Mapping[str, ImageSource | SharedImage], **fields: Any
     ) -> RecordedGrasp:
-        """Add one grasp: first its images, then its line; when it returns, both are on the disk.
+        """Append one grasp, first its images, then its line; both are on disk when this returns.
 
-        `images`: column without `_file_name` (photo, touch_a, touch_a_before, depth, ...) to an image.
-        `fields`: force_n, opening_mm, pose, touch_skew_s, grasped, outcome, sequence_id, time_s.
-        Raises RecordingError, StorageError.
+        Args:
+            grasp_id: Unique id.
+            object_id: The object.
+            images: Images by column without `_file_name` (photo, touch_a, touch_a_before, depth, ...).
+            fields: force_n, opening_mm, pose, touch_skew_s, grasped, outcome, sequence_id, time_s.
+
+        Raises:
+            RecordingError: An argument is invalid, or the writer is closed.
+            StorageError: The disk refused a write.
         """
         if self._file.closed:
             raise RecordingError(f"the writer of {self.folder} is closed; open another")
         if not isinstance(grasp_id, str) or not GRASP_ID.fullmatch(grasp_id):
             raise RecordingError(f"grasp_id must be letters, digits and ._- (at most 128), got {grasp_id!r}")
         if grasp_id in self._grasp_ids:
-            raise RecordingError(f"the recording has grasp {grasp_id} already; see grasp_ids")
+            raise RecordingError(f"the recording already contains grasp {grasp_id}; see grasp_ids")
         contents: dict[str, bytes] = {}
         paths: dict[str, str] = {}
         for column, source in images.items():
@@ -261,7 +290,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
             contents[path] = data
         row = {"grasp_id": grasp_id, "object_id": object_id, **fields, **paths}
         if unknown := sorted(unknown_keys(row)):
-            raise RecordingError(f"unknown key {unknown[0]!r}; see robot.recording.folder for the known ones")
+            raise RecordingError(f"unknown key {unknown[0]!r}; robot.recording.folder lists the known keys")
         grasp = RecordedGrasp.from_row(row)
         with storage_errors(self.folder):
             write_files({self.folder / path: data for path, data in contents.items()})
@@ -271,7 +300,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         return grasp
 
     def has_shared(self, name: str) -> bool:
-        """Whether the recording holds the shared image of this name. Raises RecordingError for what is no name."""
+        """Return whether the recording contains the shared image `name`; raise RecordingError for an invalid name."""
         if not GRASP_ID.fullmatch(name):
             raise RecordingError(f"the name of a shared image must be letters, digits and ._-, got {name!r}")
         if name not in self._shared:
@@ -282,12 +311,14 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         return name in self._shared
 
     def update_info(self, **info: Any) -> None:
-        """Say more in recording.json, or say it anew, but not what grasps are held to.
+        """Add or replace entries of recording.json, except schema_version, source, sensor, units and background.
 
-        Raises RecordingError, StorageError.
+        Raises:
+            RecordingError: An entry is fixed or is not plain JSON.
+            StorageError: The disk refused the write.
         """
         if fixed := sorted({*_FIXED_KEYS, "schema_version"} & set(info)):
-            raise RecordingError(f"{fixed[0]} of a recording stays as it is")
+            raise RecordingError(f"{fixed[0]} of an existing recording cannot be changed")
         updated = _full_info({**self.info, **info})
         if updated != self.info:
             with storage_errors(self.folder):
@@ -295,11 +326,11 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
             self.info = updated
 
     def _write_line(self, line: bytes) -> None:
-        """Write after the last whole line and sync; whatever fails, no half of it stays."""
+        """Write after the last complete line and sync; on failure, remove the partial line."""
         self._end = append_line(self._file, self._end, line + b"\n")
 
     def close(self) -> None:
-        """Let go of the folder; a second call does nothing."""
+        """Close the file and release the folder's lock; a second call does nothing."""
         self._file.close()
 
     def __exit__(self, *_: object) -> None:
@@ -307,7 +338,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
 
 
 def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
-    """`info` with its defaults, as JSON reads it back. Raises RecordingError."""
+    """Return `info` with defaults, as JSON reads it back; raise RecordingError if it is invalid."""
     defaults = {
         "schema_version": SCHEMA_VERSION,
         "source": None,
@@ -322,7 +353,7 @@ def _full_info(info: Mapping[str, Any]) -> dict[str, Any]:
     try:
         full: dict[str, Any] = json.loads(json.dumps({**defaults, **info}, allow_nan=False))
     except (TypeError, ValueError) as error:
-        raise RecordingError(f"{INFO_FILE} must hold plain JSON: {error}") from error
+        raise RecordingError(f"{INFO_FILE} must contain plain JSON: {error}") from error
     _check_info(full)
     return full
 
@@ -332,7 +363,7 @@ def _encode_info(info: Mapping[str, Any]) -> bytes:
 
 
 def software_version() -> str:
-    """Version of this project as installed."""
+    """Return the installed version of this project, or "unknown"."""
     from importlib.metadata import PackageNotFoundError, version
 
     try:
@@ -342,7 +373,7 @@ def software_version() -> str:
 
 
 def _check_no_other_files(folder: Path) -> None:
-    """Refuse to mix a new recording into a folder of other files."""
+    """Raise RecordingError if a new recording would be mixed into a folder of other files."""
     if (folder / INFO_FILE).is_file() or not folder.exists():
         return
     if not folder.is_dir():
@@ -351,6 +382,6 @@ def _check_no_other_files(folder: Path) -> None:
         names = sorted(path.name for path in folder.iterdir() if not path.name.startswith(f".{INFO_FILE}."))
         grasps = METADATA_FILE in names and (folder / METADATA_FILE).stat().st_size > 0
     if others := [name for name in names if name not in (METADATA_FILE, IMAGES_FOLDER)]:
-        raise RecordingError(f"{folder} holds other files, such as {others[0]}; give a new or an empty folder")
+        raise RecordingError(f"{folder} contains other files, such as {others[0]}; give a new or an empty folder")
     if grasps:
         raise RecordingError(f"{folder} has a {METADATA_FILE} but no {INFO_FILE}; restore it or give a new folder")

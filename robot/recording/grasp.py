@@ -1,4 +1,4 @@
-"""One grasp of a recording: its fields, what they must hold, and its line in metadata.jsonl."""
+"""One grasp of a recording: its fields, their checks, and its line in metadata.jsonl."""
 
 import contextlib
 import math
@@ -16,20 +16,34 @@ from robot.errors import RecordingError
 
 _NUMBERS = ("force_n", "opening_mm", "touch_skew_s", "time_s")
 OUTCOMES = ("held", "missed", "slipped", "no_plan")
-"""What came of an attempt: held or lost (slipped) after the lift, nothing between the jaws, or nothing tried."""
+"""Outcomes of an attempt: held after the lift, nothing between the jaws, lost during the lift, or no grasp tried."""
 
 _PLAIN_KEYS = ("grasp_id", "object_id", *_NUMBERS, "pose", "grasped", "outcome", "sequence_id")
 _IMAGE_KEY = re.compile(r"(photo|depth|touch_([a-z])(_before|_after)?)_file_name")
 _REPEATED_KEYS = re.compile(r"object_id|sequence_id|outcome|photo_file_name|touch_[a-z]_before_file_name")
-"""Keys under which many lines say the same; their text is in memory once."""
+"""Keys with equal values in many lines; their strings are interned."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedGrasp:
-    """One grasp. Images are posix paths relative to the recording, touches by finger; None: not recorded.
+    """One grasp. Images are POSIX paths relative to the recording, touches by finger; None: not recorded.
 
-    grasped: what the gate decided; training keeps these. outcome: one of OUTCOMES, what the gripper felt.
-    touch_skew_s: how far apart in time the fingers' images were taken.
+    Attributes:
+        grasp_id: Unique id.
+        object_id: The object.
+        photo: Colour picture of the object before the grasp.
+        touches: Gel images of the closed jaws.
+        touches_before: Gel images without contact.
+        touches_after: Gel images after the lift.
+        depth: Depth picture, uint16 in mm.
+        force_n: Clamping force.
+        opening_mm: Distance between the fingers.
+        pose: Pose of the gripper, as in `robot.readings.Pose.as_tuple`.
+        touch_skew_s: Time between the fingers' images.
+        grasped: Decision of the gate; training leaves out false.
+        outcome: One of OUTCOMES, as the gripper reports.
+        sequence_id: Id of the recorded sequence of the grasp.
+        time_s: Time since the recording began.
 
     >>> grasp = robot.read_recording("recording").grasps[0]
     >>> sorted(grasp.touches)
@@ -55,7 +69,7 @@ class RecordedGrasp:
     time_s: float | None = None
 
     def __post_init__(self) -> None:
-        """Check every field, and make numbers of NumPy's plain ones. Raises RecordingError."""
+        """Check every field and convert NumPy numbers to plain ones; raise RecordingError if one is invalid."""
         for key in ("grasp_id", "object_id", "sequence_id"):
             check_name(key, getattr(self, key), optional=key == "sequence_id")
         for key, path in self.images().items():
@@ -75,7 +89,7 @@ class RecordedGrasp:
             raise RecordingError(f"outcome must be one of {', '.join(OUTCOMES)}, got {self.outcome!r}")
 
     def images(self) -> dict[str, str]:
-        """The files by column name without `_file_name`: photo, depth, touch_a, touch_a_before, ..."""
+        """Return the files by column name without `_file_name`: photo, depth, touch_a, touch_a_before, ..."""
         files = {"photo": self.photo} | ({} if self.depth is None else {"depth": self.depth})
         by_moment = {"": self.touches, "_before": self.touches_before, "_after": self.touches_after}
         for moment, touches in by_moment.items():
@@ -83,13 +97,13 @@ class RecordedGrasp:
         return files
 
     def to_row(self) -> dict[str, Any]:
-        """The JSON object of this grasp's line; what was not recorded is left out."""
+        """Return the JSON object of this grasp's line, without the values that were not recorded."""
         row = {key: getattr(self, key) for key in _PLAIN_KEYS if getattr(self, key) is not None}
         return row | {f"{column}_file_name": path for column, path in self.images().items()}
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Self:
-        """Inverse of `to_row`; null counts as left out, other keys are passed over. Raises RecordingError."""
+        """Parse a row of `to_row`; null means not recorded, unknown keys are ignored. Invalid: RecordingError."""
         present: dict[str, Any] = {
             key: sys.intern(value) if type(value) is str and _REPEATED_KEYS.fullmatch(key) else value
             for key, value in row.items()
@@ -104,12 +118,12 @@ class RecordedGrasp:
 
 
 def unknown_keys(row: Mapping[str, Any]) -> set[str]:
-    """Keys of a line that mean nothing to us: other tools may keep their own there."""
+    """Return the keys of a line that the format does not define, such as those of other tools."""
     return {key for key in row if key not in _PLAIN_KEYS and not _IMAGE_KEY.fullmatch(key)}
 
 
 def _image_fields(files: Mapping[str, str]) -> dict[str, Any]:
-    """Columns with or without `_file_name` to the image fields of RecordedGrasp."""
+    """Convert columns with `_file_name` to the image fields of RecordedGrasp."""
     found: dict[str, Any] = {"touches": {}, "touches_before": {}, "touches_after": {}}
     for key, path in files.items():
         match = _IMAGE_KEY.fullmatch(key)
@@ -123,7 +137,7 @@ def _image_fields(files: Mapping[str, str]) -> dict[str, Any]:
 
 
 def check_name(key: str, value: object, optional: bool = False) -> None:
-    """Raise RecordingError unless `value` is a non-empty printable string, or None where that may be."""
+    """Raise RecordingError unless `value` is a non-empty printable string, or None if `optional`."""
     if value is None and optional:
         return
     if not isinstance(value, str) or not value.strip() or not value.isprintable():
@@ -131,9 +145,9 @@ def check_name(key: str, value: object, optional: bool = False) -> None:
 
 
 def _check_path(column: str, path: Any) -> None:
-    """A path must stay inside the recording wherever the folder is copied to."""
+    """Raise RecordingError unless the path stays inside the recording, also after the folder is copied."""
     if not _IMAGE_KEY.fullmatch(f"{column}_file_name"):
-        raise RecordingError(f"{column!r} is no image column; fingers are named by one letter, a to z")
+        raise RecordingError(f"{column!r} is not an image column; a finger is named by one letter, a to z")
     parts = PurePosixPath(path).parts if isinstance(path, str) and path.isprintable() else ()
     if not parts or ".." in parts or path.startswith("/") or re.match("[A-Za-z]:", path) or "\\" in path:
         raise RecordingError(f"{column}_file_name must be a path inside the recording, got {path!r}")

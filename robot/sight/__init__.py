@@ -1,1 +1,1 @@
-"""From a picture with depth to where the object stands."""
+"""Localise the object on the table in a depth picture, and calibrate the camera."""

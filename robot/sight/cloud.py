@@ -1,4 +1,4 @@
-"""From a depth picture to the points of the one thing on the table: the table's plane, then what stands out of it."""
+"""Points of the object on the table from a depth picture: fit the table's plane, then segment the points above it."""
 
 from dataclasses import dataclass
 
@@ -24,7 +24,7 @@ _FILTER_PX = 5
 
 @dataclass(frozen=True)
 class TablePlane:
-    """The plane z = a x + b y + c (mm) of the rig's frame, and how far a depth pixel strays along its ray."""
+    """The table's plane z = a x + b y + c (mm) in the rig's frame, and the depth noise along a ray (mm)."""
 
     a: float
     b: float
@@ -35,23 +35,26 @@ class TablePlane:
 
 @dataclass(frozen=True)
 class Rays:
-    """Where every pixel looks in the rig's frame: its point is the camera's place + depth_mm * direction."""
+    """Rays of all pixels: a pixel's point is the camera's position + depth_mm * direction.
+
+    Attributes:
+        x: (W,) x of each column's ray in the camera's frame, at depth 1.
+        y: (H,) y of each row's ray in the camera's frame, at depth 1.
+        pose: (4, 4) camera frame to rig frame, mm.
+    """
 
     x: npt.NDArray[np.float32]
-    """(W,) of the camera's frame, for a depth of 1."""
     y: npt.NDArray[np.float32]
-    """(H,) likewise."""
     pose: Array
-    """(4, 4): camera frame to rig frame, mm."""
 
     @property
     def pixel(self) -> float:
-        """Width of a pixel at a depth of 1."""
+        """Width of a pixel at depth 1."""
         return float(self.x[1] - self.x[0])
 
     @classmethod
     def from_image(cls, image: RGBD, extrinsics: Array) -> "Rays":
-        """For the pixels of `image`."""
+        """Return the rays of the pixels of `image`; `extrinsics` (4, 4): camera frame to rig frame, mm."""
         lens, (rows, columns) = image.intrinsics, image.colour.shape[:2]
         assert lens is not None, "a picture with depth has intrinsics"
         x = (np.arange(columns, dtype=np.float32) - lens.cx) / lens.fx
@@ -59,12 +62,12 @@ class Rays:
         return cls(x.astype(np.float32), y.astype(np.float32), extrinsics)
 
     def along(self, normal: Array) -> Depth:
-        """(H, W): the component along a vector of the rig's frame, for a depth of 1."""
+        """Return the (H, W) component of each ray along a vector (3,) of the rig's frame, at depth 1."""
         local = (self.pose[:3, :3].T @ normal).astype(np.float32)
         return np.asarray(self.x[None, :] * local[0] + (self.y[:, None] * local[1] + local[2]))
 
     def points(self, depth_mm: Depth, rows: npt.NDArray[np.intp], columns: npt.NDArray[np.intp]) -> Array:
-        """(N, 3) in the rig's frame, mm."""
+        """Return the (N, 3) points of N pixels in the rig's frame, mm."""
         depth = depth_mm[rows, columns].astype(np.float64)
         local = np.stack([self.x[columns] * depth, self.y[rows] * depth, depth], axis=1)
         return np.asarray(local @ self.pose[:3, :3].T + self.pose[:3, 3])
@@ -72,25 +75,34 @@ class Rays:
 
 @dataclass(frozen=True)
 class ObjectPoints:
-    """What stands on the table: (N, 3) points (mm; z above the table), the table, and what was noticed."""
+    """The object on the table.
+
+    Attributes:
+        points: (N, 3) in mm, z above the table.
+        table: The table.
+        missing: Fraction of pixels without depth inside the object's outline, 0 to 1.
+        is_cut_off: Whether the object touches the picture's border, so that a part of it is not visible.
+    """
 
     points: Array
     table: TablePlane
     missing: float
-    """Share of the pixels of its outline that have no depth."""
     is_cut_off: bool
-    """Whether it touches the picture's border, so that a part of it is not seen."""
 
 
 def find_table(depth_mm: Depth, rays: Rays) -> TablePlane:
-    """Fit the table near z = 0, where the calibration has it: RANSAC over three points, then least squares.
+    """Fit the table near z = 0, its height by the calibration: RANSAC over three points, then least squares.
 
-    Where too little of it is seen, z = 0 is taken, and a note says so.
+    If too little of the table is visible, the result is z = 0 with a note.
+
+    Args:
+        depth_mm: (H, W) depth, NaN where unknown.
+        rays: Rays of the pixels.
     """
     points = _sample(depth_mm, rays)
     near = points[np.abs(points[:, 2]) < _NEAR_TABLE_MM]
     if len(near) < 100:
-        return TablePlane(0.0, 0.0, 0.0, 2.0, ("hardly any table is seen: z = 0 of the calibration is taken for it",))
+        return TablePlane(0.0, 0.0, 0.0, 2.0, ("too little of the table is visible: z = 0 of the calibration is used",))
     plane = _best_plane(near)
     for _ in range(3):
         off = near[:, 2] - _heights(plane, near)
@@ -107,11 +119,11 @@ def _table_notes(a: float, b: float, c: float) -> tuple[str, ...]:
     slope = float(np.degrees(np.arctan(np.hypot(a, b))))
     if abs(c) < 15.0 and slope < 2.0:
         return ()
-    return (f"the table is {c:.0f} mm high and {slope:.1f} degrees steep by the camera: calibrate it again",)
+    return (f"the camera measures a table {c:.0f} mm high and {slope:.1f} degrees steep: calibrate the camera again",)
 
 
 def _steepness(rays: Rays) -> float:
-    """Rise of the middle ray for a depth of 1: the share of depth noise that shows as height."""
+    """Return the rise of the middle ray at depth 1: the factor from depth noise to height noise."""
     return float(rays.pose[2, 2])
 
 
@@ -122,12 +134,12 @@ def _sample(depth_mm: Depth, rays: Rays) -> Array:
 
 
 def _best_plane(points: Array) -> Array:
-    """The steepest-limited plane through three points that most points lie on; (3,) a, b, c."""
+    """Return (3,) a, b, c of the plane through three points, of limited slope, with the most inliers."""
     rng = np.random.default_rng(0)
     some = points[rng.choice(len(points), min(len(points), 400), replace=False)]
     triples = some[rng.integers(len(some), size=(_HYPOTHESES, 3))]
     system = np.concatenate([triples[..., :2], np.ones((_HYPOTHESES, 3, 1))], axis=2)
-    good = np.abs(np.linalg.det(system)) > 100.0  # mm2: three points in a line say nothing
+    good = np.abs(np.linalg.det(system)) > 100.0  # mm2: excludes three points almost on a line
     planes = np.linalg.solve(system[good], triples[good][..., 2:])[..., 0]
     planes = planes[(np.hypot(planes[:, 0], planes[:, 1]) < _MAX_SLOPE)]
     planes = np.concatenate([planes, [[0.0, 0.0, float(np.median(points[:, 2]))]]])
@@ -140,16 +152,26 @@ def _heights(plane: Array, points: Array) -> Array:
 
 
 def find_object_points(depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None = None) -> ObjectPoints:
-    """The largest connected thing above the table, inside `region`. Raises PlanError when there is none."""
+    """Return the points of the largest connected object above the table.
+
+    Args:
+        depth_mm: (H, W) depth, NaN where unknown.
+        rays: Rays of the pixels.
+        table: The table.
+        region: Box in the rig's frame, of which x and y limit the search; None: no limit.
+
+    Raises:
+        PlanError: There is no object.
+    """
     above = height_above(depth_mm, rays, table)
     min_height_mm = max(_MIN_HEIGHT_MM, 3.0 * table.noise_mm * abs(_steepness(rays)))
     raised = (above > min_height_mm) & (above < MAX_HEIGHT_MM)
     if region is not None:
         raised &= _inside(depth_mm, rays, region)
-    # Single pixels are outvoted.
+    # The median filter removes single pixels.
     patch = largest_patch(cv2.medianBlur(raised.astype(np.uint8), _FILTER_PX), _MIN_PX)
     if patch is None:
-        raise PlanError("depth shows nothing on the table: the object is gone, transparent or out of the picture")
+        raise PlanError("no object in the depth picture: it is missing, transparent or outside the picture")
     rows, columns = (patch.mask & raised[patch.window]).nonzero()
     rows, columns = rows + patch.window[0].start, columns + patch.window[1].start
     points = rays.points(depth_mm, rows, columns)
@@ -162,7 +184,7 @@ def find_object_points(depth_mm: Depth, rays: Rays, table: TablePlane, region: R
 
 
 def height_above(depth_mm: Depth, rays: Rays, table: TablePlane) -> Depth:
-    """(H, W) height above the table in mm, NaN where depth is unknown."""
+    """Return the (H, W) height above the table in mm, NaN where depth is unknown."""
     normal = np.array([-table.a, -table.b, 1.0])
     start = float(normal @ rays.pose[:3, 3]) - table.c
     return np.asarray(depth_mm * rays.along(normal) + np.float32(start))
@@ -172,14 +194,20 @@ def _inside(depth_mm: Depth, rays: Rays, region: Region) -> Mask:
     inside = np.ones(depth_mm.shape, bool)
     for axis in (0, 1):
         unit = np.eye(3)[axis]
-        where = depth_mm * rays.along(unit) + np.float32(rays.pose[axis, 3])
-        inside &= (where >= region.lower[axis]) & (where <= region.upper[axis])
+        position = depth_mm * rays.along(unit) + np.float32(rays.pose[axis, 3])
+        inside &= (position >= region.lower[axis]) & (position <= region.upper[axis])
     return inside
 
 
 @dataclass(frozen=True)
 class Patch:
-    """Connected pixels: where in the picture, which of them there, and whether they touch its border."""
+    """Connected pixels of a picture.
+
+    Attributes:
+        window: Slices of rows and columns of the bounding box.
+        mask: Pixels of the patch within the window.
+        is_cut_off: Whether the patch touches the picture's border.
+    """
 
     window: tuple[slice, slice]
     mask: Mask
@@ -187,7 +215,7 @@ class Patch:
 
 
 def largest_patch(candidates: npt.NDArray[np.uint8], min_px: int) -> Patch | None:
-    """The largest connected part of what is not 0; None where none has `min_px` pixels."""
+    """Return the largest connected patch of pixels that are not 0, or None if it has fewer than `min_px` pixels."""
     first_column, first_row, columns, rows = cv2.boundingRect(candidates)
     around = candidates[first_row : first_row + rows, first_column : first_column + columns]
     if around.size == 0:
@@ -206,7 +234,7 @@ def largest_patch(candidates: npt.NDArray[np.uint8], min_px: int) -> Patch | Non
 
 
 def _missing(depth_mm: Depth, mask: Mask) -> float:
-    """Share of unknown pixels in the convex outline of the mask."""
+    """Return the fraction of unknown pixels in the convex hull of the mask, 0 to 1."""
     ys = np.flatnonzero(mask.any(axis=1))
     first, last = mask[ys].argmax(axis=1), mask.shape[1] - 1 - mask[ys, ::-1].argmax(axis=1)  # of each row
     hull = cv2.convexHull(np.stack([np.concatenate([first, last]), np.tile(ys, 2)], axis=1).astype(np.int32))
@@ -215,13 +243,13 @@ def _missing(depth_mm: Depth, mask: Mask) -> float:
 
 
 def _remove_outliers(points: Array, level: float, cell_mm: float = 6.0) -> Array:
-    """Drop points with fewer neighbours in plan than a level surface has, of which `level` points see each mm2.
+    """Drop points with few neighbours in plan compared with a level surface, which has `level` points on each mm2.
 
-    Outliers lie along their ray, far from the thing's footprint and from each other.
+    Outliers lie along their rays, far from the object's footprint and from each other.
     """
     cells = np.floor((points[:, :2] - points[:, :2].min(0)) / cell_mm).astype(np.intp) + 1
     rows, columns = cells.max(0) + 2
     grid = np.bincount(cells[:, 0] * columns + cells[:, 1], minlength=rows * columns).reshape(rows, columns)
     around = cv2.boxFilter(grid.astype(np.float32), -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
-    kept = around[cells[:, 0], cells[:, 1]] >= max(3.0, 0.3 * level * 9 * cell_mm**2)
-    return points[kept] if kept.any() else points
+    dense = around[cells[:, 0], cells[:, 1]] >= max(3.0, 0.3 * level * 9 * cell_mm**2)
+    return points[dense] if dense.any() else points

@@ -1,14 +1,14 @@
-"""The cylinder that stands for the object on the table: where it is, how high and how wide, and how sure that is.
+"""Cylinder fit of the object on the table: place, height, radius and standard error of the centre.
 
-One depth picture shows one side of the object. The points above the table (robot.sight.cloud) are explained by an
-upright cylinder, a box or a lying cylinder (robot.sight.solids), whichever has the least misfit (BIC). Where that
-cannot be told, a cruder method takes over, and `method` and `notes` say so:
+A depth picture shows only one side of the object. An upright cylinder, a box and a lying cylinder (robot.sight.solids)
+are fitted to the points above the table (robot.sight.cloud); the one with the smallest BIC is returned. If none is
+reliable, a cruder method is used. `method` and `notes` of the result name it:
 
     circle              robust circle through the visible side of an upright cylinder
     box                 the cylinder inscribed in a box, as for a packet
     lying               a cylinder on its side
-    enclosing circle    smallest circle round all points: too few side points, or too short an arc of them
-    silhouette          outline in the colour picture, where depth shows nothing, as of glass
+    enclosing circle    smallest circle around all points: too few points on the side, or too short an arc
+    silhouette          outline in the colour picture, for objects without depth, such as glass
 """
 
 import math
@@ -45,18 +45,28 @@ _MAX_OUTLIER_FRACTION = 0.3
 _MIN_TOP_FRACTION = 0.05
 _MAX_LOSS, _OUTLIER_MM = 0.35, 2.0
 _OUTLINE_ERROR = 0.15
-"""Standard error of an outline's fit as a share of the radius: measured on cylinders whose base nothing hides."""
+"""Standard error of a silhouette fit relative to the radius, measured on cylinders with a visible base."""
 
 _CRUDE_MM, _ROUGH_MM, _GUESS_MM = 3.0, 6.0, 10.0
-"""Standard error of the centre from methods that guess the hidden side: of a simple solid, of any, of one unseen."""
+"""Standard error of the centre when the hidden side is guessed: simple solid, other shape, box without visible top."""
 
 
 @dataclass(frozen=True)
 class CylinderFit:
-    """An upright cylinder in the rig's frame (mm), and the footprint of what it stands for.
+    """An upright cylinder in the rig's frame, and the footprint of the object. Lengths in mm.
 
-    error_mm: standard error of the centre, camera calibration left out. half_mm: half sizes of the footprint along
-    `yaw_rad` and across, the radius twice for what is round. round: whether turning about the vertical changes nothing.
+    Attributes:
+        x_mm: x of the centre.
+        y_mm: y of the centre.
+        height_mm: Height above the table.
+        radius_mm: Radius.
+        error_mm: Standard error of the centre, without the error of the camera calibration.
+        method: Method of the fit; see the top of the file.
+        half_mm: Half sizes of the footprint along `yaw_rad` and across; both are the radius for a round object.
+        yaw_rad: Direction of the footprint's axis.
+        points: Number of points.
+        arc_deg: Visible arc of the circle, for the method "circle".
+        notes: Remarks for the user.
     """
 
     x_mm: float
@@ -73,14 +83,14 @@ class CylinderFit:
 
     @property
     def is_round(self) -> bool:
-        """Whether its width is the same from all sides."""
+        """Whether the width is the same in all directions."""
         return self.method not in ("box", "lying")
 
     def width_mm(self, yaw_rad: float, finger_mm: float) -> float:
-        """How far apart fingers `finger_mm` wide must be to pass the object on both sides of its centre.
+        """Return the opening at which fingers of width `finger_mm` pass the object on both sides of its centre.
 
-        For a rectangular footprint this is its extent along the closing direction within the strip that a finger
-        sweeps, in closed form.
+        For a rectangular footprint this is its extent along the closing direction `yaw_rad`, within the strip that a
+        finger sweeps, in closed form.
         """
         if self.is_round:
             return 2 * self.radius_mm
@@ -93,19 +103,25 @@ class CylinderFit:
         return 2 * (c * a + s * b)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, in whole micrometres."""
+        """Return plain values for JSON, rounded to micrometres."""
         sizes = ("x_mm", "y_mm", "height_mm", "radius_mm", "error_mm")
         return {name: round(getattr(self, name), 3) for name in sizes} | {"method": self.method}
 
 
 def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None = None) -> CylinderFit:
-    """Fit the cylinder of the largest thing on the table, inside `region` of the rig's frame where given.
+    """Fit a cylinder to the largest object on the table.
 
-    extrinsics (4, 4): camera frame to rig frame, mm. Raises PlanError where nothing is seen, or too little to say,
-    RobotConfigError for extrinsics that are not finite.
+    Args:
+        image: Picture with depth.
+        extrinsics: (4, 4) camera frame to rig frame, mm.
+        region: Box in the rig's frame that limits the search in x and y; None: no limit.
+
+    Raises:
+        PlanError: No object is visible, or too little of it.
+        RobotConfigError: The extrinsics are not finite.
     """
     if image.depth_m is None:
-        raise PlanError("a cylinder needs a picture with depth; read the camera with depth=True")
+        raise PlanError("a cylinder fit requires a picture with depth; read the camera with depth=True")
     if not np.isfinite(extrinsics).all():
         numbers = np.asarray(extrinsics).tolist()
         raise RobotConfigError(f"extrinsics must be finite, got {numbers}; calibrate the camera again")
@@ -120,21 +136,20 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None =
         try:
             return _from_colour(image, depth, rays, table, region)
         except PlanError:
-            pass  # what depth there is has to do
+            pass  # the sparse depth is used
     return _fit(object_points, rays)
 
 
 def _from_colour(image: RGBD, depth_mm: Depth, rays: Rays, table: TablePlane, region: Region | None) -> CylinderFit:
-    """See robot.sight.silhouette."""
     found = fit_silhouette(image.colour, depth_mm, rays, table, region)
-    notes = (*table.notes, "depth shows nothing here: fitted to the outline in the colour picture")
+    notes = (*table.notes, "no depth at the object: fitted to its outline in the colour picture")
     error_mm = max(3.0, _OUTLINE_ERROR * found.radius)
     return CylinderFit(found.x, found.y, found.height, found.radius, error_mm, "silhouette", found.half, notes=notes)
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A solid that may explain the points, by which method it was found, and the centre's standard error in mm."""
+    """A fitted solid, its method, and the standard error of its centre in mm."""
 
     solid: Solid
     method: str
@@ -157,34 +172,34 @@ def _fit(object_points: ObjectPoints, rays: Rays) -> CylinderFit:
     ]
     best = min(candidates, key=lambda candidate: candidate.solid.misfit(points, noise, rays.pose[:3, 3]))
     if best.method != "circle" and _loss(best.solid, points, noise) > _MAX_LOSS:
-        best = _enclosing_candidate(points, top, "no simple solid explains what is seen", _ROUGH_MM)
+        best = _enclosing_candidate(points, top, "no simple solid fits the visible points", _ROUGH_MM)
     if object_points.is_cut_off and best.arc_deg < _MIN_CUT_OFF_ARC_DEG:
-        raise PlanError("the object touches the border of the picture, and too little of it is seen to place it")
+        raise PlanError("the object touches the border of the picture, and its visible part is too small to locate it")
     return _to_fit(best, points, noise, _notes(object_points, best, points, noise))
 
 
 def _loss(solid: Solid, points: Array, noise: float) -> float:
-    """0 to 1: mean squared distance of the points from the surface, cut off where they count as outliers."""
+    """Return the mean squared distance of the points from the surface, truncated for outliers and scaled to 0..1."""
     return float((np.minimum(solid.distance(points) / (OUTLIER_CUT * noise), 1.0) ** 2).mean())
 
 
 def _box_candidate(points: Array, box: Cuboid, top: float, noise: float) -> _Candidate:
-    """A box, whose far side is where its top ends: without a top in sight it is a guess."""
+    """Return the box as a candidate; without a visible top, its far side is a guess."""
     if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _MIN_TOP_FRACTION:
         return _Candidate(box, "box", _CRUDE_MM)
-    return _Candidate(box, "box", _GUESS_MM, note="its top is not seen, and so not how far it reaches back")
+    return _Candidate(box, "box", _GUESS_MM, note="its top is not visible, so its depth is a guess")
 
 
 def _to_fit(best: _Candidate, points: Array, noise: float, notes: tuple[str, ...]) -> CylinderFit:
-    """The candidate as an upright cylinder with the footprint of its solid."""
+    """Convert the candidate to an upright cylinder with the footprint of its solid."""
     solid = best.solid
-    stray = OUTLIER_CUT * noise * math.sqrt(_loss(solid, points, noise))
+    residual_mm = OUTLIER_CUT * noise * math.sqrt(_loss(solid, points, noise))
     return CylinderFit(
         solid.x,
         solid.y,
         solid.height,
         min(solid.half),
-        max(best.error_mm, 0.5 * stray),
+        max(best.error_mm, 0.5 * residual_mm),
         best.method,
         solid.half,
         solid.yaw_rad,
@@ -197,14 +212,14 @@ def _to_fit(best: _Candidate, points: Array, noise: float, notes: tuple[str, ...
 def _notes(object_points: ObjectPoints, best: _Candidate, points: Array, noise: float) -> tuple[str, ...]:
     notes = [*object_points.table.notes, best.note]
     if object_points.is_cut_off:
-        notes.append("it touches the border of the picture: a part of it is not seen")
+        notes.append("it touches the border of the picture: a part of it is not visible")
     if (best.solid.distance(points) > OUTLIER_CUT * noise).mean() > _MAX_OUTLIER_FRACTION:
-        notes.append("it is no simple solid: many points lie off the fitted surface")
+        notes.append("it is not a simple solid: many points lie off the fitted surface")
     return tuple(note for note in notes if note)
 
 
 def _top(points: Array, noise: float) -> float:
-    """Height of the uppermost layer that is not thin: outliers reach higher, but there are few in any layer."""
+    """Return the height of the uppermost dense layer; layers of outliers above it are sparse."""
     width = max(4.0, noise)
     z = points[:, 2]
     layer = (z / width).astype(int)
@@ -221,13 +236,13 @@ def _top(points: Array, noise: float) -> float:
 
 
 def _upright_candidate(points: Array, top: float, noise: float, rays: Rays, box: Cuboid) -> _Candidate:
-    """An upright cylinder from its visible side; where that says too little, from all points."""
+    """Fit an upright cylinder to its visible side, or an enclosing circle if that is not sufficient."""
     side = points[points[:, 2] < top - max(4.0, noise), :2]
     if len(side) < MIN_SIDE_POINTS:
         return _enclosing_candidate(points, top, f"only {len(side)} points on its side")
-    sight = side.mean(0) - rays.pose[:2, 3]
+    viewing = side.mean(0) - rays.pose[:2, 3]
     largest = 2 * math.hypot(*box.half)
-    away = sight / max(float(np.hypot(*sight)), 1e-9)
+    away = viewing / max(float(np.hypot(*viewing)), 1e-9)
     circle = fit_circle(side, noise, away, largest)
     if circle is None:
         return _enclosing_candidate(points, top, "no circle of its size fits its side")
@@ -243,29 +258,29 @@ def _upright_candidate(points: Array, top: float, noise: float, rays: Rays, box:
 
 
 def _circle_error(circle: Circle, side: Array, arc_deg: float) -> float:
-    """Standard error of the centre by the least-squares covariance.
+    """Return the standard error of the centre by the least-squares covariance.
 
-    Residuals of neighbouring points are alike (relief, a body that is not quite round), so that each sector of the arc
+    Residuals of neighbouring points are correlated (relief, a body that is not quite round), so each sector of the arc
     counts as one measurement.
     """
     off = np.hypot(*(side[circle.inliers] - [circle.x, circle.y]).T) - circle.radius
-    alike = circle.inliers.sum() / (arc_deg / _SECTOR_DEG)
-    return float(np.sqrt(np.trace(circle.covariance[:2, :2]) * np.mean(off**2) * alike))
+    per_sector = circle.inliers.sum() / (arc_deg / _SECTOR_DEG)
+    return float(np.sqrt(np.trace(circle.covariance[:2, :2]) * np.mean(off**2) * per_sector))
 
 
 def _arc_deg(circle: Circle, side: Array) -> float:
-    """Degrees of the circle that points lie on, counted in sectors."""
+    """Return the arc covered by points in degrees, counted in sectors."""
     on = side[circle.inliers] - [circle.x, circle.y]
     sector = np.degrees(np.arctan2(on[:, 1], on[:, 0])) // _SECTOR_DEG
     count = np.bincount(sector.astype(int) + 18, minlength=37)
     return float((count >= 2).sum() * _SECTOR_DEG)
 
 
-def _enclosing_candidate(points: Array, top: float, why: str, error_mm: float = _CRUDE_MM) -> _Candidate:
-    """The smallest circle round the plan, without the farthest points on each side, which may be outliers."""
+def _enclosing_candidate(points: Array, top: float, reason: str, error_mm: float = _CRUDE_MM) -> _Candidate:
+    """Return the smallest circle around the points in plan, without the outermost points, which may be outliers."""
     plan = points[:, :2]
     low, high = np.quantile(plan, [0.02, 0.98], axis=0)
     inner = plan[((plan > low - _OUTLIER_MM) & (plan < high + _OUTLIER_MM)).all(1)]
     (x, y), radius = cv2.minEnclosingCircle(inner.astype(np.float32))
-    note = f"{why}: the smallest circle round all its points was taken"
+    note = f"{reason}: the smallest circle around all its points is used"
     return _Candidate(UprightCylinder(float(x), float(y), float(radius), top), "enclosing circle", error_mm, 0.0, note)

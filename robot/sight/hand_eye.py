@@ -1,10 +1,9 @@
-"""Where the camera stands in the rig's frame, from points known in both: a rigid and an affine fit with honest errors.
+"""Hand-eye calibration from points known in both frames: a rigid and an affine fit with leave-one-out errors.
 
-Points are (N, 3) in mm, camera frame as in robot.devices. The rigid map is what `Camera.extrinsics` takes. The affine
-one is reported beside it: a camera whose intrinsics and depth scale are right needs no stretching, so an affine fit
-that predicts left-out points much better says that they are wrong. What else makes points fit badly, the unit, a
-mirrored axis or wrong pairs, is warned of too. (The nine points of the paper's authors: affine 2.7 mm in sample and 4.7
-left out, rigid 8.7 and 10.2.)
+Points are (N, 3) in mm, in the camera frame of robot.devices and in the rig's frame. The rigid map gives
+`Camera.extrinsics`. The affine map is a diagnosis: if it predicts left-out points much better than the rigid map, the
+camera's intrinsics or depth scale are wrong. Other causes of a bad fit give a warning too: the unit, a mirrored axis,
+wrong pairs. (The nine points of the paper's authors: affine 2.7 mm in sample and 4.7 left out, rigid 8.7 and 10.2.)
 """
 
 import csv
@@ -27,31 +26,31 @@ from robot.storage import read_content, read_json_object, storage_errors
 
 Points = npt.NDArray[np.float64]
 Fit = Callable[[Points, Points], Points]
-"""From camera points and rig points (N, 3) to the (4, 4) map between them."""
+"""Function from camera points and rig points (N, 3) to the (4, 4) map between them."""
 
 VERSION = 1
 COLUMNS = tuple(f"{frame}_{axis}_mm" for frame in ("camera", "rig") for axis in "xyz")
 MIN_SPREAD = 0.02
-"""Points count as on one line (plane) when they stray from it by less than this share of their extent: at 300 mm
-that is 6 mm, below which errors of 5 mm in the points turn the camera at will."""
+"""Points count as collinear (coplanar) below this spread relative to their extent.
+
+At 300 mm this is 6 mm; below it, errors of 5 mm in the points make the camera's rotation arbitrary.
+"""
 SUSPECT_MM = 20.0
-"""Points further off than this in the mean are warned of: twice what the paper's rig had left out."""
+"""A mean error above this gives a warning: twice the leave-one-out error of the paper's rig."""
 _SUSPECT_RATIO, _SUSPECT_MM = 0.6, 1.0
 _MIN_EXTENT_MM = 5.0
-"""Points of so small an extent are in metres: nobody calibrates within a few mm."""
+"""Points of a smaller extent are probably in metres; a calibration spans more than a few mm."""
 _MIN_MIRROR_POINTS = 6
-"""Of fewer points some order of them may look like their mirror image."""
+"""With fewer points, some permutation of them may resemble their mirror image."""
 _METRES_RATIO = (500.0, 2000.0)
-"""Extents whose quotient lies here are in mm and in metres: noise and a wrong depth scale do not halve or double."""
+"""If the ratio of extents lies here, one is in mm and one in metres; noise changes it by less than a factor of 2."""
 _MAX_COORDINATE_MM = 1e6
 _MAX_CLOCK_ERROR = timedelta(days=1)
 
 
 @dataclass(frozen=True)
 class FitErrors:
-    """Distances (mm) between mapped camera points and rig points: of the points fitted, and of each point when left
-    out of the fit (loo).
-    """
+    """Distances (mm) between mapped camera points and rig points, in sample and leave-one-out (loo)."""
 
     mean_mm: float
     max_mm: float
@@ -61,9 +60,17 @@ class FitErrors:
 
 @dataclass(frozen=True, eq=False)
 class HandEye:
-    """A calibration. camera_mm, rig_mm: the points (N, 3) it was made from. rigid, affine: (4, 4), camera to rig, mm.
+    """A hand-eye calibration.
 
-    `affine` and its errors are None where the points do not tell it; `affine_problem` says why. written: when, in UTC.
+    Attributes:
+        camera_mm: (N, 3) points in the camera frame.
+        rig_mm: (N, 3) the same points in the rig's frame.
+        rigid: (4, 4) rigid map from camera to rig, mm.
+        rigid_errors: Its errors.
+        affine: (4, 4) affine map from camera to rig, mm; None if the points do not determine it.
+        affine_errors: Its errors, or None.
+        affine_problem: Reason why there is no affine map, or "".
+        written: Time of the calibration, in UTC.
     """
 
     camera_mm: Points
@@ -77,8 +84,10 @@ class HandEye:
 
     @property
     def warning(self) -> str | None:
-        """What is suspicious, with its likely cause: another unit, a mirrored axis, a camera that measures wrong (as
-        stretching space explains left-out points much better than moving the camera), or wrong pairs.
+        """A warning about large errors with their probable cause, or None.
+
+        Causes: another unit, a mirrored axis, wrong intrinsics or depth scale of the camera (the affine map predicts
+        left-out points much better than the rigid map), or wrong pairs.
         """
         rigid, affine = self.rigid_errors, self.affine_errors
         if causes := [*_unit_causes(self.camera_mm, self.rig_mm), *_mirror_causes(self)]:
@@ -86,23 +95,23 @@ class HandEye:
         enough = min(_SUSPECT_RATIO * rigid.loo_mean_mm, rigid.loo_mean_mm - _SUSPECT_MM)
         if affine is not None and affine.loo_mean_mm <= enough:
             return (
-                f"left-out points are {affine.loo_mean_mm:.1f} mm off by an affine map and {rigid.loo_mean_mm:.1f} mm "
-                "by a rigid one: the camera's intrinsics or depth scale are suspect; calibrate them, then take the "
-                "points again"
+                f"the error of left-out points is {affine.loo_mean_mm:.1f} mm with an affine map and "
+                f"{rigid.loo_mean_mm:.1f} mm with a rigid one: the camera's intrinsics or depth scale may be wrong; "
+                "calibrate them, then measure the points again"
             )
         if max(rigid.mean_mm, rigid.loo_mean_mm) <= SUSPECT_MM:
             return None
         return (
-            f"{_describe_errors(rigid)}, which is more than {SUSPECT_MM:g}: are camera points paired with the wrong rig points, or "
-            "single points mistaken? Look at each pair"
+            f"{_describe_errors(rigid)}, more than {SUSPECT_MM:g} mm: camera points may be paired with the wrong rig "
+            "points, or single points may be wrong; check each pair"
         )
 
     def age_days(self, now: datetime | None = None) -> float:
-        """Days since it was written."""
+        """Return the days since the calibration was written."""
         return ((now or datetime.now(UTC)) - self.written) / timedelta(days=1)
 
     def save(self, path: Path) -> None:
-        """Write the file whole or not at all. Raises StorageError."""
+        """Write the file completely or not at all; raise StorageError if this fails."""
         with storage_errors(path.parent):
             write_atomically(path, (json.dumps(self._document(), indent=1) + "\n").encode())
 
@@ -120,15 +129,22 @@ class HandEye:
 
 
 def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: datetime | None = None) -> HandEye:
-    """Fit the pairs: at least 4, not on one line (also with any one left out); 5 not on one plane for the affine map.
+    """Fit the rigid map and, if the points determine it, the affine map.
 
-    Raises RobotConfigError.
+    Args:
+        camera_mm: (N, 3) points in the camera frame: at least 4, not collinear, also with any one left out. The affine
+            map requires 5 points that are not coplanar.
+        rig_mm: (N, 3) the same points in the rig's frame.
+        written: Time of the calibration; now by default.
+
+    Raises:
+        RobotConfigError: The points are invalid, too few or collinear.
     """
     camera, rig = _points("camera", camera_mm), _points("rig", rig_mm)
     if len(camera) != len(rig):
-        raise RobotConfigError(f"each camera point must have its rig point, got {len(camera)} and {len(rig)}")
+        raise RobotConfigError(f"each camera point must have a rig point, got {len(camera)} and {len(rig)}")
     if len(camera) < 4:
-        raise RobotConfigError(f"a hand-eye fit must have at least 4 pairs of points, got {len(camera)}; add some")
+        raise RobotConfigError(f"a hand-eye fit requires at least 4 pairs of points, got {len(camera)}; add some")
     for name, points in (("camera", camera), ("rig", rig)):
         if _min_spread(points, 2) < MIN_SPREAD:
             raise RobotConfigError(
@@ -149,7 +165,7 @@ def fit_hand_eye(camera_mm: npt.ArrayLike, rig_mm: npt.ArrayLike, *, written: da
 
 
 def fit_rigid(camera_mm: Points, rig_mm: Points) -> Points:
-    """The rotation and translation (4, 4) of least squares, never a reflection (Kabsch 1976; Umeyama 1991, eq. 40)."""
+    """Return the least-squares rotation and translation (4, 4), no reflection (Kabsch 1976; Umeyama 1991, eq. 40)."""
     camera_mean, rig_mean = camera_mm.mean(0), rig_mm.mean(0)
     left, _, right = np.linalg.svd((rig_mm - rig_mean).T @ (camera_mm - camera_mean))
     rotation = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
@@ -157,19 +173,19 @@ def fit_rigid(camera_mm: Points, rig_mm: Points) -> Points:
 
 
 def fit_affine(camera_mm: Points, rig_mm: Points) -> Points:
-    """The linear map and translation (4, 4) of least squares; about the means, so that a far origin costs no digits."""
+    """Return the least-squares linear map and translation (4, 4), centred so that a far origin costs no digits."""
     camera_mean, rig_mean = camera_mm.mean(0), rig_mm.mean(0)
     linear = np.linalg.lstsq(camera_mm - camera_mean, rig_mm - rig_mean, rcond=None)[0].T
     return _matrix(linear, rig_mean - linear @ camera_mean)
 
 
 def apply_map(matrix: Points, points_mm: Points) -> Points:
-    """Points (N, 3) under a (4, 4) map."""
+    """Apply a (4, 4) map to points (N, 3)."""
     return points_mm @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def measure_errors(fit: Fit, camera_mm: Points, rig_mm: Points) -> FitErrors:
-    """Errors of a fit on its own points, and of each point under the fit of the others."""
+    """Return the errors of a fit in sample, and of each point under the fit of the others."""
     own = np.linalg.norm(apply_map(fit(camera_mm, rig_mm), camera_mm) - rig_mm, axis=1)
     left_out = np.empty(len(own))
     for index in range(len(own)):
@@ -180,7 +196,7 @@ def measure_errors(fit: Fit, camera_mm: Points, rig_mm: Points) -> FitErrors:
 
 
 def read_pairs(path: Path) -> tuple[Points, Points]:
-    """Camera and rig points from a CSV file with the columns COLUMNS, in any order. Raises RobotConfigError."""
+    """Read camera and rig points from a CSV file with the columns COLUMNS, in any order; or raise RobotConfigError."""
     try:
         with io.StringIO(read_content(path, RobotConfigError).decode("utf-8-sig"), newline="") as file:
             rows = csv.DictReader(file, strict=True)
@@ -194,8 +210,15 @@ def read_pairs(path: Path) -> tuple[Points, Points]:
 
 
 def load_hand_eye(path: Path, max_age_days: float | None = None, now: datetime | None = None) -> HandEye:
-    """A saved calibration, fitted again from its points. Raises RobotConfigError, also for one older than asked, and
-    for a file whose map is not that of its points.
+    """Load a saved calibration and fit it again from its points.
+
+    Args:
+        path: The file.
+        max_age_days: Largest accepted age; None: any.
+        now: Current time, for tests.
+
+    Raises:
+        RobotConfigError: The file is not a calibration, its map does not fit its points, or it is too old.
     """
     plain = read_json_object(path, RobotConfigError)
     if plain.get("version") != VERSION:
@@ -207,7 +230,7 @@ def load_hand_eye(path: Path, max_age_days: float | None = None, now: datetime |
     camera, rig = [point.camera_mm for point in document.points], [point.rig_mm for point in document.points]
     found = fit_hand_eye(camera, rig, written=document.written.astimezone(UTC))
     if not np.allclose(document.rigid, found.rigid, rtol=0, atol=1e-6):  # 1 nm: same sums elsewhere
-        raise RobotConfigError(f"{path}: the rigid map must be that of its points; the file was changed, make it again")
+        raise RobotConfigError(f"{path}: the rigid map must fit its points; the file was changed, make it again")
     _check_age(path, found, max_age_days, now)
     return found
 
@@ -218,7 +241,7 @@ def _check_age(path: Path, found: HandEye, max_age_days: float | None, now: date
         raise RobotConfigError(f"{path} was written {-age:.0f} days in the future; set the clock, or calibrate again")
     if max_age_days is not None and not age <= max_age_days:
         raise RobotConfigError(
-            f"{path} must be at most {max_age_days:g} days old, it is {age:.0f}; calibrate again, or allow more days"
+            f"{path} must be at most {max_age_days:g} days old, got {age:.0f}; calibrate again, or allow more days"
         )
 
 
@@ -234,7 +257,7 @@ class _PointPair:
 
 @dataclass(frozen=True)
 class _Document:
-    """The saved file."""
+    """Content of the saved file."""
 
     version: int
     written: datetime
@@ -246,21 +269,22 @@ class _Document:
 
 
 def _describe_errors(errors: FitErrors) -> str:
-    return f"points are {errors.mean_mm:.1f} mm off by the rigid map, and {errors.loo_mean_mm:.1f} mm when left out"
+    return f"the rigid map's mean error is {errors.mean_mm:.1f} mm, and {errors.loo_mean_mm:.1f} mm for left-out points"
 
 
 def _unit_causes(camera: Points, rig: Points) -> list[str]:
     if max(_extent(rig), _extent(camera)) < _MIN_EXTENT_MM:
         return ["all points seem to be in metres, they must be in mm"]
-    share = _extent(rig) / _extent(camera)
+    ratio = _extent(rig) / _extent(camera)
     low, high = _METRES_RATIO
-    named = (("camera", low <= share <= high), ("rig", low <= 1 / share <= high))
+    named = (("camera", low <= ratio <= high), ("rig", low <= 1 / ratio <= high))
     return [f"the {name} points seem to be in metres, they must be in mm" for name, is_so in named if is_so]
 
 
 def _mirror_causes(found: HandEye) -> list[str]:
-    """Whether a mirrored camera, of whatever unit, fits much better, or the affine map mirrors. Points on a plane do
-    not tell, and of the corners of a tetrahedron two confused ones look the same.
+    """Return a cause if a mirrored camera, in any unit, fits much better, or if the affine map mirrors.
+
+    Coplanar points cannot show a mirrored axis, and two swapped corners of a tetrahedron give the same picture.
     """
     rig, scaled = found.rig_mm, found.camera_mm * (_extent(found.rig_mm) / _extent(found.camera_mm))
     plain, mirrored = (
@@ -277,7 +301,7 @@ def _mirror_causes(found: HandEye) -> list[str]:
 
 
 def _extent(points: Points) -> float:
-    """Root of the mean squared distance from the mean; above 0, as points on a line are refused."""
+    """Return the RMS distance from the mean; above 0, because collinear points are rejected."""
     return float(np.sqrt(np.square(points - points.mean(0)).sum(1).mean()))
 
 
@@ -286,7 +310,7 @@ def _points(name: str, points: npt.ArrayLike) -> Points:
         found = np.array(points, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise RobotConfigError(f"{name} points must be rows of x, y and z in mm: {error}") from error
-    if found.ndim != 2 or found.shape[1] != 3 or not (np.abs(found) < _MAX_COORDINATE_MM).all():  # also refuses NaN
+    if found.ndim != 2 or found.shape[1] != 3 or not (np.abs(found) < _MAX_COORDINATE_MM).all():  # also rejects NaN
         raise RobotConfigError(
             f"{name} points must be (N, 3) finite mm within a kilometre, got {found.shape}: {found.tolist()}"
         )
@@ -297,29 +321,29 @@ def _row(path: Path, line: int, row: Mapping[str, Any]) -> list[float]:
     try:
         numbers = [float(row[column]) for column in COLUMNS]
     except (TypeError, ValueError, KeyError) as error:
-        raise RobotConfigError(f"{path}, line {line}: every column must hold a number of mm: {error}") from error
+        raise RobotConfigError(f"{path}, line {line}: every column must contain a number in mm: {error}") from error
     if len(row) != len(COLUMNS):
         raise RobotConfigError(f"{path}, line {line} must have {len(COLUMNS)} columns, got more")
     return numbers
 
 
 def _affine_problem(camera: Points) -> str:
-    """Why these points do not tell an affine map, or nothing."""
+    """Return the reason why these points do not determine an affine map, or ""."""
     if len(camera) < 5:
-        return f"an affine map must have at least 5 pairs of points, got {len(camera)}"
+        return f"an affine map requires at least 5 pairs of points, got {len(camera)}"
     if _min_spread(camera, 3) < MIN_SPREAD:
-        return "an affine map must have points that do not lie on one plane, nor all but one of them"
+        return "an affine map requires points that do not lie on one plane, nor all but one of them"
     return ""
 
 
 def _min_spread(points: Points, dimensions: int) -> float:
-    """Extent in the last of the main `dimensions` as a share of the first, the least with any one point left out."""
-    shares = []
+    """Return the ratio of the last to the first of the main `dimensions`, the smallest with any point left out."""
+    ratios = []
     for index in range(len(points)):
         others = np.delete(points, index, axis=0)
         extents = np.linalg.svd(others - others.mean(0), compute_uv=False)
-        shares.append(float(extents[dimensions - 1] / extents[0]) if extents[0] > 0 else 0.0)
-    return min(shares)
+        ratios.append(float(extents[dimensions - 1] / extents[0]) if extents[0] > 0 else 0.0)
+    return min(ratios)
 
 
 def _matrix(linear: Points, offset: Points) -> Points:

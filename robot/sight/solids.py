@@ -1,8 +1,8 @@
-"""Three solids that may stand on a table, fitted to one-sided noisy points: upright cylinder, box, lying cylinder.
+"""Fits of three solids on a table to one-sided noisy points: upright cylinder, box, lying cylinder.
 
-Points are (N, 3) in mm with z above the table. All three are judged by the same yardstick, the distance of every point
-from the solid's surface, so that they can be compared (BIC). Surface distances are those of a product of intervals and
-discs: with q the signed distances beyond each pair of faces, it is |max q| inside and the norm of max(q, 0) outside.
+Points are (N, 3) in mm with z above the table. The BIC compares the solids by the distance of each point from the
+surface. A solid is a product of intervals and discs: with q the signed distances beyond each pair of faces, the
+distance is |max q| inside and the norm of max(q, 0) outside.
 """
 
 import math
@@ -15,13 +15,13 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 OUTLIER_CUT = 3.0
-"""Residuals count up to so many times the noise: beyond, a point is an outlier and costs the same wherever it is."""
+"""Residuals are truncated at this multiple of the noise; points beyond are outliers of equal cost."""
 _SPACING_MM = 6.0
-"""Distance to the next of some 300 points on an object of usual size: nothing nearer can be told from seen."""
+"""Spacing of some 300 points on an object of usual size, the resolution of the visibility test."""
 _HYPOTHESES = 200
 _MAX_ITERATIONS = 12
 _NEAR_SIDE = 0.3
-"""Points of a visible side lie at most this share of the radius behind the centre; noise and relief have room."""
+"""Points of a visible side lie at most this fraction of the radius behind the centre; it leaves room for noise."""
 
 
 class Solid(ABC):
@@ -40,22 +40,22 @@ class Solid(ABC):
 
     @abstractmethod
     def face_distances(self, points: Array) -> tuple[Array, ...]:
-        """Signed distances (N,) beyond each pair of faces, negative between them."""
+        """Return the signed distances (N,) of points beyond each pair of faces, negative between them."""
 
     def distance(self, points: Array) -> Array:
-        """(N,) distance of points from the surface."""
+        """Return the (N,) distances of points from the surface."""
         q = np.stack(self.face_distances(points))
         outside = np.sqrt((np.maximum(q, 0.0) ** 2).sum(0))
         return np.asarray(np.where(outside > 0, outside, -q.max(0)))
 
     @abstractmethod
     def surface(self) -> tuple[Array, Array]:
-        """(M, 3) points all over the surface but its bottom, and their outward normals."""
+        """Return (M, 3) points on the surface except its bottom, and their outward normals."""
 
     def misfit(self, points: Array, noise_mm: float, eye: Array) -> float:
-        """Bayesian information criterion, outliers cut off, of what is seen and of what should be seen from eye (3,).
+        """Return the Bayesian information criterion with truncated residuals, for a camera at eye (3,).
 
-        The first alone would let a solid reach far behind what is seen.
+        It also counts visible surface without points: else a solid could extend far behind the points.
         """
         squared = np.minimum((self.distance(points) / noise_mm) ** 2, OUTLIER_CUT**2)
         surface, normals = self.surface()
@@ -68,7 +68,7 @@ class Solid(ABC):
 
 @dataclass(frozen=True)
 class UprightCylinder(Solid):
-    """A cylinder that stands."""
+    """A cylinder that stands on its base."""
 
     x: float
     y: float
@@ -79,18 +79,21 @@ class UprightCylinder(Solid):
 
     @property
     def half(self) -> tuple[float, float]:
+        """The radius, twice."""
         return self.radius, self.radius
 
     def face_distances(self, points: Array) -> tuple[Array, ...]:
+        """Return the distances beyond the side, and beyond bottom and top."""
         rho = np.hypot(points[:, 0] - self.x, points[:, 1] - self.y)
         return rho - self.radius, _slab(points[:, 2] - self.height / 2, self.height / 2)
 
     def surface(self) -> tuple[Array, Array]:
+        """Return points and normals of the side and the top."""
         angle, z = _grid(np.linspace(0, 2 * math.pi, 20, endpoint=False), np.linspace(0.1, 1.0, 6) * self.height)
         c, s, flat = np.cos(angle), np.sin(angle), np.zeros_like(angle)
         side = np.stack([self.radius * c, self.radius * s, z], axis=1)
-        share = z / self.height  # the same grid serves as rings of the top
-        top = np.stack([self.radius * share * c, self.radius * share * s, flat + self.height], axis=1)
+        ring = z / self.height  # the same grid gives the rings of the top
+        top = np.stack([self.radius * ring * c, self.radius * ring * s, flat + self.height], axis=1)
         normals = [np.stack([c, s, flat], axis=1), np.stack([flat, flat, flat + 1], axis=1)]
         return np.concatenate([side, top]) + np.array([self.x, self.y, 0.0]), np.concatenate(normals)
 
@@ -109,9 +112,11 @@ class Cuboid(Solid):
 
     @property
     def half(self) -> tuple[float, float]:
+        """Half length and half width."""
         return self.half_length, self.half_width
 
     def face_distances(self, points: Array) -> tuple[Array, ...]:
+        """Return the distances beyond the ends, beyond the sides, and beyond bottom and top."""
         along, across = rotate_plan(points[:, :2] - [self.x, self.y], self.yaw_rad).T
         return (
             _slab(along, self.half_length),
@@ -120,8 +125,9 @@ class Cuboid(Solid):
         )
 
     def surface(self) -> tuple[Array, Array]:
+        """Return points and normals of the four sides and the top."""
         u, v = _grid(np.linspace(-1, 1, 7), np.linspace(-1, 1, 7))
-        one, up = np.ones_like(u), 0.55 + 0.45 * v  # not the lowest tenth, where the table begins
+        one, up = np.ones_like(u), 0.55 + 0.45 * v  # without the lowest tenth, next to the table
         faces = [(one, u, up), (-one, u, up), (u, one, up), (u, -one, up), (u, v, one)]
         points = np.concatenate([np.stack(face, axis=1) for face in faces]) * [*self.half, self.height]
         normals = np.repeat([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], len(u), axis=0)
@@ -141,17 +147,21 @@ class LyingCylinder(Solid):
 
     @property
     def height(self) -> float:  # type: ignore[override]
+        """The diameter."""
         return 2 * self.radius
 
     @property
     def half(self) -> tuple[float, float]:
+        """Half length and radius."""
         return self.half_length, self.radius
 
     def face_distances(self, points: Array) -> tuple[Array, ...]:
+        """Return the distances beyond the round side and beyond the ends."""
         along, across = rotate_plan(points[:, :2] - [self.x, self.y], self.yaw_rad).T
         return np.hypot(across, points[:, 2] - self.radius) - self.radius, _slab(along, self.half_length)
 
     def surface(self) -> tuple[Array, Array]:
+        """Return points and normals of the round side and the ends."""
         angle, u = _grid(np.linspace(0, 2 * math.pi, 20, endpoint=False), np.linspace(-1, 1, 7))
         c, s, flat = self.radius * np.cos(angle), self.radius * np.sin(angle), np.zeros_like(angle)
         side = np.stack([self.half_length * u, c, s + self.radius], axis=1)
@@ -161,7 +171,7 @@ class LyingCylinder(Solid):
 
 
 def _nearest_squared_distance(points: Array, others: Array) -> Array:
-    """(N,) squared distance to the nearest of others, by |a|^2 + |b|^2 - 2 a b about the middle of the others."""
+    """Return the (N,) squared distances to the nearest of others, by |a|^2 + |b|^2 - 2 a b about their mean."""
     middle = others.mean(0)
     a, b = points - middle, others - middle
     squared = (a**2).sum(1) + ((b**2).sum(1)[:, None] - 2 * b @ a.T).min(0)
@@ -169,20 +179,20 @@ def _nearest_squared_distance(points: Array, others: Array) -> Array:
 
 
 def _grid(first: Array, second: Array) -> tuple[Array, Array]:
-    """All pairs."""
+    """Return all pairs, flattened."""
     a, b = np.meshgrid(first, second)
     return a.ravel(), b.ravel()
 
 
 def _to_table_frame(points: Array, normals: Array, solid: Solid) -> tuple[Array, Array]:
-    """From the solid's own frame to the table's."""
+    """Transform points and normals from the solid's frame to the table's."""
     c, s = math.cos(solid.yaw_rad), math.sin(solid.yaw_rad)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     return points @ turn + [solid.x, solid.y, 0.0], normals @ turn
 
 
 def rotate_plan(plan: Array, yaw_rad: float) -> Array:
-    """(N, 2) coordinates along and across the direction of yaw."""
+    """Return the (N, 2) coordinates along and across the direction of yaw."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     return np.asarray(plan @ np.array([[c, -s], [s, c]]))
 
@@ -196,7 +206,7 @@ def _slab(position: Array, half: float) -> Array:
 
 @dataclass(frozen=True)
 class Circle:
-    """A circle in plan, and (3, 3) covariance of x, y and radius for a noise of 1 mm on each of its points."""
+    """A circle in plan, and the (3, 3) covariance of x, y and radius for a noise of 1 mm on each inlier."""
 
     x: float
     y: float
@@ -206,10 +216,15 @@ class Circle:
 
 
 def fit_circle(plan: Array, noise_mm: float, away: Array, largest_mm: float) -> Circle | None:
-    """Robust geometric circle through an arc seen from outside; None where no circle of that kind is there.
+    """Fit a robust geometric circle to an arc visible from outside; return None if none is found.
 
-    plan (N, 2). away (2,): direction of sight; the centre lies behind the arc. largest_mm: bound of the radius.
     RANSAC over three points with truncated squares, then `refine_circle`.
+
+    Args:
+        plan: (N, 2) points.
+        noise_mm: Noise of the points.
+        away: (2,) viewing direction; the centre lies behind the arc.
+        largest_mm: Upper limit of the radius.
     """
     found = _circle_hypothesis(plan, noise_mm, away, largest_mm)
     return None if found is None else refine_circle(plan, *found, noise_mm, largest_mm, away)
@@ -224,11 +239,10 @@ def refine_circle(
     away: Array,
     below: Array | None = None,
 ) -> Circle | None:
-    """Gauss-Newton with Tukey's weights on |p - c| - r; None where the steps run away.
+    """Refine a circle by Gauss-Newton with Tukey's weights on |p - c| - r; return None if the steps diverge.
 
-    A side that faces away cannot be seen: points there are not on the circle. below (N,): how far each point lies
-    below a level top. One that is nearer to the top than to the side belongs to the top, of which the whole rim is
-    seen, and says nothing of the circle unless it lies outside.
+    Points on the side that faces away are ignored, because it is invisible. `below` (N,): distance of each point below
+    a level top. A point nearer to the top than to the side counts only outside the circle.
     """
     edge = np.zeros(len(plan), bool) if below is None else below < 2 * noise_mm
     for step in range(_MAX_ITERATIONS):
@@ -250,12 +264,12 @@ def refine_circle(
 
 
 def _tukey(scaled: Array) -> Array:
-    """Weight of residuals in units of the noise; 4.7 keeps 95 % of the efficiency for Gaussian noise."""
+    """Return the weights of residuals in units of the noise; 4.7 keeps 95 % of the efficiency for Gaussian noise."""
     return np.asarray(np.maximum(1 - (scaled / 4.685) ** 2, 0.0) ** 2)
 
 
 def _circle_hypothesis(plan: Array, noise_mm: float, away: Array, largest_mm: float) -> tuple[Array, float] | None:
-    """The circle through three points that misses the fewest others."""
+    """Return the circle through three points with the smallest truncated cost."""
     rng = np.random.default_rng(0)
     some = _subsample(plan)
     a, b, c = np.moveaxis(some[rng.integers(len(some), size=(_HYPOTHESES, 3))], 1, 0)
@@ -273,7 +287,7 @@ def _circle_hypothesis(plan: Array, noise_mm: float, away: Array, largest_mm: fl
 
 
 def _circles_through(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
-    """Centres (K, 2) and radii (K,) of circles through three points each; not finite for points in a line."""
+    """Return centres (K, 2) and radii (K,) of circles through three points each; not finite for collinear points."""
     ab, ac = b - a, c - a
     cross = 2 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
     bb, cc = (ab**2).sum(1), (ac**2).sum(1)
@@ -287,9 +301,9 @@ def _circles_through(a: Array, b: Array, c: Array) -> tuple[Array, Array]:
 
 
 def fit_cuboid(points: Array, height: float, eye: Array) -> Cuboid:
-    """The box whose side faces the points below its top lie nearest to. eye (2,): the camera's foot on the table.
+    """Fit a box to the points, its sides to those below the top; eye (2,): the camera's foot on the table.
 
-    Faces that the camera sees lie at the median of their points, the others where the points in plan end.
+    Visible faces lie at the median of their points, the others at the end of the points in plan.
     """
     centre = np.median(points[:, :2], axis=0)
     plan = points[:, :2] - centre
@@ -309,7 +323,7 @@ def fit_cuboid(points: Array, height: float, eye: Array) -> Cuboid:
 
 
 def _fit_visible_faces(local: Array, below: Array, low: Array, high: Array, eye: Array) -> tuple[Array, Array]:
-    """Put faces towards the eye at the median of the points that are nearest to them, the others where the top ends."""
+    """Put faces towards the eye at the median of their nearest points, the others at the end of the top."""
     faces = np.concatenate([low, high])
     for _ in range(2):
         gaps = np.abs(np.concatenate([local, local], axis=1) - faces)
@@ -325,7 +339,7 @@ def _fit_visible_faces(local: Array, below: Array, low: Array, high: Array, eye:
 
 
 def _extent(local: Array) -> tuple[Array, Array]:
-    """Least and greatest along the axis before the last one, 1 % of the points left out on either side."""
+    """Return minimum and maximum along the axis before the last one, without 1 % of the points on either side."""
     count = local.shape[-2]
     skip = count // 100
     ordered = np.partition(local, [skip, count - 1 - skip], axis=-2)
@@ -333,7 +347,7 @@ def _extent(local: Array) -> tuple[Array, Array]:
 
 
 def _best_yaw(plan: Array, side: Array, yaws: Array) -> float:
-    """The yaw at which side points lie nearest to the faces of the box, by the mean distance cut off at 10 mm."""
+    """Return the yaw with the smallest mean distance of side points from the box's faces, truncated at 10 mm."""
     c, s = np.cos(yaws), np.sin(yaws)
     turns = np.array([[c, -s], [s, c]]).transpose(2, 0, 1)
     low, high = _extent(_subsample(plan) @ turns)
@@ -347,10 +361,10 @@ def _subsample(points: Array, max_points: int = 300) -> Array:
 
 
 def fit_lying_cylinder(points: Array, box: Cuboid, along_length: bool, eye: Array) -> LyingCylinder | None:
-    """A cylinder on its side, begun at the box's long or short direction; None where the steps run away.
+    """Fit a cylinder on its side, starting at the box's long or short direction; return None if the steps diverge.
 
-    Gauss-Newton with Tukey's weights on sqrt(v^2 + (z - r)^2) - r, where v is the distance across the axis: unknown
-    are the axis's turn and offset, and the radius. The axis lies at the height of the radius.
+    Gauss-Newton with Tukey's weights on sqrt(v^2 + (z - r)^2) - r, where v is the distance across the axis. Unknowns
+    are the axis's yaw and offset, and the radius. The axis lies at the height of the radius.
     """
     yaw = box.yaw_rad if along_length else box.yaw_rad + math.pi / 2
     offset, radius = 0.0, box.height / 2
@@ -373,7 +387,7 @@ def fit_lying_cylinder(points: Array, box: Cuboid, along_length: bool, eye: Arra
 
 
 def _ends(points: Array, origin: Array, yaw: float, offset: float, radius: float, eye: Array) -> tuple[float, float]:
-    """Where the axis ends: at the flat end that the camera sees, else where the points end."""
+    """Return the ends of the axis: the visible flat end, else the end of the points."""
     along, across = rotate_plan(points[:, :2] - origin, yaw).T
     low, high = (float(edge[0]) for edge in _extent(along[:, None]))
     towards = float(rotate_plan((eye - origin)[None], yaw)[0, 0])

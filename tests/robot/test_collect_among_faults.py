@@ -1,6 +1,6 @@
-"""Collecting with real drivers over emulated devices, every one of which fails now and then.
+"""Collection with real drivers over emulated devices that fail at random.
 
-`python -m tests.emulated_rig --grasps 500 --out faulty/` does it at length.
+`python -m tests.emulated_rig --grasps 500 --out faulty/` runs a long collection.
 """
 
 import signal
@@ -20,7 +20,7 @@ from tests.waiting import wait_until
 
 @pytest.mark.slow
 @pytest.mark.parametrize("port", ["tcp", "pty"])
-def test_a_collection_among_faults_holds_whole_grasps_and_never_leaves_the_jaws_closing(tmp_path, port):
+def test_a_collection_among_faults_has_complete_grasps_and_never_leaves_the_jaws_closing(tmp_path, port):
     found = collect_among_faults(tmp_path / "r", 10, rate=0.05, seed=2, port=port)
     assert found.grasps == 10
     assert (found.left_moving, found.left_holding) == (0, 0)
@@ -31,7 +31,7 @@ def test_a_collection_among_faults_holds_whole_grasps_and_never_leaves_the_jaws_
     assert own_threads() == []
 
 
-def test_where_a_device_stays_away_the_collection_stops_with_the_reason_and_the_jaws_open(tmp_path):
+def test_if_a_device_stays_disconnected_the_collection_stops_with_the_reason_and_the_jaws_open(tmp_path):
     with emulated_rig(1) as rig:
         real = rig.arm._move_to
 
@@ -49,8 +49,8 @@ def test_where_a_device_stays_away_the_collection_stops_with_the_reason_and_the_
 
 
 @pytest.mark.parametrize("stops", [True, False])
-def test_jaws_that_a_failed_call_leaves_moving_are_seen(stops, monkeypatch):
-    """The count of these collections can tell: without its stop, the driver is found out."""
+def test_jaws_that_a_failed_call_leaves_moving_are_counted(stops, monkeypatch):
+    """The counter of these collections detects a driver that does not stop."""
     if not stops:
         monkeypatch.setattr(WSG50, "_stop", lambda self: None)
         monkeypatch.setattr(Motions, "stop", lambda self: None)
@@ -67,6 +67,6 @@ def test_jaws_that_a_failed_call_leaves_moving_are_seen(stops, monkeypatch):
 
 
 def interrupt_when(true):
-    """Ctrl-C, as soon as something is so."""
+    """Send Ctrl-C as soon as a condition is true."""
     wait_until(true)
     signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)

@@ -1,4 +1,4 @@
-"""A collection that is killed or runs in several processes ends in the same bytes as one that runs through at once."""
+"""A collection that is killed and continued, or runs in several processes, gives the same bytes as any other."""
 
 import functools
 import os
@@ -26,7 +26,7 @@ SETTINGS = CollectSettings(grasps=2, most_attempts=8)
 
 
 class BrokenRig(FakeRig):
-    """Raises what it is told to at the first attempt at an object."""
+    """A rig that fails in a given way at the first attempt at one object."""
 
     def __init__(self, seed, what):
         super().__init__(seed)
@@ -46,7 +46,7 @@ def run(out, jobs=1, make=None, names=NAMES):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The files of a collection that ran through."""
+    """Files of an undisturbed collection."""
     out = tmp_path_factory.mktemp("whole") / "r"
     run(out)
     return files(out)
@@ -54,7 +54,7 @@ def whole(tmp_path_factory):
 
 @pytest.fixture(autouse=True)
 def unsynced(monkeypatch):
-    """Waiting for the disk takes most of the time here; the processes that are killed do wait."""
+    """Skip fsync, which takes most of the time here; the killed processes do sync."""
     monkeypatch.setattr("os.fsync", lambda descriptor: None)
 
 
@@ -78,7 +78,7 @@ collect(functools.partial(FakeRig, 3), sys.argv[1], objects=NAMES, seed=3, setti
 
 
 def killed(out, syncs):
-    """Collect in a process that is killed after so many syncs; returns whether it was."""
+    """Collect in a process that is killed after `syncs` syncs; return whether it was killed."""
     command = [sys.executable, "-c", CHILD, str(out), str(syncs)]
     done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
     assert done.returncode in (0, -signal.SIGKILL), done.stderr
@@ -86,7 +86,7 @@ def killed(out, syncs):
 
 
 @pytest.mark.parametrize("syncs", [*(pytest.param(syncs, marks=pytest.mark.slow) for syncs in (1, 3, 14)), 13])
-def test_a_killed_collection_goes_on_to_the_same_bytes(tmp_path, whole, syncs):
+def test_a_killed_collection_continues_to_the_same_bytes(tmp_path, whole, syncs):
     assert killed(tmp_path / "r", syncs)
     if syncs > 2:
         read_recording(tmp_path / "r")
@@ -105,11 +105,11 @@ def test_a_collection_that_is_killed_again_and_again_ends_in_the_same_bytes(tmp_
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "stop"])
-def test_a_failure_at_any_step_of_an_attempt_can_be_gone_on_from(tmp_path, monkeypatch, error):
-    """Every call that touches the disk while the first attempt is written: two lines and eight images."""
+def test_a_collection_continues_after_a_failure_at_any_step_of_an_attempt(tmp_path, monkeypatch, error):
+    """The steps are all disk calls of the first attempt: two lines and eight images."""
     names = ["round-0"]
     run(tmp_path / "whole", names=names)
-    for step in range(10, 39, 3):  # before these the folder is made and read
+    for step in range(10, 39, 3):  # earlier calls make and read the folder
         out = tmp_path / f"r{step}"
         with pytest.raises((StorageError, KeyboardInterrupt)), Failing(monkeypatch, error, step):
             run(out, names=names)
@@ -133,7 +133,7 @@ def test_two_jobs_of_the_simulated_rig_give_the_same_bytes_as_one(tmp_path):
     assert files(tmp_path / "1") == files(tmp_path / "2")
 
 
-def test_two_jobs_go_on_with_what_one_began(tmp_path, whole):
+def test_two_jobs_continue_a_collection_of_one_job(tmp_path, whole):
     killed(tmp_path / "r", 30)
     run(tmp_path / "r", jobs=2)
     assert files(tmp_path / "r") == whole
@@ -150,10 +150,8 @@ def test_a_devices_failure_in_a_worker_is_the_same_error_here(tmp_path):
         run(tmp_path / "r", jobs=2, make=make)
 
 
-def test_any_other_failure_of_a_worker_is_a_robot_error_that_says_where(tmp_path):
-    with pytest.raises(
-        RobotError, match="attempt 0 at thin-1 broke off in a worker process: ValueError: not of the con"
-    ):
+def test_any_other_failure_of_a_worker_is_a_robot_error_that_names_the_attempt(tmp_path):
+    with pytest.raises(RobotError, match="attempt 0 at thin-1 failed in a worker process: ValueError: not of the con"):
         run(tmp_path / "r", jobs=2, make=functools.partial(BrokenRig, 3, "value"))
 
 
@@ -164,13 +162,13 @@ def test_a_dead_worker_raises_and_the_collection_can_continue(tmp_path, whole):
     assert files(tmp_path / "r") == whole
 
 
-def test_opencv_works_in_one_thread_while_attempts_are_made_and_only_then(tmp_path, monkeypatch):
+def test_opencv_uses_one_thread_only_while_attempts_are_made(tmp_path, monkeypatch):
     """GaussianBlur and others differ in their last digits with the number of threads."""
     monkeypatch.setattr(cv2, "getNumThreads", lambda: 5)
-    told = []
-    monkeypatch.setattr(cv2, "setNumThreads", told.append)
+    counts = []
+    monkeypatch.setattr(cv2, "setNumThreads", counts.append)
     run(tmp_path / "r", names=["round-0"])
-    assert told == [1, 5]
+    assert counts == [1, 5]
 
 
 def test_threads_are_limited_only_in_the_workers(tmp_path, monkeypatch):
@@ -201,15 +199,17 @@ def is_running(pid):
         return False
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="reads /proc, as Linux has it")
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="requires /proc of Linux")
 @pytest.mark.parametrize(
     "end",
     [[signal.SIGKILL], [signal.SIGINT], [signal.SIGINT, signal.SIGINT]],
     ids=["killed", "ctrl-c", "ctrl-c twice"],
 )
-def test_workers_leave_with_their_parent(tmp_path, end):
-    """A killed parent cannot end its workers; they must see to it themselves. One that is told twice to stop waits
-    for them all the same: broken off in its end, a pool of processes never ends."""
+def test_workers_exit_with_their_parent(tmp_path, end):
+    """A killed parent cannot stop its workers, so they exit by themselves.
+
+    A parent that is interrupted twice still waits for them, because an interrupted shutdown of a process pool hangs.
+    """
     (tmp_path / "endless.py").write_text(ENDLESS)
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(tmp_path / "endless.py"), str(tmp_path / "r")]
@@ -221,8 +221,8 @@ def test_workers_leave_with_their_parent(tmp_path, end):
         for each in end:
             parent.send_signal(each)
             time.sleep(0.1)
-        said = parent.communicate(timeout=60)[1]
+        output = parent.communicate(timeout=60)[1]
         wait_until(lambda: not any(map(is_running, workers)), limit_s=60.0)
     if signal.SIGINT in end:
-        assert "KeyboardInterrupt" in said
+        assert "KeyboardInterrupt" in output
     assert read_recording(tmp_path / "r").grasps

@@ -1,4 +1,4 @@
-"""Collection over the contract: what is recorded, what is asked of the devices, when it ends, and what is refused."""
+"""Collection with a fake rig: recorded data, calls of devices, end conditions, and errors."""
 
 import dataclasses
 import functools
@@ -28,20 +28,20 @@ NAMES = ("round-0", "thin-1", "round-2")
 
 @pytest.fixture(autouse=True)
 def unsynced(monkeypatch):
-    """Waiting for the disk takes most of the time here; what a crash leaves is tested elsewhere."""
+    """Skip fsync, which takes most of the time here; other tests cover crashes."""
     monkeypatch.setattr("os.fsync", lambda descriptor: None)
 
 
-def run(out, names=NAMES, *, seed=3, rig_seed=None, faults=None, grasps=2, attempt=None, most=None, **options):
-    """Collect with a fake rig; returns the tallies by object."""
+def run(out, names=NAMES, *, seed=3, rig_seed=None, faults=None, grasps=2, attempt=None, limit=None, **options):
+    """Collect with a fake rig and return the tallies by object."""
     make = functools.partial(FakeRig, seed if rig_seed is None else rig_seed, faults=faults)
-    settings = CollectSettings(grasps, most, attempt or AttemptSettings())
+    settings = CollectSettings(grasps, limit, attempt or AttemptSettings())
     tallies = collect(make, out, objects=names, seed=seed, settings=settings, **options)
     return {each.object_id: each for each in tallies}
 
 
 def files(folder):
-    """Every file and its bytes."""
+    """Return the bytes of every file."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
@@ -49,10 +49,10 @@ def rows(folder):
     return [json.loads(line) for line in (folder / "metadata.jsonl").read_text().splitlines()]
 
 
-# What is recorded -------------------------------------------------------------------------------------------
+# Recorded data ----------------------------------------------------------------------------------------------
 
 
-def test_a_gate_sees_the_recorded_frames_in_their_colours_and_what_it_leaves_alone_is_not_decoded():
+def test_a_gate_gets_the_recorded_frames_in_rgb_and_unused_frames_are_not_decoded():
     red, blue = np.full((4, 6, 3), (200, 10, 0), np.uint8), np.full((4, 6, 3), (0, 20, 190), np.uint8)
     files = {"touch_a": red, "touch_a_before": blue}
     images = {column: file_content(column, pixels)[0] for column, pixels in files.items()}
@@ -66,7 +66,7 @@ def test_a_gate_sees_the_recorded_frames_in_their_colours_and_what_it_leaves_alo
         touches["c"]
 
 
-def test_every_object_gets_its_accepted_grasps_and_the_rest_is_recorded_too(tmp_path):
+def test_every_object_gets_its_accepted_grasps_and_rejected_ones_are_recorded_too(tmp_path):
     tallies = run(tmp_path / "r", grasps=3)
     recording = read_recording(tmp_path / "r")
     assert recording.notes == ()
@@ -80,7 +80,7 @@ def test_every_object_gets_its_accepted_grasps_and_the_rest_is_recorded_too(tmp_
     assert {grasp.outcome for grasp in rejected} <= {"missed", "slipped"}
 
 
-def test_a_grasp_has_everything_that_was_measured(tmp_path):
+def test_a_grasp_contains_every_measurement(tmp_path):
     run(tmp_path / "r", ["round-0"], grasps=1)
     (row,) = [row for row in rows(tmp_path / "r") if row["grasped"]]
     assert row["outcome"] == "held"
@@ -107,7 +107,7 @@ def test_colours_are_not_swapped(tmp_path):
     assert np.abs(np.median(photo.reshape(-1, 3), axis=0) - (150, 140, 120)).max() < 5  # the table's red, green, blue
 
 
-def test_depth_is_whole_millimetres_and_zero_where_unknown():
+def test_depth_is_integer_millimetres_and_zero_where_unknown():
     depth = np.array([[0.9004, np.nan, -1.0, 0.0, 70.0, np.inf]], np.float32)
     assert depth_in_mm(depth).tolist() == [[900, 0, 0, 0, 0, 0]]
     assert depth_in_mm(depth).dtype == np.uint16
@@ -125,7 +125,7 @@ def test_times_count_from_the_beginning_of_the_recording(tmp_path):
     assert times[-1] < ends[-1]
 
 
-def test_the_recording_says_how_it_was_collected(tmp_path):
+def test_the_recording_contains_the_settings_of_its_collection(tmp_path):
     run(tmp_path / "r", grasps=2)
     info = json.loads((tmp_path / "r" / "recording.json").read_text())
     assert (info["source"], info["sensor"], info["rig"], info["seed"]) == ("fake rig", "fake gel", "fake", 3)
@@ -142,24 +142,24 @@ def test_every_attempt_is_logged_with_its_reason_and_acceptance_reads_it(tmp_pat
     assert all("wider than the stroke" in reason for reason in tallies["wide-1"].reasons)
 
 
-# When it ends -----------------------------------------------------------------------------------------------
+# End conditions ---------------------------------------------------------------------------------------------
 
 
-def test_an_object_that_cannot_be_grasped_is_given_up(tmp_path):
+def test_an_object_that_cannot_be_grasped_ends_at_the_limit_of_attempts(tmp_path):
     tallies = run(tmp_path / "r", ["wide-0", "none-1", "round-2"], grasps=1)
     assert [each.accepted for each in tallies.values()] == [0, 0, 1]
     assert tallies["wide-0"].attempts == tallies["none-1"].attempts == 4 * 1 + 10
-    assert any("nothing" in reason or "reach no lower" in reason for reason in tallies["none-1"].reasons)
+    assert any("no object" in reason or "lowest height" in reason for reason in tallies["none-1"].reasons)
 
 
 def test_the_number_of_attempts_is_a_setting(tmp_path):
-    assert run(tmp_path / "r", ["wide-0"], most=3)["wide-0"].attempts == 3
+    assert run(tmp_path / "r", ["wide-0"], limit=3)["wide-0"].attempts == 3
 
 
-def test_an_object_that_was_given_up_is_not_tried_again_when_the_collection_goes_on(tmp_path):
-    run(tmp_path / "r", ["wide-0"], most=3)
+def test_an_object_at_its_limit_is_not_tried_again_when_the_collection_continues(tmp_path):
+    run(tmp_path / "r", ["wide-0"], limit=3)
     before = files(tmp_path / "r")
-    assert run(tmp_path / "r", ["wide-0"], most=3)["wide-0"].attempts == 3
+    assert run(tmp_path / "r", ["wide-0"], limit=3)["wide-0"].attempts == 3
     assert files(tmp_path / "r") == before
 
 
@@ -185,11 +185,11 @@ def test_more_objects_may_be_added(tmp_path):
 
 
 def test_progress_is_reported_after_every_attempt(tmp_path):
-    told: list[Progress] = []
-    run(tmp_path / "r", ["round-0", "wide-1"], grasps=2, most=4, progress=told.append)
-    assert [each.attempts for each in told] == list(range(len(told)))
-    assert (told[0].grasps_done, told[0].objects_done, told[0].seconds_left, told[0].accept_rate) == (0, 0, None, 0.0)
-    last = told[-1]
+    reports: list[Progress] = []
+    run(tmp_path / "r", ["round-0", "wide-1"], grasps=2, limit=4, progress=reports.append)
+    assert [each.attempts for each in reports] == list(range(len(reports)))
+    first, last = reports[0], reports[-1]
+    assert (first.grasps_done, first.objects_done, first.seconds_left, first.accept_rate) == (0, 0, None, 0.0)
     assert (last.objects, last.objects_done, last.grasps_wanted, last.grasps_done, last.accepted) == (2, 2, 4, 4, 2)
     assert last.accept_rate == 2 / last.attempts
     assert str(last) == f"2 of 2 objects, {2 / last.attempts:.0%} of {last.attempts} attempts accepted"
@@ -197,7 +197,7 @@ def test_progress_is_reported_after_every_attempt(tmp_path):
 
 
 class OneRig(FakeRig):
-    """A rig as real ones are: one of it, whose devices read back a little else each time."""
+    """A rig that exists once, like a real one, and whose devices read back slightly different values each time."""
 
     can_run_jobs = False
     times = 0
@@ -207,38 +207,38 @@ class OneRig(FakeRig):
         return super().settings() | {"fake gel a": {"exposure_ms": 10 + 0.1 * OneRig.times}}
 
 
-def test_a_collection_goes_on_with_devices_that_read_back_other_values(tmp_path):
+def test_a_collection_continues_with_devices_that_read_back_other_values(tmp_path):
     def interrupted(now):
         if now.attempts == 1:
             raise KeyboardInterrupt
 
-    object_fit = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(2)}
+    arguments = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(2)}
     with pytest.raises(KeyboardInterrupt):
-        collect(lambda: OneRig(3), tmp_path / "r", progress=interrupted, **object_fit)
-    collect(lambda: OneRig(3), tmp_path / "r", **object_fit)
+        collect(lambda: OneRig(3), tmp_path / "r", progress=interrupted, **arguments)
+    collect(lambda: OneRig(3), tmp_path / "r", **arguments)
     assert sum(grasp.grasped for grasp in read_recording(tmp_path / "r").grasps) == 2
     assert OneRig.times == 2
 
 
 @pytest.mark.parametrize("make", [OneRig, FakeRig])
-def test_a_collection_of_software_that_said_nothing_of_the_gels_goes_on(tmp_path, make):
-    object_fit = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(1)}
-    collect(lambda: make(3), tmp_path / "r", **object_fit)
+def test_a_recording_without_gels_of_an_older_version_can_be_continued(tmp_path, make):
+    arguments = {"objects": ["round-0"], "seed": 3, "settings": CollectSettings(1)}
+    collect(lambda: make(3), tmp_path / "r", **arguments)
     path = tmp_path / "r" / "recording.json"
     info = json.loads(path.read_text())
     assert info.pop("gels") == "unknown"
     path.write_text(json.dumps(info))
 
-    def knowing():
+    def make_with_gels():
         rig = make(3)
         rig.info["gels"] = [{"a": {"thickness_mm": 2.0}}]
         return rig
 
-    collect(knowing, tmp_path / "r", **(object_fit | {"objects": ["round-0", "round-2"]}))
+    collect(make_with_gels, tmp_path / "r", **(arguments | {"objects": ["round-0", "round-2"]}))
     assert {grasp.object_id for grasp in read_recording(tmp_path / "r").grasps} == {"round-0", "round-2"}
 
 
-# What is asked of the devices -------------------------------------------------------------------------------
+# Calls of the devices ---------------------------------------------------------------------------------------
 
 
 def calls_of(attempt, name="round-0", faults=None, seed=3):
@@ -256,15 +256,15 @@ def test_the_order_of_the_calls_of_an_attempt():
 
 
 @pytest.mark.parametrize("faults", [{}, {"grasp": {1}}, {"gel a": {3}}, {"open": {3}}])
-def test_what_begins_low_goes_straight_up_or_down(faults, monkeypatch):
-    """On a slant, open jaws sweep over the object that was put down a moment before."""
+def test_a_motion_that_begins_low_is_vertical(faults, monkeypatch):
+    """On a slant, open jaws would hit the object that was just put down."""
     moves, real = [], FakeArm._move_to
 
-    def noted(self, pose, speed_mm_s):
+    def recorded(self, pose, speed_mm_s):
         moves.append((self.world.pose, pose))
         return real(self, pose, speed_mm_s)
 
-    monkeypatch.setattr(FakeArm, "_move_to", noted)
+    monkeypatch.setattr(FakeArm, "_move_to", recorded)
     rig = FakeRig(3, faults=faults)
     with rig:
         attempter = AttemptRunner(rig, 3, AttemptSettings())
@@ -275,7 +275,7 @@ def test_what_begins_low_goes_straight_up_or_down(faults, monkeypatch):
     assert all((here.x_mm, here.y_mm, here.yaw_rad) == (there.x_mm, there.y_mm, there.yaw_rad) for here, there in low)
 
 
-def test_where_the_place_is_given_no_depth_is_asked_for_and_the_object_is_put_back_there():
+def test_with_a_given_place_no_depth_is_read_and_the_object_is_put_back_there():
     rig = FakeRig(3)
     with rig:
         rig.prepare("round-0", 0)
@@ -295,7 +295,7 @@ def test_where_the_place_is_given_no_depth_is_asked_for_and_the_object_is_put_ba
 
 
 class Picky(CylinderPlanner):
-    """Takes thin things for ungraspable."""
+    """Rejects thin objects as ungraspable."""
 
     def plan(self, rig, image, settings, rng):
         if rig.world.solid.radius < 10:
@@ -310,7 +310,7 @@ def picky_rig():
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_what_a_planner_says_is_ungraspable_is_skipped_at_once_and_the_others_are_collected(tmp_path, jobs):
+def test_an_ungraspable_object_is_skipped_at_once_and_the_others_are_collected(tmp_path, jobs):
     settings = CollectSettings(2, None, AttemptSettings())
     tallies = collect(picky_rig, tmp_path / "r", objects=NAMES, seed=3, settings=settings, jobs=jobs)
     assert [(each.accepted, each.skipped) for each in tallies] == [(2, None), (0, "too thin"), (2, None)]
@@ -321,11 +321,11 @@ def test_what_a_planner_says_is_ungraspable_is_skipped_at_once_and_the_others_ar
     (tmp_path / "r" / "recording.json").write_text(
         json.dumps(json.loads(before["recording.json"]) | {"skipped_objects": {}})
     )
-    collect(picky_rig, tmp_path / "r", objects=NAMES, seed=3, settings=settings)  # as after a crash between the two
+    collect(picky_rig, tmp_path / "r", objects=NAMES, seed=3, settings=settings)  # as after a crash between both writes
     assert files(tmp_path / "r") == before
 
 
-def test_a_planner_without_need_of_depth_has_none_taken():
+def test_no_depth_is_read_for_a_planner_that_needs_none():
     class Blind(Picky):
         needs_depth = False
 
@@ -334,7 +334,7 @@ def test_a_planner_without_need_of_depth_has_none_taken():
             solid = rig.world.solid
             pose = Pose(solid.x, solid.y, 40.0, 0.5)
             return GraspPlan(
-                pose, dataclasses.replace(pose, z_mm=250.0), rig.gripper.stroke_mm, 12.0, fit={"seen": "not"}
+                pose, dataclasses.replace(pose, z_mm=250.0), rig.gripper.stroke_mm, 12.0, fit={"method": "none"}
             )
 
     rig = FakeRig(3)
@@ -342,16 +342,16 @@ def test_a_planner_without_need_of_depth_has_none_taken():
     with rig:
         attempt = AttemptRunner(rig, 3, AttemptSettings(outputs=("before",))).run("round-0", 0)
     assert "depth" not in rig.world.calls
-    assert (attempt.fields["force_n"], attempt.fit) == (12.0, {"seen": "not"})
+    assert (attempt.fields["force_n"], attempt.fit) == (12.0, {"method": "none"})
 
 
 def test_a_person_is_asked_to_put_the_object_back_before_each_attempt_at_a_given_place():
-    asked = []
+    requests = []
     rig = FakeRig(3)
-    rig.ask, rig.object_fit = asked.append, CylinderFit(5.0, -2.5, 100.0, 30.0, 1.0, "given", (30.0, 30.0))
+    rig.ask, rig.object_fit = requests.append, CylinderFit(5.0, -2.5, 100.0, 30.0, 1.0, "given", (30.0, 30.0))
     for number in range(2):
         Rig.prepare(rig, "mug", number)
-    assert asked == ["Put mug at x 5, y -2.5 mm, alone, and press Enter."] * 2
+    assert requests == ["Put mug at x 5, y -2.5 mm, alone, and press Enter."] * 2
 
 
 def test_a_person_is_not_asked_to_rise_first(monkeypatch):
@@ -360,7 +360,7 @@ def test_a_person_is_not_asked_to_rise_first(monkeypatch):
     assert calls[:3] == ["open", "arm", "depth"]
 
 
-def test_what_is_not_recorded_is_not_asked_for(tmp_path):
+def test_devices_are_not_read_for_outputs_that_are_not_recorded(tmp_path):
     _, calls = calls_of(AttemptSettings(outputs=()))
     assert calls.count("gel a") == 1
     _, calls = calls_of(AttemptSettings(outputs=("after",)))
@@ -377,22 +377,22 @@ def test_no_plan_moves_nothing_but_home():
     assert calls == ["open", "arm", "arm", "depth"]
 
 
-def test_the_gate_that_needs_what_is_not_recorded_says_so(tmp_path):
-    with pytest.raises(RobotConfigError, match="compares with the untouched gel"):
+def test_a_gate_without_its_frames_raises(tmp_path):
+    with pytest.raises(RobotConfigError, match="requires no-contact frames"):
         run(tmp_path / "r", attempt=AttemptSettings(outputs=("depth",)))
 
 
 def test_any_gate_decides_which_grasps_are_accepted(tmp_path):
-    seen = []
+    calls = []
 
     def picky(touches):
-        seen.append(sorted(touches))
+        calls.append(sorted(touches))
         frames = touches["a"]
         assert frames.before.shape == frames.during.shape == frames.after.shape == (24, 32, 3)
-        return 0.75 if len(seen) % 3 == 0 else 0.25
+        return 0.75 if len(calls) % 3 == 0 else 0.25
 
     tallies = run(tmp_path / "r", ["round-0"], grasps=2, gate=picky, gate_name="picky")
-    assert seen == [["a", "b"]] * 6
+    assert calls == [["a", "b"]] * 6
     assert tallies["round-0"].accepted == 2
     logged = read_attempts(tmp_path / "r", {row["grasp_id"] for row in rows(tmp_path / "r")})
     assert [attempt.score for attempt in logged] == [0.25, 0.25, 0.75] * 2
@@ -425,7 +425,7 @@ def test_other_seeds_give_other_grasps(tmp_path):
 
 
 def test_random_numbers_are_those_of_the_triple():
-    """By hand: the force is the fifth number of the generator seeded with seed, crc32 of the name, and number."""
+    """The force is the fifth number of the generator seeded with seed, crc32 of the name, and number."""
     result, _ = calls_of(AttemptSettings(grasp=GraspSettings(force_n=(10.0, 20.0))))
     rng = np.random.default_rng([3, zlib.crc32(b"round-0"), 0])
     rng.uniform(-1, 1, 2), rng.uniform(), rng.uniform(0, np.pi)
@@ -436,7 +436,7 @@ def test_random_numbers_are_those_of_the_triple():
 
 
 @pytest.mark.parametrize("device", ["arm", "depth", "gel a", "gel b", "grasp", "open"])
-def test_an_attempt_whose_device_failed_is_made_again_and_nothing_shows(tmp_path, device):
+def test_an_attempt_is_repeated_after_a_device_failure_and_the_recording_is_the_same(tmp_path, device):
     run(tmp_path / "r", ["round-0"])
     run(tmp_path / "s", ["round-0"], faults={device: {2, 5}})
     assert files(tmp_path / "r") == files(tmp_path / "s")
@@ -458,7 +458,7 @@ def test_a_device_that_fails_too_often_ends_the_collection_with_the_jaws_open(tm
     assert len(read_recording(tmp_path / "r").grasps) == len(rows(tmp_path / "r"))
 
 
-def test_after_the_device_was_mended_the_collection_goes_on(tmp_path):
+def test_a_collection_continues_after_the_device_was_repaired(tmp_path):
     with pytest.raises(DeviceError):
         run(tmp_path / "r", faults={"grasp": set(range(4, 100))})
     run(tmp_path / "r")
@@ -468,19 +468,19 @@ def test_after_the_device_was_mended_the_collection_goes_on(tmp_path):
 
 def test_a_gripper_that_never_stops_moving_is_a_fault(monkeypatch):
     monkeypatch.setattr("tests.fake_rig.FakeRigState.status", lambda self: "idle" if self.force is None else "moving")
-    with pytest.raises(DeviceError, match="must be holding, no_part or part_lost after a lift; it says moving"):
+    with pytest.raises(DeviceError, match="must report holding, no_part or part_lost after a lift, got moving"):
         calls_of(AttemptSettings())
 
 
 def test_a_frozen_gel_is_a_fault_and_not_a_recording(monkeypatch):
-    """A stream that stands still gives the frame from before the grasp as the frame of the grasp."""
+    """A frozen stream would return the no-contact frame as the frame of the grasp."""
     from robot.readings import Frame
     from tests.fake_rig import FakeSensor
 
-    real, kept = FakeSensor._read, {}
+    real, first = FakeSensor._read, {}
 
     def frozen(self):
-        frame = kept.setdefault(self.finger, real(self))
+        frame = first.setdefault(self.finger, real(self))
         return Frame(frame.pixels, frame.time_s)
 
     monkeypatch.setattr(FakeSensor, "_read", frozen)
@@ -488,12 +488,12 @@ def test_a_frozen_gel_is_a_fault_and_not_a_recording(monkeypatch):
         calls_of(AttemptSettings())
 
 
-def test_the_first_error_is_told_even_if_the_jaws_cannot_be_opened(tmp_path):
+def test_the_first_error_is_reported_even_if_the_jaws_cannot_be_opened(tmp_path):
     with pytest.raises(DeviceError, match="last: the fake grasp was told to fail"):
         run(tmp_path / "r", faults={"grasp": set(range(1, 9)), "open": {3, 4, 7, 8, 11, 12}})
 
 
-def test_ctrl_c_in_the_middle_leaves_open_jaws_a_closed_rig_and_a_whole_recording(tmp_path, monkeypatch):
+def test_ctrl_c_during_an_attempt_leaves_open_jaws_a_closed_rig_and_a_complete_recording(tmp_path, monkeypatch):
     from tests.fake_rig import FakeGripper
 
     rigs, real = [], FakeGripper._grasp
@@ -520,12 +520,12 @@ def test_ctrl_c_in_the_middle_leaves_open_jaws_a_closed_rig_and_a_whole_recordin
     assert files(tmp_path / "r") == files(tmp_path / "whole")
 
 
-# What is refused --------------------------------------------------------------------------------------------
+# Errors -----------------------------------------------------------------------------------------------------
 
-OTHERWISE = {
+OTHER_SETTINGS = {
     "another seed": ({"seed": 4}, "was collected with seed 3, not 4"),
     "more grasps": ({"grasps": 3}, "was collected with grasps 2, not 3"),
-    "another limit": ({"most": 5}, "was collected with most attempts 18, not 5"),
+    "another limit": ({"limit": 5}, "was collected with most attempts 18, not 5"),
     "other forces": (
         {"attempt": AttemptSettings(grasp=GraspSettings(force_n=(5, 30)))},
         r"with attempt\.grasp\.force n \[5\.0, 25\.0\], not \[5\.0, 30\.0\]",
@@ -536,12 +536,12 @@ OTHERWISE = {
 }
 
 
-@pytest.mark.parametrize("case", OTHERWISE)
-def test_a_recording_that_was_collected_otherwise_is_refused_and_left_alone(tmp_path, case):
+@pytest.mark.parametrize("case", OTHER_SETTINGS)
+def test_a_recording_with_other_settings_is_refused_and_not_changed(tmp_path, case):
     run(tmp_path / "r")
     before = files(tmp_path / "r")
-    options, words = OTHERWISE[case]
-    with pytest.raises(RecordingError, match=words):
+    options, message = OTHER_SETTINGS[case]
+    with pytest.raises(RecordingError, match=message):
         run(tmp_path / "r", **options)
     assert files(tmp_path / "r") == before
 
@@ -554,7 +554,7 @@ def test_a_recording_of_another_version_is_refused(tmp_path):
     with pytest.raises(RecordingError, match=r"was collected with software version '0\.0\.1', not"):
         run(tmp_path / "r")
     path.write_text(json.dumps({**info, "schema_version": 2}))
-    with pytest.raises(RecordingError, match=r"schema_version must be one this software knows \(1\), got 2"):
+    with pytest.raises(RecordingError, match=r"schema_version must be a supported one \(1\), got 2"):
         run(tmp_path / "r")
 
 
@@ -572,24 +572,24 @@ def test_a_lost_log_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         ({"names": []}, "at least one object"),
         ({"names": ["a", "a"]}, "different names"),
         ({"jobs": 0}, "jobs must be at least 1"),
         ({"grasps": 0}, "must be at least 1"),
-        ({"most": 0}, "must be at least 1"),
+        ({"limit": 0}, "must be at least 1"),
         ({"attempt": AttemptSettings(grasp=GraspSettings(force_n=(1.0, 2.0)))}, "force_n must be within 5 to 80 N"),
     ],
 )
-def test_settings_out_of_range_are_refused_before_a_folder_is_made(tmp_path, options, words):
-    with pytest.raises(RobotConfigError, match=words):
+def test_settings_out_of_range_are_refused_before_a_folder_is_made(tmp_path, options, message):
+    with pytest.raises(RobotConfigError, match=message):
         run(tmp_path / "r", **options)
     assert not (tmp_path / "r").exists()
 
 
 @pytest.mark.parametrize("name", ["", " ", "a\nb", "caf\udce9"])
-def test_an_object_without_a_name_that_can_be_recorded_is_refused_before_anything_moves(tmp_path, name):
+def test_an_object_with_an_invalid_name_is_refused_before_any_motion(tmp_path, name):
     with pytest.raises(RecordingError, match="an object's name must be a non-empty printable string"):
         run(tmp_path / "r", names=["round-0", name])
     assert not (tmp_path / "r").exists()
@@ -604,13 +604,13 @@ def test_an_attempt_setting_out_of_range_is_refused(setting):
         AttemptSettings(**setting)
 
 
-def test_a_real_rig_cannot_be_doubled(tmp_path, monkeypatch):
+def test_a_real_rig_cannot_run_in_several_jobs(tmp_path, monkeypatch):
     monkeypatch.setattr(FakeRig, "can_run_jobs", False)
-    with pytest.raises(RobotConfigError, match=r"there is one such rig \(FakeRig\), so jobs must be 1, got 2"):
+    with pytest.raises(RobotConfigError, match=r"FakeRig can run only once, so jobs must be 1, got 2"):
         run(tmp_path / "r", jobs=2)
 
 
-def test_a_full_disk_raises_and_recorded_grasps_are_whole(tmp_path, monkeypatch):
+def test_a_full_disk_raises_and_recorded_grasps_are_complete(tmp_path, monkeypatch):
     from robot.recording import folder as module
 
     real, count = module.write_files, []
@@ -623,7 +623,7 @@ def test_a_full_disk_raises_and_recorded_grasps_are_whole(tmp_path, monkeypatch)
         real(contents)
 
     monkeypatch.setattr(module, "write_files", full)
-    with pytest.raises(StorageError, match="No space left on device; what was appended before is whole"):
+    with pytest.raises(StorageError, match="No space left on device; earlier grasps are complete"):
         run(tmp_path / "r")
     monkeypatch.undo()
     assert len(read_recording(tmp_path / "r").grasps) == 1
@@ -636,7 +636,7 @@ def test_a_full_disk_raises_and_recorded_grasps_are_whole(tmp_path, monkeypatch)
 
 
 @pytest.mark.parametrize("object_id", ["mug", "cup 7", "größe", ".hidden", "x" * 200, "a/b"])
-def test_a_grasp_has_a_name_that_a_recording_takes(tmp_path, object_id):
+def test_a_grasp_has_an_id_that_a_recording_accepts(tmp_path, object_id):
     image = np.zeros((2, 2, 3), np.uint8)
     with RecordingWriter(tmp_path, {"source": "test", "sensor": "test"}) as writer:
         for number in (0, 12345):
@@ -644,18 +644,18 @@ def test_a_grasp_has_a_name_that_a_recording_takes(tmp_path, object_id):
     assert grasp_id_of("mug", 7) == "mug-0007"
 
 
-def test_names_that_look_alike_stay_apart():
+def test_similar_names_have_different_grasp_ids():
     names = ["a b", "a_b", "a/b", "a:b", "y" * 150, "y" * 151]
     assert len({grasp_id_of(name, 0) for name in names}) == len(names)
 
 
-def test_the_picture_of_the_camera_is_not_changed_by_what_is_made_of_it():
+def test_the_fit_does_not_change_the_picture_of_the_camera():
     with FakeRig(3) as rig:
         rig.prepare("round-0", 0)
         image = rig.camera.read()
-    kept = RGBD(image.colour.copy(), image.depth_m.copy(), image.intrinsics, 0.0)
+    copy = RGBD(image.colour.copy(), image.depth_m.copy(), image.intrinsics, 0.0)
     from robot.sight.cylinder import fit_cylinder
 
     fit_cylinder(image, rig.camera.extrinsics)
-    assert (image.colour == kept.colour).all()
-    np.testing.assert_array_equal(image.depth_m, kept.depth_m)
+    assert (image.colour == copy.colour).all()
+    np.testing.assert_array_equal(image.depth_m, copy.depth_m)

@@ -1,4 +1,4 @@
-"""The contract of devices: what the base classes refuse before a driver sees it, and what they do not let out."""
+"""The base classes of devices: their checks of arguments and of results."""
 
 import math
 
@@ -12,7 +12,7 @@ from tests.fake_rig import FORCE_N, STROKE_MM, WORKSPACE, FakeArm, FakeGripper, 
 
 
 class Plug(Device):
-    """Counts, and fails when told to."""
+    """A device that records calls and fails on request."""
 
     def __init__(self, connects=True, closes=True):
         super().__init__("plug")
@@ -33,7 +33,7 @@ class Plug(Device):
 
 
 class Gel(TactileSensor):
-    """Gives the frame it was given."""
+    """A sensor that returns a given frame."""
 
     def __init__(self, frame, now=100.0):
         super().__init__("gel", "a", clock=lambda: now)
@@ -46,16 +46,16 @@ class Gel(TactileSensor):
 
 
 class Eye(Camera):
-    """Gives the picture it was given, and notes what was asked."""
+    """A camera that returns a given picture and records requests for depth."""
 
     def __init__(self, image, extrinsics=None):
         super().__init__("eye", np.eye(4) if extrinsics is None else extrinsics, clock=lambda: image.time_s)
-        self.image, self.asked = image, []
+        self.image, self.depth_requests = image, []
 
     def _connect(self): ...
     def _close(self): ...
     def _read(self, depth):
-        self.asked.append(depth)
+        self.depth_requests.append(depth)
         return self.image
 
 
@@ -78,7 +78,7 @@ def test_a_device_is_connected_once_and_closed_once():
     assert not plug.is_connected
 
 
-def test_a_device_that_fails_to_connect_is_cleaned_up_and_can_be_tried_again():
+def test_a_device_that_fails_to_connect_is_closed_and_can_be_tried_again():
     plug = Plug(connects=False)
     with pytest.raises(DeviceError, match="plug cannot be connected: Connection timed out"):
         plug.connect()
@@ -89,12 +89,12 @@ def test_a_device_that_fails_to_connect_is_cleaned_up_and_can_be_tried_again():
     assert plug.is_connected
 
 
-def test_what_fails_after_a_failed_connection_does_not_hide_why():
+def test_a_failure_to_close_after_a_failed_connection_does_not_hide_the_first_error():
     with pytest.raises(DeviceError, match="Connection timed out"):
         Plug(connects=False, closes=False).connect()
 
 
-def test_a_device_that_fails_to_close_says_so_once_and_counts_as_closed():
+def test_a_device_that_fails_to_close_raises_once_and_counts_as_closed():
     plug = Plug(closes=False)
     plug.connect()
     with pytest.raises(DeviceError, match="plug cannot be closed: Input/output error"):
@@ -141,24 +141,24 @@ def test_a_pose_out_of_the_workspace_never_reaches_the_arm(pose):
         with pytest.raises(DeviceError, match="must be in the workspace"):
             arm.move_to(pose, 100)
         assert "arm" not in arm.world.calls
-        arm.move_to(Pose(150, -150, 8, 0), 100)  # its faces belong to it
+        arm.move_to(Pose(150, -150, 8, 0), 100)  # the faces belong to the workspace
         assert arm.pose() == Pose(150, -150, 8, 0)
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_a_place_that_is_no_number_never_leaves_the_arm(bad, monkeypatch):
+def test_a_pose_that_is_not_finite_is_never_returned(bad, monkeypatch):
     for place in range(4):
         lost = Pose(*(bad if axis == place else 9.0 for axis in range(4)))
         monkeypatch.setattr(FakeArm, "_pose", lambda arm, lost=lost: lost)
         monkeypatch.setattr(FakeArm, "_move_to", lambda arm, pose, speed, lost=lost: lost)
         with FakeArm(FakeRigState(0)) as arm:
-            for ask in (arm.pose, lambda arm=arm: arm.move_to(Pose(0, 0, 100, 0), 100)):
-                with pytest.raises(DeviceError, match="fake arm: the pose that an arm reports must be finite"):
-                    ask()
+            for read in (arm.pose, lambda arm=arm: arm.move_to(Pose(0, 0, 100, 0), 100)):
+                with pytest.raises(DeviceError, match="fake arm: the reported pose must be finite"):
+                    read()
 
 
 @pytest.mark.parametrize("lens", [(math.nan, 1, 0, 0), (1, 0, 0, 0), (1, math.inf, 0, 0), (1, 1, math.nan, 0)])
-def test_a_lens_that_is_no_lens_is_refused(lens):
+def test_invalid_intrinsics_are_refused(lens):
     with pytest.raises(DeviceError, match="intrinsics must be finite, up to a million pixels"):
         Intrinsics(*lens)
 
@@ -186,7 +186,7 @@ def test_an_opening_beyond_the_stroke_never_reaches_the_gripper(opening):
         assert gripper.open(STROKE_MM) == GripperState(STROKE_MM, 0.0, "idle")
 
 
-def test_a_gripper_says_only_what_the_contract_knows():
+def test_a_gripper_state_outside_the_contract_is_refused():
     with pytest.raises(DeviceError, match="must be one of idle, moving, holding, no_part, part_lost, got 'lost'"):
         GripperState(1.0, 0.0, "lost")
     with pytest.raises(DeviceError, match="finite"):
@@ -194,12 +194,12 @@ def test_a_gripper_says_only_what_the_contract_knows():
 
 
 @pytest.mark.parametrize("corners", [((0, 0, 0), (1, 1, 0)), ((0, 0, 0), (1, 1, math.nan)), ((0, 0), (1, 1))])
-def test_a_box_has_a_volume(corners):
+def test_a_region_without_volume_is_refused(corners):
     with pytest.raises(RobotConfigError, match="lower < upper"):
         Region(*corners)
 
 
-def test_the_workspace_of_the_fake_arm_is_what_these_tests_think():
+def test_the_workspace_of_the_fake_arm_is_that_of_these_tests():
     assert Region((-150.0, -150.0, 8.0), (150.0, 150.0, 500.0)) == WORKSPACE
 
 
@@ -211,18 +211,18 @@ def frame(age=0.0, now=100.0, pixels=None):
 
 
 @pytest.mark.parametrize("age", [0.0, 0.5, -0.04])
-def test_a_fresh_frame_is_given(age):
+def test_a_fresh_frame_is_returned(age):
     with Gel(frame(age)) as gel:
         assert gel.read().time_s == 100.0 - age
 
 
 @pytest.mark.parametrize("age", [0.51, 1e6, -0.06, math.nan])
-def test_a_stale_frame_is_refused_and_so_is_one_of_the_future(age):
+def test_a_stale_frame_and_one_from_the_future_are_refused(age):
     with Gel(frame(age)) as gel, pytest.raises(DeviceError, match=r"gel: the frame must be at most 0\.5 s old"):
         gel.read()
 
 
-def test_how_old_a_frame_may_be_is_the_callers_choice():
+def test_the_caller_sets_the_largest_age_of_a_frame():
     with Gel(frame(0.3)) as gel:
         gel.read(max_age_s=0.3 + 1e-9)
         with pytest.raises(DeviceError, match=r"at most 0\.2 s old"):
@@ -233,20 +233,20 @@ def test_how_old_a_frame_may_be_is_the_callers_choice():
     "pixels",
     [np.zeros((2, 3), np.uint8), np.zeros((2, 3, 4), np.uint8), np.zeros((2, 3, 3)), np.zeros((0, 3, 3), np.uint8)],
 )
-def test_a_frame_is_colour_of_eight_bits(pixels):
+def test_a_frame_that_is_not_8_bit_colour_is_refused(pixels):
     with Gel(frame(pixels=pixels)) as gel, pytest.raises(DeviceError, match="must be H x W x 3 uint8"):
         gel.read()
 
 
-def test_depth_is_neither_asked_nor_given_when_it_is_not_wanted():
+def test_depth_is_neither_read_nor_returned_unless_requested():
     with Eye(picture()) as eye:
         assert eye.read(depth=False).depth_m is None
         assert eye.read().depth_m.shape == (4, 6)
-        assert eye.asked == [False, True]
+        assert eye.depth_requests == [False, True]
 
 
 @pytest.mark.parametrize("image", [picture(depth=False), picture(shape=(4, 5))])
-def test_depth_that_is_wanted_is_there_and_fits_the_colour(image):
+def test_requested_depth_that_is_missing_or_of_another_size_is_refused(image):
     with Eye(image) as eye:
         eye.read(depth=False)
         with pytest.raises(DeviceError, match="depth must be float32 of the colour's"):

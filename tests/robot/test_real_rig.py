@@ -1,4 +1,4 @@
-"""A rig of real devices from a file: what is built, what is refused, and that nothing is connected by reading it."""
+"""A rig of real devices from a file: its devices, its errors; reading the file connects nothing."""
 
 import datetime
 from dataclasses import replace
@@ -30,7 +30,7 @@ TABLES = {
 
 
 def written(tmp_path, **changed):
-    """A rig file with some tables replaced (None: left out)."""
+    """Write a rig file with some tables replaced (None: left out) and return its path."""
     tables = {**TABLES, **changed}
     path = tmp_path / "rig.toml"
     heads = {name: f"[{name}]\n" if name else "" for name in tables}
@@ -39,20 +39,20 @@ def written(tmp_path, **changed):
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
+def working_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "frames").mkdir()
 
 
 def points(tmp_path, days=0):
-    """A calibration file `days` old: a camera 800 mm above the table, upside down."""
+    """Write a calibration file `days` old, of a camera 800 mm above the table that points down."""
     camera = np.array([[0, 0, 800], [100, 0, 800], [0, 100, 800], [0, 0, 700], [90, 80, 650]], float)
     rig = camera * [1, -1, -1] + [0, 0, 800]
     when = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=days)
     hand_eye.fit_hand_eye(camera, rig, written=when).save(tmp_path / "hand_eye.json")
 
 
-def test_a_file_becomes_a_rig_with_its_devices_under_its_ceilings(tmp_path):
+def test_a_file_becomes_a_rig_with_its_devices_under_its_limits(tmp_path):
     rig = load_rig(written(tmp_path), seed=0)
     assert isinstance(rig.arm, ManualArm)
     assert isinstance(rig.gripper, WSG50)
@@ -67,20 +67,20 @@ def test_a_file_becomes_a_rig_with_its_devices_under_its_ceilings(tmp_path):
     assert not any(device.is_connected for device in rig.devices)
 
 
-def test_what_is_not_said_of_attempts_stays_under_the_ceilings(tmp_path):
+def test_default_attempt_settings_are_capped_by_the_limits(tmp_path):
     attempt = load_rig(written(tmp_path), seed=0).attempt
     assert attempt.grasp.force_n == (5.0, 15)
     assert (attempt.travel_mm_s, attempt.approach_mm_s, attempt.closing_mm_s) == (90, 50, 40)
 
 
-def test_what_is_known_of_the_gels_is_recorded_and_the_rest_is_called_unknown(tmp_path):
+def test_known_values_of_the_gels_are_recorded_and_the_others_are_unknown(tmp_path):
     unknown = {"thickness_mm": "unknown", "modulus_mpa": "unknown", "poisson": "unknown"}
     assert load_rig(written(tmp_path), seed=0).info["gels"] == [{"a": unknown}]
     rig = load_rig(written(tmp_path, **{"gel.a": "thickness_mm = 4"}), seed=0)
     assert rig.info["gels"] == [{"a": {**unknown, "thickness_mm": 4.0}}]
 
 
-def test_a_given_object_stands_for_what_a_camera_without_depth_cannot_see(tmp_path):
+def test_a_given_object_replaces_the_fit_for_a_camera_without_depth(tmp_path):
     object_fit = load_rig(written(tmp_path), seed=0).object_fit
     assert (object_fit.x_mm, object_fit.y_mm, object_fit.height_mm, object_fit.radius_mm, object_fit.method) == (
         0,
@@ -90,7 +90,7 @@ def test_a_given_object_stands_for_what_a_camera_without_depth_cannot_see(tmp_pa
         "given",
     )
     assert object_fit.width_mm(1.0, 25.0) == 60
-    with pytest.raises(RobotConfigError, match="has no depth: say where every object stands and how large it is"):
+    with pytest.raises(RobotConfigError, match="has no depth: give the place and size of every object"):
         load_rig(written(tmp_path, object=None), seed=0)
 
 
@@ -116,7 +116,7 @@ class Blind(GraspPlanner):
 BLIND = 'name = "tests.robot.test_real_rig:Blind"\nheight_mm = 40'
 
 
-def test_a_planner_of_a_users_module_plans_and_needs_no_depth_where_it_says_so(tmp_path):
+def test_a_planner_of_a_users_module_plans_without_depth_if_it_needs_none(tmp_path):
     rig = load_rig(written(tmp_path, planner=BLIND, object=None), seed=0)
     plan = rig.planner.plan(rig, None, rig.attempt.grasp, np.random.default_rng(0))
     assert plan.pose == Pose(1.0, 2.0, 40, 0.5)
@@ -131,22 +131,22 @@ def test_a_camera_without_depth_is_connected_for_a_planner_that_needs_none(tmp_p
         assert rig.camera.is_connected
 
 
-def test_a_camera_with_depth_must_be_calibrated_and_not_long_ago(tmp_path):
+def test_a_camera_with_depth_requires_a_recent_calibration(tmp_path):
     replay = 'driver = "replay"\npath = "recording"\nfx = 300\nfy = 300\ncx = 127.5\ncy = 127.5\n'
-    with pytest.raises(RobotConfigError, match="must say where it stands: hand_eye = FILE"):
+    with pytest.raises(RobotConfigError, match="a camera with depth requires hand_eye = FILE"):
         load_rig(written(tmp_path, camera=replay), seed=0)
     points(tmp_path)
     found = load_rig(written(tmp_path, camera=replay + 'hand_eye = "hand_eye.json"', object=None), seed=0)
     assert found.camera.extrinsics[:3, 3] == pytest.approx([0, 0, 800], abs=1e-6)
     assert found.object_fit is None
     points(tmp_path, days=40)
-    with pytest.raises(RobotConfigError, match="must be at most 30 days old, it is 40"):
+    with pytest.raises(RobotConfigError, match="must be at most 30 days old, got 40"):
         load_rig(written(tmp_path, camera=replay + 'hand_eye = "hand_eye.json"'), seed=0)
     longer = replay + 'hand_eye = "hand_eye.json"\nhand_eye_days = 60'
     assert load_rig(written(tmp_path, camera=longer), seed=0).camera.has_depth
 
 
-def test_a_recorded_camera_without_depth_is_told_when_it_is_connected(tmp_path, monkeypatch):
+def test_a_recorded_camera_without_depth_raises_when_it_is_connected(tmp_path, monkeypatch):
     from robot.errors import RobotError
 
     points(tmp_path)
@@ -156,7 +156,7 @@ def test_a_recorded_camera_without_depth_is_told_when_it_is_connected(tmp_path, 
         monkeypatch.setattr(device, "_connect", lambda: None)
         monkeypatch.setattr(device, "_close", lambda: None)
     rig.camera.has_depth = False
-    with pytest.raises(RobotError, match=r"how large it is, in \[object\]"):
+    with pytest.raises(RobotError, match=r"size of every object in \[object\]"):
         rig.connect()
     assert not any(device.is_connected for device in rig.devices)
 
@@ -165,12 +165,12 @@ BAD = {
     "an unknown driver": ({"arm": 'driver = "kuka"'}, r"\[arm\]: driver must be one of manual, sawyer; got 'kuka'"),
     "no driver": ({"gripper": 'port = "a"'}, r"\[gripper\]: driver must be one of wsg50; got None"),
     "an unknown key": ({"gripper": 'driver = "wsg50"\nport = "a"\nbort = 1'}, r"\[gripper\] has no setting 'bort'"),
-    "a key too few": ({"gripper": 'driver = "wsg50"'}, r"\[gripper\] must say 'port'"),
+    "a key too few": ({"gripper": 'driver = "wsg50"'}, r"\[gripper\] requires 'port'"),
     "an unknown table": ({"feet": "count = 2"}, "rig.toml has no setting 'feet'"),
-    "a table too few": ({"arm": None}, "rig.toml must say 'arm'"),
+    "a table too few": ({"arm": None}, "rig.toml requires 'arm'"),
     "an unknown finger": ({"sensors.c": 'driver = "images"\npath = "frames"'}, r"\[sensors.a\] and .*; got 'c'"),
     "an unknown limit": ({"limits": "force = 3"}, r"\[limits\] has no setting 'force'"),
-    "a limit too few": ({"limits": "force_n = 3"}, r"\[limits\] must say 'workspace_lower_mm'"),
+    "a limit too few": ({"limits": "force_n = 3"}, r"\[limits\] requires 'workspace_lower_mm'"),
     "a workspace inside out": (
         {"limits": "workspace_lower_mm = [0, 0, 9]\nworkspace_upper_mm = [1, 1, 1]"},
         "a region must have lower < upper",
@@ -179,46 +179,49 @@ BAD = {
         {"limits": "workspace_lower_mm = [0, 0]\nworkspace_upper_mm = [1, 1]"},
         r"\[limits\]: workspace_lower_mm must be a list of length 3, got",
     ),
-    "a limit of nothing": (
+    "a limit of zero": (
         {"limits": TABLES["limits"] + "\nstate_age_s = 0"},
         r"\[limits\]: state_age_s must be",
     ),
-    "a force above the ceiling": ({"grasp": "force_n = [5, 16]"}, r"\[grasp\]: force_n must be at most force_n = 15"),
-    "a speed above the ceiling": (
+    "a force above the limit": ({"grasp": "force_n = [5, 16]"}, r"\[grasp\]: force_n must be at most force_n = 15"),
+    "a speed above the limit": (
         {"attempt": "travel_mm_s = 91"},
         r"\[attempt\]: travel_mm_s must be at most arm_speed_mm_s = 90 of \[limits\], got 91",
     ),
-    "an unknown habit": ({"attempt": "speed = 3"}, r"\[attempt\] has no setting 'speed'"),
-    "a grasp through the back door": ({"attempt": "grasp = 3"}, r"\[attempt\] has no setting 'grasp'"),
+    "an unknown attempt setting": ({"attempt": "speed = 3"}, r"\[attempt\] has no setting 'speed'"),
+    "a grasp setting in [attempt]": ({"attempt": "grasp = 3"}, r"\[attempt\] has no setting 'grasp'"),
     "a force that is no range": ({"grasp": "force_n = 10"}, r"\[grasp\]: force_n must be a list"),
     "a force of three": ({"grasp": "force_n = [1, 2, 3]"}, r"force_n must be a list of length 2, got \[1, 2, 3\]"),
     "a list of drivers": ({"arm": 'driver = ["manual"]'}, r"\[arm\]: driver must be one of manual, sawyer; got \['man"),
-    "a speed without end": ({"attempt": "travel_mm_s = inf"}, r"attempt\.travel_mm_s must be a finite number"),
-    "a place that is none": ({"object": "x_mm = nan\ny_mm = 0\nheight_mm = 9\nradius_mm = 3"}, "x_mm must be a finite"),
-    "a gel of no finger": ({"gel.b": "thickness_mm = 4"}, r"of the fingers that feel, in \[gel\.a\]; got 'b'"),
+    "an infinite speed": ({"attempt": "travel_mm_s = inf"}, r"attempt\.travel_mm_s must be a finite number"),
+    "a place that is not a number": (
+        {"object": "x_mm = nan\ny_mm = 0\nheight_mm = 9\nradius_mm = 3"},
+        "x_mm must be a finite",
+    ),
+    "a gel of no finger": ({"gel.b": "thickness_mm = 4"}, r"a finger with a sensor: \[gel\.a\]; got 'b'"),
     "a gel of no thickness": (
         {"gel.a": "thickness_mm = 0"},
         r"\[gel\.a\]: thickness_mm must be from 0.01 to",
     ),
-    "an unknown word of a gel": ({"gel.a": "stiffness = 4"}, r"\[gel\.a\] has no setting 'stiffness'"),
+    "an unknown setting of a gel": ({"gel.a": "stiffness = 4"}, r"\[gel\.a\] has no setting 'stiffness'"),
     "an unknown planner": (
         {"planner": 'name = "sphere"'},
         r"\[planner\]: name must be one of cylinder, mesh; got 'sphere'. Give module:Class .* touch_retrieval.planners",
     ),
     "an unknown setting of a planner": (
         {"planner": "force = 3"},
-        r"\[planner\] has no setting 'force'; it knows sight",
+        r"\[planner\] has no setting 'force'; known settings: search_margin_mm",
     ),
     "a planner without its setting": (
         {"planner": 'name = "tests.robot.test_real_rig:Blind"'},
-        r"\[planner\] must say 'height_mm'",
+        r"\[planner\] requires 'height_mm'",
     ),
-    "a planner that looks inwards": (
+    "a planner with a negative margin": (
         {"planner": "search_margin_mm = -1"},
         r"\[planner\]: search_margin_mm must be from 0 to",
     ),
     "a planner of no name": ({"planner": "name = 3"}, r"\[planner\]: name must be one of cylinder, mesh.*; got 3"),
-    "a planner that is none": ({"planner": 'name = "json:dumps"'}, "'json:dumps' must be a GraspPlanner"),
+    "a planner that is another object": ({"planner": 'name = "json:dumps"'}, "'json:dumps' must be a GraspPlanner"),
     "meshes of a real rig": ({"planner": 'name = "mesh"'}, "plans for meshes of the simulated rig only"),
     "no time to settle": ({"attempt": "settle_s = 0"}, r"\[attempt\]: settle_s must be at least 0\.1 s"),
     "an object of no size": (
@@ -230,8 +233,8 @@ BAD = {
 
 @pytest.mark.parametrize("case", sorted(BAD))
 def test_a_wrong_file_is_refused_with_the_place_and_the_remedy(case, tmp_path):
-    changed, said = BAD[case]
-    with pytest.raises((RobotConfigError, UnknownName), match=said):
+    changed, message = BAD[case]
+    with pytest.raises((RobotConfigError, UnknownName), match=message):
         load_rig(written(tmp_path, **changed), seed=0)
 
 

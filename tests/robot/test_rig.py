@@ -1,4 +1,4 @@
-"""A rig connects all or nothing, always closes, and is built from its name or a TOML file."""
+"""A rig connects all devices or none, always closes them, and is built from its name or a TOML file."""
 
 import pytest
 
@@ -21,7 +21,7 @@ def test_all_devices_are_connected_in_order_and_closed_in_reverse():
 
 
 @pytest.mark.parametrize("number", range(len(ORDER)))
-def test_where_one_device_fails_none_stays_connected(number):
+def test_if_one_device_fails_none_stays_connected(number):
     rig = FakeRig(faults={f"{ORDER[number]}.connect": {1}})
     with pytest.raises(DeviceError, match="told to fail"):
         rig.connect()
@@ -37,7 +37,7 @@ def test_a_failed_connection_reports_its_first_error():
         rig.connect()
 
 
-def test_closing_goes_on_when_one_device_fails():
+def test_closing_continues_when_one_device_fails():
     rig = FakeRig(faults={"gel b.close": {1}, "arm.close": {1}})
     rig.connect()
     with pytest.raises(DeviceError, match=r"gel b\.close"):  # the first that failed
@@ -56,7 +56,7 @@ def test_closing_twice_and_before_connecting_does_nothing():
     assert events(rig, "close") == ORDER[::-1]
 
 
-def test_a_failure_to_close_does_not_hide_what_went_wrong_before():
+def test_a_failure_to_close_does_not_hide_the_first_error():
     with pytest.raises(ZeroDivisionError) as caught, FakeRig(faults={"arm.close": {1}}):
         _ = 1 / 0
     assert "while the rig was closed: the fake arm.close was told to fail" in caught.value.__notes__[0]
@@ -69,16 +69,16 @@ def test_settings_are_read_back_from_every_device():
 
 
 def test_a_person_is_asked_when_the_object_changes_and_only_then():
-    asked = []
+    requests = []
     fake = FakeRig()
-    rig = Rig(fake.arm, fake.gripper, fake.sensors, fake.camera, info={}, ask=asked.append)
+    rig = Rig(fake.arm, fake.gripper, fake.sensors, fake.camera, info={}, ask=requests.append)
     for object_id, number in [("mug", 0), ("mug", 1), ("cup", 0), ("mug", 2)]:
         rig.prepare(object_id, number)
-    assert [text.split()[1] for text in asked] == ["mug", "cup", "mug"]
+    assert [text.split()[1] for text in requests] == ["mug", "cup", "mug"]
     assert rig.object_ids(2) == ["object-0001", "object-0002"]
 
 
-def test_a_rig_whose_objects_nobody_changes_says_so():
+def test_a_rig_without_a_person_to_change_objects_raises():
     def nobody(text):
         raise EOFError
 
@@ -98,7 +98,7 @@ def test_fingers_are_in_order_however_they_were_given():
 FAKE = "tests.fake_rig:FakeRig"
 
 
-def test_a_rig_is_built_by_its_name_and_says_how():
+def test_a_rig_is_built_by_its_name_and_its_info_rebuilds_it():
     rig = load_rig(FAKE, seed=7, fingers=["a"])
     assert isinstance(rig, FakeRig)
     assert rig.world.seed == 7
@@ -113,28 +113,26 @@ def test_a_rig_is_built_from_a_toml_file(tmp_path):
     path.write_text('rig = "tests.fake_rig:FakeRig"\nfingers = ["b"]\n')
     rig = load_rig(str(path), seed=1)
     assert list(rig.sensors) == ["b"]
-    assert list(load_rig(str(path), seed=1, fingers=["a"]).sensors) == ["a"]  # what is said last counts
+    assert list(load_rig(str(path), seed=1, fingers=["a"]).sensors) == ["a"]  # the argument overrides the file
     path.write_text('rig = "tests.fake_rig:FakeRig"\n')
     assert list(load_rig(str(path), seed=1).sensors) == ["a", "b"]
 
 
 def test_an_unknown_rig_lists_the_known_ones():
-    with pytest.raises(
-        UnknownName, match=r"rig, where it is not a \.toml file, must be one of real, sim; got 'sawyer'"
-    ):
+    with pytest.raises(UnknownName, match=r"a rig that is not a \.toml file must be one of real, sim; got 'sawyer'"):
         load_rig("sawyer", seed=0)
 
 
 def test_an_unknown_setting_lists_the_known_ones():
-    with pytest.raises(RobotConfigError, match="FakeRig has no setting 'finger'; it knows faults, fingers"):
+    with pytest.raises(RobotConfigError, match="FakeRig has no setting 'finger'; known settings: faults, fingers"):
         load_rig(FAKE, seed=0, finger="a")
 
 
 BAD_FILES = {
     "rig = ": "is not TOML",
-    "[fake]": "must say which rig it is for",
-    'fingers = ["a"]': "must say which rig it is for",
-    "rig = 3": "must say which rig it is for",
+    "[fake]": "must name its rig",
+    'fingers = ["a"]': "must name its rig",
+    "rig = 3": "must name its rig",
     'rig = "none"': "must be one of real, sim; got 'none'",
     'rig = "tests.fake_rig:FakeRig"\ncolour = 3': "has no setting 'colour'",
     'rig = "tests.fake_rig:FakeRig"\n[fake]\nfingers = ["a"]': "has no setting 'fake'",
@@ -142,7 +140,7 @@ BAD_FILES = {
 
 
 @pytest.mark.parametrize("text", sorted(BAD_FILES))
-def test_a_wrong_file_says_what_is_wrong(tmp_path, text):
+def test_a_wrong_file_raises_with_the_reason(tmp_path, text):
     path = tmp_path / "rig.toml"
     path.write_text(text)
     with pytest.raises((RobotConfigError, UnknownName), match=BAD_FILES[text]):
@@ -150,7 +148,7 @@ def test_a_wrong_file_says_what_is_wrong(tmp_path, text):
 
 
 @pytest.mark.parametrize(
-    ("setting", "said"),
+    ("setting", "message"),
     [
         ("gels = 5.0", "gels must be a whole number, got 5.0"),
         ('fingers = "ab"', "fingers must be a list, got 'ab'"),
@@ -159,10 +157,10 @@ def test_a_wrong_file_says_what_is_wrong(tmp_path, text):
         ("contact_grid = [120.0, 160.0]", r"contact_grid\[0\] must be a whole number, got 120.0"),
     ],
 )
-def test_a_setting_of_another_type_says_which_is_wanted_and_in_which_file(tmp_path, setting, said):
+def test_a_setting_of_another_type_raises_with_the_file_and_the_required_type(tmp_path, setting, message):
     path = tmp_path / "rig.toml"
     path.write_text(f'rig = "sim"\n{setting}\n')
-    with pytest.raises(RobotConfigError, match=f"rig.toml: {said}"):
+    with pytest.raises(RobotConfigError, match=f"rig.toml: {message}"):
         load_rig(str(path), seed=0)
 
 
@@ -172,6 +170,6 @@ def test_a_seed_must_be_a_whole_number_from_0(seed):
         load_rig("sim", seed=seed)
 
 
-def test_a_file_that_is_not_there_is_named():
+def test_a_missing_file_is_named():
     with pytest.raises(RobotConfigError, match=r"nowhere\.toml cannot be read"):
         load_rig("nowhere.toml", seed=0)

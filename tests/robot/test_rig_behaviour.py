@@ -1,4 +1,4 @@
-"""What every rig does, whatever it is made of: one suite over a table of rigs. A driver's rig is a row here."""
+"""Behaviour of every rig: one suite over a table of rigs. The rig of a new driver is a row here."""
 
 import contextlib
 import dataclasses
@@ -22,7 +22,7 @@ RIGS = {
     "emulated, pty": lambda: emulated_rig(5, port="pty"),
     "replayed": replay_rig,
 }
-"""Rigs by name, each a context in which its devices are there."""
+"""Rigs by name, each a context in which its devices exist."""
 
 
 @pytest.fixture(params=sorted(RIGS))
@@ -39,13 +39,13 @@ def rig(unconnected):
         yield rig
 
 
-def middle(rig, share=0.5):
+def middle(rig, fraction=0.5):
     lower, upper = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)
-    x, y, z = (lower + share * (upper - lower)).tolist()
+    x, y, z = (lower + fraction * (upper - lower)).tolist()
     return Pose(x, y, z, 0.3)
 
 
-def test_it_is_a_rig_that_says_what_a_recording_must_know(unconnected: Rig):
+def test_a_rig_has_the_info_that_a_recording_requires(unconnected: Rig):
     assert {"source", "sensor"} <= set(unconnected.info)
     assert set(unconnected.sensors) <= {"a", "b"}
     assert unconnected.sensors
@@ -64,7 +64,7 @@ def test_it_connects_closes_twice_and_connects_again(unconnected: Rig):
         assert not any(device.is_connected for device in unconnected.devices)
 
 
-def test_stopping_what_stands_and_recovering_what_works_changes_nothing(rig: Rig):
+def test_stopping_still_devices_and_recovering_working_ones_changes_nothing(rig: Rig):
     rig.arm.move_to(middle(rig), 100.0)
     before = rig.gripper.open(40.0)
     rig.gripper.stop()
@@ -78,7 +78,7 @@ def test_stopping_what_stands_and_recovering_what_works_changes_nothing(rig: Rig
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, DeviceError])
-def test_what_fails_while_it_closes_leaves_jaws_that_stand_and_can_be_opened(rig: Rig, monkeypatch, error):
+def test_a_failure_while_closing_leaves_still_jaws_that_can_be_opened(rig: Rig, monkeypatch, error):
     def failing(*_):
         raise error("in the middle")
 
@@ -94,13 +94,13 @@ def test_what_fails_while_it_closes_leaves_jaws_that_stand_and_can_be_opened(rig
     assert rig.gripper.open(rig.gripper.stroke_mm).status == "idle"
 
 
-def test_fingers_are_seen_at_once(rig: Rig):
+def test_fingers_are_read_at_the_same_time(rig: Rig):
     frames, skew_s = read_together(rig.sensors)
     assert set(frames) == set(rig.sensors)
     assert 0 <= skew_s < 0.1
 
 
-def test_the_arm_goes_where_it_is_told_and_nowhere_else(rig: Rig):
+def test_the_arm_moves_to_its_target_and_refuses_poses_outside_the_workspace(rig: Rig):
     target = middle(rig)
     reached = rig.arm.move_to(target, 100.0)
     assert math.dist(reached.as_tuple(), target.as_tuple()) < 1.0
@@ -111,7 +111,7 @@ def test_the_arm_goes_where_it_is_told_and_nowhere_else(rig: Rig):
     assert math.dist(rig.arm.pose().as_tuple(), target.as_tuple()) < 1.0
 
 
-def test_the_gripper_opens_and_refuses_what_it_cannot_do(rig: Rig):
+def test_the_gripper_opens_and_refuses_values_out_of_range(rig: Rig):
     gripper = rig.gripper
     assert 0 < gripper.min_force_n < gripper.max_force_n
     state = gripper.open(gripper.stroke_mm)
@@ -133,7 +133,7 @@ def test_closing_on_nothing_is_no_part_and_opening_ends_it(rig: Rig):
     assert rig.gripper.open(rig.gripper.stroke_mm).status == "idle"
 
 
-def test_gels_are_seen_in_colour_and_fresh(rig: Rig):
+def test_gel_frames_are_in_colour_and_fresh(rig: Rig):
     for finger, sensor in rig.sensors.items():
         frame = sensor.read()
         assert sensor.finger == finger
@@ -143,7 +143,7 @@ def test_gels_are_seen_in_colour_and_fresh(rig: Rig):
         assert frame.pixels.std() > 0
 
 
-def test_the_camera_sees_colour_and_depth_of_one_size_from_above_the_table(rig: Rig):
+def test_the_camera_returns_colour_and_depth_of_one_size_from_above_the_table(rig: Rig):
     image = rig.camera.read()
     assert image.colour.shape[:2] == image.depth_m.shape
     assert np.nanmedian(image.depth_m) > 0.1
@@ -151,7 +151,7 @@ def test_the_camera_sees_colour_and_depth_of_one_size_from_above_the_table(rig: 
     assert rig.camera.extrinsics[2, 3] > 0
     columns = image.depth_m.shape[1]
     ray = np.array([(columns / 2 - image.intrinsics.cx) / image.intrinsics.fx, 0, 1.0])
-    assert (rig.camera.extrinsics[:3, :3] @ ray)[2] < 0  # it looks down
+    assert (rig.camera.extrinsics[:3, :3] @ ray)[2] < 0  # it points down
 
 
 def test_depth_and_extrinsics_put_the_table_near_zero(rig: Rig):
@@ -163,15 +163,15 @@ def test_depth_and_extrinsics_put_the_table_near_zero(rig: Rig):
     assert abs(np.median(height[height < 20])) < 10
 
 
-def test_settings_are_plain_and_of_every_device(rig: Rig):
+def test_settings_are_plain_json_of_every_device(rig: Rig):
     import json
 
     assert set(json.loads(json.dumps(rig.settings()))) == {device.name for device in rig.devices}
 
 
-def test_a_rig_that_can_be_doubled_prepares_from_seed_object_and_number_alone(unconnected: Rig):
+def test_a_rig_that_can_run_jobs_prepares_from_seed_object_and_number_alone(unconnected: Rig):
     if not unconnected.can_run_jobs:
-        pytest.skip("there is one such rig")
+        pytest.skip("this rig can run only once")
     names = unconnected.object_ids(2)
     with unconnected as rig:
         rig.prepare(names[0], 3)

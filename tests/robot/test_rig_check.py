@@ -1,4 +1,4 @@
-"""The check of a rig: every device on its own, gently, each failure a row."""
+"""The check of a rig: each device on its own, each failure a row."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from tests.fake_rig import FakeGripper, FakeRig, FakeSensor
 
 
 @pytest.fixture(autouse=True)
-def _a_short_look(monkeypatch):
+def _short_measurement(monkeypatch):
     monkeypatch.setattr(rig_check, "MEASURE_S", 0.2)
 
 
@@ -19,7 +19,7 @@ def rig():
     return FakeRig(5)
 
 
-def test_every_device_is_exercised_and_closed_and_comes_back(rig):
+def test_every_device_is_checked_moved_back_and_closed(rig):
     rows = list(check_rig(rig))
     assert [(row.role, row.failure) for row in rows] == [
         ("arm", None),
@@ -33,28 +33,28 @@ def test_every_device_is_exercised_and_closed_and_comes_back(rig):
     assert rows[1].measured["moved"] == "5 mm, off by 0.00 mm"
     assert rows[2].measured["size"] == "32 x 24"
     assert rows[4].measured["depth known"].endswith(" m")
-    assert rows[5].measured["apart"] == "0.0 ms (most 0.0)"
+    assert rows[5].measured["apart"] == "0.0 ms (max 0.0)"
     assert not any(device.is_connected for device in rig.devices)
     assert rig.world.pose == Pose(0, 0, 300, 0)
     assert rig.world.opening == 110.0
     assert "grasp" not in rig.world.calls
 
 
-def test_without_motion_arm_and_jaws_stay_where_they_are(rig):
+def test_without_motion_arm_and_jaws_do_not_move(rig):
     rows = list(check_rig(rig, motion=False))
     assert rows[0].measured["moved"] == "not"
     assert rows[0].measured["state in"].startswith("0.00 ms")
     assert {"arm", "open", "grasp"}.isdisjoint(rig.world.calls)
 
 
-def test_without_motion_what_connects_knows_that_it_must_not_move(rig):
+def test_without_motion_devices_connect_with_may_move_false(rig):
     assert rig.gripper.may_move
     list(check_rig(rig, motion=False))
     assert not rig.gripper.may_move
     assert not rig.arm.may_move
 
 
-def test_a_wrong_setting_that_shows_when_connecting_is_a_row_too(rig, monkeypatch):
+def test_a_configuration_error_on_connecting_is_a_row_too(rig, monkeypatch):
     def wrong(self):
         raise RobotConfigError("the calibration is for another size")
 
@@ -75,28 +75,28 @@ def test_a_device_that_fails_is_a_row_and_the_others_are_still_checked(rig):
 
 def test_a_held_object_is_not_released(rig, monkeypatch):
     monkeypatch.setattr(FakeGripper, "_state", lambda self: GripperState(40.0, 10.0, "holding"))
-    monkeypatch.setattr(FakeGripper, "_open", lambda *_: pytest.fail("it let go"))
+    monkeypatch.setattr(FakeGripper, "_open", lambda *_: pytest.fail("it opened"))
     (row,) = [row for row in check_rig(rig) if row.role == "gripper"]
     assert row.measured["moved"] == "not: it is holding"
 
 
 def test_refused_settings_are_reported(rig, monkeypatch):
-    rig.sensors["a"].refused = {"exposure": "asked 5, has 8"}
+    rig.sensors["a"].refused = {"exposure": "requested 5, has 8"}
     row = next(row for row in check_rig(rig) if row.device == "fake gel a")
-    assert row.line().endswith("; refused exposure: asked 5, has 8")
+    assert row.line().endswith("; refused exposure: requested 5, has 8")
 
 
-def test_an_arm_that_is_a_person_is_not_asked_for_motions(rig, monkeypatch):
+def test_a_manual_arm_is_not_moved(rig, monkeypatch):
     monkeypatch.setattr(type(rig.arm), "is_manual", True)
     row = next(check_rig(rig))
     assert row.measured == {"moved": "by a person"}
     assert "arm" not in rig.world.calls
 
 
-def test_a_stream_that_stands_is_one_frame(rig, monkeypatch):
+def test_a_frozen_stream_counts_as_one_frame(rig, monkeypatch):
     monkeypatch.setattr(rig_check, "MEASURE_S", 0.1)
-    kept = {}
+    first = {}
     real = FakeSensor._read
-    monkeypatch.setattr(FakeSensor, "_read", lambda self: kept.setdefault(self.finger, real(self)))
+    monkeypatch.setattr(FakeSensor, "_read", lambda self: first.setdefault(self.finger, real(self)))
     row = next(row for row in check_rig(rig) if row.role == "gel")
     assert row.measured["rate"] == "1 frame(s) in 0.1 s"

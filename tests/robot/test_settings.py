@@ -1,4 +1,4 @@
-"""Plain settings to the keywords of a class."""
+"""Objects from plain settings."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -26,7 +26,7 @@ class Thing:
         self.made = {name: value for name, value in locals().items() if name != "self"}
 
 
-def test_settings_become_keywords_and_the_program_gives_the_rest_that_is_taken():
+def test_settings_and_accepted_program_arguments_become_keywords():
     made = build(Thing, {"port": "a", "rate": 3, "box": [1, 2.5], "exposure": 4}, clock="tick", unknown="left out").made
     assert (made["port"], made["rate"]) == ("a", 3)
     assert made["box"] == [1, 2.5]
@@ -35,11 +35,14 @@ def test_settings_become_keywords_and_the_program_gives_the_rest_that_is_taken()
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "message"),
     [
-        ({}, r"\[thing\] must say 'port'; it knows box, exposure"),
-        ({"port": "a", "bort": 1}, r"\[thing\] has no setting 'bort'; it knows box, exposure, loud, names, port"),
-        ({"port": "a", "clock": 1}, r"\[thing\] has no setting 'clock'"),  # what the program gives, no file may
+        ({}, r"\[thing\] requires 'port'; known settings: box, exposure"),
+        (
+            {"port": "a", "bort": 1},
+            r"\[thing\] has no setting 'bort'; known settings: box, exposure, loud, names, port",
+        ),
+        ({"port": "a", "clock": 1}, r"\[thing\] has no setting 'clock'"),  # an argument of the program
         ({"port": 3}, r"\[thing\]: port must be a text in quotes, got 3"),
         ({"port": "a", "rate": "fast"}, r"\[thing\]: rate must be a number, got 'fast'"),
         ({"port": "a", "rate": True}, r"\[thing\]: rate must be a number, got True"),
@@ -54,6 +57,6 @@ def test_settings_become_keywords_and_the_program_gives_the_rest_that_is_taken()
         ({"port": "a", "table": 3}, r"\[thing\]: table must be a table, got 3"),
     ],
 )
-def test_a_wrong_setting_is_refused_with_its_place_and_what_is_wanted(settings, said):
-    with pytest.raises(RobotConfigError, match=f"^{said}"):
+def test_a_wrong_setting_is_refused_with_its_place_and_the_requirement(settings, message):
+    with pytest.raises(RobotConfigError, match=f"^{message}"):
         build(Thing, settings, where="[thing]", clock="tick")

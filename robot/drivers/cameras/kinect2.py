@@ -1,10 +1,10 @@
-"""Kinect 2 through pylibfreenect2: depth, and the colour that belongs to each of its 512 x 424 pixels.
+"""Kinect 2 through pylibfreenect2: depth, and the colour of each of its 512 x 424 pixels.
 
-Facts used (libfreenect2, pylibfreenect2): depth is float in mm, 0 or infinite where unknown; `Registration.apply` gives
-depth without lens distortion and the colour of each of its pixels (BGRX, black where there is none); the parameters of
-the infrared camera are then the intrinsics, and are known after start(); every set of frames must be released, and none
-newer comes before that; opening a serial number that is not there crashes the process, so it is looked for first; a
-device points to its listener and belongs to its Freenect2, and both end with the last name that Python has for them.
+Facts used (libfreenect2, pylibfreenect2): depth is float in mm, 0 or infinite where unknown. `Registration.apply`
+returns undistorted depth and the colour of each of its pixels (BGRX, black where unknown). The intrinsics are then the
+parameters of the infrared camera, available after start(). Each set of frames must be released before the next one
+arrives. Opening an unknown serial number crashes the process, so the serial numbers are listed first. A device refers
+to its listener and its Freenect2, so Python references to both must live as long as the device.
 """
 
 import contextlib
@@ -30,22 +30,25 @@ PIPELINES = {
     "cuda": "CudaPacketPipeline",
     "cpu": "CpuPacketPipeline",
 }
-"""Who computes the depth, the usual choice first; a build of libfreenect2 may lack any but the last."""
+"""Processors of the depth, in order of preference; a build of libfreenect2 may lack all but the last."""
 
 _POLL_S = 0.002
 
 
 @dataclass(frozen=True, kw_only=True)
 class Kinect2Settings(VendorSettings):
-    """pipeline: one of PIPELINES, or "auto", the first that this build has. upside_down: it hangs from above; picture
-    and intrinsics are turned by half a turn.
+    """Settings of a Kinect 2.
+
+    Attributes:
+        pipeline: One of PIPELINES, or "auto", the first that this build has.
+        upside_down: Whether the camera hangs upside down; picture and intrinsics are then rotated by 180 degrees.
     """
 
     pipeline: str = "auto"
     upside_down: bool = False
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting out of range."""
+        """Raise RobotConfigError for a setting out of range."""
         super().__post_init__()
         if self.pipeline not in ("auto", *PIPELINES):
             raise RobotConfigError(f"pipeline must be auto or one of {', '.join(PIPELINES)}, got {self.pipeline!r}")
@@ -57,7 +60,7 @@ class Kinect2(VendorCamera):
     Settings = Kinect2Settings
 
     def __init__(self, *, extrinsics: npt.ArrayLike, clock: Clock = time.monotonic, **settings: Any) -> None:
-        """Raises RobotConfigError for a setting out of range; touches no device."""
+        """Check the settings without using the device; raise RobotConfigError for one out of range."""
         super().__init__("kinect2", extrinsics, clock=clock)
         self._options = Kinect2Settings(**settings)
         self._package: Any = None
@@ -76,7 +79,7 @@ class Kinect2(VendorCamera):
         with vendor_errors("kinect2 cannot be started"):
             self._freenect = package.Freenect2()
             count = self._freenect.enumerateDevices()
-            serials = list(map(self._freenect.getDeviceSerialNumber, range(count)))  # as the package gives them
+            serials = list(map(self._freenect.getDeviceSerialNumber, range(count)))  # bytes or text
             serial = serials[self._choose_camera(self._options.serial, list(map(decode_serial, serials)))]
             name, pipeline = self._make_pipeline()
             self._device = self._freenect.openDevice(serial, pipeline=pipeline)
@@ -89,14 +92,14 @@ class Kinect2(VendorCamera):
                 self._discard()
 
     def _make_pipeline(self) -> tuple[str, Any]:
-        """The first of the wanted pipelines that this build has and this computer can run."""
+        """Return the first requested pipeline that this build has and this computer can run."""
         failures = []
         for name in PIPELINES if self._options.pipeline == "auto" else (self._options.pipeline,):
             try:
                 return name, getattr(self._package, PIPELINES[name])()
             except Exception as error:
                 failures.append(f"{name}: {error}")
-        raise DeviceError(f"kinect2 must compute its depth with {self._options.pipeline}, but {'; '.join(failures)}")
+        raise DeviceError(f"kinect2 has no usable pipeline {self._options.pipeline}: {'; '.join(failures)}")
 
     def _read_parameters(self, serial: str, pipeline: str) -> None:
         infrared = self._device.getIrCameraParams()
@@ -121,15 +124,15 @@ class Kinect2(VendorCamera):
 
     @contextlib.contextmanager
     def _frames(self) -> Iterator[Any]:
-        """A set of frames, released whatever happens. Waiting is ours: not every version of the package can give up."""
+        """Yield a set of frames and release it; poll, because some versions of the package have no timeout."""
         if self._device is None:
             raise DeviceError("kinect2 was stopped by a failed recovery; call recover() again")
         deadline = time.monotonic() + self._options.timeout_s
         while not self._listener.hasNewFrame():
             if time.monotonic() > deadline:
                 raise DeviceError(
-                    f"kinect2 must give a picture within {self._options.timeout_s:g} s, but did not; "
-                    "it needs USB 3 and its own power"
+                    f"kinect2 returned no picture within {self._options.timeout_s:g} s; "
+                    "it requires USB 3 and its own power supply"
                 )
             time.sleep(_POLL_S)
         frames = self._listener.waitForNewFrame()
@@ -143,9 +146,9 @@ class Kinect2(VendorCamera):
             pass
 
     def _read(self, depth: bool) -> RGBD:
-        with vendor_errors("kinect2 gives no picture"):
+        with vendor_errors("kinect2 returned no picture"):
             if self._device is not None and self._listener.hasNewFrame():
-                self._discard()  # it may have waited there since the last time
+                self._discard()  # it may be as old as the last read
             with self._frames() as frames:
                 time_s = self.clock()
                 colour, depth_mm = self._register(frames)
@@ -156,7 +159,7 @@ class Kinect2(VendorCamera):
         )
 
     def _register(self, frames: Any) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.float32]]:
-        """Colour (RGB) of the pixels of the depth, and the depth in mm, both as copies: their memory goes back."""
+        """Return the colour (RGB) of the depth pixels, and the depth in mm, as copies of the package's memory."""
         make = self._package.Frame
         undistorted, registered = make(WIDTH, HEIGHT, 4), make(WIDTH, HEIGHT, 4)
         self._registration.apply(frames["color"], frames["depth"], undistorted, registered)

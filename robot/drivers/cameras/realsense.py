@@ -1,9 +1,8 @@
-"""Intel RealSense through pyrealsense2: colour, and depth as the colour camera would see it.
+"""Intel RealSense through pyrealsense2: colour, and depth aligned to the colour camera.
 
-Facts used (librealsense): depth counts in the sensor's depth scale (m), 0 where unknown; `align` maps it to the colour
-stream's pixels; pixel coordinates count from the centre of the first pixel; where the colour stream has distortion
-coefficients, rs2_project_point_to_pixel knows the model. The first 30 or so pictures are of a camera that still finds
-its exposure.
+Facts used (librealsense): depth is in units of the sensor's depth scale (m), 0 where unknown. `align` maps it to the
+colour stream's pixels. Pixel coordinates count from the centre of the first pixel. rs2_project_point_to_pixel applies
+the distortion model of the colour stream. Automatic exposure settles within about 30 pictures.
 """
 
 import time
@@ -23,7 +22,7 @@ from robot.settings import bounded
 
 @dataclass(frozen=True, kw_only=True)
 class RealSenseSettings(VendorSettings):
-    """width, height in pixels and fps of both streams."""
+    """Size in pixels and frame rate of both streams, and the settings of every vendor camera."""
 
     width: int = bounded(1, 20_000, 640, unit="pixels")
     height: int = bounded(1, 20_000, 480, unit="pixels")
@@ -34,14 +33,14 @@ class RealSenseSettings(VendorSettings):
 class RealSense(VendorCamera):
     """A RealSense depth camera; its keywords are those of RealSenseSettings.
 
-    A picture with lens distortion is undistorted by the maker's own model (depth by the nearest pixel, so that none is
-    made up at edges), and `settings` says so.
+    A picture with lens distortion is undistorted by the vendor's model, and `settings` reports it. Depth takes the
+    nearest pixel, because interpolation would invent depth at edges.
     """
 
     Settings = RealSenseSettings
 
     def __init__(self, *, extrinsics: npt.ArrayLike, clock: Clock = time.monotonic, **settings: Any) -> None:
-        """Raises RobotConfigError for a setting out of range; touches no device."""
+        """Check the settings without using the device; raise RobotConfigError for one out of range."""
         super().__init__("realsense", extrinsics, clock=clock)
         self._options = RealSenseSettings(**settings)
         self._pipeline: Any = None
@@ -57,7 +56,7 @@ class RealSense(VendorCamera):
             serial = found[self._choose_camera(self._options.serial, found)]
             pipeline = rs.pipeline()
             profile = pipeline.start(self._config(rs, serial))
-            self._pipeline = pipeline  # from here on `_close` stops it
+            self._pipeline = pipeline  # now `_close` stops it
             self._align = rs.align(rs.stream.color)
             self._read_parameters(rs, profile, serial)
             for _ in range(self._options.warmup_frames):
@@ -75,7 +74,7 @@ class RealSense(VendorCamera):
         return config
 
     def _read_parameters(self, rs: Any, profile: Any, serial: str) -> None:
-        """Scale of depth, intrinsics, and how to undo distortion."""
+        """Read the depth scale, the intrinsics and the distortion."""
         video = profile.get_stream(rs.stream.color).as_video_stream_profile()
         lens = video.get_intrinsics()
         depth = profile.get_device().first_depth_sensor()
@@ -103,10 +102,10 @@ class RealSense(VendorCamera):
         return self._pipeline.wait_for_frames(round(1000 * self._options.timeout_s))
 
     def _read(self, depth: bool) -> RGBD:
-        with vendor_errors("realsense gives no picture; is it plugged into USB 3?"):
+        with vendor_errors("realsense returned no picture; is it plugged into USB 3?"):
             if self._pipeline is None:
                 raise DeviceError("realsense was stopped by a failed recovery; call recover() again")
-            self._pipeline.poll_for_frames()  # what waits there was taken before it was asked for
+            self._pipeline.poll_for_frames()  # drops frames taken before this call
             frames = self._wait()
             time_s = self.clock()
             if depth:
@@ -119,14 +118,14 @@ class RealSense(VendorCamera):
         return RGBD(colour, depth_m, self._intrinsics, time_s)
 
     def _to_metres(self, raw: npt.NDArray[Any]) -> npt.NDArray[np.float32]:
-        """Known depth times the scale, NaN where unknown."""
+        """Return depth in metres, NaN where unknown."""
         if self._undistortion is not None:
             raw = cv2.remap(raw, self._undistortion, None, cv2.INTER_NEAREST, borderValue=0)
         return np.where(raw > 0, raw * np.float32(self._scale_m), np.float32(np.nan)).astype(np.float32)
 
 
 def _undistortion(rs: Any, lens: Any) -> npt.NDArray[np.float32]:
-    """(H, W, 2): where the camera shows what a camera without distortion would show at each pixel."""
+    """Return the (H, W, 2) distorted pixel coordinates of each pixel of the undistorted picture."""
     found = np.empty((lens.height, lens.width, 2), np.float32)
     for row in range(lens.height):
         y = (row - lens.ppy) / lens.fy
@@ -136,7 +135,7 @@ def _undistortion(rs: Any, lens: Any) -> npt.NDArray[np.float32]:
 
 
 def _copy_pixels(frame: Any, what: str) -> npt.NDArray[Any]:
-    """The picture's own memory goes back to the camera."""
+    """Copy the pixels, because the package reuses the frame's memory."""
     if not frame:
-        raise DeviceError(f"realsense must give {what} with each picture, but did not")
+        raise DeviceError(f"realsense returned a picture without {what}")
     return np.array(frame.get_data())

@@ -1,4 +1,4 @@
-"""A plain USB camera over the table: colour only, so the pose of a grasp must come from elsewhere."""
+"""A plain USB camera over the table: colour only, so grasps cannot be planned from its picture."""
 
 import time
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from robot.settings import bounded
 
 @dataclass(frozen=True, kw_only=True)
 class UvcSettings(UsbCameraSettings):
-    """As of any USB camera, automatics on. upside_down: its picture is turned by half a turn."""
+    """Settings of a USB camera, with automatic exposure and white balance; upside_down: rotate by 180 degrees."""
 
     auto_exposure: bool = True
     auto_white_balance: bool = True
@@ -31,7 +31,7 @@ class UvcCamera(Camera):
     has_depth = False
 
     def __init__(self, *, extrinsics: npt.ArrayLike, clock: Clock = time.monotonic, **settings: Any) -> None:
-        """Raises RobotConfigError for a setting out of range; touches no device."""
+        """Check the settings without using the device; raise RobotConfigError for one out of range."""
         super().__init__("usb camera", extrinsics, clock=clock)
         self._options = UvcSettings(**settings)
         self._reader = CaptureReader(self, self._options)

@@ -1,7 +1,7 @@
-"""Gel sensors that are USB cameras: GelSight, GelSight Mini, DIGIT, and any other.
+"""Gel sensors with a USB camera: GelSight, GelSight Mini, DIGIT, and any other.
 
-A new sensor is a class of a few lines here. What a PRESET says, a rig's file may say otherwise.
-Automatic exposure and white balance are switched off unless asked for: with them the same press looks different twice.
+A new sensor is a class of a few lines here. A rig's file may override each PRESET. Automatic exposure and white
+balance are off by default, because they make equal presses look different.
 """
 
 import time
@@ -18,16 +18,16 @@ from robot.readings import Frame
 
 @dataclass(frozen=True, kw_only=True)
 class GelCameraSettings(UsbCameraSettings, CropSettings):
-    """The camera behind a gel, and what is cut out of its pictures. keep: pictures kept to match the other finger's in
-    time.
-    """
+    """Settings of the camera behind a gel and of the crop; `keep` frames are buffered to match the other finger's."""
 
 
 class OpencvTactile(TactileSensor):
     """The gel behind a USB camera; its keywords are those of GelCameraSettings.
 
-    PRESET: what a kind of sensor is set to where the rig's file says nothing. CROP: what is cut off then.
-    QUARTER_TURNS: of its picture, to the left.
+    Attributes:
+        PRESET: Default camera settings of a kind of sensor.
+        CROP: Default crop: fractions at left, top, right and bottom.
+        QUARTER_TURNS: Rotation of the picture, in quarter turns to the left.
     """
 
     Settings = GelCameraSettings
@@ -36,7 +36,7 @@ class OpencvTactile(TactileSensor):
     QUARTER_TURNS: ClassVar[int] = 0
 
     def __init__(self, *, finger: str, clock: Clock = time.monotonic, **settings: Any) -> None:
-        """Raises RobotConfigError for a setting out of range or a calibration file that is none; touches no device."""
+        """Check settings and calibration file without using the device; raise RobotConfigError if invalid."""
         super().__init__(f"gel {finger}", finger, clock=clock)
         options, preset = GelCameraSettings(**settings), self.PRESET
         size = options if options.width or options.height else preset
@@ -54,25 +54,25 @@ class OpencvTactile(TactileSensor):
 
     @property
     def frame_count(self) -> int:
-        """Pictures taken since it was connected; their number over a while is the rate."""
+        """Number of frames since the sensor was connected."""
         return self._reader.frame_count
 
     @property
     def lost_count(self) -> int:
-        """How often the stream was lost and opened again since it was connected."""
+        """Number of stream losses since the sensor was connected."""
         return self._reader.lost_count
 
     def _connect(self) -> None:
         self._reader = CaptureReader(self, self._options)
         self._reader.start()
-        height, width = self._read().pixels.shape[:2]  # a calibration for another size is found here
+        height, width = self._read().pixels.shape[:2]  # raises for a calibration of another size
         self._picture_px = [width, height]
 
     def _close(self) -> None:
         self._reader.close()
 
     def _settings(self) -> dict[str, Any]:
-        """As the camera had them when its stream was opened last."""
+        """Return the camera's settings of the last opening of its stream."""
         return {**self._reader.camera, "picture_px": self._picture_px}
 
     def _recover(self) -> None:
@@ -85,21 +85,22 @@ class OpencvTactile(TactileSensor):
         return self._picture(self._reader.near(time_s))
 
     def _picture(self, frame: Frame) -> Frame:
-        """Turned, the gel alone, and then in RGB: the fewer pixels, the sooner."""
+        """Rotate, crop, then convert to RGB; conversion last, because it costs less for fewer pixels."""
         turns = self.QUARTER_TURNS
         turned = np.ascontiguousarray(np.rot90(frame.pixels, turns)) if turns else frame.pixels
         return Frame(to_rgb(self._rectifier.apply(turned)), frame.time_s)
 
 
 class GelSight(OpencvTactile):
-    """The paper's GelSight, as its authors ran usb_cam, with both automatics off."""
+    """The paper's GelSight with the authors' usb_cam settings, automatic exposure and white balance off."""
 
     PRESET = CaptureSettings(width=1280, height=960, fps=30.0, fourcc="MJPG")
 
 
 class GelSightMini(OpencvTactile):
-    """GelSight Mini: the size that the maker's software asks for, and the border that it cuts off. The camera's own
-    3280 x 2464 pixels at 25 pictures a second keep a core busy.
+    """GelSight Mini with the size and the crop of the vendor's software.
+
+    The camera's full 3280 x 2464 pixels at 25 frames/s would keep a core busy.
     """
 
     PRESET = CaptureSettings(width=320, height=240, fps=25.0)
@@ -107,8 +108,9 @@ class GelSightMini(OpencvTactile):
 
 
 class Digit(OpencvTactile):
-    """DIGIT, LEDs at full brightness unless `led` says otherwise. Its picture is transposed and turned over before
-    people see it, which is a quarter turn to the left.
+    """DIGIT, with LEDs at full brightness by default.
+
+    The vendor's software transposes and flips its picture, which is a quarter turn to the left.
     """
 
     PRESET = CaptureSettings(width=320, height=240, fps=60.0, led=(15, 15, 15))

@@ -1,1 +1,1 @@
-"""A Sawyer behind rosbridge."""
+"""Driver of a Sawyer arm behind rosbridge."""

@@ -1,16 +1,16 @@
-"""A Sawyer behind rosbridge: straight lines by the robot's own inverse kinematics, watched at every step.
+"""Driver of a Sawyer behind rosbridge: straight lines by the robot's inverse kinematics, checked at every step.
 
-A motion is planned whole before it begins: way-points on the line, joint angles of each from IKService, seeded with
-those of the one before, a bounded number of tries each. Then joint commands in position mode go out `rate_hz` times a
-second, along a schedule that keeps the hand at the asked speed at most and every joint at `joint_speed_rad_s`; a
-program put to sleep goes on from where it was. Above that stands the robot's own speed ratio. Position mode passes by
-the robot's collision avoidance (not detection): the workspace must be free.
+A motion is planned completely before it begins. IKService solves the way-points of the line, each seeded with the
+solution before, with a limited number of tries. Then joint commands in position mode are sent at `rate_hz`, along a
+trajectory within the requested speed of the hand and `joint_speed_rad_s`; after a pause of the program it continues
+where it was. The robot's speed ratio limits it further. Position mode bypasses the robot's collision avoidance (not
+detection), so the workspace must be free.
 
 At every step the joint state must be fresh (`max_state_age_s`), the robot enabled, no collision reported and the arm
-near its commands; else the arm holds where it is. /robot/state and the collision state come more slowly: they may be as
-old as that, or 2 s. A robot that reports no collision state when it is connected can be used, and `refused` says that
-its collisions are not seen; one that has reported it must go on. When no more commands come (the program or the network
-died) the robot itself ends the motion after `command_timeout_s`. An emergency stop is never reset here.
+near its commands; else the arm holds its position. /robot/state and the collision state are slower: they may be 2 s
+old. A robot without a collision state can be used; `refused` then reports that collisions are not detected. If
+commands stop (the program or the network failed), the robot ends the motion after `command_timeout_s`. This driver
+never resets an emergency stop.
 """
 
 import contextlib
@@ -35,28 +35,35 @@ from robot.settings import TypedSettings, bounded, check_range
 _LOG = logging.getLogger(__name__)
 _STATE_TOPICS = (messages.JOINT_STATES, messages.ROBOT_STATE, messages.TIP_STATES, messages.COLLISION)
 _SLOW_STATE_AGE_S = 2.0
-"""/robot/state and the collision state are slower than the joints; they must still come."""
+"""Oldest accepted /robot/state and collision state, which are slower than the joint states."""
 _COLLISIONS = "collision state"
 _MAX_LAG_RAD = 0.35
-"""An arm this far behind its commands is blocked; half a second of lag at 0.5 rad/s is 0.25."""
+"""An arm this far behind its commands is blocked; a lag of half a second at 0.5 rad/s is 0.25 rad."""
 _MAX_TURN_RAD = 0.5
-"""Joints that turn further between two way-points are another solution of the arm, not the same one further on."""
+"""A larger joint step between two way-points means another branch of the inverse kinematics."""
 _STOP_S = 2.0
-"""An arm that was told to hold must stand after so long."""
+"""Time in which the arm must become still after a hold command."""
 _BACK_OFF_S, _LONGEST_BACK_OFF_S = 0.25, 5.0
-"""First and longest wait between two tries to connect again; it doubles, and twenty tries would take days."""
+"""First and longest wait between two tries to connect; without the limit, doubling 20 times would take days."""
 _MARGIN_MM = 20.0
-"""So far outside the workspace a motion may begin: an arm that was stopped, or pushed a little."""
+"""A motion may begin this far outside the workspace, after a stop or a push."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SawyerSettings(TypedSettings):
-    """A Sawyer's right arm through rosbridge at host:port.
+    """Settings of a Sawyer's right arm through rosbridge at host:port.
 
-    base_xyz_mm, base_yaw_deg: the rig's frame in the robot's base frame. tool_mm: from the origin of `tip` along its z
-    axis to the point between the fingertips; tool_yaw_deg: from the tip's x axis about z to where finger a closes to.
-    enable: whether the motors may be enabled from here (never while an emergency stop holds). max_state_age_s: joint
-    states older than this stop the arm; the robot's and the collision state where older than this and than 2 s.
+    Attributes:
+        base_xyz_mm: Origin of the rig's frame in the robot's base frame.
+        base_yaw_deg: Yaw of the rig's frame in the robot's base frame.
+        tool_mm: Distance from the origin of `tip` along its z axis to the point between the fingertips.
+        tool_yaw_deg: Angle about z from the tip's x axis to the closing direction of finger a.
+        ramp_s: Duration of the acceleration to full speed.
+        arrival_rad: Tolerance of every joint at the goal.
+        settle_s: Time to arrive after the last command.
+        command_timeout_s: Time without commands after which the robot ends the motion.
+        enable: Whether this driver may enable the motors (never during an emergency stop).
+        max_state_age_s: An older joint state stops the arm; an older robot or collision state too, but only above 2 s.
     """
 
     host: str
@@ -81,7 +88,7 @@ class SawyerSettings(TypedSettings):
     max_state_age_s: float = bounded(0.02, 5, 0.5)
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting of the wrong type or out of range."""
+        """Raise RobotConfigError for a setting of another type or out of range."""
         super().__post_init__()
         for value in self.base_xyz_mm:
             check_range("base_xyz_mm", value, -1e4, 1e4, "mm")
@@ -93,7 +100,7 @@ class Sawyer(Arm):
     Settings = SawyerSettings
 
     def __init__(self, *, workspace: Region, clock: Clock = time.monotonic, **settings: Any) -> None:
-        """Raises RobotConfigError for a setting out of range."""
+        """Check the settings; raise RobotConfigError for one out of range."""
         options = self._options = SawyerSettings(**settings)
         super().__init__("sawyer", workspace, max_speed_mm_s=options.max_speed_mm_s, clock=clock)
         yaw, tool_yaw = math.radians(options.base_yaw_deg), math.radians(options.tool_yaw_deg)
@@ -112,18 +119,18 @@ class Sawyer(Arm):
         self._make_ready()
 
     def _check_collision_topic(self) -> None:
-        """Note it where nothing comes that would report one: a person may do without, and must know."""
+        """Note in `refused` if the robot reports no collision state."""
         self.refused.pop(_COLLISIONS, None)
         try:
             self._link.wait_for(messages.COLLISION[0])
             self._sees_collisions = True
         except DeviceError:
             self._link.check()
-            self.refused[_COLLISIONS] = "nothing comes: collisions are not seen"
-            _LOG.warning("%s: nothing comes on %s: collisions are not seen", self.name, messages.COLLISION[0])
+            self.refused[_COLLISIONS] = "no messages: collisions are not detected"
+            _LOG.warning("%s: no messages on %s: collisions are not detected", self.name, messages.COLLISION[0])
 
     def _open_link(self) -> None:
-        """A new link on which every state has come once; that of collisions, where it came when connecting."""
+        """Open a new link and wait for each state once, also the collision state if it was available on connecting."""
         self._link = self._new_link()
         self._link.open()
         for topic, kind in (*_STATE_TOPICS, messages.SPEED_RATIO, messages.COMMAND_TIMEOUT):
@@ -135,7 +142,7 @@ class Sawyer(Arm):
         self._set("command_timeout_s", messages.COMMAND_TIMEOUT, self._options.command_timeout_s)
 
     def _set(self, name: str, topic: tuple[str, str], value: float) -> None:
-        """Publish a setting and read it back as the topic shows it; what differs is noted in `refused`."""
+        """Publish a setting and read it back from its topic; note a difference in `refused`."""
         since = self.clock()
         self._link.advertise(*topic, latch=True)
         self._link.publish(topic[0], {"data": value})
@@ -144,16 +151,16 @@ class Sawyer(Arm):
             found = messages.number_of(self._link.wait_for(topic[0], since_s=since).message)
         except DeviceError:
             self._link.check()
-            self.refused[name] = f"asked {value:g}, nothing can be read back"
+            self.refused[name] = f"requested {value:g}, cannot be read back"
             return
         if abs(found - value) > 1e-6:
-            self.refused[name] = f"asked {value:g}, has {found:g}"
+            self.refused[name] = f"requested {value:g}, has {found:g}"
 
     def _make_ready(self) -> None:
-        """Enable the motors where that is all that is missing and allowed. Raises DeviceError."""
+        """Enable the motors if allowed and sufficient; raise DeviceError if the arm may not move."""
         state = self._robot_state()
         if self._options.enable and self.may_move and not (state.enabled or state.stopped or state.error):
-            _LOG.warning("%s: the motors are being enabled", self.name)
+            _LOG.warning("%s: enabling the motors", self.name)
             self._link.advertise(*messages.ENABLE)
             self._link.publish(messages.ENABLE[0], {"data": True})
             deadline = self.clock() + self._options.timeout_s
@@ -162,7 +169,7 @@ class Sawyer(Arm):
         self._check_free()
 
     def _close(self) -> None:
-        """Hold the arm where another thread still moves it; one that nobody moves from here is left alone."""
+        """Close the link; first hold the arm if another thread of this program still moves it."""
         try:
             if self._is_moving:
                 with contextlib.suppress(DeviceError):
@@ -183,7 +190,7 @@ class Sawyer(Arm):
         return messages.number_of(arrivals[-1].message) if arrivals else None
 
     def _recover(self) -> None:
-        """Connect again with back-off where the link or the state is gone; what a person must see to, raises."""
+        """Connect again with back-off if the link or a state is lost; raise DeviceError if a person must act."""
         try:
             self._link.check()
             self._fresh_joints()
@@ -235,7 +242,7 @@ class Sawyer(Arm):
         return self._pose_since(self.clock())
 
     def _check_inside(self, pose: Pose) -> Pose:
-        """A straight line between two points of a box stays in it; one from elsewhere may pass through anything."""
+        """Raise DeviceError unless the pose is in the workspace, so that the line to the goal stays in it too."""
         if not self.workspace.contains(pose, _MARGIN_MM):
             lower, upper = self.workspace.lower, self.workspace.upper
             raise DeviceError(
@@ -245,14 +252,14 @@ class Sawyer(Arm):
         return pose
 
     def _solve(self, poses: Sequence[Pose], start: Joints) -> Joints:
-        """Joint angles (N, 7) of way-points, the first of them where the arm is."""
+        """Return the joint angles (N, 7) of way-points, of which the first is the arm's pose."""
         found = [start]
         for pose in poses[1:]:
             found.append(self._solve_one(pose, found[-1], start))
         return np.array(found)
 
     def _solve_one(self, pose: Pose, before: Joints, start: Joints) -> Joints:
-        """Ask with other seeds when one fails, at most `ik_retries` times more."""
+        """Solve one way-point; after a failure, try other seeds up to `ik_retries` times."""
         tip, seeds = self._mount.tip_of(pose), (before, start, None)
         for trial in range(self._options.ik_retries + 1):
             request = messages.ik_request(tip, self._options.tip, seeds[trial % len(seeds)])
@@ -268,12 +275,12 @@ class Sawyer(Arm):
             problem = f"its solution turns a joint by {turn:.2f} rad at once"
         tries = self._options.ik_retries + 1
         raise DeviceError(
-            f"{self.name}: the hand must reach {pose}, but after {tries} tries: {problem}; nothing has moved. "
+            f"{self.name}: no solution for {pose} after {tries} tries: {problem}; the arm has not moved. "
             "Choose a smaller workspace or check base_xyz_mm and tool_mm"
         )
 
     def _follow(self, schedule: JointTrajectory, began: float) -> None:
-        """Command the schedule. Its time goes on by two ticks at most, however long this program was put to sleep."""
+        """Command the trajectory; its time advances by at most two ticks a step, also after a pause of the program."""
         at, last = 0.0, self.clock()
         while True:
             commanded = schedule.at(at)
@@ -286,8 +293,9 @@ class Sawyer(Arm):
             at, last = at + min(now - last, 2 * self._tick_s), now
 
     def _settle(self, goal: Joints, began: float) -> None:
-        """Wait until every joint is within `arrival_rad` and stands. Raises DeviceError for one that does not arrive
-        in `settle_s`; one that trembles where it should be is let be.
+        """Wait until every joint is within `arrival_rad` of its goal and still; raise DeviceError after `settle_s`.
+
+        A joint at its goal that still trembles after `settle_s` is accepted.
         """
         deadline = self.clock() + self._options.settle_s
         while True:
@@ -297,8 +305,8 @@ class Sawyer(Arm):
                 return
             if late:
                 raise DeviceError(
-                    f"{self.name}: every joint must come within {self._options.arrival_rad:g} rad of its goal, after "
-                    f"{self._options.settle_s:g} s one is {off:.3f} off; is the arm blocked or the load too heavy?"
+                    f"{self.name}: every joint must be within {self._options.arrival_rad:g} rad of its goal after "
+                    f"{self._options.settle_s:g} s, got {off:.3f} rad; is the arm blocked or the load too heavy?"
                 )
             self._command(goal)
             time.sleep(self._tick_s)
@@ -307,7 +315,7 @@ class Sawyer(Arm):
         return is_still(self._link.history(messages.JOINT_STATES[0]), since_s, self.clock())
 
     def _watch(self, commanded: Joints, began: float) -> Joints:
-        """The joints now. Raises DeviceError where anything says that the arm must not go on."""
+        """Return the current joints; raise DeviceError if the motion must not continue."""
         self._link.check()
         joints = self._fresh_joints()
         self._check_free()
@@ -315,18 +323,18 @@ class Sawyer(Arm):
             raise DeviceError(f"{self.name}: {messages.COLLIDED}")
         if (lag := float(np.abs(joints - commanded).max())) > _MAX_LAG_RAD:
             raise DeviceError(
-                f"{self.name}: the arm must follow within {_MAX_LAG_RAD} rad, a joint is {lag:.2f} behind; look what "
-                "holds it, and whether another program commands it"
+                f"{self.name}: the arm must follow within {_MAX_LAG_RAD} rad, but a joint is {lag:.2f} behind; check "
+                "whether it is blocked, or commanded by another program"
             )
         return joints
 
     def _stop(self) -> None:
-        """Hold the joints where they are now and wait until they stand."""
+        """Hold the joints at their current angles and wait until they are still."""
         self._link.check()
         hold, began = self._fresh_joints(), self.clock()
         while not self._is_still(began):
             if self.clock() - began > _STOP_S:
-                raise DeviceError(f"{self.name}: the arm was told to hold and still moves; press the emergency stop")
+                raise DeviceError(f"{self.name}: the arm still moves after a hold command; press the emergency stop")
             self._fresh_joints()
             self._command(hold)
             time.sleep(self._tick_s)
@@ -335,17 +343,17 @@ class Sawyer(Arm):
         self._link.publish(messages.JOINT_COMMAND[0], messages.joint_command(joints))
 
     def _fresh_joints(self) -> Joints:
-        """The newest joints. Raises DeviceError for what is too old, a message repeated with its old stamp too."""
+        """Return the newest joints; raise DeviceError if they are too old, by their first copy."""
         found, age_s = newest_joints(self._link.history(messages.JOINT_STATES[0])), math.inf
         if found is not None:
             joints, since_s = found
             if (age_s := self.clock() - since_s) <= self._options.max_state_age_s:
                 return joints
         self._link.check()
-        age = "never came" if found is None else f"is {age_s:.2f} s old"
+        age = "none" if found is None else f"{age_s:.2f} s"
         raise DeviceError(
-            f"{self.name}: the joint state must be at most {self._options.max_state_age_s:g} s old, it {age}; without "
-            f"new commands the robot ends its motion after {self._options.command_timeout_s:g} s by itself"
+            f"{self.name}: the joint state must be at most {self._options.max_state_age_s:g} s old, got {age}; without "
+            f"new commands the robot ends its motion after {self._options.command_timeout_s:g} s"
         )
 
     def _robot_state(self) -> messages.RobotState:
@@ -354,19 +362,19 @@ class Sawyer(Arm):
         return messages.robot_state(arrivals[-1].message)
 
     def _collisions(self) -> Sequence[ReceivedMessage]:
-        """What came of the collision state; nothing only where nothing came when connecting either."""
+        """Return the collision states; empty only if there was none on connecting either."""
         arrivals = self._link.history(messages.COLLISION[0])
         if arrivals or self._sees_collisions:
             self._check_arrives(messages.COLLISION[0], arrivals, "a collision")
         return arrivals
 
-    def _check_arrives(self, topic: str, arrivals: Sequence[ReceivedMessage], unseen: str) -> None:
+    def _check_arrives(self, topic: str, arrivals: Sequence[ReceivedMessage], event: str) -> None:
         limit_s = max(self._options.max_state_age_s, _SLOW_STATE_AGE_S)
         if not arrivals or self.clock() - arrivals[-1].time_s > limit_s:
             self._link.check()
             raise DeviceError(
-                f"{self.name}: {topic} must be at most {limit_s:g} s old, no newer one came; without it {unseen} would "
-                "not be seen"
+                f"{self.name}: {topic} must be at most {limit_s:g} s old, but no newer message arrived; without it "
+                f"{event} would not be detected"
             )
 
     def _check_free(self) -> None:
@@ -374,7 +382,7 @@ class Sawyer(Arm):
             raise DeviceError(f"{self.name}: {blocking_reason}")
 
     def _has_collided_since(self, began: float, *, newest: bool = False) -> bool:
-        """Whether any message after `began`, or with `newest` the last one, reports a collision."""
+        """Return whether any message after `began`, or with `newest` the last one, reports a collision."""
         arrivals = self._collisions()
-        options = arrivals[-1:] if newest else [arrival for arrival in arrivals if arrival.time_s >= began]
-        return any(messages.has_collided(arrival.message) for arrival in options)
+        checked = arrivals[-1:] if newest else [arrival for arrival in arrivals if arrival.time_s >= began]
+        return any(messages.has_collided(arrival.message) for arrival in checked)

@@ -1,7 +1,7 @@
-"""What a Sawyer says and is told, as the plain values of rosbridge messages: no socket, no time.
+"""Parsers and builders of a Sawyer's messages, as plain values of rosbridge messages. No socket, no clock.
 
-Topics, services and types are those of the Intera SDK (intera_core_msgs; names as in intera_sdk 5.3). A message that
-lacks something, or holds what is not a finite number, raises DeviceError.
+Topics, services and types are those of the Intera SDK (intera_core_msgs; names as in intera_sdk 5.3). A message with a
+missing or invalid value, or a number that is not finite, raises DeviceError.
 """
 
 import math
@@ -38,20 +38,23 @@ IK_FAILURES = {
     -2: "the arm would collide with itself",
     -3: "the robot has no such tip",
 }
-COLLIDED = "the robot reports a collision, the arm holds: look what it touches and free it by hand before you go on"
-_BUTTON = {0: "not pressed", 1: "pressed", 2: "in an unknown state", 3: "released, but the stop still holds"}
+COLLIDED = "the robot reports a collision and the arm holds: find the contact and free the arm by hand first"
+_BUTTON = {0: "not pressed", 1: "pressed", 2: "in an unknown state", 3: "released, but the stop is still active"}
 _SOURCE = {0: "nobody", 1: "the red button", 2: "an unknown source", 3: "a motor controller", 4: "the robot's engine"}
 _MAX_LEAN_RAD = math.radians(10.0)
 STILL_RAD, STILL_S = 1e-3, 0.1
-"""An arm stands when no joint has moved by more in so long."""
+"""An arm is still if no joint moves by more than STILL_RAD within STILL_S."""
 
 
 @dataclass(frozen=True)
 class Mount:
-    """Where the rig stands to the robot: rig frame in the robot's base frame (mm, rad), and the gripper on its tip.
+    """Pose of the rig frame in the robot's base frame, and of the gripper on the robot's tip.
 
-    tool_mm: from the tip's origin along its z axis to the point between the fingertips. tool_yaw: from the tip's x axis
-    about its z axis to the direction in which finger a closes.
+    Attributes:
+        base_xyz_mm: Origin of the rig frame in the base frame.
+        base_yaw_rad: Yaw of the rig frame in the base frame.
+        tool_mm: Distance from the tip's origin along its z axis to the point between the fingertips.
+        tool_yaw_rad: Angle about the tip's z axis, from its x axis to the closing direction of finger a.
     """
 
     base_xyz_mm: tuple[float, float, float]
@@ -60,9 +63,9 @@ class Mount:
     tool_yaw_rad: float
 
     def tip_of(self, pose: Pose) -> dict[str, Any]:
-        """The geometry_msgs/Pose (m, quaternion) of a tip that hangs straight down with its fingertips at `pose`.
+        """Return the geometry_msgs/Pose (m, quaternion) of a tip that points straight down, fingertips at `pose`.
 
-        The tip's rotation is half a turn about x, then `angle` about z: the quaternion (cos, sin, 0, 0) of angle / 2.
+        The tip's rotation is half a turn about x, then an angle about z: the quaternion (cos, sin, 0, 0) of angle / 2.
         """
         point = _about_z(np.array([pose.x_mm, pose.y_mm, pose.z_mm]), self.base_yaw_rad) + self.base_xyz_mm
         x, y, z = (point + np.array([0.0, 0.0, self.tool_mm])).tolist()
@@ -73,14 +76,14 @@ class Mount:
         }
 
     def pose_of(self, tip: Mapping[str, Any]) -> Pose:
-        """The pose of the fingertips for a tip's geometry_msgs/Pose. Raises DeviceError for one that leans."""
+        """Return the pose of the fingertips for a tip's geometry_msgs/Pose; raise DeviceError if it is tilted."""
         place = np.array([_number(tip, "position", axis) for axis in "xyz"]) * 1000
         turn = _rotation([_number(tip, "orientation", axis) for axis in "xyzw"])
         lean = math.acos(min(1.0, max(-1.0, -float(turn[2, 2]))))
         if lean > _MAX_LEAN_RAD:
             raise DeviceError(
-                f"the hand must hang straight down, it leans by {math.degrees(lean):.0f} deg; bring it upright above "
-                "the workspace by hand (zero-gravity mode)"
+                f"the hand must point straight down, but is tilted by {math.degrees(lean):.0f} deg; bring it upright "
+                "above the workspace by hand (zero-gravity mode)"
             )
         point = _about_z(place + self.tool_mm * turn[:, 2] - self.base_xyz_mm, -self.base_yaw_rad)
         closing = turn @ [math.cos(self.tool_yaw_rad), math.sin(self.tool_yaw_rad), 0.0]
@@ -90,7 +93,7 @@ class Mount:
 
 @dataclass(frozen=True)
 class RobotState:
-    """/robot/state: whether the arm may move, and why not."""
+    """Content of /robot/state: whether the arm may move, and the reason if not."""
 
     enabled: bool
     stopped: bool
@@ -100,25 +103,23 @@ class RobotState:
 
     @property
     def blocking_reason(self) -> str | None:
-        """What keeps the arm from moving and what a person must do about it; None where nothing does."""
+        """Reason why the arm may not move, with the action for a person; None: it may move."""
         if self.stopped:
             source = _SOURCE.get(self.estop_source, "an unknown source")
             button = _BUTTON.get(self.estop_button, "in an unknown state")
             return (
-                f"the robot is stopped by {source}, its button is {button}: find out why, clear the workspace, turn "
+                f"the robot is stopped by {source}, its button is {button}: find the reason, clear the workspace, turn "
                 "the button to release it and enable the robot by hand; this program never resets an emergency stop"
             )
         if self.error:
-            return (
-                "the robot reports an error of one of its parts: look at its screen, then reset and enable it by hand"
-            )
+            return "the robot reports an error of one of its parts: read its screen, then reset and enable it by hand"
         if not self.enabled:
             return "the robot is not enabled: clear the workspace and enable it by hand, or set enable = true"
         return None
 
 
 def robot_state(message: Mapping[str, Any]) -> RobotState:
-    """Read intera_core_msgs/RobotAssemblyState."""
+    """Parse intera_core_msgs/RobotAssemblyState."""
     enabled, stopped, error = (_flag(message, name) for name in ("enabled", "stopped", "error"))
     return RobotState(
         enabled, stopped, error, int(_number(message, "estop_button")), int(_number(message, "estop_source"))
@@ -126,12 +127,12 @@ def robot_state(message: Mapping[str, Any]) -> RobotState:
 
 
 def has_collided(message: Mapping[str, Any]) -> bool:
-    """Read intera_core_msgs/CollisionDetectionState."""
+    """Parse intera_core_msgs/CollisionDetectionState."""
     return _flag(message, "collision_state")
 
 
 def joints_of(message: Mapping[str, Any]) -> Joints | None:
-    """The arm's joints of a sensor_msgs/JointState; None for a message about other joints, as of a gripper."""
+    """Parse the arm's joints (7,) of a sensor_msgs/JointState; None for other joints, such as a gripper's."""
     names, positions = message.get("name"), message.get("position")
     if not isinstance(names, list) or not isinstance(positions, list) or len(names) != len(positions):
         raise DeviceError(f"a joint state must have a position for each name, got {_short(message)}")
@@ -142,14 +143,15 @@ def joints_of(message: Mapping[str, Any]) -> Joints | None:
 
 
 def stamp_of(message: Mapping[str, Any]) -> Any:
-    """The time stamp of a message, to compare and nothing else; None where it has none."""
+    """Return the time stamp of a message, for comparison only; None if it has none."""
     header = message.get("header")
     return header.get("stamp") if isinstance(header, dict) else None
 
 
 def newest_joints(arrivals: Sequence[ReceivedMessage]) -> tuple[Joints, float] | None:
-    """The newest joints and since when they have been said: one repeated with its old time stamp is as old as its first
-    copy. None where none came.
+    """Return the newest joints and their time of arrival, or None if there are none.
+
+    A message repeated with its old time stamp is as old as its first copy.
     """
     found, since_s = None, -math.inf
     for arrival in reversed(arrivals):
@@ -165,7 +167,7 @@ def newest_joints(arrivals: Sequence[ReceivedMessage]) -> tuple[Joints, float] |
 
 
 def is_still(arrivals: Sequence[ReceivedMessage], since_s: float, now_s: float) -> bool:
-    """Whether the joint states of the last STILL_S, none from before `since_s`, are of an arm that stands."""
+    """Return whether the arm was still for the last STILL_S, by joint states that arrived after `since_s`."""
     recent = [
         joints
         for arrival in arrivals
@@ -175,25 +177,25 @@ def is_still(arrivals: Sequence[ReceivedMessage], since_s: float, now_s: float) 
 
 
 def tip_of(message: Mapping[str, Any], tip: str) -> Mapping[str, Any]:
-    """The geometry_msgs/Pose of the tip of this name in an intera_core_msgs/EndpointStates."""
+    """Return the geometry_msgs/Pose of the named tip in an intera_core_msgs/EndpointStates."""
     names, states = message.get("names"), message.get("states")
     if not isinstance(names, list) or not isinstance(states, list) or tip not in names:
-        raise DeviceError(f"the robot must report its tip {tip!r}, it reports {_short(names)}; set tip to one of these")
+        raise DeviceError(f"the robot must report its tip {tip!r}, got {_short(names)}; set tip to one of these")
     place = names.index(tip)
     state = states[place] if place < len(states) else None
     pose = state.get("pose") if isinstance(state, dict) else None
     if not isinstance(pose, dict):
-        raise DeviceError(f"a tip state must hold a pose, got {_short(message)}")
+        raise DeviceError(f"a tip state must contain a pose, got {_short(message)}")
     return pose
 
 
 def number_of(message: Mapping[str, Any]) -> float:
-    """Read std_msgs/Float64."""
+    """Parse std_msgs/Float64."""
     return _number(message, "data")
 
 
 def joint_command(positions: Joints) -> dict[str, Any]:
-    """intera_core_msgs/JointCommand in position mode (rad)."""
+    """Return an intera_core_msgs/JointCommand in position mode (rad)."""
     return {
         "mode": POSITION_MODE,
         "names": list(JOINTS),
@@ -205,7 +207,7 @@ def joint_command(positions: Joints) -> dict[str, Any]:
 
 
 def ik_request(tip_pose: Mapping[str, Any], tip: str, seed: Joints | None) -> dict[str, Any]:
-    """Arguments of intera_core_msgs/SolvePositionIK for one pose; without a seed the robot chooses one."""
+    """Return the arguments of intera_core_msgs/SolvePositionIK for one pose; without a seed the robot chooses one."""
     seeds = [] if seed is None else [{"name": list(JOINTS), "position": seed.tolist(), "velocity": [], "effort": []}]
     return {
         "pose_stamp": [{"header": {"frame_id": "base"}, "pose": dict(tip_pose)}],
@@ -219,10 +221,10 @@ def ik_request(tip_pose: Mapping[str, Any], tip: str, seed: Joints | None) -> di
 
 
 def ik_answer(values: Mapping[str, Any]) -> Joints:
-    """The joints in the answer to `ik_request`. Raises DeviceError where there are none."""
+    """Parse the joints in the answer to `ik_request`; raise DeviceError if there is no solution."""
     kinds, solutions = values.get("result_type"), values.get("joints")
     if not isinstance(kinds, list) or not isinstance(solutions, list) or len(kinds) != 1 or len(solutions) != 1:
-        raise DeviceError(f"IKService must answer the one pose it was asked, got {_short(values)}")
+        raise DeviceError(f"IKService must return one solution for one pose, got {_short(values)}")
     kind = int(_finite(kinds[0], "result_type"))
     found = joints_of(solutions[0]) if kind > 0 and isinstance(solutions[0], dict) else None
     if found is None:
@@ -238,7 +240,7 @@ def _number(message: Mapping[str, Any], *path: str) -> float:
 
 
 def _finite(value: Any, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # also refuses NaN
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1e9:  # also rejects NaN
         raise DeviceError(f"the robot's {name} must be a finite number, got {_short(value)}")
     return float(value)
 

@@ -1,13 +1,13 @@
-"""A client of rosbridge: ROS topics and services as JSON over a websocket (port 9090), without a ROS install.
+"""Client of rosbridge: ROS topics and services as JSON over a websocket (port 9090), without a ROS install.
 
-It stands on `websockets` and not on roslibpy, because a motion command must reach the robot now or never, and a
-failure must be an exception. Seen with roslibpy 2.1: what is published while the link is gone raises nothing and is
-sent seconds later, when it has reconnected by itself; rosbridge's own "status" errors are dropped; after `terminate` no
-second connection can be made in the same process.
+It uses `websockets` instead of roslibpy, because a motion command must reach the robot now or never, and a failure
+must raise. Observed with roslibpy 2.1: a message published during a connection loss raises nothing and is sent seconds
+later, after automatic reconnection; rosbridge's "status" errors are dropped; after `terminate`, the same process
+cannot connect again.
 
 Operations (rosbridge protocol 2.1): advertise, publish, subscribe, call_service and service_response (its id echoed),
-status. `decode` and `encode` know no socket; a thread of `RosbridgeLink` reads what comes. Nothing is sent twice and
-nothing is queued: a link that is gone stays gone until it is opened again.
+status. `decode` and `encode` use no socket; a thread of `RosbridgeLink` reads messages. Nothing is sent twice and
+nothing is queued: a lost connection stays closed, and a new link must be opened.
 """
 
 import contextlib
@@ -30,59 +30,59 @@ T = TypeVar("T")
 
 _LOG = logging.getLogger(__name__)
 _MAX_MESSAGES = 200
-"""Messages kept of each topic: two seconds of one at 100 Hz."""
+"""Number of buffered messages of each topic: two seconds at 100 Hz."""
 _MAX_CHARACTERS = 2**19
-"""And no more than these, of JSON, all together: the oldest go. Read, they take up to 30 times as many bytes."""
+"""Limit of a topic's buffered JSON characters; parsed, they take up to 30 times as many bytes."""
 _MAX_MESSAGE_BYTES = 2**20
-"""Who sends a larger message loses the connection; a robot's state is a thousandth of that."""
+"""A larger message closes the connection; a robot's state is about a thousandth of this."""
 _MAX_QUEUE = 16
-"""Messages that may wait to be read; then nothing is taken from the network, and the other side has to wait."""
+"""Number of unread messages at which reading from the network pauses."""
 _MAX_ERROR_CHARACTERS = 300
-"""Characters of a complaint that are passed on."""
+"""Number of characters of an error message that are passed on."""
 _PING_S = 5.0
 
 
 @dataclass(frozen=True)
 class ReceivedMessage:
-    """A message of a topic, and when it came by the link's clock."""
+    """A message of a topic, and its time of arrival on the link's clock."""
 
     message: Message
     time_s: float
 
 
 class _MessageBuffer:
-    """The newest messages of a topic, few enough and short enough together; the last one whatever its length."""
+    """The newest messages of a topic, limited in number and total length; the last one is always stored."""
 
     def __init__(self) -> None:
         self._arrivals: deque[tuple[ReceivedMessage, int]] = deque()
         self._characters = 0
 
     def add(self, arrival: ReceivedMessage, characters: int) -> None:
-        """Keep a message that was so long as JSON, and drop the oldest for it."""
+        """Store a message of this length in JSON, and drop the oldest ones if necessary."""
         self._arrivals.append((arrival, characters))
         self._characters += characters
         while len(self._arrivals) > 1 and (len(self._arrivals) > _MAX_MESSAGES or self._characters > _MAX_CHARACTERS):
             self._characters -= self._arrivals.popleft()[1]
 
     def all(self) -> list[ReceivedMessage]:
-        """Oldest first."""
+        """Return the messages, oldest first."""
         return [arrival for arrival, _ in self._arrivals]
 
     def newest(self) -> ReceivedMessage | None:
-        """The last that came."""
+        """Return the last message, or None."""
         return self._arrivals[-1][0] if self._arrivals else None
 
 
 def encode(operation: Message) -> str:
-    """One operation as JSON. Raises DeviceError for what JSON cannot hold, NaN among it."""
+    """Return an operation as JSON; raise DeviceError for values that JSON cannot express, such as NaN."""
     try:
         return json.dumps(operation, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise DeviceError(f"rosbridge takes plain finite values only: {error}") from error
+        raise DeviceError(f"rosbridge accepts only plain finite values: {error}") from error
 
 
 def decode(text: str | bytes) -> Message | None:
-    """The operation in one websocket message; None for what is none."""
+    """Return the operation in one websocket message, or None if it is invalid."""
     try:
         found = json.loads(text)
     except ValueError:
@@ -93,7 +93,8 @@ def decode(text: str | bytes) -> Message | None:
 class RosbridgeLink:
     """A connection to `ws://host:port`; every wait ends after `timeout_s` at the latest.
 
-    counts: of "noise" (not an operation), "late" (a reply nobody waits for), "status" (complaints of rosbridge).
+    Attributes:
+        counts: Numbers of "noise" (invalid operations), "late" (unexpected replies) and "status" (errors of rosbridge).
     """
 
     def __init__(self, url: str, *, timeout_s: float = 2.0, clock: Clock = time.monotonic) -> None:
@@ -111,16 +112,16 @@ class RosbridgeLink:
 
     @property
     def is_open(self) -> bool:
-        """Whether messages can be sent, as far as is known."""
+        """Whether the connection is open, as far as this side has noticed."""
         return not self._closed_reason
 
     def open(self) -> None:
-        """Connect, once: a closed link is replaced by a new one. Raises DeviceError."""
+        """Connect, once only, or raise DeviceError; a closed link cannot be opened again."""
         try:
             from websockets.sync.client import connect
         except ImportError as error:
             raise DeviceError(
-                "a robot behind rosbridge needs websockets, which is missing; run pip install 'touch-retrieval[sawyer]'"
+                "rosbridge requires websockets, which is missing; run pip install 'touch-retrieval[sawyer]'"
             ) from error
         try:
             connection = connect(
@@ -130,13 +131,13 @@ class RosbridgeLink:
                 close_timeout=1.0,
                 ping_interval=_PING_S,
                 ping_timeout=_PING_S,
-                compression=None,  # on a cable, time matters and size does not
+                compression=None,  # latency matters more than size
                 max_size=_MAX_MESSAGE_BYTES,
                 max_queue=_MAX_QUEUE,
                 proxy=None,
             )
-            self._socket = self._contexts.enter_context(connection)  # websockets 17 wants a context, 15 allows one
-        except Exception as error:  # websockets has a tree of its own beside OSError
+            self._socket = self._contexts.enter_context(connection)  # websockets 17 requires a context
+        except Exception as error:  # websockets raises its own exceptions and OSError
             raise DeviceError(
                 f"rosbridge must answer at {self.url}, got {str(error) or type(error).__name__}; start it on the "
                 "robot's ROS machine with: roslaunch rosbridge_server rosbridge_websocket.launch"
@@ -146,33 +147,33 @@ class RosbridgeLink:
         self._reader.start()
 
     def close(self) -> None:
-        """Close; does nothing where it is closed."""
+        """Close the connection; a second call does nothing."""
         self._mark_closed("it was closed")
-        with contextlib.suppress(Exception):  # closed it is, whatever the goodbye met
+        with contextlib.suppress(Exception):  # errors of the closing handshake
             self._contexts.close()
         if self._reader is not None:
             self._reader.join(self.timeout_s)
 
     def check(self) -> None:
-        """Raise DeviceError unless the connection stands."""
+        """Raise DeviceError unless the connection is open."""
         if self._closed_reason:
-            raise DeviceError(f"the connection to rosbridge at {self.url} is gone: {self._closed_reason}")
+            raise DeviceError(f"the connection to rosbridge at {self.url} is closed: {self._closed_reason}")
 
     def subscribe(self, topic: str, kind: str) -> None:
-        """Ask for the messages of a topic of this ROS type, the newest first when the link is slow."""
+        """Subscribe to a topic of ROS type `kind`; a slow link gets only the newest message."""
         self._topics[topic] = _MessageBuffer()
         self._send({"op": "subscribe", "topic": topic, "type": kind, "throttle_rate": 0, "queue_length": 1})
 
     def advertise(self, topic: str, kind: str, *, latch: bool = False) -> None:
-        """Say that messages of this ROS type will be published. latch: ROS shows the last one to who comes later."""
+        """Advertise a topic of ROS type `kind`; with `latch`, ROS sends the last message to later subscribers."""
         self._send({"op": "advertise", "topic": topic, "type": kind, "latch": latch})
 
     def publish(self, topic: str, message: Message) -> None:
-        """Send a message now. Raises DeviceError."""
+        """Send a message now; raise DeviceError if this fails."""
         self._send({"op": "publish", "topic": topic, "msg": message})
 
     def call(self, service: str, arguments: Message, timeout_s: float | None = None) -> Message:
-        """Call a ROS service once and return its values. Raises DeviceError, also when no answer comes in time."""
+        """Call a ROS service once and return its values; raise DeviceError if it fails or does not answer in time."""
         identity = f"{service}#{next(self._numbers)}"
         with self._changed:
             self._awaited[identity] = service
@@ -189,7 +190,7 @@ class RosbridgeLink:
         return values
 
     def history(self, topic: str) -> list[ReceivedMessage]:
-        """The messages kept of a subscribed topic, oldest first."""
+        """Return the buffered messages of a subscribed topic, oldest first."""
         with self._changed:
             buffer = self._topics.get(topic)
             return buffer.all() if buffer else []
@@ -197,7 +198,7 @@ class RosbridgeLink:
     def wait_for(
         self, topic: str, *, since_s: float = float("-inf"), timeout_s: float | None = None
     ) -> ReceivedMessage:
-        """The newest message of a topic once there is one that came after `since_s`. Raises DeviceError."""
+        """Wait for a message of a topic after `since_s` and return the newest; raise DeviceError if none arrives."""
 
         def fresh() -> ReceivedMessage | None:
             buffer = self._topics.get(topic)
@@ -223,7 +224,7 @@ class RosbridgeLink:
             self._socket.send(text)
         except Exception as error:
             self._mark_closed(str(error) or type(error).__name__)
-            raise DeviceError(f"the connection to rosbridge at {self.url} is gone: {self._closed_reason}") from error
+            raise DeviceError(f"the connection to rosbridge at {self.url} is closed: {self._closed_reason}") from error
 
     def _listen(self) -> None:
         reason = "the other side closed it"
@@ -270,26 +271,26 @@ class RosbridgeLink:
         return True
 
     def _handle_status(self, operation: Message, _: int) -> bool:
-        """An error that names a call fails it; others can only be logged."""
-        identity, words = operation.get("id"), operation.get("msg")
+        """Fail the call that an error names; log other messages."""
+        identity, text = operation.get("id"), operation.get("msg")
         self.counts["status"] += 1
         if isinstance(identity, str) and identity in self._awaited and operation.get("level") == "error":
-            self._replies[identity] = {"result": False, "values": words}
+            self._replies[identity] = {"result": False, "values": text}
         else:
-            _LOG.warning("rosbridge at %s says: %s", self.url, _shorten(words))
+            _LOG.warning("rosbridge at %s reports: %s", self.url, _shorten(text))
         return True
 
 
-def _shorten(words: object) -> str:
-    """What the other side says, cut off, and harmless on a terminal."""
-    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in str(words)[:_MAX_ERROR_CHARACTERS])
+def _shorten(text: object) -> str:
+    """Return the truncated text with unprintable characters escaped."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in str(text)[:_MAX_ERROR_CHARACTERS])
 
 
 def _tcp(url: str, timeout_s: float) -> socket.socket:
-    """A connected socket that gives up on a peer that acknowledges nothing for `timeout_s`. Raises OSError."""
+    """Return a connected socket that fails when the peer acknowledges nothing for `timeout_s`; raise OSError."""
     host, _, port = url.removeprefix("ws://").rpartition(":")
     found = socket.create_connection((host.strip("[]"), int(port)), timeout_s)
     found.settimeout(None)
-    if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; elsewhere the pings notice it later
+    if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; elsewhere the pings detect it later
         found.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, max(1, round(1000 * timeout_s)))
     return found

@@ -1,1 +1,1 @@
-"""Cameras that never wait, and what is cut out of their pictures."""
+"""Streams of free-running cameras, and the rectification of their pictures."""

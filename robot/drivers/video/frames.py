@@ -1,9 +1,9 @@
-"""Pictures of a camera that never waits: a thread takes every one, notes when, and keeps the newest few.
+"""Reader of a free-running camera: a thread reads all frames with their times and buffers the newest few.
 
-What is kept is as the camera gives it (BGR); turning, cropping and colour order cost time and wait for a reader. A
-picture that is the same as the one before counts as that one and keeps its time: a stream that stands still grows old.
-The thread owns the stream. When the stream fails, ends or stands still for too long, it is closed and opened again,
-waiting a little longer each time; until a new picture has come, whoever asks waits and is then told why.
+Frames are buffered as the camera delivers them (BGR); rotation, crop and colour order are applied only on reading. A
+frame equal to the previous one keeps the previous time, so a frozen stream becomes stale. The thread owns the stream.
+When the stream fails, ends or freezes, the thread closes it and opens it again, with increasing delays. Until a new
+frame arrives, readers wait; after the timeout they raise with the reason.
 """
 
 import contextlib
@@ -25,30 +25,34 @@ from robot.settings import TypedSettings, bounded
 
 log = logging.getLogger(__name__)
 MAX_CAMERA_WAIT_S = 600.0
-"""Nobody waits longer for a camera, and the system's own waits overflow at some length."""
+"""Upper limit of all camera timeouts; the system's own waits overflow at some length."""
 
 _CLOSING_S = 5.0
-"""A thread that waits inside a camera's driver gets so long to come back before `close` says that it has not."""
+"""Time in which the thread must return from the camera's driver before `close` raises."""
 
 _SAMPLE = 16
-"""Every 16th row and column tells nearly any two pictures apart; only where they agree is the rest compared."""
+"""Every 16th row and column are compared first, because they differ in nearly any two pictures."""
 
 
 class Stream(Protocol):
-    """An opened camera. Both methods are called by one thread at a time."""
+    """An opened camera. One thread at a time calls its methods."""
 
     def next(self) -> Frame:
-        """Wait for the next picture: (H, W, 3) uint8 BGR. Raises DeviceError or OSError where none comes."""
+        """Wait for the next frame, (H, W, 3) uint8 BGR; raise DeviceError or OSError if none arrives."""
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReaderSettings(TypedSettings):
-    """keep: pictures kept. warmup_s: pictures so soon after opening are dropped (automatic exposure, first black ones).
-    timeout_s: how long somebody who asks waits for a picture. frozen_s: a stream of the same pixels for longer is
-    opened again; its picture is too old to be used long before that. Raises RobotConfigError for one out of range.
+    """Settings of a frame reader.
+
+    Attributes:
+        keep: Number of buffered frames.
+        warmup_s: Time after opening in which frames are dropped (automatic exposure, first black frames).
+        timeout_s: Longest wait for a frame.
+        frozen_s: Duration of equal frames after which the stream is opened again; they are stale long before.
     """
 
     keep: int = bounded(1, 1000, 4, unit="pictures")
@@ -58,10 +62,18 @@ class ReaderSettings(TypedSettings):
 
 
 class FrameReader:
-    """Reads the streams that `open_stream` opens, in a thread of its own, from `start` to `close`.
+    """Reads streams in a thread of its own, from `start` to `close`.
 
-    frame_count: pictures taken, the dropped ones included. lost: how often a stream was given up. backoff_s: first and
-    longest wait before it is opened again.
+    Args:
+        name: Name of the camera in messages.
+        open_stream: Opens the stream.
+        settings: Settings of the reader.
+        clock: Clock of the frames' times.
+        backoff_s: First and longest wait before a lost stream is opened again.
+
+    Attributes:
+        frame_count: Frames read, dropped ones included.
+        lost_count: Number of stream losses.
     """
 
     def __init__(
@@ -82,38 +94,41 @@ class FrameReader:
         self._thread: threading.Thread | None = None
         self._last: Frame | None = None
         self._warm_s = 0.0
-        self._last_error = "nothing came"
+        self._last_error = "no frame arrived"
 
     def start(self) -> None:
-        """Open the stream and wait for its first picture. Raises DeviceError or OSError; then `close` is due."""
+        """Open the stream and wait for its first frame; after a DeviceError or OSError, call `close`."""
         stream = self._open()
         self._thread = threading.Thread(target=self._run, args=(stream,), name=f"frames of {self.name}", daemon=True)
         self._thread.start()
         self._wait(self.settings.timeout_s + self.settings.warmup_s)
 
     def newest(self) -> Frame:
-        """The newest picture; waits for one where there is none yet, or none since the stream was lost.
+        """Return the newest frame; wait if there is none yet or none since the stream was lost.
 
-        Raises DeviceError after `timeout_s`.
+        Raises:
+            DeviceError: No frame arrived within `timeout_s`.
         """
         return self._wait(self.settings.timeout_s)[-1]
 
     def after(self, time_s: float) -> Frame:
-        """Wait for a picture newer than `time_s`. Raises DeviceError after `timeout_s` and the time to warm up, which a
-        stream that was lost takes again.
+        """Wait for a frame newer than `time_s` and return it.
+
+        Raises:
+            DeviceError: No frame arrived within `timeout_s` + `warmup_s`; a lost stream warms up again.
         """
         return self._wait(self.settings.timeout_s + self.settings.warmup_s, time_s)[-1]
 
     def near(self, time_s: float) -> Frame:
-        """Of the kept pictures the one taken nearest to `time_s`, the newer one of two. Raises DeviceError."""
+        """Return the buffered frame nearest to `time_s`, the newer one of two; raise DeviceError without frames."""
         return min(self._wait(self.settings.timeout_s), key=lambda frame: (abs(frame.time_s - time_s), -frame.time_s))
 
     def reopen_now(self) -> None:
-        """Open a lost stream again now."""
+        """Open a lost stream again without further delay."""
         self._reopen.set()
 
     def close(self) -> None:
-        """End the thread, which lets go of the stream. Raises DeviceError where the camera's driver holds it up."""
+        """Stop the thread, which closes the stream; raise DeviceError if the camera's driver blocks it."""
         self._stopped.set()
         self._reopen.set()
         if self._thread is None:
@@ -121,8 +136,8 @@ class FrameReader:
         self._thread.join(_CLOSING_S)
         if self._thread.is_alive():
             raise DeviceError(
-                f"{self.name} must end within {_CLOSING_S:g} s, but its driver still waits for a picture; "
-                "it is let go as soon as that returns. Unplug it if that does not help"
+                f"{self.name} did not close within {_CLOSING_S:g} s, because its driver still waits for a picture; "
+                "it closes when the driver returns. Unplug it if this does not help"
             )
 
     def _open(self) -> Stream:
@@ -134,8 +149,8 @@ class FrameReader:
         with self._changed:
             if not self._changed.wait_for(lambda: bool(self._frames) and self._frames[-1].time_s > since_s, timeout_s):
                 raise DeviceError(
-                    f"{self.name} must give a picture within {timeout_s:g} s: {self._last_error}; it was lost {self.lost_count} "
-                    "time(s). Is it plugged in, and used by no other program?"
+                    f"{self.name} returned no picture within {timeout_s:g} s: {self._last_error}; the stream was lost "
+                    f"{self.lost_count} time(s). Is it plugged in, and used by no other program?"
                 )
             return list(self._frames)
 
@@ -147,7 +162,7 @@ class FrameReader:
                 stream = stream or self._open()
                 self._store(stream.next())
                 delay = shortest
-            except Exception as error:  # whatever it is, the thread must live, and whoever asks must hear of it
+            except Exception as error:  # the thread must survive, and readers get the reason
                 self._handle_failure(stream, error, delay)
                 stream = None
                 self._reopen.wait(delay)
@@ -157,7 +172,7 @@ class FrameReader:
             _close_quietly(stream)
 
     def _store(self, frame: Frame) -> None:
-        """Keep a new picture; one that repeats the last is as old as its first copy, and is not kept again."""
+        """Buffer a new frame; drop a frame equal to the last one, which keeps its older time."""
         with self._changed:
             self.frame_count += 1
             if self._last is not None and _is_same_picture(self._last.pixels, frame.pixels):
@@ -174,7 +189,7 @@ class FrameReader:
             self._frames.clear()
             self._last_error = str(error) or type(error).__name__
             self.lost_count += 1
-        log.warning("%s: %s; opened again in %.2g s (time %d)", self.name, self._last_error, delay, self.lost_count)
+        log.warning("%s: %s; reopening in %.2g s (loss %d)", self.name, self._last_error, delay, self.lost_count)
         if stream is not None:
             _close_quietly(stream)
 

@@ -1,9 +1,10 @@
-"""A camera opened through OpenCV and Video4Linux: settings written, read back, and pictures with their times.
+"""A camera through OpenCV and Video4Linux: writes settings, reads them back, and reads pictures with their times.
 
-Facts used (OpenCV's cap_v4l.cpp; the kernel's uvcvideo): a change of format, size or buffers starts the stream anew, so
-these are set first, width and height one after the other; a control that a camera lacks reads -1; automatic exposure is
-a menu with 1 = manual and 3 = automatic; exposure counts in 0.1 ms; CAP_PROP_POS_MSEC is when a picture's buffer was
-filled, on the clock of time.monotonic; grab() gives up after OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT seconds, 10 unless set.
+Facts used (OpenCV's cap_v4l.cpp; the kernel's uvcvideo): a change of format, size or buffers restarts the stream, so
+these are set first, width directly before height. A control that a camera lacks reads -1. Automatic exposure is a
+menu with 1 = manual and 3 = automatic; exposure is in units of 0.1 ms. CAP_PROP_POS_MSEC is the time at which the
+picture's buffer was filled, on the clock of time.monotonic. grab() times out after OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT
+seconds, 10 by default.
 """
 
 import contextlib
@@ -26,10 +27,10 @@ from robot.settings import TypedSettings, bounded
 
 _GRAB_LIMIT_S = 1
 _DAMAGED_IN_A_ROW = 10
-"""So many pictures that cannot be decoded are passed over before the stream counts as lost."""
+"""Number of consecutive undecodable pictures that are skipped before the stream counts as lost."""
 
 _STAMP_S = (-0.05, 1.0)
-"""A picture's own time is believed where it is so much older than now; else it is on another clock."""
+"""Accepted ages of a picture's own time stamp in s; a stamp outside this range is on another clock."""
 
 _NUMBERED = re.compile(r"/dev/video\d+")
 _ZERO_ALLOWED = ("exposure_ms", "white_balance_k", "gain")
@@ -37,11 +38,20 @@ _ZERO_ALLOWED = ("exposure_ms", "white_balance_k", "gain")
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureSettings(TypedSettings):
-    """What is asked of a camera; 0, "", () and None leave a setting as the camera has it.
+    """Requested settings of a camera; 0, "", () and None leave a setting as the camera has it.
 
-    width, height in pixels; fps; fourcc as "MJPG"; exposure_ms and white_balance_k count where they are not automatic;
-    gain in the camera's own unit; buffer: pictures that the system keeps back (1 to 10); led: red, green, blue of a
-    DIGIT, each 0 to 15.
+    Attributes:
+        width: Width in pixels.
+        height: Height in pixels.
+        fps: Frames/s.
+        fourcc: Pixel format, such as "MJPG".
+        auto_exposure: Whether the exposure is automatic.
+        exposure_ms: Exposure, if not automatic.
+        auto_white_balance: Whether the white balance is automatic.
+        white_balance_k: Colour temperature, if not automatic.
+        gain: Gain in the camera's own unit.
+        buffer: Number of pictures that the system buffers, 1 to 10.
+        led: Red, green and blue of a DIGIT, each 0 to 15.
     """
 
     width: int = 0
@@ -57,19 +67,19 @@ class CaptureSettings(TypedSettings):
     led: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting out of range."""
+        """Raise RobotConfigError for a setting out of range."""
         super().__post_init__()
         size, text, led = (self.width, self.height), self.fourcc, self.led
         is_size = size == (0, 0) or 1 <= min(size) <= max(size) <= 20000
         _require("width and height must be given together, up to 20000 pixels", size, is_size)
-        _require('fourcc must be four letters, as "MJPG"', text, not text or bool(re.fullmatch(r"[ -~]{4}", text)))
+        _require('fourcc must be four letters, such as "MJPG"', text, not text or bool(re.fullmatch(r"[ -~]{4}", text)))
         for name, automatic in (("exposure_ms", self.auto_exposure), ("white_balance_k", self.auto_white_balance)):
             value = getattr(self, name)
-            _require(f"{name} must be left out where it is automatic", value, not automatic or value is None)
+            _require(f"{name} must be left out if it is automatic", value, not automatic or value is None)
         _require("led must be three numbers, 0 to 15", led, len(led) in (0, 3) and all(0 <= each <= 15 for each in led))
 
     def requested(self) -> dict[str, Any]:
-        """Settings to write, in the order in which to write them."""
+        """Return the settings to write, in order of writing."""
         values = {name: getattr(self, name) for name in _PROPERTIES}
         return {
             name: value
@@ -80,32 +90,36 @@ class CaptureSettings(TypedSettings):
 
 @dataclass(frozen=True, kw_only=True)
 class UsbCameraSettings(CaptureSettings, ReaderSettings):
-    """A USB camera named by `device`, a path in /dev/v4l/by-id (or by-path: the socket), what is asked of it and how it
-    is read. allow_index: let `device` be a number or /dev/video0.
+    """Settings of a USB camera.
+
+    Attributes:
+        device: Path in /dev/v4l/by-id, or in by-path (the socket).
+        allow_index: Whether `device` may be a number or a path such as /dev/video0.
     """
 
     device: str
     allow_index: bool = False
 
 
-def _require(what: str, got: object, holds: bool) -> None:
-    if not holds:
-        raise RobotConfigError(f"a camera's {what}, got {got}")
+def _require(requirement: str, got: object, is_met: bool) -> None:
+    if not is_met:
+        raise RobotConfigError(f"a camera's {requirement}, got {got}")
 
 
 @dataclass(frozen=True)
 class _Property:
-    """One setting: OpenCV's number of it, our value to the camera's and back, and how far off still counts as taken."""
+    """One setting: its OpenCV number, conversions to and from the camera's value, and the accepted deviation."""
 
     number: int
     to_camera: Callable[[Any], float] = float
     from_camera: Callable[[float], Any] = float
     slack: float = 0.0
 
-    def is_applied(self, requested: Any, has: Any) -> bool:
+    def is_applied(self, requested: Any, actual: Any) -> bool:
+        """Return whether the camera has applied the requested value."""
         if isinstance(requested, str | bool | Sequence):
-            return bool(has == (list(requested) if isinstance(requested, tuple) else requested))
-        return has is not None and abs(float(has) - float(requested)) <= self.slack
+            return bool(actual == (list(requested) if isinstance(requested, tuple) else requested))
+        return actual is not None and abs(float(actual) - float(requested)) <= self.slack
 
 
 _PROPERTIES: Mapping[str, _Property] = {
@@ -129,14 +143,19 @@ _PROPERTIES: Mapping[str, _Property] = {
         lambda value: [int(value) >> shift & 15 for shift in (8, 4, 0)],
     ),
 }
-"""In the order of writing. The DIGIT takes the brightness of its LEDs through the zoom control."""
+"""Settings in order of writing. The zoom control of a DIGIT sets the brightness of its LEDs."""
 
 
 class CaptureStream:
-    """One opened camera. settings: read back from it after all were written. refused: those that it did not take."""
+    """One opened camera.
+
+    Attributes:
+        settings: Settings read back after all were written.
+        refused: Settings that the camera refused, each with the requested and the actual value.
+    """
 
     def __init__(self, device: str, settings: CaptureSettings, clock: Clock) -> None:
-        """Open and set up the camera at the path `device`. Raises DeviceError."""
+        """Open and set up the camera at the path `device`; raise DeviceError if this fails."""
         self.device, self.clock = device, clock
         self.refused: dict[str, str] = {}
         self._damaged = 0
@@ -144,7 +163,7 @@ class CaptureStream:
             self._capture = open_capture(device)
         try:
             if not self._capture.isOpened():
-                raise DeviceError(f"{device} cannot be opened; is it used by another program, or not yours to read?")
+                raise DeviceError(f"{device} cannot be opened; is it used by another program, or permission missing?")
             with self._errors():
                 self.settings = self._write(settings)
         except BaseException:
@@ -152,26 +171,26 @@ class CaptureStream:
             raise
 
     def next(self) -> Frame:
-        """The next picture, (H, W, 3) uint8 BGR, and when it was taken. Raises DeviceError."""
+        """Return the next frame, (H, W, 3) uint8 BGR; raise DeviceError if the stream has ended."""
         while True:
             with self._errors():
                 grabbed = self._capture.grab()
                 time_s = self._time()
-                whole, pixels = self._capture.retrieve() if grabbed else (False, None)
-            if whole and pixels is not None and pixels.size:
+                complete, pixels = self._capture.retrieve() if grabbed else (False, None)
+            if complete and pixels is not None and pixels.size:
                 self._damaged = 0
                 return Frame(pixels, time_s)
             self._damaged += 1
             if not grabbed or self._damaged > _DAMAGED_IN_A_ROW:
-                raise DeviceError(f"{self.device} gives no more pictures")
+                raise DeviceError(f"{self.device} returned no more pictures")
 
     def close(self) -> None:
-        """Let go of the camera; twice does nothing."""
+        """Release the camera; a second call does nothing."""
         with contextlib.suppress(cv2.error):
             self._capture.release()
 
     def _time(self) -> float:
-        """The picture's own time where it has one on our clock, else now."""
+        """Return the picture's own time stamp if it is on the rig's clock, else the current time."""
         now = self.clock()
         stamp = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
         return stamp if _STAMP_S[0] <= now - stamp <= _STAMP_S[1] else now
@@ -180,12 +199,12 @@ class CaptureStream:
         requested = settings.requested()
         for name, value in requested.items():
             self._capture.set(_PROPERTIES[name].number, _PROPERTIES[name].to_camera(value))
-        has = {name: self._read(each) for name, each in _PROPERTIES.items() if name != "led" or name in requested}
+        actual = {name: self._read(each) for name, each in _PROPERTIES.items() if name != "led" or name in requested}
         for name, value in requested.items():
-            if not _PROPERTIES[name].is_applied(value, has[name]):
-                reported = "no such setting" if has[name] is None else _format_value(has[name])
-                self.refused[name] = f"asked {_format_value(value)}, has {reported}"
-        return has
+            if not _PROPERTIES[name].is_applied(value, actual[name]):
+                reported = "no such setting" if actual[name] is None else _format_value(actual[name])
+                self.refused[name] = f"requested {_format_value(value)}, has {reported}"
+        return actual
 
     def _read(self, each: _Property) -> Any:
         value = self._capture.get(each.number)
@@ -200,20 +219,22 @@ class CaptureStream:
 
 
 class CaptureReader(FrameReader):
-    """The thread that reads one camera. settings and `refused` are as of when its stream was opened last.
+    """Frame reader of one camera.
 
-    `refused` is the owner's dictionary, kept up to date.
+    Attributes:
+        camera: Settings read back at the last opening of the stream.
+        refused: The owner's dictionary of refused settings, updated at each opening.
     """
 
     def __init__(self, owner: Device, requested: UsbCameraSettings) -> None:
-        """Raises RobotConfigError for a `device` that may be another camera tomorrow; opens nothing."""
+        """Check the path without opening it; raise RobotConfigError if `device` is not a stable name."""
         super().__init__(owner.name, self._open_camera, requested, clock=owner.clock)
         self.requested, self.refused = requested, owner.refused
         self._path = stable_path(requested.device, requested.allow_index)
         self.camera: dict[str, Any] = {}
 
     def _open_camera(self) -> CaptureStream:
-        """Also called by the thread, when the stream was lost: settings are written and read back again."""
+        """Open the camera, then write and read back its settings; the thread calls this after each loss too."""
         stream = CaptureStream(self._path, self.requested, self.clock)
         self.refused.clear()
         self.refused.update(stream.refused)
@@ -221,7 +242,7 @@ class CaptureReader(FrameReader):
         return stream
 
     def recover(self) -> None:
-        """A lost stream is opened again without being asked: have it be now, and wait for a picture."""
+        """Open a lost stream without further delay and wait for a frame."""
         self.reopen_now()
         self.after(self.clock())
 
@@ -233,29 +254,35 @@ def _format_value(value: Any) -> str:
 
 
 def open_capture(device: str) -> Any:
-    """OpenCV's capture of the camera at a path: the number behind a stable name changes when it is plugged in again."""
+    """Return OpenCV's capture of the camera at a path, resolved now, because the number behind a name may change."""
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(_GRAB_LIMIT_S))
     if not Path(device).exists():
-        raise DeviceError(f"{device} must be there, but is not; is the camera plugged in?{_connected_cameras()}")
+        raise DeviceError(f"{device} does not exist; is the camera plugged in?{_connected_cameras()}")
     return cv2.VideoCapture(os.path.realpath(device), cv2.CAP_V4L2)
 
 
 def stable_path(device: str, allow_index: bool) -> str:
-    """The path to open for a `device` from a rig's file. Raises RobotConfigError for one that is no path, or that may
-    be another camera tomorrow, unless `allow_index`.
+    """Return the path to open for a `device` of a rig's file.
+
+    Args:
+        device: Path, or number of the camera.
+        allow_index: Whether a number or a path such as /dev/video0 is accepted.
+
+    Raises:
+        RobotConfigError: The device is not a path, or not a stable one.
     """
     path = f"/dev/video{device}" if device.isascii() and device.isdigit() else device
     if not os.path.isabs(path):
-        raise RobotConfigError(f"a camera must be named by its whole path, got {device!r}.{_connected_cameras()}")
+        raise RobotConfigError(f"a camera must be named by its absolute path, got {device!r}.{_connected_cameras()}")
     if allow_index or not _NUMBERED.fullmatch(os.path.normpath(path)):
         return path
     known = (
         _connected_cameras()
-        or " This system makes no such names: set allow_index = true if only one camera is ever plugged in"
+        or " This system has no stable names: set allow_index = true if only one camera is ever plugged in"
     )
     raise RobotConfigError(
-        "a camera must be named by what stays the same, a path in /dev/v4l/by-id, "
-        f"got {device!r}, a number that another camera may have tomorrow.{known}"
+        "a camera must be named by a stable path in /dev/v4l/by-id, "
+        f"got {device!r}, a number that another camera may have after a restart.{known}"
     )
 
 

@@ -1,7 +1,8 @@
-"""Bytes of the WSG-50's command interface: packets, their check sum, and how they are found in a stream. No I/O.
+"""Packets of the WSG-50's command interface: encoding, checksum, and decoding from a byte stream. No I/O.
 
-A packet is AA AA AA | id u8 | length u16 | payload | check sum u16, all little-endian. What payloads mean stands in
-robot.drivers.wsg50.commands. Facts: command set reference of the gripper (firmware 4.0) and public drivers for it.
+A packet is AA AA AA | id u8 | length u16 | payload | checksum u16, all little-endian. Module
+robot.drivers.wsg50.commands interprets payloads. Sources: the gripper's command set reference (firmware 4.0) and public
+drivers for it.
 """
 
 import functools
@@ -13,27 +14,27 @@ from robot.errors import DeviceError
 
 PREAMBLE = b"\xaa\xaa\xaa"
 MAX_PAYLOAD = 256
-"""More than any command of the table needs; a length above it is noise. Bounds what a damaged length can swallow."""
+"""Longest accepted payload, above that of any command; it limits the bytes that a damaged length can claim."""
 
 _HEADER = 6  # preamble, id, length
 _CHECK = 2
 _NO_ID = 0xAA
-"""No command has this id, so that in a run of more than three AA the preamble is the last three."""
+"""No command has this id, so in a run of more than three AA the preamble is the last three."""
 
 
 class WireError(DeviceError):
-    """Bytes do not mean what they must: a payload of the wrong length, a number that is none, an unknown status."""
+    """Invalid bytes: a payload of the wrong length, a number that is not finite, or an unknown status."""
 
 
 @dataclass(frozen=True)
 class Packet:
-    """A command or a reply. id: 0 to 255 without AA. Raises WireError for what cannot be sent."""
+    """A command or a reply; id: 0 to 255 except AA."""
 
     id: int
     payload: bytes = b""
 
     def __post_init__(self) -> None:
-        """Check what the bytes can hold."""
+        """Raise WireError for an id or a payload that cannot be encoded."""
         if not 0 <= self.id <= 255 or self.id == _NO_ID:
             raise WireError(f"a packet's id must be from 0 to 255 and not {_NO_ID}, got {self.id}")
         if len(self.payload) > MAX_PAYLOAD:
@@ -41,7 +42,7 @@ class Packet:
 
 
 def _table_row(index: int) -> int:
-    """Remainder of a byte by the polynomial 0x1021, most significant bit first."""
+    """Return the remainder of a byte by the polynomial 0x1021, most significant bit first."""
     row = index << 8
     for _ in range(8):
         row = (row << 1) ^ (0x1021 if row & 0x8000 else 0)
@@ -52,7 +53,7 @@ _TABLE = tuple(map(_table_row, range(256)))
 
 
 def checksum(data: bytes | bytearray, start: int = 0xFFFF) -> int:
-    """Check sum of `data`; over a packet and its own check sum it is 0. Not CCITT: the register moves the other way."""
+    """Return the checksum of `data`, 0 for a packet with its checksum; not CCITT, the register shifts right."""
     value = start
     for byte in data:
         value = _TABLE[(value ^ byte) & 0xFF] ^ (value >> 8)
@@ -60,17 +61,17 @@ def checksum(data: bytes | bytearray, start: int = 0xFFFF) -> int:
 
 
 class _PrefixChecksums:
-    """Check sums of many stretches of one buffer, going through each of its bytes once.
+    """Checksums of many ranges of one buffer in a single pass over its bytes.
 
-    A stream of packets that break off claims every byte up to 44 times. The sum is linear: that of a stretch follows
-    from the sums, begun at 0, up to its two ends.
+    In a stream of truncated packets, up to 44 packets claim the same byte. The checksum is linear: that of a range
+    follows from the checksums, started at 0, up to its two ends.
     """
 
     def __init__(self, buffer: bytes | bytearray, first: int) -> None:
         self._buffer, self._first, self._up_to = buffer, first, [0]
 
     def checksum_of(self, start: int, stop: int) -> int:
-        """As `checksum` of buffer[start:stop]; no byte before `first`."""
+        """Return `checksum(buffer[start:stop])`; start must be at least `first`."""
         value = self._up_to[-1]
         for byte in self._buffer[self._first + len(self._up_to) - 1 : stop]:
             value = _TABLE[(value ^ byte) & 0xFF] ^ (value >> 8)
@@ -80,13 +81,13 @@ class _PrefixChecksums:
 
 
 def _after_zeros(value: int, count: int) -> int:
-    """What `count` bytes of 0 make of a sum."""
+    """Return the checksum after `count` further bytes of 0."""
     column = _ZEROS[count]
     return functools.reduce(operator.xor, (column[bit] for bit in range(16) if value >> bit & 1), 0)
 
 
 def _zeros(max_count: int) -> tuple[tuple[int, ...], ...]:
-    """Of each number of zeros up to `max_count`: what they make of each bit of a sum."""
+    """Return, for each number of zero bytes up to `max_count`, the checksum of each single bit after them."""
     columns = [tuple(1 << bit for bit in range(16))]
     for _ in range(max_count):
         columns.append(tuple(_TABLE[value & 0xFF] ^ (value >> 8) for value in columns[-1]))
@@ -97,16 +98,16 @@ _ZEROS = _zeros(_HEADER + MAX_PAYLOAD + _CHECK)
 
 
 def encode(packet: Packet) -> bytes:
-    """The bytes of a packet."""
+    """Return the bytes of a packet."""
     body = PREAMBLE + struct.pack("<BH", packet.id, len(packet.payload)) + packet.payload
     return body + struct.pack("<H", checksum(body))
 
 
 def decode(buffer: bytes | bytearray) -> tuple[int, Packet | None]:
-    """The first whole, undamaged packet, and how many bytes to drop from the front; (n, None) where more must come.
+    """Return the number of bytes to drop and the first valid packet, or None if more bytes are needed.
 
-    Whatever is no packet is skipped byte by byte, so that a packet which began inside a damaged one is found. While a
-    packet that has begun is not yet whole, its bytes stay: where none come any more, drop one and decode again.
+    Invalid bytes are skipped one by one, so a packet that begins inside a damaged one is found. The bytes of an
+    incomplete packet are not dropped. If its rest does not arrive, drop one byte and decode again.
     """
     at = buffer.find(PREAMBLE)
     sums = _PrefixChecksums(buffer, at)
@@ -122,7 +123,7 @@ def decode(buffer: bytes | bytearray) -> tuple[int, Packet | None]:
 
 
 def _claimed_size(buffer: bytes | bytearray, at: int) -> int | None:
-    """Bytes of the packet that begins here, 0 if it can be none, None where that is not yet known."""
+    """Return the size of the packet that begins at `at`, 0 if there is none, None if not yet known."""
     if len(buffer) > at + 3 and buffer[at + 3] == _NO_ID:
         return 0
     if len(buffer) < at + _HEADER:
@@ -132,5 +133,5 @@ def _claimed_size(buffer: bytes | bytearray, at: int) -> int | None:
 
 
 def _partial_preamble_size(buffer: bytes | bytearray) -> int:
-    """How many bytes at the end may be the beginning of a preamble."""
+    """Return the number of bytes at the end that may begin a preamble."""
     return next(size for size in (2, 1, 0) if size == 0 or buffer[-size:] == PREAMBLE[:size])

@@ -1,12 +1,12 @@
-"""What the WSG-50's commands and replies mean: builders of commands, parsers of replies. No I/O.
+"""Commands and replies of the WSG-50: builders of commands, parsers of replies. No I/O.
 
-A reply bears the id of its command, and its payload begins with a status u16; parameters follow only where the status
-is SUCCESS. A command that moves is answered by PENDING first, and by a second packet of the same id when it has ended.
-An automatic update is a reply that nobody asked for.
+A reply has the id of its command, and its payload begins with a status u16; parameters follow only if the status is
+SUCCESS. A motion command gets the reply PENDING first, and a second reply of the same id at its end. An automatic
+update is an unsolicited reply.
 
-Facts: as in robot.drivers.wsg50.codec; commands that the driver does not use are left out. Lengths in mm, speeds in
-mm/s, accelerations in mm/s^2, forces in N as the gripper counts them (WSG50Settings.to_finger_force says what they are).
-Whatever cannot be raises WireError.
+Sources: as in robot.drivers.wsg50.codec. Commands that the driver does not use are left out. Lengths in mm, speeds in
+mm/s, accelerations in mm/s^2, forces in N as the gripper counts them (see WSG50Settings.to_finger_force). Invalid
+arguments and replies raise WireError.
 """
 
 import enum
@@ -19,7 +19,7 @@ from robot.drivers.wsg50.codec import Packet, WireError
 
 
 class CommandId(enum.IntEnum):
-    """Commands by id."""
+    """Ids of commands."""
 
     LOOP = 0x06
     DISCONNECT = 0x07
@@ -46,11 +46,11 @@ class CommandId(enum.IntEnum):
 
 
 UPDATING = frozenset({CommandId.SYSTEM_STATE, CommandId.GRASPING_STATE, CommandId.OPENING, CommandId.FORCE})
-"""Commands whose reply the gripper can be told to send again and again."""
+"""Commands whose reply the gripper can send periodically."""
 
 
 class Status(enum.IntEnum):
-    """What became of a command."""
+    """Status of a command in its reply."""
 
     SUCCESS = 0
     NOT_AVAILABLE = 1
@@ -86,7 +86,7 @@ class Status(enum.IntEnum):
 
 
 class SystemState(enum.IntFlag):
-    """Bits of the system state; unknown ones are kept."""
+    """Bits of the system state; unknown bits are preserved."""
 
     REFERENCED = 1 << 0
     MOVING = 1 << 1
@@ -110,7 +110,7 @@ class SystemState(enum.IntFlag):
 
 
 class GraspingState(enum.IntEnum):
-    """What the gripper makes of the grasp."""
+    """State of the grasp as the gripper reports it."""
 
     IDLE = 0
     GRASPING = 1
@@ -124,7 +124,7 @@ class GraspingState(enum.IntEnum):
 
 @dataclass(frozen=True)
 class GripperInfo:
-    """What the gripper is. kind: the vendor's number of the type. firmware: as sent, a nibble a digit."""
+    """Identity of the gripper; kind: the vendor's type number; firmware: one digit for each nibble."""
 
     kind: int
     hardware: int
@@ -134,7 +134,7 @@ class GripperInfo:
 
 @dataclass(frozen=True)
 class GripperLimits:
-    """What the gripper can do."""
+    """Limits of the gripper."""
 
     stroke_mm: float
     min_speed_mm_s: float
@@ -147,7 +147,7 @@ class GripperLimits:
 
 
 def packet(command: CommandId, *numbers: float) -> Packet:
-    """A command, with the lengths, speeds, forces or accelerations that it takes."""
+    """Build a command with its lengths, speeds, forces or accelerations."""
     try:
         packed = struct.pack(f"<{len(numbers)}f", *numbers)
     except (struct.error, OverflowError) as error:
@@ -158,40 +158,40 @@ def packet(command: CommandId, *numbers: float) -> Packet:
 
 
 def home(direction: int = 0) -> Packet:
-    """Find the reference. direction: 0 as configured, 1 outward, 2 inward."""
+    """Build the homing command (reference run); direction: 0 as configured, 1 outward, 2 inward."""
     if direction not in (0, 1, 2):
         raise WireError(f"the direction of homing must be 0, 1 or 2, got {direction}")
     return Packet(CommandId.HOME, bytes([direction]))
 
 
 def move(width_mm: float, speed_mm_s: float) -> Packet:
-    """Pre-position the fingers, and stop (rather than clamp) when blocked."""
+    """Build the command to pre-position the fingers, which stop (and do not clamp) when blocked."""
     return Packet(CommandId.MOVE, b"\x02" + packet(CommandId.MOVE, width_mm, speed_mm_s).payload)
 
 
 def acknowledge() -> Packet:
-    """End a FAST STOP."""
+    """Build the command that ends a FAST STOP."""
     return Packet(CommandId.ACKNOWLEDGE, b"ack")
 
 
 def query(command: CommandId) -> Packet:
-    """Ask for a value; of an UPDATING one this also ends its automatic updates."""
+    """Build the query of a value; for an UPDATING command it also ends the automatic updates."""
     return Packet(command, bytes(3) if command in UPDATING else b"")
 
 
 def update(command: CommandId, period_ms: int) -> Packet:
-    """Ask for a value every `period_ms` (1 to 65535) from now on."""
+    """Build the command for automatic updates of a value every `period_ms` (1 to 65535)."""
     if command not in UPDATING:
-        raise WireError(f"only {', '.join(sorted(each.name for each in UPDATING))} update themselves, not {command!r}")
+        raise WireError(f"only {', '.join(sorted(each.name for each in UPDATING))} have updates, got {command!r}")
     if not 1 <= period_ms <= 0xFFFF:
         raise WireError(f"a period must be from 1 to 65535 ms, got {period_ms}")
     return Packet(command, struct.pack("<BH", 1, period_ms))
 
 
 def reply(packet: Packet) -> tuple[Status, bytes]:
-    """Status and parameters of a reply. Raises WireError."""
+    """Return the status and parameters of a reply; raise WireError if the status is missing or unknown."""
     if len(packet.payload) < 2:
-        raise WireError(f"the reply {command_name(packet.id)} must hold a status of 2 bytes, got {len(packet.payload)}")
+        raise WireError(f"the reply {command_name(packet.id)} must have a status of 2 bytes, got {len(packet.payload)}")
     number = int.from_bytes(packet.payload[:2], "little")
     try:
         return Status(number), packet.payload[2:]
@@ -200,33 +200,33 @@ def reply(packet: Packet) -> tuple[Status, bytes]:
 
 
 def number(parameters: bytes) -> float:
-    """A length, speed, force or acceleration. Raises WireError, also for one that is not finite."""
+    """Parse a length, speed, force or acceleration; raise WireError if it is not a finite number."""
     return _numbers("<f", parameters)[0]
 
 
 def soft_limits(parameters: bytes) -> tuple[float, float]:
-    """Lower and upper opening (mm)."""
+    """Parse the lower and upper opening (mm)."""
     minus, plus = _numbers("<2f", parameters)
     return minus, plus
 
 
 def limits(parameters: bytes) -> GripperLimits:
-    """What the gripper can do."""
+    """Parse the limits of the gripper."""
     return GripperLimits(*_numbers("<8f", parameters))
 
 
 def info(parameters: bytes) -> GripperInfo:
-    """What the gripper is."""
+    """Parse the identity of the gripper."""
     return GripperInfo(*_unpack("<BBHI", parameters))
 
 
 def system_state(parameters: bytes) -> SystemState:
-    """Bits of the system state."""
+    """Parse the system state."""
     return SystemState(_unpack("<I", parameters)[0])
 
 
 def grasping_state(parameters: bytes) -> GraspingState:
-    """State of the grasp."""
+    """Parse the state of the grasp."""
     number = _unpack("<B", parameters)[0]
     try:
         return GraspingState(number)
@@ -235,7 +235,7 @@ def grasping_state(parameters: bytes) -> GraspingState:
 
 
 def command_name(command_id: int) -> str:
-    """Words for an id, as in "GRASP (25h)"."""
+    """Return the name of a command for messages, such as "GRASP (25h)"."""
     name = CommandId(command_id).name if command_id in list(CommandId) else "to an unknown command"
     return f"{name} ({command_id:02X}h)"
 

@@ -1,12 +1,11 @@
-"""The WSG-50 parallel gripper (Weiss Robotics, SCHUNK) as a Gripper of the contract.
+"""Driver of the WSG-50 parallel gripper (Weiss Robotics, SCHUNK).
 
-Beside this file: bytes (codec), what they mean (commands), the line, serial or TCP (link), how a motion is watched
-(motion), settings and what a force is (setup). Tried against an emulator, not yet on a gripper.
+Modules of the package: packets (codec), commands and replies (commands), the link, serial or TCP (link), supervised
+motions (motion), settings and forces (setup). Tested with an emulator, not yet with a gripper.
 
-Before use set in the gripper's web page: binary command interface; "part width tolerance" and "clamping travel" at
-their greatest, since the width of what is grasped is not known beforehand (a note in the Robotics Library's driver);
-"error state on TCP disconnect" left on, since then the jaws stop when this program dies; over a serial line they do
-not.
+Before use, set in the gripper's web page: the binary command interface; "part width tolerance" and "clamping travel" at
+their maximum, since the width of the object is unknown (a note in the Robotics Library's driver); "error state on TCP
+disconnect" on, so the jaws stop when this program dies. Over a serial line they do not stop.
 """
 
 import logging
@@ -34,29 +33,29 @@ _STATUS_OF: dict[GraspingState, GripperStatus] = {
     GraspingState.POSITIONING: "moving",
 }
 _CLOSED_STATES = {GraspingState.HOLDING, GraspingState.NO_PART, GraspingState.PART_LOST}
-"""States that only RELEASE leaves; GRASP is refused in them."""
+"""States that only RELEASE leaves; the gripper refuses GRASP in them."""
 
 _REACHED_MM, _SAME_MM = 1.0, 0.1
-"""A motion has arrived so near its target; nearer than the second it need not be begun."""
+"""Tolerance of a reached target, and distance below which no motion is needed."""
 
 _REGRIP_MM = 5.0
-"""So far are the jaws opened to let go of what they hold before they grasp again."""
+"""Opening motion that releases a held object before another grasp."""
 
 _SLACK_S = 2.0
-"""What a motion may take beyond its way at its speed, for acceleration and the line."""
+"""Extra time of a motion, for acceleration and the link."""
 
 
 class WSG50(Gripper):
     """A WSG-50; its keywords are those of WSG50Settings.
 
-    `stop` lets go of what is held, since STOP ends the gripper's force control. For one thread: to stop it from
-    outside, interrupt that thread (Ctrl-C).
+    `stop` releases a held object, because STOP ends the gripper's force control. Use it from one thread only; to stop
+    it from outside, interrupt that thread (Ctrl-C).
     """
 
     Settings = WSG50Settings
 
     def __init__(self, *, clock: Clock = time.monotonic, **settings: Any) -> None:
-        """Raises RobotConfigError for a setting out of range."""
+        """Check the settings; raise RobotConfigError for one out of range."""
         options = self._options = WSG50Settings(**settings)
         super().__init__(
             "WSG-50",
@@ -71,10 +70,10 @@ class WSG50(Gripper):
 
     @property
     def line_counts(self) -> dict[str, int]:
-        """What went wrong on the line so far, by kind."""
+        """Numbers of errors on the link so far, by kind."""
         return dict(self._link.counts)
 
-    # What the contract asks.
+    # Methods of the contract.
 
     def _connect(self) -> None:
         self._link.open()
@@ -82,14 +81,14 @@ class WSG50(Gripper):
         self._set_up()
 
     def _close(self) -> None:
-        """Announced is only the end of a line to jaws that stand: unannounced it makes the gripper FAST STOP (TCP)."""
-        if not (self._link.has_echoed or self._motions.may_be_moving):  # closed, or nobody there: nothing was begun
+        """Stop moving jaws, then announce the disconnect; without announcement the gripper makes a FAST STOP (TCP)."""
+        if not (self._link.has_echoed or self._motions.may_be_moving):  # no motion was begun
             self._link.close()
             return
         try:
             if self._link.is_open:
                 self._setup.stop_if_moving(self._stop)
-            else:  # the line was lost after a motion was begun: a serial one tells the jaws nothing
+            else:  # the link was lost after the start of a motion; over a serial line the jaws go on
                 self._stop()
             try:
                 self._motions.stop_updates()
@@ -102,7 +101,7 @@ class WSG50(Gripper):
         return self._setup.read_back()
 
     def _recover(self) -> None:
-        """Get the line back, then the gripper: reference and settings as on connecting."""
+        """Reconnect, then restore reference and settings as on connecting."""
         for number in range(1, self._options.reconnect_tries + 1):
             self._setup.reconnect()
             try:
@@ -126,7 +125,7 @@ class WSG50(Gripper):
             except LinkLost:
                 if not left:
                     raise
-            _log.warning("%s: the line was lost while it may have moved: opening it again to stop it", self.name)
+            _log.warning("%s: lost the link during a possible motion: opening it again to stop the jaws", self.name)
             self._setup.reopen()
 
     def _state(self) -> GripperState:
@@ -149,17 +148,17 @@ class WSG50(Gripper):
         packet = commands.packet(CommandId.GRASP, width, speed_mm_s)
         return self._as_state(self._run(packet, speed_mm_s, lambda reading, _: reading.grasping in _CLOSED_STATES))
 
-    # More than the contract.
+    # Methods beyond the contract.
 
     def home(self) -> GripperState:
-        """Find the reference. Moves the jaws over their whole stroke. Raises DeviceError."""
+        """Home the jaws, which moves them over the whole stroke; raise DeviceError if this fails."""
         with self._moving("cannot be homed"):
             return self._as_state(self._setup.home())
 
-    # How.
+    # Implementation.
 
     def _set_up(self) -> None:
-        """Bring the gripper to its settings, and learn what it can do, below the ceilings."""
+        """Apply the settings and read the gripper's limits, capped by the upper limits of the settings."""
         self._setup.run(may_home=self.may_move)
         limits, options = self._setup.limits, self._options
         self.min_opening_mm, self.stroke_mm = self._setup.opening_range
@@ -180,7 +179,7 @@ class WSG50(Gripper):
         return reading
 
     def _wider_opening(self, reading: GripperReading) -> float:
-        """A little wider than it is, to let go."""
+        """Return an opening a little wider than the current one, to release the object."""
         return min(reading.opening_mm + _REGRIP_MM, self._setup.opening_range[1])
 
     def _release(self, width_mm: float) -> GripperReading:
@@ -188,7 +187,7 @@ class WSG50(Gripper):
         return self._run(commands.packet(CommandId.RELEASE, width_mm, speed), speed, _is_at(width_mm))
 
     def _move(self, width_mm: float, *, closing: bool) -> GripperReading:
-        """Pre-position; when that closes the jaws, with no more than the least force."""
+        """Pre-position the jaws; a closing motion uses the smallest force."""
         if closing:
             self._setup.set_force(self.min_force_n)
         speed = self._opening_speed()
@@ -204,12 +203,12 @@ class WSG50(Gripper):
     def _as_state(self, reading: GripperReading) -> GripperState:
         if reading.system & SystemState.FAST_STOP or reading.grasping not in _STATUS_OF:
             raise DeviceError(
-                f"{self.name} is in FAST STOP: {fault_names(reading.system)}; look why, then call recover()"
+                f"{self.name} is in FAST STOP: {fault_names(reading.system)}; find the reason, then call recover()"
             )
-        word = _STATUS_OF[reading.grasping]
-        if word == "holding" and reading.opening_mm < self._options.min_part_mm:
-            word = "no_part"
-        return GripperState(reading.opening_mm, self._options.to_finger_force(reading.force_n), word)
+        status = _STATUS_OF[reading.grasping]
+        if status == "holding" and reading.opening_mm < self._options.min_part_mm:
+            status = "no_part"
+        return GripperState(reading.opening_mm, self._options.to_finger_force(reading.force_n), status)
 
 
 def _is_at(width_mm: float) -> IsDone:

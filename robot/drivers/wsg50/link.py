@@ -1,12 +1,11 @@
-"""The line to a WSG-50, serial or TCP: commands out, replies and updates in, each wait with a deadline.
+"""Link to a WSG-50, serial or TCP: sends commands, receives replies and updates, each wait with a deadline.
 
-Replies, results of motions and automatic updates come interleaved, and only their ids tell them apart; a reply that
-comes late bears the same id as the one that is waited for. So after anything has gone wrong the line is in doubt, and
-before the next command is sent the gripper is made to echo a token that nobody has used: it answers in the order in
-which it is asked, so whatever comes before the echo is old and is dropped.
+Replies, results of motions and automatic updates arrive interleaved and are distinguished only by their ids. A late
+reply has the same id as the expected one. Therefore the link synchronises after every error: before the next command,
+the gripper must echo a fresh token. It answers in the order of its commands, so all packets before the echo are old
+and are dropped.
 
-Reading is done by whoever waits: updates are only wanted while something is waited for. A wait ends at its deadline
-whatever still comes.
+There is no reader thread: the waiting caller reads, because updates matter only during a wait.
 """
 
 import io
@@ -27,36 +26,39 @@ from robot.errors import DeviceError
 _T = TypeVar("_T")
 _TRIES = 3
 _GAP_FRACTION = 0.25
-"""Share of the time-out after which a packet that has begun is given up: the rest of it is not coming."""
+"""Fraction of the time-out without bytes after which an incomplete packet is abandoned."""
 
 _PADDING = bytes(MAX_PAYLOAD + 8)
-"""Ends any packet that the gripper may still be waiting for the rest of, and can begin none."""
+"""Completes any packet whose rest the gripper may still expect, and begins none."""
 
 _MAX_READS = 6
-"""So often, 4096 bytes at a time, is taken in what has come by the end of a wait: more than gathers in ten seconds in
-which this program is held up. A peer that sends without end, if byte by byte, must not hold it up for longer."""
+"""Number of reads of 4096 bytes after the end of a wait.
+
+It is more than arrives in ten seconds, in case this program was suspended. The limit protects against a peer that
+sends without end.
+"""
 
 _MAX_TIMEOUTS = 3.0
-"""So many time-outs after a question was first asked it is not asked again."""
+"""A query is not repeated later than this number of time-outs after its first try."""
 
 _CHUNK = 4096
 _LOOP_POLL_S = 0.001
 
 
 class LinkLost(DeviceError):
-    """The port cannot be opened, is gone, or was closed by the other side."""
+    """The port cannot be opened, was lost, or was closed by the gripper."""
 
 
 class NoReply(DeviceError):
-    """The gripper did not answer in time, or heard a damaged command; whether it heard it is not known."""
+    """The gripper did not answer in time, or received a damaged command; it may have executed the command."""
 
 
 class NoEcho(NoReply):
-    """Nobody is there: asking again is of no use."""
+    """The gripper does not answer at all, so retries are useless."""
 
 
 class CommandFailed(DeviceError):
-    """The gripper answered with another status than SUCCESS."""
+    """The gripper answered with a status other than SUCCESS."""
 
     def __init__(self, command_id: int, status: Status) -> None:
         super().__init__(f"the gripper answered {command_name(command_id)} with {status.name} (status {int(status)})")
@@ -64,9 +66,16 @@ class CommandFailed(DeviceError):
 
 
 class Port:
-    """An open port. name: a path, or an URL of pyserial such as socket://192.168.1.20:1000. Raises DeviceError.
+    """An open port. Its methods raise LinkLost.
 
-    pyserial's settings are the same for all kinds; a socket takes them and ignores them.
+    Args:
+        name: A path, or a URL of pyserial such as socket://192.168.1.20:1000.
+        baud: Baud rate of a serial port; a socket ignores it.
+        stop_bits: Stop bits of a serial port; a socket ignores them.
+        write_timeout_s: Time-out of a write.
+
+    Raises:
+        DeviceError: pyserial is missing, or the port cannot be opened (LinkLost).
     """
 
     def __init__(self, name: str, *, baud: int, stop_bits: int, write_timeout_s: float) -> None:
@@ -74,7 +83,7 @@ class Port:
             serial = import_module("serial")
         except ImportError as error:
             raise DeviceError(
-                "the WSG-50 driver needs pyserial, which is missing; run pip install 'touch-retrieval[gripper]'"
+                "the WSG-50 driver requires pyserial, which is missing; run pip install 'touch-retrieval[gripper]'"
             ) from error
         self.name = name
         try:
@@ -87,50 +96,50 @@ class Port:
                 write_timeout=write_timeout_s,
                 exclusive=True,
             )
-            self._serial.reset_input_buffer = lambda: None  # pyserial's does not end while a socket's peer sends
+            self._serial.reset_input_buffer = lambda: None  # pyserial's never returns while a socket's peer sends
             self._serial.open()
-        except Exception as error:  # pyserial lets termios.error, ValueError and others out
+        except Exception as error:  # pyserial raises termios.error, ValueError and others too
             raise LinkLost(f"the gripper's port {name} cannot be opened: {_first_line(error)}") from error
 
     def read(self, timeout_s: float) -> bytes:
-        """What has come, waiting for the first byte at most `timeout_s`; empty at the end of that."""
+        """Return the received bytes; wait up to `timeout_s` for the first one, else return b""."""
         try:
             if not self._readable(max(0.0, timeout_s)):
                 return b""
-            data: bytes = self._serial.read(_CHUNK)  # with a time-out of 0 it returns what there is
+            data: bytes = self._serial.read(_CHUNK)  # its time-out is 0, so it does not wait
             return data
-        except (OSError, ValueError, TypeError) as error:  # a closed one is None to select
+        except (OSError, ValueError, TypeError) as error:  # select gets None from a closed port
             raise LinkLost(
-                f"the gripper's port {self.name} is gone: {_first_line(error)}; see to its cable and power, "
+                f"the gripper's port {self.name} was lost: {_first_line(error)}; check its cable and power, "
                 "recover() opens it again"
             ) from error
 
     def write(self, data: bytes) -> None:
-        """Send all of it."""
+        """Send all bytes."""
         try:
             while data:
                 data = data[self._serial.write(data) :]
         except (OSError, ValueError, TypeError) as error:
             raise LinkLost(
-                f"the gripper's port {self.name} takes no bytes: {_first_line(error)}; see to its cable and power, "
+                f"the gripper's port {self.name} accepts no bytes: {_first_line(error)}; check its cable and power, "
                 "recover() opens it again"
             ) from error
 
     def close(self) -> None:
-        """Never raises."""
+        """Close the port; never raises."""
         sock = getattr(self._serial, "_socket", None)
         try:
             self._serial.close()
         except Exception:
-            return  # what cannot be closed is gone
+            return
         finally:
-            if sock is not None:  # pyserial leaves its socket open where the other side went first
+            if sock is not None:  # pyserial leaves its socket open if the peer closed first
                 sock.close()
 
     def _readable(self, timeout_s: float) -> bool:
         try:
             return bool(select.select([self._serial.fileno()], [], [], timeout_s)[0])
-        except io.UnsupportedOperation:  # loop:// has nothing that the system could wait for
+        except io.UnsupportedOperation:  # loop:// has no file descriptor
             deadline = time.monotonic() + timeout_s
         while not self._serial.in_waiting:
             if time.monotonic() >= deadline:
@@ -144,14 +153,21 @@ def _first_line(error: Exception) -> str:
 
 
 class Link:
-    """A line to one gripper. port, baud, stop_bits: as Port takes them. timeout_s: of each answer, an echo's too.
-    Raises LinkLost, NoReply, CommandFailed, WireError, all of them DeviceError.
+    """The link to one gripper. Its methods raise LinkLost, NoReply, CommandFailed or WireError, all DeviceErrors.
 
-    Whatever comes or does not come, `poll` and `pump` end when told to, `send_urgent` after one time-out, `sync` after 3,
-    `call` after 4, and `send` and `query`, which may ask three times, after 7 at the latest.
+    All calls end in bounded time: `poll` and `pump` after the given time, `send_urgent` after one time-out, `sync`
+    after 3, `call` after 4, and `send` and `query`, with up to three tries, after 7.
 
-    counts: what went wrong, by kind. updates: of each command that updates itself, its parameters and when they came
-    (s of time.monotonic).
+    Args:
+        port: Name of the port; see `Port`.
+        baud: Baud rate of a serial port.
+        stop_bits: Stop bits of a serial port.
+        timeout_s: Time-out of each answer and echo.
+
+    Attributes:
+        counts: Numbers of errors by kind.
+        updates: For each updating command, its last parameters and their time of arrival (s, time.monotonic).
+        has_echoed: Whether a gripper has answered over the open port.
     """
 
     def __init__(self, port: str, *, baud: int = 115200, stop_bits: int = 1, timeout_s: float = 1.0) -> None:
@@ -159,7 +175,6 @@ class Link:
         self.counts: Counter[str] = Counter()
         self.updates: dict[int, tuple[bytes, float]] = {}
         self.has_echoed = False
-        """Whether a gripper has answered over the port that is open now."""
         self._port: Port | None = None
         self._buffer = bytearray()
         self._last_byte_s = 0.0
@@ -168,11 +183,11 @@ class Link:
 
     @property
     def is_open(self) -> bool:
-        """Whether the port is open, as far as is known."""
+        """Whether the port is open, as far as this side has noticed."""
         return self._port is not None
 
     def open(self) -> None:
-        """Open the port, if it is not open. Sends nothing."""
+        """Open the port if it is closed; send nothing."""
         if self._port is None:
             self._port = Port(self.name, baud=self.baud, stop_bits=self.stop_bits, write_timeout_s=self.timeout_s)
             self._buffer.clear()
@@ -180,22 +195,22 @@ class Link:
             self._needs_sync = True
 
     def close(self) -> None:
-        """Close the port, if it is open; never raises."""
+        """Close the port if it is open; never raises."""
         port, self._port, self.has_echoed = self._port, None, False
         if port is not None:
             port.close()
 
     def call(self, packet: Packet) -> bytes:
-        """Send a command once; returns the parameters of its reply."""
+        """Send a command once and return the parameters of its reply."""
         self.begin(packet)
         return self._result(packet.id)
 
     def send(self, packet: Packet) -> None:
-        """Send a command that may be said twice: it is said again where no sound reply comes."""
+        """Send an idempotent command; send it again if no valid reply arrives."""
         self.query(packet, bytes)
 
     def query(self, packet: Packet, parse: Callable[[bytes], _T]) -> _T:
-        """As `send`; returns what its reply holds. A reply that cannot be parsed is not sound."""
+        """Send an idempotent command as `send` does and return its parsed reply."""
         until = time.monotonic() + _MAX_TIMEOUTS * self.timeout_s
         for left in reversed(range(_TRIES)):
             try:
@@ -210,7 +225,7 @@ class Link:
         raise AssertionError("the loop returns or raises")
 
     def begin(self, packet: Packet) -> None:
-        """Send a command whose replies `poll` fetches; clears the line first if it is in doubt."""
+        """Send a command whose replies `poll` returns; synchronise first if necessary."""
         self.pump(0.0)
         if self._needs_sync:
             self.sync()
@@ -218,14 +233,14 @@ class Link:
         self._write(packet)
 
     def poll(self, command_id: int, timeout_s: float) -> Status | None:
-        """Status of the next reply to this command, PENDING too, or None after `timeout_s`. Notes updates."""
+        """Return the status of the next reply to a command, PENDING too, or None after `timeout_s`."""
         for packet in self._packets(timeout_s):
             if self._note(packet, command_id) and (reply := self._reply(packet)):
                 return reply[0]
         return None
 
     def send_urgent(self, packet: Packet) -> None:
-        """Send at once, whatever is under way, and wait for a reply: for stops, of which an older reply does."""
+        """Send a stop at once, without synchronisation, and wait for a reply; an older reply is sufficient."""
         try:
             self._write(packet)
             self._result(packet.id)
@@ -233,7 +248,7 @@ class Link:
             self._needs_sync = True
 
     def sync(self) -> None:
-        """Have a fresh token echoed, and drop whatever comes before it."""
+        """Synchronise: have the gripper echo a fresh token, and drop all packets before it."""
         for number in range(_TRIES):
             if number:
                 self.pad()
@@ -243,18 +258,18 @@ class Link:
                 self._needs_sync, self.has_echoed = False, True
                 return
             self.counts["no echo"] += 1
-        raise NoEcho(f"the gripper at {self.name} must answer within {self.timeout_s:g} s; is it on, and connected?")
+        raise NoEcho(f"the gripper at {self.name} did not answer within {self.timeout_s:g} s; is it on and connected?")
 
     def pad(self) -> None:
-        """Free the gripper of a packet whose damaged length swallows what it is told next: before saying it again."""
+        """Complete a packet whose damaged length would swallow the next command; call it before a repetition."""
         self._use_port(lambda port: port.write(_PADDING))
 
     def require_sync(self) -> None:
-        """Have the line cleared before the next command."""
+        """Make the next command synchronise first."""
         self._needs_sync = True
 
     def pump(self, seconds: float) -> None:
-        """Note what comes within `seconds`; 0 for what has come."""
+        """Process the packets that arrive within `seconds`; 0: those that have arrived."""
         for packet in self._packets(seconds):
             self._note(packet, None)
 
@@ -266,23 +281,21 @@ class Link:
         return False
 
     def _result(self, command_id: int) -> bytes:
-        """Parameters of the last reply to the command begun last."""
+        """Return the parameters of the final reply to the last command."""
         for packet in self._packets(self.timeout_s):
             reply = self._reply(packet) if self._note(packet, command_id) else None
             if reply is None or reply[0] is Status.CMD_PENDING:
                 continue
             self._needs_sync = False
             if reply[0] is Status.CHECKSUM_ERROR:
-                raise NoReply(
-                    f"the gripper must hear {command_name(command_id)} undamaged, and did not (CHECKSUM_ERROR)"
-                )
+                raise NoReply(f"the gripper received {command_name(command_id)} damaged (CHECKSUM_ERROR)")
             if reply[0] is not Status.SUCCESS:
                 raise CommandFailed(command_id, reply[0])
             return reply[1]
-        raise NoReply(f"the gripper must answer {command_name(command_id)} within {self.timeout_s:g} s, and did not")
+        raise NoReply(f"the gripper did not answer {command_name(command_id)} within {self.timeout_s:g} s")
 
     def _note(self, packet: Packet, command_id: int | None) -> bool:
-        """Keep an update; says whether the packet is of the command that is waited for. Any other raises doubt."""
+        """Store an update and return whether the packet is of this command; another one requires synchronisation."""
         if packet.id in commands.UPDATING:
             if packet.payload[:2] == bytes(2):
                 self.updates[packet.id] = (packet.payload[2:], time.monotonic())
@@ -299,7 +312,7 @@ class Link:
             return None
 
     def _packets(self, seconds: float) -> Iterator[Packet]:
-        """What comes within `seconds`, and then what has come by then. A packet that stops half-way is given up."""
+        """Yield the packets that arrive within `seconds`; abandon an incomplete packet."""
         deadline = time.monotonic() + seconds
         while time.monotonic() < deadline:
             if packet := self._next_packet():
@@ -318,15 +331,15 @@ class Link:
         return packet
 
     def _wait(self, deadline: float) -> None:
-        """Take in bytes as soon as they come, or give up a packet whose rest does not."""
-        given_up_s = self._last_byte_s + _GAP_FRACTION * self.timeout_s if self._buffer else deadline
-        came = self._fill(min(deadline, given_up_s) - time.monotonic())
-        if not came and self._buffer and time.monotonic() >= given_up_s:
+        """Wait for bytes; abandon an incomplete packet if none arrive."""
+        abandon_s = self._last_byte_s + _GAP_FRACTION * self.timeout_s if self._buffer else deadline
+        has_read = self._fill(min(deadline, abandon_s) - time.monotonic())
+        if not has_read and self._buffer and time.monotonic() >= abandon_s:
             self.counts["abandoned"] += 1
             del self._buffer[:1]
 
     def _fill(self, seconds: float) -> bool:
-        """Take in bytes; False where none come within `seconds`."""
+        """Read bytes into the buffer; return False if none arrive within `seconds`."""
         data = self._use_port(lambda port: port.read(seconds))
         if data:
             self._buffer += data
@@ -337,10 +350,10 @@ class Link:
         self._use_port(lambda port: port.write(encode(packet)))
 
     def _use_port(self, use: Callable[[Port], _T]) -> _T:
-        """Use the port, and close it where it is gone."""
+        """Use the port, and close it if it was lost."""
         if self._port is None:
             raise LinkLost(
-                f"the gripper's port {self.name} must be open, and was lost; see to its cable and power, "
+                f"the gripper's port {self.name} is closed or was lost; check its cable and power, "
                 "recover() opens it again"
             )
         try:

@@ -1,9 +1,9 @@
-"""Motions of a WSG-50, watched: what it says of itself decides, its replies only tell when to look.
+"""Supervised motions of a WSG-50: the gripper's state decides, its replies only trigger a read of the state.
 
-A reply can be lost, late or doubled, and a motion that is sent twice may be done twice. So a motion has ended when the
-gripper says that it stands and is in a state that the motion can end in; it is sent again, once, only after the gripper
-has said that it stands and has not done it. While it moves, its state comes by itself every few milliseconds; where it
-does not, the motion is stopped.
+A reply can be lost, late or doubled, and a motion command that is sent twice may be executed twice. Therefore a motion
+has ended when the gripper reports that it is still, in a possible end state of the motion. The command is sent again,
+once, only if the gripper is still and has not executed it. During a motion the state arrives as automatic updates every
+few milliseconds; without them the motion is stopped.
 """
 
 import logging
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 _STOP, _FAST_STOP = Packet(CommandId.STOP), Packet(CommandId.FAST_STOP)
 _UPDATED = (CommandId.SYSTEM_STATE, CommandId.GRASPING_STATE)
 UPDATE_BYTES = 25
-"""Of an update of each: 10 around a payload, and status and value, 6 and 3."""
+"""Size of one update of both states: frames of 8 bytes, and payloads (status and value) of 6 and 3 bytes."""
 
 _MOVING = {GraspingState.GRASPING, GraspingState.RELEASING, GraspingState.POSITIONING}
 _FAULTS = (
@@ -34,14 +34,14 @@ _FAULTS = (
     | SystemState.SCRIPT_FAILURE
 )
 _RESENDABLE = (None, Status.SUCCESS, Status.CHECKSUM_ERROR)
-"""Answers to a motion that the gripper, standing, has not done: it was not heard."""
+"""Answers after which a command that was not executed may be sent again, because it was not received."""
 
 _POLL_S = 0.01
 
 
 @dataclass(frozen=True)
 class GripperReading:
-    """What the gripper says of itself; force_n as the gripper counts it."""
+    """State of the gripper; force_n as the gripper counts it."""
 
     system: SystemState
     grasping: GraspingState
@@ -50,16 +50,16 @@ class GripperReading:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the jaws move, or are about to."""
+        """Whether the jaws move or will move."""
         return bool(self.system & SystemState.MOVING) or self.grasping in _MOVING
 
 
 IsDone = Callable[[GripperReading, Status | None], bool]
-"""Told what the gripper says, and its last answer or None: whether the motion has been done."""
+"""Function from the gripper's state and its last answer (or None) to whether the motion was executed."""
 
 
 def read(link: Link) -> GripperReading:
-    """Ask for all of a Reading. Raises DeviceError."""
+    """Read the gripper's state; raise DeviceError if this fails."""
     return GripperReading(
         link.query(commands.query(CommandId.SYSTEM_STATE), commands.system_state),
         link.query(commands.query(CommandId.GRASPING_STATE), commands.grasping_state),
@@ -69,41 +69,57 @@ def read(link: Link) -> GripperReading:
 
 
 def fault_names(system: SystemState) -> str:
-    """Words for the faults in a system state."""
+    """Return the faults in a system state as text."""
     named = [bit.name or "" for bit in SystemState if bit & system & _FAULTS]
-    return ", ".join(named).lower().replace("_", " ") or "no fault flag is set: a stop on the gripper, or a lost line"
+    return ", ".join(named).lower().replace("_", " ") or "no fault flag is set: a stop at the gripper, or a lost link"
 
 
 def check_ready(reading: GripperReading) -> None:
-    """Raise DeviceError unless the gripper can be told to move."""
+    """Raise DeviceError unless the gripper can execute a motion."""
     if reading.system & SystemState.FAST_STOP or reading.grasping is GraspingState.ERROR:
-        raise DeviceError(f"the gripper is in FAST STOP ({fault_names(reading.system)}); look why, then call recover()")
+        raise DeviceError(
+            f"the gripper is in FAST STOP ({fault_names(reading.system)}); find the reason, then call recover()"
+        )
     if not reading.system & SystemState.REFERENCED:
-        raise DeviceError("the gripper must know its reference, and has lost it; call recover(), which homes it")
+        raise DeviceError("the gripper has lost its reference; call recover(), which homes it")
     if reading.is_moving:
-        raise DeviceError("the gripper must stand before it is told to move, and is moving; call stop()")
+        raise DeviceError("the gripper is moving and must be still before a motion; call stop()")
 
 
 class Motions:
-    """Runs motions over a link. max_age_s: how old its state may grow while it moves. period_ms: of the updates."""
+    """Runs motions over a link.
+
+    Args:
+        link: The link.
+        max_age_s: Largest age of the state during a motion.
+        period_ms: Period of the updates.
+
+    Attributes:
+        may_be_moving: Whether the jaws may still move: a motion was begun and they were not still since.
+        common_state: System state bits that all updates of the last motion had in common.
+    """
 
     def __init__(self, link: Link, *, max_age_s: float, period_ms: int) -> None:
         self.link, self.max_age_s, self.period_ms = link, max_age_s, period_ms
         self.may_be_moving = False
-        """Whether a motion was begun after which the jaws were not yet seen to stand."""
         self.common_state = SystemState(0)
-        """What all updates of the last motion had in common."""
 
     def read(self) -> GripperReading:
-        """Ask for all of a Reading, and note whether the jaws stand. Raises DeviceError."""
+        """Read the gripper's state and update `may_be_moving`; raise DeviceError if this fails."""
         reading = read(self.link)
         self.may_be_moving = self.may_be_moving and reading.is_moving
         return reading
 
     def run(self, packet: Packet, seconds: float, done: IsDone) -> GripperReading:
-        """Send a motion, wait until it has ended, for `seconds` at most, and return what the gripper says then.
+        """Run a motion and return the gripper's state at its end.
 
-        Raises DeviceError, and then it may still be moving.
+        Args:
+            packet: The motion command.
+            seconds: Longest duration.
+            done: Returns whether the motion was executed.
+
+        Raises:
+            DeviceError: The motion failed; the jaws may still move.
         """
         deadline = time.monotonic() + seconds
         for last_try in (False, True):
@@ -117,47 +133,47 @@ class Motions:
         answer = "nothing" if status is None else status.name
         stop = f", FAST STOP: {fault_names(reading.system)}" if reading.system & SystemState.FAST_STOP else ""
         raise DeviceError(
-            f"the gripper answered {answer} to {command_name(packet.id)} and stands at {reading.opening_mm:.1f} mm, "
-            f"{reading.grasping.name.lower()}{stop}; look at it, then call recover()"
+            f"the gripper answered {answer} to {command_name(packet.id)} and is still at {reading.opening_mm:.1f} mm, "
+            f"{reading.grasping.name.lower()}{stop}; check it, then call recover()"
         )
 
     def stop(self) -> None:
-        """Stop the jaws, by FAST STOP if nothing else helps, and see that they stand. Raises DeviceError."""
-        patience_s = self.max_age_s + self.link.timeout_s
+        """Stop the jaws, by FAST STOP if STOP fails, and wait until they are still; raise DeviceError if they move."""
+        limit_s = self.max_age_s + self.link.timeout_s
         self._send_until_answered((_STOP, _STOP, _FAST_STOP, _FAST_STOP))
-        if self._last_reading(time.monotonic() + patience_s).is_moving:
+        if self._last_reading(time.monotonic() + limit_s).is_moving:
             self._send_until_answered((_FAST_STOP, _FAST_STOP))
-            self._wait_until_still(time.monotonic() + patience_s)
+            self._wait_until_still(time.monotonic() + limit_s)
         self.stop_updates()
 
     def stop_updates(self) -> None:
-        """End the updates. Raises DeviceError."""
+        """End the automatic updates; raise DeviceError if this fails."""
         for command in _UPDATED:
             self.link.send(commands.query(command))
 
     def _send_until_answered(self, packets: Sequence[Packet]) -> None:
-        """One after the other, until one is answered."""
+        """Send packets one after the other until one is answered."""
         for number, packet in enumerate(packets, start=1):
             if packet.id == CommandId.FAST_STOP:
-                _log.warning("the gripper does not stop when told to: telling it to FAST STOP")
+                _log.warning("the gripper does not stop: sending FAST STOP")
             try:
                 self.link.send_urgent(packet)
                 return
             except CommandFailed:
-                return  # heard, and of no use: where it stands is read next
+                return  # received; the state is read next
             except NoReply:
                 if number == len(packets):
                     raise
                 self.link.pad()
 
     def _watch(self, packet: Packet, deadline: float) -> Status | None:
-        """Send the motion and return its last answer, or None where the gripper stands and has not answered."""
+        """Send the motion and return its last answer, or None if the gripper is still and has not answered."""
         link = self.link
         for command in _UPDATED:
             link.send(commands.update(command, self.period_ms))
         self.may_be_moving, self.common_state = True, ~SystemState(0)
         link.begin(packet)
-        stands_since = time.monotonic()
+        still_since = time.monotonic()
         while True:
             status = link.poll(packet.id, _POLL_S)
             now = time.monotonic()
@@ -165,26 +181,26 @@ class Motions:
                 break
             self._check_age(now)
             if self._is_moving() or status is Status.CMD_PENDING:
-                stands_since = now
-            if now - stands_since > link.timeout_s:
+                still_since = now
+            if now - still_since > link.timeout_s:
                 break
             if now > deadline:
-                raise DeviceError(f"the gripper must end {command_name(packet.id)} in time, and still moves")
+                raise DeviceError(f"the gripper did not end {command_name(packet.id)} in time and still moves")
         link.require_sync()
         self.stop_updates()
         return status
 
     def _check_age(self, now: float) -> None:
-        """The watchdog: FAST STOP and DeviceError where the gripper has gone silent."""
+        """Watchdog: send FAST STOP and raise DeviceError if updates are missing."""
         if now - self.link.updates[CommandId.SYSTEM_STATE][1] <= self.max_age_s:
             return
-        self.link.pump(0.0)  # it may be this program that was held up: what has come meanwhile counts
+        self.link.pump(0.0)  # this program may have been suspended: process the updates that have arrived
         age = time.monotonic() - self.link.updates[CommandId.SYSTEM_STATE][1]
         if age <= self.max_age_s:
             return
         error = DeviceError(
-            f"the state of the moving gripper must be at most {self.max_age_s:g} s old, it is {age:.2g} s: told it to "
-            "FAST STOP; is the line overloaded?"
+            f"the state of the moving gripper must be at most {self.max_age_s:g} s old, got {age:.2g} s: sent FAST "
+            "STOP; is the line overloaded?"
         )
         try:
             self.link.send_urgent(_FAST_STOP)
@@ -193,24 +209,26 @@ class Motions:
         raise error
 
     def _is_moving(self) -> bool:
-        """Whether the last updates say that it moves. Notes them in `common_state`."""
+        """Return whether the last updates report a motion, and add them to `common_state`."""
         try:
             system = commands.system_state(self.link.updates[CommandId.SYSTEM_STATE][0])
             grasping = commands.grasping_state(self.link.updates[CommandId.GRASPING_STATE][0])
         except WireError:
-            return True  # not known: look again
+            return True  # unknown: read again
         self.common_state &= system
         return bool(system & SystemState.MOVING) or grasping in _MOVING
 
     def _wait_until_still(self, deadline: float) -> GripperReading:
-        """What the gripper says when it stands."""
+        """Return the gripper's state when it is still; raise DeviceError at the deadline."""
         reading = self._last_reading(deadline)
         if reading.is_moving:
-            raise DeviceError(f"the gripper must stand, and still moves at {reading.opening_mm:.1f} mm: stop its power")
+            raise DeviceError(
+                f"the gripper must be still, but still moves at {reading.opening_mm:.1f} mm: switch off its power"
+            )
         return reading
 
     def _last_reading(self, deadline: float) -> GripperReading:
-        """What the gripper says when it stands, or at the deadline."""
+        """Return the gripper's state when it is still, or at the deadline."""
         while (reading := self.read()).is_moving and time.monotonic() < deadline:
             self.link.pump(_POLL_S)
         return reading

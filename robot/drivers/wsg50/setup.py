@@ -1,4 +1,4 @@
-"""What a WSG-50 is set to, and the getting there: line, limits, faults, reference, force and soft limits, read back."""
+"""Settings of a WSG-50 and their application: link, limits, faults, reference, force and soft limits, read back."""
 
 import logging
 import math
@@ -19,27 +19,41 @@ from robot.settings import TypedSettings, bounded
 _log = logging.getLogger(__name__)
 _DIRECTIONS = {"default": 0, "out": 1, "in": 2}
 _LONGEST_WAIT_S = 5.0
-"""Between two tries to reach the gripper, unless the first wait is longer: doubled twenty times it would be days."""
+"""Longest wait between two tries to connect, unless the first is longer; doubling 20 times would take days."""
 
 _ROUNDING = 1e-6
-"""How much harder than asked a gripper may clamp, relatively: less than numbers of 32 bits are off."""
+"""Accepted relative excess of the force limit, a rounding error of 32-bit numbers."""
 
 TYPICAL_LIMITS = GripperLimits(110.0, 5.0, 420.0, 100.0, 5000.0, 5.0, 80.0, 120.0)
-"""Of a WSG-50-110, until the gripper has said its own."""
+"""Limits of a WSG-50-110, used until the gripper has reported its own."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WSG50Settings(TypedSettings):
-    """Settings of a WSG-50 at `port`: a path, or socket://192.168.1.20:1000. Forces are those on each finger.
+    """Settings of a WSG-50. Forces are those on each finger.
 
-    baud, stop_bits: of a serial line, as set in the gripper (the defaults are not verified). timeout_s: of an answer.
-    home_direction: "default" as the gripper is configured, "out" or "in"; it is homed on connecting if it has lost its
-    reference. acceleration_mm_s2: 0 leaves the gripper's own; soft_limits_mm: least and greatest opening, empty leaves
-    its own. tare: the force-measuring fingers on connecting. acknowledge_faults: end a FAST STOP that is found, after
-    saying it aloud; else a person must. grasp_width_mm: nominal width given with each grasp. min_part_mm: what is
-    held at less is the other finger, not a part. finger_share: see `to_finger_force`. update_ms: period of the state while
-    it moves, which must not be older than max_state_age_s. reconnect_tries, reconnect_s: how often `recover` opens the
-    port again, and the first wait (s), which doubles up to 5 s. max_force_n, max_speed_mm_s: ceilings.
+    Attributes:
+        port: A path, or socket://192.168.1.20:1000.
+        baud: Baud rate of a serial line, as set in the gripper (the default is not verified).
+        stop_bits: Stop bits of a serial line, as set in the gripper (the default is not verified).
+        timeout_s: Time-out of an answer.
+        home_direction: "default" as the gripper is configured, "out" or "in"; it is homed on connecting if it has lost
+            its reference.
+        acceleration_mm_s2: 0 leaves the gripper's own.
+        soft_limits_mm: Smallest and largest opening; empty leaves the gripper's own.
+        tare: Whether to tare force-measuring fingers on connecting.
+        acknowledge_faults: Whether to acknowledge a FAST STOP after logging it; else a person must.
+        grasp_width_mm: Nominal width of each grasp.
+        min_part_mm: Openings below this mean that the fingers hold each other, not a part.
+        opening_speed_mm_s: Speed of opening and pre-positioning.
+        finger_share: Fraction of the gripper's force on each finger; see `to_finger_force`.
+        update_ms: Period of the state updates during a motion.
+        homing_timeout_s: Longest duration of homing.
+        reconnect_tries: Number of tries of `recover` to open the port.
+        reconnect_s: First wait between them, which doubles up to 5 s.
+        max_force_n: Upper limit of forces.
+        max_speed_mm_s: Upper limit of speeds.
+        max_state_age_s: Largest age of the state during a motion.
     """
 
     port: str
@@ -64,50 +78,59 @@ class WSG50Settings(TypedSettings):
     max_state_age_s: float = bounded(1e-3, 60, 0.5)
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting of the wrong type or out of range."""
+        """Raise RobotConfigError for a setting of another type or out of range."""
         super().__post_init__()
         if self.max_state_age_s < 2e-3 * self.update_ms:
             raise RobotConfigError(f"max_state_age_s must span two updates of {self.update_ms} ms")
         if self.home_direction not in _DIRECTIONS:
-            raise RobotConfigError(f"home_direction must be of {', '.join(_DIRECTIONS)}, got {self.home_direction!r}")
+            raise RobotConfigError(
+                f"home_direction must be one of {', '.join(_DIRECTIONS)}, got {self.home_direction!r}"
+            )
         soft = self.soft_limits_mm
         if soft and (len(soft) != 2 or not 0 <= soft[0] < soft[1]):
-            raise RobotConfigError(f"soft_limits_mm must be the least and greatest opening, or empty; got {soft}")
-        # A serial line that is full of updates has no room for answers. A byte has 8 data bits and a start bit.
+            raise RobotConfigError(f"soft_limits_mm must be the smallest and largest opening, or empty; got {soft}")
+        # Updates may take half of a serial line, to leave room for answers. A byte has 8 data bits and a start bit.
         bits_s = UPDATE_BYTES * (9 + self.stop_bits) * 1000 / self.update_ms
         if not self.port.startswith("socket://") and bits_s > 0.5 * self.baud:
             raise RobotConfigError(
-                f"baud must be at least {2 * bits_s:g} for updates every {self.update_ms} ms, which then fill half of "
+                f"baud must be at least {2 * bits_s:g} for updates every {self.update_ms} ms, which then take half of "
                 f"the line; got {self.baud}"
             )
 
     def to_finger_force(self, gripper_n: float) -> float:
-        """Force on each finger (N) where the gripper counts `gripper_n`.
+        """Convert the gripper's force (N) to the force on each finger (N).
 
-        The contract's force is the one on each finger (robot.devices). The gripper's force limit is the sum over both:
-        SCHUNK's manual of its fieldbus interface says of the register FORCELIMIT that "the grasping force is twice the
-        nominal force that is applied to the part to be grasped", and SCHUNK rates its grippers by the sum over the
-        jaws. So an object gripped with a limit of 40 N is pushed with 20 N by each finger: the share 0.5 of it. A user
-        of the open simulator Drake found their own controller off by this very factor (its pull request 9950).
+        The contract's force is the force on each finger (robot.devices). The gripper's force limit is the sum over
+        both. SCHUNK's manual of its fieldbus interface defines the register FORCELIMIT: "the grasping force is twice
+        the nominal force that is applied to the part to be grasped". SCHUNK also rates its grippers by the sum over the
+        jaws. So with a limit of 40 N each finger pushes with 20 N, the fraction 0.5. A user of the simulator Drake
+        found this factor in their own controller (its pull request 9950).
 
-        Not certain: that the force which the gripper reports (45h) counts as its limit does, which is assumed here; and
-        how near the true force is, for without force-measuring fingers the gripper knows its motor's current only.
-        Whoever has a force gauge sets `finger_share` to what is measured on one finger, over the limit set.
+        Two points are uncertain. The reported force (45h) is assumed to count as the limit does. Without
+        force-measuring fingers, the gripper derives the force from its motor current only. With a force gauge, set
+        `finger_share` to the measured force on one finger divided by the limit.
         """
         return gripper_n * self.finger_share
 
     def to_gripper_force(self, finger_n: float) -> float:
-        """What the gripper must count (N) for `finger_n` on each finger, as the greatest number of 32 bits up to it."""
+        """Convert a force on each finger (N) to the gripper's force (N), rounded down to 32 bits."""
         packed = struct.pack("<f", finger_n / self.finger_share)
         if struct.unpack("<f", packed)[0] > finger_n / self.finger_share:
-            packed = struct.pack("<I", struct.unpack("<I", packed)[0] - 1)  # bits of positive numbers count like them
+            packed = struct.pack("<I", struct.unpack("<I", packed)[0] - 1)  # the next smaller positive float
         return float(struct.unpack("<f", packed)[0])
 
 
 class GripperSetup:
-    """Brings the gripper on a link to its settings. `refused` is filled with what it does not take.
+    """Applies the settings to a gripper. Its methods raise DeviceError.
 
-    limits: what the gripper can do; openings: least and greatest (mm) that its soft limits leave. Raises DeviceError.
+    Args:
+        name: Name of the gripper in messages.
+        settings: The settings.
+        refused: Receives the settings that the gripper refuses.
+
+    Attributes:
+        limits: Limits of the gripper.
+        opening_range: Smallest and largest opening (mm) within the soft limits.
     """
 
     def __init__(self, name: str, settings: WSG50Settings, refused: dict[str, str]) -> None:
@@ -117,26 +140,26 @@ class GripperSetup:
         self.limits, self.opening_range = TYPICAL_LIMITS, (0.0, TYPICAL_LIMITS.stroke_mm)
 
     def run(self, may_home: bool) -> None:
-        """All of it, over an open line. Homes where the reference is lost, or raises DeviceError where it may not."""
+        """Apply all settings over an open link; home if the reference is lost, or raise if `may_home` is false."""
         self.limits = self.link.query(commands.query(CommandId.LIMITS), commands.limits)
         force, speed = self.settings.max_force_n, self.settings.max_speed_mm_s
-        least = self.settings.to_finger_force(self.limits.min_force_n)
-        if force < least or speed < self.limits.min_speed_mm_s:
+        lowest = self.settings.to_finger_force(self.limits.min_force_n)
+        if force < lowest or speed < self.limits.min_speed_mm_s:
             raise RobotConfigError(
-                f"{self.name}: the ceilings must allow its least force on a finger, {least:g} N, and speed, "
+                f"{self.name}: the limits must allow its smallest force on a finger, {lowest:g} N, and speed, "
                 f"{self.limits.min_speed_mm_s:g} mm/s; got {force:g} N and {speed:g} mm/s"
             )
         self.stop_if_moving(self.motions.stop)
         self._end_fast_stop()
         if not self._system_state() & SystemState.REFERENCED:
             if not may_home:
-                raise DeviceError(f"{self.name} does not know its reference, and may not be moved now to find it")
-            _log.warning("%s does not know its reference: homing, the jaws move", self.name)
+                raise DeviceError(f"{self.name} has lost its reference, and homing is not allowed now")
+            _log.warning("%s has lost its reference: homing, the jaws move", self.name)
             self.home()
         self._apply()
 
     def reconnect(self) -> None:
-        """Have the gripper answer, opening the port again if need be, with waits that double."""
+        """Open the port, if necessary, and synchronise; try again with increasing waits."""
         wait_s = self.settings.reconnect_s
         for number in range(1, self.settings.reconnect_tries + 1):
             try:
@@ -147,19 +170,19 @@ class GripperSetup:
                 self.link.close()
                 if number == self.settings.reconnect_tries:
                     raise DeviceError(f"{self.name} cannot be reached after {number} tries: {error}") from error
-                _log.warning("%s: no line (%s); trying again in %.2g s", self.name, error, wait_s)
+                _log.warning("%s: no connection (%s); trying again in %.2g s", self.name, error, wait_s)
             time.sleep(wait_s)
             wait_s = min(2 * wait_s, max(wait_s, _LONGEST_WAIT_S))
 
     def reopen(self) -> None:
-        """Open the port, or wait a little where it cannot be opened."""
+        """Open the port, or wait a little if it cannot be opened."""
         try:
             self.link.open()
         except LinkLost:
             time.sleep(self.settings.reconnect_s)
 
     def home(self) -> GripperReading:
-        """Find the reference. That it is there proves homing if it was not before, or not while it moved."""
+        """Home the jaws; a reference that was missing before or during the motion proves success without an answer."""
         packet = commands.home(_DIRECTIONS[self.settings.home_direction])
         before = self._system_state()
 
@@ -170,7 +193,7 @@ class GripperSetup:
         return self.motions.run(packet, self.settings.homing_timeout_s, done)
 
     def stop_if_moving(self, stop: Callable[[], None]) -> None:
-        """Standing jaws are left as they are: STOP would drop what they hold."""
+        """Call `stop` only if the jaws move or may move, because STOP would drop a held object."""
         try:
             is_moving = self.motions.read().is_moving
         except LinkLost:
@@ -178,26 +201,27 @@ class GripperSetup:
                 raise
             is_moving = True
         except DeviceError:
-            is_moving = True  # not known
+            is_moving = True  # unknown
         if is_moving:
             stop()
 
     def set_force(self, force_n: float) -> None:
-        """Set the force limit and read it back; a gripper that would clamp harder than asked is not used."""
-        settings, least = self.settings, self.limits.min_force_n
+        """Set the force limit and read it back; raise DeviceError if the gripper would clamp harder."""
+        settings, lowest = self.settings, self.limits.min_force_n
         force_limit_n, ceiling = (
-            max(settings.to_gripper_force(each), least) for each in (force_n, settings.max_force_n)
+            max(settings.to_gripper_force(each), lowest) for each in (force_n, settings.max_force_n)
         )
         self.link.send(commands.packet(CommandId.SET_FORCE_LIMIT, force_limit_n))
         has = self.link.query(commands.query(CommandId.GET_FORCE_LIMIT), commands.number)
         self._note("force_n", force_n, settings.to_finger_force(has))
         if has > min(force_limit_n * (1 + _ROUNDING), ceiling):
             raise DeviceError(
-                f"{self.name}: the force limit must be {force_limit_n:g} N, the gripper has {has:g} N; it is not told to grasp"
+                f"{self.name}: the force limit must be {force_limit_n:g} N, but the gripper has {has:g} N; "
+                "no grasp is made"
             )
 
     def read_back(self) -> dict[str, Any]:
-        """Everything that the gripper says of its settings; forces as the contract counts them."""
+        """Return all settings that the gripper reports; forces are those on each finger."""
         link = self.link
         force = link.query(commands.query(CommandId.GET_FORCE_LIMIT), commands.number)
         return {
@@ -213,47 +237,49 @@ class GripperSetup:
         return self.link.query(commands.query(CommandId.SYSTEM_STATE), commands.system_state)
 
     def _end_fast_stop(self) -> None:
-        """Say a FAST STOP aloud, and acknowledge it if that is allowed."""
+        """Log a FAST STOP, and acknowledge it if allowed."""
         system = self._system_state()
         if not system & SystemState.FAST_STOP:
             return
         _log.warning("%s is in FAST STOP: %s", self.name, fault_names(system))
         if not self.settings.acknowledge_faults:
             raise DeviceError(
-                f"{self.name} is in FAST STOP: {fault_names(system)}; see to it, then acknowledge it on the gripper's web "
-                "page, or set acknowledge_faults = true"
+                f"{self.name} is in FAST STOP: {fault_names(system)}; remove the cause, then acknowledge it on the "
+                "gripper's web page, or set acknowledge_faults = true"
             )
         try:
             self.link.send(commands.acknowledge())
-        except CommandFailed as error:  # said twice, the second finds nothing to acknowledge
+        except CommandFailed as error:  # a repeated command has nothing to acknowledge
             _log.warning("%s: %s", self.name, error)
         if self._system_state() & SystemState.FAST_STOP:
-            raise DeviceError(f"{self.name} stays in FAST STOP though acknowledged: {fault_names(system)}; see to it")
+            raise DeviceError(
+                f"{self.name} is still in FAST STOP after acknowledgement: {fault_names(system)}; remove the cause"
+            )
         _log.warning("%s: FAST STOP acknowledged", self.name)
 
     def _apply(self) -> None:
         settings, link = self.settings, self.link
-        holds = self.motions.read().grasping is GraspingState.HOLDING
-        if not holds:  # else what is held would be held with less, and be dropped
+        is_holding = self.motions.read().grasping is GraspingState.HOLDING
+        if not is_holding:  # a smaller force would drop the held object
             self.set_force(settings.to_finger_force(self.limits.min_force_n))
         if requested := settings.acceleration_mm_s2:
-            least, most = self.limits.min_acceleration_mm_s2, self.limits.max_acceleration_mm_s2
-            self._require("acceleration_mm_s2", requested, least, most)
+            lowest, highest = self.limits.min_acceleration_mm_s2, self.limits.max_acceleration_mm_s2
+            self._require("acceleration_mm_s2", requested, lowest, highest)
             link.send(commands.packet(CommandId.SET_ACCELERATION, requested))
             has = link.query(commands.query(CommandId.GET_ACCELERATION), commands.number)
             self._note("acceleration_mm_s2", requested, has)
         self._set_soft_limits()
         self.refused.pop("tare", None)
-        if settings.tare and holds:
-            self.refused["tare"] = "asked true, but something is held; open it, then call recover()"
+        if settings.tare and is_holding:
+            self.refused["tare"] = "requested true, but an object is held; open the gripper, then call recover()"
         elif settings.tare:
             try:
                 link.send(Packet(CommandId.TARE))
             except CommandFailed as error:
-                self.refused["tare"] = f"asked true, but {error}: has it force-measuring fingers, and holds nothing?"
+                self.refused["tare"] = f"requested true, but {error}: are the fingers force-measuring and empty?"
 
     def _set_soft_limits(self) -> None:
-        """Set the openings that no motion leaves, where any are asked, and learn which openings there are."""
+        """Set the soft limits, if requested, and read back the opening range."""
         requested = self.settings.soft_limits_mm
         if requested:
             for each in requested:
@@ -263,9 +289,9 @@ class GripperSetup:
         has = self._soft_limits()
         self.refused.pop("soft_limits_mm", None)
         if requested and (has is None or not all(map(_is_close, requested, has))):
-            self.refused["soft_limits_mm"] = f"asked {tuple(requested)}, has {has}"
-        least, greatest = has or (0.0, self.limits.stroke_mm)
-        self.opening_range = max(0.0, least), min(greatest, self.limits.stroke_mm)
+            self.refused["soft_limits_mm"] = f"requested {tuple(requested)}, has {has}"
+        lowest, highest = has or (0.0, self.limits.stroke_mm)
+        self.opening_range = max(0.0, lowest), min(highest, self.limits.stroke_mm)
         self._check_grasp_width(self.opening_range[1])
 
     def _soft_limits(self) -> tuple[float, float] | None:
@@ -278,20 +304,20 @@ class GripperSetup:
     def _check_grasp_width(self, greatest_mm: float) -> None:
         if self.settings.grasp_width_mm > greatest_mm:
             raise DeviceError(
-                f"{self.name}: grasp_width_mm must be at most the greatest opening, {greatest_mm:g} mm, got "
-                f"{self.settings.grasp_width_mm:g}; set it lower, or the soft limits wider"
+                f"{self.name}: grasp_width_mm must be at most the largest opening, {greatest_mm:g} mm, got "
+                f"{self.settings.grasp_width_mm:g}; reduce it, or widen the soft limits"
             )
 
-    def _require(self, name: str, value: float, least: float, most: float) -> None:
-        if not least <= value <= most:
-            raise DeviceError(f"{self.name}: {name} must be from {least:g} to {most:g}, got {value:g}")
+    def _require(self, name: str, value: float, lowest: float, highest: float) -> None:
+        if not lowest <= value <= highest:
+            raise DeviceError(f"{self.name}: {name} must be from {lowest:g} to {highest:g}, got {value:g}")
 
     def _note(self, name: str, requested: float, has: float) -> None:
         self.refused.pop(name, None)
         if not _is_close(requested, has):
-            self.refused[name] = f"asked {requested:g}, has {has:g}"
+            self.refused[name] = f"requested {requested:g}, has {has:g}"
 
 
 def _is_close(requested: float, has: float) -> bool:
-    """Numbers of 32 bits, and what a gripper may round."""
+    """Return whether two numbers are equal up to the gripper's rounding."""
     return math.isclose(requested, has, rel_tol=0.01, abs_tol=0.01)

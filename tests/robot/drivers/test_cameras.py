@@ -1,4 +1,4 @@
-"""Cameras over the table: RealSense and Kinect 2 over stand-ins for their packages, and a plain USB camera."""
+"""Cameras of the table: RealSense and Kinect 2 with fakes of their packages, and a plain USB camera."""
 
 import json
 import math
@@ -18,7 +18,7 @@ from tests.fake_video import EXTRINSICS, FakeFreenect2, FakeRealSense, FakeVideo
 
 @pytest.fixture
 def install(monkeypatch):
-    """Have a stand-in, or None for no package, where a package is imported from."""
+    """Return a function that installs a fake package."""
 
     def installed(fake):
         name = "pyrealsense2" if isinstance(fake, FakeRealSense) else "pylibfreenect2"
@@ -39,7 +39,7 @@ def kinect(**more):
 # RealSense --------------------------------------------------------------------------------------------------
 
 
-def test_a_realsense_gives_colour_and_depth_in_metres_with_its_intrinsics(install):
+def test_a_realsense_returns_colour_and_depth_in_metres_with_its_intrinsics(install):
     rs = install(FakeRealSense())
     with realsense() as eye:
         image = eye.read()
@@ -61,14 +61,14 @@ def test_the_first_pictures_of_a_realsense_are_dropped(install):
         assert rs.pictures == 30
 
 
-def test_a_picture_that_waited_since_before_it_was_asked_for_is_passed_over(install):
+def test_a_picture_taken_before_the_read_is_skipped(install):
     rs = install(FakeRealSense())
     with realsense() as eye:
         rs.waiting = 9
         assert eye.read().colour[0, 0, 2] == 0
 
 
-def test_depth_is_aligned_only_when_it_is_asked_for(install):
+def test_depth_is_aligned_only_when_requested(install):
     rs = install(FakeRealSense())
     with realsense() as eye:
         assert eye.read(depth=False).depth_m is None
@@ -77,8 +77,8 @@ def test_depth_is_aligned_only_when_it_is_asked_for(install):
         assert rs.aligned == 1
 
 
-def test_a_realsense_with_a_distorted_lens_is_undistorted_by_the_makers_own_model(install):
-    """The lens shows one pixel further right what belongs at a pixel: all moves left, the last column is unknown."""
+def test_a_realsense_with_a_distorted_lens_is_undistorted_by_the_vendors_model(install):
+    """The lens shifts the picture by one pixel to the right, so all moves left and the last column is unknown."""
     install(FakeRealSense(distortion=(1.0, 0.0, 0.0, 0.0, 0.0)))
     with realsense() as eye:
         image = eye.read()
@@ -89,7 +89,7 @@ def test_a_realsense_with_a_distorted_lens_is_undistorted_by_the_makers_own_mode
 
 
 def test_undistorted_depth_is_never_a_mean_of_two_surfaces(install):
-    """Half a pixel off, means would put a surface at 0.75 m, where there is none."""
+    """With a shift of half a pixel, interpolation would invent a surface at 0.75 m."""
     install(FakeRealSense(distortion=(0.5, 0.0, 0.0, 0.0, 0.0)))
     with realsense() as eye:
         depth = eye.read().depth_m
@@ -99,17 +99,17 @@ def test_undistorted_depth_is_never_a_mean_of_two_surfaces(install):
 
 
 @pytest.mark.parametrize(
-    ("serials", "wanted", "words"),
+    ("serials", "requested", "message"),
     [
-        ((), "", "one realsense must be connected.*connected: none"),
-        (("1", "2"), "", "or its serial number given; connected: 1, 2"),
-        (("1", "2"), "3", "realsense 3 must be connected; connected: 1, 2"),
+        ((), "", "connect exactly one realsense.*connected: none"),
+        (("1", "2"), "", "or set its serial number; connected: 1, 2"),
+        (("1", "2"), "3", "realsense 3 is not connected; connected: 1, 2"),
     ],
 )
-def test_which_realsense_is_meant_must_be_plain(install, serials, wanted, words):
+def test_an_ambiguous_or_missing_realsense_raises(install, serials, requested, message):
     rs = install(FakeRealSense(serials=serials))
-    with pytest.raises(DeviceError, match=words):
-        realsense(serial=wanted).connect()
+    with pytest.raises(DeviceError, match=message):
+        realsense(serial=requested).connect()
     assert (rs.started, rs.stopped) == ([], 0)
 
 
@@ -120,11 +120,11 @@ def test_the_realsense_of_a_serial_number_is_chosen_among_several(install):
     assert rs.started == ["2"]
 
 
-def test_a_realsense_that_falls_silent_is_an_error_and_can_be_started_again(install):
+def test_a_silent_realsense_is_an_error_and_can_be_started_again(install):
     rs = install(FakeRealSense())
     with realsense() as eye:
         rs.silent = True
-        with pytest.raises(DeviceError, match=r"realsense gives no picture.*Frame didn't arrive within 3000"):
+        with pytest.raises(DeviceError, match=r"realsense returned no picture.*Frame didn't arrive within 3000"):
             eye.read()
         with pytest.raises(DeviceError, match="cannot be started"):
             eye.recover()
@@ -140,7 +140,7 @@ def test_a_realsense_without_depth_in_its_picture_is_an_error(install):
     rs = install(FakeRealSense())
     with realsense() as eye:
         rs.no_depth = True
-        with pytest.raises(DeviceError, match="must give depth with each picture"):
+        with pytest.raises(DeviceError, match="returned a picture without depth"):
             eye.read()
         eye.read(depth=False)
 
@@ -160,7 +160,7 @@ def test_waits_of_a_kinect_out_of_range_are_refused(setting):
         kinect(**setting)
 
 
-def test_numbers_that_a_realsense_makes_up_are_an_error_and_never_reach_the_settings(install):
+def test_numbers_of_a_realsense_that_are_not_finite_are_an_error(install):
     rs = install(FakeRealSense(distortion=(math.nan,) * 5))
     with pytest.raises(DeviceError, match="distortion coefficients must be finite numbers"):
         realsense().connect()
@@ -178,7 +178,7 @@ def test_settings_of_depth_cameras_are_plain_finite_json(install):
 # Kinect 2 ---------------------------------------------------------------------------------------------------
 
 
-def test_a_kinect_gives_depth_in_metres_and_the_colour_of_each_of_its_pixels(install):
+def test_a_kinect_returns_depth_in_metres_and_the_colour_of_each_pixel(install):
     install(FakeFreenect2())
     with kinect() as eye:
         image = eye.read()
@@ -191,7 +191,7 @@ def test_a_kinect_gives_depth_in_metres_and_the_colour_of_each_of_its_pixels(ins
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (364.5, 364.6, 259.0, 202.4)
 
 
-def test_a_kinect_upside_down_is_turned_with_its_intrinsics(install):
+def test_the_picture_and_intrinsics_of_a_kinect_upside_down_are_rotated(install):
     install(FakeFreenect2())
     with kinect(upside_down=True) as eye:
         image = eye.read()
@@ -200,20 +200,20 @@ def test_a_kinect_upside_down_is_turned_with_its_intrinsics(install):
     assert (image.intrinsics.cx, image.intrinsics.cy) == pytest.approx((511 - 259.0, 423 - 202.4))
 
 
-def test_every_set_of_frames_is_released_whatever_happens(install):
+def test_every_set_of_frames_is_released_also_after_a_failure(install):
     freenect = install(FakeFreenect2())
     with kinect() as eye:
         eye.read()
         eye.read(depth=False)
         freenect.fails = True
-        with pytest.raises(DeviceError, match="kinect2 gives no picture: a mistake of the package"):
+        with pytest.raises(DeviceError, match="kinect2 returned no picture: a mistake of the package"):
             eye.read()
         freenect.fails = False
         eye.read()
-    assert freenect.taken == freenect.released == 5 + 2 * 4  # five to warm up; each read passes over what waited
+    assert freenect.taken == freenect.released == 5 + 2 * 4  # five to warm up; each read skips a waiting set
 
 
-def test_a_kinect_is_started_stopped_and_closed_in_order_while_what_it_points_to_is_there(install):
+def test_a_kinect_is_started_stopped_and_closed_in_order(install):
     freenect = install(FakeFreenect2())
     with kinect():
         pass
@@ -221,29 +221,29 @@ def test_a_kinect_is_started_stopped_and_closed_in_order_while_what_it_points_to
 
 
 @pytest.mark.parametrize(
-    ("wanted", "has", "broken", "expected"),
+    ("requested", "available", "broken", "expected"),
     [
         ("auto", ("CudaPacketPipeline", "CpuPacketPipeline"), (), "CudaPacketPipeline"),
         ("auto", ("OpenGLPacketPipeline", "CpuPacketPipeline"), ("OpenGLPacketPipeline",), "CpuPacketPipeline"),
         ("cpu", ("OpenGLPacketPipeline", "CpuPacketPipeline"), (), "CpuPacketPipeline"),
     ],
 )
-def test_the_first_pipeline_that_works_computes_the_depth(install, wanted, has, broken, expected):
-    freenect = install(FakeFreenect2(pipelines=has, broken=broken))
-    with kinect(pipeline=wanted):
+def test_the_first_pipeline_that_works_computes_the_depth(install, requested, available, broken, expected):
+    freenect = install(FakeFreenect2(pipelines=available, broken=broken))
+    with kinect(pipeline=requested):
         assert freenect.events[0] == ("open", b"k1", expected)
 
 
 def test_a_pipeline_that_the_build_lacks_raises(install):
     install(FakeFreenect2(pipelines=("CpuPacketPipeline",)))
-    with pytest.raises(DeviceError, match="compute its depth with cuda, but cuda"):
+    with pytest.raises(DeviceError, match="no usable pipeline cuda: cuda"):
         kinect(pipeline="cuda").connect()
     with pytest.raises(RobotConfigError, match="pipeline must be auto or one of"):
         kinect(pipeline="vulkan")
 
 
 @pytest.mark.parametrize("serials", [(b"k1", b"k2"), ("k1", "k2")])
-def test_a_kinect_is_chosen_by_its_serial_number_as_the_package_spells_it(install, serials):
+def test_a_kinect_is_chosen_by_its_serial_number_as_bytes_or_text(install, serials):
     freenect = install(FakeFreenect2(serials=serials))
     with kinect(serial="k2") as eye:
         assert eye.settings()["serial"] == "k2"
@@ -251,20 +251,20 @@ def test_a_kinect_is_chosen_by_its_serial_number_as_the_package_spells_it(instal
 
 
 @pytest.mark.parametrize("serial", ["", "k3"])
-def test_a_kinect_that_is_not_there_is_never_opened(install, serial):
+def test_a_kinect_that_is_not_connected_is_never_opened(install, serial):
     freenect = install(FakeFreenect2(serials=(b"k1", b"k2")))
     with pytest.raises(DeviceError, match="connected: k1, k2"):
         kinect(serial=serial).connect()
     assert freenect.events == []
 
 
-def test_a_kinect_that_falls_silent_is_an_error_and_can_be_started_again(install):
+def test_a_silent_kinect_is_an_error_and_can_be_started_again(install):
     freenect = install(FakeFreenect2())
     with kinect() as eye:
         freenect.silent = True
-        with pytest.raises(DeviceError, match=r"a picture within 0\.05 s.*USB 3"):
+        with pytest.raises(DeviceError, match=r"no picture within 0\.05 s.*USB 3"):
             eye.read()
-        with pytest.raises(DeviceError, match="a picture within"):
+        with pytest.raises(DeviceError, match="no picture within"):
             eye.recover()
         with pytest.raises(DeviceError, match=r"call recover\(\) again"):
             eye.read()
@@ -275,10 +275,10 @@ def test_a_kinect_that_falls_silent_is_an_error_and_can_be_started_again(install
     assert names == ["open", "start", "stop", "close"] * 3
 
 
-# Packages that are missing ----------------------------------------------------------------------------------
+# Missing packages -------------------------------------------------------------------------------------------
 
 
-def test_a_missing_package_is_a_sentence_with_what_to_install(monkeypatch):
+def test_a_missing_package_is_a_device_error_with_the_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     monkeypatch.setitem(sys.modules, "pylibfreenect2", None)
     with pytest.raises(DeviceError, match=r"pip install 'touch-retrieval\[realsense\]'"):
@@ -287,23 +287,23 @@ def test_a_missing_package_is_a_sentence_with_what_to_install(monkeypatch):
         kinect().connect()
 
 
-def test_a_missing_library_of_the_system_is_a_sentence_with_what_to_install(tmp_path, monkeypatch):
+def test_a_missing_system_library_is_a_device_error_with_the_install_command(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     for package, library in (("pyrealsense2", "libusb-1.0.so.0"), ("pylibfreenect2", "libodd.so.7")):
         monkeypatch.delitem(sys.modules, package, raising=False)
         reason = f"{library}: cannot open shared object file: No such file or directory"
         (tmp_path / f"{package}.py").write_text(f"raise ImportError({reason!r})")
-    said = r"needs libusb-1\.0\.so\.0, a library of the system that pyrealsense2 cannot find; run apt-get install"
-    with pytest.raises(DeviceError, match=said):
+    message = r"requires libusb-1\.0\.so\.0, a library of the system that pyrealsense2 cannot find; run apt-get install"
+    with pytest.raises(DeviceError, match=message):
         realsense().connect()
-    with pytest.raises(DeviceError, match=r"libodd\.so\.7.*; install the package of your system that brings it"):
+    with pytest.raises(DeviceError, match=r"libodd\.so\.7.*; install the package of your system that contains it"):
         kinect().connect()
 
 
-def test_the_loader_of_macos_names_a_missing_library_in_other_words():
+def test_a_missing_library_is_found_in_the_message_of_the_macos_loader():
     reason = "dlopen(/x/pyrealsense2.so, 0x0002): Library not loaded: @rpath/libusb-1.0.0.dylib\n  Referenced from: /x"
-    said = vendor.missing_library("pyrealsense2", ImportError(reason))
-    assert said.startswith("libusb-1.0.0.dylib, a library of the system")
+    description = vendor.missing_library("pyrealsense2", ImportError(reason))
+    assert description.startswith("libusb-1.0.0.dylib, a library of the system")
 
 
 # Plain USB camera -------------------------------------------------------------------------------------------
@@ -311,7 +311,7 @@ def test_the_loader_of_macos_names_a_missing_library_in_other_words():
 
 @pytest.fixture
 def usb(tmp_path, monkeypatch):
-    """A connected camera's stand-in and its name."""
+    """A fake connected camera and its name."""
     camera = FakeVideoDevice()
     monkeypatch.setattr(cv2, "VideoCapture", camera.open)
     monkeypatch.setattr(discover, "DEV", tmp_path)
@@ -320,13 +320,13 @@ def usb(tmp_path, monkeypatch):
     return camera, str(name)
 
 
-def test_a_plain_camera_gives_colour_and_says_that_it_has_no_depth(usb):
+def test_a_plain_camera_returns_colour_and_has_no_depth(usb):
     camera, name = usb
     with UvcCamera(device=name, extrinsics=EXTRINSICS, width=640, height=480, warmup_s=0.0) as eye:
         image = eye.read(depth=False, max_age_s=10)
         assert (image.depth_m, image.intrinsics) == (None, None)
         assert (image.colour[0, :, 0] == 200).all()
-        with pytest.raises(DeviceError, match="sees colour only"):
+        with pytest.raises(DeviceError, match="has no depth: read it with depth=False"):
             eye.read()
         assert eye.settings()["width"] == 640
         assert (cv2.CAP_PROP_AUTO_EXPOSURE, 3) in camera.written  # automatic
@@ -336,18 +336,18 @@ def test_a_plain_camera_gives_colour_and_says_that_it_has_no_depth(usb):
     assert not own_threads()
 
 
-def test_a_plain_camera_upside_down_is_turned(usb):
+def test_the_picture_of_a_plain_camera_upside_down_is_rotated(usb):
     with UvcCamera(device=usb[1], extrinsics=EXTRINSICS, upside_down=True, warmup_s=0.0) as eye:
         colour = eye.read(depth=False, max_age_s=10).colour
     assert (colour[-1, :, 0] == 200).all()
     assert (colour[:-1, :, 0] == 100).all()
 
 
-def test_a_plain_camera_comes_back(usb):
+def test_a_plain_camera_recovers(usb):
     camera, name = usb
     with UvcCamera(device=name, extrinsics=EXTRINSICS, warmup_s=0.0, timeout_s=0.2) as eye:
         camera.dead = True
-        with pytest.raises(DeviceError, match="usb camera must give a picture within"):
+        with pytest.raises(DeviceError, match="usb camera returned no picture within"):
             eye.recover()
         camera.dead = False
         eye.recover()

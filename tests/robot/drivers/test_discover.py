@@ -1,4 +1,4 @@
-"""What is connected, from a made-up /dev and /sys."""
+"""Discovery of devices, from a fake /dev and /sys."""
 
 import sys
 import tomllib
@@ -9,18 +9,18 @@ from robot.drivers import discover
 from robot.drivers.discover import DiscoveredDevice
 from tests.fake_video import FakeFreenect2, FakeRealSense
 
-GONE = ("pyrealsense2", "pylibfreenect2", "serial", "serial.tools")
+MISSING_PACKAGES = ("pyrealsense2", "pylibfreenect2", "serial", "serial.tools")
 
 
 @pytest.fixture(autouse=True)
 def _nothing_installed(monkeypatch):
-    for name in GONE:
+    for name in MISSING_PACKAGES:
         monkeypatch.setitem(sys.modules, name, None)
 
 
 @pytest.fixture
 def roots(tmp_path):
-    """/dev and /sys with nothing in them."""
+    """Empty /dev and /sys."""
     for name in ("dev/v4l/by-id", "dev/serial/by-id", "sys/class/video4linux"):
         (tmp_path / name).mkdir(parents=True)
     return tmp_path / "dev", tmp_path / "sys"
@@ -41,7 +41,7 @@ def test_with_nothing_connected_and_nothing_installed_nothing_is_found(tmp_path)
     assert discover.discover(tmp_path / "none", tmp_path / "none") == []
 
 
-def test_cameras_are_found_by_their_stable_names_with_what_they_call_themselves(roots):
+def test_cameras_are_found_by_their_stable_names_with_their_own_labels(roots):
     plug_camera(roots, "usb-Maker_Webcam_12-video-index0", 0, "Webcam 12: Webcam")
     plug_camera(roots, "usb-Maker_Webcam_12-video-index1", 1, "Webcam 12: Webcam", index="1")
     name = str(roots[0] / "v4l" / "by-id" / "usb-Maker_Webcam_12-video-index0")
@@ -58,19 +58,19 @@ def test_cameras_are_found_by_their_stable_names_with_what_they_call_themselves(
         ("usb-046d_HD_Pro-video-index0", "HD Pro Webcam", "uvc"),
     ],
 )
-def test_gel_sensors_are_known_by_their_names(roots, name, label, driver):
+def test_gel_sensors_are_recognised_by_their_names(roots, name, label, driver):
     plug_camera(roots, name, 0, label)
     assert tomllib.loads(discover.discover(*roots)[0].toml)["driver"] == driver
 
 
-def test_where_the_system_makes_no_stable_names_cameras_are_found_by_number(roots):
+def test_without_stable_names_cameras_are_found_by_number(roots):
     plug_camera(roots, None, 2, "Webcam")
     plug_camera(roots, None, 3, "Webcam", index="1")
     (found,) = discover.discover(*roots)
     assert tomllib.loads(found.toml) == {"driver": "uvc", "device": str(roots[0] / "video2"), "allow_index": True}
 
 
-def test_equal_cameras_that_share_a_name_are_both_found_with_a_note_that_the_name_may_change_sides(roots):
+def test_identical_cameras_that_share_a_name_are_both_found_with_a_note(roots):
     dev = roots[0]
     plug_camera(roots, "usb-Maker_Gel-video-index0", 2, "Gel")
     plug_camera(roots, None, 0, "Gel")
@@ -84,7 +84,7 @@ def test_equal_cameras_that_share_a_name_are_both_found_with_a_note_that_the_nam
     found = discover.find_cameras(*roots)
     assert [(each.device, each.label) for each in found] == [(shared, "Gel"), (other, "Gel")]
     for each in found:
-        assert "may lead to the other camera tomorrow" in each.toml
+        assert "may lead to the other camera after a restart" in each.toml
         assert tomllib.loads(each.toml)["device"] == each.device
 
 
@@ -110,7 +110,7 @@ class Port:
         self.device, self.hwid, self.description = device, hwid, "a port"
 
 
-def test_pyserial_adds_the_ports_that_it_alone_knows(roots, monkeypatch):
+def test_ports_that_only_pyserial_lists_are_added(roots, monkeypatch):
     link = roots[0] / "serial" / "by-id" / "usb-FTDI_7"
     link.symlink_to(roots[0] / "ttyUSB0")
     ports = [Port(str(roots[0] / "ttyUSB0")), Port("/dev/ttyACM7"), Port("/dev/ttyS0", hwid="n/a")]
@@ -123,7 +123,7 @@ def test_pyserial_adds_the_ports_that_it_alone_knows(roots, monkeypatch):
     assert [each.device for each in discover.find_serial_ports(roots[0])] == [str(link), "/dev/ttyACM7"]
 
 
-def test_depth_cameras_are_asked_through_their_packages_where_these_are_installed(roots, monkeypatch):
+def test_depth_cameras_are_listed_by_their_installed_packages(roots, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyrealsense2", FakeRealSense(serials=("8", "9")))
     monkeypatch.setitem(sys.modules, "pylibfreenect2", FakeFreenect2(serials=(b"k1",)))
     found = discover.discover(*roots)
@@ -131,7 +131,7 @@ def test_depth_cameras_are_asked_through_their_packages_where_these_are_installe
     assert tomllib.loads(found[1].toml) == {"driver": "realsense", "serial": "9"}
 
 
-def test_a_package_that_fails_is_told_of_and_hides_nothing_else(roots, monkeypatch, caplog):
+def test_a_failing_package_gives_a_warning_and_hides_nothing_else(roots, monkeypatch, caplog):
     broken = FakeRealSense()
     broken.context = lambda: (_ for _ in ()).throw(RuntimeError("no udev rules"))
     monkeypatch.setitem(sys.modules, "pyrealsense2", broken)
@@ -140,13 +140,11 @@ def test_a_package_that_fails_is_told_of_and_hides_nothing_else(roots, monkeypat
     assert "RealSense cameras could not be listed: no udev rules" in caplog.text
 
 
-def test_a_package_without_its_library_of_the_system_is_told_of_and_one_that_is_not_installed_is_not(
-    roots, tmp_path, monkeypatch, caplog
-):
+def test_a_missing_system_library_gives_a_warning_and_a_missing_package_does_not(roots, tmp_path, monkeypatch, caplog):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "pyrealsense2")
     reason = "libusb-1.0.so.0: cannot open shared object file: No such file or directory"
     (tmp_path / "pyrealsense2.py").write_text(f"raise ImportError({reason!r})")
     assert discover.discover(*roots) == []
-    assert "RealSense cameras could not be listed: that needs libusb-1.0.so.0" in caplog.text
+    assert "RealSense cameras could not be listed: this requires libusb-1.0.so.0" in caplog.text
     assert "Kinect" not in caplog.text

@@ -1,4 +1,4 @@
-"""The thread that reads a camera, over streams whose every picture the test hands out."""
+"""The thread that reads a camera, with scripted streams."""
 
 import math
 import queue
@@ -20,7 +20,7 @@ ENOUGH_S = 10.0
 
 
 class Script:
-    """A camera whose streams give what is put in, in that order; an exception is raised. `end` lets every stream go."""
+    """A camera whose streams return the queued frames in order; a queued exception is raised."""
 
     def __init__(self):
         self.items, self.opened, self.closed = queue.Queue(), 0, 0
@@ -44,7 +44,7 @@ class Script:
         self.closed += 1
 
     def show(self, *times, picture=None):
-        """Pictures taken at these times, each new unless `picture` is given."""
+        """Queue frames taken at these times, each with new pixels unless `picture` is given."""
         for time_s in times:
             self.number += 1
             self.items.put(Frame(np.full((40, 40, 3), self.number if picture is None else picture, np.uint8), time_s))
@@ -57,7 +57,7 @@ def script():
 
 @pytest.fixture
 def make(script):
-    """Readers of the script, closed at the end of the test; no thread may be left."""
+    """Return a maker of readers, which are closed at the end of the test without leftover threads."""
     made = []
 
     def reader(settings=SETTINGS, script=script, backoff_s=(1e-3, 4e-3)):
@@ -71,30 +71,30 @@ def make(script):
     assert not own_threads()
 
 
-def seen(reader, count):
+def wait_for_frames(reader, count):
     wait_until(lambda: reader.frame_count >= count)
 
 
-def test_the_newest_picture_is_given_and_the_newest_few_are_kept(script, make):
+def test_the_newest_frame_is_returned_and_the_newest_few_are_buffered(script, make):
     script.show(1.0)
     reader = make()
     reader.start()
     assert reader.newest().time_s == 1.0
     script.show(2.0, 3.0, 4.0, 5.0, 6.0)
-    seen(reader, 6)
+    wait_for_frames(reader, 6)
     assert reader.newest().time_s == 6.0
     assert [reader.near(time_s).time_s for time_s in (0.0, 3.2, 4.4, 4.6, 99.0)] == [3.0, 3.0, 4.0, 5.0, 6.0]
 
 
-def test_of_two_pictures_equally_near_the_newer_is_given(script, make):
+def test_of_two_frames_equally_near_the_newer_is_returned(script, make):
     script.show(1.0, 2.0)
     reader = make()
     reader.start()
-    seen(reader, 2)
+    wait_for_frames(reader, 2)
     assert reader.near(1.5).time_s == 2.0
 
 
-def test_pictures_of_the_warm_up_are_dropped(script, make):
+def test_frames_of_the_warm_up_are_dropped(script, make):
     script.show(0.1, 0.9, 1.0)
     reader = make(ReaderSettings(warmup_s=1.0, timeout_s=5.0))
     reader.start()
@@ -102,9 +102,9 @@ def test_pictures_of_the_warm_up_are_dropped(script, make):
     assert reader.frame_count == 3
 
 
-def test_a_camera_that_gives_nothing_is_waited_for_and_then_named(script, make):
+def test_a_camera_without_frames_raises_after_the_timeout(script, make):
     reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.02))
-    with pytest.raises(DeviceError, match=r"eye must give a picture within 0\.02 s: nothing came"):
+    with pytest.raises(DeviceError, match=r"eye returned no picture within 0\.02 s: no frame arrived"):
         reader.start()
 
 
@@ -115,8 +115,8 @@ def test_a_camera_that_cannot_be_opened_leaves_no_thread(script, make):
     assert not own_threads()
 
 
-@pytest.mark.parametrize("error", [DeviceError("it gives no more pictures"), OSError(19, "No such device"), KeyError()])
-def test_a_lost_stream_is_closed_opened_again_and_counted_and_its_old_pictures_are_not_given(script, make, error):
+@pytest.mark.parametrize("error", [DeviceError("it ended"), OSError(19, "No such device"), KeyError()])
+def test_a_lost_stream_is_closed_opened_again_and_counted_and_its_old_frames_are_dropped(script, make, error):
     script.show(1.0)
     reader = make()
     reader.start()
@@ -128,19 +128,19 @@ def test_a_lost_stream_is_closed_opened_again_and_counted_and_its_old_pictures_a
     assert (reader.lost_count, script.closed) == (1, 1)
 
 
-def test_what_is_wrong_with_a_lost_stream_is_said_to_whoever_asks(script, make):
+def test_readers_of_a_lost_stream_get_the_reason(script, make):
     script.show(1.0)
     reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.02), backoff_s=(ENOUGH_S, ENOUGH_S))
     reader.start()
-    script.items.put(DeviceError("it gives no more pictures"))
+    script.items.put(DeviceError("it returned no more pictures"))
     wait_until(lambda: reader.lost_count)
-    with pytest.raises(DeviceError, match=r"it gives no more pictures; it was lost 1 time\(s\). Is it plugged in"):
+    with pytest.raises(DeviceError, match=r"it returned no more pictures; the stream was lost 1 time\(s\)"):
         reader.newest()
-    with pytest.raises(DeviceError, match="it gives no more pictures"):
+    with pytest.raises(DeviceError, match="it returned no more pictures"):
         reader.near(1.0)
 
 
-def test_each_wait_before_opening_again_is_longer_up_to_a_bound_and_a_picture_makes_it_short(script, make, monkeypatch):
+def test_the_waits_before_reopening_double_up_to_a_limit_and_a_frame_resets_them(script, make, monkeypatch):
     script.show(1.0)
     reader = make()
     waits = []
@@ -150,13 +150,13 @@ def test_each_wait_before_opening_again_is_longer_up_to_a_bound_and_a_picture_ma
     script.items.put(DeviceError("gone"))
     wait_until(lambda: script.opened == 2)
     script.show(2.0)
-    seen(reader, 2)
+    wait_for_frames(reader, 2)
     script.items.put(DeviceError("gone again"))
     wait_until(lambda: script.opened == 3)
     assert waits == [0.001, 0.002, 0.004, 0.004, 0.004, 0.001]
 
 
-def test_a_lost_stream_is_opened_at_once_when_somebody_is_in_a_hurry(script, make):
+def test_a_lost_stream_can_be_opened_again_without_delay(script, make):
     script.show(1.0)
     reader = make(ReaderSettings(warmup_s=0.0, timeout_s=5.0), backoff_s=(100.0, 100.0))
     reader.start()
@@ -167,7 +167,7 @@ def test_a_lost_stream_is_opened_at_once_when_somebody_is_in_a_hurry(script, mak
     assert reader.newest().time_s == 2.0
 
 
-def test_a_newer_picture_can_be_waited_for(script, make):
+def test_after_waits_for_a_newer_frame(script, make):
     script.show(1.0)
     reader = make()
     reader.start()
@@ -175,19 +175,19 @@ def test_a_newer_picture_can_be_waited_for(script, make):
     assert reader.after(1.0).time_s == 2.0
 
 
-def test_a_picture_that_repeats_the_last_is_as_old_as_its_first_copy(script, make):
+def test_a_frame_equal_to_the_last_is_as_old_as_its_first_copy(script, make):
     reader = make()
     script.show(0.0)
     script.show(0.1, 0.6, 1.1, picture=7)
     reader.start()
-    seen(reader, 4)
+    wait_for_frames(reader, 4)
     assert reader.newest().time_s == reader.near(1.1).time_s == 0.1
-    assert reader.near(0.0).time_s == 0.0  # and pushes no older one out
+    assert reader.near(0.0).time_s == 0.0  # and removes no older one
     script.show(1.2, picture=8)
     assert reader.after(0.1).time_s == 1.2
 
 
-def test_a_stream_that_was_lost_has_time_to_warm_up_again(script, make):
+def test_a_lost_stream_warms_up_again(script, make):
     reader = make(ReaderSettings(warmup_s=30.0, timeout_s=1e-3))
     script.show(31.0)
     reader.start()
@@ -199,22 +199,22 @@ def test_a_stream_that_was_lost_has_time_to_warm_up_again(script, make):
     later.join()
 
 
-def test_a_stream_that_stands_still_gives_nothing_fresh_long_before_it_counts_as_frozen(script, make):
+def test_a_frozen_stream_is_stale_long_before_it_is_opened_again(script, make):
     script.show(0.0, 0.3, 0.7, picture=7)
     now = [0.7]
     gel = Gel("a", make(), clock=lambda: now[0])
     gel.connect()
-    seen(gel.reader, 3)
-    with pytest.raises(DeviceError, match=r"at most 0\.5 s old, it is 0\.7 s; is the stream frozen"):
+    wait_for_frames(gel.reader, 3)
+    with pytest.raises(DeviceError, match=r"at most 0\.5 s old, got 0\.7 s; is the stream frozen"):
         gel.read()
     assert gel.reader.lost_count == 0
 
 
-def test_a_stream_frozen_for_long_is_lost_and_said_to_be_frozen(script, make):
+def test_a_stream_frozen_for_long_is_lost_with_this_reason(script, make):
     reader = make(ReaderSettings(warmup_s=0.0, timeout_s=0.05, frozen_s=2.0), backoff_s=(ENOUGH_S, ENOUGH_S))
     script.show(0.0, 1.0, 2.0, picture=7)
     reader.start()
-    seen(reader, 3)
+    wait_for_frames(reader, 3)
     assert reader.lost_count == 0
     script.show(2.1, picture=7)
     wait_until(lambda: reader.lost_count)
@@ -222,7 +222,7 @@ def test_a_stream_frozen_for_long_is_lost_and_said_to_be_frozen(script, make):
         reader.newest()
 
 
-def test_a_frozen_stream_stays_frozen_when_it_is_opened_again_until_its_picture_changes(script, make):
+def test_a_reopened_stream_is_frozen_until_its_picture_changes(script, make):
     script.show(0.0, picture=7)
     reader = make()
     reader.start()
@@ -239,14 +239,14 @@ def test_pictures_that_differ_in_one_pixel_are_not_frozen(script, make):
     reader = make()
     for number in range(5):
         pixels = np.zeros((40, 40, 3), np.uint8)
-        pixels[17, 5, 1] = number  # none of the rows and columns that are compared first
+        pixels[17, 5, 1] = number  # not in the rows and columns that are compared first
         script.items.put(Frame(pixels, 1.0 * number))
     reader.start()
-    seen(reader, 5)
+    wait_for_frames(reader, 5)
     assert reader.lost_count == 0
 
 
-def test_closing_ends_the_thread_and_lets_go_of_the_camera_also_twice_and_before_starting(script, make):
+def test_closing_ends_the_thread_and_closes_the_camera_also_twice_and_before_starting(script, make):
     make().close()
     script.show(1.0)
     reader = make()
@@ -259,7 +259,7 @@ def test_closing_ends_the_thread_and_lets_go_of_the_camera_also_twice_and_before
     assert script.closed == script.opened == 1
 
 
-def test_closing_ends_a_thread_that_waits_to_open_its_camera_again(script, make):
+def test_closing_ends_a_thread_that_waits_to_reopen_its_camera(script, make):
     script.show(1.0)
     reader = make(ReaderSettings(warmup_s=0.0), backoff_s=(100.0, 100.0))
     reader.start()
@@ -269,7 +269,7 @@ def test_closing_ends_a_thread_that_waits_to_open_its_camera_again(script, make)
     assert not own_threads()
 
 
-def test_closing_says_so_when_a_driver_does_not_come_back_and_the_camera_is_let_go_later(script, make, monkeypatch):
+def test_closing_raises_if_the_driver_blocks_and_the_camera_is_closed_later(script, make, monkeypatch):
     monkeypatch.setattr(frames, "_CLOSING_S", 0.02)
     script.show(1.0)
     reader = make()
@@ -323,15 +323,15 @@ def connected(finger, times, make):
     script.show(*times)
     gel = Gel(finger, make(script=script))
     gel.connect()
-    seen(gel.reader, len(times))
+    wait_for_frames(gel.reader, len(times))
     return gel
 
 
-def test_two_fingers_out_of_step_are_matched_nearer_in_time_than_their_newest_pictures_are(make):
-    """At 30 pictures a second and 10 ms apart: the newest are 23 ms apart, the best match 10 ms."""
+def test_two_fingers_out_of_phase_are_matched_closer_in_time_than_their_newest_frames(make):
+    """At 30 frames/s with a phase of 10 ms, the newest frames are 24 ms apart and the best match 10 ms."""
     a, b = (connected(finger, times, make) for finger, times in (("a", (0.0, 0.033, 0.067)), ("b", (0.010, 0.043))))
-    apart = abs(a.read().time_s - b.read().time_s)
+    newest_skew = abs(a.read().time_s - b.read().time_s)
     together, skew = read_together({"a": a, "b": b})
-    assert apart == pytest.approx(0.024)
+    assert newest_skew == pytest.approx(0.024)
     assert skew == pytest.approx(0.010)
     assert [together[finger].time_s for finger in "ab"] == [0.033, 0.043]

@@ -1,4 +1,4 @@
-"""The arm that is a person: asked once for each pose, in words, and never believed after an interruption."""
+"""The manual arm: one request for each pose, and no assumed pose after an interruption."""
 
 import math
 
@@ -18,20 +18,20 @@ def connected(ask):
 
 
 def test_a_pose_is_requested_in_words_and_assumed_reached():
-    asked = []
-    arm = connected(asked.append)
+    requests = []
+    arm = connected(requests.append)
     target = Pose(-12.4, 30.0, 120.0, math.radians(35))
     assert arm.move_to(target, 100.0) == target == arm.pose()
-    (words,) = asked
+    (text,) = requests
     assert (
-        "120 mm above the table, 12 mm to the left of the middle of the workspace, 30 mm away from the camera" in words
+        "120 mm above the table, 12 mm to the left of the middle of the workspace, 30 mm away from the camera" in text
     )
-    assert "turned by 35 deg" in words
-    assert words.endswith("then press Enter.")
+    assert "turned by 35 deg" in text
+    assert text.endswith("then press Enter.")
 
 
 @pytest.mark.parametrize(
-    ("change", "asks"),
+    ("change", "count"),
     [
         ((0.5, 0.5, 0.5, 0.0), 1),
         ((0.0, 0.0, 1.1, 0.0), 2),
@@ -42,27 +42,27 @@ def test_a_pose_is_requested_in_words_and_assumed_reached():
         ((0.0, 0.0, 0.0, math.pi), 2),
     ],
 )
-def test_a_pose_within_a_millimetre_and_a_degree_is_not_asked_again(change, asks):
-    asked = []
-    arm = connected(asked.append)
+def test_a_pose_within_a_millimetre_and_a_degree_is_not_requested_again(change, count):
+    requests = []
+    arm = connected(requests.append)
     first = Pose(0.0, 0.0, 100.0, 0.3)
     second = Pose(*(a + b for a, b in zip(first.as_tuple(), change, strict=True)))
     arm.move_to(first, 100.0)
-    assert arm.move_to(second, 100.0) == (first if asks == 1 else second)
-    assert len(asked) == asks
+    assert arm.move_to(second, 100.0) == (first if count == 1 else second)
+    assert len(requests) == count
 
 
-def test_small_steps_do_not_add_up_unasked():
-    asked = []
-    arm = connected(asked.append)
+def test_small_steps_add_up_to_a_request():
+    requests = []
+    arm = connected(requests.append)
     for number in range(11):
         arm.move_to(Pose(0.3 * number, 0.0, 100.0, 0.0), 100.0)
-    assert len(asked) == 3  # at 0, 1.2 and 2.4 mm
+    assert len(requests) == 3  # at 0, 1.2 and 2.4 mm
 
 
-def test_where_the_hand_is_nobody_knows_before_the_first_pose_after_a_stop_or_when_connected_again():
-    asked = []
-    arm = connected(asked.append)
+def test_the_pose_is_unknown_before_the_first_motion_after_a_stop_and_after_reconnecting():
+    requests = []
+    arm = connected(requests.append)
     with pytest.raises(DeviceError, match="call move_to first"):
         arm.pose()
     arm.move_to(Pose(0, 0, 100, 0), 100.0)
@@ -70,7 +70,7 @@ def test_where_the_hand_is_nobody_knows_before_the_first_pose_after_a_stop_or_wh
     with pytest.raises(DeviceError, match="call move_to first"):
         arm.pose()
     arm.move_to(Pose(0, 0, 100, 0), 100.0)
-    assert len(asked) == 2
+    assert len(requests) == 2
     arm.close()
     arm.connect()
     with pytest.raises(DeviceError, match="call move_to first"):
@@ -88,7 +88,7 @@ def test_a_person_who_interrupts_is_asked_again():
         arm.pose()
 
 
-def test_nobody_there_is_said_so():
+def test_a_request_without_a_terminal_raises():
     def ended(_):
         raise EOFError
 
@@ -96,7 +96,7 @@ def test_nobody_there_is_said_so():
         connected(ended).move_to(Pose(0, 0, 100, 0), 100.0)
 
 
-def test_the_limits_hold_for_a_person_too():
+def test_the_limits_apply_to_a_manual_arm_too():
     arm = ManualArm(workspace=WORKSPACE, max_speed_mm_s=50.0, ask=lambda _: None)
     with pytest.raises(DeviceError, match="must be connected"):
         arm.move_to(Pose(0, 0, 100, 0), 10.0)

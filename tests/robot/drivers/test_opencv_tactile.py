@@ -1,4 +1,4 @@
-"""Gel sensors over OpenCV: which camera, its settings written and read back, its picture, and its coming back."""
+"""Gel sensors through OpenCV: the camera's name, its settings, its pictures, and recovery."""
 
 import json
 import math
@@ -29,7 +29,7 @@ def _no_thread_is_left():
 
 @pytest.fixture
 def dev(tmp_path, monkeypatch):
-    """/dev with nothing in it."""
+    """Empty /dev."""
     (tmp_path / "v4l" / "by-id").mkdir(parents=True)
     monkeypatch.setattr(discover, "DEV", tmp_path)
     return tmp_path
@@ -37,7 +37,7 @@ def dev(tmp_path, monkeypatch):
 
 @pytest.fixture
 def plug(dev, monkeypatch):
-    """Plug a camera in under a stable name, at a number; returns the name."""
+    """Return a function that connects a camera under a stable name, at a number, and returns the name."""
     cameras = {}
     monkeypatch.setattr(cv2, "VideoCapture", lambda path, backend: cameras[path].open(path, backend))
 
@@ -56,31 +56,31 @@ def written(camera):
     return [number for number, _ in camera.written]
 
 
-# Which camera -----------------------------------------------------------------------------------------------
+# Names of cameras--------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("device", ["0", "/dev/video2", "/dev//video2", "/dev/v4l/by-id/../../video2"])
 def test_a_camera_named_by_a_number_is_refused_with_the_names_of_those_connected(plug, device):
     name = plug(FakeVideoDevice())
-    with pytest.raises(RobotConfigError, match=f"another camera may have tomorrow. Connected: {name}$"):
+    with pytest.raises(RobotConfigError, match=f"another camera may have after a restart. Connected: {name}$"):
         OpencvTactile(finger="a", device=device)
 
 
 @pytest.mark.parametrize("device", ["", "video0", "usb-Maker_Gel-video-index0"])
-def test_a_camera_that_is_not_named_by_a_whole_path_is_refused(dev, device):
-    with pytest.raises(RobotConfigError, match=f"named by its whole path, got '{device}'"):
+def test_a_camera_that_is_not_named_by_an_absolute_path_is_refused(dev, device):
+    with pytest.raises(RobotConfigError, match=f"named by its absolute path, got '{device}'"):
         OpencvTactile(finger="a", device=device, allow_index=True)
 
 
-def test_a_name_that_equal_cameras_share_is_listed_with_a_note(plug, dev):
+def test_a_name_that_identical_cameras_share_is_listed_with_a_note(plug, dev):
     name = plug(FakeVideoDevice(), number=2)
     (dev / "v4l" / "by-path").mkdir()
     (dev / "v4l" / "by-path" / "pci-1-video-index0").symlink_to(dev / "video0")
-    with pytest.raises(RobotConfigError, match=rf"Connected: {name}, .*pci-1-video-index0 \(.*other camera tomorrow"):
+    with pytest.raises(RobotConfigError, match=rf"Connected: {name}, .*pci-1-video-index0 \(.*identical cameras"):
         OpencvTactile(finger="a", device="0")
 
 
-def test_where_the_system_makes_no_stable_names_the_way_out_is_said(dev):
+def test_without_stable_names_the_message_names_allow_index(dev):
     with pytest.raises(RobotConfigError, match="set allow_index = true"):
         OpencvTactile(finger="a", device="0")
     assert stable_path("3", allow_index=True) == "/dev/video3"
@@ -89,11 +89,11 @@ def test_where_the_system_makes_no_stable_names_the_way_out_is_said(dev):
 
 def test_a_camera_that_is_not_plugged_in_is_named(plug, dev):
     name = plug(FakeVideoDevice())
-    with pytest.raises(DeviceError, match=f"usb-Other must be there, but is not.*Connected: {name}"):
+    with pytest.raises(DeviceError, match=f"usb-Other does not exist.*Connected: {name}"):
         OpencvTactile(finger="a", device=str(dev / "v4l" / "by-id" / "usb-Other")).connect()
 
 
-def test_the_stable_name_is_looked_up_and_opened_through_video4linux(plug, dev):
+def test_the_stable_name_is_resolved_and_opened_through_video4linux(plug, dev):
     camera = FakeVideoDevice()
     with OpencvTactile(finger="a", device=plug(camera, number=4), **QUICK):
         assert camera.captures[0].path == str(dev / "video4")
@@ -118,14 +118,14 @@ def test_a_camera_in_use_cannot_be_connected_and_can_be_later(plug):
     assert not camera.open_captures
 
 
-def test_what_is_no_camera_cannot_be_opened_by_the_real_opencv_either(dev):
+def test_the_real_opencv_cannot_open_a_file_that_is_not_a_camera(dev):
     path = dev / "v4l" / "by-id" / "usb-Printer"
     path.write_text("no camera")
     with pytest.raises(DeviceError, match="usb-Printer cannot be opened"):
         OpencvTactile(finger="a", device=str(path)).connect()
 
 
-def test_nothing_is_touched_before_connecting(monkeypatch):
+def test_no_device_is_used_before_connecting(monkeypatch):
     monkeypatch.setattr(opencv_stream, "open_capture", lambda device: pytest.fail("opened"))
     gel = OpencvTactile(finger="b", device="7", allow_index=True)
     assert (gel.name, gel.finger, gel.frame_count, gel.lost_count) == ("gel b", "b", 0, 0)
@@ -133,7 +133,7 @@ def test_nothing_is_touched_before_connecting(monkeypatch):
         gel.read()
 
 
-def test_opencv_waits_a_second_for_a_picture_unless_it_is_told_otherwise(plug, monkeypatch):
+def test_opencv_waits_a_second_for_a_picture_unless_the_environment_sets_another_time(plug, monkeypatch):
     monkeypatch.delenv("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", raising=False)
     name = plug(FakeVideoDevice())
     opencv_stream.open_capture(name)
@@ -165,42 +165,42 @@ def test_format_is_written_first_then_size_and_rate_and_then_the_rest(plug):
         assert gel.refused == {}
 
 
-def test_what_the_camera_says_of_its_settings_is_what_is_recorded(plug):
+def test_the_settings_that_the_camera_reports_are_recorded(plug):
     with GelSight(finger="a", device=plug(FakeVideoDevice()), exposure_ms=5.0, **QUICK) as gel:
         found = gel.settings()
     assert found["fourcc"] == "MJPG"
     assert (found["width"], found["height"], found["fps"]) == (1280, 960, 30.0)
     assert (found["auto_exposure"], found["exposure_ms"], found["auto_white_balance"]) == (False, 5.0, False)
-    assert found["picture_px"] == [8, 6]  # whatever it says, this is what comes
+    assert found["picture_px"] == [8, 6]  # the size of the actual pictures
     assert found["device"].endswith("video-index0")
     json.dumps(found)
 
 
-def test_settings_that_the_camera_does_not_take_are_told_with_what_it_has_instead(plug):
+def test_settings_that_the_camera_refuses_are_reported_with_the_actual_values(plug):
     camera = FakeVideoDevice(stubborn=[cv2.CAP_PROP_FPS, cv2.CAP_PROP_FOURCC], lacks=[cv2.CAP_PROP_EXPOSURE])
     with GelSight(finger="a", device=plug(camera), exposure_ms=5.0, **QUICK) as gel:
         assert gel.refused == {
-            "fourcc": "asked MJPG, has YUYV",
-            "fps": "asked 30, has 15",
-            "exposure_ms": "asked 5, has no such setting",
+            "fourcc": "requested MJPG, has YUYV",
+            "fps": "requested 30, has 15",
+            "exposure_ms": "requested 5, has no such setting",
         }
         assert gel.settings()["fps"] == 15.0
 
 
-def test_a_rate_that_the_camera_states_a_little_differently_is_taken(plug):
+def test_a_rate_that_differs_slightly_counts_as_applied(plug):
     camera = FakeVideoDevice(stubborn=[cv2.CAP_PROP_FPS])
     camera.values[cv2.CAP_PROP_FPS] = 29.97
     with GelSight(finger="a", device=plug(camera), **QUICK) as gel:
         assert gel.refused == {}
 
 
-def test_only_the_automatics_are_written_to_a_camera_of_which_nothing_is_asked(plug):
+def test_by_default_only_automatic_exposure_and_white_balance_are_written(plug):
     camera = FakeVideoDevice()
     with OpencvTactile(finger="a", device=plug(camera), **QUICK):
         assert camera.written == [(cv2.CAP_PROP_AUTO_EXPOSURE, 1), (cv2.CAP_PROP_AUTO_WB, 0)]
 
 
-def test_the_brightness_of_a_digit_goes_through_its_zoom(plug):
+def test_the_zoom_control_of_a_digit_sets_its_brightness(plug):
     camera = FakeVideoDevice()
     with Digit(finger="a", device=plug(camera), led=[15, 2, 1], **QUICK) as gel:
         assert (cv2.CAP_PROP_ZOOM, 0xF21) in camera.written
@@ -208,7 +208,7 @@ def test_the_brightness_of_a_digit_goes_through_its_zoom(plug):
         assert gel.refused == {}
 
 
-def test_a_files_settings_count_before_the_presets(plug):
+def test_settings_of_a_file_override_the_presets(plug):
     camera = FakeVideoDevice()
     with Digit(finger="a", device=plug(camera), width=640, height=480, fps=30.0, **QUICK) as gel:
         found = gel.settings()
@@ -217,13 +217,13 @@ def test_a_files_settings_count_before_the_presets(plug):
 
 @pytest.mark.parametrize("size", [{"width": 640}, {"height": 480}])
 @pytest.mark.parametrize("make", [GelSight, GelSightMini, Digit])
-def test_half_a_size_is_not_filled_up_with_the_presets(make, size):
+def test_a_width_or_height_alone_is_refused(make, size):
     with pytest.raises(RobotConfigError, match="width and height must be given together"):
         make(finger="a", device="/dev/v4l/by-id/usb-Gel", **size)
 
 
 @pytest.mark.parametrize(
-    ("setting", "words"),
+    ("setting", "message"),
     [
         ({"width": 640}, "width and height"),
         ({"width": -1, "height": -1}, "width and height"),
@@ -246,15 +246,15 @@ def test_half_a_size_is_not_filled_up_with_the_presets(make, size):
         ({"warmup_s": 1e10}, "warmup_s"),
     ],
 )
-def test_settings_out_of_range_are_refused_before_anything_is_connected(setting, words):
-    with pytest.raises(RobotConfigError, match=words):
+def test_settings_out_of_range_are_refused_before_connecting(setting, message):
+    with pytest.raises(RobotConfigError, match=message):
         OpencvTactile(finger="a", device="/dev/v4l/by-id/usb-Gel", **setting)
 
 
 # Pictures ---------------------------------------------------------------------------------------------------
 
 
-def test_pictures_come_in_rgb_with_row_0_on_top(plug):
+def test_pictures_are_rgb_with_row_0_on_top(plug):
     with OpencvTactile(finger="a", device=plug(FakeVideoDevice()), **QUICK) as gel:
         pixels = gel.read(10).pixels
     assert pixels.shape == (6, 8, 3)
@@ -263,8 +263,8 @@ def test_pictures_come_in_rgb_with_row_0_on_top(plug):
     assert (pixels[..., 1] == 50).all()
 
 
-def test_a_digit_is_turned_to_the_left(plug):
-    """The camera's first row becomes the left column, as after transposing and turning over."""
+def test_the_picture_of_a_digit_is_rotated_to_the_left(plug):
+    """The camera's first row becomes the left column, as after transposing and flipping."""
     with Digit(finger="a", device=plug(FakeVideoDevice()), **QUICK) as gel:
         pixels = gel.read(10).pixels
     assert pixels.shape == (8, 6, 3)
@@ -274,7 +274,7 @@ def test_a_digit_is_turned_to_the_left(plug):
     np.testing.assert_array_equal(np.rot90(picture), cv2.flip(cv2.transpose(picture), 0))
 
 
-def test_the_border_of_a_gelsight_mini_is_cut_off_and_the_size_is_as_asked(plug):
+def test_the_picture_of_a_gelsight_mini_is_cropped_and_resized(plug):
     camera = FakeVideoDevice(size=(100, 80))
     with GelSightMini(finger="a", device=plug(camera), **QUICK) as gel:
         assert gel.read(10).pixels.shape == (56, 70, 3)  # 80 - 2 * 12 by 100 - 2 * 15
@@ -282,7 +282,7 @@ def test_the_border_of_a_gelsight_mini_is_cut_off_and_the_size_is_as_asked(plug)
         assert gel.read(10).pixels.shape == (30, 40, 3)
 
 
-def test_a_calibration_file_for_another_size_is_found_when_connecting(plug, tmp_path):
+def test_a_calibration_file_for_another_size_raises_on_connecting(plug, tmp_path):
     path = tmp_path / "gel.json"
     path.write_text('{"image_px": [64, 48], "crop": [0.1, 0.1, 0.1, 0.1]}')
     camera = FakeVideoDevice()
@@ -296,7 +296,7 @@ def test_a_calibration_file_for_another_size_is_found_when_connecting(plug, tmp_
         assert other.read(10).pixels.shape == (3, 8, 3)
 
 
-def test_a_calibration_file_that_is_none_is_named_before_anything_is_connected(tmp_path):
+def test_a_missing_calibration_file_is_named_before_connecting(tmp_path):
     for make in (OpencvTactile, Digit):
         with pytest.raises(RobotConfigError, match=r"none\.json cannot be read"):
             make(finger="a", device="/dev/v4l/by-id/usb-Gel", calibration=str(tmp_path / "none.json"))
@@ -304,14 +304,14 @@ def test_a_calibration_file_that_is_none_is_named_before_anything_is_connected(t
 
 @pytest.mark.parametrize("shape", [(6, 8, 2), (6, 8), (6, 8, 4)])
 @pytest.mark.parametrize("make", [OpencvTactile, Digit, GelSightMini])
-def test_pictures_without_three_colours_are_a_device_error_that_says_what_to_set(plug, make, shape):
+def test_pictures_without_three_colours_are_a_device_error_with_the_remedy(plug, make, shape):
     camera = FakeVideoDevice()
     camera.picture = lambda number: np.full(shape, number % 256, np.uint8)
-    with pytest.raises(DeviceError, match=r'must give pictures H x W x 3 uint8, .*as "MJPG"'):
+    with pytest.raises(DeviceError, match=r'must return pictures H x W x 3 uint8, .*such as "MJPG"'):
         make(finger="a", device=plug(camera), **QUICK).connect()
 
 
-def test_numbers_that_a_camera_makes_up_never_reach_the_settings(plug):
+def test_numbers_that_are_not_finite_never_reach_the_settings(plug):
     camera = FakeVideoDevice()
     for number, value in ((cv2.CAP_PROP_GAIN, math.nan), (cv2.CAP_PROP_FPS, math.inf), (cv2.CAP_PROP_FOURCC, 1e300)):
         camera.values[number] = value
@@ -321,7 +321,7 @@ def test_numbers_that_a_camera_makes_up_never_reach_the_settings(plug):
     json.dumps(found, allow_nan=False)
 
 
-def test_a_picture_carries_the_time_at_which_its_buffer_was_filled(plug):
+def test_the_time_of_a_picture_is_that_at_which_its_buffer_was_filled(plug):
     camera = FakeVideoDevice(stamps=True)
     stream = CaptureStream(plug(camera), CaptureSettings(), lambda: 1e6)
     capture = camera.captures[0]
@@ -331,14 +331,14 @@ def test_a_picture_carries_the_time_at_which_its_buffer_was_filled(plug):
     stream.close()
 
 
-def test_a_few_damaged_pictures_are_passed_over_and_many_are_a_lost_stream(plug):
+def test_a_few_damaged_pictures_are_skipped_and_many_are_a_lost_stream(plug):
     camera = FakeVideoDevice(fps=1000.0)
     stream = CaptureStream(plug(camera), CaptureSettings(), lambda: 0.0)
-    for _ in range(2):  # each good one ends the row
+    for _ in range(2):  # a valid picture resets the count
         camera.damaged = 10
         assert stream.next().pixels.shape == (6, 8, 3)
     camera.damaged = 11
-    with pytest.raises(DeviceError, match="gives no more pictures"):
+    with pytest.raises(DeviceError, match="returned no more pictures"):
         stream.next()
     stream.close()
 
@@ -358,33 +358,33 @@ def test_an_exception_of_opencv_is_a_device_error(plug, method, monkeypatch):
         assert not camera.open_captures
 
 
-# Coming back ------------------------------------------------------------------------------------------------
+# Recovery ---------------------------------------------------------------------------------------------------
 
 
-def test_a_camera_plugged_in_again_under_another_number_goes_on_with_its_settings_written_again(plug):
+def test_a_camera_reconnected_under_another_number_gets_its_settings_again(plug):
     first, second = FakeVideoDevice(stubborn=[cv2.CAP_PROP_FRAME_WIDTH]), FakeVideoDevice(stubborn=[cv2.CAP_PROP_FPS])
     with GelSight(finger="a", device=plug(first, number=0), **QUICK) as gel:
         gel.read(10)
-        assert gel.refused == {"width": "asked 1280, has 0"}
+        assert gel.refused == {"width": "requested 1280, has 0"}
         plug(second, number=1)
         first.dead = True
         gel.recover()
         assert gel.read(10).pixels.shape == (6, 8, 3)
         assert gel.lost_count >= 1
         assert written(second)[:3] == written(first)[:3]
-        assert gel.refused == {"fps": "asked 30, has 15"}
+        assert gel.refused == {"fps": "requested 30, has 15"}
     assert not first.open_captures
     assert not second.open_captures
 
 
-def test_a_camera_that_is_gone_is_an_error_that_says_so_also_to_recover(plug, dev):
+def test_a_disconnected_camera_is_an_error_also_in_recovery(plug, dev):
     camera = FakeVideoDevice()
     with OpencvTactile(finger="a", device=plug(camera), warmup_s=0.0, timeout_s=0.3) as gel:
         camera.dead = True
         (dev / "video0").unlink()
-        with pytest.raises(DeviceError, match="must be there, but is not; is the camera plugged in"):
+        with pytest.raises(DeviceError, match="does not exist; is the camera plugged in"):
             gel.recover()
-        with pytest.raises(DeviceError, match="must be there, but is not; is the camera plugged in"):
+        with pytest.raises(DeviceError, match="does not exist; is the camera plugged in"):
             gel.read()
 
 
@@ -400,7 +400,7 @@ def test_a_frozen_camera_is_an_error(plug):
         gel.read(10)
 
 
-def test_a_driver_that_waits_for_ever_gives_stale_pictures_which_are_refused(plug):
+def test_stale_pictures_of_a_blocked_driver_are_refused(plug):
     camera = FakeVideoDevice()
     with OpencvTactile(finger="a", device=plug(camera), **QUICK) as gel:
         camera.hangs = threading.Event()

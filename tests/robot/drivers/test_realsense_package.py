@@ -1,4 +1,4 @@
-"""The RealSense driver over the real pyrealsense2 and its software device: frames, alignment and lens are real."""
+"""The RealSense driver with the real pyrealsense2 and its software device: frames, alignment and lens are real."""
 
 from types import SimpleNamespace
 
@@ -11,14 +11,14 @@ from robot.drivers.discover import find_realsenses
 from robot.errors import DeviceError
 from tests.fake_video import EXTRINSICS
 
-# Installed or not: its wheel also needs libusb of the system, and pytest says which of the two is missing.
+# The wheel also requires the system's libusb; pytest reports which of the two is missing.
 rs = pytest.importorskip("pyrealsense2", exc_type=ImportError)
 WIDTH, HEIGHT = 64, 48
 BARREL = [0.1, 0.0, 0.0, 0.0, 0.0]
 
 
 class SoftCamera:
-    """pyrealsense2 with its software device in the place of a pipeline: each wait gives a new picture of a wall."""
+    """pyrealsense2 with its software device as a pipeline: each wait returns a new picture of a wall."""
 
     def __init__(self, coefficients):
         self.coefficients, self.number, self.running = coefficients, 0, False
@@ -95,11 +95,11 @@ class SoftCamera:
 
 def connected(monkeypatch, coefficients):
     camera = SoftCamera(coefficients)
-    monkeypatch.setattr(realsense, "_package", lambda: camera)
+    monkeypatch.setattr(realsense, "import_package", lambda *_: camera)
     return RealSense(extrinsics=EXTRINSICS, warmup_frames=2, timeout_s=5.0)
 
 
-def test_colour_and_depth_of_the_real_package_come_out_as_they_went_in(monkeypatch):
+def test_the_real_package_returns_colour_and_depth_unchanged(monkeypatch):
     with connected(monkeypatch, [0.0] * 5) as eye:
         image = eye.read()
         assert eye.read(depth=False).depth_m is None
@@ -110,15 +110,15 @@ def test_colour_and_depth_of_the_real_package_come_out_as_they_went_in(monkeypat
     np.testing.assert_allclose(image.depth_m[20, 11:-1], 1.0, rtol=1e-6)
 
 
-def test_a_lens_with_distortion_is_undone_with_the_real_packages_model(monkeypatch):
-    """At the left border, half-way down: x = -31.5 / 60, so the lens shows it at 31.5 - 31.5 (1 + 0.1 x^2) = -0.87."""
+def test_a_distorted_lens_is_undistorted_with_the_real_packages_model(monkeypatch):
+    """At the middle of the left border x = -31.5 / 60, so the lens shows it at 31.5 - 31.5 (1 + 0.1 x^2) = -0.87."""
     with connected(monkeypatch, BARREL) as eye:
         assert eye.settings()["undistorted"]
-        where = eye._undistortion[23]
+        source = eye._undistortion[23]
         colour = eye.read(depth=False).colour
     x, y = -31.5 / 60, -0.5 / 60
-    assert where[0, 0] == pytest.approx(31.5 - 31.5 * (1 + 0.1 * (x * x + y * y)), abs=1e-4)
-    np.testing.assert_allclose(colour[23, 5:-5, 0], where[5:-5, 0], atol=0.6)  # whole grey levels
+    assert source[0, 0] == pytest.approx(31.5 - 31.5 * (1 + 0.1 * (x * x + y * y)), abs=1e-4)
+    np.testing.assert_allclose(colour[23, 5:-5, 0], source[5:-5, 0], atol=0.6)  # integer grey levels
 
 
 def test_without_a_camera_the_real_package_finds_none():

@@ -1,4 +1,4 @@
-"""From a camera's picture to the gel alone."""
+"""Rectification of a camera's picture to the gel."""
 
 import json
 
@@ -14,7 +14,7 @@ CORNERS = ((10.0, 5.0), (49.0, 5.0), (49.0, 24.0), (10.0, 24.0))
 
 
 def ramp(width=60, height=40):
-    """Red is the column, green the row."""
+    """Return a picture whose red is the column and green the row."""
     y, x = np.mgrid[:height, :width]
     return np.dstack([x, y, np.zeros_like(x)]).astype(np.uint8)
 
@@ -25,11 +25,11 @@ def written(tmp_path, document):
     return path
 
 
-def test_nothing_asked_is_nothing_done():
+def test_the_default_rectifier_does_not_change_a_picture():
     np.testing.assert_array_equal(Rectifier().apply(ramp()), ramp())
 
 
-def test_a_crop_cuts_shares_off_left_top_right_and_bottom():
+def test_a_crop_removes_fractions_at_left_top_right_and_bottom():
     cut = Rectifier(crop=(0.1, 0.25, 0.2, 0.5)).apply(ramp())
     np.testing.assert_array_equal(cut, ramp()[10:20, 6:48])
 
@@ -38,24 +38,24 @@ def test_a_crop_leaves_at_least_a_pixel():
     assert Rectifier(crop=(0.5, 0.5, 0.49, 0.49)).apply(ramp(3, 2)).shape == (1, 1, 3)
 
 
-def test_corners_of_an_upright_rectangle_cut_it_out_pixel_by_pixel():
+def test_the_corners_of_an_axis_aligned_rectangle_crop_it_exactly():
     cut = Rectifier(corners_px=CORNERS, image_px=(60, 40)).apply(ramp())
     np.testing.assert_array_equal(cut, ramp()[5:25, 10:50])
 
 
-def test_corners_named_from_another_one_on_turn_the_picture():
-    """With what was bottom left as top left, the gel lay on its left side: it comes out turned to the right."""
+def test_corners_in_another_cyclic_order_rotate_the_picture():
+    """With the bottom left corner as the first one, the picture is rotated to the right."""
     turned = (CORNERS[3], *CORNERS[:3])
     cut = Rectifier(corners_px=turned, image_px=(60, 40)).apply(ramp())
     np.testing.assert_array_equal(cut, np.rot90(ramp()[5:25, 10:50], -1))
 
 
-def test_a_slanted_square_comes_out_straight_with_its_corners_in_the_corners():
+def test_a_slanted_square_is_straightened_to_its_corners():
     corners = ((30.0, 4.0), (46.0, 20.0), (30.0, 36.0), (14.0, 20.0))  # sides of 22.6 pixels
     cut = Rectifier(corners_px=corners, image_px=(60, 40)).apply(ramp()).astype(int)
     assert cut.shape == (24, 24, 3)
     found = [cut[0, 0, :2], cut[0, -1, :2], cut[-1, -1, :2], cut[-1, 0, :2]]
-    np.testing.assert_allclose(found, corners, atol=1)  # whole grey levels
+    np.testing.assert_allclose(found, corners, atol=1)  # integer grey levels
     np.testing.assert_allclose(cut[11:13, 11:13, :2].mean(axis=(0, 1)), [30, 20], atol=1)
 
 
@@ -64,8 +64,8 @@ def test_a_picture_of_another_size_than_the_calibrations_is_refused():
         Rectifier(corners_px=CORNERS, image_px=(60, 40)).apply(ramp(30, 20))
 
 
-def test_shrinking_takes_means_so_that_fine_lines_do_not_become_coarse_ones():
-    """Lines of one pixel, shrunk to a third: grey. Taking every third pixel would make black and white of them."""
+def test_shrinking_averages_so_that_fine_lines_do_not_alias():
+    """Lines of one pixel shrunk to a third are grey; every third pixel would be black or white."""
     lines = np.zeros((60, 60, 3), np.uint8)
     lines[:, ::2] = 200
     shrunk = Rectifier(output_px=(20, 20)).apply(lines)
@@ -85,9 +85,9 @@ def test_a_calibration_file_is_read(tmp_path):
     assert make_rectifier(CropSettings(calibration=str(path), output_px=[8, 4])).apply(ramp()).shape == (4, 8, 3)
 
 
-def test_a_files_crop_excludes_the_settings_and_settings_count_before_a_preset(tmp_path):
+def test_a_calibration_file_excludes_a_crop_and_settings_override_a_preset(tmp_path):
     path = written(tmp_path, {"image_px": [60, 40], "crop": [0.1, 0.1, 0.1, 0.1]})
-    with pytest.raises(RobotConfigError, match="by crop or by a calibration file"):
+    with pytest.raises(RobotConfigError, match="crop and a calibration file exclude each other"):
         make_rectifier(CropSettings(calibration=str(path), crop=[0.2, 0.2, 0.2, 0.2]))
     assert make_rectifier(CropSettings(calibration=str(path)), default_crop=[0.2] * 4).crop == (0.1,) * 4
     assert make_rectifier(CropSettings(crop=[0.3] * 4), default_crop=[0.2] * 4).crop == (0.3,) * 4
@@ -98,13 +98,13 @@ SQUARE = [[1, 1], [9, 1], [9, 9], [1, 9]]
 
 
 @pytest.mark.parametrize(
-    ("document", "words"),
+    ("document", "message"),
     [
         ("{", "must be JSON"),
         ("[]", "one JSON object"),
-        ({"image_px": [10, 10]}, "one of corners_px and crop"),
-        ({"crop": [0, 0, 0, 0]}, "must have image_px"),
-        ({"image_px": [10, 10], "crop": [0, 0, 0, 0], "corners_px": SQUARE}, "one of corners_px and crop"),
+        ({"image_px": [10, 10]}, "either corners_px or crop"),
+        ({"crop": [0, 0, 0, 0]}, "must contain image_px"),
+        ({"image_px": [10, 10], "crop": [0, 0, 0, 0], "corners_px": SQUARE}, "either corners_px or crop"),
         ({"image_px": [10, 10], "crop": [0, 0, 0, 0], "rotate": 1}, "no setting 'rotate'"),
         ({"image_px": [10], "crop": [0, 0, 0, 0]}, "image_px"),
         ({"image_px": [], "corners_px": []}, "image_px"),
@@ -119,18 +119,18 @@ SQUARE = [[1, 1], [9, 1], [9, 9], [1, 9]]
         ({"image_px": [10, 10], "corners_px": SQUARE[:3]}, "four points"),
         ({"image_px": [10, 10], "corners_px": [[1, 1], [9, 1], [9], [1, 9]]}, "a list of length 2"),
         ({"image_px": [10, 10], "corners_px": SQUARE[::-1]}, "top left, top right"),
-        ({"image_px": [10, 10], "corners_px": [[1, 1], [9, 1], [3, 3], [1, 9]]}, "bulges"),
-        ({"image_px": [10, 10], "corners_px": [[1, 1], [1, 1], [9, 9], [1, 9]]}, "bulges"),
+        ({"image_px": [10, 10], "corners_px": [[1, 1], [9, 1], [3, 3], [1, 9]]}, "convex"),
+        ({"image_px": [10, 10], "corners_px": [[1, 1], [1, 1], [9, 9], [1, 9]]}, "convex"),
         ({"image_px": [9, 9], "corners_px": SQUARE}, "inside image_px"),
         ({"image_px": [10, 10], "corners_px": SQUARE, "output_px": [5]}, "output_px"),
     ],
 )
-def test_a_calibration_file_that_makes_no_picture_is_refused_by_its_name(tmp_path, document, words):
-    with pytest.raises(RobotConfigError, match=f"gel.json.*{words}"):
+def test_an_invalid_calibration_file_is_refused_by_its_name(tmp_path, document, message):
+    with pytest.raises(RobotConfigError, match=f"gel.json.*{message}"):
         load_rectifier(written(tmp_path, document))
 
 
-def test_a_calibration_file_that_is_not_there_is_named(tmp_path):
+def test_a_missing_calibration_file_is_named(tmp_path):
     with pytest.raises(RobotConfigError, match=r"none\.json cannot be read"):
         load_rectifier(tmp_path / "none.json")
 
@@ -143,7 +143,7 @@ anything = st.recursive(
 
 
 @given(st.fixed_dictionaries({}, optional=dict.fromkeys(("image_px", "crop", "corners_px", "output_px"), anything)))
-def test_whatever_a_calibration_file_holds_it_works_or_is_refused(tmp_path_factory, document):
+def test_any_calibration_file_works_or_is_refused(tmp_path_factory, document):
     path = tmp_path_factory.mktemp("any") / "gel.json"
     path.write_text(json.dumps(document))
     try:
@@ -157,7 +157,7 @@ def test_whatever_a_calibration_file_holds_it_works_or_is_refused(tmp_path_facto
 @pytest.mark.parametrize(
     "picture", [np.zeros((4, 6, 2), np.uint8), np.zeros((4, 6), np.uint8), np.zeros((4, 6, 3), np.uint16)]
 )
-def test_what_has_not_three_colours_is_refused(picture):
+def test_a_picture_without_three_colours_is_refused(picture):
     for use in (to_rgb, Rectifier(output_px=(3, 2)).apply):
         with pytest.raises(DeviceError, match="H x W x 3 uint8"):
             use(picture)

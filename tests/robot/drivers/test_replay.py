@@ -1,4 +1,4 @@
-"""Films, folders of pictures and recordings as devices."""
+"""Videos, image folders and recordings as devices."""
 
 import json
 import math
@@ -32,9 +32,9 @@ def clock():
 
 
 @pytest.fixture
-def film(tmp_path):
-    """Six grey pictures, ten a second."""
-    path = tmp_path / "film.avi"
+def video(tmp_path):
+    """Six grey pictures at 10 frames/s."""
+    path = tmp_path / "video.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (64, 48))
     for level in LEVELS:
         writer.write(np.full((48, 64, 3), level, np.uint8))
@@ -44,7 +44,7 @@ def film(tmp_path):
 
 @pytest.fixture
 def folder(tmp_path):
-    """Six pictures by name, whose blue is 255, and a file that is none."""
+    """Six pictures with blue 255, and a file that is not a picture."""
     path = tmp_path / "pictures"
     path.mkdir()
     for number, level in enumerate(LEVELS):
@@ -54,18 +54,18 @@ def folder(tmp_path):
 
 
 def level(frame):
-    """Grey level; films are not exact."""
+    """Return the nearest grey level; videos are not exact."""
     return min(LEVELS, key=lambda each: abs(each - float(frame.pixels[..., 1].mean())))
 
 
-@pytest.fixture(params=["film", "folder"])
-def make(request, film, folder, clock):
-    """The same six pictures, from a film or from a folder."""
-    kind, path = {"film": (VideoSensor, film), "folder": (ImageFolderSensor, folder)}[request.param]
+@pytest.fixture(params=["video", "folder"])
+def make(request, video, folder, clock):
+    """Return a maker of sensors of the same six pictures, from a video or a folder."""
+    kind, path = {"video": (VideoSensor, video), "folder": (ImageFolderSensor, folder)}[request.param]
     return lambda **more: kind(finger="a", path=str(path), fps=10.0, clock=clock, **more)
 
 
-def test_pictures_come_in_their_time_and_carry_it(make, clock):
+def test_each_picture_is_shown_at_its_time(make, clock):
     with make() as gel:
         for later, expected, taken in ((0.0, 20, 0.0), (0.05, 20, 0.0), (0.15, 60, 0.1), (0.5625, 220, 0.5)):
             clock.now_s = 50.0 + later
@@ -74,7 +74,7 @@ def test_pictures_come_in_their_time_and_carry_it(make, clock):
             assert frame.time_s == pytest.approx(50.0 + taken)
 
 
-def test_after_the_last_picture_comes_the_first(make, clock):
+def test_the_first_picture_follows_the_last(make, clock):
     with make() as gel:
         for later, expected in ((0.65, 20), (0.95, 140), (60.05, 20), (60.15, 60)):
             clock.now_s = 50.0 + later
@@ -83,7 +83,7 @@ def test_after_the_last_picture_comes_the_first(make, clock):
             assert 0 <= clock.now_s - frame.time_s < 0.1 + 1e-9
 
 
-def test_the_end_is_an_error_where_it_is_not_to_begin_again(make, clock):
+def test_the_end_is_an_error_without_loop(make, clock):
     with make(loop=False) as gel:
         clock.now_s += 0.55
         assert level(gel.read()) == 220
@@ -92,7 +92,7 @@ def test_the_end_is_an_error_where_it_is_not_to_begin_again(make, clock):
             gel.read()
 
 
-def test_the_picture_nearest_to_a_time_is_found_and_none_of_the_future(make, clock):
+def test_the_picture_nearest_to_a_time_is_never_one_of_the_future(make, clock):
     with make() as gel:
         clock.now_s = 50.35
         assert [level(gel.read(10, near_s=50.0 + near)) for near in (0.0, 0.12, 0.19, 9.0, -9.0)] == [
@@ -105,8 +105,8 @@ def test_the_picture_nearest_to_a_time_is_found_and_none_of_the_future(make, clo
 
 
 @pytest.mark.parametrize("fps", [1.0, 0.5])
-def test_pictures_that_stand_for_long_are_never_too_old(folder, clock, fps):
-    """At half a picture a second each is shown twenty times, every tenth of a second."""
+def test_pictures_of_a_slow_sensor_are_never_stale(folder, clock, fps):
+    """At 0.5 frames/s each picture is shown twenty times, every tenth of a second."""
     with ImageFolderSensor(finger="a", path=str(folder), fps=fps, clock=clock) as gel:
         for later, expected in ((0.0, 20), (0.99, 20), (1.05, 60), (1.95, 60), (5.51, 220), (6.05, 20)):
             clock.now_s = 50.0 + later / fps
@@ -115,7 +115,7 @@ def test_pictures_that_stand_for_long_are_never_too_old(folder, clock, fps):
         assert level(gel.read(99.0, near_s=50.0 + 1.5 / fps)) == 60
 
 
-def test_a_slow_film_that_is_not_to_begin_again_ends_after_its_last_picture(folder, clock):
+def test_a_slow_video_without_loop_ends_after_its_last_picture(folder, clock):
     with ImageFolderSensor(finger="a", path=str(folder), fps=2.0, loop=False, clock=clock) as gel:
         clock.now_s += 2.95
         assert level(gel.read()) == 220
@@ -124,12 +124,12 @@ def test_a_slow_film_that_is_not_to_begin_again_ends_after_its_last_picture(fold
             gel.read()
 
 
-def test_a_calibration_file_that_is_none_is_named_before_connecting(make, tmp_path):
+def test_a_missing_calibration_file_is_named_before_connecting(make, tmp_path):
     with pytest.raises(RobotConfigError, match=r"none\.json cannot be read"):
         make(calibration=str(tmp_path / "none.json"))
 
 
-def test_connecting_again_begins_again(make, clock):
+def test_connecting_again_starts_at_the_first_picture(make, clock):
     gel = make()
     for _ in range(2):
         with gel:
@@ -145,14 +145,14 @@ def test_two_sensors_of_one_clock_show_the_same_moment(make, clock):
         assert one.read().time_s == other.read().time_s
 
 
-def test_pictures_are_cut_and_resized_like_those_of_a_camera(make):
+def test_pictures_are_cropped_and_resized_like_those_of_a_camera(make):
     with make(crop=[0.5, 0.0, 0.0, 0.0], output_px=[16, 12]) as gel:
         assert gel.read(10).pixels.shape == (12, 16, 3)
     with pytest.raises(RobotConfigError, match="crop"):
         make(crop=[2.0])
 
 
-def test_what_is_replayed_is_said(make):
+def test_the_settings_describe_the_replay(make):
     with make() as gel:
         found = json.loads(json.dumps(gel.settings(), allow_nan=False))
     assert (found["pictures"], found["fps"], found["loop"]) == (6, 10.0, True)
@@ -163,16 +163,16 @@ def test_pictures_are_in_rgb(folder, clock):
         assert gel.read().pixels[0, 0].tolist() == [20, 20, 255]
 
 
-def test_a_film_has_its_own_rate_unless_another_is_asked_for(film, clock):
-    with VideoSensor(finger="a", path=str(film), clock=clock) as gel:
+def test_a_video_has_its_own_rate_by_default(video, clock):
+    with VideoSensor(finger="a", path=str(video), clock=clock) as gel:
         assert gel.settings()["fps"] == pytest.approx(10.0)
 
 
-def test_a_film_is_decoded_forward_and_opened_again_to_go_back(film, clock, monkeypatch):
+def test_a_video_is_decoded_forward_and_opened_again_to_go_back(video, clock, monkeypatch):
     opened = []
     real = cv2.VideoCapture
     monkeypatch.setattr(cv2, "VideoCapture", lambda path: opened.append(path) or real(path))
-    with VideoSensor(finger="a", path=str(film), clock=clock) as gel:
+    with VideoSensor(finger="a", path=str(video), clock=clock) as gel:
         monkeypatch.setattr("robot.drivers.replay._CACHE_SIZE", 1)
         for later in (0.0, 0.15, 0.15, 0.45):
             clock.now_s = 50.0 + later
@@ -183,18 +183,18 @@ def test_a_film_is_decoded_forward_and_opened_again_to_go_back(film, clock, monk
         assert len(opened) == 2
 
 
-def test_a_film_shorter_than_it_says_is_an_error(film, clock):
-    with VideoSensor(finger="a", path=str(film), clock=clock) as gel:
+def test_a_video_shorter_than_its_header_is_an_error(video, clock):
+    with VideoSensor(finger="a", path=str(video), clock=clock) as gel:
         gel._count = 10
         clock.now_s += 0.85
-        with pytest.raises(DeviceError, match="must have 10 pictures, it ends after 6"):
+        with pytest.raises(DeviceError, match="must have 10 pictures, but ends after 6"):
             gel.read()
 
 
 @pytest.mark.parametrize("kind", [VideoSensor, ImageFolderSensor])
-def test_what_holds_no_pictures_cannot_be_connected(kind, tmp_path, clock):
+def test_a_source_without_pictures_cannot_be_connected(kind, tmp_path, clock):
     empty = tmp_path / "empty"
-    empty.mkdir() if kind is ImageFolderSensor else empty.write_text("no film")
+    empty.mkdir() if kind is ImageFolderSensor else empty.write_text("no video")
     for path in (empty, tmp_path / "none"):
         with pytest.raises(DeviceError):
             kind(finger="a", path=str(path), clock=clock).connect()
@@ -206,8 +206,8 @@ def test_a_picture_that_cannot_be_decoded_is_named(folder, clock):
         ImageFolderSensor(finger="a", path=str(folder), clock=clock).connect()
 
 
-def test_what_other_systems_hide_beside_pictures_is_none(folder, pairs, clock):
-    """A Mac leaves such a file beside each picture that it copies."""
+def test_hidden_files_are_not_pictures(folder, pairs, clock):
+    """macOS writes such a file next to each picture that it copies."""
     for hidden in (folder / "._0.png", pairs / "._view1.png"):
         hidden.write_bytes(b"Mac OS X")
     with ImageFolderSensor(finger="a", path=str(folder), clock=clock) as gel:
@@ -216,18 +216,18 @@ def test_what_other_systems_hide_beside_pictures_is_none(folder, pairs, clock):
         assert int(eye.read().colour[0, 0, 1]) == 1
 
 
-def test_a_pipe_that_bears_a_pictures_name_is_refused_unread(folder, clock):
-    """Reading it would wait for ever for somebody who writes into it."""
+def test_a_pipe_with_a_pictures_name_is_refused_unread(folder, clock):
+    """Reading it would wait for ever for a writer."""
     (folder / "0.png").unlink()
     os.mkfifo(folder / "0.png")
-    with pytest.raises(DeviceError, match=r"0\.png must be a picture, but is no file"):
+    with pytest.raises(DeviceError, match=r"0\.png must be a picture, but is not a file"):
         ImageFolderSensor(finger="a", path=str(folder), clock=clock).connect()
 
 
 @pytest.mark.parametrize("fps", [-1.0, float("nan"), 2000.0, 1e-3, 5e-324, float("inf")])
 def test_a_rate_out_of_range_is_refused(fps):
     with pytest.raises(RobotConfigError, match="fps"):
-        VideoSensor(finger="a", path="film.avi", fps=fps)
+        VideoSensor(finger="a", path="video.avi", fps=fps)
 
 
 # The camera -------------------------------------------------------------------------------------------------
@@ -236,7 +236,7 @@ DEPTH_MM = np.array([[0, 900, 1500, 65535]] * 3, np.uint16)
 
 
 def colour(number):
-    """RGB."""
+    """Return a picture in RGB."""
     return np.full((3, 4, 3), (200, number, 0), np.uint8)
 
 
@@ -268,7 +268,7 @@ def camera(path, **more):
     return ReplayCamera(path=str(path), extrinsics=EXTRINSICS, **more)
 
 
-def test_each_read_shows_the_next_picture_and_after_the_last_the_first(pairs):
+def test_each_read_returns_the_next_picture_and_the_first_after_the_last(pairs):
     with camera(pairs) as eye:
         assert [int(eye.read().colour[0, 0, 1]) for _ in range(3)] == [1, 2, 1]
         eye.seek(3)
@@ -292,18 +292,18 @@ def test_without_depth_no_depth_is_read(pairs):
             eye.read()
 
 
-def test_a_folder_in_which_a_depth_is_missing_is_a_camera_of_colour_only(pairs):
+def test_a_folder_with_a_missing_depth_is_a_camera_without_depth(pairs):
     (pairs / "view2_depth.png").unlink()
     (pairs / "intrinsics.json").unlink()
     with camera(pairs) as eye:
         assert not eye.has_depth
         assert eye.read(depth=False).depth_m is None
-        with pytest.raises(DeviceError, match="sees colour only"):
+        with pytest.raises(DeviceError, match="has no depth: read it with depth=False"):
             eye.read()
 
 
 def test_depth_without_intrinsics_cannot_be_connected(recording):
-    with pytest.raises(DeviceError, match="holds depth: give fx, fy, cx and cy"):
+    with pytest.raises(DeviceError, match="contains depth: give fx, fy, cx and cy"):
         camera(recording).connect()
 
 
@@ -328,7 +328,7 @@ def test_the_cameras_of_a_recording_are_replayed_with_intrinsics_from_the_rigs_f
         LENS | {"cy": math.nan},
     ],
 )
-def test_intrinsics_are_given_whole_and_in_range_or_not_at_all(pairs, lens):
+def test_incomplete_or_invalid_intrinsics_are_refused(pairs, lens):
     with pytest.raises(RobotConfigError, match="fx, fy, cx and cy must be given together"):
         camera(pairs, **lens)
 
@@ -345,7 +345,7 @@ def test_intrinsics_are_given_whole_and_in_range_or_not_at_all(pairs, lens):
         json.dumps(LENS | {"cy": 10**400}),
     ],
 )
-def test_intrinsics_that_are_none_are_refused_by_their_file(pairs, text):
+def test_an_invalid_intrinsics_file_is_refused_by_its_name(pairs, text):
     (pairs / "intrinsics.json").write_text(text)
     with pytest.raises(DeviceError, match=r"intrinsics\.json.* must"):
         camera(pairs).connect()
@@ -357,8 +357,8 @@ def test_depth_that_is_not_16_bit_is_refused(pairs):
         eye.read()
 
 
-def test_folders_that_hold_no_pictures_cannot_be_connected(tmp_path):
-    with pytest.raises(DeviceError, match="must hold pictures"):
+def test_folders_without_pictures_cannot_be_connected(tmp_path):
+    with pytest.raises(DeviceError, match="must contain pictures"):
         camera(tmp_path).connect()
     with pytest.raises(DeviceError, match="cannot be connected"):
         camera(tmp_path / "none").connect()

@@ -1,4 +1,4 @@
-"""The rosbridge client: against scripted servers on a real websocket, every failure is a DeviceError and in time."""
+"""The rosbridge client with scripted servers on a real websocket: each failure is a DeviceError within its timeout."""
 
 import contextlib
 import json
@@ -21,7 +21,7 @@ from tests.waiting import STARTED, STARTED_IDS, first_line, run_process, wait_un
 
 
 def readers():
-    """Threads of links that live; those of websockets itself may take their time."""
+    """Return the running threads of links; those of websockets itself may end later."""
     return [thread for thread in threading.enumerate() if thread.name.startswith("rosbridge ")]
 
 
@@ -38,16 +38,16 @@ PLAIN = st.recursive(
 
 @contextlib.contextmanager
 def scripted(answer):
-    """A websocket server: `answer(operation)` gives the texts to send back, or None to break the connection."""
+    """Run a websocket server; `answer(operation)` returns the replies, or None to break the connection."""
     from websockets.sync.server import serve as listen
 
-    heard = []
+    received = []
 
     def handle(socket):
         with contextlib.suppress(Exception):
             for text in socket:
-                heard.append(json.loads(text))
-                replies = answer(heard[-1])
+                received.append(json.loads(text))
+                replies = answer(received[-1])
                 if replies is None:
                     return
                 for reply in replies:
@@ -57,7 +57,7 @@ def scripted(answer):
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     try:
-        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}", heard
+        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}", received
     finally:
         server.shutdown()
         thread.join()
@@ -65,7 +65,7 @@ def scripted(answer):
 
 @contextlib.contextmanager
 def linked(answer, timeout_s=5.0):
-    """A link to a scripted server."""
+    """Yield a link to a scripted server."""
     with scripted(answer) as (url, _), contextlib.closing(RosbridgeLink(url, timeout_s=timeout_s)) as link:
         link.open()
         yield link
@@ -77,31 +77,31 @@ def reply_to(operation, **changes):
 
 @settings(max_examples=50)
 @given(st.dictionaries(st.text(), PLAIN, max_size=3), st.text())
-def test_what_is_encoded_is_decoded(fields, name):
+def test_an_encoded_operation_is_decoded_unchanged(fields, name):
     operation = fields | {"op": name}
     assert decode(encode(operation)) == operation
 
 
 @settings(max_examples=100)
 @given(st.text() | st.binary() | PLAIN.map(lambda value: json.dumps(value)))
-def test_decoding_anything_gives_an_operation_or_nothing(text):
+def test_decoding_any_text_returns_an_operation_or_none(text):
     found = decode(text)
     assert found is None or isinstance(found["op"], str)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, object(), {1, 2}])
-def test_what_json_cannot_hold_is_not_sent(value):
+def test_values_that_json_cannot_express_are_not_sent(value):
     with pytest.raises(DeviceError, match="plain finite values"):
         encode({"op": "publish", "msg": value})
 
 
-def test_half_an_operation_is_noise():
+def test_an_incomplete_operation_is_noise():
     assert decode('{"op":"publish"') is None
     assert decode('{"op": 3}') is None
 
 
-def test_a_service_answers_by_its_own_id_only():
-    """A late answer to another call, one for another service and noise come first."""
+def test_a_call_accepts_only_the_answer_with_its_id():
+    """A late answer to another call, one for another service and noise arrive first."""
 
     def answer(operation):
         wrong = reply_to(operation, id="other", values={"x": 2})
@@ -113,12 +113,12 @@ def test_a_service_answers_by_its_own_id_only():
         assert link.counts == {"late": 2, "noise": 4}
 
 
-def test_an_answer_that_comes_after_its_time_is_never_that_of_the_next_call():
-    kept = []
+def test_a_late_answer_is_never_that_of_the_next_call():
+    calls = []
 
     def answer(operation):
-        kept.append(operation)
-        return [] if len(kept) == 1 else [reply_to(kept[0], values={"x": "old"}), reply_to(operation)]
+        calls.append(operation)
+        return [] if len(calls) == 1 else [reply_to(calls[0], values={"x": "old"}), reply_to(operation)]
 
     with linked(answer) as link:
         with pytest.raises(DeviceError, match=r"no answer of /s within 0\.05 s"):
@@ -136,7 +136,7 @@ def test_an_answer_that_comes_after_its_time_is_never_that_of_the_next_call():
         ({"values": [1]}, r"/s failed: \[1\]"),
     ],
 )
-def test_a_failed_call_says_why(changes, message):
+def test_a_failed_call_raises_with_the_reason(changes, message):
     with linked(lambda operation: [reply_to(operation, **changes)]) as link, pytest.raises(DeviceError, match=message):
         link.call("/s", {})
 
@@ -154,7 +154,7 @@ def test_a_status_error_that_names_a_call_fails_it_and_others_are_logged(caplog)
     assert "slow" in caplog.text
 
 
-def test_messages_of_a_topic_are_kept_with_their_times():
+def test_messages_of_a_topic_are_buffered_with_their_times():
     def answer(operation):
         publish = {"op": "publish", "topic": operation["topic"]}
         return [*({**publish, "msg": {"data": n}} for n in range(3)), {**publish, "msg": 7}, {**publish, "topic": "/x"}]
@@ -171,10 +171,10 @@ def test_messages_of_a_topic_are_kept_with_their_times():
             link.wait_for("/t", since_s=time.monotonic(), timeout_s=0.02)
 
 
-def kept_after(texts):
-    """What a link that subscribed to /t has of it after these texts came."""
+def history_after(texts):
+    """Return the buffered messages of /t after these texts were received."""
     link = RosbridgeLink("ws://127.0.0.1:1")
-    link._socket = type("Deaf", (), {"send": lambda self, text: None})()
+    link._socket = type("NoSocket", (), {"send": lambda self, text: None})()
     link._closed_reason = ""
     link.subscribe("/t", "std_msgs/String")
     for text in texts:
@@ -182,31 +182,31 @@ def kept_after(texts):
     return link.history("/t")
 
 
-def test_of_a_topic_the_newest_messages_are_kept_up_to_a_number_and_a_length_of_all():
+def test_the_buffer_of_a_topic_is_limited_in_number_and_total_length():
     def published(number, characters):
         return json.dumps({"op": "publish", "topic": "/t", "msg": {"n": number, "data": "x" * characters}})
 
-    many = kept_after(published(number, 10) for number in range(1000))
+    many = history_after(published(number, 10) for number in range(1000))
     assert [arrival.message["n"] for arrival in many] == list(range(800, 1000))
-    long = kept_after(published(number, 100_000) for number in range(1000))
+    long = history_after(published(number, 100_000) for number in range(1000))
     assert [arrival.message["n"] for arrival in long] == list(range(995, 1000))  # 5 x 100 KB within 512 KiB
-    alone = kept_after([published(0, 10), published(1, 1_000_000)])
+    alone = history_after([published(0, 10), published(1, 1_000_000)])
     assert [arrival.message["n"] for arrival in alone] == [1]
 
 
-def test_who_sends_a_message_without_measure_loses_the_connection_and_is_told_why():
+def test_too_large_a_message_closes_the_connection_with_the_reason():
     def answer(operation):
         return ['{"op": "publish", "topic": "/t", "msg": {"data": "' + "x" * 2**20 + '"}}']
 
     with linked(answer) as link:
         link.subscribe("/t", "std_msgs/String")
-        with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is gone: .*message too big"):
+        with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is closed: .*message too big"):
             link.wait_for("/t", timeout_s=20.0)
         assert link.history("/t") == []
 
 
-def test_what_is_not_yet_read_does_not_pile_up(monkeypatch):
-    """Nothing is read here: a peer that floods has to wait before it has sent the half, however long it may take."""
+def test_unread_messages_do_not_accumulate(monkeypatch):
+    """Nothing is read here, so a flooding peer must wait before it has sent half of its messages."""
     text = json.dumps({"op": "publish", "topic": "/t", "msg": {"data": "x" * 2**17}})
     read, sent = threading.Event(), []
 
@@ -228,22 +228,22 @@ def test_what_is_not_yet_read_does_not_pile_up(monkeypatch):
         link.close()
 
 
-def test_a_complaint_is_cut_off_and_harmless_on_a_terminal(caplog):
+def test_an_error_message_is_truncated_and_escaped(caplog):
     def answer(operation):
         flood = {"op": "status", "level": "warning", "msg": "\x1b[2J" + "x" * 10**5}
         return [flood, reply_to(operation, result=False, values="\x1b[31mno " + "y" * 10**5)]
 
     with linked(answer) as link, pytest.raises(DeviceError) as caught:
         link.call("/s", {})
-    for said in (caplog.text, str(caught.value)):
-        assert "\x1b" not in said
-        assert "\\x1b" in said
-        assert len(said) < 1000
+    for message in (caplog.text, str(caught.value)):
+        assert "\x1b" not in message
+        assert "\\x1b" in message
+        assert len(message) < 1000
 
 
 def test_a_connection_that_breaks_ends_every_wait_at_once():
     with linked(lambda _: None, timeout_s=60.0) as link:
-        with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is gone"):
+        with pytest.raises(DeviceError, match=r"the connection to rosbridge at .* is closed"):
             link.call("/s", {})
         assert not link.is_open
         for use in (
@@ -252,17 +252,17 @@ def test_a_connection_that_breaks_ends_every_wait_at_once():
             lambda: link.wait_for("/t"),
             lambda: link.call("/s", {}),
         ):
-            with pytest.raises(DeviceError, match="is gone"):
+            with pytest.raises(DeviceError, match="is closed"):
                 use()
 
 
-def test_a_link_closes_twice_and_before_it_was_opened_and_leaves_no_thread():
+def test_a_link_can_be_closed_twice_and_unopened_and_leaves_no_thread():
     link = RosbridgeLink("ws://127.0.0.1:1")
     link.close()
-    with pytest.raises(DeviceError, match="is gone"):
+    with pytest.raises(DeviceError, match="is closed"):
         link.check()
     with scripted(lambda _: []) as (url, _):
-        for _ in range(3):  # one after the other in one process
+        for _ in range(3):  # several in one process
             link = RosbridgeLink(url)
             link.open()
             assert link.is_open
@@ -272,9 +272,9 @@ def test_a_link_closes_twice_and_before_it_was_opened_and_leaves_no_thread():
             assert not readers()
 
 
-def test_nothing_published_while_the_link_is_gone_is_sent_later():
-    """The trap of clients that reconnect by themselves: an old motion command arrives seconds later."""
-    with scripted(lambda operation: None if operation["op"] == "call_service" else []) as (url, heard):
+def test_nothing_published_on_a_lost_connection_is_sent_later():
+    """With clients that reconnect automatically, an old motion command arrives seconds later."""
+    with scripted(lambda operation: None if operation["op"] == "call_service" else []) as (url, received):
         link = RosbridgeLink(url, timeout_s=5.0)
         link.open()
         with pytest.raises(DeviceError):
@@ -288,11 +288,11 @@ def test_nothing_published_while_the_link_is_gone_is_sent_later():
         with pytest.raises(DeviceError):
             again.call("/break", {})
         again.close()
-        assert [operation["op"] for operation in heard] == ["call_service", "publish", "call_service"]
-        assert heard[1]["topic"] == "/t"
+        assert [operation["op"] for operation in received] == ["call_service", "publish", "call_service"]
+        assert received[1]["topic"] == "/t"
 
 
-def test_nobody_there_a_stranger_there_and_a_name_that_is_none_are_said_so():
+def test_a_silent_server_a_closed_port_and_an_invalid_name_are_device_errors():
     import socket
 
     with socket.create_server(("127.0.0.1", 0)) as silent:
@@ -304,13 +304,13 @@ def test_nobody_there_a_stranger_there_and_a_name_that_is_none_are_said_so():
             RosbridgeLink(url, timeout_s=0.5).open()
 
 
-def test_a_missing_package_is_a_sentence_with_the_extra(monkeypatch):
+def test_a_missing_package_is_a_device_error_that_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "websockets.sync.client", None)
     with pytest.raises(DeviceError, match=r"pip install 'touch-retrieval\[sawyer\]'"):
         RosbridgeLink("ws://127.0.0.1:9090").open()
 
 
-def test_the_emulator_answers_what_rosbridge_would():
+def test_the_emulator_answers_like_rosbridge():
     with serve(EmulatedSawyer()) as url, contextlib.closing(RosbridgeLink(url, timeout_s=5.0)) as link:
         link.open()
         with pytest.raises(DeviceError, match="/none does not exist"):
@@ -325,7 +325,7 @@ def test_the_emulator_answers_what_rosbridge_would():
         assert link.wait_for("/t").message == {"data": 2.5}
 
 
-def test_faults_are_drawn_from_a_seed_and_counted():
+def test_faults_are_reproducible_and_counted():
     kinds = ("dropped", "corrupted")
     first, second = MessageFaults(0.5, kinds, seed=3), MessageFaults(0.5, kinds, seed=3)
     drawn = [first.draw(("dropped", "duplicated", "corrupted")) for _ in range(200)]
@@ -352,7 +352,7 @@ def test_the_emulator_runs_as_a_process_and_ends_with_ctrl_c(by):
     assert "corrupted: " in counts or "duplicated: " in counts
 
 
-def test_the_module_needs_no_optional_package_to_be_imported():
+def test_the_module_can_be_imported_without_optional_packages():
     code = (
         "import sys; import robot.drivers.sawyer.driver, robot.drivers.manual_arm; print('websockets' in sys.modules)"
     )

@@ -1,4 +1,4 @@
-"""The Sawyer driver against the emulated robot on a real websocket: it goes where told, no faster, and stops."""
+"""The Sawyer driver with the emulated robot on a real websocket: targets, speeds and stops."""
 
 import contextlib
 import logging
@@ -35,13 +35,13 @@ FAR = Pose(0.0, 0.0, 260.0, 0.0)
 
 def arm_at(url, **changes):
     port = int(url.rpartition(":")[2])
-    given = {"workspace": WORKSPACE, "host": "127.0.0.1", "port": port, **MOUNT, "timeout_s": 5.0, **changes}
-    return Sawyer(**given)
+    arguments = {"workspace": WORKSPACE, "host": "127.0.0.1", "port": port, **MOUNT, "timeout_s": 5.0, **changes}
+    return Sawyer(**arguments)
 
 
 @contextlib.contextmanager
 def connected(emulator=None, **changes):
-    """An emulator and a connected arm; machines are slow, so states may be a second old unless a test says less."""
+    """Yield an emulator and a connected arm; states may be a second old by default, because machines are slow."""
     emulator = emulator or EmulatedSawyer()
     with serve(emulator) as url, arm_at(url, **{"max_state_age_s": 1.0, **changes}) as arm:
         yield emulator, arm
@@ -49,7 +49,7 @@ def connected(emulator=None, **changes):
 
 @contextlib.contextmanager
 def while_it_moves(emulator, act):
-    """Do something to the robot once 15 more commands have come."""
+    """Call `act` after 15 more commands."""
     before = len(emulator.commands)
 
     def run():
@@ -62,8 +62,8 @@ def while_it_moves(emulator, act):
     thread.join()
 
 
-def stands(emulator):
-    """Whether the emulated arm is at rest."""
+def is_still(emulator):
+    """Return whether the emulated arm is still."""
     return bool(np.abs(emulator.model.velocity).max() < 1e-3)
 
 
@@ -72,11 +72,11 @@ def offset(pose, other):
     return math.dist(pose.as_tuple()[:3], other.as_tuple()[:3]), abs(turn)
 
 
-# what is computed: no robot
+# without a robot
 
 
-def test_the_tip_of_a_pose_by_hand():
-    """The rig stands 500 mm before the robot, turned by 90 deg; the tip hangs 150 mm above the fingertips."""
+def test_the_tip_of_a_pose():
+    """The rig is 500 mm in front of the robot, rotated by 90 deg; the tip is 150 mm above the fingertips."""
     mount = Mount((500.0, 0.0, -100.0), math.pi / 2, 150.0, 0.0)
     tip = mount.tip_of(Pose(10.0, 20.0, 30.0, 0.0))
     assert tip["position"] == pytest.approx({"x": 0.480, "y": 0.010, "z": 0.080})
@@ -84,20 +84,20 @@ def test_the_tip_of_a_pose_by_hand():
     assert tip["orientation"] == pytest.approx({"x": root, "y": root, "z": 0.0, "w": 0.0})
 
 
-def test_jaws_that_close_across_the_tip_turn_the_tip_back_and_forth():
+def test_the_tool_yaw_is_added_to_the_yaw_of_the_pose():
     straight, across = Mount((0, 0, 0), 0.0, 0.0, 0.0), Mount((0, 0, 0), 0.0, 0.0, math.pi / 2)
     assert straight.tip_of(Pose(0, 0, 0, math.pi / 2)) == across.tip_of(Pose(0, 0, 0, 0.0))
 
 
 @given(*[st.floats(-500, 500)] * 3, *[st.floats(-3.1, 3.1)] * 3)
-def test_the_pose_of_a_tip_is_the_one_it_was_made_for(x, y, z, yaw, base_yaw, tool_yaw):
+def test_pose_of_is_the_inverse_of_tip_of(x, y, z, yaw, base_yaw, tool_yaw):
     mount = Mount((300.0, -200.0, 50.0), base_yaw, 120.0, tool_yaw)
     found = mount.pose_of(mount.tip_of(Pose(x, y, z, yaw)))
     assert offset(found, Pose(x, y, z, yaw)) == pytest.approx((0, 0), abs=1e-9)
 
 
 @pytest.mark.parametrize("lean_deg", [9.0, 11.0])
-def test_a_hand_that_leans_is_refused(lean_deg):
+def test_a_tilted_hand_is_refused(lean_deg):
     half = math.radians(180 - lean_deg) / 2
     tip = {
         "position": {"x": 0.5, "y": 0.0, "z": 0.1},
@@ -107,13 +107,13 @@ def test_a_hand_that_leans_is_refused(lean_deg):
     if lean_deg < 10:
         assert mount.pose_of(tip).z_mm == pytest.approx(100)
     else:
-        with pytest.raises(DeviceError, match="hang straight down, it leans by 11 deg"):
+        with pytest.raises(DeviceError, match="point straight down, but is tilted by 11 deg"):
             mount.pose_of(tip)
 
 
 @settings(max_examples=60)
 @given(st.floats(-150, 150), st.floats(-150, 150), st.floats(0, 300), st.floats(-1.5, 1.5))
-def test_the_made_up_arm_is_honest(x, y, z, yaw):
+def test_forward_and_inverse_kinematics_of_the_emulated_arm_agree(x, y, z, yaw):
     tip = Mount((500.0, 0.0, -100.0), math.pi, 150.0, 0.0).tip_of(Pose(x, y, z, yaw))
     place, turn = [tip["position"][axis] for axis in "xyz"], [tip["orientation"][axis] for axis in "xyzw"]
     found = inverse(place, turn, READY)
@@ -122,7 +122,7 @@ def test_the_made_up_arm_is_honest(x, y, z, yaw):
     assert abs(np.dot(quaternion, turn)) == pytest.approx(1.0)  # a quaternion and its negative are one rotation
 
 
-def test_the_made_up_arm_says_no():
+def test_the_emulated_arm_has_no_solution_for_unreachable_poses():
     down = (1.0, 0.0, 0.0, 0.0)
     assert inverse((0.5, 0.0, 0.1), down, READY) is not None
     assert inverse((1.5, 0.0, 0.1), down, READY) is None
@@ -130,7 +130,7 @@ def test_the_made_up_arm_says_no():
     assert inverse((math.nan, 0.0, 0.1), down, READY) is None
 
 
-def test_way_points_stand_on_the_line_and_turn_the_shorter_way():
+def test_way_points_lie_on_the_line_and_turn_the_shorter_way():
     points = waypoints(Pose(0, 0, 0, 3.0), Pose(30, 40, 0, -3.0))
     assert points[0] == Pose(0, 0, 0, 3.0)
     assert points[-1] == Pose(30, 40, 0, -3.0)
@@ -152,7 +152,7 @@ def planned(speed=100.0, joint_speed=10.0, ramp_s=0.3, goal=FAR):
 
 @pytest.mark.parametrize("goal", [FAR, Pose(140, -140, 20, 1.0), Pose(-140, 140, 290, -1.0), Pose(0, 0, 62, 0)])
 @pytest.mark.parametrize("ramp_s", [0.0, 0.3, 3.0])
-def test_the_hand_stays_on_the_line_and_is_never_faster_than_asked(goal, ramp_s):
+def test_the_hand_stays_on_the_line_and_within_the_requested_speed(goal, ramp_s):
     schedule, _ = planned(100.0, ramp_s=ramp_s, goal=goal)
     moments = np.linspace(0, schedule.duration_s, 3000)
     places = np.array([forward(schedule.at(moment))[0] for moment in moments]) * 1000
@@ -173,7 +173,7 @@ def test_no_joint_is_faster_than_its_limit():
 
 
 @given(st.just(0.0) | st.floats(1e-6, 20), st.just(0.0) | st.floats(1e-6, 5))
-def test_a_schedule_begins_and_ends_where_it_must(full, ramp_s):
+def test_a_trajectory_begins_at_its_start_and_ends_at_its_goal(full, ramp_s):
     schedule = JointTrajectory(np.array([[0.0] * 7, [1.0] * 7]), np.array([0.0, full]), ramp_s)
     if full > 0:
         assert schedule.at(0.0)[0] == pytest.approx(0, abs=1e-12)
@@ -222,12 +222,12 @@ READERS = {
 @pytest.mark.parametrize("reader", sorted(READERS))
 @settings(max_examples=60)
 @given(message=st.dictionaries(st.sampled_from(["name", "names", "position", "joints", "result_type"]), ANY))
-def test_a_message_of_any_content_is_read_or_is_a_device_error(reader, message):
+def test_a_message_of_any_content_is_parsed_or_is_a_device_error(reader, message):
     with contextlib.suppress(DeviceError):
         READERS[reader](message)
 
 
-def test_joints_are_read_by_name_and_those_of_others_left_alone():
+def test_joints_are_read_by_name_and_other_joints_are_ignored():
     names = ["head_pan", *reversed(JOINTS)]
     found = messages.joints_of({"name": names, "position": [9.0, *range(7)]})
     assert found.tolist() == [6, 5, 4, 3, 2, 1, 0]
@@ -238,19 +238,19 @@ def test_joints_are_read_by_name_and_those_of_others_left_alone():
 
 
 @pytest.mark.parametrize(
-    ("fields", "words"),
+    ("fields", "text"),
     [
         ({"stopped": True, "estop_button": 1, "estop_source": 1}, "red button, its button is pressed"),
-        ({"stopped": True, "estop_button": 3, "estop_source": 1}, "released, but the stop still holds"),
+        ({"stopped": True, "estop_button": 3, "estop_source": 1}, "released, but the stop is still active"),
         ({"stopped": True, "estop_button": 77, "estop_source": 78}, "unknown"),
         ({"error": True}, "error of one of its parts"),
         ({"enabled": False}, "is not enabled"),
     ],
 )
-def test_what_keeps_the_arm_from_moving_says_what_a_person_must_do(fields, words):
+def test_the_blocking_reason_names_the_action_for_a_person(fields, text):
     message = {"enabled": True, "stopped": False, "error": False, "estop_button": 0, "estop_source": 0}
     assert messages.robot_state(message).blocking_reason is None
-    assert words in messages.robot_state(message | fields).blocking_reason
+    assert text in messages.robot_state(message | fields).blocking_reason
 
 
 @pytest.mark.parametrize(
@@ -273,72 +273,72 @@ def test_settings_out_of_range_are_refused_without_a_robot(changes):
         arm_at("ws://127.0.0.1:9090", **changes)
 
 
-def test_a_joint_state_repeated_with_its_old_stamp_grows_old():
+def test_a_joint_state_repeated_with_its_old_stamp_becomes_stale():
     now = [0.0]
     arm = arm_at("ws://127.0.0.1:9090", clock=lambda: now[0])
     names = {"name": list(JOINTS), "position": [0.0] * 7}
 
-    def heard(*stamps_and_times):
+    def receive(*stamps_and_times):
         arrivals = [ReceivedMessage({"header": {"stamp": stamp}, **names}, at) for stamp, at in stamps_and_times]
         arm._link = SimpleNamespace(history=lambda _: arrivals, check=lambda: None)
 
     now[0] = 2.0
-    heard((1, 1.0), (2, 1.9), (2, 1.95))
+    receive((1, 1.0), (2, 1.9), (2, 1.95))
     assert arm._fresh_joints().tolist() == [0.0] * 7
-    heard((1, 1.0), (2, 1.2), (2, 1.6), (2, 1.99))
-    with pytest.raises(DeviceError, match=r"at most 0\.5 s old, it is 0\.80 s"):
+    receive((1, 1.0), (2, 1.2), (2, 1.6), (2, 1.99))
+    with pytest.raises(DeviceError, match=r"at most 0\.5 s old, got 0\.80 s"):
         arm._fresh_joints()
-    heard((None, 1.2), (None, 1.9))  # without stamps the arrival counts
+    receive((None, 1.2), (None, 1.9))  # without stamps the arrival counts
     assert arm._fresh_joints().tolist() == [0.0] * 7
-    heard()
-    with pytest.raises(DeviceError, match="never came"):
+    receive()
+    with pytest.raises(DeviceError, match=r"s old, got none"):
         arm._fresh_joints()
 
 
 # with the emulated robot
 
 
-def test_it_goes_where_it_is_told_as_the_robot_itself_measures_it():
+def test_it_reaches_its_target_by_the_robots_own_measurement():
     with connected() as (emulator, arm):
         target = Pose(20.0, -30.0, 90.0, 0.2)
         assert offset(arm.move_to(target, 200.0), target) < (1.0, 0.02)
         x, y, z = forward(emulator.model.joints)[0]
         assert (x, y, z) == pytest.approx((0.480, 0.030, 0.140), abs=1e-3)  # base turned by 180 deg: 500 - 20, 30
         assert offset(arm.pose(), target) < (1.0, 0.02)
-        wait_until(lambda: stands(emulator))
+        wait_until(lambda: is_still(emulator))
 
 
-def test_commands_never_step_further_than_speed_allows_in_two_ticks_even_after_a_nap():
+def test_a_command_step_is_at_most_two_ticks_at_full_speed_also_after_a_pause():
     with connected() as (emulator, arm):
         arm.move_to(HOME, 200.0)
         emulator.commands.clear()
-        command, naps = arm._command, []
+        command, pauses = arm._command, []
 
-        def drowsy(joints):
+        def paused(joints):
             command(joints)
-            if len(emulator.commands) > 10 and not naps:
-                naps.append(time.sleep(0.15))
+            if len(emulator.commands) > 10 and not pauses:
+                pauses.append(time.sleep(0.15))
 
-        arm._command = drowsy
+        arm._command = paused
         arm.move_to(Pose(0.0, 0.0, 110.0, 0.0), 100.0)
         places = np.array([forward(joints)[0] for _, joints in emulator.commands]) * 1000
-        assert len(naps) == 1
+        assert len(pauses) == 1
         assert np.linalg.norm(np.diff(places, axis=0), axis=1).max() < 100.0 * 0.02 * 1.01
 
 
-def test_settings_are_read_back_and_what_is_not_taken_is_noted():
+def test_settings_are_read_back_and_refused_ones_are_noted():
     with connected(speed_ratio=0.2) as (emulator, arm):
         assert emulator.model.speed_ratio == 0.2
         found = {"url": arm.settings()["url"], "tip": "right_hand", "speed_ratio": 0.2, "command_timeout_s": 0.2}
-        assert arm.settings() == found  # and nothing that is measured: it would be another each time
+        assert arm.settings() == found  # without measured values, which would vary
         assert arm.refused == {}
     emulator = EmulatedSawyer()
     emulator.silent.add(LIMB + "set_speed_ratio")
     with connected(emulator, timeout_s=0.5) as (_, arm):
-        assert arm.refused == {"speed_ratio": "asked 0.3, nothing can be read back"}
+        assert arm.refused == {"speed_ratio": "requested 0.3, cannot be read back"}
 
 
-def test_an_emergency_stop_ends_the_motion_and_nobody_resets_it_from_here():
+def test_an_emergency_stop_ends_the_motion_and_the_driver_never_resets_it():
     with connected() as (emulator, arm):
         with while_it_moves(emulator, emulator.press_estop), pytest.raises(DeviceError) as caught:
             arm.move_to(FAR, 50.0)
@@ -356,7 +356,7 @@ def test_an_emergency_stop_ends_the_motion_and_nobody_resets_it_from_here():
         assert offset(arm.move_to(target, 100.0), target)[0] < 1
 
 
-def test_a_collision_reported_for_one_moment_stops_the_arm_where_it_is():
+def test_a_momentary_collision_report_stops_the_arm():
     def bump():
         emulator.model.has_collided = True
         published = len(arm._link.history(LIMB + "collision_detection_state"))
@@ -367,7 +367,7 @@ def test_a_collision_reported_for_one_moment_stops_the_arm_where_it_is():
         emulator.model.has_collided = False
 
     with connected() as (emulator, arm):
-        with while_it_moves(emulator, bump), pytest.raises(DeviceError, match="reports a collision, the arm holds"):
+        with while_it_moves(emulator, bump), pytest.raises(DeviceError, match="reports a collision and the arm holds"):
             arm.move_to(FAR, 50.0)
         held = np.array(emulator.commands[-1][1])
         assert np.abs(emulator.model.joints - held).max() < 0.02
@@ -377,7 +377,7 @@ def test_a_collision_reported_for_one_moment_stops_the_arm_where_it_is():
         assert offset(arm.move_to(target, 100.0), target)[0] < 1
 
 
-def test_a_collision_that_lasts_needs_a_person():
+def test_a_lasting_collision_requires_a_person():
     with connected() as (emulator, arm):
         emulator.model.has_collided = True
         wait_until(lambda: arm._has_collided_since(0.0))
@@ -392,17 +392,17 @@ def test_a_collision_that_lasts_needs_a_person():
     ("topic", "message", "age_s"),
     [
         ("/robot/joint_states", "joint state must be at most", 0.5),
-        ("/robot/state", r"at most 1 s old.* an emergency stop would not be seen", 1.0),
-        (LIMB + "collision_detection_state", r"at most 1 s old.* a collision would not be seen", 1.0),
+        ("/robot/state", r"at most 1 s old.* an emergency stop would not be detected", 1.0),
+        (LIMB + "collision_detection_state", r"at most 1 s old.* a collision would not be detected", 1.0),
     ],
 )
-def test_a_robot_that_falls_silent_is_not_moved_on(topic, message, age_s, monkeypatch):
+def test_a_motion_ends_if_a_topic_falls_silent(topic, message, age_s, monkeypatch):
     monkeypatch.setattr("robot.drivers.sawyer.driver._SLOW_STATE_AGE_S", 0.5)
     with connected(max_state_age_s=age_s) as (emulator, arm):
         with while_it_moves(emulator, lambda: emulator.silent.add(topic)), pytest.raises(DeviceError, match=message):
             arm.move_to(FAR, 20.0)
         count = len(emulator.commands)
-        wait_until(lambda: stands(emulator))  # the robot's own time-out
+        wait_until(lambda: is_still(emulator))  # the robot's own time-out
         assert len(emulator.commands) == count
         assert offset(FAR, Pose(0, 0, 1000 * forward(emulator.model.joints)[0][2] - 50, 0))[0] > 50
         emulator.silent.clear()
@@ -410,12 +410,12 @@ def test_a_robot_that_falls_silent_is_not_moved_on(topic, message, age_s, monkey
         assert offset(arm.pose(), FAR)[0] > 50
 
 
-def test_a_robot_that_reports_no_collisions_can_be_used_and_it_is_said(caplog):
+def test_a_robot_without_collision_state_can_be_used_with_a_warning(caplog):
     emulator = EmulatedSawyer()
     emulator.silent.add(messages.COLLISION[0])
     with caplog.at_level(logging.WARNING), connected(emulator, timeout_s=0.5) as (_, arm):
-        assert arm.refused == {"collision state": "nothing comes: collisions are not seen"}
-        assert "collisions are not seen" in caplog.text
+        assert arm.refused == {"collision state": "no messages: collisions are not detected"}
+        assert "collisions are not detected" in caplog.text
         arm.move_to(HOME, 200.0)
         arm.recover()
         emulator.silent.clear()
@@ -424,7 +424,7 @@ def test_a_robot_that_reports_no_collisions_can_be_used_and_it_is_said(caplog):
         assert arm.refused == {}
 
 
-def test_a_robot_that_reported_collisions_is_not_brought_back_without(monkeypatch):
+def test_recovery_requires_the_collision_state_if_it_was_available_before(monkeypatch):
     monkeypatch.setattr("robot.drivers.sawyer.driver._SLOW_STATE_AGE_S", 0.1)
     monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.001)
     with connected(timeout_s=0.5, max_state_age_s=0.5, reconnect_tries=2) as (emulator, arm):
@@ -441,18 +441,18 @@ def test_a_robot_that_reported_collisions_is_not_brought_back_without(monkeypatc
         assert arm.refused == {}
 
 
-def test_however_often_the_robot_is_tried_no_wait_is_longer_than_seconds(monkeypatch):
-    """Doubled each time, the last of twenty waits would take more than a day."""
+def test_the_waits_between_tries_are_limited_to_seconds(monkeypatch):
+    """Without a limit, the last of twenty doubled waits would take more than a day."""
     waits = []
     arm = arm_at("ws://127.0.0.1:9090", reconnect_tries=20)
-    monkeypatch.setattr(arm, "_open_link", Mock(side_effect=DeviceError("nobody is there")))
+    monkeypatch.setattr(arm, "_open_link", Mock(side_effect=DeviceError("no answer")))
     monkeypatch.setattr("robot.drivers.sawyer.driver.time", SimpleNamespace(sleep=waits.append))
-    with pytest.raises(DeviceError, match="nobody is there"):
+    with pytest.raises(DeviceError, match="no answer"):
         arm._reconnect()
     assert (len(waits), waits[0], max(waits)) == (19, 0.25, 5.0)
 
 
-def test_states_may_be_as_old_as_is_allowed_and_two_seconds_at_least():
+def test_slow_states_may_be_two_seconds_old_or_older_if_allowed():
     now = [0.0]
     state = {"enabled": True, "stopped": False, "error": False, "estop_button": 0, "estop_source": 0}
     for allowed_s, limit_s in ((0.5, 2.0), (3.0, 3.0)):
@@ -461,19 +461,19 @@ def test_states_may_be_as_old_as_is_allowed_and_two_seconds_at_least():
         now[0] = limit_s - 0.01
         assert arm._robot_state().enabled
         now[0] = limit_s + 0.01
-        for look, words in ((arm._robot_state, "emergency stop"), (arm._collisions, "collision")):
-            with pytest.raises(DeviceError, match=f"at most {limit_s:g} s old.*{words} would not be seen"):
-                look()
+        for read, event in ((arm._robot_state, "emergency stop"), (arm._collisions, "collision")):
+            with pytest.raises(DeviceError, match=f"at most {limit_s:g} s old.*{event} would not be detected"):
+                read()
 
 
-def test_a_broken_connection_stops_the_arm_and_is_made_anew(caplog):
+def test_a_broken_connection_stops_the_arm_and_recovery_connects_again(caplog):
     with connected() as (emulator, arm):
-        with while_it_moves(emulator, emulator.drop_connections), pytest.raises(DeviceError, match="is gone") as caught:
+        with while_it_moves(emulator, emulator.drop_connections), pytest.raises(DeviceError, match="closed") as caught:
             arm.move_to(FAR, 50.0)
         assert "and while sawyer was stopped" in caught.value.__notes__[0]
-        with pytest.raises(DeviceError, match="is gone"):
+        with pytest.raises(DeviceError, match="is closed"):
             arm.stop()
-        wait_until(lambda: stands(emulator))
+        wait_until(lambda: is_still(emulator))
         with caplog.at_level(logging.WARNING):
             arm.recover()
         assert "connecting again" in caplog.text
@@ -481,7 +481,7 @@ def test_a_broken_connection_stops_the_arm_and_is_made_anew(caplog):
         assert offset(arm.move_to(target, 100.0), target)[0] < 1
 
 
-def test_connecting_again_is_tried_so_often_and_no_more(monkeypatch, caplog):
+def test_the_tries_to_reconnect_are_limited(monkeypatch, caplog):
     monkeypatch.setattr("robot.drivers.sawyer.driver._BACK_OFF_S", 0.001)
     with contextlib.ExitStack() as robot:
         arm = arm_at(robot.enter_context(serve(EmulatedSawyer())), reconnect_tries=3, timeout_s=5.0)
@@ -496,13 +496,13 @@ def test_connecting_again_is_tried_so_often_and_no_more(monkeypatch, caplog):
         arm.close()
 
 
-def test_ctrl_c_leaves_the_arm_standing():
+def test_ctrl_c_leaves_the_arm_still():
     with connected() as (emulator, arm):
-        watch, seen = arm._watch, []
+        watch, calls = arm._watch, []
 
         def interrupted(*args):
-            seen.append(args)
-            if len(seen) == 30:
+            calls.append(args)
+            if len(calls) == 30:
                 raise KeyboardInterrupt
             return watch(*args)
 
@@ -510,14 +510,13 @@ def test_ctrl_c_leaves_the_arm_standing():
         with pytest.raises(KeyboardInterrupt):
             arm.move_to(FAR, 50.0)
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02
-        wait_until(lambda: stands(emulator))
+        wait_until(lambda: is_still(emulator))
         assert offset(arm.pose(), FAR)[0] > 50
 
 
 PROGRAM = """
 from robot.drivers.sawyer.driver import Sawyer
 from robot.readings import Region, Pose
-from tests.waiting import until
 box = Region((-150.0, -150.0, 0.0), (150.0, 150.0, 300.0))
 place = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
 with Sawyer(workspace=box, host="127.0.0.1", port=PORT, **place) as arm:
@@ -525,7 +524,7 @@ with Sawyer(workspace=box, host="127.0.0.1", port=PORT, **place) as arm:
 """
 
 
-def test_ctrl_c_in_a_terminal_leaves_the_arm_standing_and_the_program_ends():
+def test_ctrl_c_in_a_terminal_leaves_the_arm_still_and_the_program_ends():
     emulator = EmulatedSawyer()
     with serve(emulator) as url:
         code = PROGRAM.replace("PORT", url.rpartition(":")[2])
@@ -536,37 +535,37 @@ def test_ctrl_c_in_a_terminal_leaves_the_arm_standing_and_the_program_ends():
         assert "KeyboardInterrupt" in errors
         assert "and while" not in errors
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.02
-        wait_until(lambda: stands(emulator))
+        wait_until(lambda: is_still(emulator))
 
 
 def test_closing_from_another_thread_ends_a_motion():
     with connected() as (emulator, arm):
-        with while_it_moves(emulator, arm.close), pytest.raises(DeviceError, match="is gone"):
+        with while_it_moves(emulator, arm.close), pytest.raises(DeviceError, match="is closed"):
             arm.move_to(FAR, 20.0)
-        wait_until(lambda: stands(emulator))
+        wait_until(lambda: is_still(emulator))
         assert np.abs(emulator.model.joints - emulator.commands[-1][1]).max() < 0.05
         assert not arm.is_connected
 
 
-def test_closing_an_arm_that_nobody_moves_sends_it_nothing():
+def test_closing_a_still_arm_sends_no_command():
     with connected() as (emulator, _):
         pass
     assert not emulator.commands
 
 
-def test_the_robots_kinematics_is_asked_again_with_another_seed_and_not_for_ever():
+def test_inverse_kinematics_is_retried_with_other_seeds_a_limited_number_of_times():
     with connected(ik_retries=2) as (emulator, arm):
         emulator.refuse_ik = 2
         arm.move_to(HOME, 200.0)
         emulator.refuse_ik, emulator.calls = 1000, 0
         before = emulator.model.joints
-        with pytest.raises(DeviceError, match=r"after 3 tries: .*no joint angles reach it; nothing has moved"):
+        with pytest.raises(DeviceError, match=r"after 3 tries: .*no joint angles reach it; the arm has not moved"):
             arm.move_to(FAR, 200.0)
         assert emulator.calls == 3
         assert np.abs(emulator.model.joints - before).max() < 2e-3
 
 
-def test_solutions_that_leap_are_refused_before_anything_moves(monkeypatch):
+def test_solutions_with_large_joint_steps_are_refused_before_any_motion(monkeypatch):
     with connected() as (emulator, arm):
         leap = np.array([1.0, 0, 0, 0, 0, 0, 0])
         answer = messages.ik_answer
@@ -574,11 +573,11 @@ def test_solutions_that_leap_are_refused_before_anything_moves(monkeypatch):
         with pytest.raises(DeviceError, match=r"turns a joint by 1\.0"):
             arm.move_to(FAR, 100.0)
         assert offset(arm.pose(), FAR)[0] > 100
-        assert stands(emulator)
+        assert is_still(emulator)
 
 
 @pytest.mark.parametrize("kind", ["wrong_id", "dropped", "corrupted"])
-def test_answers_that_never_come_end_in_time(kind):
+def test_a_missing_answer_raises_after_the_timeout(kind):
     with connected(EmulatedSawyer(), timeout_s=1.0, ik_retries=1) as (emulator, arm):
         arm._link.timeout_s = 0.1
         emulator.faults.rate, emulator.faults.kinds = 1.0, (kind,)
@@ -588,18 +587,18 @@ def test_answers_that_never_come_end_in_time(kind):
             call(messages.IK_SERVICE, messages.ik_request({}, "right_hand", None))
 
 
-def test_an_arm_that_stands_outside_the_workspace_is_not_moved_from_here():
-    """Within 20 mm of it, as after a stop, it is."""
+def test_an_arm_outside_the_workspace_is_not_moved():
+    """It is moved within 20 mm of the workspace, as after a stop."""
     with connected(base_xyz_mm=[500.0, 0.0, -20.0]) as (emulator, arm):
         with pytest.raises(DeviceError, match=r"must be in the workspace .*first, but is at .* bring it there by hand"):
             arm.move_to(Pose(0.0, 0.0, 30.0, 0.0), 100.0)
-        assert stands(emulator)
+        assert is_still(emulator)
     with connected(base_xyz_mm=[500.0, 0.0, -60.0]) as (_, arm):
         assert arm.pose().z_mm == pytest.approx(-10.0, abs=0.5)
         arm.move_to(Pose(0.0, 0.0, 5.0, 0.0), 100.0)
 
 
-def test_an_arm_held_by_somebody_is_not_pushed_on():
+def test_a_blocked_arm_ends_the_motion():
     class Held(SawyerModel):
         def command(self, target):
             pass
@@ -613,7 +612,7 @@ def test_an_arm_held_by_somebody_is_not_pushed_on():
         arm.move_to(Pose(0.0, 0.0, 45.0, 0.0), 200.0)
 
 
-def test_a_robot_that_may_not_move_is_not_connected_and_nothing_stays_open():
+def test_a_robot_that_may_not_move_is_not_connected_and_the_link_is_closed():
     for prepare in (EmulatedSawyer.press_estop, lambda emulator: setattr(emulator.model, "enabled", False)):
         emulator = EmulatedSawyer()
         prepare(emulator)
@@ -626,7 +625,7 @@ def test_a_robot_that_may_not_move_is_not_connected_and_nothing_stays_open():
             arm.close()
 
 
-def test_motors_stay_off_where_connecting_must_let_nothing_move():
+def test_motors_stay_off_if_connecting_must_not_move_the_arm():
     emulator = EmulatedSawyer()
     emulator.model.enabled = False
     with serve(emulator) as url:
@@ -638,12 +637,12 @@ def test_motors_stay_off_where_connecting_must_let_nothing_move():
     assert not emulator.model.enabled
 
 
-def test_motors_are_enabled_only_where_that_is_allowed_and_it_is_said(caplog):
+def test_motors_are_enabled_only_if_allowed_and_with_a_warning(caplog):
     emulator = EmulatedSawyer()
     emulator.model.enabled = False
     with caplog.at_level(logging.WARNING), connected(emulator, enable=True):
         assert emulator.model.enabled
-        assert "motors are being enabled" in caplog.text
+        assert "enabling the motors" in caplog.text
     emulator = EmulatedSawyer()
     emulator.press_estop()
     with serve(emulator) as url, pytest.raises(DeviceError, match="never resets"):
@@ -651,7 +650,7 @@ def test_motors_are_enabled_only_where_that_is_allowed_and_it_is_said(caplog):
     assert not emulator.model.enabled
 
 
-def test_a_robot_that_says_nothing_or_has_no_such_tip_is_named():
+def test_a_silent_topic_and_an_unknown_tip_are_named():
     emulator = EmulatedSawyer()
     emulator.silent.add(LIMB + "tip_states")
     with serve(emulator) as url, pytest.raises(DeviceError, match="no message on /robot/limb/right/tip_states"):
@@ -692,7 +691,7 @@ def test_with_faults_every_motion_ends_at_its_goal_or_with_a_reason(rate, kinds,
                 outcomes["done"] += 1
             except DeviceError:
                 outcomes["failed"] += 1
-                wait_until(lambda: stands(emulator))
+                wait_until(lambda: is_still(emulator))
                 arm.recover()
     with capsys.disabled():
         print(f"\n10 motions: {dict(outcomes)}; faults: {dict(sorted(faults.counts.items()))}")
@@ -700,5 +699,5 @@ def test_with_faults_every_motion_ends_at_its_goal_or_with_a_reason(rate, kinds,
     assert sum(faults.counts.values()) > 0
 
 
-def test_way_point_steps_are_those_of_the_documented_accuracy():
+def test_the_steps_of_way_points_are_those_of_the_documented_accuracy():
     assert (straight_line.STEP_MM, math.degrees(straight_line.STEP_RAD)) == (10.0, pytest.approx(5.0))

@@ -1,4 +1,4 @@
-"""The WSG-50's packets to the byte, and what is found in damaged, cut and noisy streams."""
+"""The WSG-50's packets byte by byte, and decoding of damaged, truncated and noisy streams."""
 
 import contextlib
 import itertools
@@ -41,7 +41,7 @@ PARSERS = (
 
 
 def all_packets(stream):
-    """Every packet of a stream that is there as a whole."""
+    """Return every packet of a complete stream."""
     buffer, found = bytearray(stream), []
     while True:
         used, packet = decode(buffer)
@@ -52,7 +52,7 @@ def all_packets(stream):
 
 
 def fed(chunks):
-    """Every packet of a stream that comes in pieces."""
+    """Return every packet of a stream that arrives in pieces."""
     buffer, found = bytearray(), []
     for chunk in chunks:
         buffer += chunk
@@ -66,25 +66,25 @@ def fed(chunks):
 
 
 @pytest.mark.parametrize("name", PACKETS)
-def test_a_packet_of_the_manual_is_written_and_read_to_the_byte(name):
+def test_a_packet_of_the_manual_is_encoded_and_decoded_exactly(name):
     text, command, payload = PACKETS[name]
     packet = Packet(command, bytes.fromhex(payload))
     assert encode(packet) == bytes.fromhex(text)
     assert decode(bytes.fromhex(text)) == (len(bytes.fromhex(text)), packet)
 
 
-def test_every_command_of_the_public_tests_comes_out_of_its_builder():
+def test_every_command_of_the_public_tests_has_a_builder_with_the_same_bytes():
     assert set(BUILT) == set(COMMANDS)
     for name, packet in BUILT.items():
         assert encode(packet) == bytes_of(name), name
 
 
-def test_the_check_sum_runs_to_zero_over_a_packet_and_to_50f5_over_the_preamble():
+def test_the_checksum_of_a_packet_is_zero_and_that_of_the_preamble_50f5():
     assert codec.checksum(b"\xaa\xaa\xaa") == 0x50F5
     assert [codec.checksum(bytes_of(name)) for name in PACKETS] == [0] * len(PACKETS)
 
 
-def test_the_check_sum_is_not_the_textbook_ccitt():
+def test_the_checksum_is_not_the_textbook_ccitt():
     import binascii
 
     body = bytes_of("stop")[:-2]
@@ -92,7 +92,7 @@ def test_the_check_sum_is_not_the_textbook_ccitt():
     assert binascii.crc_hqx(body, 0xFFFF) != 0x760E
 
 
-def test_builders_without_a_printed_packet_pack_what_the_table_says():
+def test_builders_without_a_documented_packet_follow_the_command_table():
     assert commands.home(2) == Packet(0x20, b"\x02")
     assert commands.packet(CommandId.RELEASE, 1.0, 2.0) == Packet(0x26, struct.pack("<ff", 1, 2))
     assert commands.packet(CommandId.SET_ACCELERATION, 150.0) == Packet(0x30, bytes.fromhex("00001643"))
@@ -102,7 +102,7 @@ def test_builders_without_a_printed_packet_pack_what_the_table_says():
     assert commands.update(CommandId.FORCE, 20) == Packet(0x45, b"\x01\x14\x00")
 
 
-def test_replies_mean_what_the_manual_says():
+def test_replies_are_parsed_as_documented():
     answers = [name for name in MANUAL_REPLIES if PACKETS[name][1] != 0x01]
     status = {name: commands.reply(decode(bytes_of(name))[1])[0] for name in answers}
     assert status == {
@@ -115,7 +115,7 @@ def test_replies_mean_what_the_manual_says():
     assert commands.number(commands.reply(decode(bytes_of("acceleration 150"))[1])[1]) == 150.0
 
 
-def test_parsers_read_what_was_packed_by_hand():
+def test_parsers_return_the_values_packed_by_hand():
     assert commands.system_state(struct.pack("<I", 0x1003)) == (
         SystemState.REFERENCED | SystemState.MOVING | SystemState.FAST_STOP
     )
@@ -155,22 +155,22 @@ def test_every_status_and_bit_has_the_number_of_the_manual():
         lambda: Packet(1, bytes(codec.MAX_PAYLOAD + 1)),
     ],
 )
-def test_what_cannot_be_is_the_codecs_own_error(misuse):
+def test_invalid_values_are_wire_errors(misuse):
     with pytest.raises(WireError) as caught:
         misuse()
     assert isinstance(caught.value, DeviceError)
 
 
-def test_a_stream_is_the_same_whole_halved_and_byte_by_byte():
+def test_a_stream_gives_the_same_packets_in_one_two_or_many_pieces():
     stream = b"".join(bytes_of(name) for name in PACKETS)
-    want = [Packet(command, bytes.fromhex(payload)) for _, command, payload in PACKETS.values()]
-    assert all_packets(stream) == want
-    assert fed([stream[: len(stream) // 2], stream[len(stream) // 2 :]]) == want
-    assert fed([stream[at : at + 1] for at in range(len(stream))]) == want
+    expected = [Packet(command, bytes.fromhex(payload)) for _, command, payload in PACKETS.values()]
+    assert all_packets(stream) == expected
+    assert fed([stream[: len(stream) // 2], stream[len(stream) // 2 :]]) == expected
+    assert fed([stream[at : at + 1] for at in range(len(stream))]) == expected
 
 
 @pytest.mark.parametrize("name", PACKETS)
-def test_a_packet_cut_at_any_length_is_waited_for(name):
+def test_a_packet_truncated_at_any_length_is_incomplete(name):
     whole = bytes_of(name)
     for length in range(len(whole)):
         used, packet = decode(whole[:length])
@@ -181,15 +181,15 @@ def test_a_packet_cut_at_any_length_is_waited_for(name):
     "noise", [b"\x00", b"\xaa", b"\xaa\xaa", b"\xaa\xaa\xaa", b"\xaa\xaa\x00", b"\xaa" * 9, b"hello"]
 )
 @pytest.mark.parametrize("name", PACKETS)
-def test_noise_before_and_between_costs_no_packet(name, noise):
+def test_noise_before_and_between_packets_loses_none(name, noise):
     packet = decode(bytes_of(name))[1]
     stream = noise + bytes_of(name) + noise + bytes_of(name)
     assert all_packets(stream) == [packet, packet]
     assert fed([stream[at : at + 1] for at in range(len(stream))]) == [packet, packet]
 
 
-def test_three_aa_must_stand_in_a_row():
-    """Public drivers count any three AA: AA 00 AA AA then begins a packet for them."""
+def test_the_three_aa_must_be_consecutive():
+    """Public drivers count any three AA, so that AA 00 AA AA begins a packet."""
     spread = b"\xaa\x00\xaa\xaa" + bytes_of("stop")[3:]
     assert all_packets(spread + bytes_of("info")) == [Packet(0x50)]
 
@@ -200,21 +200,21 @@ def test_three_aa_must_stand_in_a_row():
 def test_a_preamble_inside_a_payload_splits_no_packet(payload):
     packet = Packet(CommandId.LOOP, payload)
     stream = encode(packet) + encode(packet)
-    assert len(stream.split(codec.PREAMBLE)) > 3  # a public driver cuts there: two packets make two cuts, not more
+    assert len(stream.split(codec.PREAMBLE)) > 3  # a public driver splits at each preamble
     assert all_packets(stream) == [packet, packet]
     assert fed([stream[at : at + 1] for at in range(len(stream))]) == [packet, packet]
 
 
-def test_a_whole_packet_inside_a_payload_stays_inside():
+def test_a_packet_inside_a_payload_is_not_a_packet_of_the_stream():
     packet = Packet(CommandId.LOOP, bytes_of("fast stop"))
     assert all_packets(encode(packet)) == [packet]
 
 
 @pytest.mark.parametrize("name", PACKETS)
-def test_a_packet_with_any_bit_flipped_costs_itself_and_nothing_after_it(name):
+def test_a_packet_with_any_bit_flipped_loses_no_packet_after_it(name):
     good = bytes_of(name)
     after = Packet(CommandId.LOOP, bytes(range(16)))
-    close = bytes(codec.MAX_PAYLOAD)  # a flipped length may claim so much more
+    close = bytes(codec.MAX_PAYLOAD)  # a flipped length may claim this many bytes more
     for bit in range(8 * len(good)):
         bad = bytearray(good)
         bad[bit // 8] ^= 1 << bit % 8
@@ -223,8 +223,8 @@ def test_a_packet_with_any_bit_flipped_costs_itself_and_nothing_after_it(name):
         assert decode(good)[1] not in found[:-1]
 
 
-def test_a_good_packet_that_begins_inside_a_damaged_one_is_found():
-    damaged = bytes_of("grasp 12 mm 34 mm/s")[:9]  # cut: its length claims the beginning of the next
+def test_a_valid_packet_that_begins_inside_a_damaged_one_is_found():
+    damaged = bytes_of("grasp 12 mm 34 mm/s")[:9]  # truncated: its length claims the beginning of the next
     assert all_packets(damaged + bytes_of("stop") + bytes_of("info")) == [Packet(0x22), Packet(0x50)]
 
 
@@ -233,37 +233,37 @@ def test_a_length_above_the_largest_payload_is_noise_at_once():
     assert all_packets(claim + bytes_of("stop")) == [Packet(0x22)]
     waits = b"\xaa\xaa\xaa\x06" + struct.pack("<H", codec.MAX_PAYLOAD)
     assert decode(waits + bytes_of("stop")) == (0, None)
-    assert all_packets((waits + bytes_of("stop"))[1:]) == [Packet(0x22)]  # what a caller does when no more comes
+    assert all_packets((waits + bytes_of("stop"))[1:]) == [Packet(0x22)]  # as a caller does when no more bytes arrive
 
 
 @given(st.binary(max_size=80), st.integers(0, 255).filter(lambda number: number != 0xAA), st.binary(max_size=64))
-def test_whatever_is_packetd_is_read_back(noise, command, payload):
+def test_every_encoded_packet_is_decoded(noise, command, payload):
     packet = Packet(command, payload)
     assert decode(encode(packet)) == (len(encode(packet)), packet)
     assert packet in all_packets(noise + encode(packet) + bytes(codec.MAX_PAYLOAD + 8))
 
 
 @given(st.lists(st.binary(max_size=30), max_size=6))
-def test_pieces_change_nothing(chunks):
+def test_the_pieces_of_a_stream_do_not_matter(chunks):
     assert fed(chunks) == all_packets(b"".join(chunks))
 
 
 def fuzzed(seed):
-    """A million bytes rich in AA, 00 and 01 with 2000 packets planted in them, and where each of these begins."""
+    """Return a million bytes rich in AA, 00 and 01 with 2000 inserted packets, and the offsets of these."""
     rng = np.random.default_rng(seed)
     alphabet = np.array([0xAA] * 6 + [0x00] * 4 + [0x01] + list(range(2, 7)), np.uint8)
     noise = rng.choice(alphabet, 1_000_000).tobytes()
-    stream, planted, before = bytearray(), {}, 0
+    stream, inserted, before = bytearray(), {}, 0
     for cut, name in zip(np.sort(rng.choice(len(noise), 2000, replace=False)), itertools.cycle(PACKETS), strict=False):
         stream += noise[before:cut]
-        planted[len(stream)] = name
+        inserted[len(stream)] = name
         stream += bytes_of(name)
         before = cut
-    return stream + noise[before:] + bytes(codec.MAX_PAYLOAD + 8), planted
+    return stream + noise[before:] + bytes(codec.MAX_PAYLOAD + 8), inserted
 
 
 def places(stream):
-    """Where each packet begins that is found."""
+    """Return the decoded packets by offset."""
     buffer, found, at = bytearray(stream), {}, 0
     while True:
         used, packet = decode(buffer)
@@ -274,21 +274,22 @@ def places(stream):
         del buffer[:used]
 
 
-def test_a_million_fuzzed_bytes_cost_a_planted_packet_only_where_noise_makes_a_packet_of_it():
-    """A planted packet is found, unless it lies inside noise that is itself a packet: a beginning, a length that
-    reaches so far, and a check sum that holds, which is so for 1 in 65536 of them. Nothing else is lost."""
-    stream, planted = fuzzed(0)
+def test_a_packet_in_a_million_fuzzed_bytes_is_lost_only_inside_noise_that_is_a_valid_packet():
+    """Noise is a valid packet if it has a preamble, a length that reaches past the inserted packet and a checksum
+    that matches, with probability 1 / 65536. No other packet is lost.
+    """
+    stream, inserted = fuzzed(0)
     found = places(stream)
-    lost = {at for at in planted if at not in found}
+    lost = {at for at in inserted if at not in found}
     inside = {at for start, packet in found.items() for at in range(start + 1, start + len(encode(packet)))}
-    swallowed = inside & set(planted)
+    swallowed = inside & set(inserted)
     assert lost == swallowed
     assert len(lost) <= 2
-    assert all(found[at] == decode(bytes_of(name))[1] for at, name in planted.items() if at in found)
+    assert all(found[at] == decode(bytes_of(name))[1] for at, name in inserted.items() if at in found)
     assert fed([stream[at : at + 997] for at in range(0, len(stream), 997)]) == list(found.values())
 
 
-def test_whatever_is_found_in_noise_is_parsed_or_refused_with_the_drivers_own_error():
+def test_payloads_of_noise_are_parsed_or_are_wire_errors():
     parsers = [getattr(commands, name) for name in PARSERS]
     for payload in (np.random.default_rng(size).bytes(size) for size in range(40) for _ in range(5)):
         for parse in parsers:
@@ -299,29 +300,29 @@ def test_whatever_is_found_in_noise_is_parsed_or_refused_with_the_drivers_own_er
 
 
 class Counted(tuple):
-    """The table of the check sum, which counts how often it is looked into."""
+    """The table of the checksum, which counts its accesses."""
 
-    looked = 0
+    count = 0
 
     def __getitem__(self, index):
-        type(self).looked += 1
+        type(self).count += 1
         return super().__getitem__(index)
 
 
-@pytest.mark.parametrize("half", ["aa aa aa 06 ff 00", "aa aa aa 06 00 01", "aa aa aa 06 ff 00 55"])
-def test_packets_that_break_off_cost_each_byte_once_however_many_claim_it(half, monkeypatch):
-    """Summed packet by packet, each byte is gone through once for every packet that claims it, 40 times here."""
-    stream = bytes.fromhex(half) * 500
+@pytest.mark.parametrize("truncated", ["aa aa aa 06 ff 00", "aa aa aa 06 00 01", "aa aa aa 06 ff 00 55"])
+def test_each_byte_of_truncated_packets_enters_the_checksum_once(truncated, monkeypatch):
+    """A checksum packet by packet would read each byte once for every packet that claims it, 40 times here."""
+    stream = bytes.fromhex(truncated) * 500
     monkeypatch.setattr(codec, "_TABLE", Counted(codec._TABLE))
-    Counted.looked = 0
+    Counted.count = 0
     used, packet = decode(stream)
     assert packet is None
-    assert used > len(stream) - 265  # all but what may still become a packet
-    assert Counted.looked <= len(stream)
+    assert used > len(stream) - 265  # all but a possible packet
+    assert Counted.count <= len(stream)
 
 
 @given(st.binary(max_size=600), st.data())
-def test_the_sum_of_a_stretch_is_that_of_its_bytes_alone(data, draw):
+def test_the_checksum_of_a_range_is_that_of_its_bytes_alone(data, draw):
     first = draw.draw(st.integers(0, len(data)))
     sums = codec._PrefixChecksums(data, first)
     for _ in range(3):

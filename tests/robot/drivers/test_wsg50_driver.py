@@ -1,4 +1,4 @@
-"""The WSG-50's driver against the emulated gripper, over TCP and a terminal: each method, each setting."""
+"""The WSG-50's driver with the emulated gripper, over TCP and a terminal: each method, each setting."""
 
 import contextlib
 import json
@@ -25,14 +25,14 @@ def test_it_grasps_holds_and_releases(port):
         assert gripper.line_counts == {}
 
 
-def test_a_serial_line_takes_its_rate_and_stop_bits():
+def test_a_serial_line_has_its_baud_rate_and_stop_bits():
     with gripper_with_emulator("pty", baud=9600, stop_bits=2, update_ms=100) as (gripper, _):
         assert (gripper._link._port._serial.baudrate, gripper._link._port._serial.stopbits) == (9600, 2)
         assert gripper.state().status == "idle"
 
 
 @PORTS
-def test_closing_on_nothing_is_no_part_and_is_left_by_opening_or_grasping(port):
+def test_closing_without_an_object_is_no_part_and_ends_by_opening_or_grasping(port):
     with gripper_with_emulator(port) as (gripper, emulator):
         assert gripper.grasp(10.0).status == "no_part"
         assert gripper.open(60.0).status == "idle"
@@ -43,7 +43,7 @@ def test_closing_on_nothing_is_no_part_and_is_left_by_opening_or_grasping(port):
 
 
 @PORTS
-def test_a_part_that_is_lost_is_said_and_left(port):
+def test_a_lost_part_is_reported_and_opening_ends_the_state(port):
     with gripper_with_emulator(port) as (gripper, emulator):
         emulator.object_mm = 40.0
         gripper.grasp(10.0)
@@ -52,20 +52,20 @@ def test_a_part_that_is_lost_is_said_and_left(port):
         assert gripper.open(110.0).status == "idle"
 
 
-def test_grasping_what_is_held_takes_it_anew_with_the_new_force():
+def test_grasping_a_held_object_grasps_it_again_with_the_new_force():
     with gripper_with_emulator() as (gripper, emulator):
         emulator.object_mm = 40.0
         gripper.grasp(10.0)
         assert gripper.grasp(20.0).force_n == 20.0
 
 
-def test_opening_less_far_than_what_is_held_lets_go_first():
+def test_opening_to_less_than_the_held_object_releases_it_first():
     with gripper_with_emulator() as (gripper, emulator):
         emulator.object_mm = 40.0
         gripper.grasp(10.0)
-        with pytest.raises(DeviceError, match=r"AXIS_BLOCKED to MOVE .* stands at 40.0 mm"):
+        with pytest.raises(DeviceError, match=r"AXIS_BLOCKED to MOVE .* is still at 40.0 mm"):
             gripper.open(20.0)
-        assert emulator.force_limit_n == 5.0  # the least: it only meant to open
+        assert emulator.force_limit_n == 5.0  # the smallest force, because it is not a grasp
         emulator.object_mm = None
         assert gripper.open(20.0).opening_mm == pytest.approx(20.0)
 
@@ -83,7 +83,7 @@ def test_force_is_that_on_each_finger_and_twice_as_much_for_the_gripper():
         assert emulator.force_limit_n == 12.5
 
 
-def test_what_is_out_of_range_never_reaches_the_gripper():
+def test_values_out_of_range_never_reach_the_gripper():
     with gripper_with_emulator(max_force_n=30.0, max_speed_mm_s=300.0, soft_limits_mm=[5.0, 100.0]) as (
         gripper,
         emulator,
@@ -111,27 +111,27 @@ def test_what_is_out_of_range_never_reaches_the_gripper():
             assert not {0x30, 0x34} & set(emulator.received)
 
 
-def test_a_gripper_that_would_clamp_harder_than_asked_is_not_told_to():
+def test_a_gripper_that_would_clamp_harder_than_requested_does_not_grasp():
     with gripper_with_emulator() as (gripper, emulator):
         emulator.keeps_force_n = 60.0
-        with pytest.raises(DeviceError, match="force limit must be 20 N, the gripper has 60 N"):
+        with pytest.raises(DeviceError, match="force limit must be 20 N, but the gripper has 60 N"):
             gripper.grasp(10.0)
         assert GRASP not in emulator.received
-        assert gripper.refused["force_n"] == "asked 10, has 30"
+        assert gripper.refused["force_n"] == "requested 10, has 30"
         emulator.keeps_force_n = 16.0
         gripper.grasp(10.0)
-        assert gripper.refused["force_n"] == "asked 10, has 8"
+        assert gripper.refused["force_n"] == "requested 10, has 8"
         emulator.keeps_force_n = None
         gripper.grasp(10.0)
         assert gripper.refused == {}
 
 
-def test_a_force_limit_may_be_off_by_the_rounding_of_its_number_and_never_above_the_ceiling():
+def test_a_force_limit_may_have_a_rounding_error_but_never_exceed_the_upper_limit():
     with gripper_with_emulator(max_force_n=10.0) as (gripper, emulator):
-        for kept, asked in ((20.002, 10.0), (20.00001, 10.0), (10.01, 5.0)):
-            emulator.keeps_force_n = kept
+        for actual, requested in ((20.002, 10.0), (20.00001, 10.0), (10.01, 5.0)):
+            emulator.keeps_force_n = actual
             with pytest.raises(DeviceError, match="force limit must be"):
-                gripper.grasp(asked)
+                gripper.grasp(requested)
         emulator.keeps_force_n = 10.000005
         assert gripper.grasp(5.0).status == "no_part"
     with gripper_with_emulator(max_force_n=7.1, finger_share=0.3) as (
@@ -143,7 +143,7 @@ def test_a_force_limit_may_be_off_by_the_rounding_of_its_number_and_never_above_
         assert 0.3 * emulator.force_limit_n <= 7.1
 
 
-def test_a_nominal_width_that_no_motion_may_reach_is_refused():
+def test_a_nominal_width_outside_the_opening_range_is_refused():
     for settings in ({"grasp_width_mm": 111.0}, {"grasp_width_mm": 95.0, "soft_limits_mm": [0.0, 90.0]}):
         with gripper_with_emulator(connect=False, **settings) as (gripper, emulator):
             with pytest.raises(DeviceError, match="grasp_width_mm must be at most"):
@@ -152,7 +152,7 @@ def test_a_nominal_width_that_no_motion_may_reach_is_refused():
             assert 0x34 not in emulator.received
 
 
-def test_only_the_states_are_asked_for_again_and_again():
+def test_only_the_states_have_automatic_updates():
     with gripper_with_emulator() as (gripper, emulator):
         gripper.open(80.0)
         assert 0x44 not in emulator.received
@@ -160,7 +160,7 @@ def test_only_the_states_are_asked_for_again_and_again():
 
 
 @pytest.mark.parametrize(("baud", "stop_bits", "ms", "fits"), [(9600, 1, 20, 0), (27499, 2, 20, 0), (27500, 2, 20, 1)])
-def test_a_serial_line_must_have_room_beside_the_updates(baud, stop_bits, ms, fits):
+def test_a_serial_line_must_have_room_for_more_than_the_updates(baud, stop_bits, ms, fits):
     """25 bytes of 11 bits every 20 ms are 13750 bits/s."""
     settings = {"baud": baud, "stop_bits": stop_bits, "update_ms": ms}
     WSG50(port="socket://127.0.0.1:1000", **settings)
@@ -168,18 +168,18 @@ def test_a_serial_line_must_have_room_beside_the_updates(baud, stop_bits, ms, fi
         WSG50(port="/dev/ttyUSB0", **settings)
 
 
-def test_it_does_not_home_where_connecting_must_move_nothing():
+def test_it_does_not_home_if_connecting_must_not_move_the_jaws():
     emulator = EmulatedWSG50(referenced=False, speed_up=20.0)
     with gripper_with_emulator(emulator=emulator, connect=False) as (gripper, _):
         gripper.may_move = False
-        with pytest.raises(DeviceError, match="does not know its reference, and may not be moved now"):
+        with pytest.raises(DeviceError, match="has lost its reference, and homing is not allowed now"):
             gripper.connect()
     assert HOME not in emulator.received
     assert emulator.opening_mm == 50.0
 
 
 @PORTS
-def test_it_homes_on_connecting_where_the_reference_is_lost(port, caplog):
+def test_it_homes_on_connecting_if_the_reference_is_lost(port, caplog):
     with gripper_with_emulator(port, emulator=EmulatedWSG50(speed_up=20.0)) as (gripper, emulator):
         assert emulator.received.count(HOME) == 1
         assert "homing, the jaws move" in caplog.text
@@ -189,7 +189,7 @@ def test_it_homes_on_connecting_where_the_reference_is_lost(port, caplog):
         assert gripper.state().opening_mm == pytest.approx(0.0)
 
 
-def test_settings_are_written_read_back_and_plain():
+def test_settings_are_written_and_read_back_as_plain_json():
     with gripper_with_emulator(acceleration_mm_s2=1500.0, soft_limits_mm=[5.0, 90.0], tare=True) as (gripper, emulator):
         settings = json.loads(json.dumps(gripper.settings()))
         assert settings["acceleration_mm_s2"] == 1500.0
@@ -206,7 +206,7 @@ def test_settings_are_written_read_back_and_plain():
         assert (gripper.refused, emulator.soft_limits) == ({}, (5.0, 90.0))
 
 
-def test_what_is_held_thinner_than_a_part_is_the_other_finger():
+def test_a_grasp_thinner_than_a_part_is_no_part():
     with gripper_with_emulator(min_part_mm=5.0) as (gripper, emulator):
         emulator.object_mm = 4.0
         assert gripper.grasp(10.0).status == "no_part"
@@ -235,9 +235,9 @@ def test_a_setting_out_of_range_is_refused(settings):
 
 
 @pytest.mark.parametrize("settings", [{"max_force_n": 2.0}, {"max_speed_mm_s": 4.0}])
-def test_ceilings_below_what_it_can_do_are_refused_on_connecting(settings):
+def test_limits_below_the_grippers_minimum_are_refused_on_connecting(settings):
     with gripper_with_emulator(connect=False, **settings) as (gripper, emulator):
-        with pytest.raises(RobotConfigError, match="ceilings must allow"):
+        with pytest.raises(RobotConfigError, match="limits must allow"):
             gripper.connect()
         assert not gripper.is_connected
         assert not emulator.in_fast_stop

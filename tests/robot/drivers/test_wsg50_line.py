@@ -1,4 +1,4 @@
-"""The WSG-50's driver on a line that loses, doubles, damages, delays and cuts."""
+"""The WSG-50's driver on a link that loses, doubles, damages and delays packets, and that disconnects."""
 
 import contextlib
 import time
@@ -15,7 +15,7 @@ from tests.wsg50_bench import FAST_STOP, GRASP, HOME, MOVE, PORTS, STOP, Scripte
 
 
 @PORTS
-def test_a_line_that_is_cut_while_it_closes_ends_with_the_jaws_standing(port):
+def test_a_disconnect_while_closing_ends_with_still_jaws(port):
     slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     script = ScriptedFaults()
     with gripper_with_emulator(port, faults=script, emulator=slow, acknowledge_faults=True) as (gripper, _):
@@ -30,19 +30,19 @@ def test_a_line_that_is_cut_while_it_closes_ends_with_the_jaws_standing(port):
         assert gripper.grasp(10.0, 100.0).status == "no_part"
 
 
-def test_a_serial_line_that_is_cut_while_it_homes_on_connecting_is_opened_again_to_stop_it():
+def test_a_serial_line_lost_during_homing_is_opened_again_to_stop_the_jaws():
     slow = EmulatedWSG50(speed_up=0.1)
     script = ScriptedFaults()
     with gripper_with_emulator("pty", faults=script, emulator=slow, connect=False) as (gripper, _):
         script.tell({(HOME, 2): "disconnect"})
-        with pytest.raises(DeviceError, match=r"is gone.*recover"):
+        with pytest.raises(DeviceError, match=r"was lost.*recover"):
             gripper.connect()
         assert HOME in slow.received
         assert not slow.moves
         assert not gripper._link.is_open
 
 
-def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_it_is_said(monkeypatch):
+def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_closing_raises(monkeypatch):
     slow = EmulatedWSG50(referenced=True, opening_mm=100.0, speed_up=0.1)
     script = ScriptedFaults()
 
@@ -54,11 +54,11 @@ def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_it_is_said(mon
             script.tell({(GRASP, 2): "disconnect"})
             with monkeypatch.context() as cable:
                 cable.setattr(gripper._link, "open", no_cable)
-                with pytest.raises(DeviceError, match="is gone"):
+                with pytest.raises(DeviceError, match="was lost"):
                     gripper.grasp(10.0, 100.0)
                 assert slow.moves
                 if not back:
-                    with pytest.raises(DeviceError, match="must be open"):
+                    with pytest.raises(DeviceError, match="is closed or was lost"):
                         gripper.close()
                     assert slow.moves
             if back:
@@ -72,7 +72,7 @@ def test_jaws_that_could_not_be_stopped_are_stopped_on_closing_or_it_is_said(mon
 
 
 @PORTS
-def test_a_stop_whose_length_is_damaged_swallows_no_later_one(port):
+def test_a_stop_with_a_damaged_length_does_not_swallow_the_next(port):
     slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     script = ScriptedFaults()
     with gripper_with_emulator(port, faults=script, emulator=slow, timeout_s=0.1) as (gripper, _):
@@ -85,7 +85,7 @@ def test_a_stop_whose_length_is_damaged_swallows_no_later_one(port):
         assert FAST_STOP not in slow.received
 
 
-def test_an_echo_whose_length_is_damaged_swallows_no_later_one():
+def test_an_echo_with_a_damaged_length_does_not_swallow_the_next():
     script = ScriptedFaults()
     with gripper_with_emulator(faults=script, timeout_s=0.1) as (gripper, _):
         gripper._link.require_sync()
@@ -94,7 +94,7 @@ def test_an_echo_whose_length_is_damaged_swallows_no_later_one():
         assert gripper.line_counts["no echo"] == 1
 
 
-def test_homing_whose_result_is_lost_is_not_done_twice():
+def test_homing_with_a_lost_result_is_not_repeated():
     script = ScriptedFaults()
     with gripper_with_emulator(faults=script, emulator=EmulatedWSG50(speed_up=2.0), connect=False) as (
         gripper,
@@ -110,22 +110,22 @@ def test_homing_whose_result_is_lost_is_not_done_twice():
         assert emulator.received.count(HOME) == 1
 
 
-def test_a_gripper_that_says_what_it_heard_damaged_is_told_again_at_once():
+def test_a_command_that_was_received_damaged_is_resent_at_once():
     script = ScriptedFaults()
     with gripper_with_emulator(faults=script, timeout_s=30.0) as (gripper, emulator):
         emulator.answers_bad_checksum, emulator.object_mm = True, 40.0
         script.tell({(GRASP, 1): "bad sum", (0x32, 1): "bad sum", (0x40, 1): "bad sum"})
         started = time.monotonic()
         assert gripper.grasp(10.0).status == "holding"
-        assert time.monotonic() - started < 25  # of the time-out nothing was waited for
+        assert time.monotonic() - started < 25  # less than the time-out
         assert emulator.received.count(GRASP) == 1
         assert gripper.line_counts == {"retried": 2, "resent": 1}
 
 
 @PORTS
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_a_grasp_is_done_once_whatever_of_it_is_lost(port, number):
-    """1 the command, 2 that it is pending, 3 its result."""
+def test_a_grasp_is_executed_once_whichever_of_its_packets_is_lost(port, number):
+    """The packets are 1 the command, 2 the pending reply, 3 the result."""
     script = ScriptedFaults()
     with gripper_with_emulator(port, faults=script) as (gripper, emulator):
         emulator.object_mm = 40.0
@@ -137,7 +137,7 @@ def test_a_grasp_is_done_once_whatever_of_it_is_lost(port, number):
 
 @pytest.mark.parametrize("kind", ["dropped", "duplicated", "corrupted", "delayed", "split", "wrong id"])
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_opening_ends_where_it_was_told_whatever_happens_to_a_packet(kind, number):
+def test_opening_reaches_its_target_with_any_fault_of_a_packet(kind, number):
     script = ScriptedFaults()
     with gripper_with_emulator(faults=script) as (gripper, emulator):
         for opening in (20.0, 80.0):
@@ -146,7 +146,7 @@ def test_opening_ends_where_it_was_told_whatever_happens_to_a_packet(kind, numbe
         assert not emulator.moves
 
 
-def test_a_result_that_comes_twice_does_not_end_the_next_motion():
+def test_a_doubled_result_does_not_end_the_next_motion():
     script = ScriptedFaults()
     slow = EmulatedWSG50(referenced=True, opening_mm=50.0)
     with gripper_with_emulator(faults=script, emulator=slow, opening_speed_mm_s=100.0) as (gripper, _):
@@ -157,7 +157,7 @@ def test_a_result_that_comes_twice_does_not_end_the_next_motion():
         assert state.opening_mm == pytest.approx(40.0, abs=0.1)
 
 
-def test_a_result_that_is_none_is_not_believed_while_the_jaws_move():
+def test_a_false_result_does_not_end_a_motion():
     script = ScriptedFaults()
     slow = EmulatedWSG50(referenced=True, opening_mm=50.0)
     with gripper_with_emulator(faults=script, emulator=slow, opening_speed_mm_s=50.0) as (gripper, _):
@@ -167,7 +167,7 @@ def test_a_result_that_is_none_is_not_believed_while_the_jaws_move():
         assert slow.received.count(MOVE) == 1
 
 
-def test_every_reading_that_is_lost_is_asked_again():
+def test_every_lost_reading_is_repeated():
     script = ScriptedFaults()
     with gripper_with_emulator(faults=script) as (gripper, _):
         script.tell({(command, 2): "dropped" for command in (0x33, 0x35, 0x31, 0x50, 0x53)})
@@ -177,18 +177,18 @@ def test_every_reading_that_is_lost_is_asked_again():
 
 @PORTS
 @pytest.mark.parametrize("kind", LineFaults.KINDS)
-def test_grasps_over_a_bad_line_end_right_or_with_a_reason_and_never_closing(port, kind):
+def test_grasps_over_a_bad_link_succeed_or_raise_and_never_leave_the_jaws_closing(port, kind):
     faults = LineFaults(0.0, [kind], seed=7, delay_s=0.02)
     emulator = EmulatedWSG50(referenced=True, speed_up=40.0)
     settings = {"timeout_s": 0.1, "acknowledge_faults": True, "update_ms": 10}
     with gripper_with_emulator(port, faults=faults, emulator=emulator, **settings) as (gripper, _):
         faults.rate = 0.005 if kind == "disconnect" else 0.02
         for number in range(6):
-            emulator.object_mm, want = (40.0, "holding") if number % 2 else (None, "no_part")
+            emulator.object_mm, expected = (40.0, "holding") if number % 2 else (None, "no_part")
             for _ in range(10):
                 try:
                     gripper.open(110.0)
-                    assert gripper.grasp(10.0, 300.0).status == want
+                    assert gripper.grasp(10.0, 300.0).status == expected
                     break
                 except DeviceError:
                     wait_until(lambda: not emulator.is_closing)

@@ -1,4 +1,4 @@
-"""The line to a WSG-50: deadlines, replies told apart, old ones dropped, ports that go away."""
+"""The link to a WSG-50: deadlines, late and doubled replies, lost ports."""
 
 import contextlib
 import itertools
@@ -30,7 +30,7 @@ OK = bytes(2)
 
 
 class Peer:
-    """The other end of a TCP line: answers each packet by a function packet -> bytes, or None to hang up."""
+    """The other end of a TCP link: answers each packet by a function packet -> bytes, or None to disconnect."""
 
     def __init__(self, answer):
         self.answer, self.received = answer, []
@@ -75,7 +75,7 @@ class Peer:
 
 
 class Endless:
-    """Stands for a port whose other side sends the same over and over, faster than anybody reads."""
+    """A fake port whose peer sends the same data without end, faster than it can be read."""
 
     def __init__(self, data):
         self.data = data
@@ -92,14 +92,14 @@ class Endless:
 
 
 class Timed:
-    """Stands for a port, for the time and for a slow computer: a byte that is summed takes 10 us, a look .5 ms.
+    """A fake port with a fake clock of a slow computer: a byte of a checksum takes 10 us, a read 0.5 ms.
 
-    What its other side sends is `data` over and over, `at_once` bytes a look; an echo comes too where `echoes`.
+    The peer sends `data` without end, `at_once` bytes in each read, and an echo if `echoes`.
     """
 
     def __init__(self, data, at_once, echoes):
         self.stream, self.at_once, self.echoes = itertools.cycle(data), at_once, echoes
-        self.now_s, self.told = 1000.0, b""
+        self.now_s, self.echo = 1000.0, b""
 
     def monotonic(self):
         return self.now_s
@@ -113,19 +113,19 @@ class Timed:
 
     def read(self, timeout_s):
         self.now_s += 5e-4
-        told, self.told = self.told, b""
-        return told + bytes(itertools.islice(self.stream, self.at_once))
+        echo, self.echo = self.echo, b""
+        return echo + bytes(itertools.islice(self.stream, self.at_once))
 
     def write(self, data):
         packet = decode(data)[1]
         if self.echoes and packet and packet.id == CommandId.LOOP:
-            self.told = reply(packet, packet.payload)
+            self.echo = reply(packet, packet.payload)
 
     def close(self): ...
 
 
 TABLE = wsg50_codec._TABLE
-HALF = b"\xaa\xaa\xaa\x06\xff\x00"
+TRUNCATED = b"\xaa\xaa\xaa\x06\xff\x00"
 UPDATE = encode(Packet(CommandId.SYSTEM_STATE, OK + bytes(4)))
 FLOODS = pytest.mark.parametrize(
     "data", [bytes(1000), UPDATE * 50, b"\xaa" * 1000, b"\xaa\xaa\xaa\x06\xff\x00" * 150], ids=range(4)
@@ -133,7 +133,7 @@ FLOODS = pytest.mark.parametrize(
 
 
 def ends(call, seconds=20.0):
-    """What a call raises or returns, in a thread of its own: a call that does not end fails the test."""
+    """Return the result or the DeviceError of a call, run in a thread; fail the test if it does not end."""
     ended = []
 
     def run():
@@ -154,7 +154,7 @@ def reply(packet, parameters=b"", status=0):
 
 
 def echoing(packet):
-    """Answers LOOP, and nothing else."""
+    """Answer only LOOP."""
     return reply(packet, packet.payload) if packet.id == CommandId.LOOP else b""
 
 
@@ -172,7 +172,7 @@ def quick_close(monkeypatch):
     monkeypatch.setattr(protocol, "time", type("NoWait", (), {"sleep": staticmethod(lambda _: None)}))
 
 
-def test_a_loopback_port_gives_back_what_it_is_given():
+def test_a_loopback_port_returns_the_written_bytes():
     port = Port("loop://", baud=115200, stop_bits=2, write_timeout_s=1.0)
     port.write(bytes_of("stop"))
     got = b""
@@ -206,15 +206,15 @@ def test_pending_is_not_the_end_of_a_command():
         assert link.poll(CommandId.HOME, 0.01) is None
 
 
-def test_another_status_than_success_says_which_command_and_why():
+def test_another_status_than_success_raises_with_command_and_status():
     with Peer(lambda packet: echoing(packet) or reply(packet, status=16)) as peer, linked(peer) as link:
         with pytest.raises(CommandFailed, match=r"STOP \(22h\) with ACCESS_DENIED \(status 16\)") as caught:
             link.send(Packet(CommandId.STOP))
         assert caught.value.status is Status.ACCESS_DENIED
-        assert peer.received.count(CommandId.STOP) == 1  # an answer is an answer
+        assert peer.received.count(CommandId.STOP) == 1  # an answered command is not repeated
 
 
-def test_silence_ends_with_the_deadline_and_is_asked_three_times():
+def test_a_query_without_answer_is_tried_three_times_within_the_deadline():
     with Peer(echoing) as peer, linked(peer, timeout_s=0.05) as link:
         started = time.monotonic()
         with pytest.raises(NoReply, match=r"INFO \(50h\) within 0.05 s"):
@@ -236,7 +236,7 @@ def test_silence_ends_with_the_deadline_and_is_asked_three_times():
         (lambda link: link.send(Packet(CommandId.STOP)), NoEcho),
     ],
 )
-def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, end, monkeypatch):
+def test_every_wait_ends_although_the_peer_sends_without_end(data, wait, end, monkeypatch):
     monkeypatch.setattr(wsg50_link, "Port", Endless(data))
     link = Link("a port", timeout_s=0.05)
     link.open()
@@ -246,7 +246,7 @@ def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, en
 
 @pytest.mark.parametrize("echoes", [False, True])
 @pytest.mark.parametrize("at_once", [1, 512])
-@pytest.mark.parametrize("data", [HALF, HALF + b"\x55", b"\xaa", UPDATE], ids=range(4))
+@pytest.mark.parametrize("data", [TRUNCATED, TRUNCATED + b"\x55", b"\xaa", UPDATE], ids=range(4))
 @pytest.mark.parametrize(
     ("wait", "time_outs"),
     [
@@ -259,8 +259,8 @@ def test_every_wait_ends_though_the_other_side_never_falls_silent(data, wait, en
     ],
     ids=["poll", "send_urgent", "sync", "call", "send", "pump"],
 )
-def test_a_deadline_holds_whatever_the_other_side_sends(wait, time_outs, data, at_once, echoes, monkeypatch):
-    """Half packets byte by byte once had a call of 0.5 s last 23 s: what still came at its end was waited for."""
+def test_every_call_ends_within_its_time_outs_for_any_data(wait, time_outs, data, at_once, echoes, monkeypatch):
+    """Truncated packets sent byte by byte are the worst case: they must not prolong a wait."""
     peer = Timed(data, at_once, echoes)
     for module, name in ((wsg50_link, "Port"), (wsg50_link, "time"), (wsg50_codec, "_TABLE")):
         monkeypatch.setattr(module, name, peer)
@@ -269,19 +269,19 @@ def test_a_deadline_holds_whatever_the_other_side_sends(wait, time_outs, data, a
     began = peer.now_s
     with contextlib.suppress(DeviceError):
         wait(link)
-    assert peer.now_s - began <= 0.1 * time_outs + 0.05 * (time_outs + 1)  # and what has come by then is decoded
+    assert peer.now_s - began <= 0.1 * time_outs + 0.05 * (time_outs + 1)  # plus the time to decode
 
 
 @FLOODS
-def test_connecting_ends_though_the_other_side_never_falls_silent(data, monkeypatch):
+def test_connecting_ends_although_the_peer_sends_without_end(data, monkeypatch):
     monkeypatch.setattr(wsg50_link, "Port", Endless(data))
     gripper = WSG50(port="a port", timeout_s=0.05)
-    assert "is it on, and connected" in str(ends(gripper.connect))
+    assert "is it on and connected" in str(ends(gripper.connect))
     assert not gripper.is_connected
 
 
-def test_a_socket_is_opened_though_the_other_side_sends_at_once_and_without_end():
-    """pyserial reads on opening until nothing comes; here something comes whenever it looks."""
+def test_a_socket_can_be_opened_although_the_peer_sends_without_end():
+    """On opening, pyserial reads until the socket is empty; here it is never empty."""
     pending = [b"x"] * 100
     with Peer(echoing) as peer, pytest.MonkeyPatch.context() as patch:
         real = select.select
@@ -294,7 +294,7 @@ def test_a_socket_is_opened_though_the_other_side_sends_at_once_and_without_end(
         assert len(pending) > 90
 
 
-def test_what_has_come_while_the_program_was_held_up_is_taken_in_at_once():
+def test_all_bytes_received_during_a_suspension_are_processed_at_once():
     updates = b"".join(encode(Packet(CommandId.OPENING, OK + struct.pack("<f", each))) for each in range(800))
 
     def answer(packet):
@@ -307,7 +307,7 @@ def test_what_has_come_while_the_program_was_held_up_is_taken_in_at_once():
         assert commands.number(link.updates[CommandId.OPENING][0]) == 799.0
 
 
-def test_a_command_that_was_heard_damaged_is_asked_again():
+def test_a_command_that_was_received_damaged_is_repeated():
     statuses = [11, 0]
 
     def answer(packet):
@@ -319,7 +319,7 @@ def test_a_command_that_was_heard_damaged_is_asked_again():
         assert link.counts == {"retried": 1}
 
 
-def test_where_nobody_echoes_nothing_is_asked_again():
+def test_without_an_echo_no_command_is_repeated():
     with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
         with pytest.raises(NoEcho):
             link.send(Packet(CommandId.STOP))
@@ -328,15 +328,15 @@ def test_where_nobody_echoes_nothing_is_asked_again():
         assert peer.received == [CommandId.LOOP] * 3
 
 
-def test_a_gripper_that_echoes_nothing_is_not_there():
+def test_without_an_echo_no_command_is_sent():
     with Peer(lambda packet: b"") as peer, linked(peer, timeout_s=0.05) as link:
-        with pytest.raises(NoReply, match="is it on, and connected"):
+        with pytest.raises(NoReply, match="is it on and connected"):
             link.call(Packet(CommandId.STOP))
-        assert set(peer.received) == {CommandId.LOOP}  # nothing was told to a line in doubt
+        assert set(peer.received) == {CommandId.LOOP}  # no command without synchronisation
 
 
-def test_a_late_reply_is_never_taken_for_the_present_one():
-    """The first question is answered after the second was asked; without the echo the old value would be taken."""
+def test_a_late_reply_is_never_returned_for_the_next_query():
+    """The first query is answered after the second was sent; without the echo the old value would be returned."""
     late = []
 
     def answer(packet):
@@ -354,7 +354,7 @@ def test_a_late_reply_is_never_taken_for_the_present_one():
         assert link.counts["unexpected"] == 1
 
 
-def test_a_doubled_reply_raises_doubt_before_the_next_command():
+def test_a_doubled_reply_requires_synchronisation_before_the_next_command():
     def answer(packet):
         return echoing(packet) or 2 * reply(packet, b"\x00\x00\x80\x3f")
 
@@ -366,18 +366,18 @@ def test_a_doubled_reply_raises_doubt_before_the_next_command():
         assert peer.received.count(CommandId.LOOP) == loops + 1
 
 
-def test_a_packet_that_stops_half_way_hides_nothing_behind_it():
-    half = b"\xaa\xaa\xaa\x06\xff\x00"  # claims 255 bytes that never come
+def test_an_incomplete_packet_hides_no_packet_after_it():
+    truncated = b"\xaa\xaa\xaa\x06\xff\x00"  # claims 255 bytes that never arrive
 
     def answer(packet):
-        return echoing(packet) or half + reply(packet, b"\x00\x00\x80\x3f")
+        return echoing(packet) or truncated + reply(packet, b"\x00\x00\x80\x3f")
 
     with Peer(answer) as peer, linked(peer) as link:
         assert commands.number(link.call(commands.query(CommandId.GET_FORCE_LIMIT))) == 1.0
         assert link.counts["abandoned"] >= 1
 
 
-def test_replies_of_the_wrong_length_are_asked_again():
+def test_a_query_with_a_reply_of_the_wrong_length_is_repeated():
     answers = [b"\x01", b"\x00\x00\x80\x3f"]
 
     def answer(packet):
@@ -388,21 +388,21 @@ def test_replies_of_the_wrong_length_are_asked_again():
         assert answers == []
 
 
-def test_a_stop_does_not_wait_for_the_line_to_be_cleared():
+def test_an_urgent_stop_does_not_synchronise_first():
     with Peer(lambda packet: echoing(packet) or reply(packet)) as peer, linked(peer) as link:
         link.require_sync()
         link.send_urgent(Packet(CommandId.STOP))
         assert peer.received == [CommandId.STOP]
 
 
-def test_a_line_that_the_other_side_closes_is_noticed_and_can_be_opened_again():
+def test_a_link_closed_by_the_peer_raises_and_can_be_opened_again():
     with Peer(lambda packet: None) as peer:
         link = Link(peer.url, timeout_s=0.5)
         link.open()
-        with pytest.raises(LinkLost, match=r"is gone.*recover"):
+        with pytest.raises(LinkLost, match=r"was lost.*recover"):
             link.sync()
         assert not link.is_open
-        with pytest.raises(LinkLost, match="must be open"):
+        with pytest.raises(LinkLost, match="is closed or was lost"):
             link.send(Packet(CommandId.STOP))
         link.close()
     with Peer(echoing) as other:
@@ -417,12 +417,12 @@ def test_a_line_that_the_other_side_closes_is_noticed_and_can_be_opened_again():
 @pytest.mark.parametrize(
     "port", ["/nowhere/tty", "socket://127.0.0.1:1", "socket://127.0.0.1", "what://is this", "loop://?x=1"]
 )
-def test_a_port_that_cannot_be_opened_is_a_sentence(port):
+def test_a_port_that_cannot_be_opened_is_a_lost_link(port):
     with pytest.raises(LinkLost, match="cannot be opened"):
         Link(port).open()
 
 
-def test_a_terminal_that_goes_away_is_noticed():
+def test_a_closed_terminal_is_a_lost_link():
     own, other = os.openpty()
     link = Link(os.ttyname(other), timeout_s=0.5)
     link.open()
@@ -433,15 +433,15 @@ def test_a_terminal_that_goes_away_is_noticed():
     assert not link.is_open
 
 
-def test_without_pyserial_it_says_what_to_install(monkeypatch):
+def test_without_pyserial_the_message_names_the_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "serial", None)
     with pytest.raises(
-        DeviceError, match=r"needs pyserial, which is missing; run pip install 'touch-retrieval\[gripper\]'"
+        DeviceError, match=r"requires pyserial, which is missing; run pip install 'touch-retrieval\[gripper\]'"
     ):
         Link("loop://").open()
 
 
-def test_no_module_of_the_driver_needs_pyserial_to_be_imported():
+def test_the_driver_can_be_imported_without_pyserial():
     blocked = (
         "import sys; sys.modules['serial'] = None; import robot.drivers.wsg50.driver, tests.emulators.wsg50.server"
     )

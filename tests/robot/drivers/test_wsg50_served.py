@@ -1,4 +1,4 @@
-"""The emulated WSG-50 on its ports: TCP, a terminal, a program; whatever clients send."""
+"""The emulated WSG-50 on its ports: TCP, a terminal, a program."""
 
 import contextlib
 import os
@@ -19,29 +19,29 @@ from tests.wsg50_packets import bytes_of
 STOP = 0x22
 
 
-def read_until(read, want, seconds=5.0):
+def read_until(read, expected, seconds=5.0):
     got, deadline = b"", time.monotonic() + seconds
-    while want not in got and time.monotonic() < deadline:
+    while expected not in got and time.monotonic() < deadline:
         got += read()
     return got
 
 
-def test_it_speaks_the_printed_bytes_over_tcp():
+def test_it_answers_documented_packets_over_tcp():
     with serve_tcp(EmulatedWSG50()) as url:
         host, port = url.removeprefix("socket://").split(":")
         with socket.create_connection((host, int(port)), timeout=5) as client:
             client.sendall(bytes_of("stop"))
-            want = encode(Packet(STOP, b"\0\0"))
-            assert read_until(lambda: client.recv(100), want) == want
+            expected = encode(Packet(STOP, b"\0\0"))
+            assert read_until(lambda: client.recv(100), expected) == expected
 
 
-def test_it_speaks_the_printed_bytes_over_a_terminal():
+def test_it_answers_documented_packets_over_a_terminal():
     with serve_pty(EmulatedWSG50()) as path:
         terminal = os.open(path, os.O_RDWR | os.O_NOCTTY)
         try:
             os.write(terminal, bytes_of("get force limit"))
-            want = encode(Packet(0x33, b"\0\0" + struct.pack("<f", 40)))
-            assert read_until(lambda: os.read(terminal, 100), want) == want
+            expected = encode(Packet(0x33, b"\0\0" + struct.pack("<f", 40)))
+            assert read_until(lambda: os.read(terminal, 100), expected) == expected
         finally:
             os.close(terminal)
 
@@ -50,9 +50,9 @@ def damaged(packet):
     return packet[:-1] + bytes([packet[-1] ^ 1])
 
 
-def talk(client, sent, want):
+def is_answered(client, sent, expected):
     client.sendall(sent)
-    return want in read_until(lambda: client.recv(1000), want)
+    return expected in read_until(lambda: client.recv(1000), expected)
 
 
 @contextlib.contextmanager
@@ -62,19 +62,19 @@ def client_of(url):
         yield client
 
 
-def test_a_damaged_command_is_answered_only_if_it_is_to_be():
-    emulator, said = EmulatedWSG50(), encode(Packet(STOP, b"\x0b\x00"))
+def test_a_damaged_command_is_answered_only_if_configured():
+    emulator, answer = EmulatedWSG50(), encode(Packet(STOP, b"\x0b\x00"))
     with serve_tcp(emulator) as url, client_of(url) as client:
         client.sendall(damaged(bytes_of("stop")))
-        assert talk(client, bytes_of("loop abc"), encode(Packet(0x06, b"\0\0abc")))
+        assert is_answered(client, bytes_of("loop abc"), encode(Packet(0x06, b"\0\0abc")))
         emulator.answers_bad_checksum = True
-        assert talk(client, b"\xaa" + damaged(bytes_of("stop")), said)
+        assert is_answered(client, b"\xaa" + damaged(bytes_of("stop")), answer)
         assert STOP not in emulator.received
 
 
 @pytest.mark.parametrize("by", STARTED, ids=STARTED_IDS)
 @pytest.mark.parametrize(("port", "end"), [(["--tcp", "0"], signal.SIGINT), (["--pty"], signal.SIGTERM)])
-def test_it_runs_as_a_program_and_says_where(port, end, by):
+def test_it_runs_as_a_program_and_prints_its_port(port, end, by):
     program = [sys.executable, "-m", "tests.emulators.wsg50.server", *port, "--object-mm", "40"]
     with run_process([*by, *program]) as process:
         line = first_line(process)

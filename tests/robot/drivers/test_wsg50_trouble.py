@@ -1,4 +1,4 @@
-"""The WSG-50's driver on a gripper in trouble: faults, silence, stops, interruptions, closing."""
+"""The WSG-50's driver with a failing gripper: faults, silence, stops, interruptions, closing."""
 
 import logging
 import os
@@ -47,7 +47,7 @@ def test_a_fast_stop_is_never_acknowledged_silently(port, caplog):
 
 
 @PORTS
-def test_after_a_fast_stop_nothing_works_until_it_is_recovered(port):
+def test_after_a_fast_stop_every_call_raises_until_recovery(port):
     with gripper_with_emulator(port, acknowledge_faults=True) as (gripper, emulator):
         emulator.fail("temperature")
         for use in (gripper.state, lambda: gripper.open(50.0), lambda: gripper.grasp(10.0)):
@@ -60,7 +60,7 @@ def test_after_a_fast_stop_nothing_works_until_it_is_recovered(port):
 
 
 @pytest.mark.parametrize(
-    ("fault", "words"),
+    ("fault", "text"),
     [
         ("temperature warning", "temperature warning"),
         ("finger", "finger fault"),
@@ -68,21 +68,21 @@ def test_after_a_fast_stop_nothing_works_until_it_is_recovered(port):
         ("script", "script failure"),
     ],
 )
-def test_the_cause_of_a_fast_stop_is_named(fault, words):
+def test_the_cause_of_a_fast_stop_is_named(fault, text):
     with gripper_with_emulator() as (gripper, emulator):
         emulator.fail(fault)
-        with pytest.raises(DeviceError, match=f"FAST STOP: {words};"):
+        with pytest.raises(DeviceError, match=f"FAST STOP: {text};"):
             gripper.state()
 
 
-def test_a_warning_alone_keeps_nothing_from_working():
+def test_a_warning_alone_does_not_prevent_motions():
     with gripper_with_emulator() as (gripper, emulator):
         emulator.warn("temperature warning")
         assert gripper.open(60.0).status == "idle"
 
 
 @PORTS
-def test_what_is_held_stays_held_by_its_force_when_the_program_comes_back(port):
+def test_a_held_object_keeps_its_force_when_the_program_reconnects(port):
     emulator = EmulatedWSG50(referenced=True, speed_up=20.0, object_mm=40.0)
     emulator.has_force_fingers = True
     with gripper_with_emulator(port, emulator=emulator) as (gripper, _):
@@ -90,16 +90,16 @@ def test_what_is_held_stays_held_by_its_force_when_the_program_comes_back(port):
     with gripper_with_emulator(port, emulator=emulator, tare=True) as (gripper, _):
         gripper.recover()
         assert (emulator.force_limit_n, emulator.grasping, TARE in emulator.received) == (20.0, 4, False)
-        assert "something is held" in gripper.refused["tare"]
+        assert "an object is held" in gripper.refused["tare"]
         gripper.open(60.0)
         gripper.recover()
         assert (emulator.force_limit_n, emulator.received.count(TARE), gripper.refused) == (5.0, 1, {})
 
 
-NOT_HEARD = {Status.SUCCESS, Status.CMD_PENDING, Status.CHECKSUM_ERROR}
+NOT_RECEIVED = {Status.SUCCESS, Status.CMD_PENDING, Status.CHECKSUM_ERROR}
 
 
-def test_a_grasp_that_is_answered_and_not_done_is_begun_again_only_where_it_was_not_heard():
+def test_an_answered_grasp_that_was_not_executed_is_resent_only_if_it_was_not_received():
     with gripper_with_emulator(
         timeout_s=0.1, emulator=EmulatedWSG50(referenced=True, speed_up=50.0, object_mm=40.0)
     ) as (
@@ -110,15 +110,15 @@ def test_a_grasp_that_is_answered_and_not_done_is_begun_again_only_where_it_was_
             gripper.open(60.0)
             emulator.received.clear()
             emulator.next_status = {GRASP: status}
-            if status in NOT_HEARD:
+            if status in NOT_RECEIVED:
                 assert gripper.grasp(10.0, 400.0).status == "holding"
             else:
                 with pytest.raises(DeviceError, match=f"answered {status.name} to GRASP"):
                     gripper.grasp(10.0, 400.0)
-            assert emulator.received.count(GRASP) == 1 + (status in NOT_HEARD)
+            assert emulator.received.count(GRASP) == 1 + (status in NOT_RECEIVED)
 
 
-def test_what_was_heard_damaged_is_said_again():
+def test_commands_received_damaged_are_repeated():
     with gripper_with_emulator() as (gripper, emulator):
         emulator.next_status = {0x33: 11, STOP: 11}
         assert gripper.settings()["force_limit_n"] == 2.5
@@ -128,7 +128,7 @@ def test_what_was_heard_damaged_is_said_again():
         assert not emulator.in_fast_stop
 
 
-def test_a_lost_reference_is_said_before_anything_moves():
+def test_a_lost_reference_raises_before_any_motion():
     with gripper_with_emulator() as (gripper, emulator):
         emulator.lose_reference()
         with pytest.raises(DeviceError, match="reference"):
@@ -137,7 +137,7 @@ def test_a_lost_reference_is_said_before_anything_moves():
 
 
 @PORTS
-def test_a_state_that_does_not_come_stops_the_motion(port):
+def test_missing_state_updates_stop_the_motion(port):
     slow = EmulatedWSG50(referenced=True, object_mm=5.0)
     with gripper_with_emulator(port, emulator=slow, max_state_age_s=0.1) as (gripper, _):
         slow.mute_updates = True
@@ -147,21 +147,21 @@ def test_a_state_that_does_not_come_stops_the_motion(port):
         assert not slow.moves
 
 
-def test_a_program_that_was_held_up_is_no_silent_gripper(monkeypatch):
+def test_a_suspended_program_does_not_count_as_a_silent_gripper(monkeypatch):
     slow = EmulatedWSG50(referenced=True, object_mm=40.0)
     with gripper_with_emulator(emulator=slow, max_state_age_s=1.0) as (gripper, _):
         poll, waits = gripper._link.poll, [1.5]
 
-        def held_up(command, seconds):
+        def suspended(command, seconds):
             status = poll(command, seconds)
             time.sleep(waits.pop() if waits else 0)
             return status
 
-        monkeypatch.setattr(gripper._link, "poll", held_up)
+        monkeypatch.setattr(gripper._link, "poll", suspended)
         assert gripper.grasp(10.0, 100.0).status == "holding"
 
 
-def test_a_fault_in_the_middle_of_a_motion_is_named():
+def test_a_fault_during_a_motion_is_named():
     slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     with gripper_with_emulator(emulator=slow) as (gripper, _):
         thread = threading.Thread(target=lambda: (wait_until(lambda: slow.moves), slow.fail("current")))
@@ -175,7 +175,7 @@ def test_a_motion_that_never_ends_is_stopped(monkeypatch):
     monkeypatch.setattr(wsg50, "_SLACK_S", 0.0)
     with gripper_with_emulator() as (gripper, emulator):
         emulator.jammed = True
-        with pytest.raises(DeviceError, match=r"GRASP \(25h\) in time"):
+        with pytest.raises(DeviceError, match=r"did not end GRASP \(25h\) in time"):
             gripper.grasp(10.0, 400.0)
         assert not emulator.moves
         assert emulator.received.count(GRASP) == 1
@@ -202,10 +202,10 @@ def test_ctrl_c_stops_the_jaws(port, call):
         assert not slow.moves
         assert not slow.is_closing
         assert slow.opening_mm > 50.0
-        assert not slow.in_fast_stop  # usable: homing lost its reference, no more
+        assert not slow.in_fast_stop  # usable, except that interrupted homing has lost the reference
 
 
-def test_stop_is_always_allowed_and_becomes_a_fast_stop_if_nobody_answers():
+def test_stop_is_always_allowed_and_becomes_a_fast_stop_without_an_answer():
     script = ScriptedFaults()
     with gripper_with_emulator(faults=script) as (gripper, emulator):
         gripper.stop()
@@ -216,7 +216,7 @@ def test_stop_is_always_allowed_and_becomes_a_fast_stop_if_nobody_answers():
         assert emulator.in_fast_stop
 
 
-def test_a_stop_that_is_answered_and_does_nothing_becomes_a_fast_stop(monkeypatch):
+def test_an_answered_stop_without_effect_becomes_a_fast_stop(monkeypatch):
     monkeypatch.setitem(wsg50_emulated._ACTIONS, STOP, lambda own, _: 0)
     slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     with gripper_with_emulator(emulator=slow, max_state_age_s=0.1) as (gripper, _):
@@ -240,7 +240,7 @@ def test_a_stop_that_is_answered_and_does_nothing_becomes_a_fast_stop(monkeypatc
         lambda g: g.close(),
     ],
 )
-def test_no_call_waits_for_ever_for_a_gripper_that_says_nothing(use):
+def test_no_call_waits_for_ever_for_a_silent_gripper(use):
     with gripper_with_emulator(timeout_s=0.02, reconnect_tries=2) as (gripper, emulator):
         emulator.silent = True
         started = time.monotonic()
@@ -250,7 +250,7 @@ def test_no_call_waits_for_ever_for_a_gripper_that_says_nothing(use):
 
 
 @pytest.mark.parametrize("use", ["state", "recover", "home", "stop", "settings"])
-def test_nothing_works_before_connecting_and_after_closing(use):
+def test_every_call_raises_before_connecting_and_after_closing(use):
     with gripper_with_emulator(connect=False) as (gripper, _):
         with pytest.raises(DeviceError, match="must be connected"):
             getattr(gripper, use)()
@@ -265,7 +265,7 @@ def test_nothing_works_before_connecting_and_after_closing(use):
 
 
 @PORTS
-def test_closing_says_so_leaves_no_fault_and_keeps_what_is_held(port):
+def test_closing_is_announced_leaves_no_fault_and_keeps_a_held_object(port):
     with gripper_with_emulator(port) as (gripper, emulator):
         emulator.object_mm = 40.0
         gripper.grasp(10.0)
@@ -276,21 +276,21 @@ def test_closing_says_so_leaves_no_fault_and_keeps_what_is_held(port):
         assert emulator.received[-1] == 0x07
 
 
-def test_the_end_of_a_line_is_not_announced_while_the_jaws_may_move():
-    """The gripper then stops by itself."""
+def test_the_disconnect_is_not_announced_while_the_jaws_may_move():
+    """Without announcement the gripper stops by itself."""
     slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     script = ScriptedFaults()
     with gripper_with_emulator(faults=script, emulator=slow, timeout_s=0.1) as (gripper, _):
         gripper._link.begin(wsg50.commands.move(10.0, 5.0))
         wait_until(lambda: slow.moves)
         script.tell({STOP: "dropped", FAST_STOP: "dropped"})
-        with pytest.raises(DeviceError, match="must answer FAST_STOP"):
+        with pytest.raises(DeviceError, match="did not answer FAST_STOP"):
             gripper.close()
         assert 0x07 not in slow.received
         wait_until(lambda: slow.in_fast_stop and not slow.moves)
 
 
-def test_closing_stops_what_moves():
+def test_closing_stops_moving_jaws():
     slow = EmulatedWSG50(referenced=True, opening_mm=100.0)
     with gripper_with_emulator(emulator=slow) as (gripper, _):
         gripper._link.begin(wsg50.commands.move(10.0, 10.0))
@@ -300,7 +300,7 @@ def test_closing_stops_what_moves():
         assert not slow.in_fast_stop
 
 
-def test_connecting_to_nothing_is_a_sentence_and_leaves_nothing_open():
+def test_connecting_to_a_closed_port_is_a_device_error_and_leaves_nothing_open():
     with socket.create_server(("127.0.0.1", 0)) as server:
         free = server.getsockname()[1]
     gripper = WSG50(port=f"socket://127.0.0.1:{free}", **QUICK)
@@ -309,15 +309,15 @@ def test_connecting_to_nothing_is_a_sentence_and_leaves_nothing_open():
     assert not gripper.is_connected
     with gripper_with_emulator(connect=False, timeout_s=0.02) as (gripper, emulator):
         emulator.silent = True
-        with pytest.raises(DeviceError, match="is it on, and connected"):
+        with pytest.raises(DeviceError, match="is it on and connected"):
             gripper.connect()
         assert not gripper._link.is_open
         assert not gripper.is_connected
-        assert emulator.received == [0x06] * 3  # asked three times whether it is there, and left alone
+        assert emulator.received == [0x06] * 3  # three tries of an echo and nothing else
 
 
-def test_however_often_the_gripper_is_tried_no_wait_is_longer_than_seconds(monkeypatch):
-    """Doubled each time, the last of twenty waits would take more than a day."""
+def test_the_waits_between_tries_are_limited_to_seconds(monkeypatch):
+    """Without a limit, the last of twenty doubled waits would take more than a day."""
     waits = []
     monkeypatch.setattr("robot.drivers.wsg50.setup.time", SimpleNamespace(sleep=waits.append))
     for first, longest in ((0.2, 5.0), (30.0, 30.0)):
@@ -328,10 +328,10 @@ def test_however_often_the_gripper_is_tried_no_wait_is_longer_than_seconds(monke
         assert (len(waits), waits[0], max(waits)) == (19, first, longest)
 
 
-def test_recovering_gives_up_after_the_tries_it_was_given(caplog):
+def test_recovery_raises_after_the_last_try(caplog):
     with gripper_with_emulator(reconnect_tries=3) as (gripper, _):
         pass
-    gripper._connected = True  # as if the gripper had been switched off meanwhile
+    gripper._connected = True  # as if the gripper were switched off
     with pytest.raises(DeviceError, match="after 3 tries"):
         gripper.recover()
     assert caplog.text.count("trying again") == 2

@@ -1,4 +1,4 @@
-"""A dry run: the motions of an attempt are said, and nothing moves."""
+"""A dry run reports the motions of an attempt and moves nothing."""
 
 import pytest
 
@@ -11,43 +11,46 @@ from robot.sim.rig import SimRig
 from tests.fake_rig import FakeRig
 
 
-def test_the_motions_of_an_attempt_are_said_in_order_and_nothing_is_moved():
-    said = []
+def test_the_motions_of_an_attempt_are_reported_in_order_and_nothing_is_moved():
+    reports = []
     rig = FakeRig(5)
     world = rig.world
-    with make_dry_run(rig, said.append) as dry:
+    with make_dry_run(rig, reports.append) as dry:
         attempt = AttemptRunner(dry, 5, AttemptSettings()).run("round-0", 0)
     assert attempt.outcome == "held"
     assert {"arm", "grasp", "open", "arm.connect", "gripper.connect"}.isdisjoint(world.calls)
-    assert "depth" in world.calls  # it looks, and feels
+    assert "depth" in world.calls  # camera and gels are read
     assert "gel a" in world.calls
-    starts = [" ".join(line.split()[:2]) for line in said]
+    starts = [" ".join(line.split()[:2]) for line in reports]
     assert starts == [
         "jaws: open",  # wide
         "arm: to",  # out of the picture
         "arm: to",  # above the object
-        "jaws: open",  # as wide as the object asks
+        "jaws: open",  # to the opening of the plan
         "arm: to",  # down
         "jaws: close",
         "arm: to",  # up
-        "arm: to",  # over the place to put it
+        "arm: to",  # over the place where the object is put down
         "arm: to",  # down
         "jaws: open",
         "arm: to",  # up
     ]
-    assert said[1] == "arm: to x 0.0, y 150.0, z 500.0 mm, yaw 0.000 rad, at 200 mm/s"
+    assert reports[1] == "arm: to x 0.0, y 150.0, z 500.0 mm, yaw 0.000 rad, at 200 mm/s"
 
 
-def test_a_tilt_is_said_and_is_refused_where_the_arm_keeps_the_hand_upright():
-    said, pose = [], Pose(0.0, 0.0, 100.0, 0.0, 1.5708)
-    with make_dry_run(SimRig(0), said.append) as dry:
+def test_a_tilt_is_reported_and_is_refused_for_an_arm_that_cannot_tilt():
+    reports, pose = [], Pose(0.0, 0.0, 100.0, 0.0, 1.5708)
+    with make_dry_run(SimRig(0), reports.append) as dry:
         dry.arm.move_to(pose, 100.0)
-    assert said == ["arm: to x 0.0, y 0.0, z 100.0 mm, yaw 0.000 rad, tilt 1.571 rad, at 100 mm/s"]
-    with make_dry_run(FakeRig(5), print) as dry, pytest.raises(DeviceError, match="straight down: tilt must be 0"):
+    assert reports == ["arm: to x 0.0, y 0.0, z 100.0 mm, yaw 0.000 rad, tilt 1.571 rad, at 100 mm/s"]
+    with (
+        make_dry_run(FakeRig(5), print) as dry,
+        pytest.raises(DeviceError, match="tilt must be 0, because its fingers always point down"),
+    ):
         dry.arm.move_to(pose, 100.0)
 
 
-def test_what_the_rig_may_not_do_is_refused_in_a_dry_run_too():
+def test_a_dry_run_has_the_limits_of_the_rig():
     rig = FakeRig(5)
     limits = rig.arm.workspace, rig.gripper.max_force_n
     dry = make_dry_run(rig, print)

@@ -1,4 +1,4 @@
-"""The gate on the area of contact, and what any gate may answer."""
+"""The contact-area gate, and the valid scores of any gate."""
 
 import math
 
@@ -12,13 +12,13 @@ SHAPE = (60, 80, 3)
 
 
 def gel(seed=0, level=100.0, noise=2.0):
-    """An untouched gel with sensor noise."""
+    """Return a no-contact frame with sensor noise."""
     values = level + np.random.default_rng(seed).normal(0, noise, SHAPE)
     return np.clip(values + 0.5, 0, 255).astype(np.uint8)
 
 
 def pressed(seed=1, side=20, change=(40, -30, 10), level=100.0):
-    """The same gel with a square of side `side` px that changed its colour."""
+    """Return a frame of the same gel with a square of side `side` px that changed its colour."""
     values = gel(seed, level).astype(float)
     values[20 : 20 + side, 20 : 20 + side] += change
     return np.clip(values, 0, 255).astype(np.uint8)
@@ -32,46 +32,46 @@ def test_a_no_contact_gel_is_rejected_and_a_pressed_one_accepted():
     assert GATE({"a": GraspFrames(gel(0), pressed())}) is True
 
 
-def test_the_share_is_that_of_the_changed_area():
-    share = GATE.changed_fractions({"a": GraspFrames(gel(0, noise=0), pressed(1, 20))})["a"]
-    assert 20**2 <= share * 60 * 80 <= 24**2  # a blur of 5 px moves the edge by 2 px at most
+def test_the_fraction_is_that_of_the_changed_area():
+    fraction = GATE.changed_fractions({"a": GraspFrames(gel(0, noise=0), pressed(1, 20))})["a"]
+    assert 20**2 <= fraction * 60 * 80 <= 24**2  # a blur of 5 px moves the edge by 2 px at most
 
 
-def test_a_darker_gel_is_contact_as_much_as_a_lighter_one():
+def test_a_darker_gel_counts_like_a_lighter_one():
     up = GATE.changed_fractions({"a": GraspFrames(gel(0), pressed(1, change=(30, 30, 30)))})
     down = GATE.changed_fractions({"a": GraspFrames(gel(0), pressed(1, change=(-30, -30, -30)))})
     assert up["a"] == pytest.approx(down["a"], abs=0.01)
 
 
-def test_uint8_subtraction_makes_contact_of_noise():
-    """The naive difference wraps round: half of the untouched pixels change by about 255 levels."""
+def test_uint8_subtraction_turns_noise_into_contact():
+    """The naive difference wraps round: half of the no-contact pixels change by about 255 levels."""
     before, after = gel(0), gel(1)
     assert ((after - before) > GATE.noise_levels).mean() > 0.4
     assert (np.abs(difference(after, before)) > GATE.noise_levels).mean() < 0.02
     assert (difference(np.full(SHAPE, 99, np.uint8), np.full(SHAPE, 100, np.uint8)) == -1.0).all()
 
 
-def test_any_finger_is_enough_unless_every_one_is_asked_for():
+def test_one_finger_is_sufficient_unless_every_finger_is_required():
     one = {"a": GraspFrames(gel(0), gel(1)), "b": GraspFrames(gel(2), pressed(3))}
     assert GATE(one)
     assert not ContactAreaGate(every_finger=True)(one)
     assert ContactAreaGate(every_finger=True)({"b": one["b"]})
 
 
-def test_no_finger_is_looked_at_after_the_answer_is_known():
+def test_no_finger_is_read_after_the_decision():
     class Never:
         @property
         def before(self):
-            raise AssertionError("it was looked at")
+            raise AssertionError("it was read")
 
     held, empty = GraspFrames(gel(0), pressed(1)), GraspFrames(gel(0), gel(1))
     assert GATE({"a": held, "b": Never()})
     assert not ContactAreaGate(every_finger=True)({"a": empty, "b": Never()})
-    with pytest.raises(AssertionError, match="looked at"):
+    with pytest.raises(AssertionError, match="it was read"):
         GATE({"a": empty, "b": Never()})
 
 
-def test_what_slipped_after_the_lift_is_no_grasp():
+def test_an_object_that_slipped_after_the_lift_is_rejected():
     slipped = {"a": GraspFrames(gel(0), pressed(1), gel(2))}
     assert not GATE(slipped)
     assert GATE({"a": GraspFrames(gel(0), pressed(1), pressed(2))})
@@ -83,7 +83,7 @@ def test_a_saturated_gel_is_no_contact(level):
 
 
 def test_a_gate_without_a_no_contact_frame_raises():
-    with pytest.raises(RobotConfigError, match=r"compares with the untouched gel.*finger a has none"):
+    with pytest.raises(RobotConfigError, match=r"requires no-contact frames.*finger a has none"):
         GATE({"a": GraspFrames(None, gel())})
 
 
@@ -96,14 +96,14 @@ def test_a_setting_out_of_range_is_refused(setting):
 
 
 @pytest.mark.parametrize(
-    ("answer", "decision"),
+    ("score", "decision"),
     [(True, True), (False, False), (0.5, True), (0.49, False), (np.float32(0.9), True), (1, True)],
 )
-def test_a_gate_answers_yes_no_or_a_probability(answer, decision):
-    assert apply_gate(lambda touches: answer, {}) == (decision, pytest.approx(float(answer)))
+def test_a_gate_returns_true_false_or_a_probability(score, decision):
+    assert apply_gate(lambda touches: score, {}) == (decision, pytest.approx(float(score)))
 
 
-@pytest.mark.parametrize("answer", [math.nan, -0.1, 1.1, 17.0])
-def test_a_logit_is_no_answer(answer):
+@pytest.mark.parametrize("score", [math.nan, -0.1, 1.1, 17.0])
+def test_a_logit_is_not_a_valid_score(score):
     with pytest.raises(RobotError, match="true, false or a probability"):
-        apply_gate(lambda touches: answer, {})
+        apply_gate(lambda touches: score, {})

@@ -1,4 +1,4 @@
-"""Plans: drawn as the paper says, within what the object and the rig allow, or refused with the reason."""
+"""Grasp plans: drawn as in the paper within the limits of object and rig, or refused with the reason."""
 
 import contextlib
 import dataclasses
@@ -28,14 +28,14 @@ def plans(count=2000, **changes):
 
 
 def farthest_from_uniform(values, low, high):
-    """Kolmogorov's distance between these values and a uniform distribution, by a plain loop."""
+    """Return Kolmogorov's distance between these values and a uniform distribution, by a plain loop."""
     ordered = sorted((value - low) / (high - low) for value in values)
     count = len(ordered)
     return max(max(abs(value - k / count), abs(value - (k + 1) / count)) for k, value in enumerate(ordered))
 
 
 KOLMOGOROV = 1.95
-"""Of n uniform values, n^(1/2) times the distance stays below this in 999 of 1000 cases; the seeds are fixed."""
+"""For n uniform values, n^(1/2) times the distance is below this in 999 of 1000 cases; the seeds are fixed."""
 
 
 def test_yaw_force_and_height_are_uniform():
@@ -48,10 +48,10 @@ def test_yaw_force_and_height_are_uniform():
     assert farthest_from_uniform([p.pose.y_mm for p in drawn], -8, -6) < bound
 
 
-def test_a_rounded_draw_is_not_uniform_and_the_same_test_says_so():
-    """A yaw drawn as a whole number of radians takes 3 values of a half turn."""
-    whole = [int(np.random.default_rng(seed).integers(0, 3)) for seed in range(2000)]
-    assert farthest_from_uniform(whole, 0, math.pi) > 0.3
+def test_a_rounded_draw_is_not_uniform_by_the_same_test():
+    """A yaw drawn as an integer number of radians takes 3 values of a half turn."""
+    rounded = [int(np.random.default_rng(seed).integers(0, 3)) for seed in range(2000)]
+    assert farthest_from_uniform(rounded, 0, math.pi) > 0.3
 
 
 def test_yaw_stays_within_the_half_turn_and_draws_are_independent():
@@ -73,14 +73,14 @@ def test_a_plan_comes_from_straight_above_with_open_jaws():
         assert each.opening_mm == STROKE
 
 
-def test_fingers_do_not_reach_lower_than_they_are_long():
+def test_fingers_reach_at_most_reach_mm_below_the_top():
     tall = dataclasses.replace(FIT, height_mm=250.0)
     assert min(p.pose.z_mm for p in plans(200, fit=tall)) >= 250 - 110
 
 
 @pytest.mark.parametrize(("height", "expected"), [(10.0, 10.0), (20.0, 10.0), (25.0, 10.0)])
 def test_a_low_object_is_grasped_at_the_floor(height, expected):
-    """The authors' interval is upside down below 25 mm: its lower end lies above its upper one."""
+    """The authors' interval is inverted below 25 mm: its lower end lies above its upper end."""
     low = dataclasses.replace(FIT, height_mm=height)
     assert {p.pose.z_mm for p in plans(20, fit=low)} == {expected}
 
@@ -91,16 +91,24 @@ def test_the_floor_of_the_workspace_counts_as_well():
 
 
 REFUSED = {
-    "lower than the fingers reach": ({"height_mm": 9.9}, {}, "10 mm high, and the fingers reach no lower than 10 mm"),
-    "wider than the stroke": ({"radius_mm": 50.1}, {}, "wider than the stroke: .* must open 110 mm, and they open 110"),
+    "lower than the fingers reach": (
+        {"height_mm": 9.9},
+        {},
+        "10 mm high, but the lowest height of the fingers is 10 mm",
+    ),
+    "wider than the stroke": (
+        {"radius_mm": 50.1},
+        {},
+        "wider than the stroke: .* must open 110 mm, but they open only 110",
+    ),
     "a smaller stroke": ({}, {"stroke": 60.0}, "wider than the stroke"),
-    "beside the workspace": ({"x_mm": 152.0}, {}, "out of the workspace"),
+    "outside the workspace": ({"x_mm": 152.0}, {}, "out of the workspace"),
     "too high for the arm": ({"height_mm": 495.0}, {}, "too high: 495 mm, and the arm rises to 500 mm"),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_grasped_is_refused_with_the_reason(case):
+def test_an_impossible_grasp_is_refused_with_the_reason(case):
     fit, options, reason = REFUSED[case]
     with pytest.raises(PlanError, match=reason):
         plan(fit=dataclasses.replace(FIT, **fit), **options)
@@ -116,7 +124,7 @@ def test_a_long_box_is_refused_along_its_length_and_grasped_across():
     assert all(abs(yaw - math.pi / 2) < 1.3 for yaw in yaws)  # across it is pi / 2
 
 
-def test_a_refused_plan_does_not_change_what_the_next_draws():
+def test_a_refused_plan_draws_as_many_numbers_as_any_other():
     rng, other = np.random.default_rng(0), np.random.default_rng(0)
     with pytest.raises(PlanError):
         plan_grasp(FIT, GraspSettings(), WORKSPACE, 10.0, rng)
@@ -143,18 +151,18 @@ def test_a_setting_out_of_range_is_refused(name, value):
 
 def test_settings_come_from_plain_values():
     assert build(GraspSettings, {"force_n": [6, 7], "jitter_mm": 2}) == GraspSettings((6, 7), jitter_mm=2)
-    with pytest.raises(RobotConfigError, match="no setting 'jitter'; it knows clearance_mm, finger_mm"):
+    with pytest.raises(RobotConfigError, match="no setting 'jitter'; known settings: clearance_mm, finger_mm"):
         build(GraspSettings, {"jitter": 3})
-    for wrong, said in (
+    for wrong, message in (
         ({"force_n": [1, 2, 3]}, "force_n must be a list of length 2"),
         ({"force_n": ["a", "b"]}, r"force_n\[0\] must be a number, got 'a'"),
         ({"lift_mm": "high"}, "lift_mm must be a number"),
     ):
-        with pytest.raises(RobotConfigError, match=said):
+        with pytest.raises(RobotConfigError, match=message):
             build(GraspSettings, wrong)
 
 
-def test_forces_that_the_gripper_cannot_give_are_refused_before_anything_moves():
+def test_forces_outside_the_grippers_range_are_refused_before_any_motion():
     arm, gripper = FakeArm(FakeRigState(0)), FakeGripper(FakeRigState(0))
     GraspSettings().check(arm, gripper)
     for force in ((4.0, 25.0), (5.0, 81.0)):

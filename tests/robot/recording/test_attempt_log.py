@@ -1,4 +1,4 @@
-"""attempts.jsonl: what counts of it after a crash, and acceptance by object."""
+"""attempts.jsonl: its valid lines after a crash, and acceptance by object."""
 
 import json
 
@@ -23,7 +23,7 @@ def write(folder, attempts=ALL, grasps=GRASPS):
     return folder / "attempts.jsonl"
 
 
-def test_what_is_appended_is_read(tmp_path):
+def test_appended_attempts_are_read_back(tmp_path):
     path = write(tmp_path)
     assert read_attempts(tmp_path, GRASPS) == list(ALL)
     rows = [json.loads(line) for line in path.read_text().splitlines()]
@@ -37,7 +37,7 @@ def test_what_is_appended_is_read(tmp_path):
     }
 
 
-def test_an_ungraspable_object_is_in_the_log_and_named_in_the_table_but_was_not_attempted(tmp_path):
+def test_an_ungraspable_object_is_in_the_log_and_the_table_without_attempts(tmp_path):
     ball = LoggedAttempt("ball", 0, "ungraspable", False, 31.0, reason="wider than the gripper opens")
     write(tmp_path, (*ALL, ball))
     tallies = list(tally(read_attempts(tmp_path, GRASPS)).values())
@@ -63,7 +63,7 @@ def test_a_log_is_continued(tmp_path):
     assert (other / "attempts.jsonl").read_bytes() == whole
 
 
-def test_half_a_last_line_does_not_count_wherever_it_was_cut(tmp_path):
+def test_an_incomplete_last_line_is_ignored_wherever_it_was_cut(tmp_path):
     path = write(tmp_path)
     whole = path.read_bytes()
     last = whole.rindex(b"\n", 0, -1) + 1
@@ -75,7 +75,7 @@ def test_half_a_last_line_does_not_count_wherever_it_was_cut(tmp_path):
         assert path.read_bytes() == whole
 
 
-def test_a_last_line_whose_grasp_was_never_appended_does_not_count(tmp_path):
+def test_a_last_line_whose_grasp_was_never_appended_is_ignored(tmp_path):
     path = write(tmp_path)
     whole = path.read_bytes()
     assert read_attempts(tmp_path, GRASPS - {"cup-0000"}) == list(ALL[:3])
@@ -116,14 +116,14 @@ def test_a_damaged_line_is_named(tmp_path, line):
         read_attempts(tmp_path, GRASPS)
 
 
-def test_an_attempt_that_is_there_twice_is_damage(tmp_path):
+def test_a_repeated_attempt_is_damage(tmp_path):
     path = write(tmp_path)
     path.write_bytes(path.read_bytes() + path.read_bytes().splitlines(keepends=True)[1])
-    with pytest.raises(RecordingError, match="line 5: attempts must be in order and there once, so that number 3 is"):
+    with pytest.raises(RecordingError, match="line 5: attempts must be numbered in order, the next of mug is 3, got 1"):
         read_attempts(tmp_path, GRASPS)
 
 
-def test_a_full_disk_leaves_whole_lines(tmp_path):
+def test_a_full_disk_leaves_complete_lines(tmp_path):
     path = write(tmp_path, ALL[:2])
     whole = path.read_bytes()
     with AttemptLog(tmp_path, GRASPS) as log:
@@ -136,7 +136,7 @@ def test_a_full_disk_leaves_whole_lines(tmp_path):
     assert read_attempts(tmp_path, GRASPS) == list(ALL[:3])
 
 
-def test_there_may_be_no_log(tmp_path):
+def test_a_missing_log_has_no_attempts(tmp_path):
     assert read_attempts(tmp_path, GRASPS) == []
 
 
@@ -151,7 +151,7 @@ def test_attempts_are_counted_by_object():
     assert (cup.attempts, cup.accepted) == (1, 1)
 
 
-def test_the_table_has_a_line_an_object_and_says_who_was_given_up():
+def test_the_table_has_a_line_for_each_object_and_marks_missing_grasps():
     assert acceptance_table(list(tally(ALL).values()), grasps_wanted=1).splitlines() == [
         "object     accepted  of  held  missed  slipped  no_plan",
         "mug               1   3     1       1        0        1",

@@ -1,4 +1,4 @@
-"""What a recording holds after a failure at any step of writing it: whole grasps, and the writer goes on."""
+"""A failure at any step of writing leaves complete grasps, and the writer can continue."""
 
 import builtins
 import contextlib
@@ -17,7 +17,7 @@ from tests.robot.recording.test_recording import INFO, ids, pictures, two_grasps
 
 
 class Failing:
-    """Counts the calls that touch the disk and raises at one of them, for the whole of a `with`."""
+    """Counts the disk calls inside a `with` block and raises at one of them."""
 
     def __init__(self, monkeypatch, error, at=None):
         self.monkeypatch, self.error, self.at, self.count = monkeypatch, error, at, 0
@@ -44,7 +44,7 @@ class Failing:
 STEPS = 3 * 3 + 2 + 1  # open, fsync, replace of three images; open and fsync of their folder; fsync of the line
 
 
-def test_the_steps_of_an_append_are_all_tried_below(tmp_path, monkeypatch):
+def test_the_number_of_steps_of_an_append(tmp_path, monkeypatch):
     with RecordingWriter(tmp_path, INFO) as writer, Failing(monkeypatch, None) as steps:
         writer.append("1", "mug", pictures())
     assert steps.count == STEPS
@@ -52,7 +52,7 @@ def test_the_steps_of_an_append_are_all_tried_below(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()], ids=["full", "stop"])
 @pytest.mark.parametrize("step", range(1, STEPS + 1))
-def test_a_failure_at_any_step_leaves_a_whole_recording_and_the_writer_goes_on(tmp_path, monkeypatch, step, error):
+def test_a_failure_at_any_step_leaves_a_complete_recording_and_the_writer_continues(tmp_path, monkeypatch, step, error):
     two_grasps(tmp_path)
     before = (tmp_path / "metadata.jsonl").read_bytes()
     with RecordingWriter(tmp_path, INFO) as writer:
@@ -67,7 +67,7 @@ def test_a_failure_at_any_step_leaves_a_whole_recording_and_the_writer_goes_on(t
 
 
 class FullDisk:
-    """A raw file that takes `room` more bytes and then fails."""
+    """A raw file that accepts `room` more bytes and then fails."""
 
     def __init__(self, file, room):
         self.file, self.room = file, room
@@ -78,54 +78,54 @@ class FullDisk:
     def write(self, data):
         if self.room == 0:
             raise OSError(28, "No space left on device")
-        taken = self.file.write(data[: self.room])
-        self.room -= taken
-        return taken
+        count = self.file.write(data[: self.room])
+        self.room -= count
+        return count
 
 
 @pytest.mark.parametrize("room", [0, 1, 40])
 @pytest.mark.parametrize("truncates", [True, False])
-def test_a_line_that_fits_in_half_leaves_no_half(tmp_path, room, truncates):
+def test_a_partially_written_line_is_removed(tmp_path, room, truncates):
     two_grasps(tmp_path)
     with RecordingWriter(tmp_path, INFO) as writer:
-        whole = writer._file
-        writer._file = FullDisk(whole, room)
+        real = writer._file
+        writer._file = FullDisk(real, room)
         if not truncates:
             writer._file.truncate = lambda size: (_ for _ in ()).throw(OSError(5, "Input/output error"))
         with pytest.raises(StorageError, match="could not be written: No space left on device"):
             writer.append("3", "cup", pictures())
         assert ids(tmp_path) == ["1", "2"]
-        writer._file = whole
+        writer._file = real
         writer.append("3", "cup", pictures())
     assert ids(tmp_path) == ["1", "2", "3"]
 
 
-def test_a_line_written_in_pieces_is_whole(tmp_path):
+def test_a_line_written_in_pieces_is_complete(tmp_path):
     with RecordingWriter(tmp_path, INFO) as writer:
-        whole = writer._file
-        writer._file = FullDisk(whole, 10**6)
-        writer._file.write = lambda data: whole.write(data[:7])
+        real = writer._file
+        writer._file = FullDisk(real, 10**6)
+        writer._file.write = lambda data: real.write(data[:7])
         writer.append("1", "mug", pictures())
     assert ids(tmp_path) == ["1"]
 
 
 def test_the_images_are_on_disk_before_the_line(tmp_path, monkeypatch):
-    seen = []
+    are_on_disk = []
     write_line = RecordingWriter._write_line
 
-    def looked(self, line):
-        seen.append(
+    def checked(self, line):
+        are_on_disk.append(
             all((tmp_path / path).is_file() for path in RecordedGrasp.from_row(json.loads(line)).images().values())
         )
         write_line(self, line)
 
-    monkeypatch.setattr(RecordingWriter, "_write_line", looked)
+    monkeypatch.setattr(RecordingWriter, "_write_line", checked)
     two_grasps(tmp_path)
-    assert seen == [True, True]
+    assert are_on_disk == [True, True]
 
 
 @pytest.mark.parametrize("step", range(1, 7))
-def test_a_failure_while_a_recording_is_made_can_be_tried_again(tmp_path, monkeypatch, step):
+def test_a_recording_can_be_created_after_a_failure_at_any_step(tmp_path, monkeypatch, step):
     failing = Failing(monkeypatch, OSError(28, "No space left on device"), step)
     with contextlib.suppress(RobotError), failing:
         RecordingWriter(tmp_path / "r", INFO).close()
@@ -135,7 +135,7 @@ def test_a_failure_while_a_recording_is_made_can_be_tried_again(tmp_path, monkey
     assert ids(tmp_path / "r") == ["1"]
 
 
-def test_a_process_that_is_killed_leaves_whole_grasps(tmp_path):
+def test_a_killed_process_leaves_complete_grasps(tmp_path):
     code = (
         "import os, sys; import numpy as np; from robot.recording import folder as recording\n"
         "writer = recording.RecordingWriter(sys.argv[1], {'source': 'test', 'sensor': 'GelSight'})\n"
@@ -148,6 +148,6 @@ def test_a_process_that_is_killed_leaves_whole_grasps(tmp_path):
     done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "r")], check=False, cwd=root)
     assert done.returncode == 9
     assert ids(tmp_path / "r") == ["1"]
-    with RecordingWriter(tmp_path / "r", INFO) as writer:  # the lock went with the process
+    with RecordingWriter(tmp_path / "r", INFO) as writer:  # the lock ended with the process
         writer.append("2", "mug", pictures())
     assert ids(tmp_path / "r") == ["1", "2"]

@@ -1,4 +1,4 @@
-"""The recording on disk: what a reader accepts, and what a writer writes."""
+"""The recording on disk: valid input of the reader, and output of the writer."""
 
 import json
 import os
@@ -31,7 +31,7 @@ def pictures(seed=0):
 
 
 def write(folder, *lines, info=None):
-    """A recording with these lines, each a dict or the raw text."""
+    """Write a recording with these lines, each a dict or raw text, and return its folder."""
     folder.mkdir(exist_ok=True)
     (folder / "recording.json").write_text(json.dumps({"schema_version": 1, **INFO} if info is None else info))
     text = "".join((line if isinstance(line, str) else json.dumps(line)) + "\n" for line in lines)
@@ -53,7 +53,7 @@ def ids(folder):
 # Round trip ------------------------------------------------------------------------------------------------
 
 
-def test_what_was_appended_is_read_back(tmp_path):
+def test_appended_grasps_are_read_back(tmp_path):
     with RecordingWriter(tmp_path / "r", INFO) as writer:
         images = {**pictures(), "touch_a_before": pixels(7), "touch_b_after": pixels(8)}
         images["depth"] = np.array([[0, 1, 65535]], np.uint16)
@@ -91,7 +91,7 @@ def test_what_was_appended_is_read_back(tmp_path):
     assert hash(written) == hash(recording.grasps[0])
 
 
-def test_the_columns_have_the_documented_names_and_what_is_missing_is_left_out(tmp_path):
+def test_the_columns_have_the_documented_names_without_missing_values(tmp_path):
     with RecordingWriter(tmp_path, INFO) as writer:
         writer.append("1", "mug", {"photo": pixels(), "touch_a": pixels(), "touch_a_before": pixels()}, force_n=2)
     (line,) = (tmp_path / "metadata.jsonl").read_text().splitlines()
@@ -105,7 +105,7 @@ def test_the_columns_have_the_documented_names_and_what_is_missing_is_left_out(t
     }
 
 
-def test_pixels_come_back_with_red_first_and_depth_with_sixteen_bits(tmp_path):
+def test_pixels_are_read_back_in_rgb_and_depth_with_16_bits(tmp_path):
     depth = np.array([[0, 256, 65535]], np.uint16)
     with RecordingWriter(tmp_path, INFO) as writer:
         writer.append("1", "mug", {"photo": pixels(1), "touch_a": pixels(2)[:, ::-1], "depth": depth})
@@ -116,7 +116,7 @@ def test_pixels_come_back_with_red_first_and_depth_with_sixteen_bits(tmp_path):
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "images/1_depth.png"), cv2.IMREAD_UNCHANGED), depth)
 
 
-def test_files_and_their_bytes_are_copied_as_they_are(tmp_path):
+def test_files_and_bytes_are_copied_unchanged(tmp_path):
     jpeg, png = (cv2.imencode(kind, pixels())[1].tobytes() for kind in (".jpg", ".png"))
     (tmp_path / "x.data").write_bytes(jpeg)
     with RecordingWriter(tmp_path / "r", INFO) as writer:
@@ -126,7 +126,7 @@ def test_files_and_their_bytes_are_copied_as_they_are(tmp_path):
     assert (tmp_path / "r" / grasp.touches["a"]).read_bytes() == png
 
 
-def test_recording_json_has_defaults_and_keeps_other_keys(tmp_path):
+def test_recording_json_has_defaults_and_other_keys(tmp_path):
     RecordingWriter(tmp_path, {**INFO, "licence": "MIT"}).close()
     info = json.loads((tmp_path / "recording.json").read_text())
     assert info["schema_version"] == 1
@@ -170,7 +170,7 @@ BAD_LINES = {
     "[]": "one JSON object",
     '"x"': "one JSON object",
     "\udcff": "must be JSON in UTF-8",
-    json.dumps({**ROW, "grasp_id": "0"}): "'0' has a line already",
+    json.dumps({**ROW, "grasp_id": "0"}): "grasp_id must be unique, got '0' twice",
     json.dumps({**ROW, "object_id": None}): "object_id is missing",
     json.dumps({key: ROW[key] for key in ROW if key != "grasp_id"}): "grasp_id is missing",
     json.dumps({key: ROW[key] for key in ROW if key != "photo_file_name"}): "photo_file_name is missing",
@@ -214,19 +214,19 @@ def test_a_bad_line_is_named_by_its_number(tmp_path, line):
     assert caught.value.exit_code == 2
 
 
-def test_half_a_last_line_is_dropped_with_a_note_however_long_it_is(tmp_path):
+def test_an_incomplete_last_line_of_any_length_is_dropped_with_a_note(tmp_path):
     write(tmp_path, ROW)
     whole, line = (tmp_path / "metadata.jsonl").read_bytes(), json.dumps({**ROW, "grasp_id": "é"}).encode()
     for length in range(1, len(line)):
         (tmp_path / "metadata.jsonl").write_bytes(whole + line[:length])
         recording = read_recording(tmp_path)
         assert [grasp.grasp_id for grasp in recording.grasps] == ["1"]
-        assert f"half-written last line ({length} bytes)" in recording.notes[0]
-    (tmp_path / "metadata.jsonl").write_bytes(whole + b"\0" * 512)  # what some file systems leave
+        assert f"incomplete last line ({length} bytes)" in recording.notes[0]
+    (tmp_path / "metadata.jsonl").write_bytes(whole + b"\0" * 512)  # some file systems leave this
     assert ids(tmp_path) == ["1"]
 
 
-def test_half_a_line_that_is_not_the_last_is_an_error(tmp_path):
+def test_an_incomplete_line_before_the_last_is_an_error(tmp_path):
     write(tmp_path, json.dumps(ROW)[:30], {**ROW, "grasp_id": "2"})
     with pytest.raises(RecordingError, match="line 1: must be JSON"):
         read_recording(tmp_path)
@@ -235,7 +235,7 @@ def test_half_a_line_that_is_not_the_last_is_an_error(tmp_path):
 @pytest.mark.parametrize("version", [0, 2, "1", True, None, 1.0])
 def test_another_schema_version_names_the_known_ones(tmp_path, version):
     write(tmp_path, ROW, info={**INFO, "schema_version": version})
-    with pytest.raises(RecordingError, match=r"recording\.json: schema_version must be one .*\(1\), got"):
+    with pytest.raises(RecordingError, match=r"recording\.json: schema_version must be a supported one \(1\), got"):
         read_recording(tmp_path)
 
 
@@ -246,7 +246,7 @@ def test_a_bad_recording_json_is_an_error_that_names_it(tmp_path, text):
         read_recording(tmp_path)
 
 
-def test_a_folder_that_is_no_recording_is_told_and_what_makes_one(tmp_path):
+def test_the_error_for_another_folder_names_the_import_command(tmp_path):
     for folder in (tmp_path, tmp_path / "none"):
         with pytest.raises(RecordingError, match="`retrieve import` writes recordings"):
             read_recording(folder)
@@ -266,7 +266,7 @@ def test_reading_opens_no_image_and_imports_no_opencv(tmp_path):
 # Writing ---------------------------------------------------------------------------------------------------
 
 
-def test_a_writer_goes_on_where_the_last_one_stopped(tmp_path):
+def test_a_writer_continues_an_existing_recording(tmp_path):
     two_grasps(tmp_path)
     with RecordingWriter(tmp_path, {**INFO, "seed": 9}) as writer:
         assert set(writer.grasp_ids) == {"1", "2"}
@@ -275,7 +275,7 @@ def test_a_writer_goes_on_where_the_last_one_stopped(tmp_path):
     assert ids(tmp_path) == ["1", "2", "3"]
 
 
-def test_a_torn_last_line_is_cut_off_when_the_recording_is_opened_again(tmp_path):
+def test_an_incomplete_last_line_is_removed_when_the_recording_is_opened_again(tmp_path):
     two_grasps(tmp_path)
     with open(tmp_path / "metadata.jsonl", "ab") as file:
         file.write(b'{"grasp_id": "3", "obj')
@@ -286,7 +286,7 @@ def test_a_torn_last_line_is_cut_off_when_the_recording_is_opened_again(tmp_path
     assert (tmp_path / "metadata.jsonl").read_bytes().count(b"\n") == 3
 
 
-def test_a_last_line_that_only_lacks_its_newline_is_kept(tmp_path):
+def test_a_last_line_that_lacks_only_its_newline_is_valid(tmp_path):
     path = two_grasps(tmp_path) / "metadata.jsonl"
     path.write_bytes(path.read_bytes().rstrip(b"\n"))
     with RecordingWriter(tmp_path, INFO) as writer:
@@ -295,7 +295,7 @@ def test_a_last_line_that_only_lacks_its_newline_is_kept(tmp_path):
 
 
 @pytest.mark.parametrize("key", ["source", "sensor", "units", "background"])
-def test_a_recording_of_another_kind_is_not_gone_on_with(tmp_path, key):
+def test_a_recording_with_another_fixed_value_is_not_continued(tmp_path, key):
     two_grasps(tmp_path)
     other = {"x": "y"} if key == "units" else "other"
     with pytest.raises(RecordingError, match=f"was recorded with {key} .* give another folder"):
@@ -303,7 +303,7 @@ def test_a_recording_of_another_kind_is_not_gone_on_with(tmp_path, key):
     assert ids(tmp_path) == ["1", "2"]
 
 
-def test_two_writers_do_not_write_one_recording(tmp_path):
+def test_a_second_writer_of_a_recording_is_refused(tmp_path):
     with (
         RecordingWriter(tmp_path, INFO) as first,
         pytest.raises(StorageError, match="being written by another process") as caught,
@@ -316,7 +316,7 @@ def test_two_writers_do_not_write_one_recording(tmp_path):
 
 def test_a_folder_of_other_files_is_not_written_to(tmp_path):
     (tmp_path / "thesis.tex").write_text("x")
-    with pytest.raises(RecordingError, match=r"holds other files, such as thesis\.tex"):
+    with pytest.raises(RecordingError, match=r"contains other files, such as thesis\.tex"):
         RecordingWriter(tmp_path, INFO)
     with pytest.raises(RecordingError, match="is a file"):
         RecordingWriter(tmp_path / "thesis.tex", INFO)
@@ -334,12 +334,12 @@ def test_grasps_without_their_recording_json_are_not_overwritten(tmp_path):
     [
         ({"source": "x"}, "sensor must be"),
         ({"sensor": "x"}, "source must be"),
-        ({**INFO, "rig": object()}, "must hold plain JSON"),
-        ({**INFO, "rig": float("nan")}, "must hold plain JSON"),
+        ({**INFO, "rig": object()}, "must contain plain JSON"),
+        ({**INFO, "rig": float("nan")}, "must contain plain JSON"),
         ({**INFO, "schema_version": 2}, "schema_version"),
     ],
 )
-def test_bad_info_is_refused_before_anything_is_made(tmp_path, info, reason):
+def test_bad_info_is_refused_before_a_folder_is_made(tmp_path, info, reason):
     with pytest.raises(RecordingError, match=reason):
         RecordingWriter(tmp_path / "r", info)
     assert not (tmp_path / "r").exists()
@@ -363,7 +363,7 @@ BAD_IMAGES = {
     ),
     "no file": ({"photo": "/nowhere/x.png", "touch_a": pixels()}, "photo: /nowhere/x.png cannot be read"),
     "no such name": ({"photo": "a\0b.png", "touch_a": pixels()}, "cannot be read: embedded null byte"),
-    "of Pillow": (
+    "a Pillow image": (
         {"photo": Image.new("RGB", (2, 2)), "touch_a": pixels()},
         "the path of a PNG or JPEG file; got Image",
     ),
@@ -383,16 +383,16 @@ def test_bad_images_are_refused_before_anything_is_written(tmp_path, name):
     assert ids(tmp_path) == []
 
 
-def test_a_shared_image_is_stored_once_and_the_first_of_its_name_wins(tmp_path):
-    for number in (1, 2):  # another writer goes on with it
+def test_a_shared_image_is_stored_once_and_later_ones_of_its_name_are_ignored(tmp_path):
+    for number in (1, 2):  # the second writer continues the recording
         with RecordingWriter(tmp_path / "recording", INFO) as writer:
             writer.append(
                 str(number), "mug", {**pictures(), "touch_a_before": SharedImage("rest", pixels(10 * number))}
             )
     grasps = read_recording(tmp_path / "recording").grasps
     assert {grasp.touches_before["a"] for grasp in grasps} == {"images/rest_shared.png"}
-    kept = cv2.imread(str(tmp_path / "recording/images/rest_shared.png"))[..., ::-1]
-    np.testing.assert_array_equal(kept, pixels(10))
+    stored = cv2.imread(str(tmp_path / "recording/images/rest_shared.png"))[..., ::-1]
+    np.testing.assert_array_equal(stored, pixels(10))
 
 
 @pytest.mark.parametrize("name", ["", "../rest", "a/b", ".rest", "a" * 200])
@@ -401,12 +401,12 @@ def test_the_name_of_a_shared_image_must_be_safe_in_a_file_name(tmp_path, name):
         writer.append("1", "mug", {**pictures(), "touch_a_before": SharedImage(name, pixels())})
 
 
-def test_a_writer_says_more_in_recording_json_but_not_what_grasps_are_held_to(tmp_path):
+def test_a_writer_updates_recording_json_except_its_fixed_values(tmp_path):
     with RecordingWriter(tmp_path / "recording", INFO) as writer:
         writer.update_info(skipped={"it is dark": 2})
-        with pytest.raises(RecordingError, match="sensor of a recording stays as it is"):
+        with pytest.raises(RecordingError, match="sensor of an existing recording cannot be changed"):
             writer.update_info(sensor="DIGIT")
-        with pytest.raises(RecordingError, match="must hold plain JSON"):
+        with pytest.raises(RecordingError, match="must contain plain JSON"):
             writer.update_info(skipped={1j})
     info = read_recording(tmp_path / "recording").info
     assert (info["skipped"], info["sensor"], info["seed"]) == ({"it is dark": 2}, "GelSight", 3)
@@ -421,7 +421,7 @@ def test_a_grasp_id_must_be_safe_in_a_file_name(tmp_path, grasp_id):
 def test_a_grasp_is_not_appended_twice_nor_to_a_closed_writer(tmp_path):
     with RecordingWriter(tmp_path, INFO) as writer:
         writer.append("1", "mug", pictures())
-        with pytest.raises(RecordingError, match="has grasp 1 already"):
+        with pytest.raises(RecordingError, match="already contains grasp 1"):
             writer.append("1", "mug", pictures())
         with pytest.raises(RecordingError, match="force_n must be a finite number, got nan"):
             writer.append("2", "mug", pictures(), force_n=float("nan"))
@@ -431,16 +431,16 @@ def test_a_grasp_is_not_appended_twice_nor_to_a_closed_writer(tmp_path):
     assert ids(tmp_path) == ["1"]
 
 
-def test_keys_that_other_tools_keep_in_a_line_are_passed_over_with_a_note(tmp_path: Path) -> None:
+def test_keys_of_other_tools_are_ignored_with_a_note(tmp_path: Path) -> None:
     (tmp_path / "recording.json").write_text(json.dumps({"schema_version": 1, "source": "x", "sensor": "y"}))
     (tmp_path / "metadata.jsonl").write_text(json.dumps({**ROW, "text": "a red mug"}) + "\n")
     recording = read_recording(tmp_path)
     assert len(recording.grasps) == 1
-    assert "passed over keys that are not of the format: text" in recording.notes[0]
+    assert "ignored keys that the format does not define: text" in recording.notes[0]
 
 
 @pytest.mark.parametrize("name", ["recording.json", "metadata.jsonl"])
-def test_what_is_no_file_is_refused_without_being_read_or_written(tmp_path, name):
+def test_a_path_that_is_not_a_file_is_refused_without_being_read_or_written(tmp_path, name):
     write(tmp_path, ROW)
     path = tmp_path / name
     path.unlink()
@@ -453,14 +453,14 @@ def test_what_is_no_file_is_refused_without_being_read_or_written(tmp_path, name
         path.rmdir() if path.is_dir() else path.unlink()
 
 
-def test_a_pipe_where_the_lines_are_to_stand_is_refused(tmp_path):
+def test_a_pipe_in_place_of_metadata_jsonl_is_refused(tmp_path):
     os.mkfifo(tmp_path / "metadata.jsonl")
     with pytest.raises(StorageError, match="is a pipe, not a regular file"):
         RecordingWriter(tmp_path, INFO)
     assert [path.name for path in tmp_path.iterdir() if path.suffix == ".json"] == []
 
 
-def test_a_picture_that_is_no_file_is_refused_without_being_read(tmp_path):
+def test_a_picture_that_is_not_a_file_is_refused_without_being_read(tmp_path):
     os.mkfifo(tmp_path / "pipe.png")
     with (
         RecordingWriter(tmp_path / "r", INFO) as writer,

@@ -1,4 +1,4 @@
-"""Stiff and extreme inputs of what a rig sees and does."""
+"""Extreme inputs of object localisation, depth conversion and the gate."""
 
 import math
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ _ROWS, _COLUMNS = 212, 256
 
 
 def hard_cases() -> Iterator[HardCase]:
-    """Cases of the rig, in a few seconds."""
+    """Yield the cases of the rig, in a few seconds."""
     yield _outliers()
     yield _short_arc()
     yield _straight_line()
@@ -33,11 +33,11 @@ def hard_cases() -> Iterator[HardCase]:
     yield _gel_of_another_shade()
 
 
-# What is seen ------------------------------------------------------------------------------------------------
+# Pictures ----------------------------------------------------------------------------------------------------
 
 
 def _pose() -> Array:
-    """(4, 4): a camera 600 mm up and 600 mm in front, looking at the origin."""
+    """Return the (4, 4) pose of a camera 600 mm up and 600 mm in front of the origin, towards which it points."""
     forward = np.array([0.0, 1.0, -1.0]) / math.sqrt(2.0)
     right = np.array([1.0, 0.0, 0.0])
     pose = np.eye(4)
@@ -47,24 +47,24 @@ def _pose() -> Array:
 
 
 def _directions() -> Array:
-    """(rows, columns, 3) of the rig's frame, for a depth of 1."""
+    """Return the (rows, columns, 3) rays in the rig's frame, at depth 1."""
     v, u = np.indices((_ROWS, _COLUMNS), dtype=np.float64)
     local = np.stack([(u - _LENS.cx) / _LENS.fx, (v - _LENS.cy) / _LENS.fy, np.ones_like(u)], axis=-1)
     return np.asarray(local @ _pose()[:3, :3].T)
 
 
 def _exact_depth() -> Array:
-    """(rows, columns) depth in mm of a can on a table, in closed form."""
-    start, way = _pose()[:3, 3], _directions()
-    square = (way[..., :2] ** 2).sum(-1)
-    middle = (way[..., :2] @ start[:2]) / square
+    """Return the (rows, columns) depth in mm of a can on a table, in closed form."""
+    start, ray = _pose()[:3, 3], _directions()
+    square = (ray[..., :2] ** 2).sum(-1)
+    middle = (ray[..., :2] @ start[:2]) / square
     root = middle**2 - (start[:2] @ start[:2] - _RADIUS**2) / square
     side = -middle - np.sqrt(np.where(root > 0, root, np.nan))
-    z = start[2] + side * way[..., 2]
+    z = start[2] + side * ray[..., 2]
     side[~((z >= 0) & (z <= _HEIGHT))] = np.inf
-    top = (_HEIGHT - start[2]) / way[..., 2]
-    top[~(np.hypot(*np.moveaxis(start + top[..., None] * way, -1, 0)[:2]) <= _RADIUS)] = np.inf
-    return np.asarray(np.minimum(np.minimum(side, top), -start[2] / way[..., 2]))
+    top = (_HEIGHT - start[2]) / ray[..., 2]
+    top[~(np.hypot(*np.moveaxis(start + top[..., None] * ray, -1, 0)[:2]) <= _RADIUS)] = np.inf
+    return np.asarray(np.minimum(np.minimum(side, top), -start[2] / ray[..., 2]))
 
 
 def _picture(depth_mm: Array) -> RGBD:
@@ -73,14 +73,14 @@ def _picture(depth_mm: Array) -> RGBD:
 
 
 def _points(image: RGBD) -> Array:
-    """(N, 3) of all pixels with a number for a depth, the table's left out."""
+    """Return the (N, 3) points of all pixels with finite depth above the table."""
     assert image.depth_m is not None
     points = _pose()[:3, 3] + image.depth_m[..., None] * 1000.0 * _directions()
     return np.asarray(points[np.isfinite(image.depth_m) & (points[..., 2] > 20.0)])
 
 
 def naive_circle(plan: Array) -> tuple[float, float, float]:
-    """x, y, radius of the circle through points (N, 2) by linear least squares on x^2 + y^2 (Kasa 1976)."""
+    """Return x, y, radius of the circle through points (N, 2) by least squares on x^2 + y^2 (Kasa 1976)."""
     x, y = plan.T
     design = np.c_[2.0 * x, 2.0 * y, np.ones(len(plan))]
     a, b, c = np.linalg.lstsq(design, x**2 + y**2, rcond=None)[0]
@@ -91,7 +91,7 @@ def naive_circle(plan: Array) -> tuple[float, float, float]:
 
 
 def _outliers() -> HardCase:
-    """Noise of 3 mm, and a tenth of the pixels anywhere up to 200 mm off."""
+    """Noise of 3 mm, and 10 % of the pixels with errors of up to 200 mm."""
     rng = np.random.default_rng([31])
     depth = _exact_depth() + rng.normal(0, 3, (_ROWS, _COLUMNS))
     depth += np.where(rng.random(depth.shape) < 0.1, rng.uniform(-200, 200, depth.shape), 0)
@@ -104,39 +104,39 @@ def _outliers() -> HardCase:
 
 
 def _short_arc() -> HardCase:
-    """A side of 90 degrees and 3 mm of noise: linear least squares makes the circle too small."""
+    """A side of 90 degrees with 3 mm of noise: linear least squares gives too small a circle."""
     rng = np.random.default_rng([32])
     angle = rng.uniform(-0.75 * math.pi, -0.25 * math.pi, 400)
     plan = _RADIUS * np.stack([np.cos(angle), np.sin(angle)], axis=1) + rng.normal(0, 3, (400, 2))
     circle = fit_circle(plan, 3.0, np.array([0.0, 1.0]), 150.0)
     off = [naive_circle(plan)[2] - _RADIUS, (math.nan if circle is None else circle.radius) - _RADIUS]
     naive, ours = (f"radius off by {error:+.1f} mm" for error in off)
-    case, wanted = "an arc of 90 degrees, 3 mm of noise", "radius within 2.5 mm"
-    return HardCase(_CYLINDER, case, wanted, naive, ours, abs(off[1]) < 2.5, abs(off[0]) < 2.5)
+    case, required = "an arc of 90 degrees, 3 mm of noise", "radius within 2.5 mm"
+    return HardCase(_CYLINDER, case, required, naive, ours, abs(off[1]) < 2.5, abs(off[0]) < 2.5)
 
 
 def _straight_line() -> HardCase:
-    """The face of a box: no circle of its size."""
+    """Points on the face of a box, where no circle of its size exists."""
     plan = np.stack([np.linspace(-40, 40, 81), np.zeros(81)], axis=1)
     radius = naive_circle(plan)[2]
     circle = fit_circle(plan, 1.0, np.array([0.0, 1.0]), 150.0)
-    said = "none" if circle is None else f"radius {circle.radius:g} mm"
-    wanted = "no circle"
+    ours = "none" if circle is None else f"radius {circle.radius:g} mm"
+    required = "no circle"
     return HardCase(
-        _CYLINDER, "points in a line", wanted, f"radius {radius:.3g} mm", said, circle is None, not radius < 150
+        _CYLINDER, "points in a line", required, f"radius {radius:.3g} mm", ours, circle is None, not radius < 150
     )
 
 
 def _unknown_depth() -> HardCase:
-    """Sensors write 0 where they see nothing, here for a pixel in ten: the place of the camera."""
+    """Unknown depth written as 0, as sensors do, for one pixel in ten: the position of the camera."""
     depth = _exact_depth()
     depth[np.random.default_rng([33]).random(depth.shape) < 0.1] = 0.0
     image = _picture(depth)
     naive, ours = float(_points(image)[:, 2].max()), fit_cylinder(image, _pose()).height_mm
     right = [abs(height - _HEIGHT) < 2 for height in (naive, ours)]
-    words, said = (f"{height:.0f} mm high" for height in (naive, ours))
-    wanted = f"{_HEIGHT:.0f} mm high"
-    return HardCase(_CYLINDER, "unknown depth written as 0", wanted, words, said, right[1], right[0])
+    naive_text, text = (f"{height:.0f} mm high" for height in (naive, ours))
+    required = f"{_HEIGHT:.0f} mm high"
+    return HardCase(_CYLINDER, "unknown depth written as 0", required, naive_text, text, right[1], right[0])
 
 
 def _nothing_but_nan() -> HardCase:
@@ -147,7 +147,7 @@ def _nothing_but_nan() -> HardCase:
 
 
 def _crowded_table() -> HardCase:
-    """A plate 30 mm high covers two fifths of what is seen, on one side: the table is level all the same."""
+    """A plate 30 mm high covers two fifths of the picture, on one side of a level table."""
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 900.0
     depth = np.full((_ROWS, _COLUMNS), 900.0) + np.random.default_rng([34]).normal(0, 1, (_ROWS, _COLUMNS))
@@ -159,29 +159,29 @@ def _crowded_table() -> HardCase:
     naive = np.linalg.lstsq(np.c_[points[:, :2], np.ones(len(points))], points[:, 2], rcond=None)[0]
     table = find_table(depth.astype(np.float32), rays)
     slopes = [math.degrees(math.hypot(*plane)) for plane in (naive[:2], (table.a, table.b))]
-    words, said = (f"{slope:.2f} degrees steep" for slope in slopes)
-    case, wanted = "a plate over 2/5 of the table", "level to 0.1 degrees"
-    return HardCase("table fit", case, wanted, words, said, slopes[1] < 0.1, slopes[0] < 0.1)
+    naive_text, text = (f"{slope:.2f} degrees steep" for slope in slopes)
+    case, required = "a plate over 2/5 of the table", "level to 0.1 degrees"
+    return HardCase("table fit", case, required, naive_text, text, slopes[1] < 0.1, slopes[0] < 0.1)
 
 
-# Whole numbers ---------------------------------------------------------------------------------------------
+# Integers --------------------------------------------------------------------------------------------------
 
 
 def _depth_as_millimetres() -> HardCase:
-    """NaN, infinity, behind the camera, 70 m, and half a metre: only the last is a depth of 16 bits."""
+    """NaN, infinity, behind the camera, 70 m, and half a metre: only the last is a valid 16-bit depth."""
     depth = np.array([[np.nan, np.inf, -1.0, 70.0, 0.5]], np.float32)
     with np.errstate(invalid="ignore"):
         naive = (depth * 1000).astype(np.int64).astype(np.uint16)[0].tolist()
-    ours, must = depth_in_mm(depth)[0].tolist(), [0, 0, 0, 0, 500]
+    ours, expected = depth_in_mm(depth)[0].tolist(), [0, 0, 0, 0, 500]
     case = "NaN, infinity, -1 m, 70 m, 0.5 m as uint16"
-    return HardCase(_DEPTH, case, str(must), str(naive), str(ours), ours == must, naive == must)
+    return HardCase(_DEPTH, case, str(expected), str(naive), str(ours), ours == expected, naive == expected)
 
 
 def _gel_of_another_shade() -> HardCase:
-    """The gel one grey level darker, as lamps warm up: nothing touches it."""
+    """A gel without contact, one grey level darker as lamps warm up."""
     before, after = np.full((24, 32, 3), 101, np.uint8), np.full((24, 32, 3), 100, np.uint8)
     gate = ContactAreaGate()
     naive = float(((after - before) > gate.noise_levels).any(axis=2).mean())
     ours = gate.changed_fractions({"a": GraspFrames(before, after)})["a"]
-    words, said = (f"{100 * share:.0f} % of the gel" for share in (naive, ours))
-    return HardCase("contact gate", "one grey level darker", "0 % of the gel", words, said, ours == 0, naive == 0)
+    naive_text, text = (f"{100 * fraction:.0f} % of the gel" for fraction in (naive, ours))
+    return HardCase("contact gate", "one grey level darker", "0 % of the gel", naive_text, text, ours == 0, naive == 0)

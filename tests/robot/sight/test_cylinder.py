@@ -1,7 +1,7 @@
-"""Cylinders fitted to one-sided noisy depth pictures: where they are, and what is said when that is hard to tell.
+"""Cylinder fits to one-sided noisy depth pictures: their accuracy, and their notes in difficult cases.
 
-Truth is known: tests/views.py draws the pictures in closed form. Bounds on the centre's error are for 1.5 to 3 mm of
-noise at 0.9 m, with and without 10 % of outliers; the fit's own standard error must be of the errors' size.
+The truth is known: tests/views.py renders the pictures in closed form. Bounds of the centre's error are for 1.5 to 3 mm
+of noise at 0.9 m, with and without 10 % of outliers. The fit's standard error must have the size of the errors.
 """
 
 import math
@@ -32,10 +32,10 @@ def off_centre(fit):
 
 
 def naive_fit(image, pose):
-    """Least squares through everything 2 cm above the table, after the authors' recipe: percentiles, no robust loss.
+    """Fit all points 2 cm above the table after the authors' recipe: percentiles, no robust loss.
 
     Centre: median across the line of sight and 75th percentile along it; radius: root of the 95th percentile of
-    squared distances. Not a number where nothing is that high.
+    squared distances. NaN if there are no such points.
     """
     rows, columns = np.nonzero(np.isfinite(image.depth_m))
     depth = image.depth_m[rows, columns] * 1000.0
@@ -49,7 +49,7 @@ def naive_fit(image, pose):
     return x, y, math.sqrt(np.percentile((points[:, 0] - x) ** 2 + (points[:, 1] - y) ** 2, 95))
 
 
-# Cylinders that stand, after the table in the notes ----------------------------------------------------------
+# Upright cylinders -------------------------------------------------------------------------------------------
 
 STANDING = {
     "R33 h120": (UprightCylinder(33, 120, X, Y), {}, 1.0),
@@ -78,12 +78,12 @@ def test_a_standing_cylinder_is_found(name):
 def test_the_naive_fit_fails_on_the_same_pictures():
     pose = views.camera_pose()
     clean = naive_fit(view(UprightCylinder(33, 120, X, Y)), pose)
-    assert math.hypot(clean[0] - X, clean[1] - Y) > 5  # the far side is not seen
+    assert math.hypot(clean[0] - X, clean[1] - Y) > 5  # the far side is invisible
     wild = naive_fit(view(UprightCylinder(33, 120, X, Y), **NOISY), pose)
     assert wild[2] > 33 + 50  # and outliers blow the radius up
 
 
-def test_the_fit_does_not_depend_on_when_it_is_made():
+def test_the_fit_is_deterministic():
     image = view(UprightCylinder(33, 120, X, Y), **NOISY)
     assert fit_cylinder(image, views.camera_pose()) == fit_cylinder(image, views.camera_pose())
 
@@ -100,10 +100,10 @@ def test_an_error_of_the_extrinsics_moves_the_fit_as_much():
 
 BOXES = {
     "a flat packet": DepthBlock(180, 50, 220, X, Y, 0.2),
-    "a packet seen from its side": DepthBlock(180, 50, 220, X, Y, 1.5),
+    "a packet viewed from its side": DepthBlock(180, 50, 220, X, Y, 1.5),
     "a cube on edge": DepthBlock(60, 60, 60, X, Y, math.pi / 4),
     "a box": DepthBlock(90, 50, 60, X, Y, 0.5),
-    "a box seen from its front": DepthBlock(90, 50, 60, X, Y, 0.0),
+    "a box viewed from its front": DepthBlock(90, 50, 60, X, Y, 0.0),
 }
 
 
@@ -122,7 +122,7 @@ def test_a_box_becomes_its_inscribed_cylinder(name, how):
 
 
 def test_without_a_bound_a_circle_through_a_plane_is_huge():
-    """Why the radius is bounded by twice the footprint."""
+    """This is the reason for the bound of twice the footprint."""
     rng = np.random.default_rng(0)
     face = np.c_[rng.uniform(-90, 90, 400), rng.normal(0, 1.5, 400)]
     assert fit_circle(face, 1.5, np.array([0.0, 1.0]), 1e9).radius > 500
@@ -132,7 +132,7 @@ def test_without_a_bound_a_circle_through_a_plane_is_huge():
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, 1.5])
 @pytest.mark.parametrize("how", [{}, NOISY])
-def test_a_lying_cylinder_is_told_from_a_standing_one_and_from_a_box(yaw, how):
+def test_a_lying_cylinder_is_not_confused_with_an_upright_one_or_a_box(yaw, how):
     for fit in fits(LyingCylinder(25, 120, X, Y, yaw), **how):
         assert fit.method == "lying"
         assert off_centre(fit) < 3.5
@@ -149,7 +149,7 @@ def test_a_ball_is_round():
         assert fit.is_round
 
 
-def test_too_few_points_on_the_side_end_in_the_enclosing_circle_and_a_note():
+def test_too_few_points_on_the_side_give_the_enclosing_circle_and_a_note():
     for fit in fits(UprightCylinder(25, 8, X, Y)):
         assert fit.method == "enclosing circle"
         assert off_centre(fit) < 4.0
@@ -157,27 +157,27 @@ def test_too_few_points_on_the_side_end_in_the_enclosing_circle_and_a_note():
         assert "points on its side: the smallest circle" in fit.notes[0]
 
 
-def test_a_short_arc_is_no_circle_and_the_error_says_so():
-    """Only a strip of the side has depth, 26 degrees of it, and nothing of the top."""
+def test_a_short_arc_gives_no_circle_and_a_large_error():
+    """Only a strip of 26 degrees of the side has depth, and nothing of the top."""
     image, pose = view(UprightCylinder(60, 150, X, Y)), views.camera_pose()
     height = image.depth_m * 1000 * Rays.from_image(image, pose).along(np.array([0.0, 0.0, 1.0])) + pose[2, 3]
     strip = np.zeros(image.depth_m.shape, bool)
     strip[:, 255:266] = True
     depth = np.where((height > 5) & ~(strip & (height < 140)), np.nan, image.depth_m).astype(np.float32)
-    plain = np.full_like(image.colour, 128)  # an outline is not to be had either
+    plain = np.full_like(image.colour, 128)  # no outline is visible either
     fit = fit_cylinder(RGBD(plain, depth, image.intrinsics, 0.0), pose)
     assert fit.method in ("box", "enclosing circle")
-    assert "its top is not seen" in fit.notes[0] or "the smallest circle" in fit.notes[0]
+    assert "its top is not visible" in fit.notes[0] or "the smallest circle" in fit.notes[0]
     assert fit.error_mm >= 3.0
 
 
-# Pictures that are hard --------------------------------------------------------------------------------------
+# Difficult pictures ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "solid", [UprightCylinder(33, 120, X, Y), UprightCylinder(20, 60, X, Y), UprightCylinder(45, 180, X, Y)]
 )
-def test_glass_is_placed_by_its_outline_in_the_colour_picture(solid):
+def test_glass_is_located_by_its_outline_in_the_colour_picture(solid):
     fit = fit_cylinder(view(missing=[solid]), views.camera_pose())
     assert fit.method == "silhouette"
     assert off_centre(fit) < 5.0
@@ -188,22 +188,22 @@ def test_glass_is_placed_by_its_outline_in_the_colour_picture(solid):
 
 
 def test_an_empty_table_is_a_clear_error():
-    with pytest.raises(PlanError, match="nothing stands on the table, by depth and by colour"):
+    with pytest.raises(PlanError, match="no object on the table in depth or colour"):
         fit_cylinder(view(outliers=0.1), views.camera_pose())
 
 
 def test_a_picture_without_depth_is_a_clear_error():
     image = view(UprightCylinder(33, 120))
-    with pytest.raises(PlanError, match="needs a picture with depth"):
+    with pytest.raises(PlanError, match="requires a picture with depth"):
         fit_cylinder(RGBD(image.colour, None, image.intrinsics, 0.0), views.camera_pose())
     blind = RGBD(image.colour, np.full_like(image.depth_m, np.nan), image.intrinsics, 0.0)
-    with pytest.raises(PlanError, match="neither depth nor colour shows the table"):
+    with pytest.raises(PlanError, match="the table is visible neither in depth nor in colour"):
         fit_cylinder(blind, views.camera_pose())
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, np.inf, -np.inf])
-def test_depths_that_are_none_are_unknown(value):
-    """The authors' Kinect says 0 where it knows nothing."""
+def test_invalid_depths_are_unknown(value):
+    """The authors' Kinect returns 0 for unknown depth."""
     image = view(UprightCylinder(33, 120, X, Y))
     holes = image.depth_m.copy()
     holes[np.random.default_rng(0).uniform(size=holes.shape) < 0.05] = value
@@ -213,7 +213,7 @@ def test_depths_that_are_none_are_unknown(value):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_calibration_that_is_not_finite_is_not_taken_for_an_empty_table(value):
+def test_a_calibration_that_is_not_finite_is_a_configuration_error(value):
     pose = views.camera_pose()
     pose[0, 3] = value
     with pytest.raises(RobotConfigError, match="extrinsics must be finite"):
@@ -237,33 +237,33 @@ def test_an_object_at_the_border_is_noted_or_refused():
     assert refused
 
 
-def test_what_stands_outside_the_region_is_not_looked_at():
+def test_objects_outside_the_region_are_ignored():
     region = Region((-100.0, -100.0, 0.0), (100.0, 100.0, 500.0))
     image = view(UprightCylinder(20, 80, X, Y), UprightCylinder(45, 200, 250, 0))
     assert off_centre(fit_cylinder(image, views.camera_pose(), region)) < 1.0
     assert fit_cylinder(image, views.camera_pose()).x_mm == pytest.approx(250, abs=2)
 
 
-def test_a_table_that_is_not_where_the_calibration_says_is_found_and_noted():
+def test_a_table_at_another_height_than_calibrated_is_found_and_noted():
     pose = views.camera_pose()
     pose[2, 3] += 20.0
     fit = fit_cylinder(view(UprightCylinder(33, 120, X, Y)), pose)
-    assert "the table is 20 mm high" in fit.notes[0]
+    assert "a table 20 mm high" in fit.notes[0]
     assert fit.height_mm == pytest.approx(120, abs=2)
 
 
-def test_a_table_that_is_hardly_seen_is_taken_from_the_calibration():
+def test_a_table_that_is_hardly_visible_is_taken_from_the_calibration():
     image, pose = view(UprightCylinder(60, 150, X, Y)), views.camera_pose()
     rays = Rays.from_image(image, pose)
     height = image.depth_m * 1000 * rays.along(np.array([0.0, 0.0, 1.0])) + pose[2, 3]
     depth = np.where(height < 45, np.nan, image.depth_m).astype(np.float32)
     fit = fit_cylinder(RGBD(image.colour, depth, image.intrinsics, 0.0), pose)
-    assert fit.notes[0].startswith("hardly any table is seen: z = 0")
+    assert fit.notes[0].startswith("too little of the table is visible: z = 0")
     assert off_centre(fit) < 1.0
 
 
 def test_a_fit_takes_milliseconds():
-    """No bound decides: the benchmark `cylinder` prints the time. This only keeps a mistake of 50 times out."""
+    """The loose bound detects only a slowdown of 50 times; the benchmark `cylinder` prints the time."""
     image, pose = view(UprightCylinder(33, 120, X, Y), **NOISY), views.camera_pose()
     start = time.process_time()
     fit_cylinder(image, pose)
@@ -274,16 +274,16 @@ def test_a_fit_takes_milliseconds():
 
 
 def width_by_points(fit, yaw, finger):
-    """Plain: the farthest point of the footprint, along the closing direction, within the finger's strip."""
+    """Return the width by search: the farthest point of the footprint within the finger's strip."""
     c, s = math.cos(yaw), math.sin(yaw)
-    most = 0.0
+    farthest = 0.0
     for u in np.linspace(-fit.half_mm[0], fit.half_mm[0], 401):
         for v in np.linspace(-fit.half_mm[1], fit.half_mm[1], 201):
             x = u * math.cos(fit.yaw_rad) - v * math.sin(fit.yaw_rad)
             y = u * math.sin(fit.yaw_rad) + v * math.cos(fit.yaw_rad)
             if abs(-s * x + c * y) <= finger / 2:
-                most = max(most, c * x + s * y)
-    return 2 * most
+                farthest = max(farthest, c * x + s * y)
+    return 2 * farthest
 
 
 @pytest.mark.parametrize("half_mm", [(75.0, 10.0), (10.0, 75.0)])
@@ -294,13 +294,15 @@ def test_the_width_of_a_box_is_its_extent_where_the_fingers_pass(yaw, half_mm):
 
 
 def test_fingers_that_pass_between_the_corners_meet_the_end_of_a_box():
-    """A box 20 mm long and 150 mm wide, closed on along its length by fingers of 25 mm: 20 mm. Turned by 0.2 rad the
-    strip leaves through the same end: 2 (10 + 12.5 sin 0.2) / cos 0.2."""
+    """The box is 20 mm long and 150 mm wide, the fingers 25 mm; along its length the width is 20 mm.
+
+    Rotated by 0.2 rad, the strip leaves through the same end: 2 (10 + 12.5 sin 0.2) / cos 0.2.
+    """
     fit = CylinderFit(0, 0, 100, 10, 1, "box", (10.0, 75.0))
     assert fit.width_mm(0.0, 25.0) == pytest.approx(20.0)
     assert fit.width_mm(0.2, 25.0) == pytest.approx(25.4736, abs=1e-3)
 
 
-def test_a_round_thing_is_as_wide_from_all_sides():
+def test_a_round_object_has_the_same_width_in_all_directions():
     fit = CylinderFit(0, 0, 100, 30, 1, "circle", (30.0, 30.0))
     assert {fit.width_mm(yaw, 25.0) for yaw in (0.0, 1.0, 2.0)} == {60.0}
