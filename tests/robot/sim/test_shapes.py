@@ -141,7 +141,7 @@ def test_instances_of_a_family_differ():
 @pytest.mark.parametrize("outline", [RoundedRectangle(20, 12, 5), RoundedRectangle(20, 12, 12), Polygon(5, 18, 4)])
 def test_arc_length_comes_back_from_its_point(outline):
     s = np.linspace(0, outline.length_mm, 400, endpoint=False) + 0.03
-    points, normals = outline.place(s)
+    points, normals = outline.points_at(s)
     x, y = (points + 0.5 * normals).astype(np.float32).T
     np.testing.assert_allclose(outline.locate(x, y), s, atol=2e-4)
     np.testing.assert_allclose(outline.distance(x, y), 0.5, atol=1e-4)
