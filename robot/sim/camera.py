@@ -29,7 +29,7 @@ NOISE = 1.5
 _LENS_BLUR_PX = 0.45
 _SHADOW_BLUR_PX = 0.8
 SKY_STEPS, _SKY_WIDTH = 4, 0.03
-"""The object hides part of the sky from the table near it. Standard deviation of this blur, relative to the image side."""
+"""The object hides sky from the table near it. Standard deviation of this blur, relative to the image side."""
 
 _TABLE_GLOSS = 0.03
 _TABLE_PX_PER_MM = 0.8

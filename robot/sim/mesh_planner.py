@@ -1,4 +1,4 @@
-"""Grasp planner for meshes on the simulated rig. It uses the true mesh and pose, up to the camera's calibration error."""
+"""Grasp planner for simulated meshes. It uses the true mesh and pose, up to the camera's calibration error."""
 
 import math
 from typing import Any, ClassVar

@@ -137,7 +137,7 @@ class Pinch:
         return self._finger_reach(_COARSE_RAD)
 
     def _finger_reach(self, turns: Sequence[float]) -> Array:
-        """Return (turns, fingers): the distance along its rays at which each finger touches; inf if it meets nothing."""
+        """Return (turns, fingers): the distance along its rays at which each finger touches; inf for a miss."""
         self.passes["turn"] += 1
         placements = [self._rotated_placement(angle) for angle in turns]
         rays = [self._rays(side, _COARSE_GRID, placements) for side in SIDES.values()]
@@ -168,7 +168,7 @@ class Pinch:
 
     @cached_property
     def miss_reason(self) -> str | None:
-        """Why the fingers close on nothing, or None: one comes down on the object, or the object is not between them."""
+        """Why the fingers miss, or None: one comes down on the object, or the object is not between them."""
         reach = self._coarse_reach[len(_COARSE_RAD) // 2]
         if (reach < _START_MM - self.grip.opening_mm / 2).any():
             return "a finger comes down on the object"

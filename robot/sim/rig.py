@@ -50,6 +50,7 @@ class SimClock:
         self.now_s = 0.0
 
     def __call__(self) -> float:
+        """Return the time in seconds."""
         return self.now_s
 
     def sleep(self, seconds: float) -> None:
@@ -256,7 +257,7 @@ class SimRig(Rig):
         return {name: scene.image(name) for name in names}
 
     def walls(self, grasp: RecordedGrasp) -> dict[str, Array]:
-        """Return the distance (mm) of the object from each gel at first touch, simulated again from the recorded grasp.
+        """Return the distance (mm) of the object from each gel at first touch, simulated again from the record.
 
         Each array is (rows, columns) of the contact grid, inf where the finger meets nothing. A miss gives an empty
         dictionary.
