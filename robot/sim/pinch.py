@@ -255,7 +255,7 @@ class Pinch:
         return self._field_mm[1] / self.hand.grid[1]
 
     def _centre(self, finger: str) -> Array:
-        """Return (x, y, z) of a contact in the gripper frame: the centre of pressure, or a bare finger's nearest point."""
+        """Return (x, y, z) of a contact in the gripper frame: centre of pressure, or a bare finger's nearest point."""
         wall, (height, width) = self._walls[finger], self._field_mm
         has_gel = finger in self.sensors
         weight = self.contact(finger).pressure_mpa if has_gel else (wall <= wall.min() + 0.1).astype(np.float64)

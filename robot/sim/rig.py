@@ -272,7 +272,7 @@ class SimRig(Rig):
         return {} if scene.pinch.miss_reason else {finger: scene.pinch.gap(finger) for finger in self.sensors}
 
     def _find_object(self, object_id: str) -> SimObject:
-        """Return the object of this name. Procedural names end in their index; mesh names begin with their file's name."""
+        """Return the object of this name: a procedural name ends in its index, a mesh name begins with its file's."""
         if self.meshes is not None:
             candidates = self.meshes.candidates(object_id)
         else:

@@ -130,7 +130,7 @@ class _Descent:
         self._accept(*state)
 
     def _conjugate_step(self) -> tuple[Floats, Floats]:
-        """Step along the conjugate direction to the least energy, then project to feasible pressures and to the load."""
+        """Step along the conjugate direction to the least energy, then project to feasible pressures and the load."""
         beta = self.squares / self.previous_squares if self.conjugate and self.previous_squares > 0.0 else 0.0
         direction = np.empty_like(self.direction)
         slope, total = _conjugate_direction(self.inside, self.pressure, self.direction, beta, direction)

@@ -99,6 +99,7 @@ class LayerCorrection:
     slope: Floats
 
     def __call__(self, rho: npt.ArrayLike) -> Floats:
+        """Interpolate C at `rho`."""
         place = np.asarray(rho, np.float64)
         left = np.minimum((np.log1p(place) / _RHO_STEP).astype(np.intp), len(self.rho) - 2)
         step = self.rho[left + 1] - self.rho[left]
@@ -209,6 +210,7 @@ class Operator:
         return both
 
     def __call__(self, pressure: Floats) -> Floats:
+        """Return the displacement (rows, cols), float64, of a pressure (rows, cols)."""
         (rows, cols), (high, wide) = self.shape, self._size
         values = pressure.astype(np.float32) if self.single_precision else pressure
         wave = scipy.fft.rfft(values, wide, axis=1, workers=self.workers)
