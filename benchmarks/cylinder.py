@@ -44,7 +44,7 @@ def measure(count: int = 20) -> Iterator[ResultLine]:
         cv2.setNumThreads(threads)
 
 
-def _line(name: str, solid: views.Upright, how: dict[str, float], count: int) -> ResultLine:
+def _line(name: str, solid: views.UprightCylinder, how: dict[str, float], count: int) -> ResultLine:
     pose, errors, naive, claimed, seconds, methods = views.camera_pose(), [], [], [], [], Counter()
     for seed in range(count):
         image = views.view(solid, seed=seed, **how)

@@ -13,7 +13,7 @@ try:
     import numba
 except ImportError as error:
     raise RobotConfigError(
-        "the simulated rig needs numba, which is not installed. Run pip install 'touch-retrieval[sim]'"
+        "the simulated rig needs numba, which is missing; run pip install 'touch-retrieval[sim]'"
     ) from error
 
 

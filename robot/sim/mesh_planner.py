@@ -28,7 +28,7 @@ class MeshPlanner(GraspPlanner):
         """Raise RobotConfigError unless `rig` is simulated and has meshes."""
         if not isinstance(rig, SimRig) or rig.meshes is None:
             raise RobotConfigError(
-                '[planner]: name = "mesh" works only with meshes on the simulated rig. Set meshes = FOLDER, or '
+                '[planner]: name = "mesh" plans for meshes of the simulated rig only. Set meshes = FOLDER, or '
                 'name = "cylinder".'
             )
 
