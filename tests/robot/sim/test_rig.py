@@ -182,7 +182,7 @@ def test_a_recording_has_the_materials_of_each_pair_of_gels(tmp_path):
 
 
 def test_devices_raise_when_the_table_is_empty(rig):
-    with pytest.raises(DeviceError, match="call prepare"):
+    with pytest.raises(DeviceError, match="Call prepare"):
         rig.camera.read()
 
 
