@@ -49,9 +49,9 @@ def measure(
             "rerank",
             config.matcher.tower,
             f"{count} candidates take {duration(ours)} with partial activations and {duration(other)} by the whole "
-            f"network on each pair ({sample} pairs measured, scaled): {as_text(ratio)}; {other / (ours + encoded):.3g} times "
-            f"with the {duration(encoded)} for encoding the touch; {product_ratio[0]:.0%} of the rate of the bare "
-            f"matrix product ({config.matcher.hidden} units); largest difference of a logit {error:.2g}",
+            f"network on each pair ({sample} pairs measured, scaled): {as_text(ratio)}; {other / (ours + encoded):.3g} "
+            f"times with the {duration(encoded)} for encoding the touch; {product_ratio[0]:.0%} of the rate of the "
+            f"bare matrix product ({config.matcher.hidden} units); largest difference of a logit {error:.2g}",
             {
                 "candidates": count,
                 "partials_s": ours,

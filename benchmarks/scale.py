@@ -176,13 +176,13 @@ def measure(crowd: BlendedPhotos, photos: int, kinds: Sequence[str], folder: Pat
             "self_check": 64,
         }
         try:
-            generation = store.write_blocks(rows_of(generation), **options)
+            indexed = store.write_blocks(rows_of(generation), **options)
         except ParameterError as error:  # too few vectors for codes
             size.kinds[kind] = {"refused": str(error)}
             continue
-        figures = {"structure_s": time.perf_counter() - start} | opened(folder) | on_disk(generation)
-        size.kinds[kind] = figures | _operating_point(crowd, generation, touches, exhaustive_top1, chosen)
-        size.kinds[kind] |= _growth(crowd, store, generation, size.photos)
+        figures = {"structure_s": time.perf_counter() - start} | opened(folder) | on_disk(indexed)
+        size.kinds[kind] = figures | _operating_point(crowd, indexed, touches, exhaustive_top1, chosen)
+        size.kinds[kind] |= _growth(crowd, store, indexed, size.photos)
         point = size.kinds[kind]
         point["gain"] = size.figures["exhaustive_s"] / (point["search_s"] + point["rerank_s"])
     return size
@@ -337,7 +337,7 @@ def lines(size: Size) -> Iterator[str]:
         times = {name: duration(value) for name, value in p.items() if name.endswith("_s")}
         yield (
             f"  {kind} {p['settings']}: {p['gain']:.3g} times faster than scoring all, exhaustive top-1 found "
-            f"{p['recall']:.1%} ({p['low']:.1%} to {p['high']:.1%}) among {p['k']} ({p['needed']} contain 99 % of all); "
+            f"{p['recall']:.1%} ({p['low']:.1%} to {p['high']:.1%}) among {p['k']} ({p['needed']} for 99 % of all); "
             f"search {times['search_s']}, rerank {times['rerank_s']}; structure built in {times['structure_s']}, "
             f"{p['structure_mb']:.0f} of {p['disk_mb']:.0f} MB on disk, {p['memory_mb']:.0f} MB in memory, "
             f"opened in {times['open_s']}; "

@@ -213,7 +213,8 @@ def clients(bench, share):
         "clients",
         f"32 clients {rate[32]:.1f}/s, 8 clients {rate[8]:.1f}/s: {rate[32] / rate[8]:.2f} x; accepted of 32, with a "
         f"queue of {QUEUE}: p50 {ms(waits) / single_ms:.1f} x, p95 {ms(waits, 0.95) / single_ms:.1f} x a single bare "
-        f"query, {QUEUE} of them in a row are p50 {ms(in_a_row) / single_ms:.1f} x, p95 {ms(in_a_row, 0.95) / single_ms:.1f} x; "
+        f"query, {QUEUE} of them in a row are p50 {ms(in_a_row) / single_ms:.1f} x, "
+        f"p95 {ms(in_a_row, 0.95) / single_ms:.1f} x; "
         f"bare p50 {single_ms:.1f} ms, p95 {ms(bare, 0.95):.1f} ms, under this load {ms(searches):.1f} ms, "
         f"{ms(searches, 0.95):.1f} ms; statuses {dict(statuses)}",
         f"0.9 x; {QUEUE + 1} x; the rest 429",
