@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.optics.real_presses import PIXEL_MM, BallTable, Presses, ball_table, seen_centre
+from benchmarks.optics.real_presses import PIXEL_MM, BallTable, Presses, ball_table, changed_centre
 from robot.sim.gel.fitted_optics import feature_count, normal_features, place_terms
 
 Matrix = NDArray[np.float64]
@@ -55,7 +55,7 @@ def labelled_poses(presses: Presses, setting: OpticsSetting) -> Matrix:
 def first_pose(presses: Presses, index: int, setting: OpticsSetting) -> Matrix:
     """Return the start pose (3,) of the alignment; the label only places the crop."""
     contact = min(_FIRST_CONTACT_MM[presses.name], _FIRST_FRACTION * setting.ball_mm)
-    return np.array([*seen_centre(presses, index), contact])
+    return np.array([*changed_centre(presses, index), contact])
 
 
 @lru_cache(maxsize=512)
