@@ -108,12 +108,12 @@ def _blocks(crowd: BlendedPhotos, sizes: Sequence[int], name: str) -> Iterator[t
                 bar.advance(len(block.rows))
 
 
-def lines(sizes: Sequence[int], found: NDArray[Any], asked: int) -> Iterator[dict[str, float]]:
-    """Yield the results of each size. The first `asked` touches choose k, the others evaluate it."""
+def lines(sizes: Sequence[int], found: NDArray[Any], choosing: int) -> Iterator[dict[str, float]]:
+    """Yield the results of each size. The first `choosing` touches choose k, the others evaluate it."""
     for size, order in zip(sizes, found, strict=True):
-        needed = [_needed(some) for some in (order[:asked], order)]
+        needed = [_needed(some) for some in (order[:choosing], order)]
         taken = min(MARGIN * needed[0], size)
-        evaluated = order[asked:]
+        evaluated = order[choosing:]
         contained = int((evaluated <= taken).sum())
         low, high = binomial_interval(contained, len(evaluated))
         recall = {

@@ -232,29 +232,29 @@ def _top1(scorer: FusionScorer, touches: np.ndarray, partials: Any) -> tuple[np.
 
 
 def _operating_point(
-    crowd: BlendedPhotos, made: Generation, touches: np.ndarray, exhaustive_top1: np.ndarray, asked: int
+    crowd: BlendedPhotos, made: Generation, touches: np.ndarray, exhaustive_top1: np.ndarray, choosing: int
 ) -> dict[str, Any]:
     """Return the fastest setting whose candidates contain the target fraction of exhaustive top-1s.
 
-    If no setting reaches it, return the most complete one. The first `asked` touches choose, the others evaluate.
+    If no setting reaches it, return the most complete one. The first `choosing` touches choose, the others evaluate.
     """
     queries, partials, points = crowd.embeddings(touches, "touch"), made.arrays["partials"], []
     timed, built = range(min(TIMED, len(touches))), made.index
     needed = _needed(made, queries, exhaustive_top1)
     for index in built.search_variants():
         made.index = index
-        k = _candidates(made, queries[:asked], exhaustive_top1[:asked])
+        k = _candidates(made, queries[:choosing], exhaustive_top1[:choosing])
         contained = np.array(
             [top1 in made.search(query[None], k)[0][0] for query, top1 in zip(queries, exhaustive_top1, strict=True)]
         )
-        evaluated = contained[asked:]
+        evaluated = contained[choosing:]
         search = _median(lambda n, k=k: made.search(queries[n : n + 1], k), timed)
         found = [made.search(queries[n : n + 1], k)[0][0] for n in timed]
         rerank = _median(lambda n, found=found: crowd.scorer.logits(touches[n : n + 1], partials, found[n]), timed)
         low, high = binomial_interval(int(evaluated.sum()), len(evaluated))
         point = {"k": k, "recall": float(evaluated.mean()), "low": low, "high": high}
         point |= {"search_s": search, "rerank_s": rerank, "settings": index.settings()}
-        points.append((float(contained[:asked].mean()), point))
+        points.append((float(contained[:choosing].mean()), point))
     made.index = built
     for _, point in points:
         point["needed"] = needed

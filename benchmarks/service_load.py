@@ -115,9 +115,9 @@ def ms(seconds, quantile=0.5):
     return 1e3 * float(np.quantile(seconds, quantile))
 
 
-def scaled(share, full, least):
+def scaled(fraction, full, least):
     """Return this fraction of the full size, at least `least`."""
-    return max(least, round(share * full))
+    return max(least, round(fraction * full))
 
 
 def report(name, measured, requirement=""):
@@ -127,12 +127,12 @@ def report(name, measured, requirement=""):
 # Measurements ---------------------------------------------------------------------------------------------------------
 
 
-def paired(bench, share):
+def paired(bench, fraction):
     """HTTP and the bare query on the same open index, in turn."""
     with listening(bench.index) as (url, parts), httpx.Client(base_url=url, timeout=60) as client:
         searcher = parts.generations.current.searcher
         bare, http = [], []
-        for number in range(10 + scaled(share, 400, 50)):
+        for number in range(10 + scaled(fraction, 400, 50)):
             start = time.perf_counter()
             searcher.query([bench.touch])
             between = time.perf_counter()
@@ -191,14 +191,14 @@ async def _exchange(reader, writer, data):
     return int(head[0].split()[1]), headers, body
 
 
-def clients(bench, share):
+def clients(bench, fraction):
     """32 clients and 8 clients, in turn, and the waiting times of accepted queries."""
-    seconds, rates, statuses, phases = scaled(share, 30, 8), {8: [], 32: []}, Counter(), []
+    seconds, rates, statuses, phases = scaled(fraction, 30, 8), {8: [], 32: []}, Counter(), []
     waits, searches = [], []
     options = ("--index", bench.index, "--port", "0", "--no-history", "--queue", QUEUE)
     with command(*options) as (_, url, _):
         asyncio.run(_load(url, bench.body, 1, 2))  # warm-up
-        for _ in range(scaled(share, 6, 3)):
+        for _ in range(scaled(fraction, 6, 3)):
             phases.append(asyncio.run(_load(url, bench.body, 1, seconds / 4))[1])
             for count in rates:
                 taken, searched, counts = asyncio.run(_load(url, bench.body, count, seconds))
@@ -221,9 +221,9 @@ def clients(bench, share):
     )
 
 
-def memory(bench, share):
+def memory(bench, fraction):
     """Memory of the process over minutes of load, with the history enabled."""
-    seconds, samples, loads = scaled(share, 1200, 40), [], []
+    seconds, samples, loads = scaled(fraction, 1200, 40), [], []
     with command("--index", bench.index, "--port", "0", "--history", bench.folder / "history") as (process, url, _):
         asyncio.run(_load(url, bench.body, 8, 30))  # warm-up
         deadline = time.monotonic() + seconds
@@ -243,9 +243,9 @@ def memory(bench, share):
     )
 
 
-def reloads(bench, share):
+def reloads(bench, fraction):
     """New generations under load: failed requests, and answers that mix two generations."""
-    count, own = scaled(share, 100, 5), bench.folder / "reloaded"
+    count, own = scaled(fraction, 100, 5), bench.folder / "reloaded"
     shutil.copytree(bench.index, own)
     objects, answers, failures, done = {}, Counter(), [], threading.Event()
     with listening(own, poll_s=0.1) as (url, parts), ThreadPoolExecutor(3) as client_threads:
@@ -286,9 +286,9 @@ def reloads(bench, share):
     )
 
 
-def ends(bench, share):
+def ends(bench, fraction):
     """SIGTERM with requests in flight."""
-    rounds, lost, answered = scaled(share, 20, 3), [], 0
+    rounds, lost, answered = scaled(fraction, 20, 3), [], 0
     for _ in range(rounds):
         options = ("--index", bench.index, "--port", "0", "--no-history", "--queue", "32")
         with command(*options) as (process, url, _), ThreadPoolExecutor(8) as client_threads:
@@ -328,9 +328,9 @@ BODY_S = 0.3
 """Time limit of slow bodies in this benchmark; 10 s by default."""
 
 
-def hostile(bench, share):
+def hostile(bench, fraction):
     """Junk, decompression bombs, half bodies, slow bodies, wrong types, 2 GB announced."""
-    count, draw = scaled(share, 1000, 100), random.Random(0)
+    count, draw = scaled(fraction, 1000, 100), random.Random(0)
     kinds = ("junk", "json", "bomb", "half", "slow", "type", "announced", "chunked", "form", "deep")
     taken, wrong, statuses = {kind: [] for kind in kinds}, [], Counter()
     settings = ServiceSettings(index=bench.index, port=0, body_s=BODY_S)
@@ -410,9 +410,9 @@ def _serve(settings, folder, writer):
         os._exit(0)
 
 
-def kills(bench, share):
+def kills(bench, fraction):
     """SIGKILL during feedback; the service is a fork, so that it starts at once."""
-    rounds, folder, draw, acknowledged = scaled(share, 1000, 20), bench.index.parent / "killed", random.Random(0), []
+    rounds, folder, draw, acknowledged = scaled(fraction, 1000, 20), bench.index.parent / "killed", random.Random(0), []
     gc.freeze()  # otherwise the first collection in a fork copies every page of this process
     for _ in range(rounds):
         reader, writer = os.pipe()

@@ -144,7 +144,7 @@ SECTIONS: dict[str, tuple[Callable[[], Iterator[TableRow]], dict[str, str]]] = {
     "building": (building, {}),
     "query": (query, {}),
     "candidates": (candidates, ONE_THREAD),
-    "judging": (reranking, ONE_THREAD),
+    "reranking": (reranking, ONE_THREAD),
     "rebuilding": (rebuilding, ONE_THREAD),
     "grasping": (grasping, ONE_THREAD),
     "training": (training, {}),

@@ -68,7 +68,7 @@ def _check_graspable(scene: Scene, grasps: AntipodalGrasps, settings: GraspSetti
     if not len(grasps):
         if math.isinf(grasps.min_width_mm):
             raise UngraspableError(
-                f"no two opposite sides that the fingers can hold, {settings.floor_mm:g} mm or more above the table"
+                f"no two opposite sides that the fingers could hold, {settings.floor_mm:g} mm above the table or higher"
             )
         if grasps.min_width_mm + 2 * settings.clearance_mm > stroke_mm:
             raise UngraspableError(

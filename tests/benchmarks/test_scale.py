@@ -66,7 +66,7 @@ def test_held_out_touches_evaluate_the_number_of_candidates_that_others_chose(cr
         )
         touches = np.concatenate([crowd.touches, crowd.held_out])
         exhaustive_top1 = np.concatenate([np.arange(12), np.full(7, 8)]) % 9
-        return scale._operating_point(crowd, found, touches, exhaustive_top1, asked=12)
+        return scale._operating_point(crowd, found, touches, exhaustive_top1, choosing=12)
 
     missed = point(lambda number: 0 if number is None else number % 9)
     assert (missed["k"], missed["recall"], missed["needed"]) == (4, 0, 9)  # the choosing touches needed one
@@ -115,7 +115,7 @@ def test_exhaustive_top1_by_blocks_equals_that_of_the_whole_catalogue(crowd, mon
 
 def test_candidates_are_four_times_as_many_as_the_choosing_touches_need():
     """Of touches 1 to 3 the worst needs 5; the two that evaluate need 20 and 21."""
-    line = next(needed.lines([1000], np.array([[1, 5, 2, 20, 21]]), asked=3))
+    line = next(needed.lines([1000], np.array([[1, 5, 2, 20, 21]]), choosing=3))
     assert (line["needed_by_chosen"], line["taken"], line["found"], line["worst"]) == (5, 20, 0.5, 21)
 
 

@@ -103,7 +103,7 @@ def test_a_row_of_the_table_has_medians_with_their_spread():
 
 @pytest.mark.slow
 def test_a_section_of_the_table_is_measured_in_a_separate_process():
-    rows = list(table.rows("judging"))
+    rows = list(table.rows("reranking"))
     assert [row.what for row in rows] == ["100 candidates reranked", "1,000 candidates reranked"]
     assert all(len(row.ours) == len(row.theirs) > 1 for row in rows)
 

@@ -158,7 +158,7 @@ class MeshBody(Body):
         return cKDTree(places), places, self.mesh.face_normals[face]
 
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
-        """Return the exact volume, and area times thickness, at most the volume, for the shell."""
+        """Return the exact volume; the shell's volume is area times thickness, at most the whole."""
         return self.mesh.volume_mm3, min(self.mesh.volume_mm3, float(self.mesh.areas.sum()) * shell_mm)
 
     def _cast(self, rays: ClippedRays) -> Vectors:
