@@ -1,28 +1,28 @@
-"""What measures this project, and what makes its shipped models and its reference; not installed with the package.
+"""Benchmarks of this project, and the programs that make its shipped models and reference pages.
 
-Each runs in a checkout of the repository:
+They are not installed with the package. Each runs in a checkout of the repository:
 
     python -m benchmarks                what the design saves, as ratios of one run (`make benchmark`)
-    python -m benchmarks.table          one table of all of these, with peers and bare limits; so are run by themselves:
+    python -m benchmarks.table          one table of all of these, with peers and limits; each also runs by itself:
                                         scale, needed, several, vectors, peers, again, large, simulation, growth,
                                         training, gpu, shards, queueing
     python -m benchmarks.frontier       error against run time of the kernels; that of a search: `retrieve frontier`
     python -m benchmarks.hard_cases     stiff and extreme inputs of every numerical kernel, as a table
     python -m benchmarks.optics.photometric    fits the simulated gels' optics to real presses
-    python -m benchmarks.models.shipped        makes, scores and trains again the checkpoint of the package
-    python -m benchmarks.models.verdicts       how good its "match", "none of these", ... are
+    python -m benchmarks.models.shipped        trains, scores and retrains the checkpoint of the package
+    python -m benchmarks.models.verdicts       accuracy of the verdicts "match", "none of these", ...
     python -m benchmarks.models.answers        verdict, ranking and P(object | present) of answers, and of advice
-    python -m benchmarks.models.next_grasp     information of another grasp, compared with what the page expects
-    python -m benchmarks.models.scaling        accuracy by the number of objects and grasps to train on
+    python -m benchmarks.models.next_grasp     information of another grasp, compared with the page's estimate
+    python -m benchmarks.models.scaling        accuracy against the number of training objects and grasps
     python -m benchmarks.models.in_double      a command in float64
     python -m benchmarks.importers_memory      memory of the importers for many rows
     python -m benchmarks.service_load          the service under load
-    python -m benchmarks.faults                faults of a cluster, and their consequences
+    python -m benchmarks.faults                faults of a sharded index, and their consequences
     python -m benchmarks.rehearsal             collect, check, train, index and query without hardware
-    python -m benchmarks.structure             files, lines and imports of the packages; ways through the code
+    python -m benchmarks.structure             files, lines and imports of the packages; call paths through the code
     python -m benchmarks.reference             writes docs/reference.md, docs/commands.md and docs/datasets.md
     python -m benchmarks.page_picture DEMO     makes docs/images/page.jpg
-    python -m benchmarks.notebooks             runs the notebooks again and stores their outputs
+    python -m benchmarks.notebooks             executes the notebooks and stores their outputs
 
-No time is asserted anywhere; the arms of a ratio take turns, so that a busy machine slows all of them.
+No benchmark asserts a time. The arms of a ratio run in turn, so that a busy machine slows all of them.
 """

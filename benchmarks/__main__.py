@@ -24,12 +24,12 @@ WITHOUT_TOWER = {
 
 
 def main() -> None:
-    """Print every line as soon as it is there; with --json one document a line."""
+    """Print each line as soon as it is available; with --json one document per line."""
     known = [*BENCHMARKS, *WITHOUT_TOWER]
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--tower", nargs="+", choices=sorted(TOWERS), default=["small", "resnet18"])
     parser.add_argument("--only", nargs="+", choices=sorted(known), default=known)
-    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     if not arguments.json:
         print(f"{torch.get_num_threads()} threads, torch {torch.__version__}; medians, ranges over repetitions")

@@ -1,14 +1,14 @@
-"""Building again: CPU time of one thread, for one new photo among many, and where the time goes.
+"""Rebuild an index: CPU time of one thread for one new photo among many, and how it is spent.
 
     python -m benchmarks.again --photos 100000
 
-The photos are small files, three in the folder of an object; the codes of the first generation are drawn, not encoded,
-so that a large catalogue is there in a minute. Large files would take longer to read, which is what is left out.
+The photos are small files, three in the folder of an object. The codes of the first generation are random, not encoded,
+so that a large catalogue is ready in a minute. Large files would take longer to read; this benchmark excludes that
+time.
 
-Every build is a process of its own, whose time is told in three parts: what every command takes until the model is
-loaded; decoding and encoding the new photo, which is done once before the build too, as the first time takes longer;
-and the rest, which is said first. Beside it stands what listing the folders and asking how the files look takes without
-a line of ours.
+Every build is a separate process with three times: start-up until the model is loaded, which every command needs;
+decoding and encoding of the new photo, which also runs once before the build, because the first run takes longer; and
+the rest, printed first. For comparison, `os.walk` and `os.stat` over the folders are timed alone.
 """
 
 import argparse
@@ -46,45 +46,47 @@ OLD_S = 3600
 
 
 def measure(photos: int = PHOTOS, rounds: int = ROUNDS) -> Iterator[ResultLine]:
-    """One line: the first build over an index that noted no looks, then in turns builds of nothing and of one photo
-    new, and one that reads all."""
+    """Yield one line: the first build over an index without a stat cache, then builds in turn.
+
+    In each round the arms are a build without new photos, one with one new photo, and one that reads all photos.
+    """
     checkpoint = load_checkpoint(shipped_model())
     with tempfile.TemporaryDirectory() as name:
         catalogue, index = Path(name) / "catalog", Path(name) / "index"
         picture = write_catalogue(catalogue, photos)
         write_index(catalogue, index, checkpoint)
-        told: dict[str, list[float]] = defaultdict(list)
-        told["unnoted"].append(_build(catalogue, index, 0)["rest"])
+        times: dict[str, list[float]] = defaultdict(list)
+        times["unnoted"].append(_build(catalogue, index, 0)["rest"])
         for number in range(rounds):
-            told["looking"].append(_cpu_s(lambda: _look(catalogue)))
-            told["nothing"].append(_build(catalogue, index, 0)["rest"])
-            told["verify"].append(_build(catalogue, index, 0, verify=True)["rest"])
+            times["looking"].append(_cpu_s(lambda: _stat_files(catalogue)))
+            times["nothing"].append(_build(catalogue, index, 0)["rest"])
+            times["verify"].append(_build(catalogue, index, 0, verify=True)["rest"])
             _write(catalogue / "new" / f"{number}.jpg", picture + b"new %d" % number)
             one = _build(catalogue, index, 1)
-            told["one"].append(one["rest"])
+            times["one"].append(one["rest"])
             for part in ("started", "first_encoding", "encoding"):
-                told[part].append(one[part])
-    median = {arm: float(np.median(seconds)) for arm, seconds in told.items()}
+                times[part].append(one[part])
+    median = {arm: float(np.median(seconds)) for arm, seconds in times.items()}
     shown = ", ".join(
-        f"{what} {median[arm]:.2f} s ({min(told[arm]):.2f} to {max(told[arm]):.2f})"
-        for arm, what in (
+        f"{label} {median[arm]:.2f} s ({min(times[arm]):.2f} to {max(times[arm]):.2f})"
+        for arm, label in (
             ("one", "one new photo"),
-            ("nothing", "nothing new"),
-            ("verify", "all read again"),
-            ("unnoted", "an index that noted no looks"),
+            ("nothing", "no new photo"),
+            ("verify", "all photos read"),
+            ("unnoted", "an index without a stat cache"),
             ("looking", "`os.walk` and `os.stat` alone"),
         )
     )
     text = (
-        f"{photos} photos, CPU time of one thread: {shown}; besides, decoding and encoding the new photo "
-        f"{median['first_encoding']:.3f} s ({median['encoding']:.3f} s once it has been done), and what every command "
-        f"takes, Python, its imports and the model, {median['started']:.2f} s"
+        f"{photos} photos, CPU time of one thread: {shown}; in addition, decoding and encoding the new photo "
+        f"{median['first_encoding']:.3f} s ({median['encoding']:.3f} s after the first time), and start-up of any "
+        f"command, with Python, imports and the model, {median['started']:.2f} s"
     )
-    yield ResultLine("again", checkpoint.config.matcher.tower, text, {"photos": photos, **median}, dict(told))
+    yield ResultLine("again", checkpoint.config.matcher.tower, text, {"photos": photos, **median}, dict(times))
 
 
 def build(catalogue: Path, index: Path, new: int, verify: bool) -> dict[str, float]:
-    """Build again, `new` photos of the folder "new" among the others; CPU seconds of the parts of this process."""
+    """Build again with `new` photos in the folder "new"; return the CPU seconds of the parts of this process."""
     torch.set_num_threads(1)
     checkpoint = load_checkpoint(shipped_model())
     load_kind("flat")  # imports FAISS
@@ -107,7 +109,7 @@ def build(catalogue: Path, index: Path, new: int, verify: bool) -> dict[str, flo
 
 
 def _build(catalogue: Path, index: Path, new: int, verify: bool = False) -> dict[str, float]:
-    """`build` in a process of its own."""
+    """Run `build` in a separate process."""
     command = [sys.executable, "-m", "benchmarks.again", "--build", str(catalogue), str(index), str(new)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(command + ["--verify"] * verify, env=environment, capture_output=True, text=True, check=False)
@@ -116,19 +118,22 @@ def _build(catalogue: Path, index: Path, new: int, verify: bool = False) -> dict
     return parts
 
 
-def _look(folder: Path) -> None:
+def _stat_files(folder: Path) -> None:
     for path, _, names in os.walk(folder):
         for name in names:
             os.stat(f"{path}/{name}")
 
 
 def write_catalogue(folder: Path, photos: int) -> bytes:
-    """Files of one picture, each with bytes of its own at the end, three an object; an hour old. Gives the picture."""
-    held = io.BytesIO()
-    Image.fromarray(np.random.default_rng(0).integers(256, size=(32, 32, 3), dtype=np.uint8)).save(held, "JPEG")
+    """Write files of one picture, each with unique bytes at its end, three per object, an hour old.
+
+    Returns the content of the picture file.
+    """
+    buffer = io.BytesIO()
+    Image.fromarray(np.random.default_rng(0).integers(256, size=(32, 32, 3), dtype=np.uint8)).save(buffer, "JPEG")
     for number in range(photos):
-        _write(folder / f"object-{number // 3:06d}" / f"{number % 3}.jpg", held.getvalue() + b"%d" % number)
-    return held.getvalue()
+        _write(folder / f"object-{number // 3:06d}" / f"{number % 3}.jpg", buffer.getvalue() + b"%d" % number)
+    return buffer.getvalue()
 
 
 def _write(path: Path, content: bytes) -> None:
@@ -138,7 +143,7 @@ def _write(path: Path, content: bytes) -> None:
 
 
 def write_index(catalogue: Path, out: Path, checkpoint: Checkpoint) -> None:
-    """The index over the catalogue, as `build_index` would have written it but for the codes."""
+    """Write the index over the catalogue as `build_index` would, but with random codes."""
     rng, matcher, paths = np.random.default_rng(0), checkpoint.config.matcher, sorted(catalogue.rglob("*.jpg"))
     embeddings = rng.normal(size=(len(paths), matcher.embedding_dim)).astype(np.float32)
     embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
@@ -147,12 +152,12 @@ def write_index(catalogue: Path, out: Path, checkpoint: Checkpoint) -> None:
         name = path.relative_to(catalogue).as_posix()
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         rows.append({"id": name, "object_id": path.parent.name, "path": name, "digest": digest, "metadata": {}})
-    partials, asked = (
+    partials, requirements = (
         rng.normal(size=(len(paths), matcher.partial_width)).astype(np.float16),
         asdict(SearchRequirements()),
     )
     measured = {"k": 100, "top1_agreement": 1.0, "interval": [0.99, 1.0], "queries": 398, "ms": 1.0}
-    measured |= {"exhaustive_ms": 1.0, "kind": "flat", "parameters": {}, "requirements": asked, "changed": 0}
+    measured |= {"exhaustive_ms": 1.0, "kind": "flat", "parameters": {}, "requirements": requirements, "changed": 0}
     IndexStore(out).write_blocks(
         [Block(rows, embeddings, {"partials": partials})],
         {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {},
@@ -161,9 +166,9 @@ def write_index(catalogue: Path, out: Path, checkpoint: Checkpoint) -> None:
             "checkpoint": str(checkpoint.path.resolve()),
             "catalogue": str(catalogue.resolve()),
             "objects_from": "folder",
-            "requirements": asked,
+            "requirements": requirements,
             "partial_error": 1e-3,
-            "reason": "Drawn codes.",
+            "reason": "Random codes.",
             "candidates": measured | {"photos": len(rows)},
         },
     )

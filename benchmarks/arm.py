@@ -1,4 +1,4 @@
-"""What an arm behind rosbridge costs on this machine: IK round trips, planning, a motion, states received."""
+"""Cost of an arm over rosbridge on this machine: IK round trips, planning, a motion, received states."""
 
 import time
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ LOW, HIGH = Pose(0.0, 0.0, 40.0, 0.0), Pose(0.0, 0.0, 220.0, 0.0)
 
 
 def measure(calls: int = 300) -> Iterator[ResultLine]:
-    """Over the emulator on a local websocket: the network of a real robot and its solver come on top."""
+    """Measure over the emulator on a local websocket, without the network and solver of a real robot."""
     with serve(EmulatedSawyer()) as url, _arm(url) as arm:
         yield _round_trip(arm, calls)
         yield _planning(arm)
@@ -42,9 +42,9 @@ def _round_trip(arm: Sawyer, calls: int) -> ResultLine:
         start = time.perf_counter()
         messages.ik_answer(arm._link.call(messages.IK_SERVICE, request))
         seconds.append(time.perf_counter() - start)
-    middle, late = float(np.median(seconds)), float(np.quantile(seconds, 0.99))
-    text = f"{duration(middle)} a call of IKService, .99 quantile {duration(late)}"
-    return ResultLine("arm", "rosbridge round trip", text, {"median_s": middle, "q99_s": late})
+    median, q99 = float(np.median(seconds)), float(np.quantile(seconds, 0.99))
+    text = f"{duration(median)} per call of IKService, .99 quantile {duration(q99)}"
+    return ResultLine("arm", "rosbridge round trip", text, {"median_s": median, "q99_s": q99})
 
 
 def _planning(arm: Sawyer) -> ResultLine:
@@ -57,16 +57,16 @@ def _planning(arm: Sawyer) -> ResultLine:
 
 
 def _motion(arm: Sawyer) -> Iterator[ResultLine]:
-    """A motion of 180 mm at 200 mm/s: what it takes, where it ends, and how evenly the states come."""
+    """Yield a motion of 180 mm at 200 mm/s: duration, end position, and regularity of the states."""
     arm.move_to(LOW, 200.0)
     start = time.perf_counter()
     reached = arm.move_to(HIGH, 200.0)
-    seconds, off = time.perf_counter() - start, abs(reached.z_mm - HIGH.z_mm)
-    least = 180.0 / 200.0 + 0.3
-    text = f"{duration(seconds)} for 180 mm at 200 mm/s ({least:g} s by its schedule), ends {off:.2f} mm off"
-    yield ResultLine("arm", "a motion", text, {"seconds": seconds, "scheduled_s": least, "off_mm": off})
+    seconds, error_mm = time.perf_counter() - start, abs(reached.z_mm - HIGH.z_mm)
+    scheduled_s = 180.0 / 200.0 + 0.3
+    text = f"{duration(seconds)} for 180 mm at 200 mm/s (scheduled {scheduled_s:g} s), ends {error_mm:.2f} mm off"
+    yield ResultLine("arm", "a motion", text, {"seconds": seconds, "scheduled_s": scheduled_s, "off_mm": error_mm})
     times = [arrival.time_s for arrival in arm._link.history(messages.JOINT_STATES[0])]
     gaps = np.diff(times)
     rate, longest = 1 / float(gaps.mean()), float(gaps.max())
-    text = f"{rate:.0f} a second of the 100 published, longest gap {duration(longest)}"
+    text = f"{rate:.0f} per second of the 100 published, longest gap {duration(longest)}"
     yield ResultLine("arm", "joint states", text, {"rate_hz": rate, "longest_gap_s": longest})

@@ -1,11 +1,11 @@
-"""Attack a running service and measure whether it keeps answering.
+"""Attack a running service and measure whether it still answers.
 
     python -m benchmarks.attacks INDEX --gelsight a.png b.png [--only NAME ...] [--json results.json]
 
-Each attack gets a `retrieve serve` of its own. While the attack runs, one client asks `/healthz` twenty times a
-second and another sends an honest query four times a second. The table shows, for each attack: the slowest `/healthz`,
-the honest queries answered and the slowest of them, the peak memory of the service above idle, and how long the service
-takes to end after SIGTERM. All traffic stays on the loopback addresses.
+Each attack has its own `retrieve serve`. During the attack, one client requests `/healthz` twenty times per second and
+another sends an honest query four times per second. The table shows, for each attack: the slowest `/healthz`, the
+honest queries answered and the slowest of them, the peak memory of the service above idle, and the time that the
+service needs to exit after SIGTERM. All traffic stays on the loopback addresses.
 """
 
 import argparse
@@ -30,18 +30,23 @@ from tests.hostile_pictures import jpeg_of_scans, png_chunk, png_of_zeros
 MAX_HEALTH_S, MAX_MEMORY_MB, MAX_EXIT_S = 0.5, 300, 10
 BODY_BYTES = 19_500_000
 ATTACKERS, HONEST = "127.0.0.1", "127.0.0.2"
-"""The attack and the honest clients come from two addresses."""
+"""The attack and the honest clients use two addresses."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A running service. gels: the gel images of one honest grasp, as the bytes of their files."""
+    """A running service.
+
+    Attributes:
+        port: its port.
+        gels: file contents of the gel images of one honest grasp.
+    """
 
     port: int
     gels: tuple[bytes, ...]
 
     def post(self, path: str, body: bytes, kind: str = "application/json", timeout: float = 60) -> int:
-        """Send one request from the attackers' address and return the status, 0 where the connection was cut."""
+        """Send one request from the attackers' address; return the status, or 0 if the connection was cut."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout, source_address=(ATTACKERS, 0))
         try:
             connection.request("POST", path, body, {"content-type": kind, "origin": f"http://127.0.0.1:{self.port}"})
@@ -57,36 +62,38 @@ class Target:
 
 
 Attack = Callable[[Target], str]
-"""Attacks the service and returns what it answered, in words."""
+"""An attack returns the answers of the service as text."""
 
 
 def many_keys(target: Target) -> str:
     """20 MB of small JSON keys to the path that needs no token."""
     keys = ",".join(f'"k{number}":0' for number in range(1_400_000))
-    return _at_once(target, "/v1/session", f"{{{keys}}}".encode(), 3)
+    return _post_in_parallel(target, "/v1/session", f"{{{keys}}}".encode(), 3)
 
 
 def empty_grasps(target: Target) -> str:
     """A query of millions of empty grasps."""
     body = b'{"touches": [' + b"[]," * (BODY_BYTES // 3 - 10) + b"[]]}"
-    return _at_once(target, "/v1/query", body, 3)
+    return _post_in_parallel(target, "/v1/query", body, 3)
 
 
 def nested(target: Target) -> str:
     """JSON arrays within arrays, a million deep."""
-    return _at_once(target, "/v1/query", b'{"touches": ' + b"[" * (BODY_BYTES // 2) + b"]" * (BODY_BYTES // 2), 3)
+    return _post_in_parallel(
+        target, "/v1/query", b'{"touches": ' + b"[" * (BODY_BYTES // 2) + b"]" * (BODY_BYTES // 2), 3
+    )
 
 
 def empty_objects(target: Target) -> str:
     """A batch of millions of empty objects."""
-    return _at_once(target, "/v1/query/batch", b'{"objects": [' + b"[]," * (BODY_BYTES // 3 - 10) + b"[]]}", 3)
+    return _post_in_parallel(target, "/v1/query/batch", b'{"objects": [' + b"[]," * (BODY_BYTES // 3 - 10) + b"[]]}", 3)
 
 
 def many_parts(target: Target) -> str:
     """A form of hundreds of thousands of empty parts."""
     part = b"--b\r\ncontent-disposition: form-data; name=gelsight; filename=a\r\n\r\n\r\n"
     body = part * (BODY_BYTES // len(part)) + b"--b--\r\n"
-    return _at_once(target, "/v1/query", body, 3, "multipart/form-data; boundary=b")
+    return _post_in_parallel(target, "/v1/query", body, 3, "multipart/form-data; boundary=b")
 
 
 def jpeg_scans(target: Target) -> str:
@@ -100,7 +107,7 @@ def png_column(target: Target) -> str:
 
 
 def png_pixels(target: Target) -> str:
-    """PNG pictures of the largest size that is taken, 17 kB each."""
+    """PNG pictures of the largest accepted size, 17 kB each."""
     return _pictures(target, png_of_zeros(4472, 4472), 4)
 
 
@@ -116,51 +123,51 @@ def png_chunks(target: Target) -> str:
 
 def many_pictures(target: Target) -> str:
     """Queries of 64 grasps of two tiny pictures."""
-    return _at_once(target, "/v1/query", _query([png_of_zeros(8, 8)] * 128), 8)
+    return _post_in_parallel(target, "/v1/query", _query([png_of_zeros(8, 8)] * 128), 8)
 
 
 def half_headers(target: Target) -> str:
     """600 connections that each send half of a request's headers and then wait."""
-    held = []
+    connections = []
     for _ in range(600):
         try:
             connection = target.connect()
             connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\nx-half: ")
-            held.append(connection)
+            connections.append(connection)
         except OSError:
             continue
     time.sleep(15)
-    open_still = sum(_is_open(connection) for connection in held)
-    for connection in held:
+    still_open = sum(_is_open(connection) for connection in connections)
+    for connection in connections:
         connection.close()
-    return f"{open_still} of 600 open after 15 s"
+    return f"{still_open} of 600 open after 15 s"
 
 
 def slow_bodies(target: Target) -> str:
-    """100 requests whose bodies come one byte a second."""
-    held = []
+    """100 requests whose bodies arrive at one byte per second."""
+    connections = []
     for _ in range(100):
         connection = target.connect()
         connection.sendall(
             b"POST /v1/session HTTP/1.1\r\nhost: localhost\r\ncontent-type: application/json\r\n"
             b"content-length: 1000\r\n\r\n"
         )
-        held.append(connection)
+        connections.append(connection)
     for _ in range(18):
         time.sleep(1)
-        for connection in held:
+        for connection in connections:
             try:
                 connection.sendall(b" ")
             except OSError:
                 continue
-    open_still = sum(_is_open(connection) for connection in held)
-    for connection in held:
+    still_open = sum(_is_open(connection) for connection in connections)
+    for connection in connections:
         connection.close()
-    return f"{open_still} of 100 open after 18 s"
+    return f"{still_open} of 100 open after 18 s"
 
 
 def header_flood(target: Target) -> str:
-    """One connection that sends header after header, up to 400 MB."""
+    """One connection that sends headers without end, up to 400 MB."""
     lines = b"".join(b"x-%d: %s\r\n" % (number, b"a" * 1000) for number in range(1000))
     with target.connect() as connection:
         connection.sendall(b"GET /healthz HTTP/1.1\r\nhost: localhost\r\n")
@@ -171,12 +178,12 @@ def header_flood(target: Target) -> str:
                 sent += len(lines)
         except OSError:
             pass
-        return f"{sent / 1e6:.0f} MB taken"
+        return f"{sent / 1e6:.0f} MB accepted"
 
 
 def many_grasps(target: Target) -> str:
-    """60 grasps of the simulated rig at once."""
-    return _at_once(target, "/v1/grasp", b"", 60)
+    """60 simultaneous grasps of the simulated rig."""
+    return _post_in_parallel(target, "/v1/grasp", b"", 60)
 
 
 ATTACKS: tuple[Attack, ...] = (
@@ -198,8 +205,8 @@ ATTACKS: tuple[Attack, ...] = (
 )
 
 
-def _at_once(target: Target, path: str, body: bytes, times: int, kind: str = "application/json") -> str:
-    """Send the same body several times at once, and say which statuses came."""
+def _post_in_parallel(target: Target, path: str, body: bytes, times: int, kind: str = "application/json") -> str:
+    """Send the same body several times in parallel; return the counts of the statuses."""
     statuses: list[int] = []
     threads = [threading.Thread(target=lambda: statuses.append(target.post(path, body, kind))) for _ in range(times)]
     for thread in threads:
@@ -211,7 +218,7 @@ def _at_once(target: Target, path: str, body: bytes, times: int, kind: str = "ap
 
 
 def _pictures(target: Target, picture: bytes, times: int) -> str:
-    return _at_once(target, "/v1/query", _query([picture, target.gels[-1]]), times)
+    return _post_in_parallel(target, "/v1/query", _query([picture, target.gels[-1]]), times)
 
 
 def _query(pictures: list[bytes]) -> bytes:
@@ -233,7 +240,7 @@ def _is_open(connection: socket.socket) -> bool:
 
 @dataclass
 class AttackResult:
-    """What honest clients and the operator saw during one attack."""
+    """Measurements of the honest clients and of the operator during one attack."""
 
     attack: str
     answered: str = ""
@@ -256,7 +263,7 @@ class AttackResult:
         )
 
     def row(self) -> str:
-        """A row of the Markdown table."""
+        """Return a row of the Markdown table."""
         return (
             f"| {self.attack} | {self.answered} | {max(self.health_s, default=99):.2f} ({self.health_failed} failed) | "
             f"{len(self.query_s)} of {len(self.query_s) + self.query_failed}, "
@@ -272,7 +279,7 @@ HEAD = (
 
 
 def measure(attack: Attack, index: Path, gels: tuple[bytes, ...]) -> AttackResult:
-    """Run one attack against a service of its own."""
+    """Run one attack against a new service."""
     measured = AttackResult(attack.__name__.replace("_", " "))
     with tempfile.TemporaryDirectory() as folder, _service(index, Path(folder)) as (process, port):
         target = Target(port, gels)
@@ -281,8 +288,8 @@ def measure(attack: Attack, index: Path, gels: tuple[bytes, ...]) -> AttackResul
             target.post("/v1/query", honest)
         idle, over = _memory_mb(process.pid), threading.Event()
         clients = [
-            threading.Thread(target=_ask_health, args=(port, measured, over)),
-            threading.Thread(target=_ask_queries, args=(port, honest, measured, over)),
+            threading.Thread(target=_poll_health, args=(port, measured, over)),
+            threading.Thread(target=_send_queries, args=(port, honest, measured, over)),
             threading.Thread(target=_watch_memory, args=(process.pid, idle, measured, over)),
         ]
         for client in clients:
@@ -324,13 +331,13 @@ def _service(index: Path, folder: Path) -> Iterator[tuple[subprocess.Popen[str],
 
 
 def _port(text: str) -> int | None:
-    """The port in a line of the service's log such as `http://127.0.0.1:8000`."""
+    """Return the port in a line of the service's log such as `http://127.0.0.1:8000`."""
     after = text.partition("http://127.0.0.1:")[2]
     digits = after[: len(after) - len(after.lstrip("0123456789"))]
     return int(digits) if digits and len(after) > len(digits) else None
 
 
-def _ask_health(port: int, measured: AttackResult, over: threading.Event) -> None:
+def _poll_health(port: int, measured: AttackResult, over: threading.Event) -> None:
     while not over.is_set():
         begun = time.monotonic()
         status = _honest(port, "GET", "/healthz", None)
@@ -341,8 +348,8 @@ def _ask_health(port: int, measured: AttackResult, over: threading.Event) -> Non
         time.sleep(0.05)
 
 
-def _ask_queries(port: int, body: bytes, measured: AttackResult, over: threading.Event) -> None:
-    """An honest client waits and asks again where it gets 429, for 10 s at most."""
+def _send_queries(port: int, body: bytes, measured: AttackResult, over: threading.Event) -> None:
+    """Send honest queries; after 429, wait and retry for at most 10 s."""
     while not over.is_set():
         begun = time.monotonic()
         while (status := _honest(port, "POST", "/v1/query", body)) == 429 and time.monotonic() < begun + 10:
@@ -373,7 +380,7 @@ def _watch_memory(pid: int, idle: float, measured: AttackResult, over: threading
 
 
 def _memory_mb(pid: int) -> float:
-    """Proportional memory of a process and its children."""
+    """Return the proportional memory of a process and its children."""
     total, waiting = 0.0, [pid]
     while waiting:
         one = waiting.pop()
@@ -389,21 +396,21 @@ def _memory_mb(pid: int) -> float:
 
 
 def main() -> None:
-    """Run the attacks; exit with 1 where one of them broke a limit."""
+    """Run the attacks; exit with 1 if one of them broke a limit."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("index", type=Path)
     parser.add_argument("--gelsight", type=Path, nargs="+", required=True)
     parser.add_argument("--only", nargs="+", choices=[attack.__name__ for attack in ATTACKS])
-    chosen = parser.parse_args()
-    gels = tuple(path.read_bytes() for path in chosen.gelsight)
+    arguments = parser.parse_args()
+    gels = tuple(path.read_bytes() for path in arguments.gelsight)
     print(HEAD, flush=True)
-    held = True
+    all_hold = True
     for attack in ATTACKS:
-        if not chosen.only or attack.__name__ in chosen.only:
-            measured = measure(attack, chosen.index, gels)
+        if not arguments.only or attack.__name__ in arguments.only:
+            measured = measure(attack, arguments.index, gels)
             print(measured.row(), flush=True)
-            held = held and measured.holds
-    sys.exit(0 if held else 1)
+            all_hold = all_hold and measured.holds
+    sys.exit(0 if all_hold else 1)
 
 
 if __name__ == "__main__":

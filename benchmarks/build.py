@@ -1,8 +1,8 @@
-"""Building an index from JPEG files end to end, against encoding images that are ready, and against building again.
+"""Build an index from JPEG files end to end, compared with encoding prepared images and with an unchanged rebuild.
 
-Bare is what the build itself uses: `encode_photos`, batch by batch, with PyTorch's own team of threads. What is left
-of 1 is reading, decoding and resizing, where the tower is large; where it is small these are most of the work, and no
-order of doing them hides them.
+The bare arm is `encode_photos`, which the build also uses, batch by batch, with PyTorch's own threads. With a large
+tower, the difference to 1 is reading, decoding and resizing. With a small tower these are most of the work, and no
+schedule hides them.
 """
 
 import tempfile
@@ -34,7 +34,7 @@ DRAWN = 16
 def measure(
     config: Config, photos: int | None = None, photo_px: int = 512, repetitions: int = 3
 ) -> Iterator[ResultLine]:
-    """One line. Files: `photos` JPEG of `photo_px` x `photo_px` pixels, of `DRAWN` different pictures."""
+    """Yield one line for `photos` JPEG files of `photo_px` x `photo_px` pixels, made of `DRAWN` different pictures."""
     number = photos or PHOTOS.get(config.matcher.tower, 64)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -56,22 +56,22 @@ def measure(
         "build",
         config.matcher.tower,
         f"{ours:.3g} photos per second end to end ({number} JPEG files of {photo_px} px), {other:.3g} through the bare "
-        f"tower: {as_text(ratio)} its rate; building again with nothing changed is faster {as_text(again)}",
+        f"tower: {as_text(ratio)} its rate; an unchanged rebuild is {as_text(again)} as fast",
         {"photos": number, "build_per_s": ours, "bare_per_s": other, "ratio": ratio[0], "ratio_again": again[0]},
         times.seconds,
     )
 
 
 def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3) -> Iterator[ResultLine]:
-    """One line for the shipped model, with photos enough that a build looks for a faster encoder, which is told apart.
+    """Yield one line for the shipped model, with enough photos for the build to choose a faster encoder.
 
-    Bare is that encoder alone, on as many threads, of images that lie ready; work is decoding, cutting out and
-    encoding, without an index.
+    The time of this choice is listed separately. The bare arm is that encoder alone, on as many threads, with prepared
+    images. The work arm decodes, crops and encodes, without an index.
     """
     checkpoint = load_checkpoint(shipped_model())
     photo_from_bytes = checkpoint.config.preprocessing.photo_from_bytes
 
-    def see(path: Path) -> RgbImage:
+    def load(path: Path) -> RgbImage:
         return photo_from_bytes(read_bytes(path), path)
 
     with tempfile.TemporaryDirectory() as name:
@@ -86,23 +86,23 @@ def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3
         arms = {
             "build": build,
             "bare": lambda: on_threads(encode, images),
-            "work": lambda: on_threads(lambda some: encode([see(path) for path in some]), paths),
+            "work": lambda: on_threads(lambda some: encode([load(path) for path in some]), paths),
             "looking": lambda: fastest_photo_encoder(checkpoint),
         }
         taken = in_turns(arms, repetitions).seconds
     if photos < MIN_PHOTOS_TO_TUNE:
         taken["looking"] = [0.0] * repetitions
-    beyond = [whole - looked for whole, looked in zip(taken["build"], taken["looking"], strict=True)]
-    times = Times({**taken, "beyond": beyond})
+    without_tuning = [build_s - tuning for build_s, tuning in zip(taken["build"], taken["looking"], strict=True)]
+    times = Times({**taken, "beyond": without_tuning})
     rate = {arm: photos / times.median(arm) for arm in ("beyond", "bare", "work", "build")}
-    ratio, share = times.ratio("bare", "beyond"), times.ratio("work", "beyond")
+    ratio, work_ratio = times.ratio("bare", "beyond"), times.ratio("work", "beyond")
     yield ResultLine(
         "build",
         "shipped",
-        f"{rate['beyond']:.3g} photos per second end to end ({photos} JPEG files of {photo_px} px) beyond looking for "
-        f"a faster encoder, which takes {duration(times.median('looking'))}; {rate['bare']:.3g} through it alone: "
-        f"{as_text(ratio)} its rate; {rate['work']:.3g} decoded and encoded alone: {as_text(share)}",
-        {"photos": photos, "ratio": ratio[0], "ratio_work": share[0]}
+        f"{rate['beyond']:.3g} photos per second end to end ({photos} JPEG files of {photo_px} px) without the choice "
+        f"of a faster encoder, which takes {duration(times.median('looking'))}; {rate['bare']:.3g} through it alone: "
+        f"{as_text(ratio)} its rate; {rate['work']:.3g} decoded and encoded alone: {as_text(work_ratio)}",
+        {"photos": photos, "ratio": ratio[0], "ratio_work": work_ratio[0]}
         | {f"{arm}_per_s": one for arm, one in rate.items()},
         times.seconds,
     )
@@ -111,7 +111,7 @@ def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3
 def _ready(
     folder: Path, checkpoint: Checkpoint, photos: int, photo_px: int
 ) -> tuple[list[RgbImage], Callable[..., None]]:
-    """What the towers see of a drawn catalogue, and what builds an index of it, each time another one unless named."""
+    """Return the towers' views of a synthetic catalogue, and a function that builds a new index of it."""
     catalogue, fresh = _write_catalogue(folder / "catalog", photos, photo_px), count()
 
     def build(out: str | None = None) -> None:

@@ -1,6 +1,6 @@
-"""What reading cameras costs: pictures a second, their age when read, the skew of two fingers, and one picture's work.
+"""Cost of reading cameras: frames per second, their age when read, the skew of two fingers, and the work per frame.
 
-The cameras are stand-ins that keep a camera's pace; everything between them and the reader is what runs on a rig.
+Fake cameras deliver frames at a camera's rate; everything between them and the reader is the code that runs on a rig.
 """
 
 import math
@@ -28,17 +28,17 @@ QUICK: dict[str, Any] = {"warmup_s": 0.2, "timeout_s": 10.0}
 
 
 def measure(seconds: float = 3.0) -> Iterator[ResultLine]:
-    """A line for each rate, for each way to match two fingers, for a film, and for the work on one picture."""
+    """Yield a line for each rate, for each way to match two fingers, for a video, and for the work on one frame."""
     for fps in (30.0, 60.0):
         yield _rate(fps, seconds)
     yield _skew("newest of each", 1, seconds)
     yield _skew("nearest in time", 4, seconds)
-    yield _film()
+    yield _video()
     yield from _work()
 
 
 class _Rig(ExitStack):
-    """Sensors over stand-in cameras, closed at the end."""
+    """Sensors over fake cameras, closed at the end."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class _Rig(ExitStack):
         self.enter_context(mock.patch("cv2.VideoCapture", lambda path, backend: self._cameras[path].open(path)))
 
     def gel(self, finger: str, camera: FakeVideoDevice, keep: int = 4) -> OpencvTactile:
-        """A connected sensor of that camera."""
+        """Return a connected sensor over this camera."""
         path = self._folder / f"usb-{finger}"
         path.touch()
         self._cameras[str(path)] = camera
@@ -55,7 +55,7 @@ class _Rig(ExitStack):
 
 
 def _rate(fps: float, seconds: float) -> ResultLine:
-    """Pictures a second that arrive, and how old the newest is at random moments."""
+    """Measure the frames per second that arrive, and the age of the newest at random moments."""
     rng = np.random.default_rng(0)
     ages: list[float] = []
     with _Rig() as rig:
@@ -65,14 +65,14 @@ def _rate(fps: float, seconds: float) -> ResultLine:
             time.sleep(rng.uniform(0.0, 2 / fps))
             ages.append(time.monotonic() - gel.read().time_s)
         rate = (gel.frame_count - before) / (time.monotonic() - start)
-    median, late = float(np.median(ages)), float(np.quantile(ages, 0.99))
-    text = f"{rate:.1f} of {fps:g} pictures a second; read at an age of {duration(median)}, .99: {duration(late)}"
-    figures = {"per_s": rate, "age_s": median, "age_99_s": late}
+    median, q99 = float(np.median(ages)), float(np.quantile(ages, 0.99))
+    text = f"{rate:.1f} of {fps:g} frames per second; age when read {duration(median)}, .99 quantile {duration(q99)}"
+    figures = {"per_s": rate, "age_s": median, "age_99_s": q99}
     return ResultLine("cameras", f"{SIZE[0]} x {SIZE[1]} at {fps:g}", text, figures)
 
 
 def _skew(way: str, keep: int, seconds: float) -> ResultLine:
-    """Two cameras of 30 pictures a second, 10 ms apart, read at random moments."""
+    """Read two cameras of 30 frames per second, 10 ms apart, at random moments."""
     rng = np.random.default_rng(1)
     skews: list[float] = []
     with _Rig() as rig:
@@ -84,13 +84,13 @@ def _skew(way: str, keep: int, seconds: float) -> ResultLine:
         while time.monotonic() - start < seconds:
             time.sleep(rng.uniform(0.0, 0.06))
             skews.append(read_together(sensors)[1])
-    mean, most = float(np.mean(skews)), float(np.max(skews))
-    text = f"two fingers 10 ms out of step: {duration(mean)} apart in the mean, {duration(most)} at most"
-    return ResultLine("cameras", f"skew, {way}", text, {"mean_s": mean, "most_s": most})
+    mean, largest = float(np.mean(skews)), float(np.max(skews))
+    text = f"two fingers 10 ms out of step: mean difference {duration(mean)}, at most {duration(largest)}"
+    return ResultLine("cameras", f"skew, {way}", text, {"mean_s": mean, "most_s": largest})
 
 
-def _film(pictures: int = 120) -> ResultLine:
-    """A film of 640 x 480 as a sensor, each picture asked for as soon as the last has come."""
+def _video(pictures: int = 120) -> ResultLine:
+    """Read a video of 640 x 480 as a sensor, each frame as soon as the previous one has arrived."""
     rng = np.random.default_rng(2)
     now = [0.0]
     with tempfile.TemporaryDirectory() as folder:
@@ -106,15 +106,15 @@ def _film(pictures: int = 120) -> ResultLine:
                 gel.read()
             each = (time.perf_counter() - start) / (pictures - 1)
     return ResultLine(
-        "cameras", "film, MJPG 640 x 480", f"{1 / each:.0f} pictures a second decoded", {"per_s": 1 / each}
+        "cameras", "video, MJPG 640 x 480", f"{1 / each:.0f} frames per second decoded", {"per_s": 1 / each}
     )
 
 
 def _work() -> Iterator[ResultLine]:
-    """What is done to one picture when it is read, one thread."""
+    """Measure the processing of one frame on one thread."""
     picture = np.random.default_rng(3).integers(0, 255, (960, 1280, 3), np.uint8)
     corners = ((100.0, 80.0), (1180.0, 95.0), (1170.0, 900.0), (120.0, 890.0))
-    ways = {
+    rectifiers = {
         "crop": Rectifier(crop=(0.15,) * 4),
         "crop to 640 x 480": Rectifier(crop=(0.15,) * 4, output_px=(640, 480)),
         "four corners to 640 x 480": Rectifier(corners_px=corners, image_px=(1280, 960), output_px=(640, 480)),
@@ -122,19 +122,19 @@ def _work() -> Iterator[ResultLine]:
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        for name, way in ways.items():
-            seconds = _seconds(way, picture)
-            yield ResultLine("cameras", f"1280 x 960, {name}", f"{duration(seconds)} a picture", {"seconds": seconds})
+        for name, rectifier in rectifiers.items():
+            seconds = _seconds(rectifier, picture)
+            yield ResultLine("cameras", f"1280 x 960, {name}", f"{duration(seconds)} per frame", {"seconds": seconds})
     finally:
         cv2.setNumThreads(threads)
 
 
-def _seconds(way: Rectifier, picture: np.ndarray) -> float:
-    """Least of ten: the rest is the machine's."""
+def _seconds(rectifier: Rectifier, picture: np.ndarray) -> float:
+    """Return the least of ten times; the rest is noise of the machine."""
     best = math.inf
     for _ in range(10):
         start = time.perf_counter()
-        to_rgb(way.apply(picture))
+        to_rgb(rectifier.apply(picture))
         best = min(best, time.perf_counter() - start)
     return best
 

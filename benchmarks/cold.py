@@ -1,4 +1,4 @@
-"""`retrieve query` from nothing: where the time of a fresh process goes, step by step, by PyTorch and ONNX Runtime."""
+"""`retrieve query` in a fresh process: the time of each step, with PyTorch and with ONNX Runtime."""
 
 import json
 import os
@@ -22,8 +22,8 @@ from retrieval.search.defaults import shipped_model
 PHOTOS = 1000
 REPETITIONS = 5
 
-# What `retrieve query` and `Searcher.open` do, a step at a time, in a process of its own. A step's imports are those
-# that the steps before it have not made.
+# The steps of `retrieve query` and `Searcher.open`, one at a time, in a separate process. A step's imports are those
+# that earlier steps have not made.
 PROGRAM = f"""
 import sys, time
 from importlib import import_module
@@ -41,11 +41,12 @@ from pathlib import Path
 import retrieval.search.query.opening as opening
 import retrieval.search.query.searcher as search
 generation = step("open the index", lambda: opening.IndexStore(index).open(threads=1))
-stored = step("read the checkpoint", lambda: import_module("retrieval.model.checkpoint_info").read_checkpoint_info(Path(model)))
+stored = step("read the checkpoint", lambda: import_module(
+    "retrieval.model.checkpoint_info").read_checkpoint_info(Path(model)))
 encoder = step("make the encoder", lambda: search.exported(stored) or search.torch_encoder(stored))
-judge = step("read the head", lambda: search.read_scorer(Path(model)))
-shard = step("number objects", lambda: search.FolderShard(generation, judge, stored.config.has_embeddings))
-searcher = search.Searcher(Path(index), shard, stored, encoder, judge)
+scorer = step("read the head", lambda: search.read_scorer(Path(model)))
+shard = step("number objects", lambda: search.FolderShard(generation, scorer, stored.config.has_embeddings))
+searcher = search.Searcher(Path(index), shard, stored, encoder, scorer)
 result = searcher.query([touch])
 assert result.index["encoder"] == ("torch" if backend == "torch" else "onnx")
 for name in {STAGES!r}:
@@ -58,7 +59,7 @@ print(json.dumps(ms | {{"CPU": 1e3 * time.process_time()}}), file=sys.stderr)
 
 
 def measure(photos: int = PHOTOS, repetitions: int = REPETITIONS, model: Path | None = None) -> Iterator[ResultLine]:
-    """A line for `--help`, and one for each backend that is installed, with the shipped checkpoint."""
+    """Yield a line for `--help`, and one for each installed backend, with the shipped checkpoint."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         models = _models(folder, model or shipped_model())
@@ -66,16 +67,16 @@ def measure(photos: int = PHOTOS, repetitions: int = REPETITIONS, model: Path | 
         write_index(folder / "index", checkpoint, photos)
         touch = gel_images(folder, checkpoint.config.matcher.fingers)
         yield _help(repetitions)
-        told: dict[str, list[dict[str, float]]] = {backend: [] for backend in models}
-        for _ in range(repetitions + 1):  # the first fills the disk's cache and is left out
+        runs_of: dict[str, list[dict[str, float]]] = {backend: [] for backend in models}
+        for _ in range(repetitions + 1):  # the first fills the disk cache and is not counted
             for backend, path in models.items():
-                told[backend].append(_steps(folder / "index", path, backend, touch))
-        for backend, runs in told.items():
+                runs_of[backend].append(_steps(folder / "index", path, backend, touch))
+        for backend, runs in runs_of.items():
             yield _line(backend, checkpoint, runs[1:], photos)
 
 
 def _models(folder: Path, source: Path) -> dict[str, Path]:
-    """Backend -> the same checkpoint, alone or with an export beside it."""
+    """Return backend -> the same checkpoint, alone or with an export next to it."""
     backends = ["torch"] + (["onnxruntime"] if find_spec("onnx") and find_spec("onnxruntime") else [])
     models = {}
     for backend in backends:
@@ -89,7 +90,7 @@ def _models(folder: Path, source: Path) -> dict[str, Path]:
 
 def _steps(index: Path, model: Path, backend: str, touch: Sequence[Path]) -> dict[str, float]:
     arguments = [str(item) for item in (time.time(), index, model, backend, *touch)]
-    own = {**os.environ, "XDG_CACHE_HOME": str(model.parent)}  # where no build has left an export
+    own = {**os.environ, "XDG_CACHE_HOME": str(model.parent)}  # no build has written an export there
     command = [sys.executable, "-c", PROGRAM, *arguments]
     done = subprocess.run(command, env=own, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -106,8 +107,8 @@ def _line(backend: str, checkpoint: Checkpoint, runs: Sequence[dict[str, float]]
     return ResultLine(
         "cold",
         checkpoint.config.matcher.tower,
-        f"{backend}, {photos} photos: {total:.0f} ms a query from nothing, {statistics.median(cpu):.0f} of CPU time: "
-        f"{shown}",
+        f"{backend}, {photos} photos: {total:.0f} ms per query in a fresh process, {statistics.median(cpu):.0f} of "
+        f"CPU time: {shown}",
         {"photos": photos, "total_ms": total, **{f"{step} ms": value for step, value in ms.items()}},
         {"total_ms": each, "cpu_ms": cpu},
     )

@@ -1,4 +1,4 @@
-"""What every benchmark shares: models with random weights, random images, and arms timed in turns."""
+"""Helpers of every benchmark: models with random weights, random images, and arms timed in turn."""
 
 import dataclasses
 import time
@@ -17,7 +17,15 @@ MIN_SECONDS = 0.2
 
 @dataclass(frozen=True)
 class ResultLine:
-    """One result: a sentence for people, and its figures. each: of arms what single repetitions took, for a spread."""
+    """One result.
+
+    Attributes:
+        benchmark: name of the benchmark.
+        tower: name of the tower or of the case.
+        text: the result as a sentence.
+        figures: the numbers by name.
+        each: the times of single repetitions of each arm, for their spread.
+    """
 
     benchmark: str
     tower: str
@@ -36,11 +44,11 @@ class Times:
     seconds: dict[str, list[float]]
 
     def median(self, arm: str) -> float:
-        """Median seconds of an arm."""
+        """Return the median seconds of an arm."""
         return float(np.median(self.seconds[arm]))
 
     def ratio(self, slow: str, fast: str, scale: float = 1.0) -> tuple[float, float, float]:
-        """How many times longer `slow` took: by the medians, and the least and most of single repetitions."""
+        """Return how many times longer `slow` took: by the medians, and the range over single repetitions."""
         each = scale * np.array(self.seconds[slow]) / np.array(self.seconds[fast])
         return scale * self.median(slow) / self.median(fast), float(each.min()), float(each.max())
 
@@ -50,8 +58,8 @@ def in_turns(
 ) -> Times:
     """Run every arm once unmeasured, then all of them in turn, `repetitions` times.
 
-    A short arm is called again and again for about `MIN_SECONDS` at its turn, and the mean of the calls is taken.
-    clock: gives seconds; those of `time.process_time` are CPU time.
+    A short arm is called repeatedly for about `MIN_SECONDS` in its turn, and the mean of the calls counts. `clock`
+    returns seconds; those of `time.process_time` are CPU time.
     """
     calls = {name: max(1, int(MIN_SECONDS / _seconds(arm, 1, clock))) for name, arm in arms.items()}
     seconds: dict[str, list[float]] = {name: [] for name in arms}
@@ -69,7 +77,7 @@ def _seconds(arm: Callable[[], object], calls: int, clock: Callable[[], float]) 
 
 
 def config_of(tower: str) -> Config:
-    """The preset `small` for the tower of that name, else the paper's with another tower; first weights random."""
+    """Return the preset `small` for the tower of that name, otherwise the paper's with this tower; random weights."""
     config = load_config("small" if tower == "small" else "paper")
     return dataclasses.replace(
         config,
@@ -79,21 +87,21 @@ def config_of(tower: str) -> Config:
 
 
 def matcher_of(config: Config) -> Matcher:
-    """A matcher with random weights, in evaluation mode."""
+    """Return a matcher with random weights, in evaluation mode."""
     torch.manual_seed(0)
     return Matcher(config.matcher).eval()
 
 
 def random_images(count: int, px: int, seed: int) -> list[np.ndarray]:
-    """Images (px, px, 3) float32 in 0..1."""
+    """Return images (px, px, 3) float32 in 0..1."""
     return list(np.random.default_rng(seed).random((count, px, px, 3), dtype=np.float32))
 
 
 def as_text(ratio: tuple[float, float, float]) -> str:
-    """The ratio, and its range over the repetitions."""
+    """Return the ratio and its range over the repetitions as text."""
     return "{:.3g} times ({:.3g} to {:.3g})".format(*ratio)
 
 
 def duration(seconds: float) -> str:
-    """Seconds or milliseconds with three digits."""
+    """Return seconds or milliseconds with three digits as text."""
     return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"

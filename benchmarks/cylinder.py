@@ -1,4 +1,4 @@
-"""Cylinders fitted to one-sided depth pictures: error of the centre and time, beside a naive recipe."""
+"""Cylinders fitted to one-sided depth images: error of the centre and time, compared with a naive recipe."""
 
 import math
 import time
@@ -33,49 +33,49 @@ CASES = {
 
 
 def measure(count: int = 20) -> Iterator[ResultLine]:
-    """A line a case, over `count` views of 512 x 424 pixels from 0.9 m and 35 degrees above."""
+    """Yield a line for each case, over `count` views of 512 x 424 pixels from 0.9 m and 35 degrees above."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        for name, (solid, how) in CASES.items():
-            yield _line(name, solid, how, count)
+        for name, (solid, noise) in CASES.items():
+            yield _line(name, solid, noise, count)
         yield _glass(count)
     finally:
         cv2.setNumThreads(threads)
 
 
-def _line(name: str, solid: views.Upright, how: dict[str, float], count: int) -> ResultLine:
+def _line(name: str, solid: views.UprightCylinder, noise: dict[str, float], count: int) -> ResultLine:
     pose, errors, naive, claimed, seconds, methods = views.camera_pose(), [], [], [], [], Counter()
     for seed in range(count):
-        image = views.view(solid, seed=seed, **how)
+        image = views.view(solid, seed=seed, **noise)
         start = time.perf_counter()
         fit = fit_cylinder(image, pose)
         seconds.append(time.perf_counter() - start)
         errors.append(math.hypot(fit.x_mm - X, fit.y_mm - Y))
         claimed.append(fit.error_mm)
         methods[fit.method] += 1
-        plain = naive_fit(image, pose)
-        naive.append(math.hypot(plain[0] - X, plain[1] - Y))
+        naive_centre = naive_fit(image, pose)
+        naive.append(math.hypot(naive_centre[0] - X, naive_centre[1] - Y))
     figures = {
         "centre_mm": float(np.mean(errors)),
         "worst_mm": float(np.max(errors)),
         "claimed_mm": float(np.mean(claimed)),
         "seconds": float(np.median(seconds)),
     }
-    plain_text = "sees nothing"
+    naive_text = "finds nothing"
     if np.isfinite(naive).all():
         figures["naive_mm"] = float(np.mean(naive))
-        plain_text = f"{figures['naive_mm']:.1f} mm"
-    ways = ", ".join(f"{method} {number}" for method, number in methods.most_common())
+        naive_text = f"{figures['naive_mm']:.1f} mm"
+    method_counts = ", ".join(f"{method} {number}" for method, number in methods.most_common())
     text = (
-        f"centre {figures['centre_mm']:.2f} mm off, at most {figures['worst_mm']:.2f}; claimed "
-        f"{figures['claimed_mm']:.2f}; naive {plain_text}; {1e3 * figures['seconds']:.1f} ms ({ways})"
+        f"centre {figures['centre_mm']:.2f} mm off, at most {figures['worst_mm']:.2f}; estimated error "
+        f"{figures['claimed_mm']:.2f}; naive {naive_text}; {1e3 * figures['seconds']:.1f} ms ({method_counts})"
     )
     return ResultLine("cylinder", name, text, figures)
 
 
 def _glass(count: int) -> ResultLine:
-    """Nothing but an outline in the colour picture."""
+    """Fit an object that only has an outline in the colour image."""
     errors = []
     for seed in range(count):
         try:

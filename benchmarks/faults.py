@@ -1,15 +1,16 @@
-"""`python -m benchmarks.faults [--times 20] [--only NAME ...]`: faults of a cluster, and their consequences.
+"""`python -m benchmarks.faults [--times 20] [--only NAME ...]`: faults of a sharded index, and their consequences.
 
-    router      the service is killed while it is asked, and started again
-    shard       a process that holds a shard is killed while queries go on
+    router      the service is killed during queries, and started again
+    shard       the process of a shard is killed during queries
     worker      a process of Ray Data is killed while it embeds
     job         a build from and into an object store is killed about halfway, and run again: on the same machine, and
-                on another one, which has nothing but the store
+                on another one, which has only the store
     refusals    the store refuses one request of twenty
-    torn        of one upload in five half arrives
+    torn        of one upload in five, only half arrives
 
-After each, every photo must be there once with the code of an undisturbed build, and every answer be whole and right.
-A line of figures for each kind; it ends with exit code 1 where something was lost, doubled or wrong.
+After each fault, every photo must be present once with the code of an undisturbed build, and every answer must be
+complete and right. It prints a line of figures for each kind and exits with code 1 if something was lost, duplicated or
+wrong.
 """
 
 import argparse
@@ -42,27 +43,27 @@ from tests import ray_processes, s3, serving, synthetic
 
 PHOTOS, OBJECTS, SHARDS, BLOCKS = 240, 40, 4, 8
 ATOL = 2e-3
-"""Between halves (float16), and logits of them, that were encoded in batches of another size."""
+"""Tolerance between partial activations (float16), and their logits, that were encoded in batches of another size."""
 SHARD, WORKER = r"ray::ServeReplica:shard-", r"ray::MapWorker"
 
 
 class ExpectationFailed(Exception):
-    """Something was lost, doubled, or answered wrongly."""
+    """Something was lost, duplicated, or answered wrongly."""
 
 
-def must(holds, what):
-    """Raises Wrong."""
+def require(holds, what):
+    """Raise ExpectationFailed unless `holds`."""
     if not holds:
         raise ExpectationFailed(what)
 
 
 def write_photos(folder, photos=PHOTOS, objects=OBJECTS):
-    """A catalogue of so many drawn photos, no two alike."""
+    """Write a catalogue of this many synthetic photos, no two alike."""
     return synthetic.write_catalogue(folder, synthetic.make_objects(objects, seed=9), photos // objects)
 
 
 def _make(folder):
-    """The checkpoint, trained for six steps. In a process of its own: the other one forks, and must have no threads."""
+    """Train the checkpoint for six steps, in a separate process: the parent forks later and must have no threads."""
     from retrieval.training.train import train
     from tests.conftest import TINY
 
@@ -71,7 +72,7 @@ def _make(folder):
 
 
 class FaultFixture:
-    """The photos, the model, a cluster that nothing disturbed, and touches with what it answers."""
+    """Photos, model, an undisturbed sharded index, and touches with its answers."""
 
     def __init__(self, folder, seed=0):
         self.folder, self.rng = folder, random.Random(seed)
@@ -86,7 +87,7 @@ class FaultFixture:
         drawn = synthetic.write_queries(folder / "touches", objects)
         self.touches = [pair for pairs in drawn.values() for pair in pairs]
         self.codes = self.codes_of(self.cluster)
-        must(len(self.codes) == PHOTOS, "the undisturbed build lacks photos")
+        require(len(self.codes) == PHOTOS, "the undisturbed build does not have all photos")
         with Searcher.open(self.cluster) as searcher:
             self.expected = [logits(searcher.query(touch, top=OBJECTS)) for touch in self.touches]
 
@@ -96,64 +97,64 @@ class FaultFixture:
 
     @staticmethod
     def forked(work):
-        """A process that does this and ends."""
+        """Start a process that does this work and ends."""
         process = get_context("fork").Process(target=work)
         process.start()
         return process
 
     def codes_of(self, cluster):
-        """{photo: (object, half)} of all shards; raises Wrong for a photo in two of them."""
+        """Return {photo: (object, partial activation)} of all shards; no photo may be in two of them."""
         found = {}
         for entry in read_sharded_manifest(cluster).shards:
             store = IndexStore(local_folder(cluster, entry) / entry.folder)
             generation = store.open(name=entry.generation)
             for row, partial_activation in zip(generation.rows, generation.arrays["partials"], strict=True):
-                must(row["id"] not in found, f"{row['id']} is there twice")
+                require(row["id"] not in found, f"{row['id']} is present twice")
                 found[row["id"]] = row["object_id"], partial_activation.astype(np.float32)
         return found
 
     def check_codes(self, cluster):
-        """All photos, once, with the codes of the undisturbed build."""
+        """Require all photos, once, with the codes of the undisturbed build."""
         found = self.codes_of(cluster)
-        must(found.keys() == self.codes.keys(), f"{len(found)} photos of {len(self.codes)} are there")
+        require(found.keys() == self.codes.keys(), f"{len(found)} of {len(self.codes)} photos are present")
         for name, (owner, partial_activation) in found.items():
-            must(owner == self.codes[name][0], f"{name} is of {owner}")
-            must(np.allclose(partial_activation, self.codes[name][1], atol=ATOL), f"{name} has another code")
+            require(owner == self.codes[name][0], f"{name} belongs to {owner}")
+            require(np.allclose(partial_activation, self.codes[name][1], atol=ATOL), f"{name} has another code")
 
     def check_answer(self, number, answer):
-        """Whole, and that of the undisturbed cluster."""
-        must(answer.index["searched"] == 1.0, f"only {answer.index['searched']} was searched")
+        """Require a complete answer, equal to that of the undisturbed index."""
+        require(answer.index["searched"] == 1.0, f"only {answer.index['searched']} was searched")
         found, expected = logits(answer), self.expected[number]
         best = sorted(expected.values(), reverse=True)[: len(found)]
         right = len(found) == 10 and np.allclose(list(found.values()), best, atol=ATOL)
         right = right and all(abs(logit - expected[name]) <= ATOL for name, logit in found.items())
-        must(right, f"touch {number} is answered by {found}")
+        require(right, f"touch {number} is answered by {found}")
 
     def check_answers(self, cluster):
-        """Of all touches."""
+        """Check the answers to all touches."""
         with Searcher.open(cluster) as searcher:
             for number, touch in enumerate(self.touches):
                 self.check_answer(number, searcher.query(touch))
 
     @cached_property
     def stored(self):
-        """The photos in an object store."""
+        """URL of the photos in an object store."""
         s3.put(self.photos, "faults/photos")
         return "s3://faults/photos"
 
 
 def logits(answer):
-    """{object: its logit}, the best first; of batches of another size they differ, and so may the order of equals."""
+    """Return {object: logit}, best first; batches of another size change logits slightly, and the order of ties."""
     return {match.object_id: match.logit for match in answer.results}
 
 
-def another_machine():
-    """This one, without what it keeps."""
+def clear_cache():
+    """Delete the cache, so that this machine behaves like another one."""
     shutil.rmtree(Path(os.environ["XDG_CACHE_HOME"]), ignore_errors=True)
 
 
 class EncodedPhotoCount:
-    """How many photos the processes forked from this one encode, while it is used."""
+    """Count the photos that processes forked from this one encode, while the context is active."""
 
     def __enter__(self):
         from retrieval.model import photo_encoder
@@ -162,9 +163,9 @@ class EncodedPhotoCount:
 
         def counted(matcher, photos, batch):
             photos = list(photos)
-            made = self._plain(matcher, photos, batch)
+            encoding = self._plain(matcher, photos, batch)
             self.set(self.count + len(photos))
-            return made
+            return encoding
 
         photo_encoder.encode_photos = counted
         return self
@@ -176,11 +177,11 @@ class EncodedPhotoCount:
 
     @property
     def count(self):
-        """Until now."""
+        """The count so far."""
         return struct.unpack("q", self._shared[:8])[0]
 
     def set(self, count):
-        """Count on from there."""
+        """Set the count."""
         self._shared[:8] = struct.pack("q", count)
 
 
@@ -188,13 +189,13 @@ class EncodedPhotoCount:
 
 
 def job(bench, times):
-    """Killed when 40 to 60 % of the photos were encoded. What another machine repeats are blocks: one of 8 shards."""
+    """Kill a build after 40 to 60 % of the photos. Another machine repeats only a block: one of 8 shards."""
     figures = {"killed": 0}
     with s3.run_server(), EncodedPhotoCount() as encoded:
         for where in ("same", "other"):
-            repeated, shares = [], []
+            repeated, fractions = [], []
             for turn in range(times):
-                another_machine()
+                clear_cache()
                 url, aim = f"s3://faults/{where}-{turn}", bench.rng.uniform(0.4, 0.6) * PHOTOS
                 encoded.set(0)
                 process = bench.forked(lambda url=url: bench.build(bench.stored, url, BLOCKS))
@@ -207,38 +208,41 @@ def job(bench, times):
                 done = encoded.count
                 try:
                     read_sharded_manifest(url)
-                    must(process.exitcode == 0, "a build that was killed put a cluster")
+                    require(process.exitcode == 0, "a killed build wrote the manifest of the sharded index")
                 except NoIndex:
                     pass
                 if where == "other":
-                    another_machine()
+                    clear_cache()
                 process = bench.forked(lambda url=url: bench.build(bench.stored, url, BLOCKS))
                 process.join()
-                must(process.exitcode == 0, "the next build failed")
+                require(process.exitcode == 0, "the next build failed")
                 repeated.append(encoded.count - PHOTOS)
                 if done < PHOTOS:
-                    shares.append(repeated[-1] / (PHOTOS - done))
+                    fractions.append(repeated[-1] / (PHOTOS - done))
                 bench.check_codes(url)
                 bench.check_answers(url)
             figures |= {f"{where}_repeated_mean": float(np.mean(repeated)), f"{where}_repeated_most": max(repeated)}
-            figures |= {f"{where}_of_the_rest_p50": float(np.median(shares)), f"{where}_of_the_rest_most": max(shares)}
+            figures |= {
+                f"{where}_of_the_rest_p50": float(np.median(fractions)),
+                f"{where}_of_the_rest_most": max(fractions),
+            }
     return figures
 
 
 def disturbed(bench, times, kind, **faults):
-    """Builds into a store with faults, and searches of it, until there were so many faults; a few builds at least."""
+    """Build into a store with faults and search it, until there were enough faults; at least a few builds."""
     builds = 0
     with s3.run_server() as server:
         photos = bench.stored
         for name, every in faults.items():
             setattr(server, name, every)
         while getattr(server, kind) < times or builds < max(2, times // 4):
-            another_machine()
+            clear_cache()
             url = f"s3://faults/{kind}-{builds}"
             process = bench.forked(lambda url=url: bench.build(photos, url))
             process.join()
-            must(process.exitcode == 0, "the build failed")
-            another_machine()
+            require(process.exitcode == 0, "the build failed")
+            clear_cache()
             bench.check_codes(url)
             bench.check_answers(url)
             builds += 1
@@ -246,17 +250,17 @@ def disturbed(bench, times, kind, **faults):
 
 
 def refusals(bench, times):
-    """One request of twenty."""
+    """Refuse one request of twenty."""
     return disturbed(bench, times, "refused", refuse=20)
 
 
 def torn(bench, times):
-    """One upload of five."""
+    """Truncate one upload of five."""
     return disturbed(bench, times, "torn", tear=5)
 
 
 def worker(bench, times):
-    """Killed whenever new codes were kept, at most four times a build."""
+    """Kill the workers whenever new codes were stored, at most four times per build."""
     from retrieval.cluster.building import ray_runner
 
     killed = builds = 0
@@ -269,15 +273,15 @@ def worker(bench, times):
         thread, known, own = threading.Thread(target=work), 0, 0
         thread.start()
         while thread.is_alive():
-            kept = sum(path.stat().st_size for path in out.glob("shard-*/unfinished.sqlite"))
-            if kept > known and own < min(4, times - killed) and (workers := ray_processes.processes_named(WORKER)):
+            stored = sum(path.stat().st_size for path in out.glob("shard-*/unfinished.sqlite"))
+            if stored > known and own < min(4, times - killed) and (workers := ray_processes.processes_named(WORKER)):
                 for process in workers:
                     os.kill(process, signal.SIGKILL)
-                own, known = own + 1, kept
-            known = min(known, kept)  # a finished shard leaves none
+                own, known = own + 1, stored
+            known = min(known, stored)  # a finished shard has no such file
             time.sleep(0.002)
         thread.join()
-        must("report" in done, "the build failed")
+        require("report" in done, "the build failed")
         bench.check_codes(out)
         bench.check_answers(out)
         killed, builds = killed + own, builds + 1
@@ -288,71 +292,71 @@ def worker(bench, times):
 
 
 @contextmanager
-def asked(bench, ask):
-    """What a thread tells of its queries, one after the other, while the block runs: {"answers", "errors", "wrong"}."""
-    told, stop = {"answers": 0, "errors": 0, "wrong": []}, threading.Event()
+def queried(bench, query):
+    """Send queries one after the other in a thread while the block runs; yield {"answers", "errors", "wrong"}."""
+    tally, stop = {"answers": 0, "errors": 0, "wrong": []}, threading.Event()
 
-    def go_on():
+    def run():
         number = 0
         while not stop.is_set():
             number = (number + 1) % len(bench.touches)
             try:
-                answer = ask(bench.touches[number])
+                answer = query(bench.touches[number])
                 bench.check_answer(number, answer)
-                told["answers"] += 1
-            except RetrievalError:  # said to whoever asks
-                told["errors"] += 1
+                tally["answers"] += 1
+            except RetrievalError:  # reported to the client
+                tally["errors"] += 1
                 time.sleep(0.05)
             except ExpectationFailed as error:
-                told["wrong"].append(str(error))
+                tally["wrong"].append(str(error))
 
-    thread = threading.Thread(target=go_on)
+    thread = threading.Thread(target=run)
     thread.start()
     try:
-        yield told
+        yield tally
     finally:
         stop.set()
         thread.join()
-        must(not told["wrong"], "; ".join(told["wrong"][:3]))
+        require(not tally["wrong"], "; ".join(tally["wrong"][:3]))
 
 
-def grow(told, name="answers", by=1, limit_s=240):
-    """Wait until so many more were told."""
-    start, until = told[name], time.monotonic() + limit_s
-    while told[name] < start + by and not told["wrong"]:
-        must(time.monotonic() < until, f"no {name} within {limit_s} s")
+def wait_for(tally, name="answers", by=1, limit_s=240):
+    """Wait until the count has grown by this much."""
+    start, until = tally[name], time.monotonic() + limit_s
+    while tally[name] < start + by and not tally["wrong"]:
+        require(time.monotonic() < until, f"no {name} within {limit_s} s")
         time.sleep(0.005)
 
 
 def shard(bench, times):
-    """While queries go on, one after the other."""
+    """Kill shards during queries."""
     from retrieval.cluster.serving import Deployments, ReplicaSettings
     from retrieval.cluster.session import ray_session
 
     with ray_session(2) as ray:
-        held = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=120.0))
-        with Searcher.open(bench.cluster, shards=held.open) as searcher, asked(bench, searcher.query) as told:
-            grow(told)
+        deployments = Deployments(ray, ReplicaSettings(cpus=0.1, wait_s=120.0))
+        with Searcher.open(bench.cluster, shards=deployments.open) as searcher, queried(bench, searcher.query) as tally:
+            wait_for(tally)
             for turn in range(times):
                 processes = ray_processes.processes_named(SHARD)
                 os.kill(processes[turn % len(processes)], signal.SIGKILL)
-                grow(told, by=3)
-            return {"killed": times, "answers": told["answers"], "errors": told["errors"]}
+                wait_for(tally, by=3)
+            return {"killed": times, "answers": tally["answers"], "errors": tally["errors"]}
 
 
 def router(bench, times):
-    """The service with a Ray of its own."""
+    """Kill the service with its own Ray."""
     from retrieval import Client
 
     answers = errors = 0
     options = ["--index", bench.cluster, "--cluster", "--no-history", "--port", 0]
     for _ in range(times):
         with serving.command(*options) as (process, address, _), Client(address) as client:
-            with asked(bench, client.query) as told:
-                grow(told, by=2)
+            with queried(bench, client.query) as tally:
+                wait_for(tally, by=2)
                 process.kill()
-                grow(told, "errors")
-            answers, errors = answers + told["answers"], errors + told["errors"]
+                wait_for(tally, "errors")
+            answers, errors = answers + tally["answers"], errors + tally["errors"]
     return {"killed": times, "answers": answers, "errors": errors}
 
 
@@ -362,7 +366,7 @@ KINDS = {one.__name__: one for one in (refusals, torn, job, worker, shard, route
 def main():
     """Print a line of figures for each kind."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.faults", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--times", type=int, default=20, help="how often each")
+    parser.add_argument("--times", type=int, default=20, help="repetitions of each fault")
     parser.add_argument("--only", nargs="+", choices=KINDS, default=list(KINDS), metavar="NAME", help=", ".join(KINDS))
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()

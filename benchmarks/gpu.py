@@ -1,9 +1,9 @@
-"""What a graphics card gives: building, asking, training and simulating, on a device and on the processor in turns.
+"""Speed-up by a graphics card: building, querying, training and simulating, on a device and on the processor in turn.
 
     python -m benchmarks.gpu [--device cuda] [--tower mobilenet_v2] [--json]
 
-The towers are those that the commands run, moved to the device: images come from the processor and codes go back, as in
-a build. What is judged and what is simulated is numpy's work: it is timed once, to show what a card cannot shorten.
+The towers are those of the commands, moved to the device: images come from the processor and codes go back, as in a
+build. Scoring and simulation run in numpy on the processor: they are timed once, to show what a card cannot shorten.
 """
 
 import argparse
@@ -32,38 +32,38 @@ PHOTOS, RERANKED, REPETITIONS = 64, 1000, 5
 def measure(
     config: Config, device: torch.device | str, photos: int = PHOTOS, repetitions: int = REPETITIONS
 ) -> Iterator[ResultLine]:
-    """A line each for building, asking and training; times wait for the device to be done."""
-    matcher, pre, there = matcher_of(config), config.preprocessing, torch.device(device)
-    arms = {"cpu": matcher, str(there): copy.deepcopy(matcher).to(there)}
+    """Yield a line each for building, querying and training; times include waiting for the device."""
+    matcher, pre, target = matcher_of(config), config.preprocessing, torch.device(device)
+    arms = {"cpu": matcher, str(target): copy.deepcopy(matcher).to(target)}
     images = random_images(photos, pre.photo_px, seed=1)
     strips = [np.concatenate([image] * len(pre.views), axis=1) for image in images]
     touch = random_images(config.matcher.fingers, pre.touch_px, seed=2)
     partials = np.random.default_rng(0).normal(size=(RERANKED, config.matcher.partial_width)).astype(np.float16)
     scorer = scorer_of(matcher.head)
 
-    def ask(model: Matcher) -> object:
+    def query(model: Matcher) -> object:
         return scorer.logits(encode_touches(model, [touch]).partial.numpy(), partials)
 
-    works: dict[str, Callable[[Matcher], object]] = {
+    tasks: dict[str, Callable[[Matcher], object]] = {
         f"build, {photos} photos in batches of 16": lambda model: encode_photos(model, strips),
-        f"ask, one touch, {RERANKED} photos judged": ask,
+        f"query, one touch, {RERANKED} photos scored": query,
     }
-    for name, work in works.items():
+    for name, work in tasks.items():
         yield _line(
             name,
             config,
-            {arm: _waiting(partial(work, model), there) for arm, model in arms.items()},
+            {arm: _waiting(partial(work, model), target) for arm, model in arms.items()},
             repetitions,
         )
-    steps = {arm: _waiting(_step(model, config, photos), there) for arm, model in arms.items()}
+    steps = {arm: _waiting(_step(model, config, photos), target) for arm, model in arms.items()}
     yield _line("train, a step of 6 touches x 8 photos", config, steps, repetitions)
 
 
 def _line(name: str, config: Config, arms: dict[str, Callable[[], object]], repetitions: int) -> ResultLine:
     times = in_turns(arms, repetitions)
-    here, there = "cpu", list(arms)[-1]
-    ratio = times.ratio(here, there)
-    text = f"{name}: {duration(times.median(there))} on {there}, {duration(times.median(here))} on the processor"
+    processor, device = "cpu", list(arms)[-1]
+    ratio = times.ratio(processor, device)
+    text = f"{name}: {duration(times.median(device))} on {device}, {duration(times.median(processor))} on the processor"
     text += f": {as_text(ratio)}"
     return ResultLine(
         "gpu", config.matcher.tower, text, {f"{arm}_s": times.median(arm) for arm in arms} | {"ratio": ratio[0]}
@@ -71,7 +71,7 @@ def _line(name: str, config: Config, arms: dict[str, Callable[[], object]], repe
 
 
 def _step(matcher: Matcher, config: Config, photos: int, touches: int = 6) -> Callable[[], object]:
-    """A step of training on the matcher's device, from images that lie in the processor's memory."""
+    """Return a training step on the matcher's device, from images in the processor's memory."""
     set_training_mode(matcher, config.training)
     for norm in (matcher.touch_norm, matcher.photo_norm):
         norm.eval()
@@ -93,7 +93,7 @@ def _step(matcher: Matcher, config: Config, photos: int, touches: int = 6) -> Ca
 
 
 def _waiting(work: Callable[[], object], device: torch.device) -> Callable[[], object]:
-    """The work, and what it left to the device."""
+    """Return the work followed by a wait for the device."""
     if device.type != "cuda":
         return work
 
@@ -105,11 +105,11 @@ def _waiting(work: Callable[[], object], device: torch.device) -> Callable[[], o
 
 
 def main() -> None:
-    """Print every line as soon as it is there."""
+    """Print each line as soon as it is available."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.gpu", description=__doc__.split("\n\n")[0])
     parser.add_argument("--device", default=str(default_device()))
     parser.add_argument("--tower", choices=sorted(TOWERS), default="mobilenet_v2")
-    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     for lines in (
         measure(config_of(arguments.tower), arguments.device),

@@ -1,4 +1,4 @@
-"""What a simulated grasp costs: the whole, each output alone, what leaving one out saves; then whole collections."""
+"""Cost of a simulated grasp: all outputs, each output alone, the saving by leaving one out; then whole collections."""
 
 import dataclasses
 import tempfile
@@ -29,13 +29,13 @@ ARMS = {
     "without photo and depth": EVERYTHING - {"photo", "depth"},
     "photo alone": {"photo"},
     "depth alone": {"depth"},
-    "one touched gel alone": {"touch_a"},
-    "one untouched gel alone": {"touch_a_before"},
+    "one pressed gel alone": {"touch_a"},
+    "one no-contact frame alone": {"touch_a_before"},
 }
 
 
 def measure(objects: int = 26, grasps: int = 3, collected: int = 26) -> Iterator[ResultLine]:
-    """A line an arm, each over the same scenes, one thread; then a line for one job and one for two."""
+    """Yield a line for each arm, all over the same scenes, one thread; then a line for one job and one for two."""
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -49,12 +49,12 @@ def measure(objects: int = 26, grasps: int = 3, collected: int = 26) -> Iterator
 
 
 def _scenes(objects: int, grasps: int) -> Iterator[Scene]:
-    """Grips about the middle of the rig's objects, each round over all of them."""
+    """Yield grips around the middle of the rig's objects, each round over all of them."""
     rig = SimRig(40_000)
-    held = {name: rig._find_object(name) for name in rig.object_ids(objects)}
+    objects_by_name = {name: rig._find_object(name) for name in rig.object_ids(objects)}
     rng = np.random.default_rng(0)
     for number in range(grasps):
-        for name, obj in held.items():
+        for name, obj in objects_by_name.items():
             rig.prepare(name, number)
             scene = dataclasses.replace(rig.sim_state.current_scene(), obj=obj)
             height = max(10.0, rng.uniform(0.3, 0.8) * float(obj.body.upper[2]))
@@ -63,36 +63,38 @@ def _scenes(objects: int, grasps: int) -> Iterator[Scene]:
 
 
 def _arms(scenes: list[Scene], warm: list[Scene]) -> Iterator[ResultLine]:
-    """Arms in turns, scene by scene; `warm` bakes each object's relief and fills the caches."""
+    """Time the arms in turn, scene by scene; `warm` bakes each object's relief and fills the caches."""
     for scene in warm:
         dataclasses.replace(scene, outputs=frozenset(EVERYTHING)).run()
     seconds: dict[str, list[float]] = {name: [] for name in ARMS}
     for scene in scenes:
         for name in ARMS:
             seconds[name].append(_seconds(_arm(scene, name)))
-    whole = float(np.mean(seconds["everything"]))
+    everything = float(np.mean(seconds["everything"]))
     for name, each in seconds.items():
         mean = float(np.mean(each))
-        text = f"{duration(mean)} a grasp, {1 / mean:.1f} a second; {mean / whole:.0%} of everything"
-        yield ResultLine("grasp", name, text, {"seconds": mean, "share": mean / whole})
+        text = f"{duration(mean)} per grasp, {1 / mean:.1f} per second; {mean / everything:.0%} of everything"
+        yield ResultLine("grasp", name, text, {"seconds": mean, "share": mean / everything})
 
 
 def _arm(scene: Scene, name: str) -> Scene:
-    bare = {finger: sensor for finger, sensor in scene.sensors.items() if name != "without finger b" or finger != "b"}
+    sensors = {
+        finger: sensor for finger, sensor in scene.sensors.items() if name != "without finger b" or finger != "b"
+    }
     return dataclasses.replace(
-        scene, sensors=bare, shadow=name != "without shadow", outputs=frozenset(ARMS[name]), passes=Counter()
+        scene, sensors=sensors, shadow=name != "without shadow", outputs=frozenset(ARMS[name]), passes=Counter()
     )
 
 
 def _seconds(scene: Scene) -> float:
-    """Of CPU time: it is one thread's."""
+    """Return the CPU time, of one thread."""
     start = time.process_time()
     scene.run()
     return time.process_time() - start
 
 
 def _collected(objects: int, jobs: int) -> ResultLine:
-    """A whole collection, from starting processes to the last file on the disk."""
+    """Time a whole collection, from starting processes to the last file on disk."""
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
         make_rig = partial(load_rig, "sim", seed=1)
@@ -102,6 +104,8 @@ def _collected(objects: int, jobs: int) -> ResultLine:
         seconds = time.perf_counter() - start
     attempts = sum(tally.attempts for tally in tallies)
     accepted = sum(tally.accepted for tally in tallies)
-    text = f"{attempts / seconds:.2f} attempts and {accepted / seconds:.2f} accepted grasps a second, all files written"
+    text = (
+        f"{attempts / seconds:.2f} attempts and {accepted / seconds:.2f} accepted grasps per second, all files written"
+    )
     figures = {"attempts_per_s": attempts / seconds, "accepted_per_s": accepted / seconds}
     return ResultLine("grasp", f"collect with {jobs} job{'s' * (jobs > 1)}", text, figures)

@@ -1,7 +1,7 @@
 """`python -m benchmarks.growth [--grasps 1 2 4 8] [--objects 5 10 20 40] [--touches 1 2 5 10 20] [--json]`.
 
-How CPU time grows with accepted grasps per object and with objects that the simulated rig collects, in this process and
-with planning, gate and files, and with grasps per query of the shipped model. One thread works; every round measures
+Growth of CPU time with accepted grasps per object and with objects that the simulated rig collects, in this process
+with planning, gate and files, and with grasps per query of the shipped model. One thread works. Every round measures
 all sizes in turn, and the median of the rounds counts. Slopes are those of log time over log number.
 """
 
@@ -23,19 +23,19 @@ from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.defaults import shipped_model
 
 PHOTOS, OBJECTS, GRASPS = 1_000, 10, 2
-"""Of an index that is asked; objects where grasps grow, and grasps where objects do."""
+"""Photos of the index that is queried; objects while grasps grow, and grasps while objects grow."""
 
 
 def collecting(grasps: Sequence[int], objects: Sequence[int], rounds: int) -> Iterator[tuple[str, dict[int, float]]]:
-    """Seconds by accepted grasps per object, and by objects."""
+    """Yield seconds by accepted grasps per object, and by objects."""
     cv2.setNumThreads(1)
     collected(max(objects[:1] + grasps[:1]), 1)  # compiles, and fills the caches
-    yield "grasps an object", _timed(lambda number: collected(OBJECTS, number), grasps, rounds)
+    yield "grasps per object", _timed(lambda number: collected(OBJECTS, number), grasps, rounds)
     yield "objects", _timed(lambda number: collected(number, GRASPS), objects, rounds)
 
 
-def asking(touches: Sequence[int], rounds: int, photos: int = PHOTOS) -> Iterator[tuple[str, dict[int, float]]]:
-    """Seconds by grasps per query of an index of made-up photos, with the fastest encoder that is installed."""
+def querying(touches: Sequence[int], rounds: int, photos: int = PHOTOS) -> Iterator[tuple[str, dict[int, float]]]:
+    """Yield seconds by grasps per query on an index of synthetic photos, with the fastest installed encoder."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         checkpoint = load_checkpoint(Path(shutil.copy(shipped_model(), folder / "model.safetensors")))
@@ -44,7 +44,7 @@ def asking(touches: Sequence[int], rounds: int, photos: int = PHOTOS) -> Iterato
         touch = gel_images(folder, checkpoint.config.matcher.fingers)
         searcher = searcher_of(folder / "index", checkpoint, encoder)
         searcher.query([touch])
-        yield "grasps a query", _timed(lambda number: searcher.query([touch] * number), touches, rounds)
+        yield "grasps per query", _timed(lambda number: searcher.query([touch] * number), touches, rounds)
 
 
 def _timed(work: Callable[[int], object], numbers: Sequence[int], rounds: int) -> dict[int, float]:
@@ -58,7 +58,7 @@ def _timed(work: Callable[[int], object], numbers: Sequence[int], rounds: int) -
 
 
 def slope(seconds: dict[int, float]) -> float:
-    """d log t / d log N, fitted over all sizes."""
+    """Return d log t / d log N, fitted over all sizes."""
     return float(np.polyfit(np.log(list(seconds)), np.log(list(seconds.values())), 1)[0])
 
 
@@ -69,10 +69,10 @@ def main() -> None:
     parser.add_argument("--objects", nargs="+", type=int, default=[5, 10, 20, 40])
     parser.add_argument("--touches", nargs="+", type=int, default=[1, 2, 5, 10, 20])
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     tables = [collecting(arguments.grasps, arguments.objects, arguments.rounds)]
-    tables.append(asking(arguments.touches, arguments.rounds))
+    tables.append(querying(arguments.touches, arguments.rounds))
     for what, seconds in (line for table in tables for line in table):
         power = slope(seconds)
         shown = ", ".join(f"{number}: {duration(each)}" for number, each in seconds.items())

@@ -1,11 +1,11 @@
-"""Stiff and extreme inputs of every numerical kernel: what must hold, what the naive formula gives, what ours gives.
+"""Stiff and extreme inputs of every numerical kernel: required result, result of the naive formula, and our result.
 
-`python -m benchmarks.hard_cases` runs them and prints the table; with `--out FOLDER` it writes stability.json and
-stability.html too. The exit code is 1 if one does not hold.
+`python -m benchmarks.hard_cases` runs them and prints the table; with `--out FOLDER` it also writes stability.json and
+stability.html. The exit code is 1 if a case does not hold.
 
-Each file of hard cases stands with the tests of its kernels, `tests/<package>/<room>/hard_<kernels>.py`. The naive
-formulae stand there to be shown failing; nothing else uses them. A new case is one function, and one `yield` in
-`hard_cases` of its file.
+Each file of hard cases is next to the tests of its kernels, `tests/<package>/<room>/hard_<kernels>.py`. It also
+contains the naive formulae, which nothing else uses. A new case is one function, and one `yield` in `hard_cases` of its
+file.
 """
 
 import argparse
@@ -36,7 +36,7 @@ KERNELS = {
     "indexes": ("tests.indexes.hard_vectors",),
     "robot": ("tests.robot.sim.hard_contact", "tests.robot.sight.hard_sight", "tests.robot.sim.hard_gel_pictures"),
 }
-"""Package -> modules with the hard cases of its kernels, imported when they are run."""
+"""Package -> modules with the hard cases of its kernels, imported on use."""
 
 _HEADER = ("kernel", "input", "what must hold", "naive formula", "ours", "")
 _TITLES = {"retrieval": "Learning and scoring", "indexes": "Vector search", "robot": "Robot and simulated rig"}
@@ -53,17 +53,20 @@ def hard_cases(package: str) -> list[HardCase]:
 
 
 def run_hard_cases() -> dict[str, Any]:
-    """Run the hard cases of every package; returns the content of stability.json."""
+    """Run the hard cases of every package; return the content of stability.json."""
     cases: list[dict[str, Any]] = []
     for package in KERNELS:
         for case in hard_cases(package):
-            plain = {"holds": bool(case.holds), "naive_holds": bool(case.naive_holds)}  # numpy's bool is no JSON
+            plain = {
+                "holds": bool(case.holds),
+                "naive_holds": bool(case.naive_holds),
+            }  # JSON cannot encode numpy's bool
             cases.append({"package": package, **asdict(case), **plain})
     return {"software": __version__, "failed": sum(not case["holds"] for case in cases), "cases": cases}
 
 
 def lines(document: Mapping[str, Any]) -> list[str]:
-    """Return a line of text for each case, and one that counts them."""
+    """Return a line of text for each case, and one with the count."""
     cases = document["cases"]
     return [
         *(
@@ -76,17 +79,17 @@ def lines(document: Mapping[str, Any]) -> list[str]:
 
 
 def write_page(out: Path, document: Mapping[str, Any]) -> Path:
-    """Write `out`/stability.html for the document of stability.json, a table for each package; returns the file."""
+    """Write `out`/stability.html for the document of stability.json, a table for each package; return the file."""
     cases, failed = document["cases"], document["failed"]
     kernels = dict.fromkeys(case["kernel"] for case in cases)
     wrong = sum(not case["naive_holds"] for case in cases)
     lead = (
         Text(
-            f"{len(cases)} inputs that are stiff, extreme, degenerate or no numbers at all, of {len(kernels)} "
-            "numerical kernels. Each was run just now, by the obvious formula and by ours: the obvious one fails "
+            f"{len(cases)} inputs that are stiff, extreme, degenerate or not finite, of {len(kernels)} "
+            "numerical kernels. Each was run by the naive formula and by ours. The naive formula fails on "
             f"{wrong} of them."
         ),
-        Text(f"{failed} do not hold." if failed else "What must hold does, in all of them.", warn=bool(failed)),
+        Text(f"{failed} do not hold." if failed else "All of them hold.", warn=bool(failed)),
     )
     packages = dict.fromkeys(case["package"] for case in cases)
     sections = tuple(_section(name, [case for case in cases if case["package"] == name]) for name in packages)
@@ -114,7 +117,7 @@ def _section(package: str, cases: Sequence[Mapping[str, Any]]) -> Section:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the table; returns the exit code."""
+    """Print the table; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.hard_cases", description=__doc__)
     parser.add_argument("--out", type=Path, help="folder for stability.json and stability.html")
     out = parser.parse_args(argv).out

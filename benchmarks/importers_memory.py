@@ -1,11 +1,11 @@
-"""How much memory each importer takes for many rows: `python -m benchmarks.importers_memory`.
+"""Memory of each importer for many rows: `python -m benchmarks.importers_memory`.
 
     python -m benchmarks.importers_memory                       every importer, 10,000 and 100,000 rows
     python -m benchmarks.importers_memory tvl --rows 1000 5000
 
-Rows are drawn in the layout of each data set, in folders as large as theirs, and lead by links to a few small pictures.
-An import runs in a process of its own; its peak is read before the recording is handed back and after, since what is
-handed back holds a line a grasp. Only names may grow with rows: MAX_KB.
+Rows are written in the layout of each data set, in folders of the same size, with links to a few small pictures. An
+import runs in a separate process. Its peak is read before the recording is returned and after, because the returned
+recording contains one line per grasp. Only names may grow with rows: MAX_KB.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from typing import Any
 from tests.miniatures import encoded, picture
 
 MAX_KB = {"importing": 1.0, "in all": 3.0}
-"""That a row may take: while it is imported, and once the recording was read back."""
+"""Maximum memory of a row: during the import, and after the recording was read back."""
 Options = dict[str, Any]
 
 
@@ -29,55 +29,55 @@ def main(words: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("names", nargs="*", choices=[*WIDE, []], metavar="NAME")
     parser.add_argument("--rows", nargs=2, type=int, default=(10_000, 100_000))
-    asked = parser.parse_args(words)
-    few, many = asked.rows
+    arguments = parser.parse_args(words)
+    few, many = arguments.rows
     heads = (f"{what}, {few:,} rows, MB | {many:,} | kB a row" for what in MAX_KB)
     print(f"| importer | {' | '.join(heads)} |\n|{'---|' * (1 + 3 * len(MAX_KB))}")
-    good = True
-    for name in asked.names or WIDE:
-        peaks = {rows: peak_mb(name, rows) for rows in asked.rows}
+    within_limits = True
+    for name in arguments.names or WIDE:
+        peaks = {rows: peak_mb(name, rows) for rows in arguments.rows}
         cells = []
-        for what, most in MAX_KB.items():
+        for what, limit_kb in MAX_KB.items():
             kb = growth_kb(peaks, what)
-            good &= kb <= most
+            within_limits &= kb <= limit_kb
             cells.append(f"{peaks[few][what]:.0f} | {peaks[many][what]:.0f} | {kb:.2f}")
         print(f"| {name} | {' | '.join(cells)} |", flush=True)
-    return 0 if good else 1
+    return 0 if within_limits else 1
 
 
-def growth_kb(peaks: Mapping[int, Mapping[str, float]], what: str) -> float:
-    """Of a row, from the fewer rows to the more."""
+def growth_kb(peaks: Mapping[int, Mapping[str, float]], phase: str) -> float:
+    """Return the growth per row, from fewer rows to more."""
     few, many = sorted(peaks)
-    return 1000 * (peaks[many][what] - peaks[few][what]) / (many - few)
+    return 1000 * (peaks[many][phase] - peaks[few][phase]) / (many - few)
 
 
 def peak_mb(name: str, rows: int) -> dict[str, float]:
-    """The peaks of an import of so many rows, in a process of its own."""
+    """Return the peaks of an import of this many rows, in a separate process."""
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "src"
         source.mkdir()
         options = WIDE[name](source, rows)
         task = json.dumps([name.partition(" ")[0], str(source), f"{folder}/out", rows, options])
-        done = subprocess.run(
+        finished = subprocess.run(
             [sys.executable, "-m", "benchmarks.importers_memory", "--child", task], check=True, capture_output=True
         )
-        return dict(json.loads(done.stdout))
+        return dict(json.loads(finished.stdout))
 
 
 def measure(name: str, source: str, out: str, rows: int, options: Options) -> dict[str, float]:
-    """Import here, and read the peak of this process."""
+    """Import in this process and read its peaks."""
     import os
 
     from robot.importers import load_importer
 
-    setattr(os, "fsync", lambda descriptor: None)  # it is not the disk that is asked  # noqa: B010
+    setattr(os, "fsync", lambda descriptor: None)  # not a benchmark of the disk  # noqa: B010
     last: dict[str, float] = {}
 
-    def look(done: int, total: int) -> None:
+    def progress(done: int, total: int) -> None:
         if done == rows:
             last["importing"] = _peak_mb()
 
-    recording = load_importer(name)(Path(source), Path(out), look, **options)
+    recording = load_importer(name)(Path(source), Path(out), progress, **options)
     assert len(recording.grasps) == rows, (len(recording.grasps), recording.notes)
     return {**last, "in all": _peak_mb()}
 
@@ -96,7 +96,7 @@ def link(path: Path, to: Path) -> None:
 
 
 def pictures(folder: Path, names: Sequence[str]) -> Path:
-    """One picture under many names."""
+    """Link one picture under many names."""
     one = picture(folder.with_name(f".{folder.name}-one{Path(names[0]).suffix}"), len(names))
     for name in names:
         link(folder / name, one)
@@ -208,10 +208,10 @@ def open_x_tactile(src: Path, rows: int) -> Options:
 def physiclear(src: Path, rows: int) -> Options:
     from tests.miniatures.physiclear import presses, write_video
 
-    film = src / ".press.mov"
-    write_video(film, presses(0, 0, frames=130))
+    video = src / ".press.mov"
+    write_video(video, presses(0, 0, frames=130))
     for number in range(rows // 100):
-        link(src / f"part{number // 5}_{number % 5}.mov", film)
+        link(src / f"part{number // 5}_{number % 5}.mov", video)
     return {"frames": 100}
 
 
@@ -239,7 +239,7 @@ def ssvtp(src: Path, rows: int) -> Options:
 
 
 def touch_and_go(src: Path, rows: int) -> Options:
-    """Runs of 20 frames, of which 5 after each are without contact; 1,000 of a video."""
+    """Runs of 20 frames, each followed by 5 without contact; 1,000 frames per video."""
     names = [f"{frame:010}.jpg" for frame in range(1250)]
     video = pictures(src / ".video" / "gelsight_frame", names).parent
     pictures(video / "video_frame", names)
@@ -334,7 +334,7 @@ WIDE: Mapping[str, Callable[[Path, int], Options]] = {
     "x-capture": x_capture,
     "ycb-slide": ycb_slide,
 }
-"""Importer -> draws so many rows below a folder; returns the importer's options. Rows come in whole folders: 1,000s."""
+"""Importer -> function that writes rows in a folder and returns import options. Rows come in whole folders: 1,000s."""
 
 
 if __name__ == "__main__":

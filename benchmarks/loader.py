@@ -1,10 +1,10 @@
-"""How many images a second the loader decodes, next to what the towers take.
+"""Images per second that the loader decodes, compared with the rate of the towers.
 
     python -m benchmarks.loader --recording recording/ --config small
 
-Threads, as trainings use them, and processes, all in turns: one worker and more. Then the steps of a training whose
-images lie decoded in memory, and the ratio of both: below 1 the towers wait for the loader. Without `--recording`
-pictures of camera size are drawn.
+It measures threads, which training uses, and processes, all in turn, with one worker and more. Then it measures
+training steps with decoded images in memory, and the ratio of both: below 1 the towers wait for the loader. Without
+`--recording` it draws pictures of camera size.
 """
 
 import argparse
@@ -35,16 +35,16 @@ PHOTO_PX, GEL_PX = (1280, 960), (640, 480)
 
 
 def load(settings: Preprocessing, files: tuple[bool, tuple[Path, ...]]) -> tuple[int, ...]:
-    """Decode one image; the shape alone goes back, so that processes are not charged for copies."""
+    """Decode one image; only its shape is returned, so that processes are not charged for copies."""
     is_photo, paths = files
     return (settings.load_photo if is_photo else settings.load_touch)(*paths).shape
 
 
 def files_of(grasps: Sequence[Grasp], settings: Preprocessing) -> list[tuple[bool, tuple[Path, ...]]]:
-    """Photos and gel images of grasps, as `load` takes them."""
+    """Return photos and gel images of grasps, as arguments of `load`."""
     photos = [(True, (path,)) for path in dict.fromkeys(grasp.photo for grasp in grasps)]
-    bare = settings.background == "none"
-    pairs = [((touch,) if bare else (touch, before)) for grasp in grasps for touch, before in _frames(grasp)]
+    no_background = settings.background == "none"
+    pairs = [((touch,) if no_background else (touch, before)) for grasp in grasps for touch, before in _frames(grasp)]
     gels = [(False, pair) for pair in pairs]
     return [each for pair in zip(photos, gels, strict=False) for each in pair][:MAX_IMAGES]
 
@@ -56,7 +56,7 @@ def _frames(grasp: Grasp) -> list[tuple[Path, Path]]:
 def decoding(
     grasps: Sequence[Grasp], config: Config, counts: Sequence[int]
 ) -> tuple[dict[str, float], list[ResultLine]]:
-    """Images a second of each kind and number of workers."""
+    """Return images per second for each kind and number of workers, with the lines to print."""
     settings, spawn = config.preprocessing, multiprocessing.get_context("spawn")
     files = files_of(grasps, settings)
     with ExitStack() as stack:
@@ -83,7 +83,7 @@ def _all(pool: Executor, settings: Preprocessing, files: Sequence[tuple[bool, tu
 
 
 def lines(recording: Path, config: Config, counts: Sequence[int]) -> Iterator[ResultLine]:
-    """Measure the loader and the towers, and give the lines to print."""
+    """Measure the loader and the towers; yield the lines to print."""
     rates, found = decoding(load_grasps(recording), config, counts)
     yield from found
     if config.training.freeze_towers:
@@ -93,12 +93,12 @@ def lines(recording: Path, config: Config, counts: Sequence[int]) -> Iterator[Re
     towers = STEPS * works["cached"].images / times.median("towers")
     count = min(counts, key=lambda count: abs(count - worker_count()))
     ratio = rates[f"{count} thread(s)"] / towers
-    text = f"the towers take {towers:.0f} images/s; {count} thread(s) decode {ratio:.2g} times as many"
+    text = f"the towers process {towers:.0f} images/s; {count} thread(s) decode {ratio:.2g} times as many"
     yield ResultLine("ratio", config.matcher.tower, text, {"towers_images_s": towers, "ratio": ratio})
 
 
 def drawn(folder: Path, grasps: int = 48) -> Path:
-    """A recording of noise at the resolution of a camera and of a sensor."""
+    """Write a recording of noise at the resolution of a camera and of a sensor."""
     rng = np.random.default_rng(0)
 
     def picture(size: tuple[int, int]) -> np.ndarray:
@@ -113,12 +113,12 @@ def drawn(folder: Path, grasps: int = 48) -> Path:
 
 
 def main() -> None:
-    """Print every line as soon as it is there."""
+    """Print each line as soon as it is available."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.loader", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--recording", type=Path, help="whose images are decoded (default: drawn pictures)")
+    parser.add_argument("--recording", type=Path, help="recording with the images to decode (default: random pictures)")
     parser.add_argument("--config", default="small", help="preset or TOML file: preprocessing and towers")
     parser.add_argument("--workers", nargs="+", type=int, default=sorted({1, 2, os.cpu_count() or 1}))
-    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     config = load_config(arguments.config).without_candidate_encoder()

@@ -1,13 +1,13 @@
 """`python -m benchmarks.needed [--sizes 1e3 1e4 1e5 1e6 1e7] [--recording R --features F] [--json]`: candidates.
 
-How many candidates hold the winners, against the number of photos. Catalogues are drawn as `benchmarks.scale`
-draws them, block by block, each the beginning of the next, and no block is kept: what grows is time alone. First every
-touch's winner is found, the photo that the classifier ranks first of all; then its place by the candidate_encoder. As there, half
-of the touches that the checkpoint keeps choose, `MARGIN` times as many candidates are taken as hold 99 % of their
-winners, and the other touches judge.
+Number of candidates that contain the exhaustive top-1, against the number of photos. Catalogues are drawn as in
+`benchmarks.scale`, block by block, each the beginning of the next. No block is stored, so only time grows. First the
+exhaustive top-1 of each touch is found, the photo with the greatest match logit of all; then its rank by the candidate
+encoder. As in `benchmarks.scale`, half of the touches in the checkpoint choose k: `MARGIN` times the number of
+candidates that contain the exhaustive top-1 for 99 % of them. The other touches evaluate the choice.
 
-All photos are judged in bfloat16, and in float32 whichever comes as near to the best so far as the two differ: `SAFE`
-times the most by which they did for any pair of the first block. So the winner is that of float32. A thousand touches
+All photos are scored in bfloat16, and also in float32 if their logit is close to the best so far: within `SAFE` times
+the largest difference between both precisions in the first block. So the top-1 is that of float32. A thousand touches
 of ten million photos take an hour and a half on one thread.
 """
 
@@ -43,32 +43,36 @@ class CoarseScorer:
 
     @torch.inference_mode()
     def logits(self, touches: NDArray[np.float32], photos: NDArray[np.float32]) -> Iterator[NDArray[np.float32]]:
-        """(len(photos),) for each touch half."""
-        seen = torch.from_numpy(photos[:, : self._width]).bfloat16()
-        straight = touches[:, self._width :] @ photos[:, self._width :].T + self._constant
-        for touch, more in zip(touches, straight, strict=True):
-            hidden = (seen + torch.from_numpy(touch[: self._width]).bfloat16()).relu_()
+        """Yield (len(photos),) logits for each touch partial."""
+        photo_partials = torch.from_numpy(photos[:, : self._width]).bfloat16()
+        direct_terms = touches[:, self._width :] @ photos[:, self._width :].T + self._constant
+        for touch, direct_term in zip(touches, direct_terms, strict=True):
+            hidden = (photo_partials + torch.from_numpy(touch[: self._width]).bfloat16()).relu_()
             second = torch.addmm(self._bias, hidden, self._second.T).relu_()
-            yield (second @ self._out).float().numpy() + more
+            yield (second @ self._out).float().numpy() + direct_term
 
 
 def exhaustive_top1(
     crowd: BlendedPhotos, touches: NDArray[np.float32], sizes: Sequence[int]
 ) -> tuple[NDArray[Any], float]:
-    """The candidate_encoder's cosine (sizes, touches) of each touch with its winner among so many photos, and the share of pairs
-    that were judged in float32 too."""
+    """Find the exhaustive top-1 of each touch at each catalogue size.
+
+    Returns:
+        The candidate encoder's cosine (sizes, touches) of each touch with its top-1, and the fraction of pairs that
+            were also scored in float32.
+    """
     coarse, scorer, queries = CoarseScorer(crowd.scorer), crowd.scorer, crowd.embeddings(touches, "touch")
     best, cosines = np.full(len(touches), -np.inf, np.float32), np.empty(len(touches), np.float32)
-    margin, twice = np.inf, 0
+    margin, rescored = np.inf, 0
     found = []
-    for photos, embeddings, ends in _blocks(crowd, sizes, "exhaustive_top1"):
+    for photos, embeddings, ends in _blocks(crowd, sizes, "exhaustive top-1"):
         error = 0.0
         for number, logits in enumerate(coarse.logits(touches, photos)):
             near = np.flatnonzero(logits > best[number] - margin)
             if not len(near):
                 continue
             exact = scorer.logits(touches[[number]], photos, near)
-            twice += len(near)
+            rescored += len(near)
             error = max(error, float(np.abs(exact - logits[near]).max()))
             if exact.max() > best[number]:
                 best[number], row = exact.max(), near[exact.argmax()]
@@ -76,16 +80,16 @@ def exhaustive_top1(
         margin = SAFE * error if np.isinf(margin) else margin
         if ends:
             found.append(cosines.copy())
-    return np.array(found), twice / (sizes[-1] * len(touches))
+    return np.array(found), rescored / (sizes[-1] * len(touches))
 
 
 def places(
     crowd: BlendedPhotos, touches: NDArray[np.float32], sizes: Sequence[int], cosines: NDArray[Any]
 ) -> NDArray[Any]:
-    """At which place, from 1, the candidate_encoder puts each winner: (sizes, touches)."""
+    """Return the rank, from 1, of each exhaustive top-1 by the candidate encoder: (sizes, touches)."""
     queries, before = crowd.embeddings(touches, "touch"), np.zeros(cosines.shape, np.int64)
     at = 0
-    for _, embeddings, ends in _blocks(crowd, sizes, "places"):
+    for _, embeddings, ends in _blocks(crowd, sizes, "ranks"):
         scores = queries @ embeddings.T
         for size in range(at, len(sizes)):
             before[size] += (scores > cosines[size, :, None] + 1e-6).sum(1)
@@ -94,7 +98,7 @@ def places(
 
 
 def _blocks(crowd: BlendedPhotos, sizes: Sequence[int], name: str) -> Iterator[tuple[Any, Any, bool]]:
-    """Partials and embeddings of photos in blocks, and whether one of the sizes ends with the block."""
+    """Yield partial activations and embeddings in blocks, and whether one of the sizes ends with the block."""
     start = 0
     with Bar(name, sizes[-1], "photos") as bar:
         for size in sizes:
@@ -104,16 +108,22 @@ def _blocks(crowd: BlendedPhotos, sizes: Sequence[int], name: str) -> Iterator[t
                 bar.advance(len(block.rows))
 
 
-def lines(sizes: Sequence[int], found: NDArray[Any], asked: int) -> Iterator[dict[str, float]]:
-    """What each size needed. The first `asked` touches choose, the others judge."""
+def lines(sizes: Sequence[int], found: NDArray[Any], choosing: int) -> Iterator[dict[str, float]]:
+    """Yield the results of each size. The first `choosing` touches choose k, the others evaluate it."""
     for size, order in zip(sizes, found, strict=True):
-        needed = [_needed(some) for some in (order[:asked], order)]
+        needed = [_needed(some) for some in (order[:choosing], order)]
         taken = min(MARGIN * needed[0], size)
-        judged = order[asked:]
-        held = int((judged <= taken).sum())
-        low, high = binomial_interval(held, len(judged))
-        shares = {"taken": taken, "touches": len(judged), "found": held / len(judged), "low": low, "high": high}
-        yield {"photos": size, "needed": needed[1], "needed_by_chosen": needed[0], "worst": int(order.max()), **shares}
+        evaluated = order[choosing:]
+        contained = int((evaluated <= taken).sum())
+        low, high = binomial_interval(contained, len(evaluated))
+        recall = {
+            "taken": taken,
+            "touches": len(evaluated),
+            "found": contained / len(evaluated),
+            "low": low,
+            "high": high,
+        }
+        yield {"photos": size, "needed": needed[1], "needed_by_chosen": needed[0], "worst": int(order.max()), **recall}
 
 
 def _needed(order: NDArray[Any]) -> int:
@@ -121,13 +131,15 @@ def _needed(order: NDArray[Any]) -> int:
 
 
 def main() -> None:
-    """Print a line for each size, then how candidates grow."""
+    """Print a line for each size, then the growth of candidates."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.needed", description=__doc__.split("\n\n")[0])
     parser.add_argument("--sizes", nargs="+", type=float, default=[1e3, 1e4, 1e5, 1e6])
-    parser.add_argument("--held-out", type=int, default=HELD_OUT, help="touches that judge")
+    parser.add_argument("--held-out", type=int, default=HELD_OUT, help="touches that evaluate the choice")
     parser.add_argument("--model", type=Path, default=shipped_model())
-    parser.add_argument("--recording", type=Path, help="whose photos are blended; a small one is collected where None")
-    parser.add_argument("--features", type=Path, help="where encoded features are kept")
+    parser.add_argument(
+        "--recording", type=Path, help="recording whose photos are blended (default: a small one is collected)"
+    )
+    parser.add_argument("--features", type=Path, help="file to store encoded features")
     parser.add_argument("--json", action="store_true", help="one JSON document a line")
     arguments = parser.parse_args()
     sizes = sorted(int(size) for size in arguments.sizes)
@@ -135,7 +147,7 @@ def main() -> None:
         crowd = blended_photos(arguments.model, arguments.recording or collected(Path(made)), arguments.features)
     touches = np.concatenate([crowd.touches, crowd.held_out[: arguments.held_out]])
     start = time.perf_counter()
-    cosines, twice = exhaustive_top1(crowd, touches, sizes)
+    cosines, rescored = exhaustive_top1(crowd, touches, sizes)
     table = list(lines(sizes, places(crowd, touches, sizes, cosines), len(crowd.touches)))
     for line in table:
         shown = {name: value if isinstance(value, int) else round(value, 4) for name, value in line.items()}
@@ -143,7 +155,7 @@ def main() -> None:
     for name in ("needed", "taken"):
         power = np.polyfit(np.log([line["photos"] for line in table]), np.log([line[name] for line in table]), 1)[0]
         print(json.dumps({"slope": name, "value": power}) if arguments.json else f"N^{power:.2f}  {name}")
-    print(f"{time.perf_counter() - start:.0f} s; {twice:.2%} of pairs judged in float32 too")
+    print(f"{time.perf_counter() - start:.0f} s; {rescored:.2%} of pairs also scored in float32")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""Notebooks executed without Jupyter; their outputs as Jupyter keeps them, but small and without traces of a machine.
+"""Execute notebooks without Jupyter; store outputs in Jupyter's format, but small and without traces of the machine.
 
-    python -m benchmarks.notebooks                        execute all of notebooks/ and store what they show
+    python -m benchmarks.notebooks                        execute all of notebooks/ and store their outputs
     python -m benchmarks.notebooks one_query.ipynb ...    these only
 
 All of them run right after `make demo`.
@@ -27,9 +27,9 @@ Output = dict[str, Any]
 
 
 def main(names: list[str]) -> int:
-    """Execute notebooks where they lie, and write their outputs into them."""
+    """Execute notebooks in place and write their outputs into them."""
     os.environ.setdefault("MPLBACKEND", "Agg")
-    os.environ["COLUMNS"] = "112"  # of rich's tables
+    os.environ["COLUMNS"] = "112"  # width of rich's tables
     os.chdir(FOLDER)
     for path in map(Path, names or sorted(path.name for path in FOLDER.glob("*.ipynb"))):
         print(path, file=sys.stderr)
@@ -42,7 +42,7 @@ def main(names: list[str]) -> int:
 
 
 def execute(document: Mapping[str, Any], parameters: str | None = None) -> Iterator[list[Output]]:
-    """Run the code cells in order; yields the outputs of each. `parameters` is run in place of the first one."""
+    """Run the code cells in order; yield the outputs of each. `parameters` replaces the source of the first one."""
     names: dict[str, Any] = {"__name__": "__main__"}
     cells = ["".join(cell["source"]) for cell in document["cells"] if cell["cell_type"] == "code"]
     for number, source in enumerate(cells):
@@ -54,7 +54,7 @@ def execute(document: Mapping[str, Any], parameters: str | None = None) -> Itera
 
 
 def kinds(outputs: list[Output]) -> set[str]:
-    """What a cell shows: "text" printed, a "picture", or a "value" of its last line."""
+    """Return the kinds of a cell's outputs: "text" printed, a "picture", or a "value" of its last line."""
     found = set()
     for output in outputs:
         pictures = any(mime.startswith("image/") for mime in output.get("data", {}))
@@ -63,7 +63,7 @@ def kinds(outputs: list[Output]) -> set[str]:
 
 
 def _run(source: str, names: dict[str, Any]) -> list[Output]:
-    """Run one cell: what it prints, the value of its last line, and the figures that it leaves open."""
+    """Run one cell; return its printed text, the value of its last line, and its open figures."""
     tree, value = ast.parse(source), None
     last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
     with contextlib.redirect_stdout(io.StringIO()) as printed:
@@ -87,7 +87,7 @@ def _shown(value: Any) -> dict[str, Any]:
 
 
 def _figures() -> Iterator[Image.Image]:
-    """pyplot's open figures, which Jupyter shows at the end of a cell; closed afterwards."""
+    """Yield pyplot's open figures, which Jupyter shows at the end of a cell, and close them."""
     if (pyplot := sys.modules.get("matplotlib.pyplot")) is None:
         return
     for number in pyplot.get_fignums():
@@ -98,7 +98,7 @@ def _figures() -> Iterator[Image.Image]:
 
 
 def _picture(image: Image.Image) -> dict[str, Any]:
-    """PNG of few colours or JPEG, whichever is smaller: the one is for lines, the other for photographs."""
+    """Return PNG of few colours (for lines) or JPEG (for photographs), whichever is smaller."""
     samples, files = image.convert("RGB"), {}
     for mime, picture, settings in (
         ("image/png", samples.quantize(_COLOURS, dither=Image.Dither.NONE), {"optimize": True}),

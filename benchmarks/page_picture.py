@@ -2,7 +2,7 @@
 
     retrieve demo && python -m benchmarks.page_picture demo
 
-It shows the object that the demo shows, and two of its grasps, so nobody chooses them by their answer.
+It uses the demo's own object and two of its grasps, so the choice does not depend on the answer.
 """
 
 import argparse
@@ -26,7 +26,7 @@ GRASPS = 2
 
 
 def main():
-    """Ask the page in Chromium, and write what it shows."""
+    """Query the page in Chromium and save a screenshot."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("demo", type=Path, help="folder that `retrieve demo` wrote")
     folder = parser.parse_args().demo

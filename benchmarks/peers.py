@@ -1,12 +1,12 @@
-"""Kinds of index beside the libraries that they stand on or against: FAISS as it is, hnswlib, usearch.
+"""Kinds of index compared with the libraries that they use or compete with: plain FAISS, hnswlib, usearch.
 
     OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 python -m benchmarks.peers --photos 100000
 
-One thread. Each engine's search width is the least of its ladder that finds `RECALL` of the best k with half of the
-queries; the other half is timed one by one, all engines in turns. Those that are not installed are left out:
-`pip install hnswlib usearch`. Ours score what they find again and order it by the exact inner product, which the bare
-engines do not. What a query needs of them first, the names of candidates in no order (`VectorIndex.candidates`), stands
-beside the bare call that names as many.
+One thread. Each engine's search width is the smallest of its ladder that finds `RECALL` of the best k with half of the
+queries. The other half is timed one by one, all engines in turn. Engines that are not installed are left out:
+`pip install hnswlib usearch`. Our kinds rescore their results and order them by the exact inner product; the plain
+engines do not. A query first needs only the unordered set of candidates (`VectorIndex.candidates`); it is compared with
+the plain call for as many results.
 """
 
 import argparse
@@ -28,27 +28,32 @@ from indexes.kinds.scores import Floats, Slots, scan
 
 DIM, QUERIES, BEST, RECALL = 64, 100, 10, 0.99
 LINKS, BREADTH = 32, 80
-"""Of every graph: neighbours of a node, and how many are looked at while it is built."""
+"""Of every graph: neighbours of a node, and the number of nodes visited during insertion."""
 NAMED = (100, 1160)
-"""Candidates to name; the shipped model judges 1,160 of 100,000 photos, or fewer."""
+"""Numbers of candidates; the shipped model scores at most 1,160 of 100,000 photos."""
 WIDTHS = (16, 32, 64, 128, 256, 512, 1000, 2000)
 DRAWN = {"apart": 0, "in clusters": 100}
-"""Vectors to search among: each drawn for itself, or so many around a centre."""
+"""Distributions of vectors: independent, or this many around a centre."""
 
 Search = Callable[[Floats, int], Slots]
-"""The slots of the best of one query (1, d), found with a width."""
+"""A function from one query (1, d) and a width to the slots of its best vectors."""
 
 
 @dataclass(frozen=True)
 class GraphIndex:
-    """An engine over vectors: how to search it, and what widths there are (one where it is exact)."""
+    """An engine over vectors.
+
+    Attributes:
+        search: search function.
+        widths: its widths (one if it is exact).
+    """
 
     search: Search
     widths: tuple[int, ...]
 
 
 def drawn(count: int, of_a_centre: int, seed: int = 0) -> Floats:
-    """Unit vectors (count, `DIM`)."""
+    """Return unit vectors (count, `DIM`)."""
     rng = np.random.default_rng(seed)
     vectors = rng.normal(size=(count, DIM))
     if of_a_centre:
@@ -58,7 +63,7 @@ def drawn(count: int, of_a_centre: int, seed: int = 0) -> Floats:
 
 
 def ours(kind: str) -> Callable[[Floats], GraphIndex]:
-    """One of `indexes.KINDS`."""
+    """Return a builder of one of `indexes.KINDS`."""
 
     def build(vectors: Floats) -> GraphIndex:
         index = indexes.load_kind(kind).build(vectors, threads=1)
@@ -70,14 +75,14 @@ def ours(kind: str) -> Callable[[Floats], GraphIndex]:
 
 
 def bare_flat(vectors: Floats) -> GraphIndex:
-    """FAISS's exact search."""
+    """Build FAISS's exact search."""
     index = faiss.IndexFlatIP(DIM)
     index.add(vectors)
     return GraphIndex(lambda query, _: index.search(query, BEST)[1][0], (0,))
 
 
 def bare_graph(vectors: Floats) -> GraphIndex:
-    """FAISS's graph."""
+    """Build FAISS's graph."""
     index = faiss.IndexHNSWFlat(DIM, LINKS, faiss.METRIC_INNER_PRODUCT)
     index.hnsw.efConstruction = BREADTH
     index.add(vectors)
@@ -86,7 +91,7 @@ def bare_graph(vectors: Floats) -> GraphIndex:
 
 
 def bare_lists(vectors: Floats) -> GraphIndex:
-    """FAISS's inverted lists with eight bits a number, as many lists as ours."""
+    """Build FAISS's inverted lists with eight bits per number, with as many lists as ours."""
     lists = max(round(len(vectors) ** 0.5), 1)
     index = faiss.index_factory(DIM, f"IVF{lists},SQ8", faiss.METRIC_INNER_PRODUCT)
     index.train(vectors)
@@ -97,7 +102,7 @@ def bare_lists(vectors: Floats) -> GraphIndex:
 
 
 def hnswlib(vectors: Floats) -> GraphIndex:
-    """The graph by those who described it."""
+    """Build the graph of the HNSW authors' library."""
     index = import_module("hnswlib").Index("ip", DIM)
     index.init_index(len(vectors), ef_construction=BREADTH, M=LINKS, random_seed=0)
     index.add_items(vectors, num_threads=1)
@@ -111,7 +116,7 @@ def hnswlib(vectors: Floats) -> GraphIndex:
 
 
 def usearch(vectors: Floats) -> GraphIndex:
-    """A graph by others."""
+    """Build the graph of usearch."""
     index = import_module("usearch.index").Index(
         ndim=DIM, metric="ip", dtype="f32", connectivity=LINKS, expansion_add=BREADTH
     )
@@ -137,21 +142,21 @@ ENGINES: Mapping[str, Callable[[Floats], GraphIndex]] = {
 
 
 def measure(photos: int = 100_000, queries: int = QUERIES) -> Iterator[ResultLine]:
-    """A line for each engine and each way to draw vectors."""
+    """Yield a line for each engine and each distribution of vectors."""
     with faiss_call("being measured", 1):
         for what, of_a_centre in DRAWN.items():
             vectors = drawn(photos, of_a_centre)
             yield from compare_engines(vectors, sample_queries(vectors, queries), f"{photos:,} vectors {what}")
 
 
-def compare_engines(vectors: Floats, queries: Floats, what: str) -> Iterator[ResultLine]:
-    """A line for each engine over the same vectors; half of the queries choose widths, half are timed."""
+def compare_engines(vectors: Floats, queries: Floats, label: str) -> Iterator[ResultLine]:
+    """Yield a line for each engine over the same vectors; half of the queries choose widths, half are timed."""
     choosing, timed = queries[::2], queries[1::2]
-    engines, widths, took = {}, {}, {}
+    engines, widths, build_s = {}, {}, {}
     for name, build in ENGINES.items():
         start = time.process_time()
         engines[name] = build(vectors)
-        took[name] = time.process_time() - start
+        build_s[name] = time.process_time() - start
         widths[name] = least_width(engines[name], vectors, choosing)
     times = in_turns({name: partial(found_at, one, widths[name], timed) for name, one in engines.items()}, 5)
     for name, one in engines.items():
@@ -159,36 +164,36 @@ def compare_engines(vectors: Floats, queries: Floats, what: str) -> Iterator[Res
             "width": widths[name],
             "recall": recall(one, widths[name], vectors, timed),
             "query_us": 1e6 * times.median(name) / len(timed),
-            "build_cpu_s": took[name],
+            "build_cpu_s": build_s[name],
         }
         text = (
-            f"{what}: {figures['query_us']:.0f} us a query, width {widths[name]}, recall of the best {BEST} "
-            f"{figures['recall']:.3f}; built in {took[name]:.2f} s of CPU time"
+            f"{label}: {figures['query_us']:.0f} us per query, width {widths[name]}, recall of the best {BEST} "
+            f"{figures['recall']:.3f}; built in {build_s[name]:.2f} s of CPU time"
         )
         each = [1e6 * seconds / len(timed) for seconds in times.seconds[name]]
         yield ResultLine("peers", name, text, figures, {"query_us": each})
 
 
 def named(photos: int = 100_000, queries: int = QUERIES, repetitions: int = 7) -> Iterator[ResultLine]:
-    """A line for each kind and each of `NAMED`: naming candidates, beside FAISS's own call for as many, in turns."""
+    """Yield a line for each kind and each of `NAMED`: our candidates and FAISS's own call for as many, in turn."""
     with faiss_call("being measured", 1):
         vectors = drawn(photos, 0)
-        asked, bare = sample_queries(vectors, queries), faiss.IndexFlatIP(DIM)
+        sampled, bare = sample_queries(vectors, queries), faiss.IndexFlatIP(DIM)
         bare.add(vectors)
         for kind in ("flat", "ivf_sq8", "hnsw"):
             index = indexes.load_kind(kind).build(vectors, threads=1)
             structure, settings = getattr(index, "_structure", None) or bare, index.settings()
             for k in NAMED:
-                how = {
+                parameters = {
                     "flat": None,
                     "ivf_sq8": faiss.SearchParametersIVF(nprobe=settings.get("probes", 1)),
                     "hnsw": faiss.SearchParametersHNSW(efSearch=max(k, settings.get("ef_search", 1))),
                 }[kind]
                 times = in_turns(
                     {
-                        "ours": lambda index=index, k=k: [index.candidates(query[None], k) for query in asked],
-                        "bare": lambda structure=structure, k=k, how=how: [
-                            structure.search(query[None], k, params=how) for query in asked
+                        "ours": lambda index=index, k=k: [index.candidates(query[None], k) for query in sampled],
+                        "bare": lambda structure=structure, k=k, parameters=parameters: [
+                            structure.search(query[None], k, params=parameters) for query in sampled
                         ],
                     },
                     repetitions,
@@ -196,24 +201,24 @@ def named(photos: int = 100_000, queries: int = QUERIES, repetitions: int = 7) -
                 each = {arm: [1e6 * one / queries for one in seconds] for arm, seconds in times.seconds.items()}
                 ratio = times.ratio("ours", "bare")
                 took = np.median(each["ours"])
-                text = f"the best {k} of {photos:,} named in {took:.0f} us: {as_text(ratio)} the bare call"
+                text = f"the best {k} of {photos:,} found in {took:.0f} us: {as_text(ratio)} the time of the plain call"
                 yield ResultLine("named", kind, text, {"k": k, "ratio": ratio[0]}, each)
 
 
 def least_width(built: GraphIndex, vectors: Floats, queries: Floats) -> int:
-    """The first of its widths that reaches `RECALL`, or the last."""
+    """Return the first of its widths that reaches `RECALL`, or the last."""
     return next((width for width in built.widths if recall(built, width, vectors, queries) >= RECALL), built.widths[-1])
 
 
 def recall(built: GraphIndex, width: int, vectors: Floats, queries: Floats) -> float:
-    """Mean share of the best `BEST` that are found."""
+    """Return the mean fraction of the best `BEST` that are found."""
     best = scan(vectors, queries, BEST)[1]
-    shares = [np.isin(true, some).mean() for some, true in zip(found_at(built, width, queries), best, strict=True)]
-    return float(np.mean(shares))
+    fractions = [np.isin(true, some).mean() for some, true in zip(found_at(built, width, queries), best, strict=True)]
+    return float(np.mean(fractions))
 
 
 def found_at(built: GraphIndex, width: int, queries: Floats) -> list[Slots]:
-    """The slots of each query, asked one by one."""
+    """Return the slots of each query, searched one by one."""
     return [built.search(queries[row : row + 1], width) for row in range(len(queries))]
 
 

@@ -1,4 +1,4 @@
-"""A query on an opened index, stage by stage, against the bare forward pass of the tactile tower on the same images."""
+"""A query on an open index, stage by stage, compared with the bare forward pass of the tactile tower."""
 
 import shutil
 import statistics
@@ -27,19 +27,19 @@ from retrieval.search.query.searcher import Searcher
 from retrieval.search.query.shard import FolderShard
 
 PHOTOS, CANDIDATES = 10_000, 132
-"""As many candidates as benchmarks.scale finds needed for so many photos; build-index writes them down."""
+"""Candidates that benchmarks.scale finds necessary for this many photos; build-index stores the number."""
 GEL_PX = (240, 320)
 STAGES = ("decode", "encode", "candidates", "rerank")
 
 
 def measure(config: Config, photos: int = PHOTOS, repetitions: int = REPETITIONS) -> Iterator[ResultLine]:
-    """One line for each backend that is installed, for a model with random weights."""
+    """Yield one line for each installed backend, for a model with random weights."""
     with tempfile.TemporaryDirectory() as name:
         yield from _lines(Path(name), stored_checkpoint(Path(name), matcher_of(config), config), photos, repetitions)
 
 
 def measure_shipped(photos: int = PHOTOS, repetitions: int = REPETITIONS) -> Iterator[ResultLine]:
-    """The same for the shipped checkpoint, and the time that `Searcher.open` takes once everything is imported."""
+    """Yield the same for the shipped checkpoint, and the time of `Searcher.open` after all imports."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         checkpoint = load_checkpoint(Path(shutil.copy(shipped_model(), folder / "model.safetensors")))
@@ -65,33 +65,33 @@ def _line(
 ) -> ResultLine:
     searcher = searcher_of(index, checkpoint, encoder)
     images = [checkpoint.config.preprocessing.load_touch(path) for path in touch]
-    told: list[dict[str, float]] = []
+    timings: list[dict[str, float]] = []
     arms = {
-        "query": lambda: told.append(searcher.query([touch]).timing_ms),
+        "query": lambda: timings.append(searcher.query([touch]).timing_ms),
         "bare": _bare(checkpoint.matcher, encoder, images),
     }
     times = in_turns(arms, repetitions)
     ratio = times.ratio("query", "bare")
-    stages = {stage: statistics.median(each[stage] for each in told) for stage in STAGES}
+    stages = {stage: statistics.median(each[stage] for each in timings) for stage in STAGES}
     shown = ", ".join(f"{stage} {ms:.3g}" for stage, ms in stages.items())
     return ResultLine(
         "query",
         checkpoint.config.matcher.tower,
-        f"{encoder.name}, {searcher.info.photos} photos, {CANDIDATES} judged: {duration(times.median('query'))} "
-        f"({shown} ms), {duration(times.median('bare'))} the bare tower on the same images: {as_text(ratio)}",
+        f"{encoder.name}, {searcher.info.photos} photos, {CANDIDATES} reranked: {duration(times.median('query'))} "
+        f"({shown} ms), {duration(times.median('bare'))} for the bare tower on the same images: {as_text(ratio)}",
         {"photos": searcher.info.photos, "ratio": ratio[0], **{f"{stage}_ms": ms for stage, ms in stages.items()}},
     )
 
 
 def searcher_of(index: Path, checkpoint: Checkpoint, encoder: TouchEncoder) -> Searcher:
-    """One that encodes touches by this encoder."""
+    """Return a searcher that encodes touches with this encoder."""
     scorer = read_scorer(checkpoint.path)
     shard = FolderShard(IndexStore(index).open(threads=1), scorer, checkpoint.config.has_embeddings)
     return Searcher(index, shard, checkpoint, encoder, scorer)
 
 
 def _bare(matcher: Matcher, encoder: TouchEncoder, images: list[np.ndarray]):
-    """The forward pass alone, of images that lie ready; in PyTorch folded as a query's is."""
+    """Return the forward pass alone, on prepared images; in PyTorch with folded weights, as in a query."""
     if isinstance(encoder, OnnxEncoder):
         return lambda: encoder.encode([images])
     tower, batch = TorchEncoder(matcher)._fast.touch_tower, touch_batch([images]).flatten(0, 1)
@@ -104,7 +104,7 @@ def _bare(matcher: Matcher, encoder: TouchEncoder, images: list[np.ndarray]):
 
 
 def encoders(folder: Path, checkpoint: Checkpoint) -> Iterator[TouchEncoder]:
-    """PyTorch, and ONNX Runtime where it is installed."""
+    """Yield PyTorch, and ONNX Runtime if it is installed."""
     yield TorchEncoder(checkpoint.matcher)
     if find_spec("onnx") and find_spec("onnxruntime"):
         path = folder / "exported.onnx"
@@ -113,7 +113,7 @@ def encoders(folder: Path, checkpoint: Checkpoint) -> Iterator[TouchEncoder]:
 
 
 def stored_checkpoint(folder: Path, matcher: Matcher, config: Config) -> Checkpoint:
-    """The matcher as a file, read again."""
+    """Write the matcher to a file and load it."""
     about = {"source": "random weights", "step": 0, "data_digest": "0" * 64, "metrics": {}}
     path = folder / "model.safetensors"
     save_checkpoint(path, matcher, config, split=None, provenance=about)
@@ -121,7 +121,7 @@ def stored_checkpoint(folder: Path, matcher: Matcher, config: Config) -> Checkpo
 
 
 def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
-    """An index of made-up photos, three of each object: random halves and unit embeddings."""
+    """Write an index of synthetic photos, three of each object: random partial activations and unit embeddings."""
     rng, matcher = np.random.default_rng(0), checkpoint.config.matcher
     partials = rng.normal(size=(photos, matcher.partial_width)).astype(np.float16)
     embeddings = rng.normal(size=(photos, matcher.embedding_dim)).astype(np.float32)
@@ -141,7 +141,7 @@ def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
 
 
 def gel_images(folder: Path, fingers: int) -> list[Path]:
-    """One smooth picture for each finger, as large as those of the sensor and as a rig records them."""
+    """Write one smooth picture for each finger, of the sensor's size and in a rig's file format."""
     rows, columns = (np.linspace(0, 9, size) for size in GEL_PX)
     paths = [folder / f"{finger}.jpg" for finger in range(fingers)]
     for number, path in enumerate(paths):

@@ -1,12 +1,12 @@
-"""`python -m benchmarks.queueing FIGURES.json`: what many shards cost, from what one was measured to.
+"""`python -m benchmarks.queueing FIGURES.json`: cost of many shards, extrapolated from measurements.
 
-FIGURES.json holds a line for each size, as `python -m benchmarks.shards --json` prints them. What cannot be
-measured on one machine is simulated: touches come at random times (Poisson), each is encoded, asked of all shards at
-once, and answered when the slowest has answered. A shard has replicas, each with its own queue in order of arrival, and
-takes the less loaded of two drawn at random, as Ray Serve does; its time is log-normal, with the measured median and
-99th percentile, and grows with its photos as the measured ones do.
+FIGURES.json contains a line for each size, as `python -m benchmarks.shards --json` prints them. The rest is simulated,
+because one machine cannot measure it. Touches arrive at random times (Poisson). Each is encoded, sent to all shards at
+once, and answered when the slowest shard has answered. A shard has replicas, each with its own queue in order of
+arrival, and takes the less loaded of two random ones, as Ray Serve does. Its time is log-normal, with the measured
+median and 99th percentile, and grows with its photos like the measured times.
 
-The tables say storage, memory and hours of embedding (of one core); then p50 and p99 of answers by number of shards,
+The tables show storage, memory and hours of embedding (of one core); then p50 and p99 of answers by number of shards,
 with one slow shard (three times slower), and with one replica lost.
 """
 
@@ -22,41 +22,43 @@ from typing import Any
 import numpy as np
 
 ENCODE_S = 0.050
-"""Of one touch, by one core."""
+"""Encoding of one touch, by one core."""
 HOP_S = 0.004
-"""To a shard and back."""
+"""Transfer to a shard and back."""
 EMBED_PER_S = 20.0
-"""Photos, by one core, with the shipped model."""
+"""Photos per second, by one core, with the shipped model."""
 CODES = 64 * 4 + 256 * 2
-"""Bytes of a photo's embedding and half, which searching reads."""
+"""Bytes of a photo's embedding and partial activation, which a search reads."""
 PLANS = {1e6: (1, 8), 1e7: (1, 10, 40), 1e8: (20, 100), 1e9: (100, 1000)}
 """Photos -> numbers of shards."""
 REQUESTS, SLOWER = 4000, 3.0
 BUSY, MIN_REPLICAS = 0.5, 2
-"""Share of its time that a replica works; with one alone, a shard that is lost is gone until it has started again."""
+"""Busy fraction of a replica's time. With a single replica, a lost shard is unavailable until it has restarted."""
 
 
 @dataclass(frozen=True)
 class ServiceTimes:
-    """The time of one shard: log-normal with this median and this 99th percentile, in seconds."""
+    """Time of one shard: log-normal with this median and this 99th percentile, in seconds."""
 
     p50: float
     p99: float
 
     def draw(self, rng: np.random.Generator, size: tuple[int, ...]) -> np.ndarray:
-        """Times of that shape."""
+        """Draw times of that shape."""
         return self.p50 * np.exp(math.log(self.p99 / self.p50) / 2.3263 * rng.standard_normal(size))
 
     @property
     def mean(self) -> float:
-        """Of the distribution."""
+        """Mean of the distribution."""
         spread = math.log(self.p99 / self.p50) / 2.3263
         return self.p50 * math.exp(spread**2 / 2)
 
 
 def service_of(photos: float, measured: Sequence[Mapping[str, Any]]) -> ServiceTimes:
-    """The time of a shard of so many photos: measured ones, those of whole folders too, between and beyond them by a
-    power law."""
+    """Return the time of a shard of this many photos.
+
+    It interpolates the measurements, including those of whole folders, and extrapolates by a power law.
+    """
     points = {one["photos"] / one["shards"]: one["slowest_p50_s"] for one in measured}
     points |= {one["photos"]: one["folder_p50_s"] for one in measured}
     sizes, medians = np.log(np.array(sorted(points.items()))).T
@@ -75,9 +77,16 @@ def service_of(photos: float, measured: Sequence[Mapping[str, Any]]) -> ServiceT
 def answers(
     shards: int, replicas: int, service: ServiceTimes, rate: float, seed: int = 0, slow: int = 0, lost: int = 0
 ) -> np.ndarray:
-    """Seconds from the arrival of each of `REQUESTS` touches to its answer.
+    """Return the seconds from the arrival of each of `REQUESTS` touches to its answer.
 
-    slow: shards that take `SLOWER` times longer. lost: shards that have a replica less, where they have two at least.
+    Args:
+        shards: number of shards.
+        replicas: replicas of each shard.
+        service: time of one shard.
+        rate: touches per second.
+        seed: seed of the simulation.
+        slow: number of shards that take `SLOWER` times longer.
+        lost: number of shards with one replica less, if they have at least two.
     """
     rng = np.random.default_rng([seed, shards, replicas])
     arrivals = np.cumsum(rng.exponential(1 / rate, REQUESTS))
@@ -90,23 +99,23 @@ def answers(
 
 
 def _ended(arrivals: np.ndarray, times: np.ndarray, servers: int, rng: np.random.Generator) -> np.ndarray:
-    """When each request of one shard is done; it goes to the shorter of two queues drawn at random."""
-    free, held = np.zeros(servers), [list[float]() for _ in range(servers)]
+    """Return when each request of one shard ends; it joins the shorter of two queues drawn at random."""
+    free, queues = np.zeros(servers), [list[float]() for _ in range(servers)]
     drawn = rng.integers(servers, size=(len(arrivals), 2))
     ended = np.empty(len(arrivals))
     for number, (arrival, seconds) in enumerate(zip(arrivals, times, strict=True)):
         for place in set(drawn[number].tolist()):
-            while held[place] and held[place][0] <= arrival:
-                heapq.heappop(held[place])
-        chosen = min(drawn[number].tolist(), key=lambda place: len(held[place]))
+            while queues[place] and queues[place][0] <= arrival:
+                heapq.heappop(queues[place])
+        chosen = min(drawn[number].tolist(), key=lambda place: len(queues[place]))
         free[chosen] = max(free[chosen], arrival) + seconds
-        heapq.heappush(held[chosen], free[chosen])
+        heapq.heappush(queues[chosen], free[chosen])
         ended[number] = free[chosen]
     return ended
 
 
 def tables(measured: Sequence[Mapping[str, Any]], rate: float) -> Iterator[str]:
-    """Markdown."""
+    """Yield the lines of the Markdown tables."""
     disk, shard = measured[-1]["bytes_per_photo"], measured[-1]["photos"]
     yield "| photos | on disk | codes, in memory | embedding, one core | with 100 cores |"
     yield "|---|---|---|---|---|"
@@ -135,7 +144,7 @@ def tables(measured: Sequence[Mapping[str, Any]], rate: float) -> Iterator[str]:
                 f"{_ms(np.percentile(lost, 99))} |"
             )
     yield ""
-    yield f"Measured at shards of up to {shard:,.0f} photos; what is larger is extrapolated."
+    yield f"Measured at shards of up to {shard:,.0f} photos; larger shards are extrapolated."
 
 
 def _bytes(count: float) -> str:
@@ -159,7 +168,7 @@ def main() -> None:
     lines = [json.loads(line) for line in arguments.figures.read_text().splitlines() if line.startswith("{")]
     measured = sorted((line for line in lines if "slowest_p50_s" in line), key=lambda line: line["photos"])
     if len(measured) < 2:
-        raise SystemExit(f"{arguments.figures} must hold two sizes at least; run python -m benchmarks.shards --json")
+        raise SystemExit(f"{arguments.figures} must contain at least two sizes; run python -m benchmarks.shards --json")
     for line in tables(measured, arguments.rate):
         print(line)
 

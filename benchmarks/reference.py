@@ -1,5 +1,7 @@
-"""docs/reference.md, from the docstrings of the public names, docs/commands.md, from the commands' help, and
-docs/datasets.md, from the importers: `python -m benchmarks.reference` writes them anew."""
+"""Write docs/reference.md, docs/commands.md and docs/datasets.md: `python -m benchmarks.reference`.
+
+The pages come from the docstrings of the public names, from the commands' help, and from the importers.
+"""
 
 import argparse
 import ast
@@ -36,52 +38,51 @@ MADE_BY_HAND = (
     robot.Scene,
     indexes.IndexStore,
 )
-"""Classes that a user makes an object of; all others come out of a function."""
+"""Classes that a user creates directly; functions return all others."""
 HEAD = """# Reference
 
-The public names of the three packages, from their docstrings; `python -m benchmarks.reference` writes this page. Every
-example is run by the tests, in a folder that holds `catalog/`, `index/`, `recording/`, `lab/` (a recording of 12
-objects), `model.safetensors` and the gel images of two grasps, `a.png`, `b.png`, `a2.png`, `b2.png`. A name is imported
-when it is used: `import retrieval` alone costs nothing.
+The public names of the three packages, from their docstrings; `python -m benchmarks.reference` writes this page. The
+tests run every example in a folder that contains `catalog/`, `index/`, `recording/`, `lab/` (a recording of 12
+objects), `model.safetensors` and the gel images of two grasps, `a.png`, `b.png`, `a2.png`, `b2.png`. A name is
+imported on first use, so `import retrieval` alone is fast.
 """
 WIDTH = 98
-"""Of help in a terminal of 100 columns."""
+"""Width of help texts in a terminal of 100 columns."""
 COMMANDS_HEAD = """# Commands
 
 Exit codes: 0 done, 1 the job ran and failed, 2 wrong use or bad input; `query` adds 3 to 5 for its
-[verdicts](answers.md). With `--json`, stdout holds one JSON document, and everything else goes to stderr. `python -m
-benchmarks.reference` writes this page from each command's `--help`.
+[verdicts](answers.md). With `--json`, stdout contains one JSON document, and all other output goes to stderr.
+`python -m benchmarks.reference` writes this page from each command's `--help`.
 """
 
 
 DATA_SETS_HEAD = """# Data sets
 
 ```sh
-retrieve import                                             # what can be imported, and the options of each
+retrieve import                                             # list the importers and their options
 retrieve import billets billets/ --out billets-recording/
 retrieve import folder pictures/ --out my-recording/ --option sensor="GelSight Mini" touch='{object}/touch_{n}'
-retrieve check recording/                                   # before anything is trained on it
+retrieve check recording/                                   # before training
 ```
 
-An importer reads a public data set as it is published, or pictures of your own, and writes a
-[recording](formats.md#recording), to train, evaluate and search with. It takes one grasp at a time, so memory does
-not grow with the pictures, but by names: 100,000 rows instead of 10,000 take 15 to 67 MB more, by importer (`python
--m benchmarks.importers_memory`), and a line a grasp once the recording is read back. Run again it goes on where it
-stopped. What cannot be read is skipped, counted by reason and told; `recording.json` keeps the counts under
-`skipped`, licence and citation, and under `objects` what the data set says of them. Pictures that many grasps share,
-such as one no-contact frame, are kept once. A published split that parts objects stands in `splits/<name>.json`, for
-`--split`. Some importers need packages of the extra:
+An importer reads a public data set in its published layout, or your own pictures, and writes a
+[recording](formats.md#recording) for training, evaluation and search. It processes one grasp at a time, so memory grows
+only with names, not with pictures: 100,000 rows instead of 10,000 take 15 to 67 MB more, depending on the importer
+(`python -m benchmarks.importers_memory`), and one line per grasp when the recording is read back. An interrupted import
+continues when you run it again. Unreadable items are skipped, counted by reason and reported. `recording.json` stores
+the counts under `skipped`, the licence and the citation, and under `objects` the data set's own information on them.
+Pictures that many grasps share, such as one no-contact frame, are stored once. A published split by objects is in
+`splits/<name>.json`, for `--split`. Some importers need packages of the extra:
 `pip install 'touch-retrieval[importers]'`.
 
-The data sets are not ours: the licence is what their own pages say, and what you do with them is between you and them.
-Where parts of a layout are not verified, the importer was written from the authors' descriptions and from other
-people's readers, and says which parts when it is done.
+The data sets are not ours. Their own pages state the licence, which binds you and not us. If parts of a layout are not
+verified, the importer follows the authors' descriptions and other people's readers, and lists these parts when it ends.
 
 """
 
 
 def reference() -> str:
-    """The whole page."""
+    """Return docs/reference.md."""
     page = HEAD + "".join(_package(package) for package in PACKAGES)
     return re.sub(r"\n{3,}", "\n\n", page)
 
@@ -104,7 +105,7 @@ def _public(package: Any, name: str) -> str:
 
 
 def _member(of: str, name: str, member: Any) -> str:
-    """A method or property of a class; nothing for what has no text, or is a public name itself."""
+    """Return a method or property of a class; nothing if it has no text or is itself a public name."""
     function = member.fget if isinstance(member, property) else getattr(member, "__func__", member)
     if not inspect.isfunction(function) or not function.__doc__ or getattr(retrieval.open, "__func__", 0) is function:
         return ""
@@ -112,8 +113,10 @@ def _member(of: str, name: str, member: Any) -> str:
 
 
 def _heading(level: str, title: str, thing: Any) -> str:
-    """The name, and below it a call with names and defaults of the arguments, types left out. No call of a property, or
-    of a class that is not made by hand."""
+    """Return the name, and below it a call with names and defaults of the arguments, without types.
+
+    Properties, and classes that users do not create, have no call.
+    """
     if isinstance(thing, property) or (inspect.isclass(thing) and thing not in MADE_BY_HAND):
         return f"\n{level} {title}\n"
     signature = inspect.signature(getattr(thing, "__func__", thing))
@@ -134,7 +137,7 @@ def _fields(thing: type) -> str:
 
 
 def _below(package: Any, name: str) -> str:
-    """The text that stands below a constant."""
+    """Return the text below a constant."""
     body = ast.parse(Path(package.__file__).read_text("utf-8")).body
     for statement, after in itertools.pairwise(body):
         targets = getattr(statement, "targets", None) or [getattr(statement, "target", None)]
@@ -146,7 +149,7 @@ def _below(package: Any, name: str) -> str:
 
 
 def _text(docstring: str | None) -> str:
-    """A docstring as Markdown: examples, and what is laid out in columns, in blocks."""
+    """Convert a docstring to Markdown; examples and text in columns become blocks."""
     assert docstring, "every public name has a docstring"
     return "\n\n".join(_paragraph(part) for part in re.split(r"\n\n+", docstring.strip())) + "\n"
 
@@ -166,21 +169,21 @@ def _paragraph(text: str) -> str:
 
 
 def commands() -> str:
-    """The whole page of the commands."""
+    """Return docs/commands.md."""
     return COMMANDS_HEAD + "".join(_help("retrieve", typer.main.get_command(app)))
 
 
 def _help(title: str, command: Any) -> Iterator[str]:
-    """Of a command, and of those below it."""
-    asked = CliRunner().invoke(app, [*title.split()[1:], "--help"], prog_name="retrieve", terminal_width=WIDTH)
-    yield f"\n## {title}\n\n```\n{asked.stdout.strip()}\n```\n"
+    """Yield the help of a command and of its subcommands."""
+    result = CliRunner().invoke(app, [*title.split()[1:], "--help"], prog_name="retrieve", terminal_width=WIDTH)
+    yield f"\n## {title}\n\n```\n{result.stdout.strip()}\n```\n"
     for name, below in getattr(command, "commands", {}).items():
         yield from _help(f"{title} {name}", below)
 
 
 def data_sets() -> str:
-    """The whole page of the importers. `python -m benchmarks.reference` writes it."""
-    columns = ("name", "it must hold", "sensor", "fingers", "no-contact frame", "licence", "layout")
+    """Return docs/datasets.md."""
+    columns = ("name", "required content", "sensor", "fingers", "no-contact frame", "licence", "layout")
     rows = [columns, ("---",) * len(columns)]
     for name in sorted(IMPORTERS):
         facts = data_set_of(name)

@@ -1,8 +1,8 @@
-"""A rehearsal without hardware: `python -m benchmarks.rehearsal --out rehearsal/` collects, trains, indexes, asks.
+"""A rehearsal without hardware: `python -m benchmarks.rehearsal --out rehearsal/` collects, trains, indexes, queries.
 
-A rig from a file (a person's arm whom nobody has to be, the WSG-50's driver on an emulated one, gels and depth camera
-that replay a recording) collects a recording of its own. What the replaying devices show follows the emulated gripper:
-the gel before, while it holds, and after the lift. Then the commands for any recording run on what it wrote.
+A rig from a file (a manual arm without a person, the WSG-50's driver on an emulated gripper, gels and a depth camera
+that replay a recording) collects its own recording. The replayed frames follow the emulated gripper: the gel before,
+during the hold, and after the lift. Then the commands for any recording run on the result.
 """
 
 import argparse
@@ -31,8 +31,8 @@ MOMENTS = ("before", "during", "after")
 
 
 def rehearse(folder, objects=OBJECTS, grasps=GRASPS, iterations=2):
-    """All of it, in `folder`; returns the recording that was replayed and the one that was made of it."""
-    os.environ["XDG_STATE_HOME"] = str(folder / "state")  # what is trained here is nobody's default
+    """Run all steps in `folder`; return the replayed recording and the new one."""
+    os.environ["XDG_STATE_HOME"] = str(folder / "state")  # do not make the trained model the default
     source, made = folder / "source", folder / "recording"
     _run("collect", "--rig", "sim", "--objects", objects, "--grasps", grasps, "--seed", SEED, "--out", source)
     with replayed(folder, source, grasps) as name:
@@ -52,7 +52,7 @@ def rehearse(folder, objects=OBJECTS, grasps=GRASPS, iterations=2):
 
 @contextlib.contextmanager
 def replayed(folder, source, grasps):
-    """The name of a rig that shows the recording `source` again."""
+    """Yield the name of a rig that replays the recording `source`."""
     emulator = EmulatedWSG50(speed_up=50.0, referenced=True)
     with (
         serve_tcp(emulator) as url,
@@ -63,7 +63,7 @@ def replayed(folder, source, grasps):
 
 
 def _load(emulator, url, folder, source, spec, *, seed):
-    """The rig of a file like any other's, with its replaying devices on cue."""
+    """Load the rig of a file, and synchronise its replaying devices."""
     if spec != "rehearsal":
         return load_rig(spec, seed=seed)
     lens = _prepare(folder, source)
@@ -79,7 +79,7 @@ def _load(emulator, url, folder, source, spec, *, seed):
 
 
 class Cue:
-    """Which recorded grasp, and which moment of it, is on."""
+    """Selects the recorded grasp and its moment."""
 
     def __init__(self, source, emulator, rig):
         self.grasps, self.emulator, self.rig = read_recording(source).grasps, emulator, rig
@@ -109,21 +109,21 @@ class Cue:
 
 
 def _prepare(folder, source):
-    """The gels' pictures as folders and a calibration file; returns the lens of the recorded camera."""
+    """Write the gels' pictures and a calibration file; return the intrinsics of the recorded camera."""
     for finger in "ab":
         (folder / finger).mkdir(exist_ok=True)
         for number, grasp in enumerate(read_recording(source).grasps):
-            shown = (grasp.touches_before, grasp.touches, grasp.touches_after)
-            for moment, touches in enumerate(shown):
+            moments = (grasp.touches_before, grasp.touches, grasp.touches_after)
+            for moment, touches in enumerate(moments):
                 shutil.copy(source / touches[finger], folder / finger / f"{number:05}-{moment}.jpg")
     info = read_info(source)
     camera = load_rig(info["rig"], seed=info["seed"], **info["rig_settings"]).camera
     points = np.random.default_rng(1).uniform((-200, -200, 600), (200, 200, 900), (8, 3))
     rig_points = points @ camera.extrinsics[:3, :3].T + camera.extrinsics[:3, 3]
     hand_eye.fit_hand_eye(points, rig_points).save(folder / "hand_eye.json")
-    said = info["devices"][camera.name]
-    centre = (said["px"] - 1) / 2
-    return Intrinsics(said["focal_px"], said["focal_px"], centre, centre)
+    settings = info["devices"][camera.name]
+    centre = (settings["px"] - 1) / 2
+    return Intrinsics(settings["focal_px"], settings["focal_px"], centre, centre)
 
 
 def _run(*words):
@@ -132,12 +132,12 @@ def _run(*words):
 
 
 def main():
-    """The whole rehearsal in a folder; what each command says is on stderr."""
+    """Run the whole rehearsal in a folder; the commands print to stderr."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.rehearsal", description=main.__doc__)
     parser.add_argument("--out", type=Path, required=True)
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
-    source, made = rehearse(given.out)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    source, made = rehearse(arguments.out)
     print(json.dumps({name: len(read_recording(each).grasps) for name, each in (("source", source), ("made", made))}))
 
 

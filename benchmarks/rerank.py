@@ -1,4 +1,4 @@
-"""Judging candidates from stored halves, against the whole network on every pair and the bare matrix product."""
+"""Rerank candidates with stored partial activations, compared with the whole network on every pair."""
 
 from collections.abc import Iterator
 
@@ -16,8 +16,11 @@ BATCH = 16
 def measure(
     config: Config, candidates: tuple[int, ...] = (100, 1000), sample: int = BATCH, repetitions: int = REPETITIONS
 ) -> Iterator[ResultLine]:
-    """One line for each number of candidates. The whole network runs on `sample` pairs, and its time is scaled; the
-    matrix product is that of the head's second layer for all candidates, in the library that numpy uses."""
+    """Yield one line for each number of candidates.
+
+    The whole network runs on `sample` pairs, and its time is scaled. The matrix product is that of the head's second
+    layer for all candidates, in numpy's BLAS library.
+    """
     matcher, pre = matcher_of(config), config.preprocessing
     touch = random_images(config.matcher.fingers, pre.touch_px, seed=1)
     photos = random_images(sample, pre.photo_px, seed=2)
@@ -40,22 +43,22 @@ def measure(
     times = in_turns({**arms, "touch": lambda: encode_touches(matcher, [touch]), "whole": whole_network}, repetitions)
     for count in candidates:
         scale = count / sample
-        ratio, share = times.ratio("whole", str(count), scale), times.ratio(f"product {count}", str(count))
+        ratio, product_ratio = times.ratio("whole", str(count), scale), times.ratio(f"product {count}", str(count))
         ours, encoded, other = times.median(str(count)), times.median("touch"), scale * times.median("whole")
         yield ResultLine(
             "rerank",
             config.matcher.tower,
-            f"{count} candidates take {duration(ours)} from halves and {duration(other)} by the whole network on each "
-            f"pair ({sample} pairs measured, scaled): {as_text(ratio)}; {other / (ours + encoded):.3g} times with the "
-            f"{duration(encoded)} that encode the touch; {share[0]:.0%} of the rate of the bare matrix product "
-            f"({config.matcher.hidden} units); largest difference of a logit {error:.2g}",
+            f"{count} candidates take {duration(ours)} with partial activations and {duration(other)} by the whole "
+            f"network on each pair ({sample} pairs measured, scaled): {as_text(ratio)}; {other / (ours + encoded):.3g} "
+            f"times with the {duration(encoded)} for encoding the touch; {product_ratio[0]:.0%} of the rate of the "
+            f"bare matrix product ({config.matcher.hidden} units); largest difference of a logit {error:.2g}",
             {
                 "candidates": count,
                 "partials_s": ours,
                 "encode_s": encoded,
                 "whole_s": other,
                 "ratio": ratio[0],
-                "share_of_product": share[0],
+                "share_of_product": product_ratio[0],
             },
             {"partials": times.seconds[str(count)], "product": times.seconds[f"product {count}"]},
         )

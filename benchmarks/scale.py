@@ -1,28 +1,29 @@
 """`python -m benchmarks.scale [--sizes 1e3 1e4 1e5] [--recording R --features F] [--json]`: time against N.
 
-Catalogues of N photos are drawn from the trained model's own distribution: halves of recorded photos, each blended of
-two (w A + (1 - w) B, w uniform in 1/2..1), with the embeddings that the checkpoint's candidate_encoder gives them (`--by
-contrastive`: with those whose cosine is in the halves). The touches are those of validation objects that the checkpoint
-keeps. The winner is the photo that the classifier ranks first of all. Settings, and how many candidates hold 99 % of
-the winners, are chosen with every other touch; `MARGIN` times as many are taken, for a hundred touches hardly tell the
-last percent, and the share of winners that is told is that of the touches between them.
+Catalogues of N photos are drawn from the trained model's own distribution: partial activations of recorded photos, each
+a blend of two (w A + (1 - w) B, w uniform in 1/2..1), with their embeddings by the checkpoint's candidate encoder
+(`--by contrastive`: with the embeddings whose cosine is in the partial activations). The touches are those of
+validation objects, stored in the checkpoint. The exhaustive top-1 is the photo with the greatest match logit of all.
+Every other touch chooses the settings and the number of candidates that contain the exhaustive top-1 for 99 % of
+touches. `MARGIN` times as many are used, because a hundred touches hardly determine the last percent. The reported
+recall is that of the other touches.
 
 The cost model, for h = hidden, d = embedding_dim, k candidates, L = 4 sqrt(N) lists of which p are visited:
 
     stage        flops                  bytes read                    grows as
-    exhaustive   2 h^2 N                2 h N (float16 halves)        N
+    exhaustive   2 h^2 N                2 h N (float16 partials)      N
     flat         2 d N                  4 d N                         N
     ivf          2 d (L + p N / L)      4 d L + code p N / L          N^1/2 (p fixed), code = d (sq8), d / 8 (pq)
     hnsw         2 d ef log N           4 d ef log N                  log N
     rescoring    2 d k                  4 d k, in random places       k
     rerank       2 h^2 k                2 h k, in random places       k
     build        rows: constant each; lists: 2 d L 64 L training for each of 10 rounds + 2 d L N     N, N^3/2
-    add F        2 d N hashing of what is there, and N + F rows       N
+    add F        2 d N hashing of existing photos, and N + F rows     N
 
-so with k = c N a share of all photos, and search by lists, the gain over exhaustive is at most 1 / c.
+So with k = c N candidates, and search by lists, the gain over exhaustive search is at most 1 / c.
 
-Run it on one thread (OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1), as one query is answered: teams of threads that wait
-for each other make small products many times slower. A million photos take 1.2 GB on the disk, and 20 minutes.
+Run it on one thread (OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1), like a single query: threads that wait for each other
+make small products many times slower. A million photos take 1.2 GB on disk, and 20 minutes.
 """
 
 import argparse
@@ -63,9 +64,9 @@ TARGET, MARGIN = 0.99, 4
 ADDED = 1000
 TIMED = 40
 QUERIES, HELD_OUT = 200, 1000
-"""Touches that choose how many candidates there are, and others that judge it."""
+"""Touches that choose the number of candidates, and others that evaluate it."""
 RERANKED = 3e13
-"""Most flops to spend on finding winners: fewer touches are asked of larger catalogues, but never below 60."""
+"""Maximum flops for exhaustive scoring: larger catalogues use fewer touches, but at least 60."""
 
 PROBE = """
 import sys, time
@@ -85,7 +86,7 @@ print(opened, (anonymous() - before) / 1024)
 
 @dataclass
 class Size:
-    """Everything measured at one number of photos: seconds, bytes and counts by name."""
+    """All measurements at one number of photos: seconds, bytes and counts by name."""
 
     photos: int
     queries: int = 0
@@ -96,10 +97,16 @@ class Size:
 
 @dataclass(frozen=True)
 class BlendedPhotos:
-    """A model, halves (n, h) of recorded photos to blend catalogues from, halves (Q, h) of touches to choose candidates
-    with, and (J, h) of others.
+    """A model with the material of synthetic catalogues and queries.
 
-    by: which embeddings name the candidates, "candidate_encoder" or, where their cosine is in the halves, "contrastive".
+    Attributes:
+        checkpoint: the model.
+        scorer: its fusion head.
+        photos: (n, h) partial activations of recorded photos, from which catalogues are blended.
+        touches: (Q, h) partial activations of touches that choose the number of candidates.
+        held_out: (J, h) partial activations of other touches.
+        by: the embeddings of candidate search, "candidate_encoder" or, if their cosine is in the partial activations,
+            "contrastive".
     """
 
     checkpoint: Checkpoint
@@ -110,56 +117,58 @@ class BlendedPhotos:
     by: str = "candidate_encoder"
 
     @torch.inference_mode()
-    def embeddings(self, partials: np.ndarray, what: str) -> np.ndarray:
-        """Unit embeddings (n, d) of "touch" or "photo" halves."""
+    def embeddings(self, partials: np.ndarray, modality: str) -> np.ndarray:
+        """Return unit embeddings (n, d) of "touch" or "photo" partial activations."""
         if self.by == "contrastive":
             scaled = partials[:, self.checkpoint.config.matcher.hidden :]
             return scaled / np.linalg.norm(scaled, axis=1, keepdims=True)
-        return getattr(self.checkpoint.matcher.candidate_encoder, what)(torch.from_numpy(partials)).numpy()
+        return getattr(self.checkpoint.matcher.candidate_encoder, modality)(torch.from_numpy(partials)).numpy()
 
     def blocks(self, start: int, stop: int, seed: int) -> Iterator[Block]:
-        """Photos `start` to `stop` - 1 of a catalogue, block by block."""
+        """Yield photos `start` to `stop` - 1 of a catalogue, block by block."""
         rng = np.random.default_rng([seed, start])
         for first in range(start, stop, BLOCK):
             count = min(BLOCK, stop - first)
             one, other = rng.integers(len(self.photos), size=(2, count))
-            share = rng.uniform(0.5, 1, size=(count, 1)).astype(np.float32)
-            partials = share * self.photos[one] + (1 - share) * self.photos[other]
+            weight = rng.uniform(0.5, 1, size=(count, 1)).astype(np.float32)
+            partials = weight * self.photos[one] + (1 - weight) * self.photos[other]
             rows = [_row(number) for number in range(first, first + count)]
             yield Block(rows, self.embeddings(partials, "photo"), {"partials": partials.astype(np.float16)})
 
 
 def blended_photos(model: Path, recording: Path, features: Path | None, by: str = "candidate_encoder") -> BlendedPhotos:
-    """The crowd that a recording's photos make; `features` keeps what was encoded."""
+    """Return the blended photos of a recording; `features` caches the encoding."""
     checkpoint = load_checkpoint(model)
     if checkpoint.queries is None or checkpoint.matcher.candidate_encoder is None:
-        raise SystemExit(f"{model} keeps no touches to ask with, or has no candidate_encoder; train it again")
+        raise SystemExit(f"{model} has no stored touches or no candidate encoder; train it again")
     if by == "contrastive" and not checkpoint.config.matcher.cosine:
-        raise SystemExit(f"the halves of {model} hold no contrastive embedding; its configuration has cosine = false")
+        raise SystemExit(
+            f"the partial activations of {model} contain no contrastive embedding; its configuration has cosine = false"
+        )
     found = encode_recording(load_grasps(recording), checkpoint.matcher, checkpoint.config, features)
     with torch.inference_mode():
         photos = checkpoint.matcher.photo_encoding(torch.from_numpy(found.photo)).partial.numpy()
-        felt = checkpoint.matcher.touch_encoding(torch.from_numpy(found.touch).flatten(1)).partial.numpy()
+        touches = checkpoint.matcher.touch_encoding(torch.from_numpy(found.touch).flatten(1)).partial.numpy()
     rng, queries = np.random.default_rng(0), checkpoint.queries.astype(np.float32)
-    partial = len(queries) // 2
-    held_out = rng.permutation(np.concatenate([queries[partial:], felt]))
+    middle = len(queries) // 2
+    held_out = rng.permutation(np.concatenate([queries[middle:], touches]))
     scorer = scorer_of(checkpoint.matcher.head)
-    return BlendedPhotos(checkpoint, scorer, np.unique(photos, axis=0), queries[:partial], held_out, by)
+    return BlendedPhotos(checkpoint, scorer, np.unique(photos, axis=0), queries[:middle], held_out, by)
 
 
 def measure(crowd: BlendedPhotos, photos: int, kinds: Sequence[str], folder: Path, queries: int = QUERIES) -> Size:
-    """Build, search and grow an index of so many photos of each kind in `folder`."""
-    most = max(60, int(RERANKED / (2 * crowd.photos.shape[1] ** 2 * photos)))
-    asked = min(queries, len(crowd.touches), most // 3)
-    judged = min(HELD_OUT, len(crowd.held_out), most - asked)
-    size, store = Size(photos, asked, judged), IndexStore(folder)
+    """Build, search and grow an index of this many photos of each kind in `folder`."""
+    max_touches = max(60, int(RERANKED / (2 * crowd.photos.shape[1] ** 2 * photos)))
+    chosen = min(queries, len(crowd.touches), max_touches // 3)
+    evaluated = min(HELD_OUT, len(crowd.held_out), max_touches - chosen)
+    size, store = Size(photos, chosen, evaluated), IndexStore(folder)
     generation = _build(crowd, store, size)
     partials = generation.arrays["partials"]
-    touches = np.concatenate([crowd.touches[:asked], crowd.held_out[:judged]])
+    touches = np.concatenate([crowd.touches[:chosen], crowd.held_out[:evaluated]])
     exhaustive_top1, size.figures["exhaustive_s"] = _top1(crowd.scorer, touches, partials)
     for kind in kinds:
         start = time.perf_counter()
-        how = {
+        options = {
             "fingerprint": {},
             "kind": kind,
             "threads": torch.get_num_threads(),
@@ -167,20 +176,20 @@ def measure(crowd: BlendedPhotos, photos: int, kinds: Sequence[str], folder: Pat
             "self_check": 64,
         }
         try:
-            made = store.write_blocks(rows_of(generation), **how)
+            indexed = store.write_blocks(rows_of(generation), **options)
         except ParameterError as error:  # too few vectors for codes
             size.kinds[kind] = {"refused": str(error)}
             continue
-        figures = {"structure_s": time.perf_counter() - start} | opened(folder) | on_disk(made)
-        size.kinds[kind] = figures | _operating_point(crowd, made, touches, exhaustive_top1, asked)
-        size.kinds[kind] |= _growth(crowd, store, made, size.photos)
+        figures = {"structure_s": time.perf_counter() - start} | opened(folder) | on_disk(indexed)
+        size.kinds[kind] = figures | _operating_point(crowd, indexed, touches, exhaustive_top1, chosen)
+        size.kinds[kind] |= _growth(crowd, store, indexed, size.photos)
         point = size.kinds[kind]
         point["gain"] = size.figures["exhaustive_s"] / (point["search_s"] + point["rerank_s"])
     return size
 
 
 def rows_of(generation: Generation) -> Iterator[Block]:
-    """The rows of a generation, for a new one to take over."""
+    """Return the rows of a generation, for a new one to take over."""
     return (Block(generation.rows[start : start + BLOCK]) for start in range(0, generation.count, BLOCK))
 
 
@@ -191,29 +200,29 @@ def _row(number: int) -> dict[str, Any]:
 
 
 def _build(crowd: BlendedPhotos, store: IndexStore, size: Size) -> Generation:
-    """Stream the catalogue to the disk; the time to make it up is not counted."""
-    made, most, before = 0.0, 0.0, anonymous_mb()
+    """Stream the catalogue to disk; the time for drawing it is not counted."""
+    drawing_s, peak_mb, before = 0.0, 0.0, anonymous_mb()
 
     def blocks() -> Iterator[Block]:
-        nonlocal made, most
+        nonlocal drawing_s, peak_mb
         source = crowd.blocks(0, size.photos, 0)
         while True:
             begun = time.perf_counter()
             block = next(source, None)
-            made += time.perf_counter() - begun
+            drawing_s += time.perf_counter() - begun
             if block is None:
                 return
             yield block
-            most = max(most, anonymous_mb() - before)
+            peak_mb = max(peak_mb, anonymous_mb() - before)
 
     start = time.perf_counter()
     generation = store.write_blocks(blocks(), fingerprint={}, kind="flat", self_check=64)
-    size.figures |= {"build_s": time.perf_counter() - start - made, "build_mb": most}
+    size.figures |= {"build_s": time.perf_counter() - start - drawing_s, "build_mb": peak_mb}
     return generation
 
 
 def _top1(scorer: FusionScorer, touches: np.ndarray, partials: Any) -> tuple[np.ndarray, float]:
-    """The winner of each touch, and the median seconds that it takes to judge all photos."""
+    """Return the exhaustive top-1 of each touch, and the median seconds for scoring all photos."""
     exhaustive_top1, seconds = [], []
     for touch in touches:
         start = time.perf_counter()
@@ -223,32 +232,29 @@ def _top1(scorer: FusionScorer, touches: np.ndarray, partials: Any) -> tuple[np.
 
 
 def _operating_point(
-    crowd: BlendedPhotos, made: Generation, touches: np.ndarray, exhaustive_top1: np.ndarray, asked: int
+    crowd: BlendedPhotos, made: Generation, touches: np.ndarray, exhaustive_top1: np.ndarray, choosing: int
 ) -> dict[str, Any]:
-    """The fastest setting whose candidates hold the target share of winners; where none does, the most complete.
+    """Return the fastest setting whose candidates contain the target fraction of exhaustive top-1s.
 
-    Chosen with the first `asked` touches, judged by the others.
+    If no setting reaches it, return the most complete one. The first `choosing` touches choose, the others evaluate.
     """
     queries, partials, points = crowd.embeddings(touches, "touch"), made.arrays["partials"], []
     timed, built = range(min(TIMED, len(touches))), made.index
     needed = _needed(made, queries, exhaustive_top1)
     for index in built.search_variants():
         made.index = index
-        k = _candidates(made, queries[:asked], exhaustive_top1[:asked])
-        held = np.array(
-            [
-                winner in made.search(query[None], k)[0][0]
-                for query, winner in zip(queries, exhaustive_top1, strict=True)
-            ]
+        k = _candidates(made, queries[:choosing], exhaustive_top1[:choosing])
+        contained = np.array(
+            [top1 in made.search(query[None], k)[0][0] for query, top1 in zip(queries, exhaustive_top1, strict=True)]
         )
-        judged = held[asked:]
+        evaluated = contained[choosing:]
         search = _median(lambda n, k=k: made.search(queries[n : n + 1], k), timed)
         found = [made.search(queries[n : n + 1], k)[0][0] for n in timed]
         rerank = _median(lambda n, found=found: crowd.scorer.logits(touches[n : n + 1], partials, found[n]), timed)
-        low, high = binomial_interval(int(judged.sum()), len(judged))
-        point = {"k": k, "recall": float(judged.mean()), "low": low, "high": high}
+        low, high = binomial_interval(int(evaluated.sum()), len(evaluated))
+        point = {"k": k, "recall": float(evaluated.mean()), "low": low, "high": high}
         point |= {"search_s": search, "rerank_s": rerank, "settings": index.settings()}
-        points.append((float(held[:asked].mean()), point))
+        points.append((float(contained[:choosing].mean()), point))
     made.index = built
     for _, point in points:
         point["needed"] = needed
@@ -259,23 +265,23 @@ def _operating_point(
 
 
 def _candidates(made: Generation, queries: np.ndarray, exhaustive_top1: np.ndarray) -> int:
-    """`MARGIN` times as many as these touches need."""
+    """Return `MARGIN` times the number of candidates that these touches need."""
     return min(MARGIN * _needed(made, queries, exhaustive_top1), MAX_CANDIDATES, made.count)
 
 
 def _needed(made: Generation, queries: np.ndarray, exhaustive_top1: np.ndarray) -> int:
-    """The least number of candidates that hold the target share of winners, as far as the index names them at all."""
-    most = min(MAX_CANDIDATES, made.count)
-    found = (made.search(query[None], most)[0][0] for query in queries)
-    places = [np.flatnonzero(rows == winner) for rows, winner in zip(found, exhaustive_top1, strict=True)]
-    needed = np.sort([int(place[0]) + 1 if len(place) else most for place in places])
+    """Return the least number of candidates that contain the target fraction of exhaustive top-1s, up to a limit."""
+    limit = min(MAX_CANDIDATES, made.count)
+    found = (made.search(query[None], limit)[0][0] for query in queries)
+    places = [np.flatnonzero(rows == top1) for rows, top1 in zip(found, exhaustive_top1, strict=True)]
+    needed = np.sort([int(place[0]) + 1 if len(place) else limit for place in places])
     return int(needed[int(np.ceil(TARGET * len(needed))) - 1])
 
 
 def _growth(crowd: BlendedPhotos, store: IndexStore, made: Generation, photos: int) -> dict[str, float]:
-    """Seconds that it takes to add `ADDED` photos."""
-    fresh = list(crowd.blocks(photos, photos + ADDED, 1))
-    how = {
+    """Return the seconds for adding `ADDED` photos."""
+    added = list(crowd.blocks(photos, photos + ADDED, 1))
+    options = {
         "fingerprint": {},
         "kind": made.manifest.kind,
         "threads": made.index.threads,
@@ -283,12 +289,12 @@ def _growth(crowd: BlendedPhotos, store: IndexStore, made: Generation, photos: i
         "self_check": 64,
     }
     start = time.perf_counter()
-    store.write_blocks(chain(rows_of(made), fresh), **how)
+    store.write_blocks(chain(rows_of(made), added), **options)
     return {"add_s": time.perf_counter() - start}
 
 
 def opened(folder: Path) -> dict[str, float]:
-    """Seconds to open the index in a process of its own, and the memory it then holds beside the mapped files."""
+    """Return the seconds for opening the index in a separate process, and its memory without mapped files."""
     done = subprocess.run([sys.executable, "-c", PROBE, str(folder)], check=True, capture_output=True, text=True)
     seconds, memory = map(float, done.stdout.split())
     return {"open_s": seconds, "memory_mb": memory}
@@ -317,12 +323,12 @@ def _median(work: Callable[[int], object], numbers: Sequence[int]) -> float:
 
 
 def lines(size: Size) -> Iterator[str]:
-    """What was measured at one size, for people."""
+    """Yield the measurements at one size as text."""
     f = size.figures
-    written, judged = duration(f["build_s"]), duration(f["exhaustive_s"])
+    written, scored = duration(f["build_s"]), duration(f["exhaustive_s"])
     yield (
-        f"{size.photos:,} photos: written in {written} with {f['build_mb']:.0f} MB of memory; judging all of them "
-        f"takes {judged} ({size.queries} touches choose, {size.held_out} judge)"
+        f"{size.photos:,} photos: written in {written} with {f['build_mb']:.0f} MB of memory; scoring all of them "
+        f"takes {scored} ({size.queries} touches choose, {size.held_out} evaluate)"
     )
     for kind, p in size.kinds.items():
         if "refused" in p:
@@ -330,17 +336,17 @@ def lines(size: Size) -> Iterator[str]:
             continue
         times = {name: duration(value) for name, value in p.items() if name.endswith("_s")}
         yield (
-            f"  {kind} {p['settings']}: {p['gain']:.3g} times faster than judging all, winner found {p['recall']:.1%} "
-            f"({p['low']:.1%} to {p['high']:.1%}) among {p['k']} ({p['needed']} hold 99 % of all); "
-            f"search {times['search_s']}, rerank {times['rerank_s']}; structure made in {times['structure_s']}, "
+            f"  {kind} {p['settings']}: {p['gain']:.3g} times faster than scoring all, exhaustive top-1 found "
+            f"{p['recall']:.1%} ({p['low']:.1%} to {p['high']:.1%}) among {p['k']} ({p['needed']} for 99 % of all); "
+            f"search {times['search_s']}, rerank {times['rerank_s']}; structure built in {times['structure_s']}, "
             f"{p['structure_mb']:.0f} of {p['disk_mb']:.0f} MB on disk, {p['memory_mb']:.0f} MB in memory, "
             f"opened in {times['open_s']}; "
-            f"{ADDED} more in {times['add_s']}"
+            f"{ADDED} added in {times['add_s']}"
         )
 
 
 def slopes(sizes: Sequence[Size]) -> Iterator[tuple[str, float]]:
-    """Name and d log t / d log N, fitted over all sizes at which it was measured; from 1e4 photos on."""
+    """Yield name and d log t / d log N, fitted over all measured sizes from 1e4 photos on."""
     tables: dict[str, list[tuple[int, float]]] = {}
     for size in sizes:
         flat = size.figures | {f"{kind} {name}": value for kind, p in size.kinds.items() for name, value in p.items()}
@@ -353,7 +359,7 @@ def slopes(sizes: Sequence[Size]) -> Iterator[tuple[str, float]]:
 
 
 def collected(folder: Path) -> Path:
-    """A small recording of the simulated rig."""
+    """Collect a small recording on the simulated rig."""
     words = ["collect", "--rig", "sim", "--objects", "60", "--grasps", "2", "--seed", "20000", "--jobs", "2"]
     if retrieve([*words, "--out", str(folder / "recording")]):
         raise SystemExit("the recording could not be collected")
@@ -361,21 +367,23 @@ def collected(folder: Path) -> Path:
 
 
 def main() -> None:
-    """Print every size as soon as it is measured, then the slopes."""
+    """Print each size as soon as it is measured, then the slopes."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scale", description=__doc__.split("\n\n")[0])
     parser.add_argument("--sizes", nargs="+", type=float, default=[1e3, 1e4, 1e5])
     parser.add_argument("--kinds", nargs="+", default=list(KINDS))
     parser.add_argument("--model", type=Path, default=shipped_model())
-    parser.add_argument("--recording", type=Path, help="whose photos are blended; a small one is collected where None")
-    parser.add_argument("--features", type=Path, help="where encoded features are kept")
+    parser.add_argument(
+        "--recording", type=Path, help="recording whose photos are blended (default: a small one is collected)"
+    )
+    parser.add_argument("--features", type=Path, help="file to store encoded features")
     parser.add_argument("--queries", type=int, default=QUERIES)
     parser.add_argument(
         "--by",
         choices=("candidate_encoder", "contrastive"),
         default="candidate_encoder",
-        help="embedding of the candidates",
+        help="embedding for candidate search",
     )
-    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)

@@ -1,10 +1,10 @@
-"""How the service holds under load, in ratios of one run.
+"""The service under load, in ratios of one run.
 
     python -m benchmarks.service_load [--share 1] [--only NAME ...]
 
-Everything runs against an index of simulated objects that is made first, with the shipped checkpoint; what is asked of
-the history alone against one of drawn objects, whose model starts at once. Small by default; --share 1 takes what was
-asked for: 20 minutes of load, 100 generations, 20 ends, 1,000 hostile bodies, 1,000 kills.
+Everything runs against an index of simulated objects, made first, with the shipped checkpoint. The test of the history
+uses an index of synthetic objects, whose model starts at once. Small by default; --share 1 runs the full sizes: 20
+minutes of load, 100 generations, 20 shutdowns, 1,000 hostile bodies, 1,000 kills.
 """
 
 import argparse
@@ -59,16 +59,16 @@ class LoadFixture:
         rig = SimRig(SEED)
         self.names = rig.object_ids(objects)
         for name in self.names:
-            self.show(rig, name, 2)
+            self.photograph(rig, name, 2)
         self.spare = rig.object_ids(objects + 1)[-1]
-        felt = next(felt for number in range(99) if (felt := rig.press(self.names[0], 500 + number)))
-        self.touch = [encoded(".jpg", felt[f"touch_{finger}"]) for finger in "ab"]  # as rigs record them
+        touched = next(touched for number in range(99) if (touched := rig.press(self.names[0], 500 + number)))
+        self.touch = [encoded(".jpg", touched[f"touch_{finger}"]) for finger in "ab"]  # the format of rigs
         self.body = {"touches": [[base64.b64encode(image).decode() for image in self.touch]]}
         self.rig, self.model = rig, load_checkpoint(shipped_model())
         build_index(self.catalogue, self.model, self.index, quiet=True)
 
-    def show(self, rig, name, photos):
-        """Photos of an object, into the catalogue."""
+    def photograph(self, rig, name, photos):
+        """Write photos of an object into the catalogue."""
         (self.catalogue / name).mkdir(parents=True)
         for number in range(photos):
             rig.prepare(name, number)
@@ -77,16 +77,16 @@ class LoadFixture:
             )
 
     def next_generation(self, index):
-        """One object more, or less, in turn."""
+        """Add an object or remove it, in turn, and build."""
         if (self.catalogue / self.spare).exists():
             shutil.rmtree(self.catalogue / self.spare)
         else:
-            self.show(self.rig, self.spare, 1)
+            self.photograph(self.rig, self.spare, 1)
         build_index(self.catalogue, self.model, index, quiet=True)
 
 
 class DrawnQuery:
-    """A catalogue of drawn objects and a model that knows nothing but answers at once; its index, a body of a query."""
+    """A catalogue of synthetic objects and an untrained but fast model; its index, and the body of a query."""
 
     def __init__(self, folder):
         objects, self.index = synthetic.make_objects(8, seed=9), folder / "index"
@@ -111,194 +111,199 @@ def resident_mb(pid):
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
-def ms(seconds, share=0.5):
-    return 1e3 * float(np.quantile(seconds, share))
+def ms(seconds, quantile=0.5):
+    return 1e3 * float(np.quantile(seconds, quantile))
 
 
-def of(share, asked, least):
-    """So much of what was asked for, `least` at least."""
-    return max(least, round(share * asked))
+def scaled(fraction, full, least):
+    """Return this fraction of the full size, at least `least`."""
+    return max(least, round(fraction * full))
 
 
-def say(name, measured, asked=""):
-    print(f"{name:12} {measured}" + (f"   [asked: {asked}]" if asked else ""), flush=True)
+def report(name, measured, requirement=""):
+    print(f"{name:12} {measured}" + (f"   [required: {requirement}]" if requirement else ""), flush=True)
 
 
-# What is measured -----------------------------------------------------------------------------------------------------
+# Measurements ---------------------------------------------------------------------------------------------------------
 
 
-def paired(bench, share):
-    """HTTP against the bare query on the same open index, in turn."""
+def paired(bench, fraction):
+    """HTTP and the bare query on the same open index, in turn."""
     with listening(bench.index) as (url, parts), httpx.Client(base_url=url, timeout=60) as client:
         searcher = parts.generations.current.searcher
         bare, http = [], []
-        for number in range(10 + of(share, 400, 50)):
+        for number in range(10 + scaled(fraction, 400, 50)):
             start = time.perf_counter()
             searcher.query([bench.touch])
             between = time.perf_counter()
             assert client.post("/v1/query", json=bench.body).status_code == 200
-            if number >= 10:  # what is made at first is made by then
+            if number >= 10:  # the first queries are warm-up
                 bare.append(between - start)
                 http.append(time.perf_counter() - between)
     allowed = 1.1 * ms(bare) + 5
-    say(
+    report(
         "paired",
         f"bare p50 {ms(bare):.1f} ms, HTTP p50 {ms(http):.1f} ms: {ms(http) / ms(bare):.2f} x, "
-        f"{ms(http) - ms(bare):+.1f} ms; of what is allowed {ms(http) / allowed:.2f}",
+        f"{ms(http) - ms(bare):+.1f} ms; relative to the limit {ms(http) / allowed:.2f}",
         "at most 1.1 x + 5 ms",
     )
 
 
 async def _load(url, body, clients, seconds, pause_s=0.0):
-    """Of accepted queries the seconds that they took, and that their searches took; and statuses.
+    """Return the seconds of accepted queries, the seconds of their searches, and the counts of statuses.
 
-    A client pauses between two queries; one that is told to come again does so when it was told. As the clients share
-    the machine with the service they send bytes made once, over bare lines.
+    A client pauses between two queries; after 429 it retries when the header says. The clients share the machine with
+    the service, so they send prepared bytes over plain connections.
     """
     taken, searches, statuses, until = [], [], Counter(), time.monotonic() + seconds
     request = httpx.Request("POST", f"{url}/v1/query", json=body)
     head = "".join(f"{name}: {value}\r\n" for name, value in request.headers.items())
     data = f"POST /v1/query HTTP/1.1\r\n{head}\r\n".encode() + request.content
 
-    async def ask():
-        line = None
+    async def query():
+        connection = None
         while time.monotonic() < until:
             start = time.perf_counter()
-            line = line or await asyncio.open_connection(request.url.host, request.url.port)
-            status, headers, answer = await _exchange(*line, data)
+            connection = connection or await asyncio.open_connection(request.url.host, request.url.port)
+            status, headers, answer = await _exchange(*connection, data)
             statuses[status] += 1
             if status == 200:
                 taken.append(time.perf_counter() - start)
                 searches.append(json.loads(answer)["timing_ms"]["total"] / 1e3)
             if headers.get("connection") == "close" or status is None:
-                line[1].close()
-                line = None
+                connection[1].close()
+                connection = None
             await asyncio.sleep(float(headers["retry-after"]) if status == 429 else pause_s)
 
-    await asyncio.gather(*(ask() for _ in range(clients)))
+    await asyncio.gather(*(query() for _ in range(clients)))
     return taken, searches, statuses
 
 
 async def _exchange(reader, writer, data):
-    """Status, headers and body of the answer to a request; None where the line broke."""
+    """Return status, headers and body of the answer to a request; None if the connection broke."""
     try:
         writer.write(data)
-        told = (await reader.readuntil(b"\r\n\r\n")).decode().split("\r\n")
-        headers = dict(line.lower().split(": ", 1) for line in told[1:] if line)
+        head = (await reader.readuntil(b"\r\n\r\n")).decode().split("\r\n")
+        headers = dict(line.lower().split(": ", 1) for line in head[1:] if line)
         body = await reader.readexactly(int(headers["content-length"]))
     except (OSError, asyncio.IncompleteReadError):
         return None, {}, b""
-    return int(told[0].split()[1]), headers, body
+    return int(head[0].split()[1]), headers, body
 
 
-def clients(bench, share):
-    """32 clients against 8, in turn, and what the accepted ones wait."""
-    seconds, rates, statuses, phases = of(share, 30, 8), {8: [], 32: []}, Counter(), []
+def clients(bench, fraction):
+    """32 clients and 8 clients, in turn, and the waiting times of accepted queries."""
+    seconds, rates, statuses, phases = scaled(fraction, 30, 8), {8: [], 32: []}, Counter(), []
     waits, searches = [], []
     options = ("--index", bench.index, "--port", "0", "--no-history", "--queue", QUEUE)
     with command(*options) as (_, url, _):
-        asyncio.run(_load(url, bench.body, 1, 2))  # what is made at first is made by then
-        for _ in range(of(share, 6, 3)):
+        asyncio.run(_load(url, bench.body, 1, 2))  # warm-up
+        for _ in range(scaled(fraction, 6, 3)):
             phases.append(asyncio.run(_load(url, bench.body, 1, seconds / 4))[1])
             for count in rates:
-                taken, searched, seen = asyncio.run(_load(url, bench.body, count, seconds))
+                taken, searched, counts = asyncio.run(_load(url, bench.body, count, seconds))
                 rates[count].append(len(taken) / seconds)
-                statuses += seen
+                statuses += counts
             waits, searches = waits + taken, searches + searched
-    rate = {count: statistics.mean(found) for count, found in rates.items()}
+    rate = {count: statistics.mean(values) for count, values in rates.items()}
     bare = [one for phase in phases for one in phase]
     in_a_row = [sum(phase[start : start + QUEUE]) for phase in phases for start in range(len(phase) - QUEUE + 1)]
-    alone = ms(bare)
-    say(
+    single_ms = ms(bare)
+    report(
         "clients",
         f"32 clients {rate[32]:.1f}/s, 8 clients {rate[8]:.1f}/s: {rate[32] / rate[8]:.2f} x; accepted of 32, with a "
-        f"queue of {QUEUE}: p50 {ms(waits) / alone:.1f} x, p95 {ms(waits, 0.95) / alone:.1f} x the bare query alone, "
-        f"{QUEUE} of which in a row are p50 {ms(in_a_row) / alone:.1f} x, p95 {ms(in_a_row, 0.95) / alone:.1f} x; bare "
-        f"p50 {alone:.1f} ms, p95 {ms(bare, 0.95):.1f} ms, under that load {ms(searches):.1f} ms, "
+        f"queue of {QUEUE}: p50 {ms(waits) / single_ms:.1f} x, p95 {ms(waits, 0.95) / single_ms:.1f} x a single bare "
+        f"query, {QUEUE} of them in a row are p50 {ms(in_a_row) / single_ms:.1f} x, "
+        f"p95 {ms(in_a_row, 0.95) / single_ms:.1f} x; "
+        f"bare p50 {single_ms:.1f} ms, p95 {ms(bare, 0.95):.1f} ms, under this load {ms(searches):.1f} ms, "
         f"{ms(searches, 0.95):.1f} ms; statuses {dict(statuses)}",
         f"0.9 x; {QUEUE + 1} x; the rest 429",
     )
 
 
-def memory(bench, share):
-    """Memory of the process over minutes of load, the history kept."""
-    seconds, found, loads = of(share, 1200, 40), [], []
-    with command("--index", bench.index, "--port", "0", "--history", bench.folder / "kept") as (process, url, _):
-        asyncio.run(_load(url, bench.body, 8, 30))  # what is made at first is made by then
-        ended = time.monotonic() + seconds
+def memory(bench, fraction):
+    """Memory of the process over minutes of load, with the history enabled."""
+    seconds, samples, loads = scaled(fraction, 1200, 40), [], []
+    with command("--index", bench.index, "--port", "0", "--history", bench.folder / "history") as (process, url, _):
+        asyncio.run(_load(url, bench.body, 8, 30))  # warm-up
+        deadline = time.monotonic() + seconds
         load = threading.Thread(target=lambda: loads.append(asyncio.run(_load(url, bench.body, 8, seconds, 0.5))))
         load.start()
-        while time.monotonic() < ended:
-            found.append(resident_mb(process.pid))
+        while time.monotonic() < deadline:
+            samples.append(resident_mb(process.pid))
             time.sleep(1)
         load.join()
-    third = len(found) // 3
-    first, last = statistics.median(found[:third]), statistics.median(found[-third:])
-    say(
+    third = len(samples) // 3
+    first, last = statistics.median(samples[:third]), statistics.median(samples[-third:])
+    report(
         "memory",
-        f"{seconds} s, {len(loads[0][0])} queries kept: first third {first:.0f} MB, last third {last:.0f} MB: "
+        f"{seconds} s, {len(loads[0][0])} queries stored: first third {first:.0f} MB, last third {last:.0f} MB: "
         f"{last - first:+.1f} MB",
         "flat",
     )
 
 
-def reloads(bench, share):
-    """New generations under load: failed requests, and answers whose parts are of two."""
-    wanted, own = of(share, 100, 5), bench.folder / "reloaded"
+def reloads(bench, fraction):
+    """New generations under load: failed requests, and answers that mix two generations."""
+    count, own = scaled(fraction, 100, 5), bench.folder / "reloaded"
     shutil.copytree(bench.index, own)
-    objects, answers, failures, ended = {}, Counter(), [], threading.Event()
+    objects, answers, failures, done = {}, Counter(), [], threading.Event()
     with listening(own, poll_s=0.1) as (url, parts), ThreadPoolExecutor(3) as client_threads:
 
-        def ask():
+        def query():
             with httpx.Client(base_url=url, timeout=60) as client:
-                while not ended.is_set():
+                while not done.is_set():
                     response = client.post("/v1/query", json={**bench.body, "top": 100, "none_prior": 0.5})
                     if response.status_code != 200:
                         failures.append(response.text)
                         continue
-                    told = response.json()
-                    answers[told["index"]["generation"], told["index"]["objects"]] += 1
-                    # A grasp without contact is not ranked.
-                    if told["results"] and len(told["results"]) != told["index"]["objects"]:
-                        failures.append(told)
+                    answer = response.json()
+                    answers[answer["index"]["generation"], answer["index"]["objects"]] += 1
+                    # A grasp without contact has no ranking.
+                    if answer["results"] and len(answer["results"]) != answer["index"]["objects"]:
+                        failures.append(answer)
 
-        asking = [client_threads.submit(ask) for _ in range(3)]
-        for _ in range(wanted):
+        running = [client_threads.submit(query) for _ in range(3)]
+        for _ in range(count):
             bench.next_generation(own)
             name = (own / "CURRENT").read_text().strip()
             while parts.generations.current.name != name:
                 time.sleep(0.02)
             objects[name] = parts.generations.current.searcher.objects.count
-        ended.set()
-        for one in asking:
+        done.set()
+        for one in running:
             one.result()
-    mixed = sum(count for (name, seen), count in answers.items() if objects.get(name, len(bench.names)) != seen)
-    say(
+    mixed = sum(
+        count
+        for (name, objects_shown), count in answers.items()
+        if objects.get(name, len(bench.names)) != objects_shown
+    )
+    report(
         "reloads",
-        f"{wanted} generations taken up, {sum(answers.values())} answers of {len(answers)} generations, "
+        f"{count} generations loaded, {sum(answers.values())} answers of {len(answers)} generations, "
         f"{len(failures)} failed, {mixed} of two generations",
         "0 failed, 0 mixed",
     )
 
 
-def ends(bench, share):
+def ends(bench, fraction):
     """SIGTERM with requests in flight."""
-    rounds, lost, answered = of(share, 20, 3), [], 0
+    rounds, lost, answered = scaled(fraction, 20, 3), [], 0
     for _ in range(rounds):
         options = ("--index", bench.index, "--port", "0", "--no-history", "--queue", "32")
         with command(*options) as (process, url, _), ThreadPoolExecutor(8) as client_threads:
             httpx.post(f"{url}/v1/query", json=bench.body, timeout=60)
             sent = threading.Semaphore(0)
-            flying = [client_threads.submit(_raw_query, url, bench.body, sent) for _ in range(8)]
-            for _ in flying:
+            in_flight = [client_threads.submit(_raw_query, url, bench.body, sent) for _ in range(8)]
+            for _ in in_flight:
                 sent.acquire(timeout=30)
-            time.sleep(0.05)  # of the eight, some wait and one is in work
+            time.sleep(0.05)  # of the eight, one is processed and the others wait
             process.send_signal(signal.SIGTERM)
-            found = [one.result(timeout=60) for one in flying]
+            found = [one.result(timeout=60) for one in in_flight]
             code = process.wait(60)
             answered += sum(data.startswith(b"HTTP/1.1 200") and data.endswith(b"}") for data in found)
             lost += [data[:40] for data in found if not data.startswith(b"HTTP/1.1 200")] + [code] * (code != 0)
-    say("ends", f"{rounds} SIGTERMs: {answered} of {8 * rounds} in flight answered, lost: {lost[:3]}", "none lost")
+    report("ends", f"{rounds} SIGTERMs: {answered} of {8 * rounds} in flight answered, lost: {lost[:3]}", "none lost")
 
 
 def _raw_query(url, body, sent):
@@ -320,12 +325,12 @@ def _line(url):
 
 
 BODY_S = 0.3
-"""A slow body is given up after so long here; 10 s where nothing is said."""
+"""Time limit of slow bodies in this benchmark; 10 s by default."""
 
 
-def hostile(bench, share):
-    """Junk, bombs, half bodies, slow bodies, wrong types, 2 GB announced."""
-    count, draw = of(share, 1000, 100), random.Random(0)
+def hostile(bench, fraction):
+    """Junk, decompression bombs, half bodies, slow bodies, wrong types, 2 GB announced."""
+    count, draw = scaled(fraction, 1000, 100), random.Random(0)
     kinds = ("junk", "json", "bomb", "half", "slow", "type", "announced", "chunked", "form", "deep")
     taken, wrong, statuses = {kind: [] for kind in kinds}, [], Counter()
     settings = ServiceSettings(index=bench.index, port=0, body_s=BODY_S)
@@ -352,16 +357,16 @@ def hostile(bench, share):
         os.waitpid(child, 0)
     slowest = {kind: round(1e3 * max(found)) for kind, found in taken.items()}
     every = [one for found in taken.values() for one in found]
-    say(
+    report(
         "hostile",
-        f"{count} bodies: statuses {dict(statuses)} (None: left before an answer), not 4xx {wrong[:3]}; p99 "
+        f"{count} bodies: statuses {dict(statuses)} (None: attacker disconnected first), not 4xx {wrong[:3]}; p99 "
         f"{ms(every, 0.99):.0f} ms, slowest by kind {slowest} ms; memory {most - before:+.0f} MB; then {alive}",
         f"4xx in under 500 ms (slow bodies have {BODY_S} s here), within 100 MB, alive",
     )
 
 
 def _attack(url, kind, draw):
-    """Status of the answer; None where the attacker left."""
+    """Return the status of the answer; None if the attacker disconnected."""
     junk = draw.randbytes(draw.choice((0, 10, 10_000, 1_000_000)))
     as_json = {"content-type": "application/json"}
     bomb = base64.b64encode(png_file(draw.randrange(5000, 2**31), draw.randrange(5000, 2**31))).decode()
@@ -395,7 +400,7 @@ def _attack(url, kind, draw):
 
 
 def _serve(settings, folder, writer):
-    """In a fork: serve, tell the address through the pipe, and never return."""
+    """Serve in a fork, send the address through the pipe, and never return."""
     try:
         recorder = folder and RecordingWriter(folder / "recording", {"source": "feedback", "sensor": "simulated"})
         app = create_app(settings, None, recorder)
@@ -405,10 +410,10 @@ def _serve(settings, folder, writer):
         os._exit(0)
 
 
-def kills(bench, share):
-    """SIGKILL while people speak; the service is a fork, so that it starts at once."""
-    rounds, folder, draw, acknowledged = of(share, 1000, 20), bench.index.parent / "killed", random.Random(0), []
-    gc.freeze()  # else the first collection in a fork copies every page of this process
+def kills(bench, fraction):
+    """SIGKILL during feedback; the service is a fork, so that it starts at once."""
+    rounds, folder, draw, acknowledged = scaled(fraction, 1000, 20), bench.index.parent / "killed", random.Random(0), []
+    gc.freeze()  # otherwise the first collection in a fork copies every page of this process
     for _ in range(rounds):
         reader, writer = os.pipe()
         child = os.fork()
@@ -423,8 +428,8 @@ def kills(bench, share):
                 query = client.post("/v1/query", json=bench.body).headers["x-query-id"]
                 if not number:
                     killer.start()
-                word = {"query": query, "feedback": "object", "object_id": bench.names[0]}
-                if client.post("/v1/feedback", json=word).status_code == 201:
+                feedback = {"query": query, "feedback": "object", "object_id": bench.names[0]}
+                if client.post("/v1/feedback", json=feedback).status_code == 201:
                     acknowledged.append(query)
         killer.join()
         os.waitpid(child, 0)
@@ -433,14 +438,14 @@ def kills(bench, share):
         listening(bench.index, None, recorder, history=folder) as (url, parts),
     ):
         httpx.get(f"{url}/v1/history", timeout=60)
-        kept = Counter(name for name, _ in parts.history_writer.store.recordable())
+        stored = Counter(name for name, _ in parts.history_writer.store.recordable())
     recorded = Counter(grasp.sequence_id for grasp in load_grasps(folder / "recording"))
-    lost = [name for name in acknowledged if kept[name] != 1 or recorded[name] != 1]
-    say(
+    lost = [name for name in acknowledged if stored[name] != 1 or recorded[name] != 1]
+    report(
         "kills",
-        f"{rounds} SIGKILLs, {len(acknowledged)} words acknowledged, {len(kept)} kept, {len(recorded)} recorded, "
-        f"{len(lost)} lost or twice",
-        "each there, once",
+        f"{rounds} SIGKILLs, {len(acknowledged)} feedbacks acknowledged, {len(stored)} stored, {len(recorded)} "
+        f"recorded, {len(lost)} lost or duplicated",
+        "each exactly once",
     )
 
 
@@ -448,18 +453,18 @@ PARTS = {one.__name__: one for one in (paired, clients, memory, reloads, ends, h
 
 
 def main():
-    """Run the parts that are asked for."""
+    """Run the requested parts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--share", type=float, default=0.02, help="of what was asked for; 1 takes hours")
+    parser.add_argument("--share", type=float, default=0.02, help="fraction of the full sizes; 1 takes hours")
     parser.add_argument("--only", nargs="+", choices=list(PARTS), default=list(PARTS), help="parts")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         benches = {}
-        for name in asked.only:
+        for name in arguments.only:
             kind = DrawnQuery if name == kills.__name__ else LoadFixture
             if kind not in benches:
                 benches[kind] = kind(Path(folder) / kind.__name__)
-            PARTS[name](benches[kind], asked.share)
+            PARTS[name](benches[kind], arguments.share)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """`python -m benchmarks.several [--sizes 1e4 1e5] [--grasps 2 4 8] [--recording R --features F] [--json]`.
 
-Candidates of several grasps of one object: the k photos nearest to all of them combined_embedding, as search takes them, beside
-the k nearest of each put combined_embedding. Catalogues are drawn as `benchmarks.scale` draws them. Every touch of the
-recording begins a set with the next ones of its object. A set's winner is the photo of the greatest sum of match
-logits; it is looked for among the `LOOKED` nearest of either way, whose ends winners stay far away from (the worst
-place is told). Places are those of exact cosines; naming by the index of `--kind` and judging are timed on one thread,
-both ways in turns.
+Candidates of several grasps of one object: the k photos nearest to all grasps together, as search uses them, compared
+with the union of the k nearest of each grasp. Catalogues are drawn as in `benchmarks.scale`. Every touch of the
+recording begins a set with the next touches of its object. The exhaustive top-1 of a set is the photo with the greatest
+sum of match logits. It is searched among the `SEARCHED` nearest photos of either way, whose limits it never comes near
+(the worst rank is printed). Ranks are those of exact cosines. Candidate search in the index of `--kind` and reranking
+are timed on one thread, both ways in turn.
 """
 
 import argparse
@@ -31,13 +31,13 @@ from retrieval.search.query.shard import combined_embedding
 from retrieval.training.distil import feature_partials
 from retrieval.training.features import encode_recording
 
-LOOKED = 4096
+SEARCHED = 4096
 Rows = NDArray[np.int64]
 Way = Callable[[np.ndarray], Rows]
 
 
 def ways(made: Generation, k: int) -> dict[str, Way]:
-    """From embeddings (G, d) of grasps to the rows of the candidates, sorted."""
+    """Return functions from embeddings (G, d) of grasps to the sorted rows of the candidates."""
     return {
         "together": lambda embeddings: np.sort(made.candidates(combined_embedding(embeddings), k)[0]),
         "each": lambda embeddings: np.unique(np.concatenate(made.candidates(embeddings, k))),
@@ -45,13 +45,13 @@ def ways(made: Generation, k: int) -> dict[str, Way]:
 
 
 def places(queries: np.ndarray, photos: np.ndarray, scorer: Callable[[Rows], np.ndarray]) -> dict[str, int]:
-    """At which place, from 1, each way puts the winner of grasps (G, d) among photos (N, d)."""
+    """Return the rank, from 1, of the exhaustive top-1 of grasps (G, d) among photos (N, d), for each way."""
     cosines = queries @ photos.T
     scores = {"together": cosines.sum(0, keepdims=True), "each": cosines}
-    near = [_nearest(each, LOOKED // len(score)) for score in scores.values() for each in score]
+    near = [_nearest(each, SEARCHED // len(score)) for score in scores.values() for each in score]
     rows = np.unique(np.concatenate(near))
-    winner = rows[scorer(rows).argmax()]
-    return {name: 1 + int((score > score[:, [winner]]).sum(1).min()) for name, score in scores.items()}
+    top1 = rows[scorer(rows).argmax()]
+    return {name: 1 + int((score > score[:, [top1]]).sum(1).min()) for name, score in scores.items()}
 
 
 def _nearest(scores: np.ndarray, count: int) -> Rows:
@@ -61,7 +61,7 @@ def _nearest(scores: np.ndarray, count: int) -> Rows:
 def measure(
     crowd: BlendedPhotos, made: Generation, partials: np.ndarray, sets: Rows, k: int
 ) -> Iterator[dict[str, Any]]:
-    """For each way a line of figures: sets (S, G) are of rows of touch halves (T, half)."""
+    """Yield a line of figures for each way; sets (S, G) contain rows of touch partial activations (T, width)."""
     queries, photos = crowd.embeddings(partials, "touch"), made.embeddings[made.slots]
     stored, found = made.arrays["partials"], []
     for chosen in sets:
@@ -70,11 +70,11 @@ def measure(
                 queries[chosen], photos, lambda rows, chosen=chosen: crowd.scorer.logits(partials[chosen], stored, rows)
             )
         )
-    named, seconds = _timed(crowd, made, partials, queries, sets, k)
-    for way in named:
+    counts, seconds = _timed(crowd, made, partials, queries, sets, k)
+    for way in counts:
         order = np.sort([place[way] for place in found])
-        held = int((order <= k).sum())
-        low, high = binomial_interval(held, len(order))
+        contained = int((order <= k).sum())
+        low, high = binomial_interval(contained, len(order))
         yield {
             "photos": made.count,
             "grasps": sets.shape[1],
@@ -83,19 +83,19 @@ def measure(
             "needed": int(order[int(np.ceil(TARGET * len(order))) - 1]),
             "worst": int(order[-1]),
             "k": k,
-            "found": held / len(order),
+            "found": contained / len(order),
             "low": low,
             "high": high,
-            "reranked": float(np.mean(named[way])),
-            "name_ms": 1e3 * float(np.median([naming for naming, _ in seconds[way]])),
-            "rerank_ms": 1e3 * float(np.median([judging for _, judging in seconds[way]])),
+            "reranked": float(np.mean(counts[way])),
+            "name_ms": 1e3 * float(np.median([searching for searching, _ in seconds[way]])),
+            "rerank_ms": 1e3 * float(np.median([reranking for _, reranking in seconds[way]])),
         }
 
 
 def _timed(
     crowd: BlendedPhotos, made: Generation, partials: np.ndarray, queries: np.ndarray, sets: Rows, k: int
 ) -> tuple[dict[str, list[int]], dict[str, list[tuple[float, float]]]]:
-    """By way, of the first `TIMED` sets: how many photos are judged, and seconds to name and to judge them."""
+    """Return, for each way and the first `TIMED` sets, numbers of candidates, and seconds of search and reranking."""
     counts: dict[str, list[int]] = {name: [] for name in ways(made, k)}
     seconds: dict[str, list[tuple[float, float]]] = {name: [] for name in counts}
     for chosen in sets[:TIMED]:
@@ -110,17 +110,17 @@ def _timed(
 
 
 def sets_of(owner: Rows, grasps: int, most: int) -> Rows:
-    """(S, grasps) rows of one object each, at most so many sets, of objects with grasps enough."""
+    """Return (S, grasps) rows, each set of one object with enough grasps, at most `most` sets."""
     enough = np.flatnonzero(np.bincount(owner)[owner] >= grasps)
     return np.random.default_rng(0).permutation(enough[next_rows_of_object(owner[enough], grasps)])[:most]
 
 
 def line(figures: dict[str, Any]) -> str:
-    """For people."""
+    """Return the figures as text."""
     return (
-        "{photos:,} photos, {grasps} grasps, nearest to {way}: 99 % of {sets} winners within the first {needed} "
-        "(worst {worst}); of k = {k} found {found:.1%} [{low:.1%}, {high:.1%}], {judged:.0f} judged, "
-        "named in {name_ms:.3g} ms, judged in {rerank_ms:.3g} ms"
+        "{photos:,} photos, {grasps} grasps, nearest to {way}: 99 % of {sets} exhaustive top-1s within the first "
+        "{needed} (worst {worst}); of k = {k} found {found:.1%} [{low:.1%}, {high:.1%}], {reranked:.0f} reranked, "
+        "search {name_ms:.3g} ms, rerank {rerank_ms:.3g} ms"
     ).format(**figures)
 
 
@@ -128,16 +128,16 @@ def main() -> None:
     """Print two lines for each size and number of grasps."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.several", description=__doc__.split("\n\n")[1])
     parser.add_argument("--sizes", nargs="+", type=float, default=[1e4, 1e5])
-    parser.add_argument("--grasps", nargs="+", type=int, default=[2, 4, 8], help="of objects with so many")
-    parser.add_argument("--sets", type=int, default=1000, help="at most so many of one number of grasps")
+    parser.add_argument("--grasps", nargs="+", type=int, default=[2, 4, 8], help="grasps per set")
+    parser.add_argument("--sets", type=int, default=1000, help="maximum number of sets for each number of grasps")
     parser.add_argument(
-        "--candidates", type=int, default=EXHAUSTIVE_LIMIT, help="k (default: as many as a build tries first)"
+        "--candidates", type=int, default=EXHAUSTIVE_LIMIT, help="k (default: the first value that a build tries)"
     )
-    parser.add_argument("--kind", default="flat", help="of the index")
+    parser.add_argument("--kind", default="flat", help="kind of index")
     parser.add_argument("--model", type=Path, default=shipped_model())
-    parser.add_argument("--recording", type=Path, help="whose photos are blended; one is collected where None")
-    parser.add_argument("--features", type=Path, help="where encoded features are kept")
-    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    parser.add_argument("--recording", type=Path, help="recording whose photos are blended (default: one is collected)")
+    parser.add_argument("--features", type=Path, help="file to store encoded features")
+    parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

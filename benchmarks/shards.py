@@ -1,12 +1,12 @@
 """`python -m benchmarks.shards [--sizes 1e4 1e5 1e6] [--shards 8] [--ray] [--json]`: one folder against shards.
 
-Catalogues are drawn as `benchmarks.scale` draws them, blended of the codes of made-up pictures; the touches are
-those that the checkpoint keeps. Each is written as one index folder and as a cluster, and both are asked in turns, in
-this process, by one thread: the same winners, how long a shard takes, what both hold in memory. Last, how long whoever
-asks takes to open the cluster, its manifest and the model, without a shard of its own: of all sizes, in turns. With
---ray Ray Serve holds a cluster of one shard: the way there and back, against the folder.
+Catalogues are drawn as in `benchmarks.scale`, blended from the codes of synthetic pictures; the touches are those
+stored in the checkpoint. Each catalogue is written as one index folder and as a sharded index, and both are searched in
+turn, in this process, by one thread: agreement of the top-1, time of a shard, and memory of both. Last, the time that a
+client needs to open the sharded index, its manifest and the model, without a shard of its own: for all sizes, in turn.
+With --ray, Ray Serve runs a sharded index of one shard: the round trip, compared with the folder.
 
-Run it on one thread (OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1). A million photos take 3 GB on the disk.
+Run it on one thread (OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1). A million photos take 3 GB on disk.
 """
 
 import argparse
@@ -50,8 +50,8 @@ from tests import synthetic
 TOUCHES, OPENINGS = 200, 21
 BLOCK = 10_000
 CANDIDATES = 5300
-"""Of a million photos, that hold 99 % of the winners; of others, as N^0.8 (docs/performance.md)."""
-OPENED = """
+"""Candidates that contain 99 % of the top-1s of a million photos; for other sizes N^0.8 (docs/performance.md)."""
+OPEN_PROBE = """
 import sys, time
 from pathlib import Path
 from indexes.store.sharded import read_sharded_manifest
@@ -59,11 +59,11 @@ from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.search.query.opening import sharded_index_info
 start = time.process_time()
 manifest = read_sharded_manifest(Path(sys.argv[1]))
-described = sharded_index_info(manifest)
+info = sharded_index_info(manifest)
 read_checkpoint_info(Path(sys.argv[2]))
-print(time.process_time() - start, described.photos)
+print(time.process_time() - start, info.photos)
 """
-HELD = """
+MEMORY_PROBE = """
 import sys
 from pathlib import Path
 from retrieval.search.query.searcher import Searcher
@@ -75,18 +75,18 @@ import numpy as np, gc
 from retrieval.search.query.shard import ShardQuery
 codes = np.load(sys.argv[2])
 before = anonymous()
-searcher.shard.ask(ShardQuery(codes["embeddings"][:1], codes["halves"][:1]), 10, None, searcher.posterior)
+searcher.shard.search(ShardQuery(codes["embeddings"][:1], codes["partials"][:1]), 10, None, searcher.posterior)
 print(anonymous() / 1024, (anonymous() - before) / 1024)
 """
 
 
 def candidates_of(photos: int) -> int:
-    """How many candidates so many photos need."""
+    """Return the number of candidates for this many photos."""
     return max(100, round(CANDIDATES * (photos / 1e6) ** 0.8))
 
 
 def drawn_photos(checkpoint: Checkpoint, objects: int = 60) -> BlendedPhotos:
-    """Codes of pictures of made-up objects, to blend photos from."""
+    """Return the codes of pictures of synthetic objects, to blend photos from."""
     with tempfile.TemporaryDirectory() as name:
         folder = synthetic.write_catalogue(Path(name) / "catalog", synthetic.make_objects(objects))
         codes = embed_photos(sorted(folder.rglob("*.jpg")), model=checkpoint)
@@ -95,15 +95,15 @@ def drawn_photos(checkpoint: Checkpoint, objects: int = 60) -> BlendedPhotos:
 
 
 def write(crowd: BlendedPhotos, photos: int, shards: int, out: Path) -> dict[str, float]:
-    """The drawn catalogue as one folder, `out`/index, and as a cluster, `out`/cluster; seconds and bytes."""
+    """Write the catalogue as one folder, `out`/index, and as shards, `out`/cluster; return seconds and bytes."""
     model = crowd.checkpoint
     about = {"checkpoint": str(model.path.resolve()), "catalogue": "/drawn"}
     calibration = {"calibration": model.posterior.to_dict()} if model.posterior else {}
-    said: dict[str, Any] = {"fingerprint": fingerprint(model), "self_check": 16, "threads": 1}
+    options: dict[str, Any] = {"fingerprint": fingerprint(model), "self_check": 16, "threads": 1}
     start = time.perf_counter()
     measured = {"candidates": {"k": candidates_of(photos)}}
     whole = IndexStore(out / "index").write_blocks(
-        crowd.blocks(0, photos, 0), calibration, about=about | measured, **said
+        crowd.blocks(0, photos, 0), calibration, about=about | measured, **options
     )
     folder_s = time.perf_counter() - start
     measured = {"candidates": {"k": candidates_of(photos // shards)}}
@@ -112,7 +112,7 @@ def write(crowd: BlendedPhotos, photos: int, shards: int, out: Path) -> dict[str
     for number in range(shards):
         name = shard_folder(number, shards)
         blocks = _blocks_of(whole, np.flatnonzero(places == number))
-        made = IndexStore(out / "cluster" / name).write_blocks(blocks, calibration, about=about | measured, **said)
+        made = IndexStore(out / "cluster" / name).write_blocks(blocks, calibration, about=about | measured, **options)
         entries.append(shard_entry(out / "cluster", name, made, len(np.unique(made.codes("object_id")))))
     manifest = ShardedManifest(
         sharded_generation_name(1),
@@ -137,7 +137,7 @@ def _blocks_of(whole: Generation, rows: NDArray[np.int64]) -> Iterator[Block]:
 
 
 def compare(crowd: BlendedPhotos, folder: Shard, cluster: Shard, touches: int, reranked: int) -> dict[str, float]:
-    """Ask both in turns; how often the winners agree, with candidates and with all judged, and times."""
+    """Search both in turn; return the agreement of the top-1, with candidates and with all photos scored, and times."""
     partials = crowd.touches[:touches]
     embeddings = crowd.embeddings(partials, "touch")
     posterior, photos = crowd.checkpoint.posterior, folder.info.photos
@@ -153,20 +153,20 @@ def compare(crowd: BlendedPhotos, folder: Shard, cluster: Shard, touches: int, r
         times["shards"].append(time.thread_time() - middle)
         single = cluster.shards[number % len(cluster.shards)]  # type: ignore[attr-defined]
         start = time.thread_time()
-        alone = single.search(query, 10, None, posterior)
+        result = single.search(query, 10, None, posterior)
         times["slowest"].append(time.thread_time() - start)
-        times["search"].append(alone.timing_ms["candidates"] / 1e3)
-        times["rerank"].append(alone.timing_ms["rerank"] / 1e3)
+        times["search"].append(result.timing_ms["candidates"] / 1e3)
+        times["rerank"].append(result.timing_ms["rerank"] / 1e3)
         same += one.best[0].photo == many.best[0].photo
         better += many.best[0].logit >= one.best[0].logit - 1e-5
-    exact, exhaustive_top1, error, whole_s = 0, 0, 0.0, list[list[float]]()
+    exact, exhaustive_top1, error, exhaustive_s = 0, 0, 0.0, list[list[float]]()
     for number in range(reranked):
         query = ShardQuery(embeddings[number : number + 1], partials[number : number + 1])
         start = time.thread_time()
         one = folder.search(query, 10, photos, posterior)
         middle = time.thread_time()
         many = cluster.search(query, 10, photos, posterior)
-        whole_s.append([middle - start, time.thread_time() - middle])
+        exhaustive_s.append([middle - start, time.thread_time() - middle])
         exhaustive_top1 += one.best[0].photo == many.best[0].photo
         exact += [each.photo for each in one.best] == [each.photo for each in many.best]
         error = max(error, *(abs(a.logit - b.logit) for a, b in zip(one.best, many.best, strict=True)))
@@ -177,18 +177,18 @@ def compare(crowd: BlendedPhotos, folder: Shard, cluster: Shard, touches: int, r
             error = max(error, float(np.abs(ours.objects - theirs.objects).max()), abs(ours.none - theirs.none))
     found = {f"{name}_p50_s": float(np.median(one)) for name, one in times.items()}
     found["shard_p99_s"] = float(np.percentile(times["slowest"], 99))
-    shares = {"same_top1": same / len(partials), "top1_no_worse": better / len(partials)}
-    folder_s, shards_s = np.median(whole_s, axis=0)
+    agreement = {"same_top1": same / len(partials), "top1_no_worse": better / len(partials)}
+    folder_s, shards_s = np.median(exhaustive_s, axis=0)
     return (
         found
-        | shares
+        | agreement
         | {"all_scored": reranked, "all_scored_top1": exhaustive_top1 / reranked, "all_scored_same": exact / reranked}
         | {"all_judged_error": error, "all_judged_folder_s": float(folder_s), "all_judged_shards_s": float(shards_s)}
     )
 
 
 def measure(crowd: BlendedPhotos, photos: int, shards: int, touches: int, reranked: int, out: Path) -> dict[str, float]:
-    """Everything at one number of photos. judged: touches for which all photos are."""
+    """Measure everything at one number of photos. All photos are scored for `reranked` touches."""
     figures: dict[str, float] = {"photos": photos, "shards": shards} | write(crowd, photos, shards, out)
     stored = read_checkpoint_info(crowd.checkpoint.path)
     start = time.perf_counter()
@@ -198,17 +198,17 @@ def measure(crowd: BlendedPhotos, photos: int, shards: int, touches: int, rerank
     cluster = open_sharded_index(out / "cluster", manifest, stored, verify=False)
     figures |= compare(crowd, folder, cluster, touches, reranked)
     np.savez(out / "codes.npz", partials=crowd.touches, embeddings=crowd.embeddings(crowd.touches, "touch"))
-    figures["folder_mb"] = _probe(HELD, out / "index", out / "codes.npz")[0]
-    figures["shard_mb"] = _probe(HELD, out / "cluster" / manifest.shards[0].folder, out / "codes.npz")[0]
+    figures["folder_mb"] = _probe(MEMORY_PROBE, out / "index", out / "codes.npz")[0]
+    figures["shard_mb"] = _probe(MEMORY_PROBE, out / "cluster" / manifest.shards[0].folder, out / "codes.npz")[0]
     return figures
 
 
 def opened(places: dict[str, Path], model: Path) -> dict[str, float]:
-    """Processor time in which clusters are opened by whoever asks, in turns; {what it is called: seconds}."""
+    """Return the median CPU time in which a client opens each sharded index, in turn; {name of the figure: seconds}."""
     taken: dict[str, list[float]] = {name: [] for name in places}
     for _ in range(OPENINGS):
         for name, place in places.items():
-            taken[name].append(_probe(OPENED, place / "cluster", model)[0])
+            taken[name].append(_probe(OPEN_PROBE, place / "cluster", model)[0])
     return {f"client_open_{name}_s": float(np.median(one)) for name, one in taken.items()}
 
 
@@ -219,7 +219,7 @@ def _probe(program: str, *words: Any) -> list[float]:
 
 
 def on_ray(crowd: BlendedPhotos, photos: int, touches: int, out: Path) -> dict[str, float]:
-    """A cluster of one shard on Ray against the folder, in turns: seconds by the clock on the wall."""
+    """Compare a sharded index of one shard on Ray with the folder, in turn: wall-clock seconds."""
     from retrieval.cluster.serving import Deployments, ReplicaSettings
     from retrieval.cluster.session import ray_session
 
@@ -231,9 +231,9 @@ def on_ray(crowd: BlendedPhotos, photos: int, touches: int, out: Path) -> dict[s
     partials = crowd.touches[:touches]
     embeddings, posterior = crowd.embeddings(partials, "touch"), crowd.checkpoint.posterior
     times: dict[str, list[float]] = {"folder": [], "ray": []}
-    with ray_session(2) as ray, threadpool_limits(1, "blas"):  # as the service: its threads spin between two queries
-        far = Deployments(ray, ReplicaSettings(cpus=0.5, wait_s=60.0)).open(out / "cluster", manifest, stored)
-        arms = {"folder": folder, "ray": far}
+    with ray_session(2) as ray, threadpool_limits(1, "blas"):  # like the service: its threads spin between two queries
+        remote = Deployments(ray, ReplicaSettings(cpus=0.5, wait_s=60.0)).open(out / "cluster", manifest, stored)
+        arms = {"folder": folder, "ray": remote}
         for turn in range(-5, len(partials)):
             query = ShardQuery(embeddings[[turn]], partials[[turn]])
             for name, shard in arms.items():
@@ -248,22 +248,24 @@ def on_ray(crowd: BlendedPhotos, photos: int, touches: int, out: Path) -> dict[s
 
 
 def main() -> None:
-    """Print the figures of every size as soon as they are there."""
+    """Print the figures of each size as soon as they are available."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.shards", description=__doc__.split("\n\n")[0])
     parser.add_argument("--sizes", nargs="+", type=float, default=[1e4, 1e5, 1e6])
     parser.add_argument("--shards", type=int, default=8)
     parser.add_argument("--touches", type=int, default=TOUCHES)
-    parser.add_argument("--judged", type=int, default=3, help="touches for which all photos are judged")
+    parser.add_argument(
+        "--judged", dest="reranked", type=int, default=3, help="touches for which all photos are scored"
+    )
     parser.add_argument("--model", type=Path, default=shipped_model())
-    parser.add_argument("--ray", action="store_true", help="the way over Ray too, with the first of the sizes")
-    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    parser.add_argument("--ray", action="store_true", help="also measure Ray, with the first of the sizes")
+    parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     crowd = drawn_photos(load_checkpoint(arguments.model))
     with tempfile.TemporaryDirectory() as name:
         places = {f"{size:.0e}": Path(name) / str(int(size)) for size in arguments.sizes}
         for size, place in zip(arguments.sizes, places.values(), strict=True):
-            asked = arguments.shards, arguments.touches, arguments.reranked
-            _show(measure(crowd, int(size), *asked, place), arguments.json)
+            options = arguments.shards, arguments.touches, arguments.reranked
+            _show(measure(crowd, int(size), *options, place), arguments.json)
         _show(opened(places, arguments.model), arguments.json)
     if arguments.ray:
         with tempfile.TemporaryDirectory() as name:

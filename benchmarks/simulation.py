@@ -1,9 +1,9 @@
-"""What the parts of a simulated grasp cost in CPU time of one thread, beside another checkout of this project:
+"""CPU time of the parts of a simulated grasp on one thread, compared with another checkout of this project:
 
     git worktree add ../before v0.1.0
     python -m benchmarks.simulation --before ../before
 
-Both take turns, each turn a process of its own that warms up first; ratios are by medians, with the range over turns.
+Both run in turn, each time in a new process that warms up first. Ratios are by medians, with the range over turns.
 """
 
 import argparse
@@ -37,7 +37,7 @@ LARGE = PinholeCamera(px=512, focal_px=1720.0)
 
 
 def parts(objects: int, grasps: int) -> dict[str, float]:
-    """Mean CPU seconds of each part, and of a whole attempt with planning, gate and files."""
+    """Return the mean CPU seconds of each part, and of a whole attempt with planning, gate and files."""
     cv2.setNumThreads(1)
     for scene in _scenes(objects, 1):  # compiles, and fills the caches
         _outputs(scene, defaultdict(list))
@@ -45,12 +45,12 @@ def parts(objects: int, grasps: int) -> dict[str, float]:
     for scene in _scenes(objects, 1 + grasps):
         _outputs(scene, spent)
     start, attempts = time.process_time(), collected(objects, grasps)
-    whole = (time.process_time() - start) / attempts
-    return {name: float(np.mean(each)) for name, each in spent.items()} | {"attempt with its files": whole}
+    attempt_s = (time.process_time() - start) / attempts
+    return {name: float(np.mean(each)) for name, each in spent.items()} | {"attempt with its files": attempt_s}
 
 
 def _scenes(objects: int, grasps: int) -> Iterator[Scene]:
-    """Grips about the middle of the rig's objects; the relief of each is baked."""
+    """Yield grips around the middle of the rig's objects, with baked relief."""
     rig, rng = SimRig(40_000), np.random.default_rng(0)
     for name in rig.object_ids(objects):
         for number in range(grasps):
@@ -73,37 +73,39 @@ def _outputs(scene: Scene, spent: dict[str, list[float]]) -> None:
     timed("depth", lambda: scene.image("depth"))
     large = replace(scene, camera=LARGE)
     timed("photo of 512 px, as a file", lambda: file_content("photo", large.image("photo")))
-    if timed("where it rests, its walls", lambda: scene.pinch.miss_reason):
+    if timed("final placement and walls", lambda: scene.pinch.miss_reason):
         return
     timed("two contacts", lambda: [scene.pinch.contact(finger) for finger in scene.sensors])
     timed("two gels", lambda: [scene.image(f"touch_{finger}") for finger in scene.sensors])
 
 
 def collected(objects: int, grasps: int) -> int:
-    """Attempts of a collection into a folder that is thrown away."""
+    """Collect into a temporary folder; return the number of attempts."""
     with tempfile.TemporaryDirectory() as folder:
         settings = CollectSettings(grasps=grasps)
         rig = partial(load_rig, "sim", seed=1)
         return sum(each.attempts for each in collect(rig, folder + "/r", objects=objects, seed=1, settings=settings))
 
 
-def beside(checkouts: dict[str, Path], rounds: int, objects: int, grasps: int) -> dict[str, dict[str, list[float]]]:
-    """Seconds of each part in each round, by checkout; their processes take turns."""
-    made: dict[str, dict[str, list[float]]] = {name: defaultdict(list) for name in checkouts}
+def compare_checkouts(
+    checkouts: dict[str, Path], rounds: int, objects: int, grasps: int
+) -> dict[str, dict[str, list[float]]]:
+    """Return the seconds of each part in each round, by checkout; their processes run in turn."""
+    seconds_of: dict[str, dict[str, list[float]]] = {name: defaultdict(list) for name in checkouts}
     for _ in range(rounds):
         for name, root in checkouts.items():
-            # -P: only the other checkout's packages, and none that stand beside this file.
+            # -P: import only the other checkout's packages, none that are next to this file.
             command = [sys.executable, "-P", __file__, "--parts", str(objects), str(grasps)]
             environment = {**os.environ, "PYTHONPATH": str(root.resolve()), "OMP_NUM_THREADS": "1"}
             done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
             for part, seconds in json.loads(done.stdout).items():
-                made[name][part].append(seconds)
-    return made
+                seconds_of[name][part].append(seconds)
+    return seconds_of
 
 
 def line(part: str, ours: list[float], before: list[float] | None) -> str:
-    """Milliseconds, and how many times longer it took before."""
-    text = f"{part}: {1e3 * float(np.median(ours)):.1f} ms, {1 / float(np.median(ours)):.1f} a second"
+    """Return the milliseconds of a part, and how many times longer it took before."""
+    text = f"{part}: {1e3 * float(np.median(ours)):.1f} ms, {1 / float(np.median(ours)):.1f} per second"
     if before is None:
         return text
     each, was = np.array(before) / np.array(ours), float(np.median(before))
@@ -125,9 +127,9 @@ def main() -> None:
         print(json.dumps(parts(*arguments.parts)))
         return
     checkouts = {"ours": ROOT} | ({"before": arguments.before} if arguments.before else {})
-    made = beside(checkouts, arguments.rounds, arguments.objects, arguments.grasps)
-    for part, ours in made["ours"].items():
-        print(line(part, ours, made["before"][part] if arguments.before else None), flush=True)
+    seconds = compare_checkouts(checkouts, arguments.rounds, arguments.objects, arguments.grasps)
+    for part, ours in seconds["ours"].items():
+        print(line(part, ours, seconds["before"][part] if arguments.before else None), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,13 @@
-"""One training step on the paper's batch, against the same number of pairs one at a time and as one batch.
+"""One training step on the paper's batch, compared with the same number of pairs one at a time and as one batch.
 
     ours        6 touches encoded once, and 24 photos, each the positive of one touch and the negative of another
-    touches     6 touches encoded once, and 48 photos that no two touches share
+    touches     6 touches encoded once, and 48 photos, none shared by two touches
     batch       48 pairs in one batch, each touch 8 times in it
     one         pair by pair: forward, backward, and one step of the optimiser on the sum
 
-The first three rows' gradients of the same pairs are equal (tests/retrieval/training/test_batches.py); pair by
-pair they are too where batch normalisation keeps to the running statistics, for in training it sees a batch of one.
+The gradients of the first three on the same pairs are equal (tests/retrieval/training/test_batches.py). Those of pair
+by pair are equal too if batch normalisation uses the running statistics; in training mode it would normalise a batch of
+one.
 """
 
 from collections.abc import Callable, Iterator
@@ -26,21 +27,21 @@ Index = np.ndarray
 
 
 def measure(config: Config, touches: int = 6, photos_each: int = 8, repetitions: int = 3) -> Iterator[ResultLine]:
-    """One line. Half of a touch's photos are of its object, and as many are its own."""
+    """Yield one line. Half of a touch's photos show its object, and as many belong to it alone."""
     matcher, pre, pairs = matcher_of(config), config.preprocessing, touches * photos_each
     set_training_mode(matcher, config.training)
     for norm in (matcher.touch_norm, matcher.photo_norm):
-        norm.eval()  # one pair has no spread of features to standardise by
+        norm.eval()  # one pair has no variance of features to standardise by
     optimizer = torch.optim.Adam(matcher.parameters(), lr=1e-6)
     grasps = [random_images(config.matcher.fingers, pre.touch_px, seed=number) for number in range(touches)]
     touch, photo = touch_batch(grasps), to_batch(random_images(pairs, pre.photo_px, seed=99))
     owner = np.repeat(np.arange(touches), photos_each)
     shared = shared_photos(touches, photos_each)
 
-    def backward(touch: Tensor, photo: Tensor, batch: PairBatch, share: float = 1.0) -> None:
+    def backward(touch: Tensor, photo: Tensor, batch: PairBatch, weight: float = 1.0) -> None:
         features = matcher.touch_features(touch), matcher.photo_features(photo)
         (
-            share * batch_loss(matcher, WeightedLosses(config.training.weights, matcher, 9), batch, *features)[0]
+            weight * batch_loss(matcher, WeightedLosses(config.training.weights, matcher, 9), batch, *features)[0]
         ).backward()
 
     def step(passes: Callable[[], None]) -> None:
@@ -75,7 +76,7 @@ def measure(config: Config, touches: int = 6, photos_each: int = 8, repetitions:
 
 
 def shared_photos(touches: int, photos_each: int) -> Index:
-    """(pairs,) photos: a touch's own, then as many of those of the touches after it, one of each in turn."""
+    """Return photo numbers (pairs,): a touch's own, then as many of the next touches, one of each in turn."""
     own = photos_each // 2
     rows = []
     for touch in range(touches):
@@ -86,7 +87,7 @@ def shared_photos(touches: int, photos_each: int) -> Index:
 
 
 def pair_batch(touch_index: Index, photo_index: Index, labels: Index) -> PairBatch:
-    """The pairs as the loss wants them; every touch is another object's."""
+    """Return the pairs as arguments of the loss; every touch is of another object."""
     photo_objects = np.zeros(photo_index.max() + 1, np.int64)
     photo_objects[photo_index[labels == 1]] = touch_index[labels == 1]
     touch_objects = np.arange(touch_index.max() + 1)

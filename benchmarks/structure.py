@@ -1,9 +1,9 @@
-"""How the code hangs together: `python -m benchmarks.structure`.
+"""Structure of the code: `python -m benchmarks.structure`.
 
-Files, lines and imports of every folder; then ways through the code, each followed as it runs: of a query's gel images
-(by an exported encoder, and by PyTorch), of a catalogue's photo into an index, and of a grasp's force to the gripper. A
-way's modules stand in the order in which it first enters them. "again": calls into a module where the way had been
-before. What every module may use (errors, speaking, progress) is left out.
+It prints files, lines and imports of every folder. Then it traces some calls through the code: a query's gel images
+(with an exported encoder, and with PyTorch), a catalogue's photo into an index, and a grasp's force to the gripper. A
+trace lists modules in the order of their first call. "again" counts calls into a module that was entered before.
+Modules that everything may use (errors, output, progress) are left out.
 """
 
 import ast
@@ -29,7 +29,7 @@ def modules() -> dict[str, Path]:
 
 
 def imported(path: Path, known: set[str]) -> set[str]:
-    """Modules of the project that a file imports, at its top or inside a function."""
+    """Return modules of the project that a file imports, at its top or inside a function."""
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.Import):
@@ -40,12 +40,12 @@ def imported(path: Path, known: set[str]) -> set[str]:
 
 
 def folder_of(path: Path) -> str:
-    """Its package, with the first folder below it."""
+    """Return its package, with the first folder below it."""
     return "/".join(path.relative_to(ROOT).parent.parts[:2])
 
 
 def folders() -> dict[str, Counter[str]]:
-    """Of each folder: files, lines, and imports inside it, from others and of others."""
+    """Return, for each folder, files, lines, and imports inside it, from others and of others."""
     paths, rows = modules(), {}
     for path in paths.values():
         row = rows.setdefault(folder_of(path), Counter())
@@ -53,30 +53,30 @@ def folders() -> dict[str, Counter[str]]:
         row["lines"] += len(path.read_text("utf-8").splitlines())
     for name, path in paths.items():
         for other in imported(path, set(paths)) - {name}:
-            here, there = folder_of(path), folder_of(paths[other])
-            rows[here]["inside" if here == there else "of others"] += 1
-            if here != there:
-                rows[there]["from others"] += 1
+            importer, imported_folder = folder_of(path), folder_of(paths[other])
+            rows[importer]["inside" if importer == imported_folder else "of others"] += 1
+            if importer != imported_folder:
+                rows[imported_folder]["from others"] += 1
     return dict(sorted(rows.items()))
 
 
 class CallRecorder:
-    """Modules that are called from another module, told by the interpreter while `with` lasts, on any thread."""
+    """Records the modules that are called from another module inside the `with` block, on any thread."""
 
     def __init__(self) -> None:
         self.entered: list[str] = []
         self._stacks: dict[int, list[str]] = {}
 
     def __enter__(self) -> "CallRecorder":
-        threading.setprofile(self._told)
-        sys.setprofile(self._told)
+        threading.setprofile(self._profile)
+        sys.setprofile(self._profile)
         return self
 
     def __exit__(self, *error: object) -> None:
         sys.setprofile(None)
         threading.setprofile(None)
 
-    def _told(self, frame: FrameType, event: str, argument: object) -> None:
+    def _profile(self, frame: FrameType, event: str, argument: object) -> None:
         code = frame.f_code
         ours = code.co_filename.startswith(tuple(f"{ROOT / package}/" for package in PACKAGES))
         if event not in ("call", "return") or not ours or code.co_name == "<module>":
@@ -102,7 +102,7 @@ class CallRecorder:
 
 
 def follow(folder: Path) -> dict[str, CallRecorder]:
-    """The ways, on things drawn into `folder`; what is set up once has been set up before."""
+    """Return the traces, with synthetic data in `folder`; one-time set-up is done before."""
     import retrieval
     from retrieval.model.export import export
     from tests import synthetic
@@ -114,20 +114,20 @@ def follow(folder: Path) -> dict[str, CallRecorder]:
     model = Path(shutil.copy(retrieval.shipped_model(), folder / "model.safetensors"))
     checkpoint = retrieval.load_checkpoint(model)
     names = ("a catalogue's photo", "a query's images, PyTorch", "a query's images, exported", "a grasp's force")
-    ways = {name: CallRecorder() for name in names}
-    with ways["a catalogue's photo"]:
+    traces = {name: CallRecorder() for name in names}
+    with traces["a catalogue's photo"]:
         retrieval.build_index(folder / "catalog", checkpoint, folder / "index", quiet=True)
     for encoder in ("PyTorch", "exported"):
         if encoder == "exported":
             export(checkpoint)
         with retrieval.open(folder / "index") as searcher:
-            searcher.gel_check = None  # which would send drawn pictures back
+            searcher.gel_check = None  # the check would reject synthetic pictures
             searcher.query(touch)
-            with ways[f"a query's images, {encoder}"]:
+            with traces[f"a query's images, {encoder}"]:
                 searcher.query(touch)
-    with gripper_with_emulator() as (gripper, _), ways["a grasp's force"]:
+    with gripper_with_emulator() as (gripper, _), traces["a grasp's force"]:
         gripper.grasp(20.0)
-    return ways
+    return traces
 
 
 def main() -> None:
@@ -137,8 +137,8 @@ def main() -> None:
     for name, row in rows.items():
         print(f"{name:24}{row['files']:7}{row['lines']:8}{row['inside']:8}{row['of others']:11}{row['from others']:13}")
     with tempfile.TemporaryDirectory() as folder:
-        for name, way in follow(Path(folder)).items():
-            print(f"\n{name}: " + "\n".join(way.lines()))
+        for name, trace in follow(Path(folder)).items():
+            print(f"\n{name}: " + "\n".join(trace.lines()))
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""One table: ours beside peers and the bare limit, all in one run; medians, with the least and the most of repetitions.
+"""One table of our results, peers and limits, all in one run; medians, with the range of repetitions.
 
     python -m benchmarks.table [--only candidates query ...]
 
-Every section is a process of its own, for those of one thread must be told so before numpy is there; what a line
-compares takes turns inside. About a quarter of an hour of two cores; lines appear as they are measured.
+Every section is a separate process, because single-threaded ones must set the number of threads before numpy is
+imported. The arms of a line run in turn. It takes about a quarter of an hour of two cores; lines appear as they are
+measured.
 """
 
 import argparse
@@ -27,7 +28,15 @@ HEADER = "| what | ours | against | theirs | ours / theirs |\n|---|---|---|---|-
 
 @dataclass(frozen=True)
 class TableRow:
-    """A line: figures of single repetitions, of ours and of what it is held against, where there is something."""
+    """A line of the table.
+
+    Attributes:
+        what: what is measured.
+        unit: unit of the figures.
+        ours: our figures of single repetitions.
+        against: name of the comparison, if any.
+        theirs: its figures of single repetitions.
+    """
 
     what: str
     unit: str
@@ -42,42 +51,42 @@ class TableRow:
 
 
 def spread(figures: Sequence[float], unit: str) -> str:
-    """Median, least and most."""
+    """Return median, minimum and maximum as text."""
     if not figures:
         return ""
-    told = (float(np.median(figures)), min(figures), max(figures))
-    middle, least, most = (f"{value:,.0f}" if value >= 100 else f"{value:.3g}" for value in told)
-    return f"{middle} ({least} to {most}) {unit}"
+    values = (float(np.median(figures)), min(figures), max(figures))
+    median, least, greatest = (f"{value:,.0f}" if value >= 100 else f"{value:.3g}" for value in values)
+    return f"{median} ({least} to {greatest}) {unit}"
 
 
 def building() -> Iterator[TableRow]:
-    """Photos a second from files to a searchable index."""
+    """Yield photos per second from files to a searchable index."""
     for line in build.measure_shipped():
         arms = ("beyond", "bare", "work")
         ours, bare, work = ([line.figures["photos"] / seconds for seconds in line.each[arm]] for arm in arms)
         what = "`build-index`, shipped model, JPEG of 512 px"
-        yield TableRow(what, "photos/s", ours, "its encoder alone, images ready", bare)
-        yield TableRow(what, "photos/s", ours, "decoding, cutting out and encoding alone", work)
-        yield TableRow("looking for the faster encoder, once a build of 256 photos or more", "s", line.each["looking"])
+        yield TableRow(what, "photos/s", ours, "its encoder alone, prepared images", bare)
+        yield TableRow(what, "photos/s", ours, "decoding, cropping and encoding alone", work)
+        yield TableRow("choice of the faster encoder, once per build of 256 photos or more", "s", line.each["looking"])
 
 
 def query() -> Iterator[TableRow]:
-    """`retrieve query` in a fresh process."""
+    """Yield `retrieve query` in a fresh process."""
     for line in cold.measure():
         if line.each:
             backend = line.text.partition(",")[0]
-            what = f"a query from nothing, 1,000 photos, {backend}"
+            what = f"a query in a fresh process, 1,000 photos, {backend}"
             yield TableRow(f"{what}: CPU time, interpreter included", "ms", line.each["cpu_ms"])
             yield TableRow(what, "ms", line.each["total_ms"])
 
 
 def candidates() -> Iterator[TableRow]:
-    """Naming candidates, and the best ten at equal recall."""
+    """Yield candidate search, and the best ten at equal recall."""
     for line in peers.named(PHOTOS):
-        what = f"{line.figures['k']:,} candidates of {PHOTOS:,} x {peers.DIM} named, `{line.tower}`"
-        yield TableRow(what, "us", line.each["ours"], "the bare FAISS call", line.each["bare"])
+        what = f"{line.figures['k']:,} candidates of {PHOTOS:,} x {peers.DIM}, `{line.tower}`"
+        yield TableRow(what, "us", line.each["ours"], "the plain FAISS call", line.each["bare"])
     vectors = peers.drawn(PHOTOS, 0)
-    with peers.guarded("being measured", 1):
+    with peers.faiss_call("being measured", 1):
         found = {
             line.tower: line
             for line in peers.compare_engines(
@@ -95,35 +104,35 @@ def candidates() -> Iterator[TableRow]:
 
 
 def reranking() -> Iterator[TableRow]:
-    """Match logits from stored halves."""
+    """Yield match logits from stored partial activations."""
     for line in rerank.measure(config_of("mobilenet_v2")):
         ours, product = ([1e3 * seconds for seconds in line.each[arm]] for arm in ("partials", "product"))
         yield TableRow(
-            f"{line.figures['candidates']:,} candidates judged", "ms", ours, "the bare matrix product", product
+            f"{line.figures['candidates']:,} candidates reranked", "ms", ours, "the bare matrix product", product
         )
 
 
 def rebuilding() -> Iterator[TableRow]:
-    """Building again, in CPU time of one thread."""
+    """Yield rebuilds, in CPU time of one thread."""
     for line in again.measure(PHOTOS):
-        looking, all_read = "`os.walk` and `os.stat` alone", "all read again"
+        stat_only, all_read = "`os.walk` and `os.stat` alone", "all photos read"
         what = f"rebuild of {PHOTOS:,} photos"
         yield TableRow(
-            f"{what}, one new, beyond its encoding: CPU", "s", line.each["one"], looking, line.each["looking"]
+            f"{what}, one new, without its encoding: CPU", "s", line.each["one"], stat_only, line.each["looking"]
         )
-        yield TableRow(f"{what}, nothing new: CPU", "s", line.each["nothing"], all_read, line.each["verify"])
+        yield TableRow(f"{what}, no new photo: CPU", "s", line.each["nothing"], all_read, line.each["verify"])
         yield TableRow("encoding that one photo, the first of a process: CPU", "s", line.each["first_encoding"])
-        yield TableRow("Python, its imports and the model: CPU", "s", line.each["started"])
+        yield TableRow("Python, imports and the model: CPU", "s", line.each["started"])
 
 
 def grasping() -> Iterator[TableRow]:
-    """The parts of a simulated grasp, in CPU time of one thread."""
-    for part, seconds in simulation.beside({"ours": simulation.ROOT}, 3, 13, 2)["ours"].items():
+    """Yield the parts of a simulated grasp, in CPU time of one thread."""
+    for part, seconds in simulation.compare_checkouts({"ours": simulation.ROOT}, 3, 13, 2)["ours"].items():
         yield TableRow(f"simulated: {part}: CPU", "ms", [1e3 * each for each in seconds])
 
 
 def training() -> Iterator[TableRow]:
-    """A training step on shared images."""
+    """Yield a training step on shared images."""
     lines = [line for _ in range(3) for line in step.measure(config_of("mobilenet_v2"), repetitions=1)]
     ours = [line.figures["ours_s"] for line in lines]
     for arm, against in (("batch", "one batch of 48 pairs"), ("one", "pair by pair")):
@@ -135,7 +144,7 @@ SECTIONS: dict[str, tuple[Callable[[], Iterator[TableRow]], dict[str, str]]] = {
     "building": (building, {}),
     "query": (query, {}),
     "candidates": (candidates, ONE_THREAD),
-    "judging": (reranking, ONE_THREAD),
+    "reranking": (reranking, ONE_THREAD),
     "rebuilding": (rebuilding, ONE_THREAD),
     "grasping": (grasping, ONE_THREAD),
     "training": (training, {}),
@@ -143,7 +152,7 @@ SECTIONS: dict[str, tuple[Callable[[], Iterator[TableRow]], dict[str, str]]] = {
 
 
 def rows(section: str) -> Iterator[TableRow]:
-    """Those of a section, measured by a process with its environment."""
+    """Yield the rows of a section, measured by a process with its environment."""
     command = [sys.executable, "-m", "benchmarks.table", "--section", section]
     environment = {**os.environ, **SECTIONS[section][1], "PYTHONPATH": os.pathsep.join(sys.path)}
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:

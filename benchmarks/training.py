@@ -1,16 +1,16 @@
-"""Images a second of training towers, against the bare forward and backward pass of a batch that lies ready.
+"""Images per second of tower training, compared with the bare forward and backward pass of a prepared batch.
 
     python -m benchmarks.training --recording recording/ --tower small mobilenet_v2 resnet50
 
     bare      forward pass, loss and backward pass of one batch
-    kept      steps of a training, other images each time, from files that were decoded once (`--cache`); the optimiser
+    cached    training steps, other images each time, from files that were decoded once (`--cache`), with the optimiser
     decoded   the same, each image decoded for its step, as in the first round of a training without such files
 
-All in turns. With one thread everything is held on one core, so that what decodes takes its time from the step, and CPU
-time is told: it is the same while other programs run. With two threads it is the clock. `--ranks`: two processes of one
-thread, as `torchrun` starts them, in turns with one process of two and with one of one. Without `--recording` pictures
-are drawn; `--pictures` (of `collect --photos-only` or `--touches-only`) trains the tower of preset `relief` too, whose
-pictures are turned, shifted, lit and made noisy for each step.
+All arms run in turn. With one thread everything runs on one core, so that decoding takes time from the step, and the
+figure is CPU time, which does not depend on other programs. With two threads it is wall-clock time. `--ranks`: two
+processes of one thread, started like those of `torchrun`, in turn with one process of two threads and one of one.
+Without `--recording` pictures are drawn. `--pictures` (of `collect --photos-only` or `--touches-only`) also trains the
+tower of preset `relief`, whose pictures are rotated, shifted, relit and made noisy for each step.
 """
 
 import argparse
@@ -49,12 +49,20 @@ from tests import synthetic
 
 STEPS, REPETITIONS = 4, 5
 ROUNDS = 3
-"""Of `--ranks`: how often processes are started."""
+"""Number of rounds of `--ranks`."""
 
 
 @dataclass(frozen=True)
 class Work:
-    """A training: what makes the batch of a step, its loss, and how many images the tower sees in a step."""
+    """A training.
+
+    Attributes:
+        optimizer: the optimiser.
+        prepare: returns the batch of a step.
+        loss: returns the loss of a batch.
+        images: number of images per step.
+        before_step: called before each step of the optimiser.
+    """
 
     optimizer: torch.optim.Optimizer
     prepare: Callable[[int], "Future[Any]"]
@@ -63,30 +71,30 @@ class Work:
     before_step: Callable[[], None] = lambda: None
 
     def steps(self, count: int) -> None:
-        """So many steps, as a training takes them; nothing is validated."""
+        """Run this many training steps, without validation."""
         plan = Plan(2 * count, 1e-6, "constant", 2 * count)
         with Bar("", count, "steps", quiet=True) as bar:
             batches = prefetch(map(self.prepare, range(count)), 1)
             fit(self.optimizer, plan, batches, self.loss, bar=bar, before_step=self.before_step)
 
     def bare(self, batch: Any) -> None:
-        """One pass forward and back."""
+        """Run one forward and backward pass."""
         self.optimizer.zero_grad(set_to_none=True)
         self.loss(batch).backward()
 
 
 @contextmanager
 def matching(config: Config, recording: Path, folder: Path) -> Iterator[tuple[Trainer, dict[str, Work]]]:
-    """Both ways to train towers on a recording; what is kept is kept in `folder`."""
+    """Yield both ways to train towers on a recording; decoded images are cached in `folder`."""
     grasps, training = load_grasps(recording), config.training
     split = make_split(grasps, validation=training.validation_fraction, test=training.test_fraction, seed=0)
     trainer = Trainer(config, split, grasps, folder / "none.safetensors", "benchmark")
     with (
         TrainedFeatures(config, trainer.device, keep_bytes=0) as decoded,
-        TrainedFeatures(config, trainer.device) as kept,
+        TrainedFeatures(config, trainer.device) as cached,
     ):
-        kept.cache_decoded(folder, grasps, quiet=True)
-        trainer.features = kept
+        cached.cache_decoded(folder, grasps, quiet=True)
+        trainer.features = cached
 
         def work(source: TrainedFeatures) -> Work:
             def prepare(step: int) -> "Future[Any]":
@@ -102,13 +110,13 @@ def matching(config: Config, recording: Path, folder: Path) -> Iterator[tuple[Tr
                 lambda: distributed.average_gradients(trainer.matcher),
             )
 
-        yield trainer, {"cached": work(kept), "decoded": work(decoded)}
+        yield trainer, {"cached": work(cached), "decoded": work(decoded)}
 
 
 @contextmanager
 def relief(config: Config, pictures: Path, folder: Path) -> Iterator[dict[str, Work]]:
-    """Both ways to train a tower to see relief."""
-    made: dict[str, Work] = {}
+    """Yield both ways to train a tower on relief."""
+    works: dict[str, Work] = {}
     with ThreadPoolExecutor(1) as prefetch:
         for name in ("cached", "decoded"):
             training = ReliefTraining(*load_labelled(pictures), config, STEPS)
@@ -117,19 +125,19 @@ def relief(config: Config, pictures: Path, folder: Path) -> Iterator[dict[str, W
             else:
                 training._variants = ImageCache(training._load, 0)
             batch = training._batch(0)
-            made[name] = Work(
+            works[name] = Work(
                 training.optimizer,
                 lambda step, training=training: prefetch.submit(training._batch, step),
                 training._loss,
                 len(batch[1]),
             )
-        yield made
+        yield works
 
 
 def rates(
     name: str, works: dict[str, Work], threads: int, steps: int = STEPS, repetitions: int = REPETITIONS
 ) -> Iterator[ResultLine]:
-    """Images a second of each arm, and the parts of a step where there is one thread."""
+    """Yield images per second of each arm, and with one thread the parts of a step."""
     with running_on(threads):
         ready = works["cached"].prepare(0).result()
         arms = {name: lambda work=work: work.steps(steps) for name, work in works.items()}
@@ -142,8 +150,8 @@ def rates(
         yield ResultLine(
             "training",
             name,
-            f"{threads} thread{'s' * (threads > 1)}: {rate['kept']:.3g} images a second from kept files, "
-            f"{rate['decoded']:.3g} decoding each, {rate['bare']:.3g} by bare passes: {as_text(ratio['kept'])} and "
+            f"{threads} thread{'s' * (threads > 1)}: {rate['cached']:.3g} images per second from cached files, "
+            f"{rate['decoded']:.3g} with decoding, {rate['bare']:.3g} by bare passes: {as_text(ratio['cached'])} and "
             f"{as_text(ratio['decoded'])} the bare rate",
             {f"{arm}_per_s": value for arm, value in rate.items()} | {f"ratio_{arm}": ratio[arm][0] for arm in works},
         )
@@ -152,59 +160,61 @@ def rates(
 
 
 def parts(name: str, works: dict[str, Work], steps: int) -> ResultLine:
-    """CPU time of what a step is made of."""
+    """Return the CPU time of the parts of a step."""
     seconds: dict[str, list[float]] = {}
 
     def timed(part: str, work: Callable[[], Any]) -> Any:
         start = time.process_time()
-        made = work()
+        result = work()
         seconds.setdefault(part, []).append(time.process_time() - start)
-        return made
+        return result
 
-    kept = works["cached"]
+    cached = works["cached"]
     for step in range(steps):
         timed("draw and decode", lambda step=step: works["decoded"].prepare(step).result())
-        batch = timed("draw and map", lambda step=step: kept.prepare(step).result())
-        kept.optimizer.zero_grad(set_to_none=True)
-        loss = timed("forward", lambda batch=batch: kept.loss(batch))
+        batch = timed("draw and map", lambda step=step: cached.prepare(step).result())
+        cached.optimizer.zero_grad(set_to_none=True)
+        loss = timed("forward", lambda batch=batch: cached.loss(batch))
         timed("backward", loss.backward)
-        timed("optimiser", kept.optimizer.step)
+        timed("optimiser", cached.optimizer.step)
     medians = {part: float(np.median(each)) for part, each in seconds.items()}
-    said = ", ".join(f"{part} {duration(value)}" for part, value in medians.items())
-    return ResultLine("parts", name, said, {f"{part}_s": value for part, value in medians.items()})
+    text = ", ".join(f"{part} {duration(value)}" for part, value in medians.items())
+    return ResultLine("parts", name, text, {f"{part}_s": value for part, value in medians.items()})
 
 
 def validation(name: str, trainer: Trainer) -> ResultLine:
-    """What a validation costs for each step after which there is none, in CPU time of one thread."""
+    """Return the cost of a validation, also per training step, in CPU time of one thread."""
     start = time.process_time()
     with running_on(1):
         trainer.validate()
     spent, every = time.process_time() - start, trainer.config.training.validate_every
-    text = f"validation {duration(spent)}, {duration(spent / every)} for each of the {every} steps between two"
+    text = (
+        f"validation {duration(spent)}, {duration(spent / every)} for each of the {every} steps between two validations"
+    )
     return ResultLine("parts", name, text, {"validation_s": spent, "validation_per_step_s": spent / every})
 
 
 def rounding(name: str, trainer: Trainer, work: Work) -> ResultLine:
-    """How far the gradients in bfloat16 lie from those in float32, at the first weights."""
+    """Compare the gradients in bfloat16 with those in float32, at the first weights."""
     ready = work.prepare(0).result()
 
     def gradient(precision: str) -> Tensor:
         training = dataclasses.replace(trainer.config.training, precision=precision)
         trainer.features.config = dataclasses.replace(trainer.config, training=training)
-        work.bare(ready)  # with the same dropout mask, which the step draws
+        work.bare(ready)  # the step draws the same dropout mask
         return torch.cat([each.grad.flatten() for each in trainer.matcher.parameters() if each.grad is not None])
 
     with running_on(1):
         exact, rounded = gradient("float32"), gradient("bfloat16")
-    apart = float((rounded - exact).norm() / exact.norm())
+    distance = float((rounded - exact).norm() / exact.norm())
     cosine = float(torch.nn.functional.cosine_similarity(rounded, exact, dim=0))
-    text = f"gradients in bfloat16 lie {apart:.2g} of their length from those in float32, cosine {cosine:.4f}"
-    return ResultLine("rounding", name, text, {"apart": apart, "cosine": cosine})
+    text = f"gradients in bfloat16 differ by {distance:.2g} of their length from those in float32, cosine {cosine:.4f}"
+    return ResultLine("rounding", name, text, {"apart": distance, "cosine": cosine})
 
 
 @contextmanager
 def running_on(threads: int) -> Iterator[None]:
-    """PyTorch on so many threads; with one, all threads that are begun here are on one core."""
+    """Run PyTorch on this many threads; with one, all threads started here share one core."""
     before, cores = torch.get_num_threads(), os.sched_getaffinity(0)
     torch.set_num_threads(threads)
     if threads == 1:
@@ -217,21 +227,23 @@ def running_on(threads: int) -> Iterator[None]:
 
 
 def ranks(towers: Sequence[str], recording: Path, precision: str, rounds: int = ROUNDS) -> Iterator[ResultLine]:
-    """Two processes of one thread against one of two, and one of one, started in turns; each tells the medians of its
-    steps. By the clock where nothing else runs; while other programs run, teams of threads wait for one another, and
-    CPU time tells the most that two can reach, who wait for each other besides."""
+    """Compare two processes of one thread with one process of two threads and one of one, started in turn.
+
+    Each prints the medians of its steps. Wall-clock time counts if nothing else runs. While other programs run, threads
+    wait for one another; then CPU time gives the upper bound for two processes, which also wait for each other.
+    """
     two = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     start = {"two": (two, 1), "one": ([sys.executable], 2), "alone": ([sys.executable], 1)}
     for tower in towers:
-        told: dict[str, list[list[float]]] = {name: [] for name in start}
+        outputs: dict[str, list[list[float]]] = {name: [] for name in start}
         for _ in range(rounds):
-            for name, (words, threads) in start.items():
-                words = [*words, "-m", "benchmarks.training", "--rank", "--tower", tower]
-                words += ["--recording", str(recording), "--precision", precision]
+            for name, (command, threads) in start.items():
+                command = [*command, "-m", "benchmarks.training", "--rank", "--tower", tower]
+                command += ["--recording", str(recording), "--precision", precision]
                 settings = os.environ | {"OMP_NUM_THREADS": str(threads)}
-                done = subprocess.run(words, env=settings, capture_output=True, text=True, check=True)
-                told[name].append([float(word) for word in done.stdout.split()[-2:]])
-        clock, cpu = ({name: np.array(each)[:, which] for name, each in told.items()} for which in (0, 1))
+                done = subprocess.run(command, env=settings, capture_output=True, text=True, check=True)
+                outputs[name].append([float(word) for word in done.stdout.split()[-2:]])
+        clock, cpu = ({name: np.array(each)[:, column] for name, each in outputs.items()} for column in (0, 1))
         ratio, by_cpu = _times(clock["one"], clock["two"]), _times(cpu["alone"], cpu["two"])
         seconds = {name: float(np.median(each)) for name, each in clock.items()}
         spent = {name: float(np.median(each)) for name, each in cpu.items()}
@@ -240,7 +252,7 @@ def ranks(towers: Sequence[str], recording: Path, precision: str, rounds: int = 
             tower,
             f"a step takes {duration(seconds['two'])} on two processes of one thread, {duration(seconds['one'])} on "
             f"one of two: {as_text(ratio)} its rate; CPU time {duration(spent['two'])} of each of the two, "
-            f"{duration(spent['alone'])} of one of one thread: {as_text(by_cpu)} its rate at most",
+            f"{duration(spent['alone'])} of one process of one thread: {as_text(by_cpu)} its rate at most",
             {f"{name}_s": each for name, each in seconds.items()}
             | {f"{name}_cpu_s": each for name, each in spent.items()}
             | {"ratio": ratio[0], "ratio_cpu": by_cpu[0]},
@@ -248,13 +260,13 @@ def ranks(towers: Sequence[str], recording: Path, precision: str, rounds: int = 
 
 
 def _times(slow: np.ndarray, fast: np.ndarray) -> tuple[float, float, float]:
-    """By the medians, and the least and most of single rounds."""
+    """Return the ratio of the medians, and the range over single rounds."""
     each = slow / fast
     return float(np.median(slow) / np.median(fast)), float(each.min()), float(each.max())
 
 
 def as_rank(config: Config, recording: Path, steps: int = STEPS, repetitions: int = REPETITIONS) -> None:
-    """Print the median seconds of a step, by the clock and by this process's CPU time, on the first rank."""
+    """Print the median seconds of a step on the first rank: wall-clock time and CPU time of this process."""
     distributed.start()
     taken = []
     with tempfile.TemporaryDirectory() as name, matching(config, recording, Path(name)) as (_, works):
@@ -268,24 +280,24 @@ def as_rank(config: Config, recording: Path, steps: int = STEPS, repetitions: in
 
 
 def configured(tower: str, precision: str, init: str = "random") -> Config:
-    """`config_of` in this precision, with these first weights."""
+    """Return `config_of` with this precision and these first weights."""
     config = config_of(tower).without_candidate_encoder()
     training = dataclasses.replace(config.training, precision=precision, init=init)
     return dataclasses.replace(config, training=training)
 
 
 def main() -> None:
-    """Print every line as soon as it is there."""
+    """Print each line as soon as it is available."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.training", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--recording", type=Path, help="to train on (default: drawn pictures)")
-    parser.add_argument("--pictures", type=Path, help="labelled pictures, to learn relief from")
+    parser.add_argument("--recording", type=Path, help="training data (default: synthetic pictures)")
+    parser.add_argument("--pictures", type=Path, help="labelled pictures, to train relief on")
     parser.add_argument("--tower", nargs="+", choices=sorted(TOWERS), default=["small", "mobilenet_v2"])
     parser.add_argument("--precision", choices=PRECISIONS, default="auto")
-    parser.add_argument("--init", default="random", help="first weights, as `retrieve train` takes them")
+    parser.add_argument("--init", default="random", help="first weights, as in `retrieve train`")
     parser.add_argument("--threads", nargs="+", type=int, default=[1, 2])
-    parser.add_argument("--ranks", action="store_true", help="two processes against one of two threads, nothing else")
+    parser.add_argument("--ranks", action="store_true", help="only compare two processes with one of two threads")
     parser.add_argument("--rank", action="store_true", help=argparse.SUPPRESS)  # a process of `--ranks`
-    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -300,7 +312,7 @@ def main() -> None:
 
 
 def lines(arguments: argparse.Namespace, recording: Path, folder: Path) -> Iterator[ResultLine]:
-    """What was asked for."""
+    """Yield the requested lines."""
     if arguments.ranks:
         yield from ranks(arguments.tower, recording, arguments.precision)
         return

@@ -1,10 +1,11 @@
-"""`python -m benchmarks.vectors [--photos 1e7] [--kinds flat ivf_sq8] [--recording R]`: a large index by itself.
+"""`python -m benchmarks.vectors [--photos 1e7] [--kinds flat ivf_sq8] [--recording R]`: a large index alone.
 
-Build, memory, opening and candidates of an index that holds rows and embeddings alone, no halves: what `indexes` takes
-by itself, where `benchmarks.scale` measures it beside the judging of what it names. Photos are drawn as there,
-and the 64 numbers are those of the checkpoint's candidate_encoder. Touches ask for `--candidates`; the share of them that is among
-the exact best is told for each setting of a kind's ladder. CPU time is told beside the clock's, as other programs may
-run; memory is what the process holds beside mapped files. Ten million photos take 11 GB on the disk and 25 minutes.
+Build, memory, opening and candidates of an index that contains only rows and embeddings, no partial activations: the
+cost of `indexes` alone, while `benchmarks.scale` also measures the reranking of its candidates. Photos are drawn as in
+`benchmarks.scale`, and the 64 numbers are those of the checkpoint's candidate encoder. Each touch requests
+`--candidates`; for each setting of a kind's ladder the recall of the exact best is printed. CPU time is printed next to
+wall-clock time, because other programs may run. Memory is that of the process without mapped files. Ten million photos
+take 11 GB on disk and 25 minutes.
 """
 
 import argparse
@@ -25,21 +26,20 @@ from indexes.store.generation import Generation
 from indexes.store.tables import Block
 from retrieval.search.defaults import shipped_model
 
-ASKED = 40
+QUERIES = 40
 
 
 @contextmanager
-def timed(what: str) -> Iterator[None]:
-    """Print seconds of a part, and the most that this process held meanwhile beside mapped files, above what it held
-    before."""
-    before, most, done = anonymous_mb(), 0.0, threading.Event()
+def timed(label: str) -> Iterator[None]:
+    """Print the seconds of a part, and the peak growth of this process's memory without mapped files."""
+    before, peak_mb, done = anonymous_mb(), 0.0, threading.Event()
 
-    def look() -> None:
-        nonlocal most
+    def watch() -> None:
+        nonlocal peak_mb
         while not done.wait(0.1):
-            most = max(most, anonymous_mb() - before)
+            peak_mb = max(peak_mb, anonymous_mb() - before)
 
-    thread = threading.Thread(target=look)
+    thread = threading.Thread(target=watch)
     thread.start()
     wall, cpu = time.perf_counter(), time.process_time()
     try:
@@ -48,16 +48,16 @@ def timed(what: str) -> Iterator[None]:
         done.set()
         thread.join()
     wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    print(f"{what}: {duration(wall)}, CPU {duration(cpu)}, at most {most:,.0f} MB of memory", flush=True)
+    print(f"{label}: {duration(wall)}, CPU {duration(cpu)}, at most {peak_mb:,.0f} MB of memory", flush=True)
 
 
 def bare(crowd: BlendedPhotos, photos: int) -> Iterator[Block]:
-    """The crowd's photos without their halves."""
+    """Return the crowd's photos without their partial activations."""
     return (Block(block.rows, block.embeddings) for block in crowd.blocks(0, photos, 0))
 
 
-def ask(made: Generation, queries: np.ndarray, k: int, exact: list[np.ndarray]) -> None:
-    """Print what candidates take, and how many of the exact ones are among them, along the ladder of the kind."""
+def print_candidates(made: Generation, queries: np.ndarray, k: int, exact: list[np.ndarray]) -> None:
+    """Print the time of candidates and their recall, along the ladder of the kind."""
     built = made.index
     for index in built.search_variants():
         made.index = index
@@ -66,32 +66,34 @@ def ask(made: Generation, queries: np.ndarray, k: int, exact: list[np.ndarray]) 
             start = time.thread_time()
             found.append(made.candidates(query[None], k)[0])
             seconds.append(time.thread_time() - start)
-        shares = [len(np.intersect1d(one, other)) / k for one, other in zip(found, exact, strict=True)]
+        recalls = [len(np.intersect1d(one, other)) / k for one, other in zip(found, exact, strict=True)]
         spread = ", ".join(duration(float(value)) for value in np.percentile(seconds, [50, 5, 95]))
         print(
-            f"  {index.settings()}: {spread} (median, 5 and 95 % of queries; CPU), {np.mean(shares):.4f} of the exact"
+            f"  {index.settings()}: {spread} (median, 5 and 95 % of queries; CPU), {np.mean(recalls):.4f} of the exact"
         )
     made.index = built
 
 
 def main() -> None:
-    """Print every part as soon as it is measured."""
+    """Print each part as soon as it is measured."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.vectors", description=__doc__.split("\n\n")[0])
     parser.add_argument("--photos", type=float, default=1e7)
     parser.add_argument("--kinds", nargs="+", default=["flat", "ivf_sq8"])
     parser.add_argument("--candidates", type=int, default=1000)
-    parser.add_argument("--recording", type=Path, help="whose photos are blended; a small one is collected where None")
-    parser.add_argument("--features", type=Path, help="where encoded features are kept")
-    asked = parser.parse_args()
+    parser.add_argument(
+        "--recording", type=Path, help="recording whose photos are blended (default: a small one is collected)"
+    )
+    parser.add_argument("--features", type=Path, help="file to store encoded features")
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as made:
-        folder, count = Path(made), int(asked.photos)
-        crowd = blended_photos(shipped_model(), asked.recording or collected(folder), asked.features)
+        folder, count = Path(made), int(arguments.photos)
+        crowd = blended_photos(shipped_model(), arguments.recording or collected(folder), arguments.features)
         store = IndexStore(folder / "index")
         with timed(f"{count:,} photos drawn and written"):
             generation = store.write_blocks(bare(crowd, count), fingerprint={}, kind="flat", self_check=64)
-        queries = crowd.embeddings(crowd.touches[:ASKED], "touch")
-        exact = [generation.candidates(query[None], asked.candidates)[0] for query in queries]
-        for kind in asked.kinds:
+        queries = crowd.embeddings(crowd.touches[:QUERIES], "touch")
+        exact = [generation.candidates(query[None], arguments.candidates)[0] for query in queries]
+        for kind in arguments.kinds:
             if kind != generation.manifest.kind:
                 with timed(f"{kind}, written again with its structure"):
                     generation = store.write_blocks(
@@ -105,11 +107,11 @@ def main() -> None:
                     )
             figures = opened(folder / "index") | on_disk(generation)
             print(
-                f"{kind}: {figures['disk_mb']:,.0f} MB on the disk ({figures['structure_mb']:,.0f} its structure), "
-                f"opened in {duration(figures['open_s'])}, {figures['memory_mb']:,.0f} MB in memory once asked",
+                f"{kind}: {figures['disk_mb']:,.0f} MB on disk ({figures['structure_mb']:,.0f} of it the structure), "
+                f"opened in {duration(figures['open_s'])}, {figures['memory_mb']:,.0f} MB in memory after a query",
                 flush=True,
             )
-            ask(generation, queries, asked.candidates, exact)
+            print_candidates(generation, queries, arguments.candidates, exact)
         shutil.rmtree(folder / "index")
 
 

@@ -1,7 +1,8 @@
-"""Error against run time of the kernels: the simulated rig, canonical correlations, photos decoded at a fraction, the
-number format of training.
+"""Error against run time of the kernels.
 
-`python -m benchmarks.frontier --out report/` measures and plots them as `retrieve frontier` does those of a search.
+The kernels are the simulated rig, canonical correlations, photos decoded at reduced size, and the number format of
+training. `python -m benchmarks.frontier --out report/` measures and plots them as `retrieve frontier` does for a
+search.
 """
 
 APPROXIMATIONS = {
@@ -18,4 +19,4 @@ APPROXIMATIONS = {
 """Name -> the function that measures it, as in `retrieval.frontier`."""
 
 NEED_NO_MODEL = frozenset({"cca_solver", "rays", "sky_occlusion", "contact", "contact_products", "gel_optics"})
-"""Measured without a model and without a recording."""
+"""Approximations that need neither a model nor a recording."""

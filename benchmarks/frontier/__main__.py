@@ -13,15 +13,15 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for frontier.json, frontier.html and plots")
     parser.add_argument("--only", nargs="+", default=(), choices=APPROXIMATIONS, metavar="NAME")
     parser.add_argument("--recording", type=Path, help="grasps of unseen objects (default: a small one is collected)")
-    parser.add_argument("--model", help="a checkpoint (default: as of `retrieve frontier`)")
-    parser.add_argument("--quick", action="store_true", help="smallest sizes, to see that it runs")
-    of = parser.parse_args(argv)
+    parser.add_argument("--model", help="a checkpoint (default: that of `retrieve frontier`)")
+    parser.add_argument("--quick", action="store_true", help="smallest sizes, as a quick test")
+    arguments = parser.parse_args(argv)
     run_frontier(
-        of.out,
-        model=of.model,
-        recording=of.recording,
-        only=of.only,
-        quick=of.quick,
+        arguments.out,
+        model=arguments.model,
+        recording=arguments.recording,
+        only=arguments.only,
+        quick=arguments.quick,
         table=APPROXIMATIONS,
         model_free=NEED_NO_MODEL,
     )

@@ -1,4 +1,4 @@
-"""The contact solver beside the closed forms: what is known without a grid, and how far the grid is from it.
+"""The contact solver compared with closed forms: exact solutions without a grid, and the error of the grid.
 
 Formulae: Johnson, Contact Mechanics (1985), chapters 3 to 5 and 13.2 (Westergaard's wavy surface); thin bonded layers
 from the long-wave limits of robot.sim.contact.kernels (compressible: springs of M/h; incompressible: u = -h^3 lap p /
@@ -21,9 +21,17 @@ BALL_MM = 4.0
 
 @dataclass(frozen=True)
 class Check:
-    """`error` of the solver in `unit`; `limit` is what it must not exceed.
+    """Error of the solver in one case.
 
     Most limits are the errors of an earlier prototype of 60 lines, as printed, plus half of the last digit.
+
+    Attributes:
+        case: the problem.
+        quantity: the compared quantity.
+        grid: the grid of the solver.
+        error: the error in `unit`.
+        limit: the maximum error.
+        unit: unit of error and limit.
     """
 
     case: str
@@ -56,12 +64,12 @@ class Grid:
         return cls(rows, rows, side_mm / rows)
 
     def axes(self) -> tuple[Floats, Floats]:
-        """y (rows, 1) and x (1, cols) of the pixels' centres in mm, 0 in the middle."""
+        """Return y (rows, 1) and x (1, cols) of the pixel centres in mm, 0 in the middle."""
         y, x = (self.pixel_mm * (np.arange(float(n)) - (n - 1) / 2.0) for n in (self.rows, self.cols))
         return np.asarray(y[:, None]), np.asarray(x[None, :])
 
     def radius(self) -> Floats:
-        """(rows, cols) distance of the pixels' centres from the middle in mm."""
+        """Return the distance (rows, cols) of the pixel centres from the middle in mm."""
         return np.hypot(*self.axes())
 
     def __str__(self) -> str:
@@ -69,13 +77,13 @@ class Grid:
 
 
 def closed_form_table() -> tuple[Check, ...]:
-    """Every closed form, in about two seconds."""
+    """Check every closed form, in about two seconds."""
     sources = (_hertz(), _punch(), _cone(), _line_contacts(), _thin_compressible(), _thin_incompressible())
     return tuple(check for source in (*sources, _identities()) for check in source)
 
 
 def percent(value: float, exact: float) -> float:
-    """Relative error in per cent."""
+    """Return the relative error in per cent."""
     return 100.0 * (value / exact - 1.0)
 
 
@@ -83,13 +91,13 @@ def percent(value: float, exact: float) -> float:
 
 
 def hertz(force_n: float, radius_mm: float, modulus_mpa: float) -> tuple[float, float, float]:
-    """Contact radius a, approach a^2/R and peak pressure 3F/(2 pi a^2) of a paraboloid; `modulus_mpa` is E*."""
+    """Return contact radius a, approach a^2/R and peak pressure 3F/(2 pi a^2) of a paraboloid; `modulus_mpa` is E*."""
     a = (0.75 * force_n * radius_mm / modulus_mpa) ** (1.0 / 3.0)
     return a, a * a / radius_mm, 1.5 * force_n / (math.pi * a * a)
 
 
 def pressed_ball(grid: Grid, layer: Layer, force_n: float, tolerance: float, padded: bool = True) -> Contact:
-    """A paraboloid of BALL_MM pressed into the middle of the field."""
+    """Press a paraboloid of BALL_MM into the middle of the field."""
     return press(_ball(grid), grid.pixel_mm, layer, force_n=force_n, tolerance=tolerance, padded=padded)
 
 
@@ -98,7 +106,7 @@ def _ball(grid: Grid) -> Floats:
 
 
 # Rows, force, and the limits: depth %, peak pressure %, pressure in L2 %. (The prototype's first L2 was 7.4; ours is
-# 7.53 for the same discretisation, whose other errors agree to every digit, so 7.4 was another measure.)
+# 7.53 for the same discretisation, whose other errors agree to every digit, so 7.4 was a different measure.)
 _HERTZ = (
     (60, 0.02, 0.285, 2.75, 7.55),
     (60, 0.5, 0.045, 0.335, 2.55),
@@ -131,10 +139,10 @@ def _hertz() -> Iterator[Check]:
 
 
 def _punch() -> Iterator[Check]:
-    """d = F / (2 E* a); outside u = (2 d / pi) asin(a/r). A round punch on square pixels has a staircase for a rim.
+    """Check d = F / (2 E* a) and, outside, u = (2 d / pi) asin(a/r). A round punch on square pixels has a stepped rim.
 
-    The depth against the radius from the area, whose limit is ours, is of first order in pixel / a: the pressure is
-    singular at the rim.
+    The limit for the depth with the radius from the area is our own. This error is of first order in pixel / a, because
+    the pressure is singular at the rim.
     """
     for rows, nominal, by_area, outside in ((64, 1.55, 0.8, 0.325), (128, 0.645, 0.4, 0.155), (256, 0.295, 0.2, 0.065)):
         grid, a = Grid.of_square(rows, 4.0), 1.0
@@ -151,7 +159,7 @@ def _punch() -> Iterator[Check]:
 
 
 def _cone() -> Iterator[Check]:
-    """d = (pi/2) a tan t, F = (pi/2) E* a^2 tan t."""
+    """Check d = (pi/2) a tan t, F = (pi/2) E* a^2 tan t."""
     grid, slope, a = Grid.of_square(64, 4.0), 0.2, 1.0
     force = math.pi / 2.0 * HALF_SPACE.plane_modulus_mpa * a * a * slope
     contact = press(slope * grid.radius(), grid.pixel_mm, HALF_SPACE, force_n=force, tolerance=1e-6)
@@ -160,7 +168,7 @@ def _cone() -> Iterator[Check]:
 
 
 def _line_contacts() -> Iterator[Check]:
-    """A periodic grid of one row is plane strain: Westergaard's wavy surface, and a cylinder (nearly Hertz's line)."""
+    """Check Westergaard's wavy surface and a cylinder (nearly Hertz's line) on one row, which is plane strain."""
     cols, period, wave = 512, 10.0, 0.1
     grid, modulus = Grid(1, cols, period / cols), HALF_SPACE.plane_modulus_mpa
     x = grid.axes()[1]
@@ -180,7 +188,7 @@ def _line_contacts() -> Iterator[Check]:
 
 
 def _cylinder(grid: Grid, modulus: float) -> Iterator[Check]:
-    """a^2 = 4 F'R/(pi E*), p0 = 2F'/(pi a); its neighbours are 25 contact radii away."""
+    """Check a^2 = 4 F'R/(pi E*), p0 = 2F'/(pi a); its neighbours are 25 contact radii away."""
     radius, a, x = 4.0, 0.4, grid.axes()[1]
     force = math.pi * modulus * a * a / (4.0 * radius)
     gap = x * x / (2.0 * radius)
@@ -195,7 +203,7 @@ def _cylinder(grid: Grid, modulus: float) -> Iterator[Check]:
 
 
 def _thin_compressible() -> Iterator[Check]:
-    """Springs of K = M/h: d = a^2/(2R), F = pi K a^4/(4R)."""
+    """Check springs of K = M/h: d = a^2/(2R), F = pi K a^4/(4R)."""
     radius, a, h, grid = 50.0, 4.0, 0.05, Grid.of_square(128, 10.0)
     layer = Layer(0.2, 0.3, h)
     stiffness = 0.2 * 0.7 / (1.3 * 0.4) / h
@@ -207,7 +215,7 @@ def _thin_compressible() -> Iterator[Check]:
 
 
 def _thin_incompressible() -> Iterator[Check]:
-    """F = pi G a^6/(32 R h^3), d = a^2/(4R), to order h/a."""
+    """Check F = pi G a^6/(32 R h^3), d = a^2/(4R), to order h/a."""
     for slenderness, limit in ((14, 3.15), (20, 1.65), (28, 0.85)):
         grid, a, radius = Grid.of_square(256, 12.0), 4.0, 100.0
         layer = Layer(0.3, 0.5, a / slenderness)
@@ -233,7 +241,7 @@ def _identities() -> Iterator[Check]:
 
 
 def _work_slope(grid: Grid, layer: Layer, contact: Contact) -> float:
-    """dU/dd by central differences; U = 1/2 sum p u dA."""
+    """Return dU/dd by central differences; U = 1/2 sum p u dA."""
     step = 1e-3 * contact.approach_mm
     gap = _ball(grid)
     works = []

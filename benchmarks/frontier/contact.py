@@ -1,4 +1,4 @@
-"""The simulated rig's approximations: grid, tolerance and precision of the gel's contact."""
+"""Approximations of the simulated rig's gel contact: grid, tolerance and precision."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -19,18 +19,18 @@ from robot.sim.pinch import Hand
 
 LAYER = Layer(HALF_SPACE.modulus_mpa, 0.48, 2.0)
 CAMERA_NOISE = 0.8
-"""Grey levels of a sensor's read noise: what the model can see lies above."""
+"""Read noise of a sensor in grey levels; effects visible to the model are larger."""
 
 # Contact ---------------------------------------------------------------------------------------------------
 
 
 def contact(sample: Sample) -> ApproximationResult:
-    """Grid and tolerance of the gel's contact. Under a minute."""
+    """Measure grid and tolerance of the gel's contact. Under a minute."""
     text = (
-        "A ball pressed into the gel: on a half-space against Hertz's closed form, on a layer, which the simulated "
-        "fingers have, against a fine grid. Then what the camera sees of a ball with ridges 1.5 mm apart, the finest "
-        "that objects are drawn with: this decides the grid, since an error below the camera's noise is not seen. Each "
-        "colour is a grid, each point a tolerance of the solver."
+        "A ball pressed into the gel: on a half-space, compared with Hertz's closed form; on a layer, as on the "
+        "simulated fingers, compared with a fine grid. Then the camera's image of a ball with ridges 1.5 mm apart, the "
+        "finest relief of simulated objects. This image decides the grid, because an error below the camera's noise is "
+        "not visible. Each colour is a grid, each point a tolerance of the solver."
     )
     repeats = sample.scale.repeats
     panels = contact_panels(repeats, (30, 120), (1e-1, 1e-2), 240) if sample.scale.quick else contact_panels(repeats)
@@ -43,10 +43,11 @@ def contact_panels(
     tolerances: Sequence[float] = (1e-1, 1e-2, 1e-3, 1e-4),
     reference_rows: int = 480,
 ) -> tuple[Panel, Panel, Panel]:
-    """Grid, tolerance and padding of the contact solver.
+    """Return the panels for grid, tolerance and padding of the contact solver.
 
-    A ball of 4 mm on the half-space against Hertz; on a layer of 2 mm against `reference_rows` at a tolerance of 1e-6,
-    of which each number of rows must be an even part; then the gel image of a ridged ball against the same grid's.
+    A ball of 4 mm on the half-space is compared with Hertz; on a layer of 2 mm with `reference_rows` at a tolerance of
+    1e-6, a multiple by an even factor of each number of rows. Then the gel image of a ridged ball is compared with that
+    of the reference grid.
     """
     return (
         _half_space(repeats, rows, tolerances),
@@ -80,7 +81,7 @@ def _layer(repeats: int, rows: Sequence[int], tolerances: Sequence[float], refer
 
 
 def _gel_image(repeats: int, rows: Sequence[int], tolerances: Sequence[float], reference_rows: int) -> Panel:
-    """What the camera sees of ridges: the error that matters to who looks at gel images."""
+    """Return the panel for the camera's image of ridges: the error that matters for gel images."""
     exact = _picture(_pressed_ridges(_of_gel(reference_rows), 1e-6))
     points, works = list[Tradeoff](), list[Callable[[], Contact]]()
     for grid in map(_of_gel, rows):
@@ -93,7 +94,7 @@ def _gel_image(repeats: int, rows: Sequence[int], tolerances: Sequence[float], r
 
 
 def _point(grid: Grid, tolerance: float, error: float, padded: bool = True) -> Tradeoff:
-    """One setting of the solver; the default is what the gripper's contacts are solved with."""
+    """Return one setting of the solver; the default is that of the gripper's contacts."""
     hand, series = Hand(), f"{grid}" if padded else f"{grid} periodic"
     is_default = padded and ((grid.rows, grid.cols), tolerance) == (hand.grid, hand.tolerance)
     return Tradeoff(series, f"tolerance {tolerance:g}", abs(error), is_default=is_default)
@@ -108,30 +109,30 @@ def _panel(
     works: Sequence[Callable[[], object]],
     repeats: int,
 ) -> Panel:
-    title, made = f"contact grid and tolerance, {surface}", time_points(points, works, repeats)
-    return Panel(title, "one contact", unit, reference, tolerance, made, smallest_error(made))
+    title, timed = f"contact grid and tolerance, {surface}", time_points(points, works, repeats)
+    return Panel(title, "one contact", unit, reference, tolerance, timed, smallest_error(timed))
 
 
 def _pressed_ridges(grid: Grid, tolerance: float) -> Contact:
-    """A ball of 15 mm with ridges 1.5 mm apart, the finest that objects are drawn with, and .2 mm high, at 3 N."""
+    """Press a ball of 15 mm with ridges 1.5 mm apart, the finest of simulated objects, and .2 mm high, at 3 N."""
     ridges = 0.1 * (1.0 - np.cos(2.0 * math.pi * grid.axes()[1] / 1.5))
     gap = grid.radius() ** 2 / 30.0 + ridges
     return press(gap, grid.pixel_mm, LAYER, force_n=3.0, tolerance=tolerance)
 
 
 def _of_gel(rows: int) -> Grid:
-    """`rows` rows over what the gel's camera sees."""
+    """Return `rows` rows over the field of the gel's camera."""
     return Grid(rows, rows * 4 // 3, Field().size_mm[0] / rows)
 
 
 def _picture(contact: Contact) -> Floats:
-    """(240, 320, 3) grey levels of the gel by its lamps, before noise and rounding."""
+    """Return grey levels (240, 320, 3) of the gel under its lamps, before noise and rounding."""
     surface = Surface(contact.displacement_mm, Field())
     return LedOptics().colours(surface, surface.slopes).astype(np.float64)
 
 
 def _at_centres(fine: Floats, factor: int) -> Floats:
-    """A fine field at the centres of blocks of `factor` pixels: the mean of the four pixels that meet there."""
+    """Sample a fine field at the centres of blocks of `factor` pixels: the mean of the four pixels around them."""
     rows, cols = (n // factor for n in fine.shape)
     blocks = fine.reshape(rows, factor, cols, factor)
     middle = slice(factor // 2 - 1, factor // 2 + 1)
@@ -142,11 +143,11 @@ def _at_centres(fine: Floats, factor: int) -> Floats:
 
 
 def contact_products(sample: Sample) -> ApproximationResult:
-    """float32 in the products of the gel's contact."""
+    """Measure float32 in the products of the gel's contact."""
     text = (
         "A ball with ridges pressed into a layer on the rig's grid: the products of pressure and influence by FFT in "
-        "float32 or in float64, and the solver's tolerance. The rig's contacts, at a tolerance of "
-        f"{SINGLE_PRECISION_TOLERANCE:g} or more, take float32."
+        "float32 or in float64, and the solver's tolerance. The rig's contacts use float32 at a tolerance of "
+        f"{SINGLE_PRECISION_TOLERANCE:g} or more."
     )
     repeats = sample.scale.repeats
     panel = products_panel(repeats, rows=48) if sample.scale.quick else products_panel(repeats)
@@ -154,7 +155,7 @@ def contact_products(sample: Sample) -> ApproximationResult:
 
 
 def products_panel(repeats: int, rows: int | None = None, tolerances: Sequence[float] = (1e-1, 1e-2, 1e-3)) -> Panel:
-    """A point for each precision and tolerance: rms error of the surface against float64 at 1e-8 on the same grid."""
+    """Return a point for each precision and tolerance: rms error of the surface against float64 at 1e-8, same grid."""
     hand = Hand()
     grid = hand.grid if rows is None else (rows, rows * 4 // 3)
     pixel_mm = 15.2 / grid[0]
@@ -169,13 +170,15 @@ def products_panel(repeats: int, rows: int | None = None, tolerances: Sequence[f
             is_default = (tolerance, single_precision) == (hand.tolerance, True)
             series = "float32" if single_precision else "float64"
             points.append(Tradeoff(series, f"tolerance {tolerance:g}", error, is_default=is_default))
-    made = time_points(points, works, repeats)
+    timed = time_points(points, works, repeats)
     reference = "float64, tolerance 1e-08"
-    return Panel("precision of contact", "one contact", "um rms of surface", reference, 0.1, made, smallest_error(made))
+    return Panel(
+        "precision of contact", "one contact", "um rms of surface", reference, 0.1, timed, smallest_error(timed)
+    )
 
 
 def _pressed(gap: Floats, pixel_mm: float, tolerance: float, single_precision: bool, force_n: float = 3.0) -> Floats:
-    """(rows, cols) mm of displacement by so much force."""
+    """Return the displacement (rows, cols) in mm under this force."""
     scale = force_n / LAYER.plane_modulus_mpa / pixel_mm**2
     surface = ElasticSurface(LAYER.thickness_mm / pixel_mm, LAYER.poisson, 0.0, False, single_precision)
     solution = ScaledProblem(surface, gap / pixel_mm / scale, 1.0, 1.0, tolerance, 1000).solve()

@@ -1,4 +1,4 @@
-"""Canonical correlations: how they are computed, and how many components a score keeps."""
+"""Canonical correlations: the solver, and the number of components in a score."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ Solver = Callable[["CcaProblem"], Matrix]
 OURS = "SVD of the data, float64 (ours)"
 SIZES = (4, 8, 16, 32, 64, 128, 256)
 MIN_ROWS = 8
-"""Objects: half of them are fitted on, a quarter chosen on, a quarter judged."""
+"""Minimum number of objects: half of them fit, a quarter choose, a quarter test."""
 
 
 @dataclass(frozen=True, eq=False)
 class CcaProblem:
-    """Two views (n, d) whose canonical correlations are known: mixed sources, `rho` (d,) falling."""
+    """Two views (n, d) with known canonical correlations: mixed sources, `rho` (d,) decreasing."""
 
     x: Matrix
     y: Matrix
@@ -32,7 +32,7 @@ class CcaProblem:
 
 
 def known_problem(rows: int, width: int, spread: float, seed: int = 0) -> CcaProblem:
-    """Orthonormal sources U and V with U'V = diag(rho), each mixed by a matrix whose singular values span `spread`."""
+    """Mix orthonormal sources U and V with U'V = diag(rho) by matrices whose singular values span `spread`."""
     rng = np.random.default_rng([seed, 3])
     drawn = rng.normal(size=(rows, 2 * width))
     sources = np.linalg.qr(drawn - drawn.mean(0))[0]
@@ -48,7 +48,7 @@ def _mixing(width: int, spread: float, rng: np.random.Generator) -> Matrix:
 
 
 def cca_solver(sample: Sample) -> ApproximationResult:
-    """Ours against the textbook's and scikit-learn's, where the answer is known."""
+    """Compare our solver with the textbook's and scikit-learn's on a problem with a known answer."""
     size = (200, 12) if sample.scale.quick else (2000, 64)
     problem = known_problem(*size, spread=1e6)
     solvers: dict[str, Solver] = {
@@ -74,7 +74,7 @@ def cca_solver(sample: Sample) -> ApproximationResult:
     return ApproximationResult(
         "CCA: solver",
         "X'X squares the condition number of the data; the singular value decomposition of X does not. scikit-learn's "
-        "CCA iterates one component after the other (NIPALS), here its first eight.",
+        "CCA iterates one component after the other (NIPALS); only its first eight are computed here.",
         (panel,),
     )
 
@@ -90,7 +90,7 @@ def _by_svd(problem: CcaProblem) -> Matrix:
 
 
 def _by_covariance(kind: type[np.floating], problem: CcaProblem) -> Matrix:
-    """Whiten by eigenvalues of the covariance, as textbooks print it; only here, to be compared."""
+    """Whiten with eigenvalues of the covariance, as in textbooks; used only for this comparison."""
     x, y = (one.astype(kind) - one.astype(kind).mean(0) for one in (problem.x, problem.y))
     whitened = [one @ _root(one.T @ one) for one in (x, y)]
     found = np.linalg.svd(whitened[0].T @ whitened[1], compute_uv=False)
@@ -99,17 +99,17 @@ def _by_covariance(kind: type[np.floating], problem: CcaProblem) -> Matrix:
 
 def _root(covariance: NDArray[np.floating]) -> NDArray[np.floating]:
     values, vectors = np.linalg.eigh(covariance)
-    kept = values > np.finfo(values.dtype).eps * values[-1]
-    return np.asarray(vectors[:, kept] / np.sqrt(values[kept]))
+    nonzero = values > np.finfo(values.dtype).eps * values[-1]
+    return np.asarray(vectors[:, nonzero] / np.sqrt(values[nonzero]))
 
 
 def _padded(found: Matrix, count: int) -> Matrix:
-    """A correlation that was not found counts as 0, one above 1 stays wrong."""
+    """Count a correlation that was not found as 0; one above 1 stays wrong."""
     return np.pad(found[:count], (0, max(0, count - len(found))))
 
 
 def _by_sklearn(problem: CcaProblem) -> Matrix:
-    """Its first eight components; not all of them, for it takes seconds a component."""
+    """Return its first eight components only, because each takes seconds."""
     from sklearn.cross_decomposition import CCA
 
     found = CCA(n_components=8, max_iter=5000).fit_transform(problem.x, problem.y)
@@ -120,7 +120,7 @@ def _by_sklearn(problem: CcaProblem) -> Matrix:
 
 
 def cca_components(sample: Sample) -> ApproximationResult:
-    """Wrong first guesses by number of canonical components, fitted on half of the sample's objects."""
+    """Measure the top-1 error by number of canonical components, fitted on half of the sample's objects."""
     title = "CCA: components"
     names = [str(name) for name in np.unique(sample.features.object_ids)]
     if len(names) < MIN_ROWS:
@@ -138,17 +138,17 @@ def cca_components(sample: Sample) -> ApproximationResult:
     touch = views[0].standardise(test.touch) @ found.touch_weights * weights
     photo = views[1].standardise(test.photo) @ found.photo_weights * weights
     points, works = list[Tradeoff](), list[Callable[[], object]]()
-    many = np.tile(photo, (1 + sample.scale.photos // len(photo), 1))[: sample.scale.photos]
+    photos_tiled = np.tile(photo, (1 + sample.scale.photos // len(photo), 1))[: sample.scale.photos]
     for count in sorted({*component_counts(SIZES, len(weights)), method.best_params["components"]}):
         codes = unit_rows(touch[:, :count]), unit_rows(photo[:, :count])
         scores = cosine(*codes)
-        np.fill_diagonal(scores, -np.inf)  # the photo of the touch's own grasp
+        np.fill_diagonal(scores, -np.inf)  # exclude the photo of the touch's own grasp
         wrong = test.owner[scores.argmax(1)] != test.owner
         points.append(miss_rate_point("", f"{count} components", wrong, count == method.best_params["components"]))
-        works.append(partial(cosine, codes[0][:1], unit_rows(many[:, :count])))
+        works.append(partial(cosine, codes[0][:1], unit_rows(photos_tiled[:, :count])))
     points = list(time_points(points, works, sample.scale.repeats))
     panel = Panel(
-        title="wrong first guesses by number of canonical components",
+        title="top-1 errors by number of canonical components",
         time=f"scores of one touch with {sample.scale.photos:,} photos, one thread",
         unit="% of queries",
         reference=f"the object in the hand, one of {len(parts[2])}",
@@ -157,7 +157,7 @@ def cca_components(sample: Sample) -> ApproximationResult:
         resolution=100 / len(test),
     )
     text = (
-        f"Fitted on {len(parts[0])} objects, ridge, power and the default number of components chosen on "
-        f"{len(parts[1])} others, judged on {len(parts[2])} that neither has seen."
+        f"Fitted on {len(parts[0])} objects; ridge, power and the default number of components chosen on "
+        f"{len(parts[1])} others; tested on {len(parts[2])} that neither includes."
     )
     return ApproximationResult(title, text, (panel,))

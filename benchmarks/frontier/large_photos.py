@@ -1,4 +1,4 @@
-"""Photos as large as a phone's, decoded whole or at a fraction of their size by their own cosine transform."""
+"""Large photos, decoded at full size or at a fraction of their size by the JPEG cosine transform."""
 
 import dataclasses
 import io
@@ -22,36 +22,36 @@ from robot.sim.objects.draw import draw_object
 from robot.sim.scene import Scene
 
 PHOTOS, SIDE, SIZE = 12, 2048, (4000, 3000)
-"""How many are drawn, so many pixels a side; then their sides are stretched to those of a phone's."""
+"""Number of photos and their side in pixels; they are then resized to a phone's photo size."""
 FRACTIONS = (2, 4, 8)
 QUALITY, LOWER = 92, 85
 _SEED = 70_000
-_NAME = "a drawn photo"
-See = Callable[[bytes], RgbImage]
+_NAME = "a simulated photo"
+Decoder = Callable[[bytes], RgbImage]
 
 
 def reduced(sample: Sample) -> ApproximationResult:
-    """How far views, logits and answers move, and the time of one photo."""
+    """Measure the change of views, logits and answers, and the time of one photo."""
     count, side, size = (3, 256, (1600, 1200)) if sample.scale.quick else (PHOTOS, SIDE, SIZE)
     settings = sample.checkpoint.config.preprocessing
     pictures = [photographed(number, side).resize(size, Image.Resampling.LANCZOS) for number in range(count)]
     files, again = ([as_jpeg(picture, quality) for picture in pictures] for quality in (QUALITY, LOWER))
-    points, ways = zip(*decoders(settings), strict=True)
-    views = [[see(file) for file in files] for see in ways]
-    points = time_points(points, [_seeing(see, files) for see in ways], sample.scale.repeats)
+    points, decode_functions = zip(*decoders(settings), strict=True)
+    views = [[load(file) for file in files] for load in decode_functions]
+    points = time_points(points, [_load_next(load, files) for load in decode_functions], sample.scale.repeats)
     return ApproximationResult(
         "Large photos: size at which they are decoded",
-        f"{count} drawn photos, JPEG files of {size[0]:,} x {size[1]:,} pixels. A JPEG file can be decoded at 1/2, 1/4 "
-        "or 1/8 of its size by its own cosine transform. With `reduced` among its preprocessing, as presets for new "
-        "models have it, a model sees a photo decoded at the smallest of these that leaves its views two pixels a side "
-        "for each of theirs, and learns from such photos: the errors here are those of a change afterwards. Tolerated "
-        f"is what saving the photos at quality {LOWER} instead of {QUALITY} moves.",
-        tuple(_panels(sample, points, views, [ways[0](file) for file in again])),
+        f"{count} simulated photos, JPEG files of {size[0]:,} x {size[1]:,} pixels. A JPEG file can be decoded at 1/2, "
+        "1/4 or 1/8 of its size by its own cosine transform. With `reduced` in its preprocessing, as in the presets "
+        "for new models, a model receives a photo decoded at the smallest of these sizes that has two pixels a side "
+        "for each pixel of a view, and is trained on such photos. The errors here are those of a change after "
+        f"training. The tolerance is the effect of saving the photos at quality {LOWER} instead of {QUALITY}.",
+        tuple(_panels(sample, points, views, [decode_functions[0](file) for file in again])),
     )
 
 
-def decoders(settings: Preprocessing) -> Iterator[tuple[Tradeoff, See]]:
-    """(a point without its error, how it sees the bytes of a photo's file): whole first."""
+def decoders(settings: Preprocessing) -> Iterator[tuple[Tradeoff, Decoder]]:
+    """Yield (a point without its error, its decoder from the bytes of a photo's file): full size first."""
     plain, needed = (dataclasses.replace(settings, reduced=each) for each in (False, True))
 
     def at(fraction: int, data: bytes) -> RgbImage:
@@ -72,16 +72,23 @@ def decoders(settings: Preprocessing) -> Iterator[tuple[Tradeoff, See]]:
 def _panels(
     sample: Sample, points: Sequence[Tradeoff], views: Sequence[Sequence[RgbImage]], again: Sequence[RgbImage]
 ) -> Iterator[Panel]:
-    """views: of each point, the first of whole photos; again: of whole photos that were saved again."""
-    whole, time = np.array(views[0]), "decoding one photo and cutting its views, one thread"
-    logits = [_logits(sample, seen) for seen in (*views, again)]
-    grey = [255 * float(np.abs(np.array(seen) - whole).mean()) for seen in (*views, again)]
-    moved = [float(np.abs(each - logits[0]).mean()) for each in logits]
+    """Yield the panels.
+
+    Args:
+        sample: the sample.
+        points: the settings, with their times.
+        views: views of each point, first those of photos decoded at full size.
+        again: views of photos that were saved again, decoded at full size.
+    """
+    whole, time = np.array(views[0]), "decoding one photo and cropping its views, one thread"
+    logits = [_logits(sample, images) for images in (*views, again)]
+    grey = [255 * float(np.abs(np.array(images) - whole).mean()) for images in (*views, again)]
+    logit_changes = [float(np.abs(each - logits[0]).mean()) for each in logits]
     first = [each.argmax(1) != logits[0].argmax(1) for each in logits]
     reference = "photos decoded whole"
     for title, unit, errors in (
-        ("how far views move", "grey levels, mean", grey),
-        ("how far match logits move", "nats, mean", moved),
+        ("change of views", "grey levels, mean", grey),
+        ("change of match logits", "nats, mean", logit_changes),
     ):
         made = tuple(dataclasses.replace(point, error=error) for point, error in zip(points, errors[:-1], strict=True))
         yield Panel(title, time, unit, reference, float(f"{errors[-1]:.2g}"), made, smallest_error(made))
@@ -91,31 +98,31 @@ def _panels(
         )
         for point, wrong in zip(points, first[:-1], strict=True)
     )
-    most = round(100 * float(first[-1].mean()), 2)
-    yield Panel("another photo first", time, "% of touches", reference, most, flips, 100 / len(logits[0]))
+    tolerance = round(100 * float(first[-1].mean()), 2)
+    yield Panel("another photo ranked first", time, "% of touches", reference, tolerance, flips, 100 / len(logits[0]))
 
 
 def _logits(sample: Sample, views: Sequence[RgbImage]) -> Array:
-    """(touches, photos)."""
+    """Return match logits (touches, photos)."""
     partials = encode_photos(sample.checkpoint.matcher, views).partial.numpy()
     return np.array([sample.logits(touch, partials) for touch in sample.queries["partial"]])
 
 
-def _seeing(see: See, files: Sequence[bytes]) -> Callable[[], RgbImage]:
-    """One photo after the other."""
+def _load_next(load: Decoder, files: Sequence[bytes]) -> Callable[[], RgbImage]:
+    """Return a function that decodes one photo after the other."""
     photos = cycle(files)
-    return lambda: see(next(photos))
+    return lambda: load(next(photos))
 
 
 def photographed(number: int, side: int) -> Image.Image:
-    """A scene of the simulated rig, by a camera of so many pixels a side that sees as much as the rig's."""
+    """Photograph a scene of the simulated rig with this many pixels a side and the rig's field of view."""
     camera = PinholeCamera(px=side, focal_px=PinholeCamera.focal_px * side / PinholeCamera.px)
     scene = Scene(draw_object(_SEED, number), camera=camera, seed=number, outputs={"photo"})
     return Image.fromarray(scene.run()["photo"])
 
 
 def as_jpeg(picture: Image.Image, quality: int) -> bytes:
-    """The picture as a JPEG file."""
+    """Encode the picture as a JPEG file."""
     buffer = io.BytesIO()
     picture.save(buffer, "JPEG", quality=quality)
     return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""Degree of the fitted gel optics: errors on real presses against the time of a picture."""
+"""Degree of the fitted gel optics: error on real presses against the time of a picture."""
 
 import math
 from dataclasses import replace
@@ -15,15 +15,13 @@ from robot.sim.gel.surface import Field, Surface
 
 
 def gel_optics(sample: Sample) -> ApproximationResult:
-    """Degree of the fitted gel optics, against real presses."""
-    text = (
-        "Pictures of real balls pressed into a real gel that were left out of the fit, and what the model says of them."
-    )
+    """Measure the degree of the fitted gel optics on real presses."""
+    text = "Pictures of real balls pressed into a real gel, left out of the fit, compared with the model's predictions."
     return ApproximationResult("Gel optics: degree of the fitted model", text, (optics_panel(sample.scale.repeats),))
 
 
 def optics_panel(repeats: int, name: str = "gelsight") -> Panel:
-    """A point per degree of the fitted optics of a sensor: a picture of 240 x 320 pixels, its maps made before.
+    """Return a point per degree of the fitted optics: a picture of 240 x 320 pixels, its maps computed before.
 
     The error is the rms over held-out real presses, in grey levels, from the shipped file.
     """
@@ -40,19 +38,19 @@ def optics_panel(repeats: int, name: str = "gelsight") -> Panel:
         for degree in DEGREES
     ]
     works = [partial(_of_degree(shipped, degree).colours, surface, surface.slopes) for degree in DEGREES]
-    made = time_points(points, works, repeats)
+    timed = time_points(points, works, repeats)
     return Panel(
         title="gel optics",
         time="one picture of 240 x 320 pixels",
         unit="grey levels rms",
         reference="real presses held out",
         tolerance=3.5,
-        points=made,
-        resolution=smallest_error(made),
+        points=timed,
+        resolution=smallest_error(timed),
     )
 
 
 def _of_degree(optics: FittedOptics, degree: int) -> FittedOptics:
-    """Optics that cost what this degree costs; time does not depend on what the weights are."""
+    """Return optics with the cost of this degree; the time does not depend on the values of the weights."""
     count = feature_count(degree, len(optics.reaches_mm)) * optics.places
     return replace(optics, degree=degree, weights=((0.0, 0.0, 0.0),) * count)

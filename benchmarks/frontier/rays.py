@@ -1,4 +1,4 @@
-"""Rays of the simulated rig: the steps of those from a gel and from the camera, and how many a ray may take."""
+"""Rays of the simulated rig: step length of gel and camera rays, and the maximum number of steps."""
 
 import dataclasses
 import math
@@ -25,20 +25,20 @@ from robot.sim.scene import Scene
 _FAMILIES = ("knurl", "bumps", "weave")
 _OBJECTS, _PX = 8, 256
 _EXACT = 1 / 20
-"""Of the detail that a photo's ray asks for: equal steps so short are the reference."""
+"""Step of the reference, relative to the detail of a photo's ray."""
 _UNBOUNDED = 100_000
-"""Steps that no ray needs."""
+"""Number of steps that no ray needs."""
 
 
 def rays(sample: Sample) -> ApproximationResult:
-    """Steps of the rays of gels and photos, how many a ray may take, and float32 where light is worked out."""
+    """Measure the steps of gel and photo rays, the maximum number of steps, and float32 in shading."""
     text = (
-        "Rays to a solid that wears relief: no step is shorter than half the detail that is asked for, and where f "
-        "changes sign two secants find the place. A gel asks for 0.1 mm; its picture shows heights of some thousandths "
-        "of a mm. The camera asks for one of its pixels on the object, and two on the way to the lamp: photos are "
-        "compared with those whose rays go in equal steps of a twentieth of that in plain numpy, over the same relief, "
-        "which is as fine as a pixel; errors below the noise of the camera's sensor are tolerated. A ray that has met "
-        "nothing after so many steps is a miss. Light is worked out in float32, in one compiled pass."
+        "Rays to a solid with relief: no step is shorter than half the requested detail, and where f changes sign two "
+        "secants find the place. A gel requests 0.1 mm; its picture shows heights of some thousandths of a mm. The "
+        "camera requests one of its pixels on the object, and two on the way to the lamp. Photos are compared with "
+        "photos whose rays go in equal steps of a twentieth of that in plain numpy, over the same relief, which is as "
+        "fine as a pixel. Errors below the noise of the camera's sensor are tolerated. A ray without a hit after this "
+        "many steps is a miss. Shading uses float32, in one compiled pass."
     )
     repeats = sample.scale.repeats
     few, objects, px = (12, 2, 64) if sample.scale.quick else (48, _OBJECTS, _PX)
@@ -52,39 +52,38 @@ def rays(sample: Sample) -> ApproximationResult:
 
 
 class RayMarcher(SdfBody):
-    """The solid of a body, met by steps `stride` times as long, at most `max_steps`; `asked` are the casts so far,
-    to be made again."""
+    """A body whose rays take steps `stride` times as long, at most `max_steps`; `casts` repeats the casts so far."""
 
     def __init__(self, body: SdfBody, stride: float = 1.0, max_steps: int = MAX_STEPS) -> None:
         super().__init__(body.shape, body.relief)
         self.wall = body.wall
         self.stride, self.max_steps = stride, max_steps
-        self.asked: list[Callable[[], NDArray[Any]]] = []
+        self.casts: list[Callable[[], NDArray[Any]]] = []
 
     def _cast(self, rays: ClippedRays) -> Vectors:
-        return self._kept(partial(self._by, first_hits, rays))
+        return self._recorded(partial(self._by, first_hits, rays))
 
     def _hit(self, rays: ClippedRays) -> NDArray[np.bool_]:
-        return self._kept(partial(self._by, hits, rays))
+        return self._recorded(partial(self._by, hits, rays))
 
-    def _kept(self, cast: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-        self.asked.append(cast)
+    def _recorded(self, cast: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+        self.casts.append(cast)
         return cast()
 
-    def _by(self, met: Callable[..., NDArray[Any]], rays: ClippedRays) -> NDArray[Any]:
-        return met(self.displaced_solid(rays.step_mm), rays.arrays, self.stride * rays.step_mm, self.max_steps)
+    def _by(self, intersect: Callable[..., NDArray[Any]], rays: ClippedRays) -> NDArray[Any]:
+        return intersect(self.displaced_solid(rays.step_mm), rays.arrays, self.stride * rays.step_mm, self.max_steps)
 
 
 class EqualStepMarcher(RayMarcher):
-    """The same in equal steps of plain numpy, `stride` times the detail that is asked for, as many as it takes."""
+    """The same in equal steps of plain numpy, `stride` times the requested detail, without a limit."""
 
-    def _by(self, met: Callable[..., NDArray[Any]], rays: ClippedRays) -> NDArray[Any]:
+    def _by(self, intersect: Callable[..., NDArray[Any]], rays: ClippedRays) -> NDArray[Any]:
         found = by_equal_steps(self, rays, self.stride * rays.step_mm)
-        return np.isfinite(found) if met is hits else found
+        return np.isfinite(found) if intersect is hits else found
 
 
 def by_equal_steps(body: SdfBody, rays: ClippedRays, step_mm: float) -> Vectors:
-    """Where the field in plain numpy first changes sign, and there by its chord; inf where it does not."""
+    """Return where the field in plain numpy first changes sign, refined by its chord; inf if it does not."""
     found, before, along = np.full(len(rays.near_mm), np.inf), np.zeros(len(rays.near_mm)), 0.0
     open_ = np.flatnonzero(rays.near_mm <= rays.far_mm)
     while len(open_):
@@ -92,8 +91,8 @@ def by_equal_steps(body: SdfBody, rays: ClippedRays, step_mm: float) -> Vectors:
         x, y, z = (rays.origins[open_] + t[:, None] * rays.directions[open_]).astype(np.float32).T
         f = body.field(x, y, z, rays.step_mm).astype(np.float64)
         inside = f <= 0
-        hit, share = open_[inside], f[inside] / (before[open_[inside]] - f[inside]) if along else 0.0
-        found[hit] = t[inside] + step_mm * share
+        hit, fraction = open_[inside], f[inside] / (before[open_[inside]] - f[inside]) if along else 0.0
+        found[hit] = t[inside] + step_mm * fraction
         before[open_] = f
         open_, along = open_[~inside & (t <= rays.far_mm[open_])], along + step_mm
     return found
@@ -103,19 +102,19 @@ def by_equal_steps(body: SdfBody, rays: ClippedRays, step_mm: float) -> Vectors:
 
 
 def gel_panel(repeats: int, rows: int = 48, steps_mm: Sequence[float] = (1.6, 0.8, 0.4, 0.2, 0.1, 0.05)) -> Panel:
-    """A point for each step: the rms error of depth over the walls of three objects, `rows` by 4/3 `rows` rays each."""
+    """Return a point for each step: the rms error of depth over three walls, `rows` by 4/3 `rows` rays each."""
     walls = [(body, *_rays_onto(body, rows)) for body in map(_wall, _FAMILIES)]
     exact = np.concatenate([_exact_depth(*wall) for wall in walls])
     met = np.isfinite(exact)
     points, works = list[Tradeoff](), [partial(_cast, walls, step) for step in steps_mm]
     for step, work in zip(steps_mm, works, strict=True):
         found = work()
-        both = met & np.isfinite(found)
-        error = 1e3 * math.sqrt(float(np.mean((found[both] - exact[both]) ** 2)))
+        hit_in_both = met & np.isfinite(found)
+        error = 1e3 * math.sqrt(float(np.mean((found[hit_in_both] - exact[hit_in_both]) ** 2)))
         points.append(Tradeoff("", f"{step:g} mm", error, is_default=step == GEL_STEP_MM))
-    made = time_points(points, works, repeats)
+    timed = time_points(points, works, repeats)
     reference, time = "equal steps of 0.01 mm", f"{len(exact):,} rays"
-    return Panel("step of a gel's rays", time, "um rms of depth", reference, 2.0, made, smallest_error(made))
+    return Panel("step of a gel's rays", time, "um rms of depth", reference, 2.0, timed, smallest_error(timed))
 
 
 def _wall(relief: str) -> SdfBody:
@@ -125,7 +124,7 @@ def _wall(relief: str) -> SdfBody:
 
 
 def _rays_onto(body: SdfBody, rows: int) -> tuple[Vectors, Vectors]:
-    """Parallel rays from the front, 6 mm apart from the box, over 12 x 16 mm of its middle."""
+    """Return parallel rays from the front, 6 mm away from the box, over 12 x 16 mm of its middle."""
     height, width = 12.0, 16.0
     z = 0.5 * body.upper[2] + height * (np.arange(rows) / rows - 0.5)
     x, up = np.meshgrid(width * (np.arange(rows * 4 // 3) / (rows * 4 // 3) - 0.5), z)
@@ -148,38 +147,38 @@ def _cast(walls: Sequence[tuple[SdfBody, Vectors, Vectors]], step_mm: float) -> 
 def photo_panel(
     repeats: int, objects: int = _OBJECTS, px: int = _PX, strides: Sequence[float] = (16, 8, 4, 2, 1, 0.5, 0.25)
 ) -> Panel:
-    """A point for each step: the rms error of photos of so many objects, and the time of all of their rays."""
-    ways = [("as the rig casts", RayMarcher, stride) for stride in strides]
-    ways += [("equal steps, plain numpy", EqualStepMarcher, stride) for stride in (1, 0.25, _EXACT)]
-    taken = [_photos(way, stride, objects, px) for _, way, stride in ways]
+    """Return a point for each step: the rms error of photos of this many objects, and the time of all of their rays."""
+    marchers = [("as the rig casts", RayMarcher, stride) for stride in strides]
+    marchers += [("equal steps, plain numpy", EqualStepMarcher, stride) for stride in (1, 0.25, _EXACT)]
+    taken = [_photos(marcher, stride, objects, px) for _, marcher, stride in marchers]
     exact = taken[-1][0]
     points = [
         Tradeoff(
             series,
             f"{stride:g} px",
             math.sqrt(float(np.mean((pictures - exact) ** 2))),
-            is_default=way is RayMarcher and stride == 1,
+            is_default=marcher is RayMarcher and stride == 1,
         )
-        for (series, way, stride), (pictures, _) in zip(ways, taken, strict=True)
+        for (series, marcher, stride), (pictures, _) in zip(marchers, taken, strict=True)
     ]
-    made = time_points(points, [casts for _, casts in taken], repeats)
+    timed = time_points(points, [casts for _, casts in taken], repeats)
     time, reference = f"rays of {objects} photos of {px} px, shadows included", f"equal steps of {_EXACT:g} px"
-    return Panel("step of a photo's rays", time, "grey levels rms", reference, NOISE, made, smallest_error(made))
+    return Panel("step of a photo's rays", time, "grey levels rms", reference, NOISE, timed, smallest_error(timed))
 
 
-def _photos(way: type[RayMarcher], stride: float, objects: int, px: int) -> tuple[Vectors, Callable[[], object]]:
-    """(objects, px, px, 3) grey levels, and what casts all of their rays once more."""
-    scenes = [_scene(way, stride, number, px) for number in range(objects)]
+def _photos(marcher: type[RayMarcher], stride: float, objects: int, px: int) -> tuple[Vectors, Callable[[], object]]:
+    """Return grey levels (objects, px, px, 3), and a function that repeats all of their casts."""
+    scenes = [_scene(marcher, stride, number, px) for number in range(objects)]
     pictures = np.array([scene.run()["photo"] for scene, _ in scenes], np.float64)
-    asked = [again for _, body in scenes for again in body.asked]
-    return pictures, lambda: [again() for again in asked]
+    casts = [again for _, body in scenes for again in body.casts]
+    return pictures, lambda: [again() for again in casts]
 
 
-def _scene(way: type[RayMarcher], stride: float, number: int, px: int) -> tuple[Scene, RayMarcher]:
-    """An object with its body, before a camera that sees as much as the rig's; two bare fingers can close on it."""
+def _scene(marcher: type[RayMarcher], stride: float, number: int, px: int) -> tuple[Scene, RayMarcher]:
+    """Return a scene and its body: a camera with the rig's field of view, and two bare fingers that can close."""
     obj = draw_object(0, number)
     assert isinstance(obj.body, SdfBody)
-    body = way(obj.body, stride)
+    body = marcher(obj.body, stride)
     camera = PinholeCamera(px=px, focal_px=PinholeCamera.focal_px * px / PinholeCamera.px)
     grip = Grip(Pose(0.0, 0.0, 0.5 * float(obj.body.upper[2]), 0.0), 10.0)
     return Scene(dataclasses.replace(obj, body=body), camera=camera, grip=grip, seed=number, outputs={"photo"}), body
@@ -194,7 +193,7 @@ def limit_panel(
     px: int = _PX,
     limits: Sequence[int] = (25, 50, 100, 200, 300, MAX_STEPS, 2 * MAX_STEPS),
 ) -> Panel:
-    """A point for each limit: how many rays miss by it, of photos and of fingers that find where an object rests."""
+    """Return a point for each limit: the rays that miss because of it, of photos and of closing fingers."""
     bodies = []
     for number in range(objects):
         scene, body = _scene(RayMarcher, 1.0, number, px)
@@ -206,15 +205,15 @@ def limit_panel(
     for limit, work in zip(limits, works, strict=True):
         lost = 100.0 * float(np.mean(work() != exact))
         points.append(Tradeoff("", f"{limit:,} steps", lost, is_default=limit == MAX_STEPS))
-    made = time_points(points, works, repeats)
+    timed = time_points(points, works, repeats)
     time = f"{len(exact):,} rays of photos and fingers"
-    return Panel("most steps of a ray", time, "% of rays lost", "no limit", 0.01, made, 100.0 / len(exact))
+    return Panel("maximum steps of a ray", time, "% of rays lost", "no limit", 0.01, timed, 100.0 / len(exact))
 
 
 def _met(bodies: Sequence[RayMarcher], max_steps: int) -> NDArray[np.bool_]:
-    """Which of all the rays that were asked of the bodies meet them within so many steps."""
+    """Return which of all recorded rays hit within this many steps."""
     met = []
     for body in bodies:
         body.max_steps = max_steps
-        met += [again() for again in body.asked]
+        met += [again() for again in body.casts]
     return np.concatenate([found if found.dtype == bool else np.isfinite(found) for found in met])

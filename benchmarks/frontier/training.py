@@ -1,4 +1,4 @@
-"""Number formats of the towers in training: how far the gradient of a step turns, and how long the step takes."""
+"""Number formats of the towers in training: rotation of the gradient of a step, and the time of the step."""
 
 import copy
 import dataclasses
@@ -19,19 +19,19 @@ from retrieval.training.step import WeightedLosses, batch_loss
 from retrieval.training.train import set_training_mode
 
 TOLERANCE = 0.1
-"""Of 1 - cosine: a tenth of how far the gradients of two batches lie apart, which have little in common."""
+"""Tolerance of 1 - cosine: a tenth of the value for two batches, whose gradients have little in common."""
 _CPU = torch.device("cpu")
 
 
 def training_formats(sample: Sample) -> ApproximationResult:
-    """float32, and bfloat16 where the processor multiplies it, at the model's weights."""
+    """Compare float32 with bfloat16, if the processor supports it, at the model's weights."""
     step, other = (_Step(sample, 2 if sample.scale.quick else 4, number) for number in range(2))
     fast = has_fast_bfloat16(_CPU)
     points, works = zip(*_formats(sample, step, fast), strict=True)
     gradients = [work() for work in works]
-    turned = [0.0, *(1 - _cosine(gradient, gradients[0]) for gradient in gradients[1:])]
-    made = time_points(
-        [dataclasses.replace(point, error=error) for point, error in zip(points, turned, strict=True)],
+    errors = [0.0, *(1 - _cosine(gradient, gradients[0]) for gradient in gradients[1:])]
+    timed = time_points(
+        [dataclasses.replace(point, error=error) for point, error in zip(points, errors, strict=True)],
         works,
         sample.scale.repeats,
     )
@@ -39,16 +39,16 @@ def training_formats(sample: Sample) -> ApproximationResult:
     time = f"a step of {len(step.touches)} touches and {len(step.photos)} photos, forward and back, one thread"
     return ApproximationResult(
         "Number format of training",
-        "The gradient of all weights by one batch, at the model's own weights, against that in float32; those of two "
-        f"batches have a cosine of {between:.2f} with each other. Gels differ by a few grey levels, which bfloat16 "
-        "rounds away from an image: a training keeps the first layers of some towers in float32."
+        "The gradient of all weights by one batch, at the model's own weights, compared with that in float32. Those of "
+        f"two batches have a cosine of {between:.2f} with each other. Gel images differ by a few grey levels, which "
+        "bfloat16 rounds away, so training computes the first layers of some towers in float32."
         + ("" if fast else " Left out here: this processor multiplies no bfloat16, and trains in float32."),
-        (Panel("turn of the gradient", time, "1 - cosine", "float32", TOLERANCE, made, smallest_error(made)),),
+        (Panel("rotation of the gradient", time, "1 - cosine", "float32", TOLERANCE, timed, smallest_error(timed)),),
     )
 
 
 class _Step:
-    """A batch that lies ready; called with a matcher it gives the gradient of all weights, (weights,)."""
+    """A prepared batch; calling it with a matcher returns the gradient of all weights, (weights,)."""
 
     def __init__(self, sample: Sample, touches: int, number: int) -> None:
         config = sample.checkpoint.config
@@ -70,25 +70,25 @@ class _Step:
 
 
 def _formats(sample: Sample, step: _Step, fast: bool) -> Iterator[tuple[Tradeoff, Callable[[], Tensor]]]:
-    """(a point without its error, its step): float32 first."""
+    """Yield (a point without its error, its step): float32 first."""
     matcher = _trained(sample, step)
     rounds = fast and step.settings.precision != "float32"
     yield Tradeoff("float32", "", 0.0, is_default=not rounds), partial(step, matcher, "float32")
     if fast:
         point = Tradeoff("bfloat16", "first layers in float32", 0.0, is_default=rounds)
         yield point, partial(step, matcher, "bfloat16")
-        yield Tradeoff("bfloat16", "all layers", 0.0), partial(step, _with_no_layer_spared(matcher), "bfloat16")
+        yield Tradeoff("bfloat16", "all layers", 0.0), partial(step, _all_in_bfloat16(matcher), "bfloat16")
 
 
 def _trained(sample: Sample, step: _Step) -> Matcher:
-    """A copy of the model, to be trained."""
+    """Return a copy of the model in training mode."""
     matcher = copy.deepcopy(sample.checkpoint.matcher).requires_grad_(True)
     set_training_mode(matcher, step.settings)
     return matcher
 
 
 class _RoundedLinear(nn.Module):
-    """A layer in bfloat16, wherever it stands."""
+    """A layer in bfloat16."""
 
     def __init__(self, layer: nn.Module) -> None:
         super().__init__()
@@ -100,15 +100,15 @@ class _RoundedLinear(nn.Module):
         return y
 
 
-def _with_no_layer_spared(matcher: Matcher) -> Matcher:
-    """A copy whose towers' convolutions are all computed in bfloat16."""
-    made = copy.deepcopy(matcher)
-    for tower in (made.touch_tower, made.photo_tower):
+def _all_in_bfloat16(matcher: Matcher) -> Matcher:
+    """Return a copy whose towers compute all convolutions in bfloat16."""
+    copied = copy.deepcopy(matcher)
+    for tower in (copied.touch_tower, copied.photo_tower):
         for module in list(tower.modules()):
             for name, child in list(module.named_children()):
                 if isinstance(child, nn.Conv2d):
                     setattr(module, name, _RoundedLinear(child))
-    return made
+    return copied
 
 
 def _cosine(one: Tensor, other: Tensor) -> float:

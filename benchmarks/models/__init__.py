@@ -1,1 +1,1 @@
-"""What makes the shipped models, and what says how good they are."""
+"""Programs that train the shipped models and measure their accuracy."""

@@ -3,9 +3,10 @@
     python -m benchmarks.models.answers RECORDING [RECORDING ...] [--photos 3] [--references 0] [--touches 5]
 
 The photos of each object's first grasps are the catalogue, its next touches reference touches, its last touches the
-queries, in as many orders. Each query is asked of 30 objects with the true one, and of 30 others, with the shipped
-checkpoint, which must not have seen them. An object's logit does not depend on the rest of the catalogue, so that one
-index of all objects of a recording gives the logits of all these catalogues. Intervals resample objects.
+queries, in as many orders. Each query is run against 30 objects with the true one, and against 30 others, with the
+shipped checkpoint, which must not have been trained on them. An object's logit does not depend on the rest of the
+catalogue, so one index of all objects of a recording gives the logits of all these catalogues. Intervals resample
+objects.
 """
 
 import argparse
@@ -34,8 +35,14 @@ BINS = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer to some grasps of one object: is the first object right, is the verdict "match", its P(o | present),
-    and the further grasps that it asks for."""
+    """An answer to some grasps of one object.
+
+    Attributes:
+        right: whether the first object is right.
+        match: whether the verdict is "match".
+        if_present: P(first object | present).
+        more: the number of further grasps that the answer recommends, or None.
+    """
 
     right: bool
     match: bool
@@ -44,7 +51,7 @@ class Answer:
 
     @property
     def advice(self):
-        """The kind of the advice where the verdict is "none of these"."""
+        """Kind of advice for the verdict "none of these"."""
         if not is_clear(self.if_present):
             return "the ranking is not clear"
         return "more grasps hardly change it" if self.more is None else "another grasp would help"
@@ -52,7 +59,13 @@ class Answer:
 
 @dataclass(frozen=True)
 class Series:
-    """Answers after the first grasp, after two, ...; whose grasps, and whether the catalogue has the object."""
+    """Answers after the first grasp, after two, ...
+
+    Attributes:
+        owner: the object of the grasps.
+        present: whether the catalogue contains it.
+        answers: the answers.
+    """
 
     owner: str
     present: bool
@@ -65,35 +78,35 @@ def main():
     parser.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING")
     parser.add_argument("--photos", type=int, default=3, help="grasps of each object whose photos are the catalogue")
     parser.add_argument("--references", type=int, default=0, help="grasps of each object that are reference touches")
-    parser.add_argument("--touches", type=int, default=5, help="grasps of each object that query")
-    given = parser.parse_args()
-    counts = (given.photos, given.references, given.touches)
-    series = [one for recording in given.recordings for one in asked(recording, *counts)]
+    parser.add_argument("--touches", type=int, default=5, help="grasps of each object that are queries")
+    arguments = parser.parse_args()
+    counts = (arguments.photos, arguments.references, arguments.touches)
+    series = [one for recording in arguments.recordings for one in answer_series(recording, *counts)]
     print(f"{len({one.owner for one in series})} objects, {len(series) // 2} orders of their grasps")
     for table in (verdicts, calibration, advised):
         print("\n".join(table(series)) + "\n")
 
 
-def asked(recording, photos, references, touches):
-    """Two series of answers for each object and order of its grasps: with the object in the catalogue, and without."""
+def answer_series(recording, photos, references, touches):
+    """Yield two series of answers for each object and order of its grasps: with the object and without it."""
     with tempfile.TemporaryDirectory() as folder:
         queries = arrange(recording, photos, references, touches, Path(folder, "catalog"))
         build_index(Path(folder, "catalog"), load_checkpoint(shipped_model()), Path(folder, "index"), quiet=True)
         with Searcher.open(Path(folder, "index")) as searcher:
-            names, draw = np.array(sorted(queries)), np.random.default_rng(0)
+            names, rng = np.array(sorted(queries)), np.random.default_rng(0)
             for name in names:
                 codes = searcher.encode(queries[name])
                 for start in range(touches):
                     order = np.roll(np.arange(touches), -start)
                     logits = [logits_of(searcher, codes, order[:count], len(names)) for count in range(1, touches + 1)]
-                    others = draw.permutation(names[names != name])
+                    others = rng.permutation(names[names != name])
                     for catalogue in (np.append(others[: OBJECTS - 1], name), others[:OBJECTS]):
-                        told = [answer(searcher.posterior, own, catalogue, name) for own in enumerate(logits, 1)]
-                        yield Series(f"{recording.name} {name}", name in catalogue, told)
+                        answers = [answer(searcher.posterior, own, catalogue, name) for own in enumerate(logits, 1)]
+                        yield Series(f"{recording.name} {name}", name in catalogue, answers)
 
 
 def logits_of(searcher, codes, rows, count):
-    """Logit of each object after these grasps."""
+    """Return the logit of each object after these grasps."""
     found = searcher.shard.search(
         ShardQuery(codes.embeddings[rows], codes.partials[rows]), count, None, searcher.posterior
     )
@@ -101,7 +114,7 @@ def logits_of(searcher, codes, rows, count):
 
 
 def arrange(recording, photos, references, touches, catalogue):
-    """Fill a catalogue; returns the touches of each object that query."""
+    """Fill a catalogue; return the query touches of each object."""
     grasps = defaultdict(list)
     for grasp in load_grasps(recording):
         grasps[grasp.object_id].append(grasp)
@@ -119,43 +132,46 @@ def arrange(recording, photos, references, touches, catalogue):
     return queries
 
 
-def answer(posterior, numbered, catalogue, name):
-    """The answer from a catalogue of some objects, by their logits after so many grasps."""
-    grasps, logits = numbered
+def answer(posterior, grasps_and_logits, catalogue, name):
+    """Return the answer from a catalogue, by the logits of its objects after this many grasps."""
+    grasps, logits = grasps_and_logits
     own = np.array([logits[one] for one in catalogue])
-    belief, best = posterior.probabilities(own, grasps), int(own.argmax())
-    match, if_present = bool(belief.objects[best] > belief.none), float(belief.objects_if_present[best])
+    probabilities, best = posterior.probabilities(own, grasps), int(own.argmax())
+    match, if_present = (
+        bool(probabilities.objects[best] > probabilities.none),
+        float(probabilities.objects_if_present[best]),
+    )
     more = None if match or not is_clear(if_present) else posterior.more_grasps(own[best], len(own), grasps)
     return Answer(catalogue[best] == name, match, if_present, more)
 
 
 def verdicts(series):
-    """Rows by the number of grasps."""
+    """Yield table rows by the number of grasps."""
     yield "| grasps | R@1 | match, right | match, wrong | none, ranking right | none, ranking wrong | absent: match |"
     yield "|---|---|---|---|---|---|---|"
     for grasps in range(1, len(series[0].answers) + 1, 2):
-        here, gone = split(series, grasps)
+        present, absent = split(series, grasps)
         cells = [
-            share(here, lambda one: one.right),
-            share(here, lambda one: one.match and one.right),
-            share(here, lambda one: one.match and not one.right),
-            share(here, lambda one: not one.match and one.right),
-            share(here, lambda one: not one.match and not one.right),
-            share(gone, lambda one: one.match),
+            fraction(present, lambda one: one.right),
+            fraction(present, lambda one: one.match and one.right),
+            fraction(present, lambda one: one.match and not one.right),
+            fraction(present, lambda one: not one.match and one.right),
+            fraction(present, lambda one: not one.match and not one.right),
+            fraction(absent, lambda one: one.match),
         ]
         yield f"| {grasps} | " + " | ".join(cells) + " |"
 
 
 def split(series, grasps):
-    """(owner, answer) with the object in the catalogue, and without."""
+    """Return (owner, answer) pairs with the object in the catalogue, and without."""
     every = [
         [(one.owner, one.answers[grasps - 1]) for one in series if one.present is there] for there in (True, False)
     ]
     return every[0], every[1]
 
 
-def share(pairs, holds):
-    """The share for which it holds, with its interval over objects."""
+def fraction(pairs, holds):
+    """Return the fraction for which it holds, with its interval over objects."""
     owners = np.unique([owner for owner, _ in pairs], return_inverse=True)[1]
     values = np.array([holds(one) for _, one in pairs], dtype=float)
     value, low, high = interval(lambda rows: float(values[rows].mean()), np.arange(len(values)), list(redrawn(owners)))
@@ -163,19 +179,19 @@ def share(pairs, holds):
 
 
 def calibration(series):
-    """P(object | present) of the first object against how often it is right, in bins; objects that are present."""
+    """Yield P(object | present) of the first object against its accuracy, in bins, for present objects."""
     yield "| grasps | P(object given present) | all: answers, mean, right | none of these: answers, mean, right |"
     yield "|---|---|---|---|"
     for grasps in (1, 3):
-        here, _ = split(series, grasps)
+        present, _ = split(series, grasps)
         for low, high in itertools.pairwise(BINS):
-            own = [one for _, one in here if low < one.if_present <= high]
+            own = [one for _, one in present if low < one.if_present <= high]
             cells = [counted(own), counted([one for one in own if not one.match])]
             yield f"| {grasps} | {low} to {high} | " + " | ".join(cells) + " |"
 
 
 def counted(own):
-    """Number of answers, mean probability, share that is right."""
+    """Return number of answers, mean probability, and fraction of right ones."""
     if not own:
         return "0"
     means = np.mean([(one.if_present, one.right) for one in own], axis=0)
@@ -183,7 +199,7 @@ def counted(own):
 
 
 def advised(series):
-    """What became of "none of these" after the grasps that the advice names; where it names none, after all grasps."""
+    """Yield the outcome of "none of these" after the recommended grasps, or else after all grasps."""
     yield "| grasps | advice | present: answers, ranking right, then match, match right | absent: answers, then match |"
     yield "|---|---|---|---|"
     for grasps in range(1, len(series[0].answers)):
@@ -192,12 +208,16 @@ def advised(series):
             for present in (True, False):
                 own = [one for one in series if one.present is present and not one.answers[grasps - 1].match]
                 own = [one.answers for one in own if one.answers[grasps - 1].advice == advice]
-                own = [each for each in own if grasps + (each[grasps - 1].more or 0) <= len(each)]  # so many were made
+                own = [
+                    each for each in own if grasps + (each[grasps - 1].more or 0) <= len(each)
+                ]  # enough grasps exist
                 later = [each[grasps + (each[grasps - 1].more or len(each) - grasps) - 1] for each in own]
-                then = sum(one.match for one in later)
+                matches = sum(one.match for one in later)
                 right = sum(each[grasps - 1].right for each in own)
-                kept = sum(one.match and one.right for one in later)
-                cells.append(f"{len(own)}, {right}, {then}, {kept}" if present else f"{len(own)}, {then}")
+                right_matches = sum(one.match and one.right for one in later)
+                cells.append(
+                    f"{len(own)}, {right}, {matches}, {right_matches}" if present else f"{len(own)}, {matches}"
+                )
             yield f"| {grasps} | {advice} | " + " | ".join(cells) + " |"
 
 

@@ -1,7 +1,7 @@
-"""`python -m benchmarks.models.in_double COMMAND ...`: retrieve, with float64 wherever it computes with float32.
+"""`python -m benchmarks.models.in_double COMMAND ...`: run retrieve with float64 in place of float32.
 
-Rounding is then out of the way of whoever asks whether two ways to train are the same: in float32 the order of a sum
-alone moves the weights of trained towers apart, within some steps as far as another seed would.
+This removes rounding from a comparison of two ways to train. In float32, the order of a sum alone moves the weights of
+trained towers apart, within some steps as far as another seed would.
 """
 
 import sys
@@ -13,13 +13,13 @@ _single, _from_numpy, _numpy = torch.float32, torch.from_numpy, torch.Tensor.num
 
 
 def _double_of(array):
-    made = _from_numpy(array)
-    return made.double() if made.dtype == _single else made
+    tensor = _from_numpy(array)
+    return tensor.double() if tensor.dtype == _single else tensor
 
 
-def _single_of(tensor, **how):
-    made = _numpy(tensor, **how)
-    return made.astype("float32") if made.dtype == "float64" else made
+def _single_of(tensor, **options):
+    array = _numpy(tensor, **options)
+    return array.astype("float32") if array.dtype == "float64" else array
 
 
 torch.from_numpy, torch.Tensor.numpy, torch.Tensor.float = _double_of, _single_of, torch.Tensor.double

@@ -1,12 +1,13 @@
-"""How accuracy on unseen objects grows with the number of training objects, and with the grasps of each.
+"""Accuracy on unseen objects against the number of training objects, and of grasps of each.
 
     python -m benchmarks.models.scaling RECORDING UNSEEN --out FOLDER --preset mobilenet --init WEIGHTS
 
-RECORDING gives training and validation objects, UNSEEN is a recording of other objects; all of its touches are judged.
-Training sets are nested: 20 objects are among the 80. With `--photographed 0 1000 10000` (and --photos, --touches) each
-number of felt objects is trained on beside so many photographed ones, paired by their labels with pressed ones, and the
-plot has a line for each. With `--seeds 3` every method that draws anything is trained three times, and its numbers are
-means over them. Writes scaling.json and scaling.png in FOLDER; what is fitted already, and features, are used again.
+RECORDING contains training and validation objects, UNSEEN is a recording of other objects; all of its touches are
+scored. Training sets are nested: 20 objects are among the 80. With `--photographed 0 1000 10000` (and --photos,
+--touches), each number of touched objects is combined with this many photo-only objects, paired by their labels with
+touch-only ones, and the plot has a line for each. With `--seeds 3` every randomised method is trained three times, and
+its numbers are means over them. It writes scaling.json and scaling.png in FOLDER; existing fits and features are
+reused.
 """
 
 import argparse
@@ -39,10 +40,10 @@ from robot.recording.folder import read_recording
 
 LINES = ("-", "--", "-.")
 KNOWN = {"shape": slice(0, 1), "relief": slice(1, 2), "both": slice(0, 2)}
-"""Words of a simulated object's name ("mug-ribs-0-00001") that say what it is."""
+"""Words of a simulated object's name ("mug-ribs-0-00001") that describe it."""
 PHOTO_ONLY = 8
-"""Added to numbers of felt objects where they are plotted, so that none has a place on a logarithmic axis."""
-SHOWN = {"pair_accuracy": "pair accuracy", "topn_k5": "K = 5, first guess", "topn_k10": "K = 10, first guess"}
+"""Added to numbers of touched objects in plots, because 0 has no place on a logarithmic axis."""
+SHOWN = {"pair_accuracy": "pair accuracy", "topn_k5": "top-1 accuracy, K = 5", "topn_k10": "top-1 accuracy, K = 10"}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -55,23 +56,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--init", default="imagenet", help="first weights of the towers")
     for side in ("photo", "touch"):
         parser.add_argument(
-            f"--init-{side}", default="", help="of one tower alone, from `retrieve train --task relief`"
+            f"--init-{side}", default="", help="first weights of one tower, from `retrieve train --task relief`"
         )
     for pictures in ("photos", "touches"):
-        parser.add_argument(f"--{pictures}", default="", help="labelled ones, to be paired and trained on too")
-    parser.add_argument("--photographed", type=int, nargs="+", help="photographed objects whose pairs are trained on")
+        parser.add_argument(f"--{pictures}", default="", help="folder of labelled ones, for additional training pairs")
+    parser.add_argument("--photographed", type=int, nargs="+", help="numbers of photo-only objects in training pairs")
     parser.add_argument("--views", nargs="+", help="ablation: other views of a photo than the preset's")
     parser.add_argument("--iterations", type=int, default=1000)
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=["late_fusion", "cca"])
     parser.add_argument("--objects", type=int, nargs="+", default=[20, 80, 320, 1280])
-    parser.add_argument("--grasps", type=int, nargs="+", default=[1, 2, 4], help="of each object, at most")
-    parser.add_argument("--validation", type=int, default=100, help="objects to choose and calibrate by")
-    parser.add_argument("--fingers", type=int, default=2, help="ablation: only the first so many fingers feel")
-    parser.add_argument("--opening", action="store_true", help="addition: how far the jaws stood apart")
-    parser.add_argument("--known", choices=list(KNOWN), help="oracle: this of the object is known")
+    parser.add_argument(
+        "--grasps", type=int, nargs="+", default=[1, 2, 4], help="maximum number of grasps of each object"
+    )
+    parser.add_argument("--validation", type=int, default=100, help="objects for model choice and calibration")
+    parser.add_argument("--fingers", type=int, default=2, help="ablation: use only this many fingers")
+    parser.add_argument("--opening", action="store_true", help="addition: use the opening of the jaws")
+    parser.add_argument("--known", choices=list(KNOWN), help="oracle: this property of the object is known")
     parser.add_argument("--seeds", type=int, default=1, help="trainings of each method")
-    parser.add_argument("--touch-px", type=int, help="ablation: side of the gel images that the towers see")
-    parser.add_argument("--cache", type=Path, help="folder where features are kept (default: FOLDER/features)")
+    parser.add_argument("--touch-px", type=int, help="ablation: side of the gel images in pixels")
+    parser.add_argument("--cache", type=Path, help="folder for encoded features (default: FOLDER/features)")
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
     found = measure(arguments)
@@ -83,27 +86,36 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Fit and judge every training set: each number of objects with all grasps, then all objects with fewer."""
+    """Fit and score every training set: each number of objects with all grasps, then all objects with fewer."""
     config = _config(arguments)
     cache = arguments.cache or arguments.out / "features"
     recordings = (arguments.recording, arguments.unseen)
-    (seen, seen_digest), (unseen, unseen_digest) = (_features(one, config, cache, arguments) for one in recordings)
-    pairs = seen.of_objects(())
+    (recorded, recorded_digest), (unseen, unseen_digest) = (
+        _features(one, config, cache, arguments) for one in recordings
+    )
+    pairs = recorded.of_objects(())
     if config.training.photos:
         pairs = _encoded(labelled_pairs(config), config, cache, arguments)
-    names = [str(name) for name in np.random.default_rng(0).permutation(sorted(set(seen.object_ids)))]
-    validation, pool = seen.of_objects(names[: arguments.validation]), names[arguments.validation :]
-    most = max(arguments.grasps)
+    names = [str(name) for name in np.random.default_rng(0).permutation(sorted(set(recorded.object_ids)))]
+    validation, pool = recorded.of_objects(names[: arguments.validation]), names[arguments.validation :]
+    max_grasps = max(arguments.grasps)
     sizes = sorted({min(count, len(pool)) for count in arguments.objects})
-    asked = [(count, most) for count in sizes] + [(sizes[-1], grasps) for grasps in arguments.grasps if grasps < most]
-    liked = [str(name) for name in np.random.default_rng(1).permutation(sorted(set(pairs.object_ids)))]
-    beside = sorted({min(count, len(liked)) for count in arguments.photographed or [len(liked)]})
+    requested = [(count, max_grasps) for count in sizes] + [
+        (sizes[-1], grasps) for grasps in arguments.grasps if grasps < max_grasps
+    ]
+    pair_objects = [str(name) for name in np.random.default_rng(1).permutation(sorted(set(pairs.object_ids)))]
+    photo_only_counts = sorted(
+        {min(count, len(pair_objects)) for count in arguments.photographed or [len(pair_objects)]}
+    )
     points = []
-    for (count, grasps), photographed in product(asked, beside):
+    for (count, grasps), photographed in product(requested, photo_only_counts):
         if not count and not photographed:
             continue
-        felt, paired = first_grasps(seen.of_objects(pool[:count]), grasps), pairs.of_objects(liked[:photographed])
-        train = felt.concatenate(paired) if count and photographed else felt if count else paired
+        touched, paired = (
+            first_grasps(recorded.of_objects(pool[:count]), grasps),
+            pairs.of_objects(pair_objects[:photographed]),
+        )
+        train = touched.concatenate(paired) if count and photographed else touched if count else paired
         folder = arguments.out / f"{count}-objects-{grasps}-grasps-{photographed}-photographed"
         for name in arguments.methods:
             seeds = range(arguments.seeds if METHODS.load(name).is_seeded else 1)
@@ -122,7 +134,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         "known": arguments.known,
         "touch_px": config.preprocessing.touch_px,
         "views": config.preprocessing.views,
-        "recording": seen_digest,
+        "recording": recorded_digest,
         "unseen": unseen_digest,
         "points": points,
     }
@@ -160,15 +172,15 @@ def _encoded(grasps: Sequence[Grasp], config: Config, cache: Path, arguments: ar
 
 
 def with_opening(features: Features, recording: Path) -> Features:
-    """How far the jaws stood apart, millimetres, as one more feature of each finger."""
+    """Add the opening of the jaws in millimetres as one more feature of each finger."""
     known = {line.grasp_id: line.opening_mm for line in read_recording(recording).grasps}
-    apart = np.array([known[name] for name in features.grasp_ids], dtype=np.float32)
-    column = np.broadcast_to(apart[:, None, None], (*features.touch.shape[:2], 1))
+    openings = np.array([known[name] for name in features.grasp_ids], dtype=np.float32)
+    column = np.broadcast_to(openings[:, None, None], (*features.touch.shape[:2], 1))
     return dataclasses.replace(features, touch=np.concatenate([features.touch, column], axis=2))
 
 
 def first_grasps(features: Features, most: int) -> Features:
-    """The first grasps of each object, at most so many."""
+    """Return the first grasps of each object, at most this many."""
     place = [features.object_ids[:row].count(name) for row, name in enumerate(features.object_ids)]
     return features.select(np.flatnonzero(np.array(place) < most))
 
@@ -176,12 +188,14 @@ def first_grasps(features: Features, most: int) -> Features:
 def score_methods(
     trained: Sequence[Method], validation: Features, unseen: Features, known: str | None
 ) -> dict[str, Any]:
-    """Summaries of the measures on unseen objects, by name: means over trainings, and under "together" the same of
-    the trainings' mean scores."""
+    """Return summaries of the measures on unseen objects: means over trainings, and those of the mean scores.
+
+    The latter are under "together".
+    """
     scored = [tuple(scores_of(method, part, known) for part in (validation, unseen)) for method in trained]
-    alone = summaries([_measures(*tables) for tables in scored], DRAWS, seed=0)
+    single = summaries([_measures(*tables) for tables in scored], DRAWS, seed=0)
     together = (mean_scores(tables) for tables in zip(*scored, strict=True))
-    return alone | {"together": summaries([_measures(*together)], DRAWS, seed=0)}
+    return single | {"together": summaries([_measures(*together)], DRAWS, seed=0)}
 
 
 def _measures(validation: ScoreTable, unseen: ScoreTable) -> dict[str, Measure]:
@@ -189,23 +203,23 @@ def _measures(validation: ScoreTable, unseen: ScoreTable) -> dict[str, Measure]:
 
 
 def mean_scores(tables: Sequence[ScoreTable]) -> ScoreTable:
-    """What several trainings say together."""
+    """Return the mean scores of several trainings."""
     return dataclasses.replace(tables[0], scores=np.mean([table.scores for table in tables], axis=0))
 
 
 def scores_of(method: Method, features: Features, known: str | None = None) -> ScoreTable:
-    """Every touch with every photo; where the shape or the relief is known, photos that show another come last."""
+    """Score every touch with every photo; if shape or relief is known, photos of another one come last."""
     scores = method.score(method.encode_touch(features.touch), method.encode_photo(features.photo))
     if known:
-        told = ["-".join(name.split("-")[KNOWN[known]]) for name in features.object_ids]
-        scores[np.array(told)[:, None] != np.array(told)] -= np.ptp(scores) + 1
+        labels = ["-".join(name.split("-")[KNOWN[known]]) for name in features.object_ids]
+        scores[np.array(labels)[:, None] != np.array(labels)] -= np.ptp(scores) + 1
     return ScoreTable(scores, features.owner, features.owner, np.eye(len(features), dtype=bool))
 
 
 def table(points: Sequence[dict[str, Any]]) -> str:
-    """A Markdown table of the points."""
+    """Return a Markdown table of the points."""
     lines = [
-        "| method | training objects | grasps of each | photographed | " + " | ".join(SHOWN.values()) + " |",
+        "| method | training objects | grasps of each | photo-only objects | " + " | ".join(SHOWN.values()) + " |",
         "|---|---|---|---|" + "---|" * len(SHOWN),
     ]
     for point in points:
@@ -220,20 +234,20 @@ def _cell(summary: dict[str, Any]) -> str:
 
 
 def plot(points: Sequence[dict[str, Any]]) -> Figure:
-    """Two panels: against objects at the most grasps, against grasps at the most objects; a line style a method."""
+    """Plot accuracy against objects at the most grasps, and against grasps at the most objects."""
     figure = Figure(figsize=(10, 4.2), layout="constrained")
     left, right = figure.subplots(1, 2, sharey=True)
     grasps, objects = max(point["grasps"] for point in points), max(point["objects"] for point in points)
     _panel(left, [point for point in points if point["grasps"] == grasps], "objects")
     _panel(right, [point for point in points if point["objects"] == objects], "grasps")
-    left.set(xlabel=f"training objects, {grasps} grasps of each", ylabel="share right, unseen objects", ylim=(0, 1))
+    left.set(xlabel=f"training objects, {grasps} grasps of each", ylabel="accuracy, unseen objects", ylim=(0, 1))
     right.set(xlabel=f"grasps of each of {objects:,} training objects")
     right.legend(loc="lower right", fontsize="small", facecolor="white", edgecolor="none", framealpha=1)
     return figure
 
 
 def plot_photographed(points: Sequence[dict[str, Any]]) -> Figure:
-    """A panel a measure, against felt objects, of the first method; a line for each number of photographed objects."""
+    """Plot each measure of the first method against touched objects; a line per number of photo-only objects."""
     figure = Figure(figsize=(12, 4.2), layout="constrained")
     points = [point for point in points if point["method"] == points[0]["method"]]
     counts = sorted({point["photographed"] for point in points})
@@ -245,10 +259,10 @@ def plot_photographed(points: Sequence[dict[str, Any]]) -> Figure:
             x = np.array([each["objects"] for each in own]) + PHOTO_ONLY
             colour = colormaps["viridis"](0.9 * number / max(len(counts) - 1, 1))
             bars = [list(value - low), list(high - value)]
-            axes.errorbar(x, value, bars, marker="o", capsize=3, color=colour, label=f"{count:,} photographed")
+            axes.errorbar(x, value, bars, marker="o", capsize=3, color=colour, label=f"{count:,} photo-only")
         axes.axhline(points[0][name]["chance"][0], color="black", linestyle=":", linewidth=1)
         ticks = sorted({point["objects"] for point in points})
-        axes.set(xscale="log", xlabel="felt objects", title=label, ylim=(0, 1))
+        axes.set(xscale="log", xlabel="touched objects", title=label, ylim=(0, 1))
         axes.set_xticks([tick + PHOTO_ONLY for tick in ticks], [f"{tick:,}" for tick in ticks])
         axes.minorticks_off()
         axes.grid(alpha=0.3)

@@ -1,23 +1,23 @@
-"""The checkpoint that comes with the package: how it was made, and how good it is on objects that it never saw.
+"""The checkpoint of the package: its training, and its accuracy on unseen objects.
 
     python -m benchmarks.models.shipped make FOLDER --init WEIGHTS
-        collect grasps, photos and presses of other objects each on the simulated rig, teach both towers relief, train
+        collect grasps on the simulated rig, photos and presses of other objects, pretrain both towers on relief, train
         the matcher, and store it as float16 in FOLDER/simulated-mobilenet.safetensors; with --fingers 1 one for touches
         of one gel image, of the same grasps
     python -m benchmarks.models.shipped distil FOLDER
-        teach the candidate_encoder of the shipped checkpoint again, from the recording, pictures and features that `make` left in
-        FOLDER; with --fingers 1 that of the one for one finger
+        retrain the candidate encoder of the shipped checkpoint, from the recording, pictures and features that `make`
+        left in FOLDER; with --fingers 1 that of the one for one finger
     python -m benchmarks.models.shipped verdicts FOLDER
         fit the posterior and the gel check of the shipped checkpoint again, on its validation objects and as many
         training ones, collected into FOLDER/verdicts
     python -m benchmarks.models.shipped references FOLDER
-        fit what reference touches are worth to the shipped checkpoint, on its validation objects, collected into
-        FOLDER/references; with --fingers 1 to the one for one finger
+        fit the calibration of reference touches of the shipped checkpoint, on its validation objects, collected into
+        FOLDER/references; with --fingers 1 that of the one for one finger
     python -m benchmarks.models.shipped score FOLDER
         collect other objects into FOLDER/recording, and evaluate the shipped checkpoint on them: FOLDER/report; with
         --fingers 1 that for one finger, in FOLDER/report-one-finger
 
-Simulated touches are no measure of what the method does on real sensors.
+Accuracy on simulated touches does not predict accuracy on real sensors.
 """
 
 import argparse
@@ -47,21 +47,21 @@ from retrieval.training.features import Features, encode_recording, features_by_
 from retrieval.training.train import labelled_pairs
 from retrieval.training.verdicts import posterior_touches, with_verdicts
 
-# Worlds of the simulated rig. The demo has one of its own (retrieval.commands.demo.SEED), the benchmark has 0.
+# Seeds of the simulated rig. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0.
 SEED_TRAINED, SEED_SCORED = 10_000, 30_000
 SEED_PHOTOS, SEED_TOUCHES = 60_000, 61_000
 RIG, TOUCH_RIG = (Path(__file__).with_name(name) for name in ("shipped_rig.toml", "shipped_touches.toml"))
 PRESET = "relief"
 VALIDATION = 100
-"""Objects that choose the checkpoint and calibrate it."""
+"""Number of objects that choose the checkpoint and calibrate it."""
 VERDICT_GRASPS, REFERENCE_GRASPS = 4, 8
-"""Of each object on which the posterior and the gel check are fitted, and what references are worth."""
+"""Grasps of each object for fitting the posterior and the gel check, and the calibration of references."""
 FOREIGN = 8000
-"""Pictures that are no gels, from which its check of touches learns: more than a training's own."""
+"""Number of non-gel pictures for training its check of touches: more than in an ordinary training."""
 DISTIL_STEPS = 4000
-"""Steps of teaching its candidate_encoder, more than the preset's: it is taught once and used by everyone."""
+"""Training steps of its candidate encoder, more than the preset's: it is trained once and used by everyone."""
 FITTED = 10
-"""Scored objects on which calibration and, as training objects, whatever else is fitted; the others are judged."""
+"""Scored objects for calibration, and as many training objects for other fits; the rest are the test set."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -71,31 +71,29 @@ def main(argv: list[str] | None = None) -> int:
     make = jobs.add_parser("make", help="collect and train the checkpoint that comes with the package")
     make.add_argument("folder", type=Path)
     make.add_argument("--init", type=Path, required=True, help="state dict of MobileNetV2, torchvision's key names")
-    make.add_argument("--objects", type=int, default=1380, help="felt and photographed")
-    make.add_argument("--grasps", type=int, default=4, help="of each of them")
-    make.add_argument("--photos", type=int, default=10_000, help="objects that are only photographed")
-    make.add_argument("--touches", type=int, default=9_361, help="objects that are only pressed")
-    make.add_argument("--steps", type=int, default=2500, help="of teaching each tower relief")
-    make.add_argument("--iterations", type=int, default=2500, help="of training the head")
-    candidate_encoder = jobs.add_parser(
-        "distil", help="teach the candidate_encoder of the shipped checkpoint again, and nothing else of it"
-    )
-    candidate_encoder.add_argument("folder", type=Path)
-    candidate_encoder.add_argument("--steps", type=int, default=DISTIL_STEPS)
-    verdicts = jobs.add_parser("verdicts", help="fit its posterior and its gel check again, and nothing else of it")
+    make.add_argument("--objects", type=int, default=1380, help="number of touched objects")
+    make.add_argument("--grasps", type=int, default=4, help="grasps of each of them")
+    make.add_argument("--photos", type=int, default=10_000, help="number of photo-only objects")
+    make.add_argument("--touches", type=int, default=9_361, help="number of touch-only objects")
+    make.add_argument("--steps", type=int, default=2500, help="steps of pretraining each tower on relief")
+    make.add_argument("--iterations", type=int, default=2500, help="iterations of training the head")
+    distil_job = jobs.add_parser("distil", help="retrain only the candidate encoder of the shipped checkpoint")
+    distil_job.add_argument("folder", type=Path)
+    distil_job.add_argument("--steps", type=int, default=DISTIL_STEPS)
+    verdicts = jobs.add_parser("verdicts", help="fit only its posterior and its gel check again")
     verdicts.add_argument("folder", type=Path)
-    worth = jobs.add_parser("references", help="fit what reference touches are worth, and nothing else of it")
-    worth.add_argument("folder", type=Path)
-    score = jobs.add_parser("score", help="judge it on other objects")
+    references = jobs.add_parser("references", help="fit only the calibration of reference touches")
+    references.add_argument("folder", type=Path)
+    score = jobs.add_parser("score", help="evaluate it on other objects")
     score.add_argument("folder", type=Path)
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
-    for job in (make, candidate_encoder, worth, score):
+    for job in (make, distil_job, references, score):
         job.add_argument(
             "--fingers", type=int, choices=tuple(defaults.SHIPPED), default=2, help="gel images of a touch"
         )
-    for job in (make, verdicts, worth, score):
+    for job in (make, verdicts, references, score):
         job.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
     run = {
@@ -109,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def make_shipped(arguments: argparse.Namespace) -> int:
-    """Collect, encode and train; what is there already is gone on with."""
+    """Collect, encode and train; continue an interrupted run."""
     folder = arguments.folder
     recording = folder / "recording"
     code = collect(recording, arguments, SEED_TRAINED) or pretrain_towers(arguments)
@@ -128,24 +126,24 @@ def make_shipped(arguments: argparse.Namespace) -> int:
     config = dataclasses.replace(config, matcher=matcher, training=training)
     grasps, towers = load_grasps(recording), frozen_matcher(config)
     if arguments.fingers == 1:
-        grasps = [part for grasp in grasps for part in each_finger(grasp)]
+        grasps = [each for grasp in grasps for each in each_finger(grasp)]
     features, pairs = (
-        encode_recording(part, towers, config, folder / "features") for part in (grasps, labelled_pairs(config))
+        encode_recording(each, towers, config, folder / "features") for each in (grasps, labelled_pairs(config))
     )
     split = draw_split(grasps, train=None, validation=VALIDATION)
     train, validation = features.of_objects(split.train).concatenate(pairs), features.of_objects(split.validation)
     trained = folder / f"{arguments.fingers}-fingers"
-    made = trained_checkpoint(MethodSettings(config, folder=trained, quiet=False), train, validation)
+    checkpoint = trained_checkpoint(MethodSettings(config, folder=trained, quiet=False), train, validation)
     about = {"source": recording_source(recording), "data_digest": data_digest(grasps), "pairs": len(pairs)}
-    # The split names whom a recording may not be judged on; no recording holds the pairs.
-    made = dataclasses.replace(made, provenance=made.provenance | about, split=split)
-    made = distilled(made, train, validation, DISTIL_STEPS)
-    store(fit_calibration(made, grasps, features), folder / defaults.SHIPPED[arguments.fingers])
+    # The split excludes its training objects from evaluations; no recording contains the pairs.
+    checkpoint = dataclasses.replace(checkpoint, provenance=checkpoint.provenance | about, split=split)
+    checkpoint = distilled(checkpoint, train, validation, DISTIL_STEPS)
+    store(fit_calibration(checkpoint, grasps, features), folder / defaults.SHIPPED[arguments.fingers])
     return 0
 
 
 def each_finger(grasp: Grasp) -> list[Grasp]:
-    """What each finger felt, as a grasp of its own."""
+    """Return the touch of each finger as a separate grasp."""
     return [
         dataclasses.replace(
             grasp,
@@ -158,7 +156,7 @@ def each_finger(grasp: Grasp) -> list[Grasp]:
 
 
 def pretrain_towers(arguments: argparse.Namespace) -> int:
-    """Photograph and press objects of two other worlds, and teach each tower what it sees there."""
+    """Photograph and press objects of two other seeds, and pretrain each tower on relief with them."""
     for side, pictures, seed, rig in (
         ("photo", "photos", SEED_PHOTOS, "sim"),
         ("touch", "touches", SEED_TOUCHES, TOUCH_RIG),
@@ -167,15 +165,15 @@ def pretrain_towers(arguments: argparse.Namespace) -> int:
         size = ("--objects", getattr(arguments, pictures), "--seed", seed, "--jobs", arguments.jobs)
         code = retrieve("collect", f"--{pictures}-only", "--rig", rig, *size, "--out", folder)
         if not code and not tower.exists():
-            how = ("--config", PRESET, "--init", arguments.init, "--iterations", arguments.steps)
-            code = retrieve("train", folder, "--task", "relief", *how, "--out", tower)
+            options = ("--config", PRESET, "--init", arguments.init, "--iterations", arguments.steps)
+            code = retrieve("train", folder, "--task", "relief", *options, "--out", tower)
         if code:
             return code
     return 0
 
 
 def calibrate_shipped(arguments: argparse.Namespace) -> int:
-    """All weights stay; of the recording that `make` would collect only the objects that are looked at are made."""
+    """Fit posterior and gel check; keep all weights. Collect only the needed objects of the recording of `make`."""
     shipped = load_checkpoint(defaults.shipped_model())
     assert shipped.split is not None
     names = sorted({*shipped.split.validation, *shipped.split.train[:: len(shipped.split.train) // VALIDATION]})
@@ -186,7 +184,7 @@ def calibrate_shipped(arguments: argparse.Namespace) -> int:
 
 
 def calibrate_posterior(arguments: argparse.Namespace) -> int:
-    """All weights and the posterior stay."""
+    """Fit the calibration of reference touches; keep all weights and the posterior."""
     shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
     assert shipped.split is not None
     names = shipped.split.validation
@@ -197,15 +195,15 @@ def calibrate_posterior(arguments: argparse.Namespace) -> int:
     device = default_device()
     with FrozenFeatures(shipped.config, device, features_by_image(grasps, features, device)) as source:
         found = recorded_features(shipped.matcher, source, grasps, what="references", quiet=False)
-    asked = posterior_touches(shipped.matcher, grasps, *found)
-    assert asked is not None
-    made = same_codes(dataclasses.replace(shipped, references=fit_reference_calibration(asked)), shipped)
-    store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
+    trials = posterior_touches(shipped.matcher, grasps, *found)
+    assert trials is not None
+    calibrated = same_codes(dataclasses.replace(shipped, references=fit_reference_calibration(trials)), shipped)
+    store(calibrated, arguments.folder / defaults.SHIPPED[arguments.fingers])
     return 0
 
 
 def collect_of(recording: Path, names: Sequence[str], grasps: int, jobs: int) -> list[Grasp]:
-    """Of the world that `make` collects, these objects."""
+    """Collect these objects of the object set of `make`."""
     robot.collect(
         functools.partial(robot.load_rig, str(RIG), seed=SEED_TRAINED),
         recording,
@@ -218,13 +216,13 @@ def collect_of(recording: Path, names: Sequence[str], grasps: int, jobs: int) ->
 
 
 def same_codes(made: Checkpoint, before: Checkpoint) -> Checkpoint:
-    """A checkpoint with the towers and the head of the one before: an index of that one keeps its halves."""
-    halves_of = [*before.provenance.get(PARTIALS_FROM, []), before.digest]
-    return dataclasses.replace(made, provenance=made.provenance | {PARTIALS_FROM: halves_of})
+    """Return a checkpoint with the towers and head of the one before: indexes keep their partial activations."""
+    partials_from = [*before.provenance.get(PARTIALS_FROM, []), before.digest]
+    return dataclasses.replace(made, provenance=made.provenance | {PARTIALS_FROM: partials_from})
 
 
 def fit_calibration(made: Checkpoint, grasps: list[Grasp], features: Features) -> Checkpoint:
-    """A checkpoint with its posterior and its gel check."""
+    """Return a checkpoint with its posterior and its gel check."""
     assert made.split is not None
     device = default_device()
     with FrozenFeatures(made.config, device, features_by_image(grasps, features, device)) as source:
@@ -233,7 +231,7 @@ def fit_calibration(made: Checkpoint, grasps: list[Grasp], features: Features) -
 
 
 def distil_shipped(arguments: argparse.Namespace) -> int:
-    """Towers, head, calibration and split stay; the candidate_encoder reads the weights that are shipped, rounded as they are."""
+    """Retrain the candidate encoder on the shipped, rounded weights; keep towers, head, calibration and split."""
     shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
     grasps = load_grasps(arguments.folder / "recording")
     if arguments.fingers == 1:
@@ -251,16 +249,16 @@ def distil_shipped(arguments: argparse.Namespace) -> int:
 
 
 def distilled(made: Checkpoint, train: Features, validation: Features, steps: int) -> Checkpoint:
-    """A checkpoint with the preset's candidate_encoder."""
+    """Return a checkpoint with the preset's candidate encoder."""
     training = dataclasses.replace(made.config.training, distil_steps=steps)
     config = dataclasses.replace(made.config.with_candidate_encoder_of(load_config(PRESET)), training=training)
-    with one_thread():  # as training on features that stand still
+    with one_thread():  # like training on frozen features
         partials = (distil.feature_partials(made.matcher, part) for part in (train, validation))
         return distil.with_candidate_encoder(made, config, *partials)
 
 
 def store(made: Checkpoint, out: Path) -> None:
-    """Write a checkpoint once more, as float16; where its first weights lay on this machine concerns nobody."""
+    """Write a checkpoint as float16, without the paths of its first weights on this machine."""
     training = dataclasses.replace(
         made.config.training, init="imagenet", init_photo="", init_touch="", photos="", touches=""
     )
@@ -269,7 +267,7 @@ def store(made: Checkpoint, out: Path) -> None:
 
 
 def score_shipped(arguments: argparse.Namespace) -> int:
-    """The whole report on objects of another world, felt by other gels."""
+    """Write the whole report on objects of another seed, touched by other gels."""
     recording = arguments.folder / "recording"
     if code := collect(recording, arguments, SEED_SCORED):
         return code
@@ -284,35 +282,35 @@ def score_shipped(arguments: argparse.Namespace) -> int:
 
 
 def first_finger(recording: Path) -> Path:
-    """A recording of the same grasps, of which one finger felt anything, beside `recording`; images are linked."""
+    """Write a recording of the same grasps with only one finger, next to `recording`; images are linked."""
     out = recording.with_name(recording.name + "-one-finger")
     out.mkdir(exist_ok=True)
     if not (out / "images").exists():
         (out / "images").symlink_to((recording / "images").resolve(), target_is_directory=True)
     (out / "recording.json").write_bytes((recording / "recording.json").read_bytes())
     lines = [json.loads(line) for line in (recording / "metadata.jsonl").read_text().splitlines()]
-    felt = [{name: value for name, value in line.items() if not name.startswith("touch_b_")} for line in lines]
-    (out / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in felt))
+    one_finger = [{name: value for name, value in line.items() if not name.startswith("touch_b_")} for line in lines]
+    (out / "metadata.jsonl").write_text("".join(json.dumps(line) + "\n" for line in one_finger))
     return out
 
 
 def draw_split(grasps: list[Grasp], train: int | None, validation: int) -> Split:
-    """So many objects to train and to validate on, the others to test; train None: all others train."""
+    """Split objects into this many for training and validation, the others for test; train None: all others train."""
     names = sorted({grasp.object_id for grasp in grasps})
     names = [str(name) for name in np.random.default_rng(0).permutation(names)]
-    held, others = names[:validation], names[validation:]
-    seen = others if train is None else others[:train]
-    return Split(0, tuple(sorted(seen)), tuple(sorted(held)), tuple(sorted(set(others) - set(seen))))
+    validated, others = names[:validation], names[validation:]
+    trained = others if train is None else others[:train]
+    return Split(0, tuple(sorted(trained)), tuple(sorted(validated)), tuple(sorted(set(others) - set(trained))))
 
 
 def collect(recording: Path, arguments: argparse.Namespace, seed: int) -> int:
-    """`retrieve collect` on the simulated rig."""
+    """Run `retrieve collect` on the simulated rig."""
     size = ("--objects", arguments.objects, "--grasps", arguments.grasps, "--seed", seed, "--jobs", arguments.jobs)
     return retrieve("collect", "--rig", RIG, *size, "--out", recording)
 
 
 def retrieve(*arguments: object) -> int:
-    """Say a command as a user would type it, and run it."""
+    """Print a command as a user would type it, and run it."""
     words = [str(argument) for argument in arguments]
     print("$ retrieve " + " ".join(words), file=sys.stderr, flush=True)
     return run_command(words)

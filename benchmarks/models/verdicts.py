@@ -1,13 +1,13 @@
-"""What "match", "none of these", "no contact" and "not a gel image" are worth, for the checkpoint that is shipped.
+"""Accuracy of "match", "none of these", "no contact" and "not a gel image" for the shipped checkpoint.
 
     python -m benchmarks.models.verdicts FOLDER
-        writes FOLDER/verdicts.md, verdicts.json and risk.png; goes on where it stopped
+        writes FOLDER/verdicts.md, verdicts.json and risk.png; continues an interrupted run
 
-Objects of a world and gels that the checkpoint never saw: 120 of them felt (the recording of `python -m
-benchmarks.models.shipped score FOLDER`), 880 more only photographed, so that catalogues of up to 1,000 objects can be
-searched with the object in the hand and without it. Then inputs that are no touches. Pictures of real sensors and
-things are looked at where the variable TOUCH_DATA names a folder that has them. Simulated touches are no measure of
-what real sensors do.
+The objects and gels have seeds that the checkpoint was not trained on: 120 touched objects (the recording of `python -m
+benchmarks.models.shipped score FOLDER`), and 880 photo-only objects, so that catalogues of up to 1,000 objects can be
+searched with the queried object and without it. Then it tests inputs that are not touches. Pictures of real sensors and
+things are tested if the variable TOUCH_DATA names a folder that has them. Results on simulated touches do not predict
+those on real sensors.
 """
 
 import argparse
@@ -44,7 +44,7 @@ from robot.collection import CollectSettings, collect
 from robot.rig import load_rig
 from robot.sim.objects.draw import draw_object
 
-FELT, PHOTOGRAPHED, GRASPS = 120, 1000, 8
+TOUCHED, PHOTOGRAPHED, GRASPS = 120, 1000, 8
 SIZES, SET_SIZES, SETS = (20, 100, 1000), (1, 2, 3, 5), 4
 INPUTS, DRAWS = 1000, 1000
 OTHER_OPTICS = "gelsight"
@@ -57,16 +57,16 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--model", type=Path, default=shipped_model(), help="another checkpoint than the shipped one")
     parser.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
-    folder, made = arguments.folder, load_checkpoint(arguments.model)
-    if made.posterior is None or made.gel_check is None:
+    folder, checkpoint = arguments.folder, load_checkpoint(arguments.model)
+    if checkpoint.posterior is None or checkpoint.gel_check is None:
         parser.error(f"{arguments.model} has no posterior or no check of touches; train it again")
-    collected = argparse.Namespace(objects=FELT, grasps=GRASPS, jobs=arguments.jobs)
-    if code := shipped.collect(folder / "recording", collected, shipped.SEED_SCORED):
+    options = argparse.Namespace(objects=TOUCHED, grasps=GRASPS, jobs=arguments.jobs)
+    if code := shipped.collect(folder / "recording", options, shipped.SEED_SCORED):
         return code
     photograph(folder / "photographed")
-    catalogues, curves = evaluate_catalogues(made, folder)
-    inputs = list(evaluate_inputs(made, folder, arguments.jobs))
-    document = {"model": made.digest, "catalogues": catalogues, "inputs": inputs, "risk": curves}
+    catalogues, curves = evaluate_catalogues(checkpoint, folder)
+    inputs = list(evaluate_inputs(checkpoint, folder, arguments.jobs))
+    document = {"model": checkpoint.digest, "catalogues": catalogues, "inputs": inputs, "risk": curves}
     (folder / "verdicts.json").write_text(json.dumps(document, indent=1) + "\n", "utf-8")
     (folder / "verdicts.md").write_text("\n".join(as_markdown(document)) + "\n", "utf-8")
     plot(curves, folder / "risk.png")
@@ -75,11 +75,11 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def photograph(folder: Path) -> None:
-    """A photo of each object that is not felt."""
+    """Write a photo of each object that is not touched."""
     folder.mkdir(parents=True, exist_ok=True)
     with load_rig(str(shipped.RIG), seed=shipped.SEED_SCORED) as rig, Bar("photograph", PHOTOGRAPHED, "objects") as bar:
-        bar.advance(FELT)
-        for index in range(FELT, PHOTOGRAPHED):
+        bar.advance(TOUCHED)
+        for index in range(TOUCHED, PHOTOGRAPHED):
             name = draw_object(shipped.SEED_SCORED, index).object_id
             if not (folder / f"{name}.png").is_file():
                 rig.prepare(name, 0)
@@ -88,12 +88,18 @@ def photograph(folder: Path) -> None:
             bar.advance()
 
 
-# With the object and without it ----------------------------------------------------------------------------
+# Catalogues with the object and without it -----------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class OpenSetRatios:
-    """Log likelihood ratios (T, K) of catalogues with the object, which stands first, and without; whose (T,)."""
+    """Log likelihood ratios of catalogues with the queried object and without it.
+
+    Attributes:
+        present: (T, K) ratios with the object, which comes first.
+        absent: (T, K) ratios without it.
+        owner: (T,) the object of each query.
+    """
 
     present: NDArray[np.float64]
     absent: NDArray[np.float64]
@@ -101,18 +107,18 @@ class OpenSetRatios:
 
 
 def evaluate_catalogues(made: Checkpoint, folder: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """A row for each size of catalogue and number of grasps, and the curves of risk against coverage."""
+    """Return a row for each size of catalogue and number of grasps, and the curves of risk against coverage."""
     scored = score_photos(made, folder)
     rows, curves = [], {}
     for grasps in SET_SIZES:
-        for size, asked in questions(made, scored, grasps):
-            rows.append({"objects": size, "grasps": grasps, "questions": len(asked.owner)} | measured(asked))
-            curves[f"{size} objects, {grasps} grasp{'s' * (grasps > 1)}"] = risk_against_coverage(asked)
+        for size, ratios in query_sets(made, scored, grasps):
+            rows.append({"objects": size, "grasps": grasps, "questions": len(ratios.owner)} | measured(ratios))
+            curves[f"{size} objects, {grasps} grasp{'s' * (grasps > 1)}"] = risk_against_coverage(ratios)
     return rows, curves
 
 
 def score_photos(made: Checkpoint, folder: Path) -> ScoredTouches:
-    """Match logits of the touches of the felt objects with photos of all."""
+    """Return match logits of the touches of the touched objects with photos of all."""
     grasps = load_grasps(folder / "recording")
     features = encode_recording(grasps, made.matcher, made.config, folder / "features")
     files = sorted((folder / "photographed").glob("*.png"))
@@ -121,25 +127,25 @@ def score_photos(made: Checkpoint, folder: Path) -> ScoredTouches:
         photos = torch.cat([torch.from_numpy(features.photo), photo_features(made.matcher, images)])
         touches = made.matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1)).partial.numpy()
         partials = made.matcher.photo_encoding(photos).partial.numpy()
-    judge = scorer_of(made.matcher.head)
-    felt = features.owner
-    owner = np.concatenate([felt, felt.max() + 1 + np.arange(len(files))])
-    own = np.zeros((len(felt), len(owner)), dtype=bool)
-    own[np.arange(len(felt)), np.arange(len(felt))] = True
+    scorer = scorer_of(made.matcher.head)
+    touch_owner = features.owner
+    owner = np.concatenate([touch_owner, touch_owner.max() + 1 + np.arange(len(files))])
+    own = np.zeros((len(touch_owner), len(owner)), dtype=bool)
+    own[np.arange(len(touch_owner)), np.arange(len(touch_owner))] = True
     return ScoredTouches(
-        np.stack([judge.logits(partial_activation[None], partials) for partial_activation in touches]), felt, owner, own
+        np.stack([scorer.logits(touch_partial[None], partials) for touch_partial in touches]), touch_owner, owner, own
     )
 
 
-def questions(made: Checkpoint, scored: ScoredTouches, grasps: int) -> Iterator[tuple[int, OpenSetRatios]]:
-    """Of sets of so many grasps, for every size of catalogue; rivals drawn by a seed."""
+def query_sets(made: Checkpoint, scored: ScoredTouches, grasps: int) -> Iterator[tuple[int, OpenSetRatios]]:
+    """Yield sets of this many grasps for every size of catalogue; the other objects are drawn by a seed."""
     assert made.posterior is not None
     rng = np.random.default_rng([7, grasps])
     sets = []
     for name in np.unique(scored.touch_owner):
-        mine = np.flatnonzero(scored.touch_owner == name)
-        if len(mine) > grasps:
-            sets += [[row] for row in mine] if grasps == 1 else [rng.permutation(mine)[:grasps] for _ in range(SETS)]
+        own = np.flatnonzero(scored.touch_owner == name)
+        if len(own) > grasps:
+            sets += [[row] for row in own] if grasps == 1 else [rng.permutation(own)[:grasps] for _ in range(SETS)]
     rows = np.array(sets)
     ratios = IdentificationTrials.of(scored, rows).log_ratios(made.posterior)
     owner = scored.touch_owner[rows[:, 0]]
@@ -151,10 +157,10 @@ def questions(made: Checkpoint, scored: ScoredTouches, grasps: int) -> Iterator[
         yield size, OpenSetRatios(ranked[:, :count], ranked[:, 1 : count + 1], owner)
 
 
-def measured(asked: OpenSetRatios) -> dict[str, Any]:
-    """Shares, each with its 95 % interval over objects, drawn again with all their questions."""
-    present, absent = (posterior_probabilities(part) for part in (asked.present, asked.absent))
-    first_right = asked.present.argmax(1) == 0
+def measured(ratios: OpenSetRatios) -> dict[str, Any]:
+    """Return fractions with 95 % intervals over objects, resampled with all their queries."""
+    present, absent = (posterior_probabilities(part) for part in (ratios.present, ratios.absent))
+    first_right = ratios.present.argmax(1) == 0
     accepted, accepted_absent = (part[:, 1:].max(1) > part[:, 0] for part in (present, absent))
     known, unknown = -present[:, 0], -absent[:, 0]
     found: dict[str, Callable[[NDArray[np.int64]], float]] = {
@@ -166,19 +172,19 @@ def measured(asked: OpenSetRatios) -> dict[str, Any]:
         "auroc_of_none": lambda rows: auroc(known[rows], unknown[rows]),
         "false_accepts_at_95": lambda rows: float((unknown[rows] >= np.quantile(known[rows], 0.05)).mean()),
     }
-    draws = list(redrawn(asked.owner))
-    every = np.arange(len(asked.owner))
+    draws = list(redrawn(ratios.owner))
+    every = np.arange(len(ratios.owner))
     values = {name: interval(measure, every, draws) for name, measure in found.items()}
-    said = np.concatenate([present[:, 1:].max(1), absent[:, 1:].max(1)])
-    true = np.concatenate([first_right, np.zeros(len(absent), dtype=bool)])
-    return {**values, "calibration_error": calibration_error(said, true)}
+    probabilities = np.concatenate([present[:, 1:].max(1), absent[:, 1:].max(1)])
+    is_right = np.concatenate([first_right, np.zeros(len(absent), dtype=bool)])
+    return {**values, "calibration_error": calibration_error(probabilities, is_right)}
 
 
 def posterior_probabilities(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(T, 1 + K) probabilities of "none of these" and of each object, at even odds: what `Posterior.believe` gives."""
+    """Return probabilities (T, 1 + K) of "none of these" and each object, at even odds, as in `Posterior`."""
     terms = np.column_stack([np.zeros(len(ratios)), ratios - np.log(ratios.shape[1])])
-    shares = np.exp(terms - terms.max(1, keepdims=True))
-    return np.asarray(shares / shares.sum(1, keepdims=True))
+    weights = np.exp(terms - terms.max(1, keepdims=True))
+    return np.asarray(weights / weights.sum(1, keepdims=True))
 
 
 def redrawn(owner: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
@@ -196,38 +202,40 @@ def interval(
 
 
 def auroc(known: NDArray[np.float64], unknown: NDArray[np.float64]) -> float:
-    """Chance that a question with the object looks more like one than a question without; equals count half."""
+    """Return the probability that a query with the object scores higher than one without; ties count half."""
     ranks = rankdata(np.concatenate([known, unknown]))[: len(known)]
     return float((ranks.sum() - len(known) * (len(known) + 1) / 2) / (len(known) * len(unknown)))
 
 
-def calibration_error(said: NDArray[np.float64], true: NDArray[np.bool_]) -> float:
-    """Mean distance of what was said from how often it came true, over 10 equal bins."""
-    bins = np.minimum((10 * said).astype(int), 9)
-    return float(np.abs(np.bincount(bins, weights=said - true, minlength=10)).sum() / len(said))
+def calibration_error(stated: NDArray[np.float64], true: NDArray[np.bool_]) -> float:
+    """Return the mean distance between stated probability and frequency, over 10 equal bins."""
+    bins = np.minimum((10 * stated).astype(int), 9)
+    return float(np.abs(np.bincount(bins, weights=stated - true, minlength=10)).sum() / len(stated))
 
 
-def risk_against_coverage(asked: OpenSetRatios) -> dict[str, list[float]]:
-    """Answers by the probability of their first guess: share answered, and share of these that is wrong; half of the
-    questions are without the object, and every answer to these is wrong."""
-    parts = [posterior_probabilities(part)[:, 1:] for part in (asked.present, asked.absent)]
-    said = np.concatenate([part.max(1) for part in parts])
+def risk_against_coverage(ratios: OpenSetRatios) -> dict[str, list[float]]:
+    """Return the fraction answered, and the fraction of wrong ones among these, by decreasing top-1 probability.
+
+    Half of the queries are without the object, and every answer to these is wrong.
+    """
+    parts = [posterior_probabilities(part)[:, 1:] for part in (ratios.present, ratios.absent)]
+    probabilities = np.concatenate([part.max(1) for part in parts])
     wrong = np.concatenate([parts[0].argmax(1) != 0, np.ones(len(parts[1]), dtype=bool)])
-    order = np.argsort(-said, kind="stable")
+    order = np.argsort(-probabilities, kind="stable")
     counts = np.arange(1, len(order) + 1)
     risk = np.cumsum(wrong[order]) / counts
     shown = np.unique(np.linspace(len(order) // 100, len(order) - 1, 100).astype(int))
     return {"coverage": (counts[shown] / len(order)).tolist(), "risk": risk[shown].tolist()}
 
 
-# What is no touch ------------------------------------------------------------------------------------------
+# Inputs that are not touches -------------------------------------------------------------------------------
 
 
 def evaluate_inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[dict[str, Any]]:
-    """A row for each kind of input: how many, and what they were called."""
+    """Yield a row for each kind of input: their number, and their verdicts."""
     assert made.gel_check is not None
     fast = for_inference(made.matcher, ["touch_tower"])
-    for name, wanted, pictures in inputs(made, folder, jobs):
+    for name, expected, pictures in inputs(made, folder, jobs):
         readings = []
         for start in range(0, len(pictures), 16):
             with torch.inference_mode():
@@ -235,14 +243,14 @@ def evaluate_inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[dict[
                 reading = fast.gel_readings(features)
                 assert reading is not None
                 readings.append(reading.numpy())
-        called = made.gel_check.classify(np.concatenate(readings))
-        right = called.count(wanted)
+        verdicts = made.gel_check.classify(np.concatenate(readings))
+        right = verdicts.count(expected)
         yield {
             "input": name,
-            "count": len(called),
-            "wanted": wanted,
-            "called": {verdict: called.count(verdict) for verdict in (CONTACT, NO_CONTACT, NOT_A_GEL)},
-            "share": [right / len(called), *binomial_interval(right, len(called))],
+            "count": len(verdicts),
+            "wanted": expected,
+            "called": {verdict: verdicts.count(verdict) for verdict in (CONTACT, NO_CONTACT, NOT_A_GEL)},
+            "share": [right / len(verdicts), *binomial_interval(right, len(verdicts))],
         }
 
 
@@ -250,7 +258,7 @@ Reader = Callable[[], list[RgbImage]]
 
 
 def inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[tuple[str, str, list[Reader]]]:
-    """Name, what it should be called, and readers of touches (an image for each finger)."""
+    """Yield name, expected verdict, and readers of touches (an image for each finger)."""
     settings, fingers = made.config.preprocessing, made.config.matcher.fingers
     grasps = load_grasps(folder / "recording")
 
@@ -261,7 +269,7 @@ def inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[tuple[str, str
         return lambda: [settings.touch(picture)] * fingers
 
     yield "touches", CONTACT, [files(grasp.touches) for grasp in grasps][:INPUTS]
-    yield "untouched gels", NO_CONTACT, [files(grasp.backgrounds) for grasp in grasps][:INPUTS]
+    yield "no-contact gels", NO_CONTACT, [files(grasp.backgrounds) for grasp in grasps][:INPUTS]
     photos = [read_rgb(path) for path in sorted((folder / "photographed").glob("*.png"))[:200]]
     drawn: dict[str, list[RgbImage]] = {}
     for name, picture in draw_foreign(INPUTS, 240, photos, [], seed=99):
@@ -284,7 +292,7 @@ def inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[tuple[str, str
 
 
 def other_optics(folder: Path, jobs: int, files: Callable[[Sequence[Path]], Reader]) -> list[Reader]:
-    """Touches of the same objects by gels with the lamps of another sensor."""
+    """Collect touches of the same objects by gels with the lamps of another sensor."""
     rig = folder / "other_optics.toml"
     rig.write_text(f'rig = "sim"\noptics = "{OTHER_OPTICS}"\n', "utf-8")
     recording = folder / "other_optics"
@@ -293,16 +301,16 @@ def other_optics(folder: Path, jobs: int, files: Callable[[Sequence[Path]], Read
     return [files(grasp.touches) for grasp in load_grasps(recording)]
 
 
-# For people ------------------------------------------------------------------------------------------------
+# Output ----------------------------------------------------------------------------------------------------
 
 
 def as_markdown(document: dict[str, Any]) -> Iterator[str]:
-    """Both tables."""
+    """Yield the lines of both tables."""
     columns = {
-        "first_guess": "first guess",
+        "first_guess": "R@1",
         "match_and_right": "match, right",
         "match_and_wrong": "match, wrong",
-        "none_though_there": "none, though there",
+        "none_though_there": "none, though present",
         "match_though_absent": "object absent: match",
         "auroc_of_none": "AUROC",
         "false_accepts_at_95": "false accepts at 95 %",
@@ -313,7 +321,7 @@ def as_markdown(document: dict[str, Any]) -> Iterator[str]:
         cells = [_with_interval(row[name]) for name in columns]
         yield f"| {row['objects']:,} | {row['grasps']} | " + " | ".join(cells) + f" | {row['calibration_error']:.3f} |"
     yield ""
-    yield "| input | number | should be called | is called so | contact / no contact / not a gel image |"
+    yield "| input | number | expected verdict | fraction | contact / no contact / not a gel image |"
     yield "|---|---|---|---|---|"
     for row in document["inputs"]:
         counts = " / ".join(str(count) for count in row["called"].values())
@@ -325,7 +333,7 @@ def _with_interval(values: Sequence[float]) -> str:
 
 
 def plot(curves: dict[str, Any], path: Path) -> None:
-    """Risk against coverage, a panel for each size of catalogue."""
+    """Plot risk against coverage, a panel for each size of catalogue."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -337,10 +345,10 @@ def plot(curves: dict[str, Any], path: Path) -> None:
             name = f"{size} objects, {grasps} grasp{'s' * (grasps > 1)}"
             panel.plot(curves[name]["coverage"], curves[name]["risk"], label=f"{grasps} grasp{'s' * (grasps > 1)}")
         panel.axhline(1 - 0.5 / size, color="grey", linestyle=":", linewidth=1, label="chance")
-        panel.set(title=f"{size:,} objects", xlabel="share answered", xlim=(0, 1), ylim=(0, 1))
-    axes[0].set_ylabel("share of answers that are wrong")
+        panel.set(title=f"{size:,} objects", xlabel="coverage", xlim=(0, 1), ylim=(0, 1))
+    axes[0].set_ylabel("risk: fraction of wrong answers")
     axes[0].legend(loc="lower right", fontsize=8)
-    figure.suptitle("Half of the questions are of objects that the catalogue lacks", fontsize=10)
+    figure.suptitle("Half of the queries are of objects that are not in the catalogue", fontsize=10)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 

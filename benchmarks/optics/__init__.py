@@ -1,1 +1,1 @@
-"""Gel optics fitted to real presses, and judged on presses held out."""
+"""Gel optics fitted to real presses, and evaluated on held-out presses."""

@@ -1,8 +1,8 @@
-"""Least squares behind the fitted optics: features of a press, weights by ridge, and where a press really was.
+"""Least squares for the fitted optics: features of a press, weights by ridge regression, and the pose of a press.
 
-A press has a pose: x, y of its middle (pixels) and the contact radius (mm). By label, or aligned: the three numbers
-that best explain the picture, the colours held fixed. Alignment looks at the picture that it explains, as the
-manual alignment of Taxim's authors does; colours are never fitted to a picture that is judged.
+A press has a pose: x, y of its middle (pixels) and the contact radius (mm). It comes from the label, or from alignment:
+the three numbers that best explain the picture with fixed colours. Alignment uses the picture that it explains, like
+the manual alignment of Taxim's authors; colours are never fitted to a picture of the test set.
 """
 
 from collections.abc import Sequence
@@ -12,23 +12,23 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.optics.real_presses import PIXEL_MM, BallTable, Presses, ball_table, seen_centre
+from benchmarks.optics.real_presses import PIXEL_MM, BallTable, Presses, ball_table, changed_centre
 from robot.sim.gel.fitted_optics import feature_count, normal_features, place_terms
 
 Matrix = NDArray[np.float64]
 
-STRIDE = 4  # every fourth pixel of a crop is fitted: neighbours say the same
-_ALIGN_STRIDE = 8  # three numbers need fewer still
-_PROBE = np.array([0.5, 0.5, 0.02])  # px, px, mm: the steps of a difference quotient
-_LONGEST = np.array([6.0, 6.0, 0.1])  # what a pose may move at a time
+STRIDE = 4  # fit every fourth pixel of a crop: neighbours are nearly equal
+_ALIGN_STRIDE = 8  # three numbers need even fewer
+_PROBE = np.array([0.5, 0.5, 0.02])  # px, px, mm: steps of the difference quotients
+_LONGEST = np.array([6.0, 6.0, 0.1])  # maximum change of a pose per step
 _DEEPEST = 0.985  # contact radius over the ball's; at the equator the slope is infinite
-_FIRST_CONTACT_MM = {"gelsight": 1.8, "gelsight_mini": 0.7}  # where aligning starts; labels of the Mini are no radii
-_FIRST_SHARE = 0.9  # of the ball's radius, at most
+_FIRST_CONTACT_MM = {"gelsight": 1.8, "gelsight_mini": 0.7}  # start of the alignment; labels of the Mini are not radii
+_FIRST_FRACTION = 0.9  # maximum, relative to the ball's radius
 
 
 @dataclass(frozen=True)
 class OpticsSetting:
-    """What a model is made of; the layer's numbers shape the surface, the others its colours."""
+    """Settings of a model; the layer's numbers shape the surface, the others its colours."""
 
     degree: int = 3
     places: int = 6
@@ -38,36 +38,36 @@ class OpticsSetting:
     poisson: float = 0.48
     ball_mm: float = 2.0
     contact_share: float = (
-        1.0  # of the labelled radius, where labels are used: people draw what they see, skirt and all
+        1.0  # factor of labelled radii: people draw the visible edge, which includes the gel around the contact
     )
 
     def table(self) -> BallTable:
-        """The profiles of this ball on this layer."""
+        """Return the profiles of this ball on this layer."""
         return ball_table(self.ball_mm, self.thickness_mm, self.poisson, self.reaches_mm)
 
 
 def labelled_poses(presses: Presses, setting: OpticsSetting) -> Matrix:
-    """(count, 3): the labels, the radius scaled; no contact reaches the equator."""
+    """Return the labelled poses (count, 3) with scaled radii; no contact reaches the equator."""
     radii = np.minimum(presses.radii * PIXEL_MM * setting.contact_share, _DEEPEST * setting.ball_mm)
     return np.column_stack([presses.centres, radii])
 
 
 def first_pose(presses: Presses, index: int, setting: OpticsSetting) -> Matrix:
-    """(3,): where aligning starts, with no use of the label but for the crop."""
-    contact = min(_FIRST_CONTACT_MM[presses.name], _FIRST_SHARE * setting.ball_mm)
-    return np.array([*seen_centre(presses, index), contact])
+    """Return the start pose (3,) of the alignment; the label only places the crop."""
+    contact = min(_FIRST_CONTACT_MM[presses.name], _FIRST_FRACTION * setting.ball_mm)
+    return np.array([*changed_centre(presses, index), contact])
 
 
 @lru_cache(maxsize=512)
 def change(presses: Presses, index: int, stride: int = STRIDE) -> Matrix:
-    """(pixels, 3): the pressed less the unpressed picture over the crop."""
+    """Return the pressed minus the unpressed picture over the crop, (pixels, 3)."""
     rows, cols = presses.crop(index)
     pressed = presses.pictures[index][rows, cols][::stride, ::stride].astype(np.float64)
     return np.reshape(pressed - presses.no_contact[rows, cols][::stride, ::stride], (-1, 3))
 
 
 def features(presses: Presses, index: int, pose: Matrix, setting: OpticsSetting, stride: int = STRIDE) -> Matrix:
-    """(pixels, features x places) of a press in this pose; the order is that of FittedOptics."""
+    """Return the features (pixels, features x places) of a press in this pose, in the order of FittedOptics."""
     rows, cols = presses.crop(index)
     y = np.arange(rows.start, rows.stop, stride, dtype=np.float64)[:, None]
     x = np.arange(cols.start, cols.stop, stride, dtype=np.float64)[None, :]
@@ -87,7 +87,7 @@ def features(presses: Presses, index: int, pose: Matrix, setting: OpticsSetting,
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """What least squares needs of one press: A^T A, A^T b, b^T b, and how many values b has."""
+    """Sums of one press for least squares: A^T A, A^T b, b^T b, and the number of values in b."""
 
     square: Matrix
     cross: Matrix
@@ -95,23 +95,23 @@ class Gram:
     values: int
 
     def loss(self, weights: Matrix) -> float:
-        """Mean squared error of these weights on this press."""
+        """Return the mean squared error of these weights on this press."""
         fit = np.sum(weights * (self.square @ weights)) - 2 * np.sum(weights * self.cross)
         return float((self.total + fit) / self.values)
 
     def part(self, columns: NDArray[np.intp]) -> "Gram":
-        """The same press with some of the columns only."""
+        """Return the same press with only some of the columns."""
         return Gram(self.square[np.ix_(columns, columns)], self.cross[columns], self.total, self.values)
 
 
 def gram(presses: Presses, index: int, pose: Matrix, setting: OpticsSetting) -> Gram:
-    """The Gram matrices of one press."""
-    one, wanted = features(presses, index, pose, setting), change(presses, index)
-    return Gram(one.T @ one, one.T @ wanted, float(np.sum(wanted**2)), wanted.size)
+    """Return the Gram matrices of one press."""
+    one, target = features(presses, index, pose, setting), change(presses, index)
+    return Gram(one.T @ one, one.T @ target, float(np.sum(target**2)), target.size)
 
 
 def solve(grams: Sequence[Gram], ridge: float) -> Matrix:
-    """(columns, 3) weights by ridge regression, every column scaled to unit rms first; columns of zeros get 0."""
+    """Return weights (columns, 3) by ridge regression with columns scaled to unit rms; columns of zeros get 0."""
     square, cross = sum(one.square for one in grams), sum(one.cross for one in grams)
     pixels = sum(one.values for one in grams) / 3
     scale = np.sqrt(np.maximum(np.diag(square) / pixels, 1e-24))
@@ -120,7 +120,7 @@ def solve(grams: Sequence[Gram], ridge: float) -> Matrix:
 
 
 def columns_of(wide: OpticsSetting, narrow: OpticsSetting) -> NDArray[np.intp]:
-    """Which columns of a wide model make up a narrower one (lower degree, fewer places, no reaches or the same)."""
+    """Return the columns of a wide model that form a narrower one (lower degree, fewer places, same or no reaches)."""
     lit, lit_wide = feature_count(narrow.degree, 0), feature_count(wide.degree, 0)
     chosen = [*range(lit), *range(lit_wide, lit_wide + 3 * len(narrow.reaches_mm))]
     return np.array([one * wide.places + place for one in chosen for place in range(narrow.places)], dtype=np.intp)
@@ -130,7 +130,7 @@ def columns_of(wide: OpticsSetting, narrow: OpticsSetting) -> NDArray[np.intp]:
 
 
 def aligned(presses: Presses, index: int, pose: Matrix, weights: Matrix, setting: OpticsSetting, steps: int) -> Matrix:
-    """The pose after some Gauss-Newton steps on the picture, the colours (`weights`) held fixed."""
+    """Return the pose after some Gauss-Newton steps on the picture, with fixed colours (`weights`)."""
     limit = _DEEPEST * setting.ball_mm
     for _ in range(steps):
         error = _error(presses, index, pose, weights, setting)
@@ -138,7 +138,7 @@ def aligned(presses: Presses, index: int, pose: Matrix, weights: Matrix, setting
         errors = [_error(presses, index, probe, weights, setting) for probe in probes]
         jacobian = (np.stack(errors, axis=-1) - error[:, None]) / _PROBE
         square = jacobian.T @ jacobian
-        # A little damping, for a press that shows nothing.
+        # A little damping, for a press without information.
         step = np.linalg.solve(square + np.diag(1e-3 * np.diag(square) + 1e-9), -jacobian.T @ error)
         pose = pose + np.clip(step, -_LONGEST, _LONGEST)
         pose[2] = np.clip(pose[2], 0.05, limit)
@@ -146,12 +146,12 @@ def aligned(presses: Presses, index: int, pose: Matrix, weights: Matrix, setting
 
 
 def _error(presses: Presses, index: int, pose: Matrix, weights: Matrix, setting: OpticsSetting) -> Matrix:
-    seen = features(presses, index, pose, setting, _ALIGN_STRIDE) @ weights
-    return np.ravel(seen - change(presses, index, _ALIGN_STRIDE))
+    predicted = features(presses, index, pose, setting, _ALIGN_STRIDE) @ weights
+    return np.ravel(predicted - change(presses, index, _ALIGN_STRIDE))
 
 
 def align_all(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, rounds: int = 8) -> Matrix:
-    """Poses (count, 3) of the chosen presses, by turns with their colours; the others stay where aligning starts."""
+    """Fit poses (count, 3) and colours of the chosen presses in turn; the others keep their start pose."""
     poses = np.array([first_pose(presses, index, setting) for index in range(len(presses))])
     for _ in range(rounds):
         weights = solve([gram(presses, index, poses[index], setting) for index in chosen], setting.ridge)

@@ -1,7 +1,7 @@
-"""Fit the optics of one sensor to its presses, everything chosen on the presses that are fitted.
+"""Fit the optics of one sensor to its presses; all choices use only the fitted presses.
 
-Thickness of the layer, degree, places, reaches and ridge are chosen by inner folds, the blur of the unpressed picture
-(it frees it of noise) on the fitted presses themselves.
+Inner folds choose thickness of the layer, degree, places, reaches and ridge. The fitted presses themselves choose the
+blur of the unpressed picture, which removes its noise.
 """
 
 import itertools
@@ -29,23 +29,23 @@ from benchmarks.optics.least_squares import (
 from benchmarks.optics.real_presses import BALLS_MM, CROP, Presses
 from robot.sim.gel.fitted_optics import FittedLimits, FittedOptics, place_powers
 
-# The Mini was pressed in the middle alone, and lightly: what place, neighbourhood and fourth powers do to its colours
-# cannot be known elsewhere and for other objects, where they draw rings and false colours.
+# The Mini was pressed only in the middle, and lightly. The effect of place, neighbourhood and fourth powers on its
+# colours is unknown elsewhere and for other objects, where they would draw rings and false colours.
 SHALLOW = ("gelsight_mini",)
-# The Mini was pressed on three places, ever deeper: a random split holds out a depth, not a place.
+# The Mini was pressed at three places, deeper each time: a random split holds out a depth, not a place.
 SAME_PLACE = {"gelsight_mini": (range(13), range(13, 18), range(18, 24))}
-ALIGNING = OpticsSetting(degree=3, places=3, reaches_mm=())  # small, so that poses are not explained away by colours
+ALIGNING = OpticsSetting(degree=3, places=3, reaches_mm=())  # small, so that colours cannot compensate for wrong poses
 _ALIGN_STEPS = 10
 _FLAT_DEGREE = 6
 _WIDE = OpticsSetting(degree=4, places=6)
 _BLURS_PX = (0.0, 1.0, 2.0, 4.0, 8.0)
 _THICKNESSES_MM = (2.0, 4.0, 6.0)
-_SHARES = (1.0, 0.5)
+_CONTACT_SCALES = (1.0, 0.5)
 _RIDGES = (1e-5, 1e-4, 1e-3, 1e-2)
 
 
 def candidates(wide: OpticsSetting, *, careful: bool = False) -> Iterator[OpticsSetting]:
-    """What to choose from, for one shape of the surface; `careful`: no degree 4, no places, no neighbourhood."""
+    """Yield the settings for one shape of the surface; `careful`: no degree 4, no places, no neighbourhood."""
     reaches = ((),) if careful else ((), wide.reaches_mm)
     degrees, places_known = ((2, 3), (1,)) if careful else ((2, 3, 4), (1, 3, 6))
     for degree, places, ridge, reach in itertools.product(degrees, places_known, _RIDGES, reaches):
@@ -54,7 +54,15 @@ def candidates(wide: OpticsSetting, *, careful: bool = False) -> Iterator[Optics
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A setting, its weights, the poses (count, 3) of the fitted presses, and how the unpressed picture is blurred."""
+    """A fitted model.
+
+    Attributes:
+        setting: its setting.
+        weights: its weights.
+        poses: (count, 3) poses of the fitted presses.
+        align: whether poses are aligned instead of labelled.
+        blur_px: blur of the unpressed picture.
+    """
 
     setting: OpticsSetting
     weights: Matrix
@@ -64,7 +72,7 @@ class Fit:
 
 
 def fit(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, *, align: bool) -> Fit:
-    """Weights of one setting on the chosen presses, and the blur that suits them best."""
+    """Return the weights of one setting on the chosen presses, and the best blur for them."""
     poses = _poses(presses, chosen, setting, align=align)
     weights = solve([gram(presses, one, poses[one], setting) for one in chosen], setting.ridge)
     fitted = Fit(setting, weights, poses, align)
@@ -77,16 +85,16 @@ def fit(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, *, alig
 
 
 def select(presses: Presses, chosen: Sequence[int], *, align: bool, ship: bool = False) -> OpticsSetting:
-    """The setting with the least squared error over inner folds of the chosen presses.
+    """Return the setting with the least squared error over inner folds of the chosen presses.
 
-    To `ship`, a fold is a place where presses share places, and the choice is careful where every press was shallow
-    (see SHALLOW): the model is to hold elsewhere and for other objects, not on these presses alone.
+    With `ship`, a fold is a place if presses share places, and the choice is careful if every press was shallow (see
+    SHALLOW): the model must generalise to other places and objects, not only to these presses.
     """
     folds = _place_folds(presses, chosen) if ship else [list(range(first, len(chosen), 3)) for first in range(3)]
     losses: list[tuple[float, OpticsSetting]] = []
-    shares = (1.0,) if align else _SHARES
-    for thickness, ball, share in itertools.product(_THICKNESSES_MM, BALLS_MM[presses.name], shares):
-        wide = replace(_WIDE, thickness_mm=thickness, ball_mm=ball, contact_share=share)
+    contact_scales = (1.0,) if align else _CONTACT_SCALES
+    for thickness, ball, contact_scale in itertools.product(_THICKNESSES_MM, BALLS_MM[presses.name], contact_scales):
+        wide = replace(_WIDE, thickness_mm=thickness, ball_mm=ball, contact_share=contact_scale)
         poses = _poses(presses, chosen, wide, align=align)
         grams = [gram(presses, one, poses[one], wide) for one in chosen]
         for setting in candidates(wide, careful=ship and presses.name in SHALLOW):
@@ -95,7 +103,7 @@ def select(presses: Presses, chosen: Sequence[int], *, align: bool, ship: bool =
 
 
 def _place_folds(presses: Presses, chosen: Sequence[int]) -> list[list[int]]:
-    """Which of the chosen (by position) are judged together: a place at a time, or every third."""
+    """Return the positions in `chosen` that are held out together: one place at a time, or every third."""
     groups: Sequence[Sequence[int]] = SAME_PLACE.get(presses.name) or [list(chosen)[first::3] for first in range(3)]
     folds = [[at for at, one in enumerate(chosen) if one in group] for group in groups]
     return [fold for fold in folds if fold]
@@ -108,7 +116,7 @@ def _poses(presses: Presses, chosen: Sequence[int], setting: OpticsSetting, *, a
 
 
 def _change(presses: Presses, index: int, pose: Matrix, model: Fit) -> Matrix:
-    """The change (200, 200, 3) that a model predicts for a press in this pose."""
+    """Return the change (200, 200, 3) that a model predicts for a press in this pose."""
     return np.reshape(features(presses, index, pose, model.setting, 1) @ model.weights, (CROP, CROP, 3))
 
 
@@ -124,7 +132,7 @@ def _inner_loss(
 
 
 def to_optics(presses: Presses, fitted: Fit) -> FittedOptics:
-    """The fit as optics that a sensor can use, with the limits of what was seen."""
+    """Return the fit as optics for a sensor, with the limits of its presses."""
     setting = fitted.setting
     flat = _tuples(flat_weights(presses.no_contact))
     weights, limits = _tuples(fitted.weights), _limits(presses, fitted)
@@ -132,7 +140,7 @@ def to_optics(presses: Presses, fitted: Fit) -> FittedOptics:
 
 
 def _limits(presses: Presses, fitted: Fit) -> FittedLimits:
-    """Tilts that half of the presses reached, the crops' places, and what the neighbourhoods were."""
+    """Return tilts that half of the presses reached, the crops' places, and the ranges of the neighbourhoods."""
     smoothed = np.concatenate([_neighbourhood(presses, one, pose, fitted) for one, pose in enumerate(fitted.poses)])
     rows, cols = zip(*(presses.crop(index) for index in range(len(presses))), strict=True)
     height, width = presses.no_contact.shape[:2]
@@ -148,14 +156,14 @@ def _limits(presses: Presses, fitted: Fit) -> FittedLimits:
 
 
 def _neighbourhood(presses: Presses, index: int, pose: Matrix, fitted: Fit) -> Matrix:
-    """(pixels, 3 x reaches): the smoothed displacement of a press and its slopes, without the places."""
+    """Return the smoothed displacement of a press and its slopes, without the places: (pixels, 3 x reaches)."""
     count = 3 * len(fitted.setting.reaches_mm)
     plain = features(presses, index, pose, fitted.setting)[:, :: fitted.setting.places]
     return plain[:, plain.shape[1] - count :]
 
 
 def flat_weights(no_contact: NDArray[np.uint8]) -> Matrix:
-    """(terms, 3): the unpressed picture as a polynomial in x and y (-1 to 1), by least squares."""
+    """Fit the unpressed picture by a polynomial in x and y (-1 to 1), (terms, 3), by least squares."""
     height, width = no_contact.shape[:2]
     y, x = np.mgrid[0:height:4, 0:width:4]
     x, y = (2 * x.ravel() - width + 1) / width, (2 * y.ravel() - height + 1) / height
@@ -168,7 +176,7 @@ def _tuples(values: Matrix) -> tuple[tuple[float, ...], ...]:
 
 
 def held_out_error(presses: Presses, index: int, model: Fit) -> PictureError:
-    """The error of a model on a press that it was not fitted to."""
+    """Return the error of a model on a press that it was not fitted to."""
     if model.align:
         start = first_pose(presses, index, model.setting)
         pose = aligned(presses, index, start, model.weights, model.setting, _ALIGN_STEPS)
@@ -178,7 +186,7 @@ def held_out_error(presses: Presses, index: int, model: Fit) -> PictureError:
 
 
 def picture_error(presses: Presses, index: int, change: Any, blur_px: float = 0.0) -> PictureError:
-    """Errors of untouched + change on the crop of a press."""
+    """Return the errors of unpressed picture + change on the crop of a press."""
     rows, cols = presses.crop(index)
     return compare(
         presses.smooth_no_contact(blur_px)[rows, cols] + np.asarray(change), presses.pictures[index][rows, cols]

@@ -1,17 +1,17 @@
-"""Fit gel optics to real presses and judge them on presses held out: `python -m benchmarks.optics.photometric --out
-FOLDER`.
+"""Fit gel optics to real presses and test them on held-out presses.
 
-Everything is chosen on the fitting presses (benchmarks.optics.model_choice). A held-out press is predicted as the
-sensor's own unpressed picture and the change that the model sees, and compared over a crop of 200 x 200 pixels round
-the ball.
+    python -m benchmarks.optics.photometric --out FOLDER
 
-    labels       centre and contact radius of the held-out press are its label's
-    aligned      these three numbers are found in its picture, the colours held fixed
+The fitting presses make all choices (benchmarks.optics.model_choice). A held-out press is predicted as the sensor's own
+unpressed picture plus the model's change, and compared over a crop of 200 x 200 pixels around the ball.
+
+    labels       centre and contact radius of the held-out press are those of its label
+    aligned      these three numbers are fitted to its picture, with fixed colours
                  (benchmarks.optics.least_squares)
-    as shipped   aligned, and chosen so as to hold at other places and for other objects than the presses
+    as shipped   aligned, and chosen to generalise to other places and objects than the presses
 
 Taxim's published figures (L1 5.565, SSIM .882, PSNR 30.97; Si & Yuan, RA-L 2022) are for other objects than balls,
-crops of 400 x 400 and a manual alignment: they say how good the field's pictures are, not who wins here.
+crops of 400 x 400 and a manual alignment: they show the quality of the field's pictures, not a ranking.
 """
 
 import argparse
@@ -41,25 +41,25 @@ SOURCE = (
     "fitted to the ball presses in the Python package taxim 1.4.1 (MIT licence, T. Schneider; Si & Yuan, RA-L 2022)"
 )
 
-# Judging ---------------------------------------------------------------------------------------------------
+# Evaluation ------------------------------------------------------------------------------------------------
 
 
 @dataclass
 class Scores:
-    """Errors of one way of predicting, by press: a press may be held out by several splits."""
+    """Errors of one way of predicting, by press; several splits may hold out the same press."""
 
     by_press: dict[int, list[PictureError]] = field(default_factory=dict)
 
     def add(self, index: int, error: PictureError) -> None:
-        """Note the error on one held-out press."""
+        """Record the error on one held-out press."""
         self.by_press.setdefault(index, []).append(error)
 
     def per_press(self) -> Matrix:
-        """(presses, 4): l1, mse, ssim, psnr of each press, the mean over its splits."""
+        """Return l1, mse, ssim, psnr of each press, the mean over its splits: (presses, 4)."""
         return np.array([np.mean(errors, axis=0) for errors in self.by_press.values()])
 
     def summary(self, seed: int = 0, draws: int = 2000) -> dict[str, dict[str, float]]:
-        """Mean and 95 % bootstrap interval over presses for each measure."""
+        """Return mean and 95 % bootstrap interval over presses for each measure."""
         table = self.per_press()
         rng = np.random.default_rng([seed, 0xB007])
         means = table[rng.integers(0, len(table), (draws, len(table)))].mean(axis=1)
@@ -72,14 +72,14 @@ class Scores:
 
 
 def splits(count: int, fit_count: int, number: int = SPLITS) -> Iterator[tuple[list[int], list[int]]]:
-    """Random (fitting, held-out) presses, by seeds 0, 1, ..."""
+    """Yield random (fitting, held-out) presses, by seeds 0, 1, ..."""
     for seed in range(number):
         order = [int(one) for one in np.random.default_rng([seed, 0x5B117]).permutation(count)]
         yield sorted(order[:fit_count]), sorted(order[fit_count:])
 
 
 def evaluate(presses: Presses, *, number: int = SPLITS, taxim_table: Any = None) -> dict[str, Scores]:
-    """Held-out errors of every way of predicting, over `number` splits."""
+    """Return held-out errors of every way of predicting, over `number` splits."""
     out: dict[str, Scores] = {}
     for chosen, held_out in splits(len(presses), FIT_COUNT[presses.name], number):
         models = _models(presses, chosen)
@@ -96,7 +96,7 @@ def evaluate(presses: Presses, *, number: int = SPLITS, taxim_table: Any = None)
 
 
 def _models(presses: Presses, chosen: Sequence[int]) -> dict[str, Fit]:
-    """The best model by labels and aligned, and those of the shipped kind of every degree."""
+    """Return the best models by labels and by alignment, and those of the shipped kind of every degree."""
     by_label = fit(presses, chosen, select(presses, chosen, align=False), align=False)
     by_picture = fit(presses, chosen, select(presses, chosen, align=True), align=True)
     setting = select(presses, chosen, align=True, ship=True)
@@ -111,12 +111,12 @@ def _models(presses: Presses, chosen: Sequence[int]) -> dict[str, Fit]:
 
 
 def by_degree(degree: int) -> str:
-    """The row of the shipped kind of model, of this degree."""
+    """Return the row name of the shipped kind of model of this degree."""
     return f"as shipped, degree {degree}"
 
 
 def _across_places(presses: Presses, groups: Sequence[range]) -> Scores:
-    """Held-out errors where no fitted press was at the place of the one judged."""
+    """Return held-out errors for presses at places without fitted presses."""
     scores = Scores()
     for group in groups:
         chosen = [one for one in range(len(presses)) if one not in group]
@@ -130,7 +130,7 @@ def _across_places(presses: Presses, groups: Sequence[range]) -> Scores:
 
 
 def document(presses: Presses, scores: dict[str, Scores]) -> dict[str, Any]:
-    """The content of a shipped file: source, the model fitted to every press, and its held-out figures."""
+    """Return the content of a shipped file: source, the model fitted to every press, and its held-out results."""
     everything = range(len(presses))
     setting = select(presses, everything, align=True, ship=True)
     fitted = fit(presses, everything, setting, align=True)
@@ -150,9 +150,9 @@ def document(presses: Presses, scores: dict[str, Scores]) -> dict[str, Any]:
 
 
 def table(presses: Presses, scores: dict[str, Scores]) -> str:
-    """The held-out figures for a person: mean and 95 % interval over presses."""
+    """Return the held-out results as text: mean and 95 % interval over presses."""
     fitted, held = FIT_COUNT[presses.name], len(presses) - FIT_COUNT[presses.name]
-    lines = [f"{presses.name}: fitted on {fitted}, judged on {held} other presses, {SPLITS} random splits", ""]
+    lines = [f"{presses.name}: fitted on {fitted}, tested on {held} other presses, {SPLITS} random splits", ""]
     lines.append(f"{'':54}{'L1':>18}{'MSE':>22}{'SSIM':>21}{'PSNR dB':>21}")
     for name, one in scores.items():
         cells = [
@@ -164,7 +164,7 @@ def table(presses: Presses, scores: dict[str, Scores]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fit, judge, print, and write <out>/<sensor>.json; 0, or the error's exit code."""
+    """Fit, test, print, and write <out>/<sensor>.json; return 0, or the error's exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.optics.photometric", description=__doc__.splitlines()[0]
     )

@@ -1,14 +1,14 @@
-"""Real presses of a ball into a GelSight, and the surface that each should have made.
+"""Real presses of a ball into a GelSight, and the surface of each.
 
-The data are the `dataPack.npz` of the package `taxim` (MIT): `f0` the untouched gel, `imgs` the pressed one,
+The data are the `dataPack.npz` of the package `taxim` (MIT): `f0` the unpressed gel, `imgs` the pressed ones,
 `touch_center` (x, y) and `touch_radius` in pixels, labelled by hand. The arrays are plain; nothing is unpickled.
 
-Channels are kept as stored and the first is called red. It cannot be told from the files: looked at so, the presses
-on the Mini have the colours of other Mini recordings, and the lamps of the older sensor stand red below on the left,
-green above on the left, blue on the right. (The package itself takes the first for blue.)
+Channels keep their order, and the first is called red. The files do not state the order. In this order, the presses on
+the Mini have the colours of other Mini recordings, and the lamps of the older sensor are red below on the left, green
+above on the left, blue on the right. (The package itself takes the first for blue.)
 
-The surface is our own contact solver's: a ball on a bonded layer, solved once for a row of depths; a press is
-found between them by its contact radius. Only shape is asked here, so the gel's modulus does not matter.
+The surface comes from our own contact solver: a ball on a bonded layer, solved once for a series of depths; a press is
+interpolated by its contact radius. Only the shape matters here, so the gel's modulus has no effect.
 """
 
 import math
@@ -32,14 +32,22 @@ Matrix = NDArray[np.float64]
 
 CROP = 200
 PIXEL_MM = 0.0295
-# Of the ball of the Mini's presses nothing is said: its radius is chosen with the rest of the model.
+# The radius of the ball of the Mini's presses is not documented: it is chosen with the rest of the model.
 BALLS_MM = {"gelsight": (2.0,), "gelsight_mini": (0.7, 0.85, 1.0, 2.0)}
-TAXIM_BALL_MM = 2.0  # with this radius Taxim's tables do best, on either sensor
+TAXIM_BALL_MM = 2.0  # Taxim's tables have the least error with this radius, on either sensor
 
 
 @dataclass(frozen=True, eq=False)
 class Presses:
-    """`no_contact` (rows, cols, 3), `pictures` (count, rows, cols, 3), both uint8; labels in pixels."""
+    """Presses of one sensor.
+
+    Attributes:
+        name: the sensor.
+        no_contact: (rows, cols, 3) uint8, the unpressed gel.
+        pictures: (count, rows, cols, 3) uint8, the pressed gels.
+        centres: (count, 2) labelled centres x, y in pixels.
+        radii: (count,) labelled radii in pixels.
+    """
 
     name: str
     no_contact: NDArray[np.uint8]
@@ -51,11 +59,11 @@ class Presses:
         return len(self.pictures)
 
     def smooth_no_contact(self, blur_px: float) -> Matrix:
-        """(rows, cols, 3): the untouched gel, its noise blurred away (standard deviation; 0 leaves it alone)."""
+        """Return the unpressed gel (rows, cols, 3), with its noise blurred away (standard deviation; 0: unchanged)."""
         return _blurred(self, blur_px)
 
     def crop(self, index: int) -> tuple[slice, slice]:
-        """Rows and columns of 200 x 200 pixels round the labelled centre, moved inside the picture."""
+        """Return rows and columns of 200 x 200 pixels around the labelled centre, moved inside the picture."""
         starts = [
             min(max(round(float(middle)) - CROP // 2, 0), size - CROP)
             for middle, size in zip(self.centres[index][::-1], self.no_contact.shape[:2], strict=True)
@@ -70,7 +78,7 @@ def _blurred(presses: Presses, blur_px: float) -> Matrix:
 
 
 def find_presses() -> Path:
-    """The folder with a folder per sensor in the installed `taxim`. Raises BadRobotInput where it is missing."""
+    """Return the folder with a folder per sensor in the installed `taxim`. Raise BadRobotInput if it is missing."""
     spec = find_spec("taxim")
     if spec is None or not spec.submodule_search_locations:
         raise BadRobotInput(
@@ -81,9 +89,9 @@ def find_presses() -> Path:
 
 
 def read_presses(folder: str | Path, name: str) -> Presses:
-    """Read `<folder>/<name>/dataPack.npz`. Raises UnknownName, BadRobotInput for a file that is not one."""
+    """Read `<folder>/<name>/dataPack.npz`. Raise UnknownName, or BadRobotInput for an invalid file."""
     if name not in BALLS_MM:
-        raise UnknownName(f"no presses are called {name!r}; known are {', '.join(BALLS_MM)}")
+        raise UnknownName(f"there are no presses {name!r}; known are {', '.join(BALLS_MM)}")
     path = Path(folder) / name / "dataPack.npz"
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as pack:
@@ -109,7 +117,7 @@ def read_presses(folder: str | Path, name: str) -> Presses:
 
 
 def _check_labels(path: Path, labels: Matrix) -> None:
-    """labels (count, 3): x, y, radius. A NaN among them would make every fitted weight NaN."""
+    """Check the labels (count, 3): x, y, radius. A NaN would make every fitted weight NaN."""
     bad = np.flatnonzero(~(np.isfinite(labels).all(axis=1) & (labels[:, 2] > 0)))
     if len(bad):
         raise BadRobotInput(
@@ -118,8 +126,8 @@ def _check_labels(path: Path, labels: Matrix) -> None:
 
 
 @lru_cache(maxsize=256)
-def seen_centre(presses: Presses, index: int, threshold: float = 25) -> tuple[float, float]:
-    """x, y of the middle of what changed in the crop (pixels of the picture): a start that needs no label."""
+def changed_centre(presses: Presses, index: int, threshold: float = 25) -> tuple[float, float]:
+    """Return x, y of the middle of the change in the crop (pixels of the picture): a start without a label."""
     rows, cols = presses.crop(index)
     change = np.abs(presses.pictures[index][rows, cols].astype(np.float32) - presses.no_contact[rows, cols]).sum(axis=2)
     change = cv2.GaussianBlur(change, (0, 0), 3)
@@ -133,23 +141,23 @@ def seen_centre(presses: Presses, index: int, threshold: float = 25) -> tuple[fl
 
 # Surfaces --------------------------------------------------------------------------------------------------
 
-_GRID, _HALF_MM = 129, 8.0  # of the solved press: 0.12 mm; the skirt ends well inside
+_GRID, _HALF_MM = 129, 8.0  # of the solved press: 0.12 mm; the displaced region ends well inside
 _DEPTHS = 22
-_FINE = 1600  # points of a profile, 0.005 mm
-_EXACT = 0.98  # up to this share of the contact radius the gel is the ball
+_FINE = 1600  # points of a profile, 0.005 mm apart
+_EXACT = 0.98  # up to this fraction of the contact radius the gel follows the ball
 
 
 @dataclass(frozen=True, eq=False)
 class BallTable:
-    """Profiles along the radius for a row of contact radii: displacement first, then smoothed over each reach."""
+    """Profiles along the radius for a series of contact radii: displacement first, then smoothed over each reach."""
 
     ball_mm: float
-    contact_mm: Matrix  # (depths,), rising
+    contact_mm: Matrix  # (depths,), increasing
     heights: Matrix  # (depths, 1 + reaches, points)
-    slopes: Matrix  # the same, along the radius
+    slopes: Matrix  # same shape, along the radius
 
     def at(self, contact_mm: float, x_mm: Matrix, y_mm: Matrix) -> list[tuple[Matrix, Matrix, Matrix]]:
-        """For displacement and each smoothed one: value, slope along x, slope along y, at these offsets."""
+        """Return value, slope along x and slope along y at these offsets, for displacement and each smoothed one."""
         radius = np.hypot(x_mm, y_mm)
         safe = np.maximum(radius, 1e-9)
         out = []
@@ -164,18 +172,18 @@ class BallTable:
     def _profiles(self, contact_mm: float) -> tuple[Matrix, Matrix]:
         known = self.contact_mm
         upper = int(np.clip(np.searchsorted(known, contact_mm), 1, len(known) - 1))
-        share = float(np.clip((contact_mm - known[upper - 1]) / (known[upper] - known[upper - 1]), 0, 1))
-        heights = (1 - share) * self.heights[upper - 1] + share * self.heights[upper]
-        return heights, (1 - share) * self.slopes[upper - 1] + share * self.slopes[upper]
+        fraction = float(np.clip((contact_mm - known[upper - 1]) / (known[upper] - known[upper - 1]), 0, 1))
+        heights = (1 - fraction) * self.heights[upper - 1] + fraction * self.heights[upper]
+        return heights, (1 - fraction) * self.slopes[upper - 1] + fraction * self.slopes[upper]
 
     def _ball_slope(self, radius: Matrix) -> Matrix:
-        """Steep, but finite, at the equator: r / sqrt(R^2 - r^2)."""
+        """Return r / sqrt(R^2 - r^2), limited near the equator."""
         return radius / np.sqrt(np.maximum(self.ball_mm**2 - radius**2, (0.05 * self.ball_mm) ** 2))
 
 
 @lru_cache(maxsize=16)
 def ball_table(ball_mm: float, thickness_mm: float, poisson: float, reaches_mm: tuple[float, ...]) -> BallTable:
-    """Press a rigid ball to a row of depths; nearly to its equator for the deepest."""
+    """Press a rigid ball to a series of depths; the deepest is nearly to its equator."""
     pixel = 2 * _HALF_MM / _GRID
     axis = (np.arange(_GRID) - _GRID // 2) * pixel
     square = axis[:, None] ** 2 + axis**2
@@ -194,7 +202,7 @@ def ball_table(ball_mm: float, thickness_mm: float, poisson: float, reaches_mm: 
 
 
 def _radial(displacement: Matrix, reaches_mm: tuple[float, ...], pixel: float) -> Matrix:
-    """(1 + reaches, points): the middle row to the right, as it is and smoothed over each reach."""
+    """Return the middle row to the right, unsmoothed and smoothed over each reach: (1 + reaches, points)."""
     maps = [displacement, *(gaussian_filter(displacement, reach / pixel) for reach in reaches_mm)]
     return np.stack([one[_GRID // 2, _GRID // 2 :] for one in maps])
 
@@ -203,11 +211,11 @@ def _radial(displacement: Matrix, reaches_mm: tuple[float, ...], pixel: float) -
 
 
 def taxim_change(presses: Presses, index: int, table: Any) -> Matrix:
-    """The change (200, 200, 3) that Taxim's binned table predicts for a labelled press; a reproduction.
+    """Return the change (200, 200, 3) that Taxim's binned table predicts for a labelled press; a reproduction.
 
     Si & Yuan, RA-L 2022: the ball inside the contact, outside it a pyramid of Gaussian blurs; slopes by np.gradient
-    (theirs are central differences too); 125 x 125 bins of tilt and direction with a polynomial in x and y each.
-    `table`: grad_r, grad_g, grad_b (125, 125, 6). Without their shadows and the curve of their gel pad.
+    (theirs are central differences too); 125 x 125 bins of tilt and direction, each with a polynomial in x and y.
+    `table`: grad_r, grad_g, grad_b (125, 125, 6). Their shadows and the curvature of their gel pad are left out.
     """
     rows, cols = presses.crop(index)
     height, width = presses.no_contact.shape[:2]
@@ -226,7 +234,7 @@ _PYRAMID_PX = (30.5, 15.5, 8.0, 3.5, 2.0, 1.1)
 
 
 def _pyramid(presses: Presses, index: int, x: Matrix, y: Matrix) -> Matrix:
-    """Heights in mm: the ball's cap above the flat gel, its rim smoothed, its core (deeper than 0.4) kept."""
+    """Return heights in mm: the ball's cap above the gel, its rim smoothed, its core (deeper than 0.4) unchanged."""
     ball_mm = TAXIM_BALL_MM
     contact = min(presses.radii[index] * PIXEL_MM, 0.99 * ball_mm)
     square = ((x - presses.centres[index][0]) ** 2 + (y - presses.centres[index][1]) ** 2) * PIXEL_MM**2

@@ -1,7 +1,7 @@
-"""The camera over the table: a photo and a Kinect-like depth image of one object, each made when asked for.
+"""The camera over the table: a photo and a Kinect-like depth image of one object, each computed on request.
 
-One geometry pass (a ray a pixel against the object and the table) serves both. The photo adds normals at the scale of
-a pixel, one lamp, the sky's light, a cast shadow, lens blur and sensor noise; the depth image adds the faults of a
+Both use one geometry pass: one ray per pixel against the object and the table. The photo adds normals at the scale of a
+pixel, one lamp, sky light, a cast shadow, lens blur and sensor noise. The depth image adds the faults of a
 structured-light or time-of-flight sensor. Camera frame: x right, y down, z forward, mm.
 """
 
@@ -22,20 +22,20 @@ from robot.sim.objects.materials import ObjectMaterial
 Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 Pixels = npt.NDArray[np.intp]
-"""Places of pixels in a picture, row by row."""
+"""Indices of pixels in a picture, row by row."""
 
 NOISE = 1.5
-"""Grey levels of the sensor's noise."""
+"""Standard deviation of the sensor noise in grey levels."""
 _LENS_BLUR_PX = 0.45
 _SHADOW_BLUR_PX = 0.8
 SKY_STEPS, _SKY_WIDTH = 4, 0.03
-"""The object hides the sky from the table beside it: standard deviation of that as a share of the picture's side."""
+"""The object hides sky from the table near it. Standard deviation of this blur, relative to the image side."""
 
 _TABLE_GLOSS = 0.03
 _TABLE_PX_PER_MM = 0.8
 _TABLE_PX = (400, 560)
 _SHADOW_DETAIL = 2.0
-"""Shadows show relief only from this many pixels up."""
+"""Shadows show only relief of at least this many pixels."""
 
 _SHADOW_BIAS_MM = 0.4
 """Shadow rays start this far above the surface, so that rounding does not put a point in its own shadow."""
@@ -43,30 +43,46 @@ _SHADOW_BIAS_MM = 0.4
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the object stands: its origin on the table in mm, and its turn about the vertical in rad."""
+    """Pose of the object on the table.
+
+    Attributes:
+        x_mm: x of the object's origin.
+        y_mm: y of the object's origin.
+        yaw_rad: rotation about the vertical.
+    """
 
     x_mm: float = 0.0
     y_mm: float = 0.0
     yaw_rad: float = 0.0
 
     def rotation(self) -> Array:
-        """(3, 3): object frame to rig frame."""
+        """Return the rotation (3, 3) from object frame to rig frame."""
         c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
     def to_object(self, points: Array) -> Array:
-        """(N, 3) points of the rig frame in the object's."""
+        """Transform points (N, 3) from the rig frame to the object frame."""
         return (points - [self.x_mm, self.y_mm, 0.0]) @ self.rotation()
 
     def corners(self, body: Body) -> Array:
-        """(8, 3): of the body's bounding box, in the rig frame."""
+        """Return the corners (8, 3) of the body's bounding box in the rig frame."""
         box = np.stack(np.meshgrid(*zip(body.lower, body.upper, strict=True)), axis=-1).reshape(-1, 3)
         return np.asarray(box @ self.rotation().T + [self.x_mm, self.y_mm, 0.0])
 
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A pinhole camera of square pixels that looks at `target_mm` with the rig's z upward in its picture."""
+    """Pinhole camera with square pixels that looks at `target_mm`, with the rig's z upward in the picture.
+
+    Attributes:
+        px: pixels of each side of the picture.
+        focal_px: focal length in pixels.
+        position_mm: centre of projection in the rig frame.
+        target_mm: point in the middle of the picture, in the rig frame.
+
+    Raises:
+        SceneError: The camera is below the table, or it looks along the vertical or nowhere.
+    """
 
     px: int = 256
     focal_px: float = 860.0
@@ -74,16 +90,15 @@ class PinholeCamera:
     target_mm: tuple[float, float, float] = (0.0, 0.0, 80.0)
 
     def __post_init__(self) -> None:
-        """Raises SceneError for a camera below the table, or one that looks along the vertical or nowhere."""
         forward = np.subtract(self.target_mm, self.position_mm)
         if self.px < 1 or not self.focal_px > 0 or not self.position_mm[2] > 0:
-            raise SceneError(f"a camera must have pixels, a focal length and stand above the table, got {self}")
+            raise SceneError(f"a camera must have pixels and a focal length and be above the table, got {self}")
         if not np.isfinite(forward).all() or np.hypot(forward[0], forward[1]) < 1e-6:
-            raise SceneError(f"a camera must look at a target beside its foot, got {self}")
+            raise SceneError(f"a camera must not look along the vertical, got {self}")
 
     @cached_property
     def to_rig(self) -> Array:
-        """(4, 4): camera frame to rig frame."""
+        """Transform (4, 4) from camera frame to rig frame."""
         forward = np.subtract(self.target_mm, self.position_mm)
         forward = forward / np.linalg.norm(forward)
         right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -94,7 +109,7 @@ class PinholeCamera:
 
     @cached_property
     def rays(self) -> Array:
-        """(px * px, 3): unit directions through the pixel centres in the rig frame, row by row."""
+        """Unit directions (px * px, 3) through the pixel centres in the rig frame, row by row."""
         axis = (np.arange(self.px) + 0.5 - self.px / 2) / self.focal_px
         x, y = np.meshgrid(axis, axis)
         local = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
@@ -103,20 +118,24 @@ class PinholeCamera:
 
     @cached_property
     def table_distance_mm(self) -> Array:
-        """(px * px,): how far along each ray the table is. Raises SceneError where a ray never meets it."""
+        """Distance (px * px,) to the table along each ray.
+
+        Raises:
+            SceneError: A ray does not meet the table.
+        """
         if not self.rays[:, 2].max() < 0:
-            raise SceneError(f"the camera must see nothing but the table behind the object, got {self}")
+            raise SceneError(f"every pixel of the camera must meet the table, got {self}; tilt it further down")
         return -self.position_mm[2] / self.rays[:, 2]
 
     @cached_property
     def table(self) -> Array:
-        """(px * px, 3): where each ray meets the table, in the rig frame."""
+        """Point (px * px, 3) where each ray meets the table, in the rig frame."""
         return self.position_mm + self.table_distance_mm[:, None] * self.rays
 
     def pixels_around(self, corners: Array) -> Pixels:
-        """The pixels, in order, of the upright rectangle that holds a convex thing with these corners (N, 3)."""
+        """Return the sorted pixels of the upright rectangle around a convex body with these corners (N, 3)."""
         x, y, forward = ((corners - self.position_mm) @ self.to_rig[:3, :3]).T
-        if forward.min() <= 0:  # it reaches behind the camera
+        if forward.min() <= 0:  # part of it is behind the camera
             return np.arange(self.px * self.px)
         spans = []
         for along in (y, x):
@@ -127,7 +146,15 @@ class PinholeCamera:
 
 @dataclass(frozen=True)
 class Lighting:
-    """One lamp and a sky. Drawn apart from the object, so that light tells nothing of it."""
+    """One lamp and a sky, drawn independently of the object, so that the light gives no hint of it.
+
+    Attributes:
+        direction: unit vector towards the lamp.
+        lamp: RGB intensity of the lamp.
+        sky: RGB intensity of the sky.
+        exposure: factor for both.
+        table_seed: seed of the table's texture.
+    """
 
     direction: tuple[float, float, float]
     lamp: tuple[float, float, float]
@@ -137,7 +164,7 @@ class Lighting:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> "Lighting":
-        """A lamp from the camera's side of the room, 30 to 65 degrees high, warm or cool."""
+        """Draw a lamp on the camera's side of the room, 30 to 65 degrees high, warm or cool."""
         turn, height = (
             rng.uniform(math.radians(185), math.radians(355)),
             rng.uniform(math.radians(30), math.radians(65)),
@@ -155,9 +182,16 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 @dataclass(frozen=True)
 class CameraView:
-    """What the camera meets: `distance_mm` along each ray, (px * px,), and `points` (px * px, 3) of the rig frame.
+    """Result of the geometry pass.
 
-    `pixels`: those of the object. `detail_mm`: the size of a pixel on the object.
+    Attributes:
+        obj: the object.
+        placement: its pose on the table.
+        camera: the camera.
+        detail_mm: size of a pixel on the object.
+        distance_mm: (px * px,) distance along each ray.
+        points: (px * px, 3) first point on each ray, in the rig frame.
+        pixels: pixels that show the object.
     """
 
     obj: SimObject
@@ -170,28 +204,28 @@ class CameraView:
 
     @cached_property
     def is_object(self) -> npt.NDArray[np.bool_]:
-        """(px * px,): which pixels are the object's."""
+        """Mask (px * px,) of the pixels that show the object."""
         mask = np.zeros(len(self.points), bool)
         mask[self.pixels] = True
         return mask
 
     @cached_property
     def object_points(self) -> Array:
-        """Points of the object's pixels in its own frame."""
+        """Points of the object's pixels in the object frame."""
         return self.placement.to_object(self.points[self.pixels])
 
 
 def cast_camera_rays(obj: SimObject, placement: Placement, camera: PinholeCamera) -> CameraView:
-    """The geometry pass: the nearest of object and table along each ray. Only rays near the object are cast."""
+    """Intersect each ray with object and table; cast only the rays near the object."""
     distance, points = camera.table_distance_mm.copy(), camera.table.copy()
     pixels = camera.pixels_around(placement.corners(obj.body))
     origin, rays = np.asarray(camera.position_mm), camera.rays[pixels]
     origins = np.broadcast_to(placement.to_object(origin[None]), rays.shape)
     detail_mm = float(np.linalg.norm(np.subtract(camera.target_mm, camera.position_mm))) / camera.focal_px
     hit = obj.body.cast(origins, rays @ placement.rotation(), detail_mm)
-    seen = hit < distance[pixels]
-    pixels, hit = pixels[seen], hit[seen]
-    distance[pixels], points[pixels] = hit, origin + hit[:, None] * rays[seen]
+    visible = hit < distance[pixels]
+    pixels, hit = pixels[visible], hit[visible]
+    distance[pixels], points[pixels] = hit, origin + hit[:, None] * rays[visible]
     return CameraView(obj, placement, camera, detail_mm, distance, points, pixels)
 
 
@@ -199,7 +233,14 @@ def cast_camera_rays(obj: SimObject, placement: Placement, camera: PinholeCamera
 
 
 def photo(view: CameraView, lighting: Lighting, noise_seed: int, shadow: bool = True) -> Picture:
-    """(px, px, 3) RGB."""
+    """Render the photo (px, px, 3), RGB uint8.
+
+    Args:
+        view: the geometry pass.
+        lighting: the lamp and the sky.
+        noise_seed: seed of the sensor noise.
+        shadow: whether the object casts a shadow.
+    """
     px = view.camera.px
     linear = radiance(*shading_inputs(view, lighting, shadow)).reshape(px, px, 3)
     linear = cv2.GaussianBlur(linear, (0, 0), _LENS_BLUR_PX)
@@ -208,23 +249,23 @@ def photo(view: CameraView, lighting: Lighting, noise_seed: int, shadow: bool = 
 
 
 def shading_inputs(view: CameraView, lighting: Lighting, shadow: bool = True) -> tuple[GBuffer, Lamps]:
-    """What light meets at each pixel, and where it comes from."""
+    """Return surface and light at each pixel, the inputs of `radiance`."""
     px = view.camera.px
     light = np.asarray(lighting.direction)
-    # Across about one pixel, so that finer relief does not flicker.
+    # Average normals over about one pixel, so that finer relief does not flicker.
     own = view.obj.body.normals(view.object_points, 0.4 * view.detail_mm) @ view.placement.rotation().T
     normals = np.zeros((px * px, 3), np.float32)
     normals[:, 2], normals[view.pixels] = 1, own
-    seen = _lamp_visibility(view, own, light) if shadow else np.ones(px * px, np.float32)
+    lamp_visibility = _lamp_visibility(view, own, light) if shadow else np.ones(px * px, np.float32)
     occlusion = sky_occlusion(view.is_object.reshape(px, px))
     colour = _table(lighting.table_seed, view.camera)
     colour[view.pixels] = view.obj.appearance.albedo(view.object_points)
-    surfaces = GBuffer(view.camera.rays, normals, view.is_object, seen, occlusion.ravel(), colour)
+    surfaces = GBuffer(view.camera.rays, normals, view.is_object, lamp_visibility, occlusion.ravel(), colour)
     return surfaces, _lamps(lighting, view.obj.material)
 
 
 def _lamps(lighting: Lighting, material: ObjectMaterial) -> Lamps:
-    """The rougher the material, the wider and weaker its highlight."""
+    """Return the lamps; the rougher the material, the wider and weaker its highlight."""
     sharpness = 4.0 + 120.0 * (1.0 - material.roughness) ** 2
     strength = (sharpness + 8.0) / 60.0
     lamp, sky = (lighting.exposure * np.array(colour) for colour in (lighting.lamp, lighting.sky))
@@ -233,21 +274,24 @@ def _lamps(lighting: Lighting, material: ObjectMaterial) -> Lamps:
 
 
 def _lamp_visibility(view: CameraView, own: Array, light: Array) -> Floats:
-    """0..1: how much of the lamp each point sees; the edge is softened as by a lamp of some size.
+    """Return how much of the lamp each point receives, 0..1, with an edge softened as by a lamp of some size.
 
-    own: (n, 3), the normals at the object's pixels.
+    Args:
+        view: the geometry pass.
+        own: (n, 3) normals at the object's pixels.
+        light: (3,) unit direction to the lamp.
     """
     px, facing, table = view.camera.px, own @ light > 0, shadow_pixels(view, light)
     pixels, up = np.concatenate([view.pixels[facing], table]), np.broadcast_to([0.0, 0.0, 1.0], (len(table), 3))
     starts = view.placement.to_object(view.points[pixels] + _SHADOW_BIAS_MM * np.concatenate([own[facing], up]))
     towards = np.broadcast_to(light @ view.placement.rotation(), starts.shape)
-    seen = np.ones(px * px, np.float32)
-    seen[pixels] = ~view.obj.body.hit(starts, towards, _SHADOW_DETAIL * view.detail_mm)
-    return np.asarray(cv2.GaussianBlur(seen.reshape(px, px), (0, 0), _SHADOW_BLUR_PX)).ravel()
+    visibility = np.ones(px * px, np.float32)
+    visibility[pixels] = ~view.obj.body.hit(starts, towards, _SHADOW_DETAIL * view.detail_mm)
+    return np.asarray(cv2.GaussianBlur(visibility.reshape(px, px), (0, 0), _SHADOW_BLUR_PX)).ravel()
 
 
 def shadow_pixels(view: CameraView, light: Array) -> Pixels:
-    """The table's pixels in the upright rectangle that holds the shadow of the object's bounding box."""
+    """Return the table pixels in the upright rectangle around the shadow of the object's bounding box."""
     if not light[2] > 0:
         return np.zeros(0, np.intp)
     corners, table = view.placement.corners(view.obj.body), view.camera.table
@@ -259,34 +303,38 @@ def shadow_pixels(view: CameraView, light: Array) -> Pixels:
 
 
 def sky_occlusion(is_object: npt.NDArray[np.bool_], steps: int = SKY_STEPS) -> Floats:
-    """0..1, (px, px): how much of the sky the object hides from the table beside it.
+    """Return how much of the sky the object hides from the table near it, 0..1, (px, px).
 
-    It is the object's mask (px, px), blurred on a grid of `steps` points over the blur's width.
+    This is the object's mask, blurred on a coarse grid.
+
+    Args:
+        is_object: (px, px) mask of the object.
+        steps: grid points per width of the blur.
     """
     px = len(is_object)
     width = _SKY_WIDTH * px
     coarse = min(px, max(1, round(px * steps / width)))
-    shares = cv2.resize(is_object.astype(np.float32), (coarse, coarse), interpolation=cv2.INTER_AREA)
-    blurred = cv2.GaussianBlur(shares, (0, 0), width * coarse / px)
+    coverage = cv2.resize(is_object.astype(np.float32), (coarse, coarse), interpolation=cv2.INTER_AREA)
+    blurred = cv2.GaussianBlur(coverage, (0, 0), width * coarse / px)
     return np.asarray(cv2.resize(blurred, (px, px), interpolation=cv2.INTER_CUBIC))
 
 
 def _table(seed: int, camera: PinholeCamera) -> Floats:
-    """Reflectance (px * px, 3) of the table top at the camera's pixels: weakly streaked like wood, or speckled."""
+    """Return the reflectance (px * px, 3) of the table top: weakly streaked like wood, or speckled."""
     rng = np.random.default_rng([71, seed])
     colour = np.clip(rng.uniform(0.35, 0.85) + rng.uniform(-0.08, 0.08, 3), 0, 1)
     streaks, strength = int(rng.choice([24, 64, 160])), rng.uniform(0.02, 0.09)
     grain = cv2.resize(rng.uniform(-1, 1, (160, streaks)).astype(np.float32), _TABLE_PX, interpolation=cv2.INTER_CUBIC)
     grain += 0.5 * cv2.resize(rng.uniform(-1, 1, (9, 9)).astype(np.float32), _TABLE_PX)
     shade = cv2.remap(grain, *_grain_coordinates(camera), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
-    # Colour and grain are grey levels: of their product each has its own power, of which the grain's serves three.
+    # Colour and grain are grey levels. The power of a product is the product of powers; the grain's serves 3 channels.
     tone = cv2.pow(1 + np.float32(strength) * shade, GAMMA).reshape(-1, 1)
     return np.asarray(np.minimum(tone * (colour**GAMMA).astype(np.float32), 1))
 
 
 @lru_cache(maxsize=4)
 def _grain_coordinates(camera: PinholeCamera) -> tuple[Floats, Floats]:
-    """Column and row of the table's grain at each pixel, both (px, px)."""
+    """Return column and row of the table's grain at each pixel, both (px, px)."""
     at = (camera.table[:, :2] * _TABLE_PX_PER_MM + [_TABLE_PX[0] / 2, 0.2 * _TABLE_PX[1]]).astype(np.float32)
     column, row = np.ascontiguousarray(at.T).reshape(2, camera.px, camera.px)
     return column, row
@@ -296,10 +344,10 @@ def _grain_coordinates(camera: PinholeCamera) -> tuple[Floats, Floats]:
 
 
 def depth(view: CameraView, noise_seed: int) -> npt.NDArray[np.float32]:
-    """(px, px) metres along the camera's axis, NaN where the sensor gives nothing.
+    """Return the depth image (px, px), in metres along the camera's axis, NaN where the sensor has no reading.
 
-    Noise of 1.5 mm at 0.7 m that grows with the square of the distance, pixels that fly between an edge and what is
-    behind it, holes at grazing angles and on glossy surfaces, whole millimetres.
+    It has noise of 1.5 mm at 0.7 m that grows with the square of the distance, flying pixels between an edge and the
+    surface behind it, holes at grazing angles and on glossy surfaces, and a resolution of 1 mm.
     """
     px = view.camera.px
     rng = np.random.default_rng([73, noise_seed])
@@ -311,7 +359,7 @@ def depth(view: CameraView, noise_seed: int) -> npt.NDArray[np.float32]:
 
 
 def _add_flying_pixels(exact: Array, rng: np.random.Generator) -> Array:
-    """Beside an edge a pixel may mix the near and the far surface."""
+    """Mix the near and the far surface in some pixels next to an edge."""
     window = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(exact, window), cv2.dilate(exact, window)
     mixed = near + rng.random(exact.shape) * (far - near)
@@ -319,7 +367,7 @@ def _add_flying_pixels(exact: Array, rng: np.random.Generator) -> Array:
 
 
 def _hole_mask(view: CameraView, exact: Array, rng: np.random.Generator) -> npt.NDArray[np.bool_]:
-    """Where nothing comes back: steep surfaces, glossy ones now and then, and single pixels anywhere."""
+    """Return where the sensor has no reading: steep surfaces, some glossy pixels, and single pixels anywhere."""
     px = view.camera.px
     steep = np.hypot(cv2.Sobel(exact, cv2.CV_64F, 1, 0, scale=0.125), cv2.Sobel(exact, cv2.CV_64F, 0, 1, scale=0.125))
     gloss = np.where(view.is_object, view.obj.material.gloss, 0.0).reshape(px, px)

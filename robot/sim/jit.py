@@ -1,6 +1,7 @@
-"""Functions in machine code, for loops over rays and pixels that numpy cannot say in few passes over memory.
+"""Just-in-time compilation of loops over rays and pixels that numpy cannot express in few passes over memory.
 
-They need numba, an extra: without it the import of this module raises RobotConfigError, which says what to install.
+It needs numba, an optional dependency. Without numba, importing this module raises RobotConfigError with the install
+command.
 """
 
 from collections.abc import Callable
@@ -17,20 +18,24 @@ except ImportError as error:
 
 
 def jit(function: Callable[..., Any], **settings: Any) -> Callable[..., Any]:
-    """The function as numba compiles it when it is first called with arguments of a type.
+    """Compile a function with numba at its first call with arguments of a type.
 
-    What was compiled is kept beside the source (or, where that cannot be written, in the user's cache) and made anew
-    when the function's own file has changed: what it calls stands in that file too. Divisions by 0 are numpy's. It uses
-    no threads, so that processes that use it may fork, and it lets other threads run.
+    The compiled code is cached next to the source, or in the user's cache if that folder is read-only. It is compiled
+    again when the function's own file changes, so every function that it calls must be in the same file. Divisions by 0
+    follow numpy. It uses no threads, so processes that use it may fork, and it releases the GIL.
+
+    Args:
+        function: the function to compile.
+        **settings: further options of `numba.njit`.
     """
     settings = {"error_model": "numpy", "nogil": True, **settings}
     try:
-        made: Callable[..., Any] = numba.njit(cache=True, **settings)(function)
-    except RuntimeError:  # there is no place to keep it
-        made = numba.njit(**settings)(function)
-    return made
+        compiled: Callable[..., Any] = numba.njit(cache=True, **settings)(function)
+    except RuntimeError:  # no folder for the cache is writable
+        compiled = numba.njit(**settings)(function)
+    return compiled
 
 
 def jit_reassociated(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compiled so that a sum may be taken in several parts at once, as numpy takes it; the rest is as exact as else."""
+    """Compile a function whose sums may be reordered, as numpy does; all else is as exact as with `jit`."""
     return jit(function, fastmath={"reassoc", "nsz"})

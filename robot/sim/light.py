@@ -1,5 +1,7 @@
-"""What light does at each pixel of the camera, in one compiled pass: reflectance and lamps to radiance, radiance to
-grey levels. Powers of float32 are exponentials of logarithms: they err by less than a thousandth of a grey level.
+"""Shading of each pixel of the camera in one compiled pass.
+
+Reflectance and lamps give radiance; radiance gives grey levels. Powers of float32 are computed as exponentials of
+logarithms, with an error below a thousandth of a grey level.
 """
 
 from typing import NamedTuple
@@ -16,8 +18,15 @@ GAMMA = 2.2
 
 
 class GBuffer(NamedTuple):
-    """Of each pixel, (n,) or (n, 3): its ray and outward normal, whether it is the object's, how much of the lamp it
-    sees and how much of the sky around is hidden by the object (0..1), and the linear reflectance there.
+    """Surface at each pixel.
+
+    Attributes:
+        rays: (n, 3) unit direction of the ray.
+        normals: (n, 3) outward unit normal.
+        is_object: (n,) whether the pixel shows the object.
+        lamp_visibility: (n,) visible fraction of the lamp, 0..1.
+        occlusion: (n,) fraction of the sky that the object hides, 0..1.
+        colour: (n, 3) linear reflectance.
     """
 
     rays: Array
@@ -29,8 +38,14 @@ class GBuffer(NamedTuple):
 
 
 class Lamps(NamedTuple):
-    """Unit direction to the lamp, its colour and the sky's, all with the exposure; gloss and sharpness of the object's
-    highlight and of the table's.
+    """Light sources and highlights.
+
+    Attributes:
+        direction: (3,) unit vector towards the lamp.
+        lamp: (3,) colour of the lamp, with the exposure.
+        sky: (3,) colour of the sky, with the exposure.
+        gloss: strength of the highlight of the object and of the table.
+        sharpness: exponent of the highlight.
     """
 
     direction: Array
@@ -41,14 +56,14 @@ class Lamps(NamedTuple):
 
 
 def radiance(surfaces: GBuffer, lamps: Lamps) -> Floats:
-    """(n, 3): by the lamp (Lambert, and Blinn's highlight) and the sky, whose half above is seen."""
+    """Return the radiance (n, 3) from the lamp (Lambert, and Blinn's highlight) and the upper hemisphere of the sky."""
     out = np.empty(surfaces.rays.shape, np.float32)
     _shade(surfaces, lamps, out)
     return out
 
 
 def develop(linear: Floats, noise: Array) -> Picture:
-    """(rows, columns, 3) grey levels of a linear picture, with the noise of the sensor in grey levels."""
+    """Convert a linear picture (rows, columns, 3) to grey levels with sensor noise (in grey levels)."""
     out = np.empty(linear.shape, np.uint8)
     _develop(linear.reshape(-1), noise.reshape(-1), out.reshape(-1))
     return out

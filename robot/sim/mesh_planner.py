@@ -1,4 +1,4 @@
-"""Grasps of meshes on the simulated rig: it knows the mesh, and how it lies, but for the camera's calibration."""
+"""Grasp planner for simulated meshes. It uses the true mesh and pose, up to the camera's calibration error."""
 
 import math
 from typing import Any, ClassVar
@@ -20,20 +20,32 @@ from robot.sim.scene import Scene
 
 
 class MeshPlanner(GraspPlanner):
-    """Draws among the grasps of a mesh on the simulated rig: first from above or from a side, then uniformly."""
+    """Draw one of the grasps of a mesh: first the approach (from above or from a side), then uniformly."""
 
     needs_depth: ClassVar[bool] = False
 
     def check(self, rig: Rig) -> None:
-        """Raise RobotConfigError unless `rig` is simulated and holds meshes."""
+        """Raise RobotConfigError unless `rig` is simulated and has meshes."""
         if not isinstance(rig, SimRig) or rig.meshes is None:
             raise RobotConfigError(
-                '[planner]: name = "mesh" plans for meshes of the simulated rig only: give meshes = FOLDER, or '
-                'name = "cylinder"'
+                '[planner]: name = "mesh" plans for meshes of the simulated rig only. Set meshes = FOLDER, or '
+                'name = "cylinder".'
             )
 
     def plan(self, rig: Rig, image: RGBD, settings: GraspSettings, rng: np.random.Generator) -> GraspPlan:
-        assert isinstance(rig, SimRig), "check refuses others"
+        """Draw a grasp of the object on the table.
+
+        Args:
+            rig: a simulated rig with meshes.
+            image: not used.
+            settings: limits of the grasp.
+            rng: source of the random draws.
+
+        Raises:
+            UngraspableError: No attempt on this object can succeed.
+            PlanError: No grasp lies in the arm's workspace.
+        """
+        assert isinstance(rig, SimRig), "check() rejects other rigs"
         scene = rig.sim_state.current_scene()
         assert isinstance(scene.obj.body, MeshBody)
         grasps = grasps_of(scene.obj.body, settings)
@@ -52,7 +64,7 @@ class MeshPlanner(GraspPlanner):
 
 
 def _check_graspable(scene: Scene, grasps: AntipodalGrasps, settings: GraspSettings, stroke_mm: float) -> None:
-    """Raise UngraspableError where no attempt can succeed."""
+    """Raise UngraspableError if no attempt can succeed."""
     if not len(grasps):
         if math.isinf(grasps.min_width_mm):
             raise UngraspableError(
@@ -73,7 +85,7 @@ def _check_graspable(scene: Scene, grasps: AntipodalGrasps, settings: GraspSetti
 
 
 class _PlacedGrasps:
-    """The grasps in the rig's frame, and which of them the arm can reach."""
+    """Grasps in the rig's frame, with a mask of those that the arm reaches."""
 
     def __init__(
         self, grasps: AntipodalGrasps, placement: Placement, shift_mm: Array, workspace: Region, settings: GraspSettings
@@ -93,7 +105,7 @@ class _PlacedGrasps:
         self.is_reachable = inside[0] & inside[1] & rises
 
     def plan(self, number: int, stroke_mm: float, force_n: float, fit: dict[str, Any]) -> GraspPlan:
-        """The plan of one of them."""
+        """Return the plan of one grasp."""
         yaw, tilt = math.floor(self._yaw[number] * 1e6) / 1e6, float(self._tilt[number])
         (x, y, z), (start_x, start_y, start_z) = self._points[number].round(3), self._start[number].round(3)
         pose = Pose(float(x), float(y), float(z), yaw, tilt)

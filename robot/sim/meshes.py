@@ -1,4 +1,4 @@
-"""A folder of meshes as the objects of a simulated rig, each in a resting pose in which the gripper can grasp it."""
+"""A folder of meshes as objects of a simulated rig, each in a resting pose in which the gripper can grasp it."""
 
 import hashlib
 from collections import Counter
@@ -13,13 +13,19 @@ from robot.sim.objects.mesh import FORMATS, MeshBody, mesh_object, object_prefix
 from robot.sim.objects.resting import stable_up_directions
 
 _ENOUGH_GRASPS = 100
-"""A resting pose with so many grasps is taken; few may be a chance of the grid, out of the arm's reach."""
+"""Take the first resting pose with this many grasps. Fewer may be an artefact of the grid, out of the arm's reach."""
 
 
 class MeshFolder:
-    """The STL, OBJ and PLY files of a folder as objects of one seed, for a rig with these grasp settings.
+    """The STL, OBJ and PLY files of a folder as objects of one seed.
 
-    Raises RobotConfigError for a folder that is none.
+    Args:
+        folder: the folder of mesh files.
+        seed: seed of the objects' appearance and material.
+        settings: grasp settings of the rig; they decide the resting pose.
+
+    Raises:
+        RobotConfigError: `folder` is not a folder.
     """
 
     def __init__(self, folder: str, seed: int, settings: GraspSettings) -> None:
@@ -34,35 +40,45 @@ class MeshFolder:
 
     @property
     def digest(self) -> str:
-        """Of all mesh files and their names: a recording goes on with the same ones only."""
+        """SHA-256 of all mesh files and their names; a recording continues only with the same ones."""
         digest = hashlib.sha256()
         for path in self._paths:
             digest.update(f"{path.name} {hashlib.sha256(path.read_bytes()).hexdigest()}\n".encode())
         return digest.hexdigest()
 
     def object_ids(self, count: int) -> list[str]:
-        """Names of the first `count`. Raises RobotConfigError for more than there are, SceneError for a bad file."""
+        """Return the names of the first `count` objects.
+
+        Raises:
+            RobotConfigError: The folder has fewer meshes, or two meshes of one name.
+            SceneError: A mesh file is not usable.
+        """
         paths = self._paths
         if count > len(paths):
-            raise RobotConfigError(f"{self._folder} must hold as many STL, OBJ or PLY as objects; it has {len(paths)}")
+            raise RobotConfigError(
+                f"{self._folder} must contain at least {count} STL, OBJ or PLY files, got {len(paths)}"
+            )
         names = [mesh_object(path, read_mesh(path), self._seed).object_id for path in paths[:count]]
-        if twice := sorted(name for name, times in Counter(names).items() if times > 1):
-            raise RobotConfigError(f"{self._folder} must not hold two meshes of one name, got {twice[0]!r}; rename one")
+        if repeated := sorted(name for name, times in Counter(names).items() if times > 1):
+            raise RobotConfigError(
+                f"{self._folder} must not contain two meshes of one name, got {repeated[0]!r}. Rename one"
+            )
         return names
 
     def candidates(self, object_id: str) -> list[SimObject]:
-        """Objects that may have this name, for their files' names fit. Raises SceneError."""
+        """Return the objects whose file names fit this object_id. Raise SceneError for a bad file."""
         paths = [path for path in self._paths if object_id.startswith(object_prefix(path))]
         return [_resting_object(path, self._seed, self._settings) for path in paths]
 
 
-# An object keeps its search tree and its grasps from attempt to attempt.
+# Caches: an object keeps its search tree and its grasps between attempts.
 
 
 @lru_cache(maxsize=4)
 def _resting_object(path: Path, seed: int, settings: GraspSettings) -> SimObject:
-    """The mesh in the first resting pose with enough grasps, else in that with the most; where there are none, in that
-    whose opposite sides are nearest to each other.
+    """Return the mesh in the first resting pose with enough grasps, or else in the pose with the most.
+
+    If no pose has a grasp, return the pose whose opposite sides are nearest to each other.
     """
     mesh = read_mesh(path)
     rated: list[tuple[int, float, SimObject]] = []
@@ -77,5 +93,5 @@ def _resting_object(path: Path, seed: int, settings: GraspSettings) -> SimObject
 
 @lru_cache(maxsize=16)
 def grasps_of(body: MeshBody, settings: GraspSettings) -> AntipodalGrasps:
-    """`find_grasps` for the stroke of the simulated gripper, once."""
+    """Return `find_grasps` for the stroke of the simulated gripper, cached."""
     return find_grasps(body, settings, STROKE_MM)

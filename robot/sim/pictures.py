@@ -1,13 +1,13 @@
-"""Pictures of simulated objects with what is known of each, to learn relief from: no touch needs its photo.
+"""Labelled pictures of simulated objects, for training on relief: photos and touches need no pairs.
 
     pictures.json     schema_version, kind ("photo" or "touch"), source, sensor, seed, objects, software_version
-    metadata.jsonl    a line for each picture: file_name, object_id, and the object's labels
-                      (`robot.sim.objects.draw.SimObject.labels`); touches also finger and before_file_name, the
-                      untouched gel
-    images/           PNG files; the folder opens as it is with Hugging Face datasets ("imagefolder")
+    metadata.jsonl    one line per picture: file_name, object_id, and the object's labels
+                      (`robot.sim.objects.draw.SimObject.labels`); touches also have finger and before_file_name,
+                      the no-contact frame
+    images/           PNG files; the folder opens as is with Hugging Face datasets ("imagefolder")
 
-A photographed object costs a tenth of a felt one, and a press of its own a third. An object's lines are written when
-its pictures are on the disk; what was stopped goes on where it was.
+A photographed object takes a tenth of the time of a full grasp, and a press a third. An object's lines are written when
+its pictures are on disk; an interrupted run continues where it stopped.
 """
 
 import functools
@@ -32,7 +32,7 @@ INFO_FILE = "pictures.json"
 SCHEMA_VERSION = 1
 KINDS = ("photo", "touch")
 _MAX_PRESSES = 3
-"""At most so many tries at an object on which the jaws close without meeting it."""
+"""Maximum number of presses of one object until the jaws meet it."""
 Pictures = dict[str, npt.NDArray[np.uint8]]
 
 
@@ -46,11 +46,24 @@ def collect_pictures(
     jobs: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
-    """Photograph, or press, the first `objects` objects of a simulated rig into `out`, or go on with what is there.
+    """Photograph or press the first `objects` objects of a simulated rig into `out`; continue an interrupted run.
 
-    Returns the number of pictures. kind: "photo" (one an object) or "touch" (one a finger); rig: "sim" or the TOML file
-    of a simulated one; progress: told how many objects are done, of how many. Raises RobotConfigError, RecordingError
-    for a folder with something else, StorageError.
+    Args:
+        kind: "photo" (one picture per object) or "touch" (one per finger).
+        out: the folder to write or continue.
+        objects: number of objects.
+        seed: seed of the rig.
+        rig: "sim" or the TOML file of a simulated rig.
+        jobs: number of worker processes.
+        progress: called with the number of finished objects and the number of all objects.
+
+    Returns:
+        The number of pictures in the folder.
+
+    Raises:
+        RobotConfigError: An argument or the rig file is invalid.
+        RecordingError: The folder contains something else.
+        StorageError: A file cannot be read or written.
     """
     if kind not in KINDS:
         raise RobotConfigError(f"pictures must be of kind {' or '.join(KINDS)}, got {kind!r}")
@@ -70,28 +83,28 @@ def collect_pictures(
 
 
 def _load_sim_rig(rig: str, seed: int) -> SimRig:
-    made = load_rig(rig, seed=seed)
-    if not isinstance(made, SimRig):
-        raise RobotConfigError(f"pictures with labels come from a simulated rig, for it knows its objects; got {rig}")
-    return made
+    loaded = load_rig(rig, seed=seed)
+    if not isinstance(loaded, SimRig):
+        raise RobotConfigError(f"labelled pictures need a simulated rig, got {rig}")
+    return loaded
 
 
 def _make_worker(kind: str, rig: str, seed: int) -> Work[tuple[Pictures, Mapping[str, Any]]]:
-    made = _load_sim_rig(rig, seed)
+    sim_rig = _load_sim_rig(rig, seed)
 
     def photograph(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
-        made.prepare(object_id, number)
-        return {"photo": made.sim_state.current_scene().image("photo")}, made.labels(object_id)
+        sim_rig.prepare(object_id, number)
+        return {"photo": sim_rig.sim_state.current_scene().image("photo")}, sim_rig.labels(object_id)
 
     def press(object_id: str, number: int) -> tuple[Pictures, Mapping[str, Any]]:
-        tries = (made.press(object_id, number + each) for each in range(_MAX_PRESSES))
-        return next((pictures for pictures in tries if pictures), {}), made.labels(object_id)
+        tries = (sim_rig.press(object_id, number + each) for each in range(_MAX_PRESSES))
+        return next((pictures for pictures in tries if pictures), {}), sim_rig.labels(object_id)
 
     return photograph if kind == "photo" else press
 
 
 def _ordered_results(workers: WorkerPool[Any], names: list[str]) -> Iterator[tuple[str, Any]]:
-    """What is made of each object, in their order; a few are under way ahead."""
+    """Yield the result for each object in order, with a few results computed ahead."""
     pending: deque[tuple[str, Callable[[], Any]]] = deque()
     for name in names:
         pending.append((name, workers.submit(name, 0)))
@@ -103,19 +116,23 @@ def _ordered_results(workers: WorkerPool[Any], names: list[str]) -> Iterator[tup
 
 
 def _open_folder(folder: Path, info: dict[str, Any]) -> dict[str, int]:
-    """Make the folder, or check that it holds pictures made likewise; object -> how many pictures it has."""
+    """Create the folder, or check that its pictures were made with the same settings.
+
+    Returns:
+        The number of pictures of each object.
+    """
     plain = json.loads(json.dumps(info))
     with storage_errors(folder):
         if (folder / INFO_FILE).exists():
-            held = read_json_object(folder / INFO_FILE, RecordingError)
-            if differ := sorted(key for key in plain if key != "software_version" and held.get(key) != plain[key]):
+            stored = read_json_object(folder / INFO_FILE, RecordingError)
+            if differ := sorted(key for key in plain if key != "software_version" and stored.get(key) != plain[key]):
                 raise RecordingError(
-                    f"{folder} holds pictures made otherwise ({differ[0]} differs); give another --out"
+                    f"{folder} contains pictures made with other settings ({differ[0]} differs); give another --out"
                 )
             return _completed_objects(folder / METADATA_FILE)
         ours = (IMAGES_FOLDER, METADATA_FILE, f".{METADATA_FILE}.", f".{INFO_FILE}.")
         if folder.exists() and any(not path.name.startswith(ours) for path in folder.iterdir()):
-            raise RecordingError(f"{folder} must be a new folder, or one of pictures; it holds something else")
+            raise RecordingError(f"{folder} must be a new folder or a folder of pictures; it contains something else")
         (folder / IMAGES_FOLDER).mkdir(parents=True, exist_ok=True)
         write_atomically(folder / METADATA_FILE, b"")
         write_atomically(folder / INFO_FILE, (json.dumps(plain, indent=1) + "\n").encode())
@@ -123,22 +140,27 @@ def _open_folder(folder: Path, info: dict[str, Any]) -> dict[str, int]:
 
 
 def _completed_objects(path: Path) -> dict[str, int]:
-    """Objects whose lines are whole. Half a last line is cut off, and with it the last object, whose it may be."""
+    """Return the number of pictures of each complete object.
+
+    If the last line is incomplete, it is cut off together with the last object, to which it may belong.
+    """
     lines = read_content(path, RecordingError).splitlines(keepends=True)
     try:
         names = [json.loads(line)["object_id"] for line in lines if line.endswith(b"\n")]
     except (ValueError, KeyError, TypeError) as error:
-        raise RecordingError(f"{path} has a line that is no picture's ({error!r}); give another folder") from error
+        raise RecordingError(
+            f"{path} has a line that does not describe a picture ({error!r}); give another folder"
+        ) from error
     if len(names) < len(lines):
-        kept = [name for name in names if name != names[-1]]
+        complete = [name for name in names if name != names[-1]]
         with open(path, "r+b") as file:
-            file.truncate(sum(map(len, lines[: len(kept)])))
-        names = kept
+            file.truncate(sum(map(len, lines[: len(complete)])))
+        names = complete
     return dict(Counter(names))
 
 
 def _write(folder: Path, kind: str, object_id: str, pictures: Pictures, labels: Mapping[str, Any]) -> int:
-    """Write an object's pictures, then its lines at once; returns how many pictures it has."""
+    """Write an object's pictures, then all its lines at once; return the number of its pictures."""
     files, contents = {}, {}
     for name, pixels in pictures.items():
         data, suffix = file_content(name, pixels)

@@ -1,9 +1,9 @@
-"""Two fingers close on the object: what each meets, how deep it is pressed, how wide the jaws stand, whether it holds.
+"""Two fingers close on the object: contact of each finger, press depth, jaw opening, and whether the grip holds.
 
 Gripper frame: x along the closing direction, z from the fingertips to the hand (up, unless the hand is tilted), origin
-between the fingertips. Finger a comes from -x and looks along +x, finger b the other way. A gel's grid has its rows
-towards the fingertip (-z) and its columns to the finger's right.
-Each part is worked out when it is asked for, and once.
+between the fingertips. Finger a comes from -x and faces +x, finger b faces -x. A gel's grid has its rows towards the
+fingertip (-z) and its columns to the finger's right.
+Each quantity is computed once, on first use.
 """
 
 import math
@@ -26,32 +26,36 @@ Array = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]
 GRAVITY_M_S2 = 9.81
 SIDES = {"a": 1.0, "b": -1.0}
-"""The way each finger looks along the gripper's x."""
+"""The direction that each finger faces along the gripper's x."""
 
 _START_MM = 400.0
-"""Rays towards the object start this far from the closing plane, outside any object that a gripper meets."""
+"""Rays towards the object start this far from the closing plane, outside any object that a gripper grasps."""
 _COARSE_RAD = [math.radians(angle) for angle in range(-40, 41, 4)]
 _FINE_RAD = [math.radians(0.4 * step) for step in range(-10, 11)]
 _MAX_TURN_ERROR_RAD = math.radians(0.2)
-"""The object ends at most this far from the position towards which the jaws turn it."""
+"""Maximum error of the object's final turn between the jaws."""
 
 _MIN_WIDTH_RATIO = 0.2
-"""A soft object stands at this share of its width at least, as foam does that has no more room to give."""
+"""Lower bound on the squeezed width of a soft object, relative to its width; foam has no more room to give."""
 
 PAD_MM = (15.2, 20.3)
 """Height and width of a bare finger's pad."""
 
 _COARSE_GRID = (5, 9)
-"""Rows and columns of the coarse grid with which the turning of the object is worked out."""
+"""Rows and columns of the coarse grid for computing the object's turn."""
 
 
 @dataclass(frozen=True)
 class Hand:
-    """What of the gripper matters here. `safety`: friction must carry this many times the weight, for the lift.
+    """Properties of the gripper and of the contact solver.
 
-    `grid` and `tolerance` are those of the contact solver: what they cost in error is measured by `frontier`.
-    `turns_about_grip`: closing jaws turn the object about the point between them, as one that is grasped far from its
-    middle; else about its own axis, near which procedural objects are grasped.
+    Attributes:
+        stroke_mm: greatest opening.
+        safety: for the lift, friction must carry this many times the weight.
+        grid: rows and columns of the contact solver; `frontier` measures their effect on the error.
+        tolerance: tolerance of the contact solver.
+        turns_about_grip: closing jaws turn the object about the point between them, for objects grasped far from their
+            middle; otherwise about the object's own axis, near which procedural objects are grasped.
     """
 
     stroke_mm: float = STROKE_MM
@@ -63,7 +67,7 @@ class Hand:
 
 @dataclass(frozen=True)
 class Grip:
-    """The jaws close at `pose`, from `opening_mm` apart, with `force_n` on each finger.
+    """Grip of the jaws: they close at `pose`, from `opening_mm` apart, with `force_n` on each finger.
 
     >>> robot.Grip(robot.Pose(x_mm=0, y_mm=0, z_mm=40, yaw_rad=0), force_n=12).force_n
     12
@@ -76,10 +80,19 @@ class Grip:
 
 @dataclass(frozen=True, eq=False)
 class Pinch:
-    """What comes of a grip at an object; `sensors` are the fingers that feel.
+    """Outcome of a grip on an object.
 
-    A finger without a sensor is a bare rigid one. `seed` draws how far from square the object ends; `passes` counts
-    the work done, by name.
+    Attributes:
+        obj: the object.
+        placement: its pose before the jaws close.
+        grip: pose, force and opening of the jaws.
+        sensors: the gel of each finger; a finger without one is bare and rigid.
+        hand: the gripper.
+        seed: seed of the error of the object's final turn.
+        passes: counts of the computations done, by name.
+
+    Raises:
+        SceneError: No gripper has this force or opening.
     """
 
     obj: SimObject
@@ -93,25 +106,24 @@ class Pinch:
     _clean_images: dict[str, npt.NDArray[np.float32]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Raises SceneError for a force that no gripper has."""
         force_n, opening_mm = self.grip.force_n, self.grip.opening_mm
         if not (math.isfinite(force_n) and force_n > 0):
             raise SceneError(f"a grip's force_n must be positive and finite, got {force_n}")
         if not 0 < opening_mm <= self.hand.stroke_mm:
-            raise SceneError(f"opening_mm must be above 0, at most {self.hand.stroke_mm:g}; got {opening_mm}")
+            raise SceneError(f"opening_mm must be above 0 and at most {self.hand.stroke_mm:g}, got {opening_mm}")
 
     # Where the object ends ----------------------------------------------------------------------------------
 
     @cached_property
     def final_placement(self) -> Placement:
-        """The object as the closing jaws turn it: towards the nearest position in which they come closest together.
+        """Pose of the object after the jaws turn it to the nearest position in which they close furthest.
 
-        The jaws push it while they close, so that flat sides end square to the fingers but for a trifle.
+        The jaws push the object while they close, so flat sides end square to the fingers up to a small error.
         """
         coarse = _nearest_widest_turn(_COARSE_RAD, self._coarse_reach)
         fine = [coarse + angle for angle in _FINE_RAD]
-        rest = np.random.default_rng([81, self.seed]).uniform(-1.0, 1.0) * _MAX_TURN_ERROR_RAD
-        return self._rotated_placement(_nearest_widest_turn(fine, self._finger_reach(fine)) + rest)
+        error_rad = np.random.default_rng([81, self.seed]).uniform(-1.0, 1.0) * _MAX_TURN_ERROR_RAD
+        return self._rotated_placement(_nearest_widest_turn(fine, self._finger_reach(fine)) + error_rad)
 
     def _rotated_placement(self, angle: float) -> Placement:
         x, y, pose = self.placement.x_mm, self.placement.y_mm, self.grip.pose
@@ -125,7 +137,7 @@ class Pinch:
         return self._finger_reach(_COARSE_RAD)
 
     def _finger_reach(self, turns: Sequence[float]) -> Array:
-        """(turns, fingers): how far along its rays each finger goes until it touches; inf where it meets nothing."""
+        """Return (turns, fingers): the distance along its rays at which each finger touches; inf for a miss."""
         self.passes["turn"] += 1
         placements = [self._rotated_placement(angle) for angle in turns]
         rays = [self._rays(side, _COARSE_GRID, placements) for side in SIDES.values()]
@@ -134,8 +146,9 @@ class Pinch:
         return np.asarray(reach.reshape(len(turns), len(SIDES), -1).min(axis=2))
 
     def _rays(self, side: float, grid: tuple[int, int], placements: Sequence[Placement]) -> tuple[Array, Array]:
-        """Starts and directions, (placements, pixels, 3) in the object's frame as it is placed, of parallel rays from
-        the pad of a finger.
+        """Return starts and directions of parallel rays from the pad of a finger.
+
+        Both are (placements, pixels, 3), in the frame of the object in each placement.
         """
         height, width = self._field_mm
         z = height * (0.5 - (np.arange(grid[0]) + 0.5) / grid[0])
@@ -155,7 +168,7 @@ class Pinch:
 
     @cached_property
     def miss_reason(self) -> str | None:
-        """Why the fingers close on nothing, or None: one comes down on the object, or the object is not between."""
+        """Why the fingers miss, or None: one comes down on the object, or the object is not between them."""
         reach = self._coarse_reach[len(_COARSE_RAD) // 2]
         if (reach < _START_MM - self.grip.opening_mm / 2).any():
             return "a finger comes down on the object"
@@ -165,7 +178,7 @@ class Pinch:
 
     @cached_property
     def _walls(self) -> dict[str, Array]:
-        """Distance along each finger's rays to the turned object; a bare finger feels its way on the coarse grid."""
+        """Distance along each finger's rays to the turned object; a bare finger uses the coarse grid."""
         walls = {}
         for finger, side in SIDES.items():
             grid = self.hand.grid if finger in self.sensors else _COARSE_GRID
@@ -174,14 +187,14 @@ class Pinch:
             walls[finger] = self.obj.body.cast(starts, directions).reshape(grid)
         return walls
 
-    # What the fingers feel ----------------------------------------------------------------------------------
+    # Contact ------------------------------------------------------------------------------------------------
 
     def gap(self, finger: str) -> Array:
-        """(rows, columns) mm from the gel at first touch to the object; inf where there is none."""
+        """Return the distance (rows, columns), mm, from the gel at first touch to the object; inf beyond the object."""
         return np.asarray(self._walls[finger] - self._walls[finger].min())
 
     def contact(self, finger: str) -> Contact:
-        """The gel of one finger pressed against the object's side. Only where the fingers did not miss."""
+        """Return the contact of one finger's gel with the object's side. Call it only if `miss_reason` is None."""
         if finger not in self._contacts:
             self.passes["contact"] += 1
             self._contacts[finger] = press(
@@ -196,7 +209,7 @@ class Pinch:
         return self._contacts[finger]
 
     def touch(self, finger: str, noise_seed: int) -> Picture:
-        """The gel image while the object is held."""
+        """Return the gel image during the hold."""
         if self.miss_reason:
             return self.sensors[finger].background(noise_seed)
         if finger not in self._clean_images:
@@ -204,26 +217,26 @@ class Pinch:
             self._clean_images[finger] = self.sensors[finger].render_clean(self.contact(finger).displacement_mm)
         return self.sensors[finger].capture(self._clean_images[finger], noise_seed)
 
-    # What comes of it ---------------------------------------------------------------------------------------
+    # Outcome ------------------------------------------------------------------------------------------------
 
     @cached_property
     def final_opening_mm(self) -> float:
-        """Opening when the jaws have come to rest: 0 for a miss, else the width less what gels and object give way.
+        """Opening of the jaws at rest: 0 for a miss, otherwise the width less the compression of gels and object.
 
-        A soft object is never squeezed below a fifth of its width, where linear elasticity has long ceased to hold.
+        A soft object is never squeezed below a fifth of its width, where linear elasticity does not hold.
         """
         if self.miss_reason:
             return 0.0
         width = 2 * _START_MM - sum(float(wall.min()) for wall in self._walls.values())
-        gives_way = sum(self.contact(finger).approach_mm for finger in self.sensors)
-        return max(width - gives_way, _MIN_WIDTH_RATIO * width)
+        compression = sum(self.contact(finger).approach_mm for finger in self.sensors)
+        return max(width - compression, _MIN_WIDTH_RATIO * width)
 
     @cached_property
     def slip_reason(self) -> str | None:
-        """Why the object is lost in the lift, or None. Coulomb friction, a hard-finger model.
+        """Why the lift loses the object, or None. Coulomb friction, a hard-finger model.
 
-        The weight must stay below what both fingers' friction carries; the line between the contacts and the mean
-        slope under each finger must lie within the friction cone (Nguyen 1988).
+        The weight must stay below the friction of both fingers. The line between the contacts and the mean slope under
+        each finger must lie within the friction cone (Nguyen 1988).
         """
         if self.miss_reason:
             return self.miss_reason
@@ -242,21 +255,21 @@ class Pinch:
         return self._field_mm[1] / self.hand.grid[1]
 
     def _centre(self, finger: str) -> Array:
-        """(x, y, z) of a contact in the gripper frame: the centre of pressure, or a bare finger's nearest point."""
+        """Return (x, y, z) of a contact in the gripper frame: centre of pressure, or a bare finger's nearest point."""
         wall, (height, width) = self._walls[finger], self._field_mm
-        felt = finger in self.sensors
-        weight = self.contact(finger).pressure_mpa if felt else (wall <= wall.min() + 0.1).astype(np.float64)
+        has_gel = finger in self.sensors
+        weight = self.contact(finger).pressure_mpa if has_gel else (wall <= wall.min() + 0.1).astype(np.float64)
         rows, columns = np.indices(wall.shape)
-        share = weight / weight.sum()
-        z = height * (0.5 - ((rows + 0.5) * share).sum() / wall.shape[0])
-        y = -SIDES[finger] * width * (((columns + 0.5) * share).sum() / wall.shape[1] - 0.5)
+        fraction = weight / weight.sum()
+        z = height * (0.5 - ((rows + 0.5) * fraction).sum() / wall.shape[0])
+        y = -SIDES[finger] * width * (((columns + 0.5) * fraction).sum() / wall.shape[1] - 0.5)
         return np.array([SIDES[finger] * (float(wall.min()) - _START_MM), y, z])
 
 
 def _nearest_widest_turn(turns: Sequence[float], reached: Array) -> float:
-    """From the middle turn, the way on which the fingers reach further, up to the nearest place where neither does."""
+    """Walk from the middle turn to larger reach and return the nearest turn where neither neighbour reaches further."""
     reach = reached.sum(axis=1)
-    reach[np.isinf(reach)] = -np.inf  # turned away from a finger is not narrow
+    reach[np.isinf(reach)] = -np.inf  # a finger that misses the object does not count as narrow
     step = len(turns) // 2
     while 0 < step < len(turns) - 1:
         further = max(step - 1, step + 1, key=lambda other: float(reach[other]))
@@ -267,7 +280,7 @@ def _nearest_widest_turn(turns: Sequence[float], reached: Array) -> float:
 
 
 def _mean_slope(contact: Contact, pixel_mm: float) -> float:
-    """Tangent of the angle between the closing direction and the resultant force of a frictionless contact."""
+    """Return the tangent of the angle between closing direction and resultant force of a frictionless contact."""
     along = np.gradient(contact.displacement_mm, pixel_mm)
     total = contact.pressure_mpa.sum()
     return math.hypot(*(float((contact.pressure_mpa * slope).sum() / total) for slope in along))

@@ -1,4 +1,4 @@
-"""A contact sheet that a person can look at: photo, depth, gels before and during, and the wall that each gel met."""
+"""A contact sheet of a recording: photo, depth, gels before and during, and the surface that each gel met."""
 
 import struct
 import zlib
@@ -22,15 +22,27 @@ TILE_PX = 160
 _HEADER_PX = 24
 _CAPTION_PX = 20
 _FIRST_CHUNK_END = 8 + 25
-"""Bytes of a PNG file before its second chunk: the signature and the header."""
+"""Length in bytes of a PNG file up to its second chunk: the signature and the header."""
 _MAX_DEPTH_MM = 3.0
-"""Walls are drawn from touched (bright) to this far behind (dark)."""
+"""Surfaces are drawn from contact (bright) to this far behind (dark)."""
 
 
 def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
     """Write a PNG with one grasp of each of up to `rows` objects of a simulated recording, evenly chosen.
 
-    The walls are simulated once more from seed, attempt, pose and force. Raises RecordingError, StorageError.
+    The surfaces are simulated again from seed, attempt, pose and force.
+
+    Args:
+        folder: the recording.
+        out: the PNG file to write.
+        rows: maximum number of objects.
+
+    Returns:
+        The path of the PNG file.
+
+    Raises:
+        RecordingError: The recording is invalid, empty or not of the simulated rig.
+        StorageError: The file cannot be written.
     """
     recording = read_recording(folder)
     rig = _rig(recording.folder, recording.info)
@@ -44,30 +56,30 @@ def write_preview(folder: str | Path, out: str | Path, rows: int = 12) -> Path:
 
 
 def _add_software_chunk(png: bytes) -> bytes:
-    """The PNG file with a chunk after its first that says what made it, by which a later preview may replace it."""
+    """Insert a chunk with the program's name after the first one; a later preview may replace such a file."""
     chunk = b"tEXtSoftware\0touch-retrieval"
     length, check = (struct.pack(">I", number) for number in (len(chunk) - 4, zlib.crc32(chunk)))
     return png[:_FIRST_CHUNK_END] + length + chunk + check + png[_FIRST_CHUNK_END:]
 
 
 def _rig(folder: Path, info: Mapping[str, Any]) -> SimRig:
-    """The rig that made the recording."""
+    """Load the rig that made the recording."""
     if info.get("rig") != "sim":
-        raise RecordingError(f"{folder} must be of the simulated rig for a preview with walls, got {info.get('rig')!r}")
+        raise RecordingError(f"a preview needs a recording of the simulated rig; {folder} is of {info.get('rig')!r}")
     rig = load_rig("sim", seed=info["seed"], **info["rig_settings"])
     assert isinstance(rig, SimRig)
     return rig
 
 
 def _pick_grasps(grasps: Sequence[RecordedGrasp], rows: int) -> list[RecordedGrasp]:
-    """The first accepted grasp of each of up to `rows` objects; of all grasps where none was accepted."""
+    """Return the first accepted grasp of each of up to `rows` objects, or the first grasp if none was accepted."""
     accepted = [grasp for grasp in grasps if grasp.grasped is not False] or list(grasps)
     first: dict[str, RecordedGrasp] = {}
     for grasp in accepted:
         first.setdefault(grasp.object_id, grasp)
     names = list(first)
     if not names:
-        raise RecordingError("a preview needs a recording with at least one grasp; this one holds none")
+        raise RecordingError("a preview needs a recording with at least one grasp; this one has none")
     picked = np.linspace(0, len(names) - 1, min(rows, len(names))).round().astype(int)
     return [first[names[index]] for index in picked]
 
@@ -80,7 +92,7 @@ def _header(fingers: Sequence[str]) -> Picture:
 
 
 def _row(folder: Path, grasp: RecordedGrasp, rig: SimRig) -> Picture:
-    """Tiles of one grasp, with its name and force below."""
+    """Return the tiles of one grasp, with its name and force below."""
     tiles = [_tile(_read(folder, grasp.photo)), _tile(_depth(folder, grasp))]
     walls = rig.walls(grasp)
     for finger in rig.sensors:
@@ -95,13 +107,13 @@ def _row(folder: Path, grasp: RecordedGrasp, rig: SimRig) -> Picture:
 
 
 def _read(folder: Path, path: str | None) -> Picture | None:
-    """RGB pixels of an image of the recording; None where it was not recorded."""
+    """Return the RGB pixels of an image of the recording; None if it was not recorded."""
     image = None if path is None else cv2.imread(str(folder / path), cv2.IMREAD_COLOR)
     return None if image is None else np.asarray(image[..., ::-1], np.uint8)
 
 
 def _depth(folder: Path, grasp: RecordedGrasp) -> Picture | None:
-    """The depth image as colours over its own range; holes are black."""
+    """Return the depth image as colours over its own range; holes are black."""
     if grasp.depth is None:
         return None
     image = cv2.imread(str(folder / grasp.depth), cv2.IMREAD_UNCHANGED)
@@ -113,7 +125,7 @@ def _depth(folder: Path, grasp: RecordedGrasp) -> Picture | None:
 
 
 def _apply_colormap(distance: npt.NDArray[Any] | None, deepest: float) -> Picture | None:
-    """Near is bright, `deepest` and beyond dark, nothing at all (inf) black."""
+    """Colour distances: near is bright, `deepest` and beyond dark, inf black."""
     if distance is None:
         return None
     level = 255 * (1 - np.clip(distance / max(deepest, 1e-6), 0, 1))
@@ -122,7 +134,7 @@ def _apply_colormap(distance: npt.NDArray[Any] | None, deepest: float) -> Pictur
 
 
 def _tile(image: Picture | None) -> Picture:
-    """Fit into a square tile, a grey one where there is no image."""
+    """Fit the image into a square tile; without an image the tile is grey."""
     tile = np.full((TILE_PX, TILE_PX, 3), 238, np.uint8)
     if image is not None:
         scale = (TILE_PX - 4) / max(image.shape[:2])

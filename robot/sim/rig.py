@@ -1,4 +1,4 @@
-"""The simulated rig: devices like any other over one Scene; seed, object and number decide all of an attempt."""
+"""The simulated rig: virtual devices over one Scene. Seed, object and number determine the whole attempt."""
 
 import math
 import zlib
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 FORCE_N = (5.0, 80.0)
-"""Clamping force of the Weiss WSG-50 that is simulated."""
+"""Range of the clamping force of the simulated Weiss WSG-50."""
 
 _MESH_UNITS = UNITS | {"pose": f"{UNITS['pose']}; then its tilt in radian, where it does not point straight down"}
 _ATTEMPT_S = 40.0
@@ -44,21 +44,22 @@ _TABLE_MM = 15.0
 
 
 class SimClock:
-    """Time that passes only when something is done."""
+    """Clock that advances only when a device acts."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
 
     def __call__(self) -> float:
+        """Return the time in seconds."""
         return self.now_s
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass."""
+        """Advance the time."""
         self.now_s += seconds
 
 
 class SimState:
-    """What the devices share: the scene of this attempt, where the hand is, what it holds, and the time."""
+    """State that the devices share: the scene of this attempt, the pose of the hand, the opening, and the time."""
 
     def __init__(self, clock: SimClock) -> None:
         self.clock = clock
@@ -67,9 +68,9 @@ class SimState:
         self.opening_mm = STROKE_MM
 
     def current_scene(self) -> Scene:
-        """The scene of this attempt. Raises DeviceError before there is one."""
+        """Return the scene of this attempt. Raise DeviceError if there is none."""
         if self.scene is None:
-            raise DeviceError("nothing stands on the simulated table yet; call prepare(object_id, number) first")
+            raise DeviceError("the simulated table is empty. Call prepare(object_id, number) first")
         return self.scene
 
     @property
@@ -81,18 +82,28 @@ class SimState:
 
 @dataclass(frozen=True, kw_only=True)
 class SimSettings(TypedSettings):
-    """What the simulated rig is like.
+    """Settings of the simulated rig.
 
-    fingers: those with a gel. optics: led, grey (white lamps, a grey camera), or a sensor fitted to real presses
-    (gelsight, gelsight_mini). gels: so many pairs serve one after the other, each for its share of the objects.
-    markers: black dots on the gels. families: only shapes of these. meshes: a folder of STL, OBJ or PLY files to hold
-    instead (needs the extra `mesh`). contact_grid (rows, columns) and contact_tolerance of the contact solver. shadow:
-    whether the lamp casts one. focal_px: of the camera, whose pictures have 256 px a side; at 860 they show some 190
-    mm, and larger objects in part. localisation_mm: how far off the camera's calibration is, drawn from this range.
-    grasp, attempt, planner and gel are the tables [grasp], [attempt], [planner], [gel.a] and [gel.b] of a real rig's
-    file: how grasps are drawn and attempts are made (robot.grasping.settings), where the jaws close
-    (robot.grasping.planner; "mesh" by default for meshes), and what the gels are made of (robot.gel_settings); what is
-    not known of one is drawn.
+    Attributes:
+        fingers: fingers with a gel.
+        optics: led, grey (white lamps, a grey camera), or a sensor fitted to real presses (gelsight, gelsight_mini).
+        gels: number of gel pairs; the objects are divided between them.
+        markers: whether the gels have black dots.
+        families: shape families to draw from; all if empty.
+        meshes: folder of STL, OBJ or PLY files to use instead of procedural objects (needs the extra `mesh`).
+        contact_grid: rows and columns of the contact solver.
+        contact_tolerance: tolerance of the contact solver.
+        shadow: whether the lamp casts a shadow.
+        focal_px: focal length of the camera. Its pictures have 256 px a side; at 860 they show about 190 mm, and part
+            of larger objects.
+        localisation_mm: range from which the error of the camera's calibration is drawn.
+        grasp: the table [grasp] of a real rig's file: how grasps are drawn (robot.grasping.settings).
+        attempt: the table [attempt]: how attempts are made (robot.grasping.settings).
+        planner: the table [planner]: where the jaws close (robot.grasping.planner; "mesh" by default for meshes).
+        gel: the tables [gel.a] and [gel.b]: materials of the gels (robot.gel_settings); unknown properties are drawn.
+
+    Raises:
+        RobotConfigError: A setting has the wrong type or is out of range.
     """
 
     fingers: tuple[str, ...] = ("a", "b")
@@ -112,50 +123,60 @@ class SimSettings(TypedSettings):
     gel: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Raises RobotConfigError for a setting of the wrong type or out of range."""
         super().__post_init__()
         fingers, (rows, columns) = self.fingers, self.contact_grid
         if not fingers or len(set(fingers)) != len(fingers) or set(fingers) - set(SIDES):
             raise RobotConfigError(f'fingers must be ["a"], ["b"] or ["a", "b"], got {list(fingers)}')
         if unknown := sorted(set(self.families) - set(SHAPES)):
-            raise RobotConfigError(f"families must be of {', '.join(sorted(SHAPES))}; got {unknown[0]!r}")
+            raise RobotConfigError(f"families must be among {', '.join(sorted(SHAPES))}; got {unknown[0]!r}")
         if not 3 <= rows <= columns <= 2000 or 4 * rows != 3 * columns:
-            raise RobotConfigError(f"contact_grid must be 3 to 2000, 3 rows to 4 columns, got {rows}, {columns}")
+            raise RobotConfigError(
+                f"contact_grid must have 3 to 2000 rows and columns in the ratio 3 to 4, got {rows}, {columns}"
+            )
         if not 0 <= self.localisation_mm[0] <= self.localisation_mm[1]:
-            raise RobotConfigError(f"localisation_mm must be a range of two lengths, got {self.localisation_mm}")
+            raise RobotConfigError(
+                f"localisation_mm must be two lengths, the smaller first, got {self.localisation_mm}"
+            )
 
 
 class SimRig(Rig):
-    """Arm, gripper with a gel on each finger, and an RGB-D camera over a table with procedural objects; its keywords
-    are those of SimSettings.
+    """Arm, gripper with a gel on each finger, and an RGB-D camera over a table with simulated objects.
+
+    Args:
+        seed: seed of objects, gels, placements and light.
+        **settings: the fields of `SimSettings`.
+
+    Raises:
+        RobotConfigError: A setting or the folder of meshes is invalid.
+        UnknownName: There is no planner or optics of this name.
+        SceneError: The settings describe an impossible scene.
     """
 
     Settings = SimSettings
     can_run_jobs: ClassVar[bool] = True
 
     def __init__(self, seed: int = 0, **settings: Any) -> None:
-        """Raises RobotConfigError, UnknownName, SceneError."""
         check_seed(seed)
-        asked = SimSettings(**settings)
-        self._seed, self._families = seed, tuple(sorted(asked.families))
-        attempt = parse_attempt_settings(asked.attempt, asked.grasp)
-        self.meshes = _mesh_folder(asked.meshes, seed, attempt.grasp) if asked.meshes else None
-        self._shadow = asked.shadow
+        options = SimSettings(**settings)
+        self._seed, self._families = seed, tuple(sorted(options.families))
+        attempt = parse_attempt_settings(options.attempt, options.grasp)
+        self.meshes = _mesh_folder(options.meshes, seed, attempt.grasp) if options.meshes else None
+        self._shadow = options.shadow
         self._hand = Hand(
-            grid=asked.contact_grid, tolerance=asked.contact_tolerance, turns_about_grip=self.meshes is not None
+            grid=options.contact_grid, tolerance=options.contact_tolerance, turns_about_grip=self.meshes is not None
         )
-        drawn = np.random.default_rng([103, seed]).integers(2**31, size=asked.gels)
-        dots = Markers() if asked.markers else None
-        fingers, known = asked.fingers, parse_gel_settings(asked.gel, asked.fingers)
+        drawn = np.random.default_rng([103, seed]).integers(2**31, size=options.gels)
+        dots = Markers() if options.markers else None
+        fingers, known = options.fingers, parse_gel_settings(options.gel, options.fingers)
         self._gels = [
             {
-                finger: replace(draw_sensor(int(pair), finger, optics=asked.optics, gel=known[finger]), markers=dots)
+                finger: replace(draw_sensor(int(pair), finger, optics=options.optics, gel=known[finger]), markers=dots)
                 for finger in fingers
             }
             for pair in drawn
         ]
-        self._camera = PinholeCamera(focal_px=asked.focal_px)
-        clock, self.error_mm = SimClock(), _calibration_error(seed, asked.localisation_mm)
+        self._camera = PinholeCamera(focal_px=options.focal_px)
+        clock, self.error_mm = SimClock(), _calibration_error(seed, options.localisation_mm)
         self.sim_state = SimState(clock)
         super().__init__(
             SimArm(self.sim_state),
@@ -164,7 +185,7 @@ class SimRig(Rig):
             SimCamera(self.sim_state, self._camera, self.error_mm),
             info={
                 "source": "simulated rig",
-                "sensor": f"simulated GelSight ({asked.optics} optics)",
+                "sensor": f"simulated GelSight ({options.optics} optics)",
                 "rig": "sim",
                 "fingers": sorted(fingers),
                 "gels": [{finger: pair[finger].gel.to_dict() for finger in sorted(pair)} for pair in self._gels],
@@ -173,20 +194,24 @@ class SimRig(Rig):
             clock=clock,
             sleep=clock.sleep,
             attempt=attempt,
-            planner=load_planner(asked.planner, "mesh" if self.meshes else "cylinder"),
+            planner=load_planner(options.planner, "mesh" if self.meshes else "cylinder"),
         )
         self.attempt.grasp.check(self.arm, self.gripper)
 
     def object_ids(self, count: int) -> list[str]:
-        """The first `count` objects of this seed. Raises RobotConfigError for more than 100000, or than meshes."""
+        """Return the first `count` objects of this seed.
+
+        Raises:
+            RobotConfigError: `count` exceeds 100000 or the number of meshes.
+        """
         if count > _MAX_OBJECTS:
-            raise RobotConfigError(f"the simulated rig has at most {_MAX_OBJECTS} objects a seed, got {count}")
+            raise RobotConfigError(f"the simulated rig has at most {_MAX_OBJECTS} objects per seed, got {count}")
         if self.meshes is not None:
             return self.meshes.object_ids(count)
         return [_procedural(self._seed, index, self._families).object_id for index in range(count)]
 
     def prepare(self, object_id: str, number: int) -> None:
-        """Stand the object on the table, turned and placed at random, under new light."""
+        """Place the object on the table at a random position and yaw, under new light."""
         obj = self._find_object(object_id)
         name = zlib.crc32(object_id.encode())
         rng = np.random.default_rng([101, self._seed, name, number])
@@ -204,12 +229,18 @@ class SimRig(Rig):
         self.sim_state.clock.now_s = number * _ATTEMPT_S
 
     def labels(self, object_id: str) -> dict[str, float | bool | str]:
-        """`SimObject.labels` of an object of this rig. Raises RobotConfigError where it has none of this name."""
+        """Return `SimObject.labels` of an object of this rig.
+
+        Raises:
+            RobotConfigError: The rig has no object of this name.
+        """
         return self._find_object(object_id).labels()
 
     def press(self, object_id: str, number: int) -> dict[str, npt.NDArray[np.uint8]]:
-        """Gel images of each finger, pressed and before (touch_a, touch_a_before, ...), as jaws close on the object
-        at a random height, turn and force, without arm or camera; nothing where they close on air.
+        """Press the object at a random height, yaw and force, without arm or camera.
+
+        Returns:
+            The gel images of each finger, pressed and before (touch_a, touch_a_before, ...); empty if the jaws miss.
         """
         self.prepare(object_id, number)
         scene = self.sim_state.current_scene()
@@ -226,18 +257,22 @@ class SimRig(Rig):
         return {name: scene.image(name) for name in names}
 
     def walls(self, grasp: RecordedGrasp) -> dict[str, Array]:
-        """Distance (mm) of the object from each gel at first touch, simulated again from what was recorded.
+        """Return the distance (mm) of the object from each gel at first touch, simulated again from the record.
 
-        (rows, columns) of the contact grid, inf where the finger meets nothing; empty for a miss.
+        Each array is (rows, columns) of the contact grid, inf where the finger meets nothing. A miss gives an empty
+        dictionary.
+
+        Raises:
+            RecordingError: The grasp has no pose or force.
         """
         if grasp.pose is None or grasp.force_n is None:
-            raise RecordingError(f"{grasp.grasp_id} must have a pose and a force for its walls to be simulated again")
+            raise RecordingError(f"{grasp.grasp_id} must have a pose and a force to be simulated again")
         self.prepare(grasp.object_id, int(grasp.grasp_id.rsplit("-", 1)[-1]))
         scene = replace(self.sim_state.current_scene(), grip=Grip(Pose(*grasp.pose), grasp.force_n))
         return {} if scene.pinch.miss_reason else {finger: scene.pinch.gap(finger) for finger in self.sensors}
 
     def _find_object(self, object_id: str) -> SimObject:
-        """The object of this name: procedural ones end in their index, meshes begin with their file's name."""
+        """Return the object of this name: a procedural name ends in its index, a mesh name begins with its file's."""
         if self.meshes is not None:
             candidates = self.meshes.candidates(object_id)
         else:
@@ -251,7 +286,7 @@ class SimRig(Rig):
 
 @lru_cache(maxsize=4)
 def _procedural(seed: int, index: int, families: tuple[str, ...]) -> SimObject:
-    """It keeps its baked relief from attempt to attempt."""
+    """Draw an object, cached: it keeps its baked relief between attempts."""
     return draw_object(seed, index, family=families[index % len(families)] if families else None)
 
 
@@ -262,7 +297,7 @@ def _mesh_folder(folder: str, seed: int, settings: GraspSettings) -> "MeshFolder
 
 
 def _calibration_error(seed: int, localisation_mm: Sequence[float]) -> Array:
-    """(3,) how far, in mm, the camera believes itself from where it is."""
+    """Return the error (3,) of the camera's calibration in mm."""
     rng = np.random.default_rng([102, seed])
     turn, size = rng.uniform(0.0, 2.0 * math.pi), rng.uniform(localisation_mm[0], localisation_mm[1])
     return np.array([size * math.cos(turn), size * math.sin(turn), 0.0])
@@ -272,7 +307,7 @@ def _calibration_error(seed: int, localisation_mm: Sequence[float]) -> Array:
 
 
 class SimArm(VirtualDevice, Arm):
-    """Goes where it is told, at once but for the clock."""
+    """Arm that reaches each pose exactly; only the clock advances."""
 
     def __init__(self, sim_state: SimState) -> None:
         super().__init__("simulated arm", _WORKSPACE, clock=sim_state.clock)
@@ -290,7 +325,7 @@ class SimArm(VirtualDevice, Arm):
 
 
 class SimGripper(VirtualDevice, Gripper):
-    """Closes on what stands between its fingers; what it reports comes from the mechanics of the pinch."""
+    """Gripper that closes on the object between its fingers; the mechanics of the pinch give its readings."""
 
     def __init__(self, sim_state: SimState) -> None:
         super().__init__(
@@ -332,7 +367,7 @@ class SimGripper(VirtualDevice, Gripper):
 
 
 class SimTactileSensor(VirtualDevice, TactileSensor):
-    """The gel of one finger: untouched, pressed, or after the lift."""
+    """The gel of one finger: without contact, pressed, or after the lift."""
 
     def __init__(self, sim_state: SimState, finger: str) -> None:
         super().__init__(f"simulated gel {finger}", finger, clock=sim_state.clock)
@@ -345,7 +380,7 @@ class SimTactileSensor(VirtualDevice, TactileSensor):
 
 
 class SimCamera(VirtualDevice, Camera):
-    """Looks at the table; it knows where it stands only as well as it was calibrated."""
+    """RGB-D camera over the table; its reported pose has the calibration error."""
 
     def __init__(self, sim_state: SimState, camera: PinholeCamera, error_mm: Array) -> None:
         reported = camera.to_rig.copy()

@@ -1,10 +1,10 @@
-"""What the simulated rig holds for one grasp: an object on a table, fingers, a camera, and WHICH OUTPUTS ARE WANTED.
+"""The scene of the simulated rig for one grasp: an object on a table, fingers, a camera, and THE REQUESTED OUTPUTS.
 
     scene = Scene(draw_object(0, 3), outputs={"photo", "touch_a"}, grip=Grip(Pose(0, 0, 60, 0.4), force_n=12))
     images = scene.run()        # {"photo": (256, 256, 3) uint8, "touch_a": (240, 320, 3) uint8}
 
-Outputs have the names of a recording's image columns. Nothing is computed that no output needs: `scene.passes` counts
-what was (view, photo, shadow, depth, turn, wall, feel, contact, gel, background).
+Outputs have the names of a recording's image columns. Only what an output needs is computed: `scene.passes` counts the
+computations (view, photo, shadow, depth, turn, wall, bare_finger, contact, gel, background).
 """
 
 import re
@@ -30,10 +30,22 @@ _MOMENTS = {"_before": 1, None: 2, "_after": 3}
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """One object on the table, and what is done to it. `seed` draws light, noise and how the object settles.
+    """One object on the table and the grip on it.
 
-    `sensors` are the fingers that feel, by letter; leave one out and the finger is bare. Raises SceneError for what
-    cannot be: an unknown output, a touch without its sensor or without a grip, a finger that no gripper has.
+    Attributes:
+        obj: the object.
+        placement: its pose on the table.
+        camera: the camera over the table.
+        sensors: the gel of each finger, by letter; a finger without one is bare.
+        hand: the gripper.
+        grip: pose and force of the jaws; None before a grasp.
+        seed: seed of light, noise and the error of the object's turn.
+        shadow: whether the lamp casts a shadow.
+        outputs: names of the outputs that `run` computes.
+        passes: counts of the computations done, by name.
+
+    Raises:
+        SceneError: An output is unknown, a touch has no sensor or no grip, or no gripper has this finger.
 
     >>> scene = robot.Scene(robot.draw_object(seed=0, index=0), outputs={"photo"})
     >>> scene.run()["photo"].dtype
@@ -64,14 +76,14 @@ class Scene:
         if touch and touch[1] not in self.sensors:
             raise SceneError(f"{name} needs a sensor on finger {touch[1]}; this scene has {sorted(self.sensors)}")
         if touch and touch[2] != "_before" and self.grip is None:
-            raise SceneError(f"{name} needs a grip; give Scene(grip=Grip(pose, force_n))")
+            raise SceneError(f"{name} needs a grip; pass Scene(grip=Grip(pose, force_n))")
 
     def run(self) -> dict[str, npt.NDArray[Any]]:
-        """The wanted outputs by name, and nothing else."""
+        """Return the requested outputs by name."""
         return {name: self.image(name) for name in sorted(self.outputs)}
 
     def image(self, name: str) -> npt.NDArray[Any]:
-        """One output: colour (H, W, 3) uint8; `depth` (H, W) float32 in metre, NaN where unknown."""
+        """Return one output: colour (H, W, 3) uint8, or `depth` (H, W) float32 in metres, NaN where unknown."""
         self._check(name)
         if name == "photo":
             return self._photo()
@@ -89,15 +101,15 @@ class Scene:
 
     @cached_property
     def _view(self) -> cameras.CameraView:
-        """What the camera meets; photo and depth share it."""
+        """Geometry pass that photo and depth share."""
         self.passes["view"] += 1
         return cameras.cast_camera_rays(self.obj, self.placement, self.camera)
 
     @cached_property
     def pinch(self) -> Pinch:
-        """The mechanics of the grip, each part worked out when asked for."""
+        """Mechanics of the grip; each quantity is computed on first use."""
         if self.grip is None:
-            raise SceneError("no grip in this scene; give Scene(grip=Grip(pose, force_n))")
+            raise SceneError("this scene has no grip; pass Scene(grip=Grip(pose, force_n))")
         return Pinch(
             obj=self.obj,
             placement=self.placement,
@@ -109,7 +121,7 @@ class Scene:
         )
 
     def _touch(self, finger: str, moment: str | None) -> npt.NDArray[np.uint8]:
-        """The gel image before, while and after holding; a gel that lost its object is a background."""
+        """Return the gel image before, during or after the hold; after a slip it is a no-contact frame."""
         noise = self._noise(_MOMENTS[moment], ord(finger))
         if moment == "_before" or (moment == "_after" and self.pinch.slip_reason):
             self.passes["background"] += 1
@@ -117,5 +129,5 @@ class Scene:
         return self.pinch.touch(finger, noise)
 
     def _noise(self, *stream: int) -> int:
-        """A seed of its own for each frame of this scene."""
+        """Return a separate seed for each frame of this scene."""
         return int(np.random.default_rng([92, self.seed, *stream]).integers(2**31))

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.faults`, once through the kinds without Ray; the tests of clusters have the others."""
+"""`python -m benchmarks.faults`, once for the kinds without Ray; the tests of sharded indexes cover the others."""
 
 import json
 
@@ -14,16 +14,16 @@ def test_builds_that_are_killed_refused_and_torn_lose_nothing(monkeypatch, capsy
     pytest.importorskip("s3fs", reason="needs s3fs")
     monkeypatch.setattr("sys.argv", ["faults", "--times", "1", "--only", "job", "refusals", "torn"])
     assert faults.main() == 0
-    told = {line["kind"]: line for line in map(json.loads, capsys.readouterr().out.splitlines())}
-    assert told["job"]["killed"] == 2
-    assert told["job"]["same_repeated_most"] == 0
-    assert told["job"]["other_repeated_most"] < faults.PHOTOS / 2
-    assert told["refusals"]["refused"] >= 1
-    assert told["torn"]["torn"] >= 1
+    figures = {line["kind"]: line for line in map(json.loads, capsys.readouterr().out.splitlines())}
+    assert figures["job"]["killed"] == 2
+    assert figures["job"]["same_repeated_most"] == 0
+    assert figures["job"]["other_repeated_most"] < faults.PHOTOS / 2
+    assert figures["refusals"]["refused"] >= 1
+    assert figures["torn"]["torn"] >= 1
 
 
-def test_a_photo_that_is_lost_doubled_or_changed_is_found():
-    """The check of codes, by hand: of what is there, what must be."""
+def test_a_lost_duplicated_or_changed_photo_is_detected():
+    """The check of codes, on sets made by hand."""
     bench = object.__new__(faults.FaultFixture)
     bench.codes = {"a": ("mug", faults.np.zeros(2)), "b": ("tin", faults.np.ones(2))}
     for found in (

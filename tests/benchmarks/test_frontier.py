@@ -1,4 +1,4 @@
-"""The kernels' error against run time: every row measures points, and the defaults are what the code uses."""
+"""Error against run time of the kernels: every row measures points, and the defaults are those of the code."""
 
 import numpy as np
 import pytest
@@ -38,12 +38,12 @@ def test_every_row_measures_points_and_names_its_reference(name, rows):
 
 
 @pytest.mark.parametrize("name", sorted(set(APPROXIMATIONS) - {"contact", "gel_optics"}))
-def test_every_panel_of_ours_marks_one_default(name, rows):
+def test_every_panel_marks_one_default(name, rows):
     for panel in rows[name].panels:
         assert sum(point.is_default for point in panel.points) == 1, panel.title
 
 
-def test_the_command_plots_a_kernel_s_row_and_collects_nothing_for_it(model, tmp_path, capsys):
+def test_the_command_plots_a_kernel_s_row_without_a_recording(model, tmp_path, capsys):
     assert "cca_solver" in NEED_NO_MODEL
     main(["--out", str(tmp_path), "--model", str(model), "--quick", "--only", "cca_solver"])
     assert "cca_solver: canonical correlations" in capsys.readouterr().err
@@ -57,21 +57,21 @@ def test_the_rig_solves_contacts_at_the_default():
 
     panels = contact_panels(1, rows=(60, 120), tolerances=(1e-1, 1e-2), reference_rows=120)
     hand = Hand()
-    wanted = f"{hand.grid[0]}x{hand.grid[1]}, tolerance {hand.tolerance:g}"
-    assert [panel.default.name for panel in panels] == [wanted] * 3
+    expected = f"{hand.grid[0]}x{hand.grid[1]}, tolerance {hand.tolerance:g}"
+    assert [panel.default.name for panel in panels] == [expected] * 3
 
 
 # Canonical correlations ------------------------------------------------------------------------------------
 
 
-def test_the_constructed_problem_has_the_correlations_that_it_says():
-    """By a route of its own: principal angles between the column spaces."""
+def test_the_constructed_problem_has_the_stated_correlations():
+    """Checked independently: principal angles between the column spaces."""
     problem = known_problem(300, 6, spread=10.0)
     x, y = (np.linalg.qr(one - one.mean(0))[0] for one in (problem.x, problem.y))
     assert np.linalg.svd(x.T @ y, compute_uv=False) == pytest.approx(problem.rho, abs=1e-12)
 
 
-def test_the_textbook_way_fails_where_ours_does_not():
+def test_the_textbook_solver_fails_and_ours_does_not():
     problem = known_problem(500, 24, spread=1e6)
     assert _by_svd(problem) == pytest.approx(problem.rho, abs=1e-6)
     naive = _by_covariance(np.float32, problem)

@@ -1,4 +1,4 @@
-"""Error against run time, as data: what a point says, and that errors fall where they should."""
+"""Error against run time: the content of points, and errors that fall as expected."""
 
 import math
 
@@ -14,7 +14,7 @@ from robot.sim.objects.packets import MAX_STEPS
 
 @pytest.fixture(scope="module")
 def panels():
-    """Of the half-space, the layer and the gel image."""
+    """Panels of the half-space, the layer and the gel image."""
     return contact_panels(1, rows=(15, 30), tolerances=(1e-1, 1e-3), reference_rows=120)
 
 
@@ -22,7 +22,7 @@ def errors(panel, *words):
     return [point.error for point in panel.points if all(word in point.name for word in words)]
 
 
-def test_every_point_says_what_it_measured_against_what(panels):
+def test_every_point_has_its_error_time_and_reference(panels):
     assert [len(panel.points) for panel in panels] == [2 * 2, 2 * 2 * 2, 2 * 2]
     for panel in panels:
         assert all((panel.title, panel.time, panel.unit, panel.reference))
@@ -42,7 +42,7 @@ def test_a_finer_grid_is_nearer_to_hertz_and_to_the_finest_grid(panels):
         assert fine < coarse
 
 
-def test_padding_is_what_the_periodic_grid_lacks(panels):
+def test_padding_removes_the_error_of_the_periodic_grid(panels):
     assert errors(panels[1], "30x40, tolerance 0.001")[0] < 0.5 * min(errors(panels[1], "periodic"))
 
 
@@ -67,7 +67,7 @@ def test_the_optics_have_a_point_for_each_degree_and_error_falls():
     assert all(point.seconds > 0 for point in panel.points)
 
 
-def test_shorter_steps_are_nearer_to_equal_ones_and_the_gel_s_is_within_what_it_shows():
+def test_shorter_gel_steps_have_smaller_errors_and_the_default_is_within_tolerance():
     panel = gel_panel(1, rows=12, steps_mm=(1.6, 0.8, 0.1))
     long, middle, gels = errors(panel, "")
     assert long > 1.5 * middle > 1e3 * gels > 0
@@ -75,7 +75,7 @@ def test_shorter_steps_are_nearer_to_equal_ones_and_the_gel_s_is_within_what_it_
     assert panel.default.setting == "0.1 mm"
 
 
-def test_photos_of_shorter_steps_are_nearer_to_those_of_equal_steps_and_the_rig_s_err_less_than_its_camera():
+def test_shorter_photo_steps_have_smaller_errors_and_the_default_is_below_camera_noise():
     panel = photo_panel(1, objects=2, px=64, strides=(16, 4, 1))
     assert panel.default.name == "as the rig casts, 1 px"
     long, middle, ours = errors(panel, "as the rig casts")
@@ -84,14 +84,14 @@ def test_photos_of_shorter_steps_are_nearer_to_those_of_equal_steps_and_the_rig_
     assert errors(panel, "equal steps")[-1] == 0
 
 
-def test_few_steps_lose_rays_and_as_many_as_the_rig_s_none():
+def test_few_steps_lose_rays_and_the_default_number_loses_none():
     panel = limit_panel(1, objects=2, px=64, limits=(4, 8, 12, MAX_STEPS))
     *few, ours = errors(panel, "")
     assert few[0] > few[1] > few[2] > ours == 0
     assert panel.default.setting == "600 steps"
 
 
-def test_photos_are_the_same_whether_light_is_worked_out_compiled_in_float32_or_in_float64_but_for_a_grey_level():
+def test_float32_and_float64_shading_differ_by_at_most_a_grey_level():
     panel = light_panel(1, objects=2, px=64)
     compiled, arrays, exact = errors(panel, "")
     assert compiled <= 1
@@ -106,7 +106,7 @@ def test_the_sky_on_a_finer_grid_is_nearer_to_the_full_one():
     assert found[2] < 1.0
 
 
-def test_float32_changes_less_of_a_contact_than_its_tolerance():
+def test_float32_changes_a_contact_by_less_than_its_tolerance():
     panel = products_panel(1, rows=60, tolerances=(1e-2,))
     double, single = errors(panel, "")
     assert double == pytest.approx(single, rel=0.02)

@@ -69,12 +69,12 @@ OF_PACKAGE = {
 
 @pytest.fixture(scope="module")
 def rows():
-    """Package -> its hard cases, run when they are first asked for."""
+    """Package -> its hard cases, run on first use."""
     return cache(hard_cases)
 
 
 @pytest.mark.parametrize(("package", "kernel"), [(name, kernel) for name in KERNELS for kernel in OF_PACKAGE[name]])
-def test_what_must_hold_does_and_the_naive_formula_fails(rows, package, kernel):
+def test_our_result_holds_and_the_naive_formula_fails(rows, package, kernel):
     of_kernel = [row for row in rows(package) if row.kernel == kernel]
     assert of_kernel
     assert [f"{row.case}: {row.ours}" for row in of_kernel if not row.holds] == []
@@ -82,13 +82,13 @@ def test_what_must_hold_does_and_the_naive_formula_fails(rows, package, kernel):
 
 
 @pytest.mark.parametrize("package", KERNELS)
-def test_every_row_says_all_of_it_and_comes_once(rows, package):
+def test_every_row_is_complete_and_unique(rows, package):
     assert {row.kernel for row in rows(package)} == set(OF_PACKAGE[package])
     assert len({(row.kernel, row.case) for row in rows(package)}) == len(rows(package))
     assert all(row.case and row.must_hold and row.naive and row.ours for row in rows(package))
 
 
-def test_a_kernel_that_no_longer_holds_is_shown_so(monkeypatch):
+def test_a_broken_kernel_is_reported(monkeypatch):
     monkeypatch.setattr(losses, "match_loss", lambda z, y: -torch.log(torch.sigmoid(z)).mean())
     row = losses._sure_and_wrong()
     assert not row.holds
@@ -96,7 +96,7 @@ def test_a_kernel_that_no_longer_holds_is_shown_so(monkeypatch):
 
 
 @pytest.mark.parametrize("kind", [BadInput, RowError, SceneError])
-def test_what_is_accepted_does_not_count_as_refused(kind):
+def test_an_accepted_input_does_not_count_as_refused(kind):
     def raising():
         raise kind("row 7 is NaN")
 
@@ -107,17 +107,17 @@ def test_what_is_accepted_does_not_count_as_refused(kind):
         error_of(lambda: 1 / 0)
 
 
-# The naive formulae are right where nothing is hard: they fail by their arithmetic, not by a mistake ----------
+# The naive formulae are right on easy inputs: they fail by their arithmetic, not by a mistake -----------------
 
 
-def test_the_naive_canonical_correlations_are_ours_on_plain_features():
+def test_the_naive_canonical_correlations_equal_ours_on_easy_features():
     touch, photo = linear._views(200, 4)
     ours = linear._correlations(touch, photo).correlations
     assert linear.naive_correlations(touch, photo) == pytest.approx(ours, abs=1e-9)
     assert linear._by_eigenvectors(touch, photo) == pytest.approx(ours, abs=1e-5)
 
 
-def test_the_naive_fits_are_ours_where_pairs_overlap():
+def test_the_naive_fits_equal_ours_on_overlapping_pairs():
     rng = np.random.default_rng([8])
     logits, labels = np.append(rng.normal(1, 1, 20_000), rng.normal(-1, 1, 20_000)), np.repeat([1, 0], 20_000)
     fitted = probability.fit_calibration(logits, labels)
@@ -128,7 +128,7 @@ def test_the_naive_fits_are_ours_where_pairs_overlap():
     assert probability.naive_slope(scores) == pytest.approx(fitted.slope, rel=2e-2)
 
 
-def test_the_naive_components_are_those_of_the_cross_covariance_where_there_are_as_many():
+def test_the_naive_components_are_those_of_the_cross_covariance():
     touch, photo = linear._views(300, 5)
     first = np.linalg.svd((touch - touch.mean(0)).T @ (photo - photo.mean(0)))[0][:, 0]
     assert abs(linear.naive_pls(touch, photo, 2)[:, 0] @ first) == pytest.approx(1, abs=1e-6)
@@ -140,11 +140,11 @@ def test_the_naive_interval_is_the_t_interval_of_many_values():
     assert high - low == pytest.approx(2 * 1.96 * values.std() / 20, rel=0.1)
 
 
-def test_the_can_is_drawn_where_it_stands():
+def test_the_can_is_drawn_at_its_place():
     points = _points(_picture(_exact_depth()))
     assert points[:, 2].max() == pytest.approx(120, abs=1e-3)
     side = points[points[:, 2] < 119]
-    # float32 depth of 800 mm is good to 6e-5 mm
+    # float32 depth of 800 mm has an error of 6e-5 mm
     assert np.hypot(side[:, 0], side[:, 1]) == pytest.approx(np.full(len(side), 33), abs=1e-3)
     assert side[:, 1].max() < 0
 
@@ -155,9 +155,9 @@ def test_the_naive_circle_is_right_on_a_whole_circle_without_noise():
     assert naive_circle(plan) == pytest.approx((3, -2, 7))
 
 
-def test_the_naive_ridge_is_ours_on_features_of_one_size():
-    columns, wanted = _columns()
-    assert naive_ridge(columns, wanted) == pytest.approx(solve(_grams(columns, wanted), 1e-4), abs=1e-2)
+def test_the_naive_ridge_equals_ours_on_features_of_one_scale():
+    columns, target = _columns()
+    assert naive_ridge(columns, target) == pytest.approx(solve(_grams(columns, target), 1e-4), abs=1e-2)
 
 
 # The command ---------------------------------------------------------------------------------------------------
@@ -168,7 +168,7 @@ BAD = HardCase("losses", "a logit of 1000", "1000", "inf", "inf", False, False)
 
 @pytest.fixture
 def few_cases(monkeypatch):
-    """Packages that have no hard case but what a test gives the robot."""
+    """Packages without hard cases, except those that a test adds to the robot."""
 
     def give(*cases):
         monkeypatch.setattr(command, "hard_cases", lambda package: cases if package == "robot" else ())
@@ -179,11 +179,11 @@ def few_cases(monkeypatch):
 def test_hard_cases_that_hold_are_printed_and_written_and_the_exit_code_is_0(few_cases, tmp_path, capsys):
     few_cases(GOOD)
     assert command.main(["--out", str(tmp_path)]) == 0
-    said = capsys.readouterr().out
-    assert "holds  top k, a <NaN>: must hold: is refused; naive ranked first; ours refused\n1 of 1 hold\n" in said
+    output = capsys.readouterr().out
+    assert "holds  top k, a <NaN>: must hold: is refused; naive ranked first; ours refused\n1 of 1 hold\n" in output
     page = (tmp_path / "stability.html").read_text()
     assert "a &lt;NaN&gt;" in page
-    assert "What must hold does" in page
+    assert "All of them hold" in page
     assert json.loads((tmp_path / "stability.json").read_text())["failed"] == 0
 
 
@@ -201,15 +201,15 @@ def test_without_a_folder_nothing_is_written(few_cases, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_cases_name_the_package_that_they_are_of(monkeypatch):
+def test_cases_name_their_package(monkeypatch):
     monkeypatch.setattr(command, "hard_cases", lambda package: {"robot": [BAD], "indexes": [GOOD]}.get(package, []))
     made = command.run_hard_cases()
     assert [case["package"] for case in made["cases"]] == ["indexes", "robot"]
     assert made["failed"] == 1
 
 
-def test_the_page_of_performance_says_how_many_hold(rows):
+def test_the_performance_page_has_the_number_of_cases(rows):
     found = [row for package in KERNELS for row in rows(package)]
-    said = " ".join((ROOT / "docs" / "performance.md").read_text("utf-8").split())
+    page = " ".join((ROOT / "docs" / "performance.md").read_text("utf-8").split())
     kernels = {(package, row.kernel) for package in KERNELS for row in rows(package)}
-    assert f"{len(found)} stiff, extreme or degenerate inputs of {len({name for _, name in kernels})} numerical" in said
+    assert f"{len(found)} stiff, extreme or degenerate inputs of {len({name for _, name in kernels})} numerical" in page

@@ -1,4 +1,4 @@
-"""An import's memory grows with its rows by their names only: `python -m benchmarks.importers_memory`."""
+"""The memory of an import grows only with the names of its rows: `python -m benchmarks.importers_memory`."""
 
 import re
 from pathlib import Path
@@ -10,9 +10,9 @@ from robot.importers import IMPORTERS
 
 FEW, MANY = 1000, 6000
 SPREAD_MB = 4
-"""By which two runs of the same rows differ."""
+"""Difference between two runs of the same rows."""
 CODEC = "lerobot"
-"""Its decoder of videos fills buffers over some ten thousand rows: shown by the command alone."""
+"""Its video decoder fills buffers over about ten thousand rows: only the command covers it."""
 
 
 def test_rows_are_drawn_for_every_importer():
@@ -22,8 +22,8 @@ def test_rows_are_drawn_for_every_importer():
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is read from /proc")
 @pytest.mark.parametrize("name", [name for name in WIDE if name != CODEC])
-def test_memory_grows_by_the_names_of_rows_alone(name):
+def test_memory_grows_only_by_the_names_of_rows(name):
     peaks = {rows: peak_mb(name, rows) for rows in (FEW, MANY)}
     spread_kb = 1000 * SPREAD_MB / (MANY - FEW)
-    for what, most in MAX_KB.items():
-        assert growth_kb(peaks, what) < most + spread_kb, peaks
+    for what, limit_kb in MAX_KB.items():
+        assert growth_kb(peaks, what) < limit_kb + spread_kb, peaks

@@ -1,4 +1,4 @@
-"""The shipped checkpoint, judged in small."""
+"""A small evaluation of the shipped checkpoint."""
 
 import json
 
@@ -10,7 +10,7 @@ from retrieval.search import defaults
 
 
 @pytest.mark.slow
-def test_the_shipped_checkpoint_is_far_above_chance_on_objects_it_never_saw(tmp_path, monkeypatch):
+def test_the_shipped_checkpoint_is_far_above_chance_on_unseen_objects(tmp_path, monkeypatch):
     monkeypatch.setattr(shipped, "FITTED", 3)
     assert shipped.main(["score", str(tmp_path), "--objects", "13", "--grasps", "2", "--jobs", "1"]) == 0
     measures = json.loads((tmp_path / "report" / "results.json").read_text())["methods"]["late_fusion"]["measures"]
@@ -19,10 +19,10 @@ def test_the_shipped_checkpoint_is_far_above_chance_on_objects_it_never_saw(tmp_
 
 
 @pytest.mark.parametrize("fingers", defaults.SHIPPED)
-def test_the_shipped_checkpoints_know_what_a_touch_is_worth_beside_and_without_a_photo(fingers):
+def test_the_shipped_checkpoints_calibrate_reference_touches_with_and_without_photos(fingers):
     made = load_checkpoint(defaults.shipped_model(fingers))
     references = made.references
     assert references.objects == len(made.split.validation) == 100
     apart, equal = references.touch_only.log_ratio([-0.2, 0.9], 1)
-    assert apart < 0 < equal  # a touch that is nothing like it speaks against the object
+    assert apart < 0 < equal  # a dissimilar touch is evidence against the object
     assert references.weight * references.with_photos.slope > 1

@@ -1,4 +1,4 @@
-"""Optics fitted to presses: measures, reading, surfaces, least squares, aligning, judging; drawn and real presses."""
+"""Optics fitted to presses: measures, reading, surfaces, least squares, alignment, testing; drawn and real presses."""
 
 import json
 import math
@@ -27,7 +27,7 @@ PLAIN = OpticsSetting(degree=2, places=3, reaches_mm=())
 
 
 def draw_presses(count=6, seed=0, setting=PLAIN, noise=1.0):
-    """Presses whose colours follow a known model of `setting`, in a picture of 260 x 320; labels are the truth."""
+    """Draw presses whose colours follow a known model of `setting`, in a picture of 260 x 320; labels are exact."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.linspace(-1, 1, 320), np.linspace(-1, 1, 260))
     flat = np.stack([120 + 20 * x, 110 - 10 * y, 100 + 10 * x * y], axis=-1)
@@ -59,8 +59,8 @@ def ssim_by_two_loops(a, b):
                 two = b[row - 5 : row + 6, col - 5 : col + 6, channel].astype(float)
                 mean_1, mean_2 = (window * one).sum(), (window * two).sum()
                 var_1, var_2 = (window * (one - mean_1) ** 2).sum(), (window * (two - mean_2) ** 2).sum()
-                both = (window * (one - mean_1) * (two - mean_2)).sum()
-                top = (2 * mean_1 * mean_2 + 2.55**2) * (2 * both + 7.65**2)
+                covariance = (window * (one - mean_1) * (two - mean_2)).sum()
+                top = (2 * mean_1 * mean_2 + 2.55**2) * (2 * covariance + 7.65**2)
                 values.append(top / ((mean_1**2 + mean_2**2 + 2.55**2) * (var_1 + var_2 + 7.65**2)))
     return np.mean(values)
 
@@ -73,11 +73,11 @@ def test_similarity_is_that_of_two_plain_loops():
     assert ssim(a, a) == pytest.approx(1)
 
 
-def test_errors_are_counted_on_what_a_person_would_see():
+def test_errors_are_measured_on_rounded_and_clipped_pictures():
     truth = np.full((11, 11, 3), 250, np.uint8)
-    shown = compare(np.full((11, 11, 3), 300.0), truth)
-    assert (shown.l1, shown.mse) == (5, 25)
-    assert shown.psnr == pytest.approx(20 * math.log10(255 / 5))
+    errors = compare(np.full((11, 11, 3), 300.0), truth)
+    assert (errors.l1, errors.mse) == (5, 25)
+    assert errors.psnr == pytest.approx(20 * math.log10(255 / 5))
     assert compare(np.full((11, 11, 3), 250.4), truth).psnr == math.inf
     with pytest.raises(BadRobotInput, match="one shape"):
         compare(np.zeros((11, 12, 3)), truth)
@@ -97,8 +97,8 @@ def write(folder, **changes):
         "touch_radius": drawn.radii,
     }
     (folder / "gelsight").mkdir(parents=True, exist_ok=True)
-    kept = {key: value for key, value in {**arrays, **changes}.items() if value is not None}
-    np.savez(folder / "gelsight" / "dataPack.npz", **kept)
+    given_arrays = {key: value for key, value in {**arrays, **changes}.items() if value is not None}
+    np.savez(folder / "gelsight" / "dataPack.npz", **given_arrays)
     return folder
 
 
@@ -121,14 +121,14 @@ def test_presses_are_read_as_they_are(tmp_path):
         {"touch_radius": np.array([{"a": 1}, None], dtype=object)},
     ],
 )
-def test_what_is_no_pack_of_presses_is_refused_and_nothing_is_unpickled(tmp_path, changes):
+def test_an_invalid_file_of_presses_is_refused_and_nothing_is_unpickled(tmp_path, changes):
     with pytest.raises(BadRobotInput, match=r"dataPack\.npz must hold"):
         read_presses(write(tmp_path, **changes), "gelsight")
 
 
 @pytest.mark.parametrize("key", ["touch_center", "touch_radius"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_label_that_is_not_finite_is_refused_and_its_press_named(tmp_path, key, value):
+def test_a_label_that_is_not_finite_is_refused_with_its_press(tmp_path, key, value):
     drawn, _ = draw_presses(2)
     labels = {"touch_center": drawn.centres, "touch_radius": drawn.radii}[key].copy()
     labels[1, ...] = value
@@ -167,7 +167,7 @@ def test_a_crop_at_the_border_is_moved_inside():
 # Surfaces --------------------------------------------------------------------------------------------------
 
 
-def test_inside_the_contact_the_gel_is_the_ball_and_outside_it_falls_off():
+def test_the_gel_follows_the_ball_in_the_contact_and_falls_off_outside():
     table = ball_table(2.0, 4.0, 0.48, (0.5,))
     x = np.linspace(0.01, 7.9, 400)
     (height, slope, across), (smooth, *_) = table.at(1.5, x, np.zeros(400))
@@ -187,9 +187,9 @@ def test_profiles_smoothed_along_the_radius_are_those_of_the_smoothed_map():
     x, y = np.meshgrid(axis, axis)
     (height, *_), (smooth, along, down) = table.at(1.2, x, y)
     np.testing.assert_allclose(smooth, gaussian_filter(height, 6.0), atol=0.01)
-    wanted = np.gradient(smooth, 0.1)
-    np.testing.assert_allclose(along[20:-20, 20:-20], wanted[1][20:-20, 20:-20], atol=0.02)
-    np.testing.assert_allclose(down[20:-20, 20:-20], wanted[0][20:-20, 20:-20], atol=0.02)
+    expected = np.gradient(smooth, 0.1)
+    np.testing.assert_allclose(along[20:-20, 20:-20], expected[1][20:-20, 20:-20], atol=0.02)
+    np.testing.assert_allclose(down[20:-20, 20:-20], expected[0][20:-20, 20:-20], atol=0.02)
 
 
 def test_a_ball_pressed_beyond_its_equator_has_finite_slopes():
@@ -206,14 +206,14 @@ def test_weights_without_ridge_are_those_of_least_squares_and_empty_columns_get_
     poses = labelled_poses(drawn, PLAIN)
     found = solve([gram(drawn, index, poses[index], PLAIN) for index in range(4)], 0.0)
     rows = np.concatenate([features(drawn, index, poses[index], PLAIN) for index in range(4)])
-    wanted = np.concatenate([pose_fit.change(drawn, index) for index in range(4)])
-    np.testing.assert_allclose(found, np.linalg.lstsq(rows, wanted, rcond=None)[0], atol=1e-6)
+    target = np.concatenate([pose_fit.change(drawn, index) for index in range(4)])
+    np.testing.assert_allclose(found, np.linalg.lstsq(rows, target, rcond=None)[0], atol=1e-6)
     np.testing.assert_allclose(rows @ found, rows @ weights, atol=0.2)  # pictures are rounded
     empty = pose_fit.Gram(np.diag([1.0, 0.0]), np.array([[2.0] * 3, [0.0] * 3]), 1.0, 3)
     np.testing.assert_allclose(solve([empty], 1e-9), [[2.0] * 3, [0.0] * 3], rtol=1e-6)
 
 
-def test_the_naive_normal_equations_are_singular_where_the_ridge_is_not():
+def test_the_naive_normal_equations_are_singular_and_the_ridge_is_not():
     twice = pose_fit.Gram(np.ones((2, 2)), np.ones((2, 3)), 3.0, 3)
     with pytest.raises(np.linalg.LinAlgError):
         np.linalg.solve(twice.square, twice.cross)
@@ -242,10 +242,10 @@ def test_a_press_is_found_again_from_its_picture():
     for index in range(2):
         start = truth[index] + [9, -7, -0.2]
         found = aligned(drawn, index, start, weights, PLAIN, 10)
-        np.testing.assert_allclose(found, truth[index], atol=0.5)  # it began 9 px away
+        np.testing.assert_allclose(found, truth[index], atol=0.5)  # it started 9 px away
 
 
-def test_a_press_that_shows_nothing_stays_where_it_was():
+def test_a_press_without_information_is_not_moved():
     drawn, weights = draw_presses(1)
     drawn.pictures[0] = drawn.no_contact
     found = aligned(drawn, 0, pose_fit.first_pose(drawn, 0, PLAIN), 0 * weights, PLAIN, 5)
@@ -253,7 +253,7 @@ def test_a_press_that_shows_nothing_stays_where_it_was():
     np.testing.assert_array_equal(found[:2], drawn.centres[0])
 
 
-# Fitting and judging ---------------------------------------------------------------------------------------
+# Fitting and testing ---------------------------------------------------------------------------------------
 
 
 def test_a_fit_predicts_held_out_presses_to_their_noise(monkeypatch):
@@ -267,7 +267,7 @@ def test_a_fit_predicts_held_out_presses_to_their_noise(monkeypatch):
 
 
 @pytest.mark.slow
-def test_held_out_pictures_have_no_say_in_the_fit(monkeypatch):
+def test_held_out_pictures_do_not_affect_the_fit(monkeypatch):
     monkeypatch.setattr(press_model, "_THICKNESSES_MM", (4.0,))
     drawn, _ = draw_presses(6)
     other = replace(drawn, pictures=drawn.pictures.copy())
@@ -280,7 +280,7 @@ def test_held_out_pictures_have_no_say_in_the_fit(monkeypatch):
         assert models[0].blur_px == models[1].blur_px
 
 
-def test_the_optics_of_a_fit_draw_what_the_fit_predicts():
+def test_the_optics_of_a_fit_render_its_predictions():
     setting = OpticsSetting(2, 3, reaches_mm=(0.6,))
     drawn, _ = draw_presses(4, setting=setting)
     model = fit(drawn, range(4), setting, align=False)
@@ -291,27 +291,29 @@ def test_the_optics_of_a_fit_draw_what_the_fit_predicts():
         contact, x - (centre[0] - 159.5) * PIXEL_MM, y - (centre[1] - 129.5) * PIXEL_MM
     )
     at_centre = replace(drawn, centres=np.tile(centre, (4, 1)))
-    wanted = np.reshape(features(at_centre, 0, np.array([*centre, contact]), setting, 1) @ model.weights, (200, 200, 3))
+    expected = np.reshape(
+        features(at_centre, 0, np.array([*centre, contact]), setting, 1) @ model.weights, (200, 200, 3)
+    )
     optics = to_optics(drawn, model)
     surface = Surface(height, field)
     change = optics.colours(surface, surface.slopes) - optics.backdrop(field)
     rows, cols = at_centre.crop(0)
     radius = np.hypot(*np.broadcast_arrays(np.arange(200) - 100, (np.arange(200) - 100)[:, None])) * PIXEL_MM
-    # At the rim the map's differences smooth the kink; far out the smoothing feels the border of the picture.
+    # At the rim the map's differences smooth the kink; far out the border of the picture affects the smoothing.
     away_from_rim = (np.abs(radius - contact) > 0.15) & (radius < 2.3)
-    assert np.abs(wanted).max() > 10
-    np.testing.assert_allclose(change[rows, cols][away_from_rim], wanted[away_from_rim], atol=1.5)
+    assert np.abs(expected).max() > 10
+    np.testing.assert_allclose(change[rows, cols][away_from_rim], expected[away_from_rim], atol=1.5)
 
 
 def test_splits_share_no_press():
-    seen = list(photometric.splits(24, 18, 5))
-    assert len({tuple(held) for _, held in seen}) == 5
-    for chosen, held in seen:
+    splits = list(photometric.splits(24, 18, 5))
+    assert len({tuple(held_out) for _, held_out in splits}) == 5
+    for chosen, held_out in splits:
         assert len(chosen) == 18
-        assert sorted(chosen + held) == list(range(24))
+        assert sorted(chosen + held_out) == list(range(24))
 
 
-def test_an_interval_goes_over_presses_not_over_repeats_of_one():
+def test_an_interval_resamples_presses_not_repeats_of_one():
     scores = photometric.Scores()
     for index, value in ((0, 1.0), (0, 3.0), (1, 6.0)):
         scores.add(index, photometric.PictureError(value, value, value, value))
@@ -337,15 +339,15 @@ def test_the_command_fits_scores_and_writes_a_file_that_loads(tmp_path, monkeypa
     monkeypatch.setattr(press_model, "candidates", lambda wide, careful=False: [replace(wide, degree=2)])
     command = ["--data", str(data), "--sensor", "gelsight", "--out"]
     assert photometric.main([*command, str(tmp_path / "out")]) == 0
-    shown = capsys.readouterr().out
-    assert "background only" in shown
-    assert "5.565" in shown
+    output = capsys.readouterr().out
+    assert "background only" in output
+    assert "5.565" in output
     content = json.loads((tmp_path / "out" / "gelsight.json").read_text())
     assert optics_from_json(content).weights
     assert content["held_out"]["labels"]["mse"]["mean"] < 3
 
 
-def test_the_command_says_in_a_line_what_is_wrong(tmp_path, capsys):
+def test_the_command_prints_an_error_in_one_line(tmp_path, capsys):
     assert photometric.main(["--data", str(tmp_path), "--out", str(tmp_path)]) == 2
     assert capsys.readouterr().err.startswith("error: ")
 
@@ -366,17 +368,16 @@ def shipped_setting(name):
 @pytest.mark.slow
 @real
 @pytest.mark.parametrize("name", fitted_names())
-def test_the_shipped_fit_is_what_the_presses_give(name, packs):
+def test_the_shipped_fit_is_reproducible_from_the_presses(name, packs):
     again = to_optics(packs[name], fit(packs[name], range(len(packs[name])), shipped_setting(name), align=True))
     field = Field(60, 80, 0.25)
     x, y = field.positions()
     surface = Surface(np.maximum(0, 0.6 - (x * x + y * y) / 16), field)
     colours = [one.colours(surface, surface.slopes) for one in (again, load_fitted(name))]
-    np.testing.assert_allclose(*colours, atol=0.5)  # grey levels; other BLAS round otherwise
+    np.testing.assert_allclose(*colours, atol=0.5)  # grey levels; another BLAS rounds differently
 
 
-# What the table of `python -m benchmarks.optics.photometric` shows, with some room: PSNR in dB and SSIM of held-out
-# presses.
+# Results of `python -m benchmarks.optics.photometric`, with some room: PSNR in dB and SSIM of held-out presses.
 HELD_OUT = {"gelsight": (36.0, 0.974), "gelsight_mini": (33.0, 0.968)}
 
 
@@ -395,7 +396,7 @@ def test_held_out_presses_are_predicted_better_than_before(name, packs):
 
 
 @real
-def test_labels_alone_do_for_the_sensor_whose_labels_are_right(packs):
+def test_labels_suffice_for_the_sensor_with_correct_labels(packs):
     pack = packs["gelsight"]
     chosen, held_out = next(photometric.splits(len(pack), 36))
     model = fit(pack, chosen, shipped_setting("gelsight"), align=False)
@@ -406,7 +407,7 @@ def test_labels_alone_do_for_the_sensor_whose_labels_are_right(packs):
 
 @real
 def test_the_first_channel_is_red_by_the_lamps(packs):
-    """Displayed so, the lamps of the older sensor are red below left, green above left, blue right."""
+    """In this order, the lamps of the older sensor are red below left, green above left, blue right."""
     pack = packs["gelsight"]
     index = int(np.argmin(np.hypot(*(pack.centres - (320, 240)).T)))
     rows, cols = pack.crop(index)

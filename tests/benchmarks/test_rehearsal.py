@@ -1,4 +1,4 @@
-"""The rehearsal: what a rig of real drivers records is what any other command takes, unchanged."""
+"""The rehearsal: every command accepts the recording of a rig of real drivers unchanged."""
 
 import pytest
 
@@ -11,9 +11,7 @@ from robot.recording.folder import read_info, read_recording
 
 
 @pytest.mark.slow
-def test_what_the_emulated_gripper_and_replayed_sensors_collect_is_searched_like_what_they_replay(
-    tmp_path, monkeypatch
-):
+def test_a_replayed_recording_gives_the_same_search_results_as_its_source(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     source, made = rehearse(tmp_path, objects=8, grasps=1)
     replayed = {grasp.grasp_id: grasp for grasp in read_recording(source).grasps}
@@ -26,13 +24,13 @@ def test_what_the_emulated_gripper_and_replayed_sensors_collect_is_searched_like
     searcher = Searcher.open(tmp_path / "shipped-index")
     for grasp in recorded:
         before = replayed[grasp.grasp_id]
-        assert (grasp.outcome == "held") == (before.outcome == "held")  # what slips is emulated as a miss
+        assert (grasp.outcome == "held") == (before.outcome == "held")  # a slip is emulated as a miss
         assert set(grasp.touches_after) == {"a", "b"}
         if grasp.outcome != "held":
             continue
         assert abs(grasp.opening_mm - before.opening_mm) < 1.0
-        guesses = []
+        top1_objects = []
         for folder, each in ((source, before), (made, grasp)):
             touch = [folder / each.touches[finger] for finger in "ab"]
-            guesses.append(searcher.query([touch], top=1).results[0].object_id)
-        assert guesses[0] == guesses[1]
+            top1_objects.append(searcher.query([touch], top=1).results[0].object_id)
+        assert top1_objects[0] == top1_objects[1]

@@ -1,4 +1,4 @@
-"""The benchmark of scale runs, at sizes that say nothing about time."""
+"""The benchmarks of scale run, at sizes too small for times to matter."""
 
 import dataclasses
 import json
@@ -27,7 +27,7 @@ def crowd():
     return scale.BlendedPhotos(checkpoint, scorer_of(matcher.head), photos, touches[:12], touches[12:])
 
 
-def test_every_kind_gives_its_figures(crowd, tmp_path, monkeypatch):
+def test_every_kind_returns_its_figures(crowd, tmp_path, monkeypatch):
     monkeypatch.setattr(scale, "ADDED", 20)
     size = scale.measure(crowd, 700, ("flat", "ivf_sq8"), tmp_path / "index", queries=5)
     assert (size.photos, size.queries, size.held_out) == (700, 5, 7)
@@ -52,9 +52,9 @@ def test_contrastive_embeddings_are_the_last_part_of_the_partials_at_unit_length
     assert found.tolist() == pytest.approx(np.array([[0.6, 0.8], [0, -1]]))
 
 
-def test_held_out_touches_measure_candidate_counts_that_others_chose(crowd, tmp_path, monkeypatch):
-    """Where a search never names the winner of a held-out touch, and always that of the others."""
-    asked = {touch.tobytes(): number for number, touch in enumerate(crowd.embeddings(crowd.touches, "touch"))}
+def test_held_out_touches_evaluate_the_number_of_candidates_that_others_chose(crowd, tmp_path, monkeypatch):
+    """A search that never finds the top-1 of a held-out touch, and always that of the others."""
+    numbers = {touch.tobytes(): number for number, touch in enumerate(crowd.embeddings(crowd.touches, "touch"))}
 
     def point(top1_of):
         found = SimpleNamespace(
@@ -62,29 +62,29 @@ def test_held_out_touches_measure_candidate_counts_that_others_chose(crowd, tmp_
             manifest=None,
             arrays={"partials": np.zeros((9, crowd.photos.shape[1]), np.float16)},
             index=SimpleNamespace(search_variants=lambda: [SimpleNamespace(settings=dict)]),
-            search=lambda query, k: [(np.array([top1_of(asked.get(query[0].tobytes()))]), None)],
+            search=lambda query, k: [(np.array([top1_of(numbers.get(query[0].tobytes()))]), None)],
         )
         touches = np.concatenate([crowd.touches, crowd.held_out])
         exhaustive_top1 = np.concatenate([np.arange(12), np.full(7, 8)]) % 9
-        return scale._operating_point(crowd, found, touches, exhaustive_top1, asked=12)
+        return scale._operating_point(crowd, found, touches, exhaustive_top1, choosing=12)
 
     missed = point(lambda number: 0 if number is None else number % 9)
-    assert (missed["k"], missed["recall"], missed["needed"]) == (4, 0, 9)  # the touches that chose needed one
+    assert (missed["k"], missed["recall"], missed["needed"]) == (4, 0, 9)  # the choosing touches needed one
     assert point(lambda number: 8 if number is None else number % 9)["recall"] == 1
 
 
-def test_a_kind_that_needs_more_photos_says_so(crowd, tmp_path):
+def test_a_kind_that_needs_more_photos_reports_it(crowd, tmp_path):
     size = scale.measure(crowd, 100, ("ivf_sq8",), tmp_path / "index", queries=2)
     assert "624 or more vectors" in "\n".join(scale.lines(size))
 
 
-def test_the_exhaustive_top1_is_the_photo_that_the_classifier_puts_first(crowd):
+def test_the_exhaustive_top1_has_the_greatest_match_logit(crowd):
     partials = np.concatenate([block.arrays["partials"] for block in crowd.blocks(0, 60, 0)])
     exhaustive_top1, seconds = scale._top1(crowd.scorer, crowd.touches[:3], partials)
     with torch.inference_mode():
         head, photos = crowd.checkpoint.matcher.head, torch.from_numpy(partials.astype(np.float32))
-        must = [int(head(torch.from_numpy(touch[None]), photos).argmax()) for touch in crowd.touches[:3]]
-    assert exhaustive_top1.tolist() == must
+        expected = [int(head(torch.from_numpy(touch[None]), photos).argmax()) for touch in crowd.touches[:3]]
+    assert exhaustive_top1.tolist() == expected
     assert seconds > 0
 
 
@@ -97,7 +97,7 @@ def test_the_slope_of_a_power_of_n_is_its_exponent():
 
 
 def test_exhaustive_top1_by_blocks_equals_that_of_the_whole_catalogue(crowd, monkeypatch):
-    """ShardResult in half as many bits, and exactly where that could tell wrong."""
+    """Scored in bfloat16, and in float32 where bfloat16 could choose wrongly."""
     monkeypatch.setattr(scale, "BLOCK", 64)
     sizes, touches = [100, 300], np.concatenate([crowd.touches, crowd.held_out])
     cosines, _ = needed.exhaustive_top1(crowd, touches, sizes)
@@ -109,13 +109,13 @@ def test_exhaustive_top1_by_blocks_equals_that_of_the_whole_catalogue(crowd, mon
     for size, places in zip(sizes, found, strict=True):
         for touch, query, place in zip(touches, crowd.embeddings(touches, "touch"), places, strict=True):
             scores = photos[:size] @ query
-            winner = scores[crowd.scorer.logits(touch[None], partials[:size]).argmax()]
-            assert place == 1 + (scores > winner + 1e-6).sum()
+            top1_score = scores[crowd.scorer.logits(touch[None], partials[:size]).argmax()]
+            assert place == 1 + (scores > top1_score + 1e-6).sum()
 
 
-def test_candidates_are_four_times_as_many_as_the_touches_that_choose_need():
-    """Of touches 1 to 3 the worst needs 5; the two that judge need 20 and 21."""
-    line = next(needed.lines([1000], np.array([[1, 5, 2, 20, 21]]), asked=3))
+def test_candidates_are_four_times_as_many_as_the_choosing_touches_need():
+    """Of touches 1 to 3 the worst needs 5; the two that evaluate need 20 and 21."""
+    line = next(needed.lines([1000], np.array([[1, 5, 2, 20, 21]]), choosing=3))
     assert (line["needed_by_chosen"], line["taken"], line["found"], line["worst"]) == (5, 20, 0.5, 21)
 
 
@@ -134,7 +134,7 @@ def test_two_ways_to_find_candidates_of_several_grasps_are_compared(crowd, tmp_p
 
 
 def test_the_exhaustive_top1_of_several_grasps_has_the_greatest_sum_of_logits():
-    """Of four photos the third is between both grasps, and the classifier likes it best."""
+    """Of four photos the third is between both grasps and has the greatest logit."""
     grasps = np.eye(2, dtype=np.float32)
     photos = np.array([[1, 0], [0, 1], [0.7, 0.7], [0.8, 0]], dtype=np.float32)
     found = several.places(grasps, photos, lambda rows: np.array([0, 1, 5, 2])[rows])

@@ -1,4 +1,4 @@
-"""Shards beside one folder, and the queues of many shards, against what can be reckoned by hand."""
+"""Shards compared with one folder, and the queues of many shards against results by hand."""
 
 import json
 import math
@@ -23,14 +23,14 @@ MEASURED = [
 ]
 
 
-def test_drawn_times_have_the_median_and_the_percentile_that_were_measured():
+def test_drawn_times_have_the_measured_median_and_percentile():
     times = ServiceTimes(0.02, 0.05).draw(np.random.default_rng(0), (200_000,))
     assert np.median(times) == pytest.approx(0.02, rel=0.02)
     assert np.percentile(times, 99) == pytest.approx(0.05, rel=0.03)
     assert times.mean() == pytest.approx(ServiceTimes(0.02, 0.05).mean, rel=0.02)
 
 
-def test_a_lonely_request_waits_for_its_shard_alone_and_of_many_for_the_slowest():
+def test_a_single_request_waits_for_its_slowest_shard():
     service = ServiceTimes(0.02, 0.04)
     one, many = (answers(shards, 1, service, rate=0.01) - ENCODE_S - HOP_S for shards in (1, 60))
     assert np.median(one) == pytest.approx(0.02, rel=0.05)
@@ -38,7 +38,7 @@ def test_a_lonely_request_waits_for_its_shard_alone_and_of_many_for_the_slowest(
     assert np.median(many) == pytest.approx(0.02 * math.exp(2.27 * spread), rel=0.05)
 
 
-def test_one_server_waits_as_the_formula_of_pollaczek_and_khinchine_says():
+def test_one_server_follows_the_pollaczek_khinchine_formula():
     """Mean wait = rate * E[S^2] / (2 (1 - rate E[S]))."""
     service = ServiceTimes(0.02, 0.04)
     waits = [answers(1, 1, service, rate=30.0, seed=seed).mean() - ENCODE_S - HOP_S for seed in range(10)]
@@ -50,13 +50,13 @@ def test_one_server_waits_as_the_formula_of_pollaczek_and_khinchine_says():
 
 def test_a_lost_replica_and_a_slow_shard_cost_time():
     service = ServiceTimes(0.02, 0.04)
-    plain, slow, lost = (answers(4, 2, service, 40.0, **how) for how in ({}, {"slow": 1}, {"lost": 1}))
+    plain, slow, lost = (answers(4, 2, service, 40.0, **options) for options in ({}, {"slow": 1}, {"lost": 1}))
     assert np.percentile(plain, 99) < np.percentile(lost, 99)
     assert np.median(slow) > np.median(plain) + 0.03
 
 
 @pytest.mark.parametrize("photos", [1e3, 5e4, 1e6, 1e7])
-def test_what_lies_between_and_beyond_sizes_follows_their_power_law(photos):
+def test_other_sizes_follow_the_measured_power_law(photos):
     assert service_of(photos, MEASURED).p50 == pytest.approx(1e-7 * photos)
     assert service_of(photos, MEASURED).p99 == pytest.approx(2e-7 * photos)
 

@@ -1,4 +1,4 @@
-"""The benchmarks run, at sizes that say nothing about time."""
+"""The benchmarks run, at sizes too small for times to matter."""
 
 import json
 import sys
@@ -45,7 +45,7 @@ def test_every_benchmark_has_a_smallest_case():
 
 
 @pytest.mark.parametrize("name", sorted(SMALLEST))
-def test_a_benchmark_gives_its_lines(name, monkeypatch):
+def test_a_benchmark_yields_its_lines(name, monkeypatch):
     monkeypatch.setattr(common, "MIN_SECONDS", 0.0)  # one call of each arm
     measure, sizes, count = SMALLEST[name]
     lines = list(measure(TINY, **sizes))
@@ -69,13 +69,13 @@ def test_large_photos_are_compared_with_themselves_reduced_and_saved_again():
 def test_the_benchmark_of_a_card_runs_on_any_device(monkeypatch):
     monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     lines = list(gpu.measure(TINY, "cpu:0", photos=3, repetitions=1))
-    assert [line.text.split(",")[0] for line in lines] == ["build", "ask", "train"]
+    assert [line.text.split(",")[0] for line in lines] == ["build", "query", "train"]
     for line in lines:
         assert set(line.figures) == {"cpu_s", "cpu:0_s", "ratio"}
         json.dumps(line.figures, allow_nan=False)
 
 
-def test_naming_candidates_stands_beside_the_bare_call(monkeypatch):
+def test_candidate_search_is_compared_with_the_plain_call(monkeypatch):
     monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     monkeypatch.setattr(peers, "NAMED", (10, 50))
     lines = list(peers.named(photos=700, queries=3, repetitions=2))
@@ -88,27 +88,27 @@ def test_naming_candidates_stands_beside_the_bare_call(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_build_with_the_shipped_model_stands_beside_its_encoder(monkeypatch):
+def test_a_build_with_the_shipped_model_is_compared_with_its_encoder(monkeypatch):
     monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     (line,) = build.measure_shipped(photos=3, photo_px=64, repetitions=1)
     assert line.figures["build_per_s"] == pytest.approx(3 / line.each["build"][0])
-    assert line.each["looking"] == [0.0]  # a build of so few does not
+    assert line.each["looking"] == [0.0]  # a build of so few photos does not tune
 
 
-def test_a_row_of_the_table_tells_medians_with_their_spread():
+def test_a_row_of_the_table_has_medians_with_their_spread():
     row = table.TableRow("work", "ms", [2.0, 1.0, 1234.5], "other work", [4.0])
     assert str(row) == "| work | 2 (1 to 1,234) ms | other work | 4 (4 to 4) ms | 0.50 |"
     assert str(table.TableRow("work", "ms", [2.0])) == "| work | 2 (2 to 2) ms |  |  |  |"
 
 
 @pytest.mark.slow
-def test_a_section_of_the_table_is_measured_by_a_process_of_its_own():
-    rows = list(table.rows("judging"))
-    assert [row.what for row in rows] == ["100 candidates judged", "1,000 candidates judged"]
+def test_a_section_of_the_table_is_measured_in_a_separate_process():
+    rows = list(table.rows("reranking"))
+    assert [row.what for row in rows] == ["100 candidates reranked", "1,000 candidates reranked"]
     assert all(len(row.ours) == len(row.theirs) > 1 for row in rows)
 
 
-def test_the_benchmark_of_training_tells_rates_and_parts_of_a_step(recording, tmp_path, monkeypatch):
+def test_the_benchmark_of_training_has_rates_and_parts_of_a_step(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     with training.matching(TINY, recording, tmp_path) as (trainer, works):
         rates, parts = training.rates("small", works, threads=1, steps=1, repetitions=1)
@@ -125,20 +125,20 @@ def test_the_benchmark_of_training_tells_rates_and_parts_of_a_step(recording, tm
 @pytest.mark.slow
 def test_the_benchmark_of_training_compares_two_processes_with_one(recording):
     (line,) = training.ranks(["small"], recording, "auto", rounds=1)
-    told = line.figures
-    assert told["ratio"] == pytest.approx(told["one_s"] / told["two_s"])
-    assert told["ratio_cpu"] == pytest.approx(told["alone_cpu_s"] / told["two_cpu_s"])
+    figures = line.figures
+    assert figures["ratio"] == pytest.approx(figures["one_s"] / figures["two_s"])
+    assert figures["ratio_cpu"] == pytest.approx(figures["alone_cpu_s"] / figures["two_cpu_s"])
 
 
 @pytest.mark.slow
-def test_the_benchmark_of_a_second_build_tells_each_arm():
+def test_the_benchmark_of_a_rebuild_has_each_arm():
     (line,) = again.measure(photos=6, rounds=1)
     encoding = {"started", "first_encoding", "encoding"}
     assert set(line.figures) == {"photos", "unnoted", "verify", "nothing", "one", "looking"} | encoding
     assert min(line.figures.values()) > 0
 
 
-def test_every_engine_is_asked_at_the_least_width_that_finds_enough():
+def test_every_engine_uses_the_least_width_that_finds_enough():
     lines = list(peers.measure(photos=700, queries=10))
     assert [line.tower for line in lines] == 2 * list(peers.ENGINES)
     for line in lines:
@@ -150,11 +150,13 @@ def test_every_engine_is_asked_at_the_least_width_that_finds_enough():
 
 
 @pytest.mark.slow
-def test_the_parts_of_a_simulated_grasp_are_timed_beside_another_checkout():
-    made = simulation.beside({"ours": simulation.ROOT, "before": simulation.ROOT}, rounds=1, objects=1, grasps=1)
+def test_the_parts_of_a_simulated_grasp_are_compared_with_another_checkout():
+    made = simulation.compare_checkouts(
+        {"ours": simulation.ROOT, "before": simulation.ROOT}, rounds=1, objects=1, grasps=1
+    )
     assert set(made["ours"]) == set(made["before"]) >= {"photo of 256 px", "two contacts", "attempt with its files"}
-    said = [simulation.line(part, ours, made["before"][part]) for part, ours in made["ours"].items()]
-    assert all(" ms, " in each and " times (" in each for each in said)
+    texts = [simulation.line(part, ours, made["before"][part]) for part, ours in made["ours"].items()]
+    assert all(" ms, " in each and " times (" in each for each in texts)
 
 
 def test_the_slope_of_a_growth_is_its_power():
@@ -163,8 +165,8 @@ def test_the_slope_of_a_growth_is_its_power():
 
 @pytest.mark.slow
 def test_growth_is_measured_with_grasps_objects_and_touches():
-    tables = [*growth.collecting([1, 2], [1, 2], rounds=1), *growth.asking([1, 2], rounds=1, photos=9)]
-    assert [what for what, _ in tables] == ["grasps an object", "objects", "grasps a query"]
+    tables = [*growth.collecting([1, 2], [1, 2], rounds=1), *growth.querying([1, 2], rounds=1, photos=9)]
+    assert [what for what, _ in tables] == ["grasps per object", "objects", "grasps per query"]
     for _, seconds in tables:
         assert list(seconds) == [1, 2]
         assert min(seconds.values()) > 0
@@ -178,7 +180,7 @@ OF_DEVICES = {
 
 
 @pytest.mark.parametrize("name", sorted(OF_DEVICES))
-def test_a_benchmark_of_devices_gives_its_lines(name):
+def test_a_benchmark_of_devices_yields_its_lines(name):
     lines = list(OF_DEVICES[name]())
     assert len(lines) > 2
     for line in lines:
@@ -187,7 +189,7 @@ def test_a_benchmark_of_devices_gives_its_lines(name):
 
 
 @pytest.mark.slow
-def test_a_cold_query_is_told_step_by_step_for_each_backend(model):
+def test_a_cold_query_is_timed_step_by_step_for_each_backend(model):
     lines = list(cold.measure(photos=12, repetitions=1, model=model))
     assert len(lines) == 1 + SMALLEST["query"][2]
     for line in lines[1:]:
@@ -202,7 +204,7 @@ def test_the_query_benchmark_of_the_shipped_model_ends_with_the_time_of_opening(
     assert set(opening.figures) == {"photos", "open_s"}
 
 
-def test_the_table_of_cylinders_has_a_line_a_case():
+def test_the_table_of_cylinders_has_a_line_for_each_case():
     lines = list(cylinder.measure(count=1))
     assert [line.tower for line in lines] == [*cylinder.CASES, "R33 h120 of glass"]
     for line in lines:
@@ -220,7 +222,7 @@ def test_the_arms_take_turns_and_the_first_round_is_not_measured(monkeypatch):
     assert times.ratio("a", "b")[1:] == (low, high)
 
 
-def test_a_short_arm_is_called_until_its_time_can_be_told(monkeypatch):
+def test_a_short_arm_is_called_until_its_time_is_measurable(monkeypatch):
     calls = {"short": 0, "long": 0}
 
     def arm(name, seconds):
@@ -233,7 +235,7 @@ def test_a_short_arm_is_called_until_its_time_can_be_told(monkeypatch):
     assert 2 < calls["short"] <= 251
 
 
-def test_the_program_prints_a_document_a_line(monkeypatch, capsys):
+def test_the_program_prints_one_document_per_line(monkeypatch, capsys):
     monkeypatch.setattr(common, "MIN_SECONDS", 0.0)
     monkeypatch.setattr(program, "BENCHMARKS", {"step": lambda config: step.measure(TINY, 2, 2, 1)})
     monkeypatch.setattr(sys, "argv", ["benchmarks", "--tower", "small", "resnet18", "--only", "step", "--json"])
@@ -242,7 +244,7 @@ def test_the_program_prints_a_document_a_line(monkeypatch, capsys):
     assert [line["benchmark"] for line in lines] == ["step", "step"]
 
 
-def test_the_presets_are_those_that_users_train_with():
+def test_the_presets_are_those_of_users():
     assert common.config_of("small").preprocessing.photo_px == 128
     paper = common.config_of("resnet18")
     assert (paper.matcher.tower, paper.matcher.hidden, paper.preprocessing.photo_px) == ("resnet18", 1024, 256)

@@ -2,10 +2,11 @@
 
     minimise  1/2 p.K p + p.gap  over p >= 0,  with sum p = load (force control) or less depth sum p (depth control)
 
-Polonsky & Keer, Wear 231 (1999) 206, with three changes. Their energy may rise, and then the iteration can cycle for
-ever (a pin that gives way to the plate around it): here a step that raises it is taken back, and a projected gradient
-step of length 1/bound is made instead, which always lowers it. A contact set of one pixel has no direction to go along;
-that step stands in there too. And where no pixel enters or leaves the contact, K p follows without another product.
+Polonsky & Keer, Wear 231 (1999) 206, with three changes. In their method the energy may rise, and then the iteration
+can cycle forever (a pin that gives way to the plate around it). Here a step that raises the energy is undone and
+replaced by a projected gradient step of length 1/bound, which always lowers it. A contact set of one pixel has no
+search direction; the same step replaces it. If no pixel enters or leaves the contact, K p is updated without another
+product.
 """
 
 import math
@@ -16,17 +17,24 @@ import numpy as np
 from robot.sim.contact.kernels import Floats, Operator
 from robot.sim.jit import jit_reassociated
 
-# The contact conditions are held tighter than the pressure: a displacement is seen, a pressure is not.
+# The contact conditions have a tighter tolerance than the pressure: images show displacement, not pressure.
 GAP_WEIGHT = 20.0
-_ROUNDING = 1e-12  # relative; what is smaller is not told from rounding
+_ROUNDING = 1e-12  # relative; smaller values are rounding errors
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Scaled pressure and K p, both (rows, cols), the approach, and how they were reached.
+    """Solution in scaled units, with its convergence.
 
-    `residual` is the largest of: relative change of pressure in the last step; GAP_WEIGHT times the root mean square
-    of the gap within the contact, and times the deepest penetration beside it, both over the largest displacement.
+    Attributes:
+        pressure: (rows, cols) pressure p.
+        displacement: (rows, cols) displacement K p.
+        approach: approach of the undeformed object.
+        iterations: number of steps.
+        residual: the largest of: relative change of pressure in the last step; GAP_WEIGHT times the root mean square of
+            the gap within the contact; GAP_WEIGHT times the deepest penetration outside it. The last two are relative
+            to the largest displacement.
+        converged: whether the residual is at most the tolerance.
     """
 
     pressure: Floats
@@ -39,7 +47,14 @@ class Solution:
 
 @dataclass(frozen=True)
 class ContactProblem:
-    """`gap` (rows, cols), +inf where there is nothing; `load` None for depth control."""
+    """Contact of a height map with an elastic surface.
+
+    Attributes:
+        operator: displacement of a pressure.
+        gap: (rows, cols) distance of the undeformed object, +inf where there is no object.
+        load: sum of the pressures; None for depth control.
+        depth: approach of the object for depth control.
+    """
 
     operator: Operator
     gap: Floats
@@ -47,38 +62,44 @@ class ContactProblem:
     depth: float = 0.0
 
     def solve(self, start: Floats, tolerance: float, max_iterations: int) -> Solution:
-        """From `start`, a pressure of the right sum that is zero wherever the gap is infinite."""
-        run = _Descent(self, start)
+        """Solve from a start pressure.
+
+        Args:
+            start: (rows, cols) pressure with the right sum that is zero wherever the gap is infinite.
+            tolerance: upper bound on the residual.
+            max_iterations: maximum number of steps.
+        """
+        descent = _Descent(self, start)
         for iteration in range(max_iterations):
-            if run.residual <= tolerance:
-                return run.solution(iteration, True)
-            run.step()
-        return run.solution(max_iterations, run.residual <= tolerance)
+            if descent.residual <= tolerance:
+                return descent.solution(iteration, True)
+            descent.step()
+        return descent.solution(max_iterations, descent.residual <= tolerance)
 
     def initial_pressure(self) -> Floats:
-        """A pressure to start from when nothing better is known: as springs would carry it."""
+        """Return a start pressure: that of independent springs."""
         if self.load is None:
             return np.maximum(self.depth - self.gap, 0.0) / self.operator.bound
         above = self.gap - self.gap.min()
         there = np.sort(above[np.isfinite(above)])
-        # Of a flat punch over all pixels that lie lower than it goes: the depth falls with the root of the area.
+        # Flat punch over all pixels below its depth: the depth falls with the root of the area.
         punch = self.operator.peak * self.load / np.sqrt(np.arange(1, there.size + 1))
         springs = np.maximum(float(punch[np.count_nonzero(there < punch) - 1]) - above, 0.0)
-        springs = springs if springs.any() else (above == 0.0).astype(np.float64)  # a surface that does not give
+        springs = springs if springs.any() else (above == 0.0).astype(np.float64)  # a rigid surface
         return np.asarray(springs * (self.load / springs.sum()))
 
 
 class _Descent:
-    """One descent: the pressure, what follows from it, and the direction last gone along."""
+    """State of the iteration: the pressure, the quantities that depend on it, and the last search direction."""
 
     def __init__(self, problem: ContactProblem, start: Floats) -> None:
         self.problem = problem
-        self.change = np.inf  # relative, of the pressure in the last step
+        self.change = np.inf  # relative change of pressure in the last step
         self.direction, self.previous_squares, self.conjugate = np.zeros_like(start), 1.0, False
         self._accept(*self._measure(np.ascontiguousarray(start), problem.operator(start)))
 
     def _measure(self, pressure: Floats, displacement: Floats) -> tuple[Floats, Floats, float]:
-        """With its energy, which is infinite if nothing is left to carry a load."""
+        """Return the arguments with their energy, which is infinite if no pressure remains to carry a load."""
         energy, total = _energy(pressure, displacement, self.problem.gap)
         if self.problem.load is None:
             return pressure, displacement, energy - self.problem.depth * total
@@ -88,42 +109,42 @@ class _Descent:
         self.pressure, self.displacement, self.energy = pressure, displacement, energy
         self.distance, self.inside = np.empty_like(pressure), np.empty_like(pressure)
         by_load, depth = self.problem.load is not None, self.problem.depth
-        self.approach, self.count, self.squares, beside, largest = _contact_state(
+        self.approach, self.count, self.squares, penetration, largest = _contact_state(
             pressure, displacement, self.problem.gap, by_load, depth, self.distance, self.inside
         )
-        # What of the largest displacement would be rounding counts for nothing.
+        # Ignore rounding errors in the largest displacement.
         rounding = _ROUNDING * self.problem.operator.bound * float(pressure.max())
-        error = max(math.sqrt(self.squares / self.count), beside) / (max(largest, rounding) or 1.0)
+        error = max(math.sqrt(self.squares / self.count), penetration) / (max(largest, rounding) or 1.0)
         self.residual = max(self.change, GAP_WEIGHT * error)
 
     def step(self) -> None:
-        """Along the conjugate direction; if that raises the energy, by the safe step."""
+        """Step along the conjugate direction; if that raises the energy, take the safe step instead."""
         before = self.pressure
         pressure, displacement = self._conjugate_step()
-        reached = self._measure(pressure, displacement)
-        if not reached[2] <= self.energy + self.problem.operator.rounding * abs(self.energy):
+        state = self._measure(pressure, displacement)
+        if not state[2] <= self.energy + self.problem.operator.rounding * abs(self.energy):
             self.conjugate = False
             pressure = self._safe_step()
-            reached = self._measure(pressure, self.problem.operator(pressure))
-        self.change = _relative_change(before, reached[0])
-        self._accept(*reached)
+            state = self._measure(pressure, self.problem.operator(pressure))
+        self.change = _relative_change(before, state[0])
+        self._accept(*state)
 
     def _conjugate_step(self) -> tuple[Floats, Floats]:
-        """Along the direction to the least energy, then to pressures that are allowed and to the load."""
+        """Step along the conjugate direction to the least energy, then project to feasible pressures and the load."""
         beta = self.squares / self.previous_squares if self.conjugate and self.previous_squares > 0.0 else 0.0
         direction = np.empty_like(self.direction)
         slope, total = _conjugate_direction(self.inside, self.pressure, self.direction, beta, direction)
         self.direction, self.previous_squares = direction, self.squares
         moved = self.problem.operator(direction)
-        bend, raised = _curvature(moved, direction, self.pressure)
+        curvature, raised = _curvature(moved, direction, self.pressure)
         if self.problem.load is not None:
-            bend -= raised / self.count * total
-        # 1/bound where the energy does not bend.
-        length = slope / bend if bend > 0.0 and slope > 0.0 else 1.0 / self.problem.operator.bound
+            curvature -= raised / self.count * total
+        # 1/bound if the curvature is not positive.
+        length = slope / curvature if curvature > 0.0 and slope > 0.0 else 1.0 / self.problem.operator.bound
         pressure = np.empty_like(self.pressure)
         leaving, entering, total = _project_step(self.pressure, direction, self.distance, length, pressure)
         self.conjugate = not entering
-        # Back to the load; nothing brings it back if no pressure is left, and the safe step follows.
+        # Rescale to the load. If no pressure is left, this is impossible, and the safe step follows.
         factor = 1.0 if self.problem.load is None or total <= 0.0 else self.problem.load / total
         pressure *= factor
         if leaving or entering:
@@ -131,33 +152,34 @@ class _Descent:
         return pressure, (self.displacement - length * moved) * factor
 
     def _safe_step(self) -> Floats:
-        """Down the gradient by 1/bound, to the nearest pressure that is allowed."""
-        there = np.isfinite(self.problem.gap)
-        wanted = self.pressure - np.where(there, self.distance, 0.0) / self.problem.operator.bound
+        """Step down the gradient by 1/bound, then project to the nearest feasible pressure."""
+        has_object = np.isfinite(self.problem.gap)
+        target = self.pressure - np.where(has_object, self.distance, 0.0) / self.problem.operator.bound
         if self.problem.load is None:
-            return np.maximum(wanted, 0.0)
-        pressure = np.zeros_like(wanted)
-        pressure[there] = project_to_simplex(wanted[there], self.problem.load)
+            return np.maximum(target, 0.0)
+        pressure = np.zeros_like(target)
+        pressure[has_object] = project_to_simplex(target[has_object], self.problem.load)
         return pressure
 
     def solution(self, iterations: int, converged: bool) -> Solution:
+        """Return the current state as a Solution."""
         return Solution(self.pressure, self.displacement, self.approach, iterations, float(self.residual), converged)
 
 
 def project_to_simplex(values: Floats, total: float) -> Floats:
-    """The point nearest to `values` (n,) among those >= 0 that add up to `total` > 0 (Held, Wolfe & Crowder 1974)."""
+    """Return the point nearest to `values` (n,) with entries >= 0 and sum `total` > 0 (Held, Wolfe & Crowder 1974)."""
     falling = np.sort(values)[::-1]
     excess = (np.cumsum(falling) - total) / np.arange(1, values.size + 1)
     last = int(np.nonzero(falling > excess)[0][-1])
     return np.asarray(np.maximum(values - excess[last], 0.0))
 
 
-# One pass over the pixels each ------------------------------------------------------------------------------
+# Each function makes one pass over the pixels ---------------------------------------------------------------
 
 
 @jit_reassociated
 def _energy(pressure, displacement, gap):  # type: ignore[no-untyped-def]
-    """The energy but for the depth's share, and the sum of pressures; where the gap is infinite there is none."""
+    """Return the energy without the depth term, and the sum of pressures; pixels of infinite gap add nothing."""
     energy, total = 0.0, 0.0
     for row in range(pressure.shape[0]):
         for i in range(pressure.shape[1]):
@@ -169,10 +191,11 @@ def _energy(pressure, displacement, gap):  # type: ignore[no-untyped-def]
 
 @jit_reassociated
 def _contact_state(pressure, displacement, gap, by_load, depth, distance, inside):  # type: ignore[no-untyped-def]
-    """Fill `distance` (inf where nothing is) and what of it lies `inside` the contact.
+    """Fill `distance` (inf where there is no object) and `inside`, the distance within the contact.
 
-    Returns the approach (by load, what makes the mean distance inside 0), the number of pixels inside (at least 1), the
-    sum of the squares of their distances, the deepest penetration beside them, and the largest displacement.
+    Returns:
+        The approach (by load: it makes the mean distance inside 0), the number of pixels inside (at least 1), the sum
+            of squares of their distances, the deepest penetration outside, and the largest displacement.
     """
     count, total, largest = 0, 0.0, 0.0
     for row in range(pressure.shape[0]):
@@ -199,8 +222,10 @@ def _contact_state(pressure, displacement, gap, by_load, depth, distance, inside
 
 @jit_reassociated
 def _conjugate_direction(inside, pressure, before, beta, direction):  # type: ignore[no-untyped-def]
-    """Fill `direction` with `inside` + beta times the one before, within the contact; the energy's slope along it, and
-    its sum.
+    """Fill `direction` with `inside` + beta times the last one, within the contact.
+
+    Returns:
+        The slope of the energy along `direction`, and the sum of `direction`.
     """
     slope, total = 0.0, 0.0
     for row in range(pressure.shape[0]):
@@ -214,19 +239,21 @@ def _conjugate_direction(inside, pressure, before, beta, direction):  # type: ig
 
 @jit_reassociated
 def _curvature(moved, direction, pressure):  # type: ignore[no-untyped-def]
-    """How the energy bends along the direction, and the sum of the displacement by it within the contact."""
-    bend, raised = 0.0, 0.0
+    """Return the curvature of the energy along the direction, and the sum of its displacement within the contact."""
+    curvature, raised = 0.0, 0.0
     for row in range(pressure.shape[0]):
         for i in range(pressure.shape[1]):
-            bend += moved[row, i] * direction[row, i]
+            curvature += moved[row, i] * direction[row, i]
             raised += moved[row, i] if pressure[row, i] > 0.0 else 0.0
-    return bend, raised
+    return curvature, raised
 
 
 @jit_reassociated
 def _project_step(before, direction, distance, length, pressure):  # type: ignore[no-untyped-def]
-    """Fill `pressure` with what lies a step ahead and is allowed; whether pixels leave and enter the contact, and its
-    sum.
+    """Fill `pressure` with the feasible pressure one step ahead.
+
+    Returns:
+        Whether pixels leave the contact, whether pixels enter it, and the sum of `pressure`.
     """
     leaving, entering, total = 0, 0, 0.0
     for row in range(before.shape[0]):
@@ -244,7 +271,7 @@ def _project_step(before, direction, distance, length, pressure):  # type: ignor
 
 @jit_reassociated
 def _relative_change(before, pressure):  # type: ignore[no-untyped-def]
-    """Of the pressure, relative."""
+    """Return the relative change of the pressure."""
     change, total = 0.0, 0.0
     for row in range(before.shape[0]):
         for i in range(before.shape[1]):

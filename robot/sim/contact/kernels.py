@@ -3,12 +3,12 @@
     half-space        Love (1929): a square pixel of uniform pressure, exact, not periodic
     bonded layer      half-space less a smooth correction C(r/h), the Hankel transform of 1 - S(qh); S is the
                       closed form of a layer on a rigid base (its limits are tested)
-    thin layer        h below THIN_PIXELS: the closed form sampled in Fourier space, on a grid wide enough that
-                      its period is not felt; exact for pressure that is smooth on the scale of a pixel
+    thin layer        h below THIN_PIXELS: the closed form sampled in Fourier space, on a grid so wide that its
+                      period has no effect; exact for pressure that is smooth on the scale of a pixel
 
 An influence is a quadrant (rows, cols): entry (i, j) is the displacement i rows and j columns from a pixel of unit
-pressure. It is even, so the quadrant says everything and any smaller window is a corner of it. Products are made by
-FFT with zero padding to at least 2 n - 1, hence without wrap-around (Liu, Wang & Liu 2000).
+pressure. It is even, so the quadrant is complete and any smaller window is a corner of it. Products use FFT with zero
+padding to at least 2 n - 1, hence without wrap-around (Liu, Wang & Liu 2000).
 """
 
 import copy
@@ -24,20 +24,20 @@ from scipy.special import j0, j1
 Floats = npt.NDArray[np.float64]
 Quadrant = tuple[int, int]
 
-THIN_PIXELS = 2.0  # a thinner layer's correction is too sharp for pixels
+THIN_PIXELS = 2.0  # the correction of a thinner layer is too sharp for pixels
 REACH = 32.0  # in thicknesses: a bonded layer's influence falls faster than exp(-.739 r/h), 1e-10 here
 _X_MAX, _X_PANELS, _PANEL_POINTS = 20.0, 32, 24  # 1 - S falls like x^2 exp(-2 x), 1e-14 at 20
 _RHO_STEP = 0.0075  # of log(1 + rho): the correction is smoother where it is small
 _PATCH_POINTS = 3  # Gauss points on a pixel's side; 1e-7 at THIN_PIXELS
 _SERIES_BELOW = 0.5
-_DEEP = 100.0  # S is 1 from here on, by far more than float64 tells
+_DEEP = 100.0  # S is 1 from here on in float64
 
 
 def layer_symbol(x: Floats, poisson: float) -> Floats:
-    """S(qh) of a layer bonded to a rigid base: u(q) = 2 S / (E* q) p(q); 1 for a half-space.
+    """Return S(qh) of a layer bonded to a rigid base: u(q) = 2 S / (E* q) p(q); 1 for a half-space.
 
-    S(x) = [(3-4v) sinh 2x - 2x] / [(3-4v) cosh 2x + 2x^2 + 5 - 12v + 8v^2], both multiplied by exp(-2x) so that
-    nothing overflows, and the difference written as (3-4v) (sinh 2x - 2x) + (2-4v) 2x so that nothing cancels.
+    S(x) = [(3-4v) sinh 2x - 2x] / [(3-4v) cosh 2x + 2x^2 + 5 - 12v + 8v^2]. Both are multiplied by exp(-2x) to avoid
+    overflow, and the difference is written as (3-4v) (sinh 2x - 2x) + (2-4v) 2x to avoid cancellation.
     """
     x = np.minimum(x, _DEEP)
     y, decay, k = 2.0 * x, np.exp(-2.0 * x), 3.0 - 4.0 * poisson
@@ -47,7 +47,7 @@ def layer_symbol(x: Floats, poisson: float) -> Floats:
 
 
 def _scaled_sinh_less_argument(y: Floats) -> Floats:
-    """(sinh y - y) exp(-y); by its series near 0, where the difference would cancel."""
+    """Return (sinh y - y) exp(-y), by its series near 0, where the difference would cancel."""
     square = y * y
     series = 1.0 + square / 20 * (1.0 + square / 42 * (1.0 + square / 72 * (1.0 + square / 110 * (1.0 + square / 156))))
     near = y * square / 6.0 * series * np.exp(-y)
@@ -55,9 +55,10 @@ def _scaled_sinh_less_argument(y: Floats) -> Floats:
 
 
 def layer_compliance(q: Floats, thickness: float, poisson: float) -> Floats:
-    """u(q)/p(q) at wave number q (radian a pixel): 2 S(qh)/q, at q = 0 its limit h (1-2v)/(1-v)^2 = h E*/M.
+    """Return u(q)/p(q) = 2 S(qh)/q at wave number q (radian per pixel).
 
-    An infinite thickness is the half-space, whose mean displacement is not defined: 0 at q = 0.
+    At q = 0 it is the limit h (1-2v)/(1-v)^2 = h E*/M. The mean displacement of a half-space (infinite thickness) is
+    not defined: 0 at q = 0.
     """
     q = np.asarray(q, np.float64)
     mean = 0.0 if math.isinf(thickness) else thickness * (1.0 - 2.0 * poisson) / (1.0 - poisson) ** 2
@@ -67,7 +68,7 @@ def layer_compliance(q: Floats, thickness: float, poisson: float) -> Floats:
 
 
 def love_patch(shape: Quadrant) -> Floats:
-    """(rows, cols) displacement around a square pixel of uniform unit pressure on a half-space.
+    """Return the displacement (rows, cols) around a square pixel of uniform unit pressure on a half-space.
 
     Love's formula; in the first quadrant no logarithm's argument is a difference of near-equal numbers.
     """
@@ -82,10 +83,15 @@ def love_patch(shape: Quadrant) -> Floats:
 
 @dataclass(frozen=True)
 class LayerCorrection:
-    """C(rho) = integral of (1 - S(x)) J0(x rho) dx over x >= 0, for 0 <= rho <= REACH (+ a pixel): cubic between values
-    and slopes that are known at rho + 1 = exp(k _RHO_STEP).
+    """C(rho) = integral of (1 - S(x)) J0(x rho) dx over x >= 0, for 0 <= rho <= REACH (+ a pixel).
 
-    A point force F on a layer h thick displaces F (1/rho - C(rho)) / (pi E* h) at rho = r/h.
+    A point force F on a layer h thick displaces F (1/rho - C(rho)) / (pi E* h) at rho = r/h. The interpolation is cubic
+    between values and slopes at rho + 1 = exp(k _RHO_STEP).
+
+    Attributes:
+        rho: the grid points.
+        value: C at the grid points.
+        slope: dC/drho at the grid points.
     """
 
     rho: Floats
@@ -93,6 +99,7 @@ class LayerCorrection:
     slope: Floats
 
     def __call__(self, rho: npt.ArrayLike) -> Floats:
+        """Interpolate C at `rho`."""
         place = np.asarray(rho, np.float64)
         left = np.minimum((np.log1p(place) / _RHO_STEP).astype(np.intp), len(self.rho) - 2)
         step = self.rho[left + 1] - self.rho[left]
@@ -105,7 +112,7 @@ class LayerCorrection:
 
 @functools.lru_cache(maxsize=64)
 def layer_correction(poisson: float) -> LayerCorrection:
-    """The correction of a layer of this Poisson's ratio, by Gauss-Legendre over x."""
+    """Compute the correction for this Poisson's ratio, by Gauss-Legendre quadrature over x."""
     nodes, weights = np.polynomial.legendre.leggauss(_PANEL_POINTS)
     edges = np.linspace(0.0, _X_MAX, _X_PANELS + 1)
     half = 0.5 * (edges[1] - edges[0])
@@ -118,7 +125,7 @@ def layer_correction(poisson: float) -> LayerCorrection:
 
 @functools.lru_cache(maxsize=16)
 def influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
-    """(rows, cols) quadrant of the influence of a layer `thickness` pixels thick; inf is the half-space."""
+    """Return the quadrant (rows, cols) of the influence of a layer `thickness` pixels thick; inf is the half-space."""
     if math.isinf(thickness):
         table = love_patch(shape)
     elif thickness < THIN_PIXELS:
@@ -130,7 +137,7 @@ def influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
 
 
 def _corrected_influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
-    """Love's patch less the correction integrated over the pixel; nothing beyond REACH thicknesses."""
+    """Return Love's patch less the correction integrated over the pixel; 0 beyond REACH thicknesses."""
     rows, cols = (min(n, math.ceil(REACH * thickness) + 1) for n in shape)
     nodes, weights = np.polynomial.legendre.leggauss(_PATCH_POINTS)
     correction, near = layer_correction(poisson), love_patch((rows, cols))
@@ -146,26 +153,35 @@ def _corrected_influence(shape: Quadrant, thickness: float, poisson: float) -> F
 
 
 def _sampled_influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
-    """The closed form at the wave numbers of a grid twice as wide and REACH thicknesses more."""
+    """Sample the closed form at the wave numbers of a grid twice as wide plus REACH thicknesses."""
     margin = math.ceil(REACH * thickness)
     rows, cols = (2 * scipy.fft.next_fast_len(n + margin, real=True) for n in shape)
     return np.ascontiguousarray(periodic_influence((rows, cols), thickness, poisson)[: shape[0], : shape[1]])
 
 
 def periodic_influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
-    """(rows, cols) displacement of a periodic surface by unit pressure on pixel (0, 0): the closed form at the wave
-    numbers of scipy.fft.rfft2.
+    """Return the displacement (rows, cols) of a periodic surface by unit pressure on pixel (0, 0).
+
+    It is the closed form at the wave numbers of scipy.fft.rfft2.
     """
     q = 2.0 * np.pi * np.hypot(np.fft.fftfreq(shape[0])[:, None], np.fft.rfftfreq(shape[1]))
     return np.asarray(scipy.fft.irfft2(layer_compliance(q, thickness, poisson), shape))
 
 
 class Operator:
-    """Displacement (rows, cols) of a pressure (rows, cols): one real FFT each way, rows of zeros left out.
+    """Displacement (rows, cols) of a pressure (rows, cols): one real FFT each way, skipping rows of zeros.
 
-    `periodic` wraps around at the border of `shape`; otherwise `table` is a quadrant at least as large as `shape`.
-    `bound` is not below the largest eigenvalue, `peak` is the displacement of a loaded pixel itself. `single_precision`: by
-    FFT in float32, right to some 1e-7 of the largest displacement; `rounding` is by how much an energy may err.
+    Args:
+        table: influence; a quadrant at least as large as `shape`, or of the size of `shape` if `periodic`.
+        shape: rows and columns of the pressure.
+        periodic: whether the surface wraps around at the border of `shape`.
+        workers: threads of the FFT.
+        single_precision: whether the FFT is in float32, accurate to about 1e-7 of the largest displacement.
+
+    Attributes:
+        bound: an upper bound on the largest eigenvalue.
+        peak: displacement of a loaded pixel itself.
+        rounding: relative error of an energy.
     """
 
     def __init__(
@@ -187,16 +203,17 @@ class Operator:
         self.bound, self.peak = _largest(transform), float(table[0, 0])
 
     def plus(self, other: "Operator", weight: float) -> "Operator":
-        """The sum of this and `weight` times another of the same shape."""
+        """Return the sum of this and `weight` times another operator of the same shape."""
         both = copy.copy(self)
         both._transform = self._transform + weight * other._transform
         both.bound, both.peak = _largest(both._transform), self.peak + weight * other.peak
         return both
 
     def __call__(self, pressure: Floats) -> Floats:
+        """Return the displacement (rows, cols), float64, of a pressure (rows, cols)."""
         (rows, cols), (high, wide) = self.shape, self._size
-        given = pressure.astype(np.float32) if self.single_precision else pressure
-        wave = scipy.fft.rfft(given, wide, axis=1, workers=self.workers)
+        values = pressure.astype(np.float32) if self.single_precision else pressure
+        wave = scipy.fft.rfft(values, wide, axis=1, workers=self.workers)
         wave = scipy.fft.fft(wave, high, axis=0, overwrite_x=True, workers=self.workers)
         wave *= self._transform
         wave = scipy.fft.ifft(wave, axis=0, overwrite_x=True, workers=self.workers)[:rows]
@@ -205,12 +222,12 @@ class Operator:
 
 
 def _largest(transform: npt.NDArray[np.floating]) -> float:
-    """1 for a surface that does not give at all, so that a step of 1/bound is a step."""
+    """Return the largest eigenvalue, or 1 for a rigid surface, so that a step of 1/bound is finite."""
     return float(np.abs(transform).max()) or 1.0
 
 
 def _mirrored(table: Floats, shape: Quadrant, size: tuple[int, ...]) -> Floats:
-    """The quadrant laid out circularly over `size`; what lies beyond shape - 1 meets only zeros."""
+    """Lay out the quadrant circularly over `size`; entries beyond shape - 1 multiply only zeros."""
     rows, cols = (np.minimum(np.arange(period), period - np.arange(period)) for period in size)
     inside = (rows < shape[0])[:, None] & (cols < shape[1])
     return np.where(inside, table[np.minimum(rows, shape[0] - 1)[:, None], np.minimum(cols, shape[1] - 1)], 0.0)

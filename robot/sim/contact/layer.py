@@ -2,9 +2,9 @@
 
 Find p >= 0 and the approach d with   s = u(p) + gap - d >= 0,   p s = 0,   and either sum p dA = force or d = depth.
 
-u is the inward displacement of the gel, by robot.sim.contact.kernels; an elastic object adds a half-space's (composite
-modulus 1/E* = (1-v1^2)/E1 + (1-v2^2)/E2, where only the gel's share is a layer's). Lengths are scaled by the pixel,
-pressures by E* and both by the load inside, so the units do not matter as long as they agree: mm, N and MPa do.
+u is the inward displacement of the gel (robot.sim.contact.kernels); an elastic object adds the displacement of a
+half-space (composite modulus 1/E* = (1-v1^2)/E1 + (1-v2^2)/E2, where only the gel's term is a layer's). Lengths are
+scaled by the pixel, pressures by E*, and both by the load, so any consistent units work: mm, N and MPa.
 """
 
 import math
@@ -18,14 +18,23 @@ from robot.sim.contact.constrained_cg import Solution
 from robot.sim.contact.kernels import Floats
 from robot.sim.contact.scaled_problem import ElasticSurface, ScaledProblem
 
-STRAIN_LIMIT = 0.5  # of displacement over thickness, and of slope, that linear elasticity may claim
-SINGLE_PRECISION_TOLERANCE = 5e-3  # a tolerance: products in float32 err by thousands of times less
+STRAIN_LIMIT = 0.5  # linear elasticity holds below this: displacement over thickness, and slope
+SINGLE_PRECISION_TOLERANCE = 5e-3  # the error of float32 products is thousands of times smaller
 _SCALED_RANGE = (1e-100, 1e100)  # of force / (E* pixel^2) and depth / pixel
 
 
 @dataclass(frozen=True)
 class Layer:
-    """Elastic gel bonded to a rigid base (a half-space if infinitely thick), in MPa and mm. Raises RobotConfigError."""
+    """Elastic gel bonded to a rigid base.
+
+    Attributes:
+        modulus_mpa: Young's modulus.
+        poisson: Poisson's ratio.
+        thickness_mm: thickness; infinite for a half-space.
+
+    Raises:
+        RobotConfigError: A value is out of range.
+    """
 
     modulus_mpa: float
     poisson: float = 0.48
@@ -34,9 +43,13 @@ class Layer:
     def __post_init__(self) -> None:
         _check_elastic("a layer's", self.modulus_mpa, self.poisson)
         if math.isinf(self.modulus_mpa):
-            raise RobotConfigError("a layer's modulus must be finite, got inf: a rigid gel shows nothing; give its MPa")
+            raise RobotConfigError(
+                "a layer's modulus must be finite, got inf: a rigid gel shows nothing. Give its value in MPa"
+            )
         if not self.thickness_mm > 0.0:
-            raise RobotConfigError(f"a layer's thickness must be above 0 mm, got {self.thickness_mm}; inf: half-space")
+            raise RobotConfigError(
+                f"a layer's thickness must be above 0 mm (inf for a half-space), got {self.thickness_mm}"
+            )
 
     @property
     def plane_modulus_mpa(self) -> float:
@@ -46,20 +59,28 @@ class Layer:
 
 @dataclass(frozen=True)
 class Contact:
-    """A solved press. `flags` name what must be known before it is trusted; none is good.
+    """A solved press. Check `flags` before you trust it; an empty tuple means no problem.
 
-    pressure_mpa      (rows, cols) >= 0
-    displacement_mm   (rows, cols) inward displacement of the gel alone; the object's own deformation is left out
-    approach_mm       of the undeformed object, from gap = 0
-    residual          of robot.sim.contact.constrained_cg.Solution; at most the tolerance when converged
+    Attributes:
+        pressure_mpa: (rows, cols) >= 0.
+        displacement_mm: (rows, cols) inward displacement of the gel alone, without the object's own deformation.
+        approach_mm: approach of the undeformed object, from gap = 0.
+        force_n: total force.
+        area_mm2: contact area.
+        iterations: number of solver steps.
+        residual: as in robot.sim.contact.constrained_cg.Solution; at most the tolerance if converged.
+        converged: whether the solver reached the tolerance.
+        flags: names from the list below.
 
-    no_contact        nothing is touched; not converged if there was a force to carry
-    unresolved        the contact is under three pixels wide: trust force and place, not pressure and depth
-    at_border         the contact reaches the border of the map, and nothing presses beyond
-    large_strain      a displacement over half the thickness: linear elasticity does not hold
-    steep             a slope over one half: linear elasticity does not hold
-    iteration_cap     stopped short of the tolerance; not converged
-    rigid_volume      a periodic surface cannot lose the volume that the depth asks for; not converged, nothing solved
+    Flags:
+
+        no_contact        nothing touches; not converged if there was a force to carry
+        unresolved        the contact is under three pixels wide: trust force and place, not pressure and depth
+        at_border         the contact reaches the border of the map, and nothing presses beyond
+        large_strain      a displacement over half the thickness: linear elasticity does not hold
+        steep             a slope over one half: linear elasticity does not hold
+        iteration_cap     stopped short of the tolerance; not converged
+        rigid_volume      a periodic surface cannot lose the volume that the depth requires; not converged, not solved
     """
 
     pressure_mpa: Floats
@@ -86,12 +107,23 @@ def press(
     max_iterations: int = 1000,
     padded: bool = True,
 ) -> Contact:
-    """Press an object into the gel with a force, or to a depth.
+    """Press an object into the gel with a force or to a depth.
 
-    gap_mm (rows, cols): distance of the undeformed object from the flat gel, +inf where there is no object.
-    depth_mm: approach of the undeformed object, from gap = 0. `padded=False` makes the surface periodic (a half-
-    space's mean displacement is then 0). Raises SceneError for an impossible gap, force or depth, RobotConfigError
-    for the settings.
+    Args:
+        gap_mm: (rows, cols) distance of the undeformed object from the flat gel, +inf where there is no object.
+        pixel_mm: side of a pixel.
+        layer: the gel.
+        force_n: total force; exclusive with `depth_mm`.
+        depth_mm: approach of the undeformed object, from gap = 0.
+        object_modulus_mpa: Young's modulus of the object; infinite for a rigid one.
+        object_poisson: Poisson's ratio of the object.
+        tolerance: upper bound on the solver's residual.
+        max_iterations: maximum number of solver steps.
+        padded: False makes the surface periodic (a half-space's mean displacement is then 0).
+
+    Raises:
+        SceneError: The gap, force or depth is impossible.
+        RobotConfigError: A setting is out of range.
     """
     _check_settings(pixel_mm, tolerance, max_iterations)
     _check_elastic("an object's", object_modulus_mpa, object_poisson)
@@ -101,13 +133,13 @@ def press(
     if math.isinf(lowest) or force_n == 0.0 or (depth_mm is not None and depth_mm <= lowest):
         return _no_contact(gap, force_n or 0.0, depth_mm, ())
     softness = layer.plane_modulus_mpa * (1.0 - object_poisson**2) / object_modulus_mpa
-    # Of a plane on a periodic surface nothing is left but what float32 rounds away.
+    # A plane on a periodic surface leaves only float32 rounding errors, so periodic problems use float64.
     single_precision = padded and tolerance >= SINGLE_PRECISION_TOLERANCE
     surface = ElasticSurface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded, single_precision)
     if depth_mm is not None and not surface.can_change_volume() and depth_mm > gap.mean():
         return _no_contact(gap, math.inf, depth_mm, ("rigid_volume",))
     scale = _scale(pixel_mm, layer.plane_modulus_mpa, force_n, 0.0 if depth_mm is None else depth_mm - lowest)
-    with np.errstate(over="ignore"):  # what is that far away is not there
+    with np.errstate(over="ignore"):  # surfaces that far away never touch
         scaled = (gap - lowest) / pixel_mm / scale
         scaled[scaled > _SCALED_RANGE[1]] = math.inf
     load = None if force_n is None else 1.0
@@ -116,18 +148,18 @@ def press(
 
 
 def _scale(pixel_mm: float, modulus_mpa: float, force_n: float | None, depth_mm: float) -> float:
-    """What load or depth is, in pixels and E*. Raises SceneError if that is no number to compute with."""
+    """Return load or depth in units of pixels and E*. Raise SceneError if it is outside the computable range."""
     scale = depth_mm / pixel_mm if force_n is None else force_n / modulus_mpa / pixel_mm / pixel_mm
     if not _SCALED_RANGE[0] < scale < _SCALED_RANGE[1]:
         raise SceneError(
             f"force / (E* pixel^2) or depth / pixel must be between {_SCALED_RANGE[0]} and {_SCALED_RANGE[1]}, "
-            f"got {scale}; give force, modulus and lengths in units that agree"
+            f"got {scale}; give force, modulus and lengths in consistent units"
         )
     return scale
 
 
 def _no_contact(gap: Floats, force_n: float, depth_mm: float | None, flags: tuple[str, ...]) -> Contact:
-    """No pressure anywhere; not converged if a force was to be carried."""
+    """Return a contact without pressure; not converged if there was a force to carry."""
     lowest = float(gap.min())
     approach = depth_mm if depth_mm is not None else lowest if math.isfinite(lowest) else 0.0
     nothing = np.zeros(gap.shape)
@@ -138,7 +170,7 @@ def _no_contact(gap: Floats, force_n: float, depth_mm: float | None, flags: tupl
 def _contact(
     solution: Solution, surface: ElasticSurface, layer: Layer, pixel_mm: float, scale: float, lowest_mm: float
 ) -> Contact:
-    """Back in the caller's units, with flags."""
+    """Convert the solution to the caller's units and set the flags."""
     pressure, displacement = solution.pressure, solution.displacement
     if surface.softness > 0.0:
         displacement = surface.gel_operator(pressure.shape, pressure.shape)(pressure)
@@ -166,14 +198,14 @@ def _contact(
 
 
 def _is_narrow(touching: npt.NDArray[np.bool_]) -> bool:
-    """Whether no pixel in contact has all its four neighbours in contact; beyond the border counts as contact."""
+    """Return whether every contact pixel has a neighbour without contact; beyond the border counts as contact."""
     padded = np.pad(touching, 1, mode="edge")
     around = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     return bool(touching.any()) and not bool((touching & around).any())
 
 
 def _max_slope(height: Floats) -> float:
-    """Largest slope by central differences, both in pixels."""
+    """Return the largest slope by central differences, both in pixels."""
     slopes = [np.gradient(height, axis=axis) for axis in (0, 1) if height.shape[axis] > 1]
     return float(np.sqrt(sum((slope**2 for slope in slopes), np.zeros(1))).max())
 
@@ -205,7 +237,9 @@ def _validate_gap(gap_mm: npt.ArrayLike) -> Floats:
     if gap.ndim != 2 or gap.size == 0:
         raise SceneError(f"a gap must be rows x cols with at least one pixel, got shape {gap.shape}; give a height map")
     if np.isnan(gap).any() or (gap == -np.inf).any():
-        raise SceneError("a gap must be a number or +inf in each pixel, got NaN or -inf; give +inf where nothing is")
+        raise SceneError(
+            "a gap must be a number or +inf in each pixel, got NaN or -inf; give +inf where there is no object"
+        )
     return gap
 
 

@@ -1,7 +1,7 @@
 """The contact problem in scaled units (pixel 1, E* of the gel 1): coarse grid first, then a window around the contact.
 
-Influences do not wrap around, so a window of the grid is exact as long as nothing outside it is touched. The whole
-field is looked at once at the end, and the window grows if the object touches beside it.
+Influences do not wrap around, so a window of the grid is exact if nothing outside it touches. The whole field is
+checked at the end, and the window grows if the object touches outside it.
 """
 
 import functools
@@ -16,10 +16,10 @@ from robot.sim.contact.constrained_cg import GAP_WEIGHT, ContactProblem, Solutio
 from robot.sim.contact.kernels import Floats, Operator, Quadrant, influence, layer_compliance, periodic_influence
 
 _COARSENING = 4
-_MIN_NESTED_PIXELS = 48  # pixels along the shorter side below which a coarser grid saves nothing
+_MIN_NESTED_PIXELS = 48  # along the shorter side; below this a coarser grid saves nothing
 _MARGIN = 2  # pixels around the coarse grid's contact
-_COARSE_CAP = 40  # iterations on the coarse grid, which only gives a start
-_WINDOW_STEPS = 8  # a window's sides are multiples of an eighth of the grid's: few operators to keep
+_COARSE_CAP = 40  # iterations on the coarse grid, which only gives a start pressure
+_WINDOW_STEPS = 8  # a window's sides are multiples of 1/8 of the grid's, so few operators are cached
 
 Mask = npt.NDArray[np.bool_]
 Window = tuple[slice, slice]
@@ -27,8 +27,14 @@ Window = tuple[slice, slice]
 
 @dataclass(frozen=True)
 class ElasticSurface:
-    """A layer `thickness` pixels thick; `softness` is its E* over the object's, 0 for a rigid object; `single_precision`: by
-    products in float32.
+    """An elastic layer under an elastic object.
+
+    Attributes:
+        thickness: thickness of the layer in pixels.
+        poisson: Poisson's ratio of the layer.
+        softness: E* of the layer over E* of the object; 0 for a rigid object.
+        periodic: whether the surface wraps around at the border.
+        single_precision: whether products are in float32.
     """
 
     thickness: float
@@ -38,11 +44,11 @@ class ElasticSurface:
     single_precision: bool = False
 
     def gel_operator(self, grid: Quadrant, window: Quadrant) -> Operator:
-        """Displacement of the gel by a pressure on a window of the grid."""
+        """Return the displacement of the gel by a pressure on a window of the grid."""
         return _operator(grid, window, self.thickness, self.poisson, self.periodic, self.single_precision)
 
     def combined_operator(self, grid: Quadrant, window: Quadrant) -> Operator:
-        """Displacement of the gel and of the object, a half-space, together."""
+        """Return the displacement of the gel plus that of the object, a half-space."""
         gel_operator = self.gel_operator(grid, window)
         if self.softness == 0.0:
             return gel_operator
@@ -50,7 +56,7 @@ class ElasticSurface:
         return gel_operator.plus(half_space, self.softness)
 
     def can_change_volume(self) -> bool:
-        """Whether the mean displacement can differ from 0."""
+        """Return whether the mean displacement can differ from 0."""
         return not self.periodic or float(layer_compliance(np.zeros(1), self.thickness, self.poisson)[0]) > 0.0
 
 
@@ -64,7 +70,16 @@ def _operator(
 
 @dataclass(frozen=True)
 class ScaledProblem:
-    """Press with `load` (sum of pressures), or where it is None to `depth`; `gap` (rows, cols) is inf where empty."""
+    """A press in scaled units.
+
+    Attributes:
+        surface: the elastic layer and object.
+        gap: (rows, cols) distance of the undeformed object, inf where there is no object.
+        load: sum of pressures; None for a press to `depth`.
+        depth: approach for a press without load.
+        tolerance: upper bound on the residual.
+        max_iterations: maximum number of steps on the fine grid.
+    """
 
     surface: ElasticSurface
     gap: Floats
@@ -74,7 +89,7 @@ class ScaledProblem:
     max_iterations: int
 
     def solve(self) -> Solution:
-        """From the coarse grid's pressure where that helps."""
+        """Solve, starting from the coarse grid's pressure if the grid is large enough."""
         start = self._coarse_start() if min(self.gap.shape) >= _MIN_NESTED_PIXELS else None
         if start is None:
             start = self._problem(_full_window(self.gap.shape)).initial_pressure()
@@ -85,7 +100,7 @@ class ScaledProblem:
         return ContactProblem(self.surface.combined_operator(self.gap.shape, gap.shape), gap, self.load, self.depth)
 
     def _coarse_start(self) -> Floats | None:
-        """The coarse grid's pressure on the fine one; None if the coarse grid does not touch."""
+        """Return the coarse grid's pressure on the fine grid; None if the coarse grid does not touch."""
         gap = coarsen(self.gap) / _COARSENING
         load = None if self.load is None else self.load / _COARSENING**2
         surface = replace(self.surface, thickness=self.surface.thickness / _COARSENING)
@@ -101,21 +116,21 @@ class ScaledProblem:
         return pressure if self.load is None or total <= 0.0 else pressure * (self.load / total)
 
     def _refine(self, start: Floats) -> Solution:
-        """Solve on a window around `start`, larger each time until nothing outside it is touched."""
-        wanted, iterations = start > 0.0, 0
+        """Solve on a window around `start` and enlarge it until nothing touches outside it."""
+        active, iterations = start > 0.0, 0
         while True:
             window = _full_window(self.gap.shape)
-            if not self.surface.periodic:  # around the wanted pixels
-                window = _padded_span(np.asarray(wanted.any(axis=1))), _padded_span(np.asarray(wanted.any(axis=0)))
+            if not self.surface.periodic:  # around the active pixels
+                window = _padded_span(np.asarray(active.any(axis=1))), _padded_span(np.asarray(active.any(axis=0)))
             part = self._problem(window).solve(start[window], self.tolerance, self.max_iterations - iterations)
             iterations += part.iterations
             solution, missed = self._extend_to_grid(part, window)
             if not part.converged or not missed.any():
                 return replace(solution, iterations=iterations)
-            wanted, start = (solution.pressure > 0.0) | missed, solution.pressure
+            active, start = (solution.pressure > 0.0) | missed, solution.pressure
 
     def _extend_to_grid(self, part: Solution, window: Window) -> tuple[Solution, Mask]:
-        """The window's solution on the whole field, and where the object touches outside the window."""
+        """Extend the window's solution to the whole field; also return where the object touches outside the window."""
         pressure, missed = np.zeros(self.gap.shape), np.zeros(self.gap.shape, bool)
         pressure[window] = part.pressure
         if part.pressure.size == pressure.size:
@@ -133,9 +148,9 @@ def _full_window(shape: tuple[int, ...]) -> Window:
     return slice(0, shape[0]), slice(0, shape[1])
 
 
-def _padded_span(wanted: Mask) -> slice:
-    """Where any is wanted, with a margin, in one of _STEPS lengths."""
-    count, where = wanted.size, np.nonzero(wanted)[0]
+def _padded_span(active: Mask) -> slice:
+    """Return the span of the active pixels with a margin; its length is a multiple of 1/_WINDOW_STEPS of the grid."""
+    count, where = active.size, np.nonzero(active)[0]
     first, last = max(0, int(where[0]) - _MARGIN), min(count, int(where[-1]) + 1 + _MARGIN)
     step = max(1, -(-count // _WINDOW_STEPS))
     length = min(count, -(-(last - first) // step) * step)
@@ -144,11 +159,11 @@ def _padded_span(wanted: Mask) -> slice:
 
 
 def coarsen(gap: Floats) -> Floats:
-    """Mean over blocks of _COARSENING pixels of what is there; inf where a block is empty."""
+    """Return the mean over the finite pixels of each block of _COARSENING pixels; inf if a block has none."""
     rows, cols = (-(-n // _COARSENING) for n in gap.shape)
     padded = np.full((rows * _COARSENING, cols * _COARSENING), np.inf)
     padded[: gap.shape[0], : gap.shape[1]] = gap
     blocks = padded.reshape(rows, _COARSENING, cols, _COARSENING)
-    there = np.isfinite(blocks)
-    count, total = there.sum(axis=(1, 3)), np.where(there, blocks, 0.0).sum(axis=(1, 3))
+    is_finite = np.isfinite(blocks)
+    count, total = is_finite.sum(axis=(1, 3)), np.where(is_finite, blocks, 0.0).sum(axis=(1, 3))
     return np.where(count > 0, total / np.maximum(count, 1), np.inf)

@@ -1,1 +1,1 @@
-"""The simulated gel sensor: a displacement map in, its camera's picture out."""
+"""The simulated gel sensor: it turns a displacement map into its camera's picture."""

@@ -1,14 +1,14 @@
-"""Optics fitted to real presses: the change of colour is a low-order polynomial of the normal and the place.
+"""Optics fitted to real presses: the change of colour is a low-order polynomial of the normal and the position.
 
     I_c(p) = backdrop_c(p) + sum_k sum_j  w_kjc  place_j(p)  feature_k(p)
 
-Features are the products nx^i ny^j of 1 <= i + j <= degree, and for each reach the displacement smoothed over that
-reach and its two slopes: light that the gel sends on, and soft shadows, come from the wider neighbourhood. Places
-are 1, x, y, xy, x^2, y^2 (x, y from -1 to 1 over the field), or the first of them. A flat gel has no feature, so
-it shows the backdrop: a polynomial in x and y.
+Features are the products nx^i ny^j with 1 <= i + j <= degree, and for each reach the displacement smoothed over that
+reach and its two slopes: scattered light and soft shadows come from the wider neighbourhood. Place terms are 1, x, y,
+xy, x^2, y^2 (x, y from -1 to 1 over the field), or the first of them. A flat gel has no feature, so it shows the
+backdrop: a polynomial in x and y.
 
-Outside what the presses showed (steeper normals, deeper neighbourhoods, places where nobody pressed) a polynomial
-runs away; there every quantity is held at the limits that the fit noted.
+A polynomial diverges outside the range of the fitted presses (steeper normals, deeper neighbourhoods, places without
+presses), so every quantity is clipped to the limits of the fit.
 """
 
 import json
@@ -35,8 +35,16 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class FittedLimits(TypedSettings):
-    """What the fitted presses showed; everything is held inside. steepest: of |n|, the sine of the tilt. lowest,
-    highest: of each smoothed map.
+    """Ranges of the fitted presses; every input is clipped to them.
+
+    Attributes:
+        steepest: greatest |n|, the sine of the tilt.
+        left: least x of the presses.
+        right: greatest x of the presses.
+        top: least y of the presses.
+        bottom: greatest y of the presses.
+        lowest: least value of each smoothed map.
+        highest: greatest value of each smoothed map.
     """
 
     steepest: float
@@ -50,9 +58,19 @@ class FittedLimits(TypedSettings):
 
 @dataclass(frozen=True)
 class FittedOptics(TypedSettings, Optics):
-    """A fitted sensor. `weights`: (features x places, 3) row by row; `flat`: (terms, 3) of the backdrop.
+    """Optics of a fitted sensor.
 
-    Raises BadRobotInput where the sizes do not belong together, or a number is not finite.
+    Attributes:
+        degree: degree of the polynomial in the normal.
+        places: number of place terms.
+        reaches_mm: smoothing lengths of the neighbourhood features.
+        weights: (features x places, 3), row by row.
+        flat_degree: degree of the backdrop.
+        flat: (terms, 3) coefficients of the backdrop.
+        limits: ranges of the fitted presses.
+
+    Raises:
+        BadRobotInput: The sizes do not match, or a number is not finite.
     """
 
     degree: int
@@ -65,18 +83,20 @@ class FittedOptics(TypedSettings, Optics):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        wanted = (feature_count(self.degree, len(self.reaches_mm)) * self.places, CHANNELS)
+        weights = (feature_count(self.degree, len(self.reaches_mm)) * self.places, CHANNELS)
         flat = (len(place_powers(self.flat_degree)), CHANNELS)
-        if np.shape(self.weights) != wanted or np.shape(self.flat) != flat:
+        if np.shape(self.weights) != weights or np.shape(self.flat) != flat:
             raise BadRobotInput(
-                f"weights and flat must be {wanted} and {flat} numbers for this degree, "
+                f"weights and flat must be {weights} and {flat} numbers for this degree, "
                 f"got {np.shape(self.weights)} and {np.shape(self.flat)}; fit again"
             )
 
     def backdrop(self, field: Field) -> Array:
+        """Return the fitted backdrop (rows, cols, 3)."""
         return _maps(self, field)[0].copy()
 
     def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
+        """Return the backdrop plus the weighted features (rows, cols, 3)."""
         backdrop, weights = _maps(self, surface.field)
         features = normal_features(*self._tilts(slopes), self.degree)
         if self.reaches_mm and surface.displacement_mm.any():
@@ -92,7 +112,7 @@ class FittedOptics(TypedSettings, Optics):
         return out
 
     def _tilts(self, slopes: tuple[Array, Array]) -> tuple[Array, Array]:
-        """Nx and ny, no steeper than the limit."""
+        """Return nx and ny, limited to the steepest fitted tilt."""
         slope_x, slope_y = slopes
         square = slope_x * slope_x + slope_y * slope_y
         steepest = np.float32(min(self.limits.steepest, 1))
@@ -101,7 +121,7 @@ class FittedOptics(TypedSettings, Optics):
         return slope_x * shrink, slope_y * shrink
 
     def _neighbourhood(self, surface: Surface) -> list[Array]:
-        """For each reach: smoothed displacement and its slopes, at the pixels."""
+        """Return the smoothed displacement and its slopes at the pixels, for each reach."""
         field = surface.field
         heights = surface.coarse(_COARSE)
         steps = [size / count for size, count in zip(field.size_mm, heights.shape, strict=True)]
@@ -120,12 +140,12 @@ def _slope(heights: Array, axis: int, step_mm: float) -> Array:
 
 
 def feature_count(degree: int, reaches: int) -> int:
-    """How many features a model of this degree in the normal and this number of reaches has."""
+    """Return the number of features of a model of this degree in the normal and this number of reaches."""
     return degree * (degree + 3) // 2 + 3 * reaches
 
 
 def normal_features(nx: Any, ny: Any, degree: int) -> list[Any]:
-    """nx^i ny^j for i + j = 1, 2, ... degree."""
+    """Return nx^i ny^j for i + j = 1, 2, ... degree."""
     powers_x, powers_y = [np.ones_like(nx)], [np.ones_like(ny)]
     for _ in range(degree):
         powers_x.append(powers_x[-1] * nx)
@@ -134,55 +154,59 @@ def normal_features(nx: Any, ny: Any, degree: int) -> list[Any]:
 
 
 def place_powers(degree: int) -> list[tuple[int, int]]:
-    """Powers of x and y up to a total degree: of degree 2, in order, 1, x, y, x^2, xy, y^2."""
+    """Return powers of x and y up to a total degree: for degree 2, in order, 1, x, y, x^2, xy, y^2."""
     return [(total - j, j) for total in range(degree + 1) for j in range(total + 1)]
 
 
 def place_terms(x: Any, y: Any, count: int) -> list[Any]:
-    """The first `count` of 1, x, y, xy, x^2, y^2."""
+    """Return the first `count` of 1, x, y, xy, x^2, y^2."""
     return [np.ones_like(x * y), x, y, x * y, x * x, y * y][:count]
 
 
 @lru_cache(maxsize=4)
 def _maps(optics: FittedOptics, field: Field) -> tuple[Array, list[Array]]:
-    """The backdrop, and for each feature its weight at every pixel (3, rows, cols): made once per sensor."""
+    """Return the backdrop, and the weight (3, rows, cols) of each feature at every pixel; cached per sensor."""
     x, y = field.unit_positions()
     flat = np.array(optics.flat, np.float32)
     powers = place_powers(optics.flat_degree)
     backdrop = sum(x[..., None] ** i * y[..., None] ** j * row for (i, j), row in zip(powers, flat, strict=True))
     limits = optics.limits
-    held = np.clip(x, limits.left, limits.right), np.clip(y, limits.top, limits.bottom)
-    places = [np.broadcast_to(term, (field.rows, field.cols)) for term in place_terms(*held, optics.places)]
+    clipped = np.clip(x, limits.left, limits.right), np.clip(y, limits.top, limits.bottom)
+    places = [np.broadcast_to(term, (field.rows, field.cols)) for term in place_terms(*clipped, optics.places)]
     weights = np.array(optics.weights, np.float32).reshape(-1, optics.places, CHANNELS)
     maps = [np.tensordot(row.T, np.stack(places), axes=1) for row in weights]
     return np.maximum(np.asarray(backdrop, np.float32), 1), maps
 
 
-# On the disk -----------------------------------------------------------------------------------------------
+# Files -----------------------------------------------------------------------------------------------------
 
 
 def fitted_names() -> list[str]:
-    """The sensors whose fits are shipped."""
+    """Return the names of the sensors with a shipped fit."""
     folder = resources.files("robot.sim.gel") / "fitted"
     return sorted(item.name.removesuffix(".json") for item in folder.iterdir() if item.name.endswith(".json"))
 
 
 def fitted_document(name: str) -> dict[str, Any]:
-    """The shipped file of this sensor: source, setting, held-out figures, model. Raises UnknownName."""
+    """Return the shipped file of this sensor: source, settings, held-out results, model. Raise UnknownName."""
     if name not in (known := fitted_names()):
-        raise UnknownName(f"no sensor called {name!r} was fitted; known are {', '.join(known)}")
+        raise UnknownName(f"there is no fitted sensor {name!r}; known are {', '.join(known)}")
     content: dict[str, Any] = json.loads((resources.files("robot.sim.gel") / "fitted" / f"{name}.json").read_text())
     return content
 
 
 @lru_cache(maxsize=8)
 def load_fitted(name: str) -> FittedOptics:
-    """The shipped fit of this sensor. Raises UnknownName, listing those there are."""
+    """Load the shipped fit of this sensor. Raise UnknownName with the known names."""
     return optics_from_json(fitted_document(name))
 
 
 def optics_from_json(content: dict[str, Any]) -> FittedOptics:
-    """The optics that a fitted file describes. Raises BadRobotInput for another format or missing keys."""
+    """Build the optics from a fitted file.
+
+    Raises:
+        BadRobotInput: The format is another one, or keys are missing.
+    """
     if content.get("format") != FORMAT:
         raise BadRobotInput(f"a fitted sensor must have format {FORMAT}, got {content.get('format')!r}; fit again")
     model = content.get("model")
@@ -193,9 +217,9 @@ def optics_from_json(content: dict[str, Any]) -> FittedOptics:
 
 
 def optics_to_json(optics: FittedOptics) -> dict[str, Any]:
-    """What optics_from_json() reads back, with six digits of each number."""
-    found: dict[str, Any] = _round_numbers(asdict(optics))
-    return found
+    """Convert to a document that `optics_from_json` reads, with six digits of each number."""
+    document: dict[str, Any] = _round_numbers(asdict(optics))
+    return document
 
 
 def _round_numbers(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""What sits on a gel: specks of dust, hairs, scratches, grains under the skin, and printed markers."""
+"""Marks on a gel: specks of dust, hairs, scratches, grains under the skin, and printed markers."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +17,15 @@ _SUBPIXEL = 4  # cv2 draws at 1/16 of a pixel
 
 @dataclass(frozen=True)
 class Flaws:
-    """Flaws of one gel, drawn once from `seed`: how many of each, and how rough the skin is (rms slope)."""
+    """Flaws of one gel, drawn once from `seed`.
+
+    Attributes:
+        seed: seed of all places and sizes.
+        specks: number of dark dots.
+        hairs: number of hairs and scratches.
+        grains: number of bumps under the skin.
+        texture: rms slope of the skin's roughness.
+    """
 
     seed: int
     specks: int = 14
@@ -28,7 +36,13 @@ class Flaws:
 
 @dataclass(frozen=True)
 class FlawMaps:
-    """What flaws do to a picture: `darkening` (rows, cols) multiplies it, `slope_x` and `slope_y` add to the gel's."""
+    """Effect of flaws on a picture.
+
+    Attributes:
+        darkening: (rows, cols) factor of the picture.
+        slope_x: (rows, cols) addition to the gel's slope to the right.
+        slope_y: (rows, cols) addition to the gel's slope downwards.
+    """
 
     darkening: Array
     slope_x: Array
@@ -37,7 +51,7 @@ class FlawMaps:
 
 @lru_cache(maxsize=8)
 def flaw_maps(flaws: Flaws, field: Field) -> FlawMaps:
-    """The maps of these flaws; the same flaws are on the same places whatever the size of the image."""
+    """Return the maps of these flaws; their places do not depend on the size of the image."""
     rng = np.random.default_rng([flaws.seed, 0x6E1])
     darkening = _specks(rng, flaws.specks, field) * _hairs(rng, flaws.hairs, field)
     heights = _grains(rng, flaws.grains, field)
@@ -46,7 +60,7 @@ def flaw_maps(flaws: Flaws, field: Field) -> FlawMaps:
         for axis in (0, 1)
     )
     rough = rng.standard_normal((2, field.rows, field.cols), dtype=np.float32)
-    # Skin is rough at many scales; grains of two pixels are what a camera still sees.
+    # Skin is rough at many scales; a camera still resolves grains of two pixels.
     rough = np.stack([cv2.GaussianBlur(one, (0, 0), 1.4) * np.float32(5.0 * flaws.texture) for one in rough])
     return FlawMaps(darkening, (right + rough[0]).astype(np.float32), (down + rough[1]).astype(np.float32))
 
@@ -56,7 +70,7 @@ def _places(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
 
 
 def _specks(rng: np.random.Generator, count: int, field: Field) -> Array:
-    """Dark dots of 0.03 to 0.12 mm, each let through 50 to 90 % of the light."""
+    """Draw dark dots of 0.03 to 0.12 mm; each transmits 50 to 90 % of the light."""
     out = np.ones((field.rows, field.cols), np.float32)
     radii, values = rng.uniform(0.03, 0.12, count), rng.uniform(0.5, 0.9, count)
     for place, radius, value in zip(_places(rng, count), radii, values, strict=True):
@@ -73,7 +87,7 @@ def _draw_dot(image: Array, place: NDArray[Any], radius_mm: float, value: float,
 
 
 def _hairs(rng: np.random.Generator, count: int, field: Field) -> Array:
-    """Thin dark arcs of 0.5 to 2.5 mm: hairs on the gel and scratches in it."""
+    """Draw thin dark arcs of 0.5 to 2.5 mm: hairs on the gel and scratches in it."""
     out = np.ones((field.rows, field.cols), np.float32)
     for place in _places(rng, count):
         length, bend, angle = rng.uniform(0.5, 2.5), rng.uniform(-1.5, 1.5), rng.uniform(0, 2 * math.pi)
@@ -87,7 +101,7 @@ def _hairs(rng: np.random.Generator, count: int, field: Field) -> Array:
 
 
 def _grains(rng: np.random.Generator, count: int, field: Field) -> Array:
-    """Heights in mm of little bumps (grit under the skin, 0.05 to 0.15 mm wide)."""
+    """Return heights in mm of little bumps (grit under the skin, 0.05 to 0.15 mm wide)."""
     x, y = field.positions()
     height, width = field.size_mm
     out = np.zeros((field.rows, field.cols), np.float32)
@@ -103,10 +117,17 @@ def _grains(rng: np.random.Generator, count: int, field: Field) -> Array:
 
 @dataclass(frozen=True)
 class Markers:
-    """Black dots printed on the gel, `pitch_mm` apart, that move with its surface.
+    """Black dots printed on the gel that move with its surface.
 
-    A press spreads them: the shift is `spread` times sum u (x - x_i) exp(-|x - x_i|^2 / (2 reach^2)), normalised,
-    which is -spread * reach * the slope of the smoothed displacement (the form of FOTS, RA-L 2024).
+    A press spreads them: the shift is `spread` times sum u (x - x_i) exp(-|x - x_i|^2 / (2 reach^2)), normalised, which
+    is -spread * reach * the slope of the smoothed displacement (the form of FOTS, RA-L 2024).
+
+    Attributes:
+        pitch_mm: distance between dots.
+        radius_mm: radius of a dot.
+        darkness: fraction of the light that a dot absorbs.
+        spread: factor of the shift.
+        reach_mm: smoothing length of the shift.
     """
 
     pitch_mm: float = 1.5
@@ -121,7 +142,7 @@ class Markers:
 
 
 def marker_positions(markers: Markers, surface: Surface) -> Array:
-    """(count, 2): x, y of the dots in mm from the middle of the field, moved by the surface."""
+    """Return x, y (count, 2) of the displaced dots in mm from the middle of the field."""
     at_rest = _rest_positions(markers, surface.field)
     heights = surface.coarse(4)
     height, width = surface.field.size_mm
@@ -146,7 +167,7 @@ def _rest_positions(markers: Markers, field: Field) -> Array:
 
 
 def marker_darkening(markers: Markers, surface: Surface) -> Array:
-    """(rows, cols) factors: 1, and 1 - darkness where a marker is."""
+    """Return factors (rows, cols): 1, and 1 - darkness at a marker."""
     field = surface.field
     out = np.ones((field.rows, field.cols), np.float32)
     height, width = field.size_mm

@@ -1,13 +1,13 @@
 """From the shape of a gel to colours: near-field LEDs, or a low-order model fitted to real presses.
 
-Both answer with grey levels (0 to 255, not yet clipped) for red, green and blue, and a flat gel gives the
-backdrop. What a sensor adds (tint, dust, blur, noise) is in `robot.sim.gel.sensor`.
+Both return grey levels (0 to 255, before clipping) for red, green and blue; a flat gel gives the backdrop. The other
+effects of a sensor (tint, dust, blur, noise) are in `robot.sim.gel.sensor`.
 
-LEDs (SIMULATION: near-field LED): a point source at s with axis o and emission order m lights the point p of a
-matt surface with normal n by w = max(0, n . d) max(0, -o . d)^m / |s - p|^2, d = (s - p) / |s - p|. One colour
-is a bar of such points. The unpressed gel has w_flat, and the picture is
+LEDs (SIMULATION: near-field LED): a point source at s with axis o and emission order m lights the point p of a matt
+surface with normal n by w = max(0, n . d) max(0, -o . d)^m / |s - p|^2, d = (s - p) / |s - p|. One colour is a bar of
+such points. The unpressed gel has w_flat, and the picture is
     I_c = backdrop_c * (ambient + (1 - ambient) * sum_b mix_cb * shade_b * w_b / w_flat_b),
-so that what the backdrop holds (the lamp's own falloff, the vignette of the lens) is not counted twice.
+so the effects that the backdrop contains (the lamp's falloff, the vignette of the lens) are not counted twice.
 """
 
 import math
@@ -26,15 +26,15 @@ Triple = tuple[float, float, float]
 
 
 class Optics(ABC):
-    """What turns a surface into colours. Frozen and hashable, so that maps made once are found again."""
+    """Base class of models that turn a surface into colours. Frozen and hashable, for caches."""
 
     @abstractmethod
     def backdrop(self, field: Field) -> Array:
-        """The unpressed gel: (rows, cols, 3) grey levels."""
+        """Return the unpressed gel: (rows, cols, 3) grey levels."""
 
     @abstractmethod
     def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
-        """The pressed gel: (rows, cols, 3) grey levels; `slopes` are the surface's and those of its flaws."""
+        """Return the pressed gel: (rows, cols, 3) grey levels; `slopes` are those of the surface plus its flaws."""
 
 
 # Near-field LEDs -------------------------------------------------------------------------------------------
@@ -42,10 +42,15 @@ class Optics(ABC):
 
 @dataclass(frozen=True)
 class LedBar:
-    """LEDs of one colour beside the gel: `points` of them along a line that faces the middle of the field.
+    """A bar of LEDs of one colour next to the gel; it faces the middle of the field.
 
-    `angle_rad` is where it stands, counted from the right of the image, counter-clockwise as seen on screen;
-    `height_mm` is above the gel, on the camera's side; `order` is the Lambertian order of emission.
+    Attributes:
+        angle_rad: direction from the middle of the field, from the right of the image, counter-clockwise on screen.
+        distance_mm: distance from the middle of the field.
+        height_mm: height above the gel, on the camera's side.
+        length_mm: length of the bar.
+        points: number of LEDs.
+        order: Lambertian order of emission.
     """
 
     angle_rad: float
@@ -58,15 +63,15 @@ class LedBar:
     def __post_init__(self) -> None:
         lengths = (self.distance_mm, self.height_mm)
         if not all(0 < value < math.inf for value in lengths) or self.points < 1 or self.order < 0:
-            raise RobotConfigError(f"a bar of LEDs must stand above the gel and hold one LED or more, got {self}")
+            raise RobotConfigError(f"a bar of LEDs must be above the gel and have at least one LED, got {self}")
 
     def positions(self) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-        """(points, 3): x, y, z of the LEDs in mm, y down."""
+        """Return x, y, z (points, 3) of the LEDs in mm, y down."""
         outwards = np.array([math.cos(self.angle_rad), -math.sin(self.angle_rad), 0.0])
         along = np.array([-outwards[1], outwards[0], 0.0])
-        shares = np.linspace(-0.5, 0.5, self.points) if self.points > 1 else np.zeros(1)
+        offsets = np.linspace(-0.5, 0.5, self.points) if self.points > 1 else np.zeros(1)
         middle = outwards * self.distance_mm + np.array([0.0, 0.0, self.height_mm])
-        return np.asarray(middle + shares[:, None] * self.length_mm * along)
+        return np.asarray(middle + offsets[:, None] * self.length_mm * along)
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ class GaussianBackdrop:
     slant_y: float = 0.0
 
     def __call__(self, field: Field) -> Array:
-        """(rows, cols) grey levels, none below 1."""
+        """Return grey levels (rows, cols), at least 1."""
         x, y = field.unit_positions()
         hill = np.exp(-(((x - self.x0) / self.width_x) ** 2)) * np.exp(-(((y - self.y0) / self.width_y) ** 2))
         level = self.floor + self.span * hill + self.slant_x * x + self.slant_y * y
@@ -100,7 +105,7 @@ MINI_BACKDROPS = (
     GaussianBackdrop(50, 76, 0.2, -0.13, 1.4, 1.9, -14.0, -1.0),
     GaussianBackdrop(28, 133, 0.03, 0.13, 0.88, 0.85, 0.0, 9.0),
 )
-# How much of each channel (rows) comes from each bar (columns); the rows add up to 1.
+# Contribution of each bar (columns) to each channel (rows); the rows add up to 1.
 MINI_MIX = ((0.76, 0.19, 0.05), (0.23, 0.69, 0.08), (0.07, 0.07, 0.86))
 
 
@@ -108,9 +113,15 @@ MINI_MIX = ((0.76, 0.19, 0.05), (0.23, 0.69, 0.08), (0.07, 0.07, 0.86))
 class LedOptics(Optics):
     """Three bars of near-field LEDs.
 
-    `ambient` is the share of the light that comes from everywhere (reflected inside the gel); `shadow` is how
-    much of a bar's light a surface in its way takes (0: cast shadows are left out and not computed).
-    Raises RobotConfigError for shares outside 0 to 1 or mixes that do not add up to 1.
+    Attributes:
+        bars: the three bars.
+        backdrops: the unpressed gel, one for each channel.
+        mix: contribution of each bar to each channel; each row adds up to 1.
+        ambient: fraction of the light that comes from all directions (reflected inside the gel).
+        shadow: fraction of a bar's light that the surface can block; 0 skips cast shadows.
+
+    Raises:
+        RobotConfigError: A fraction is outside 0 to 1, or a row of `mix` does not add up to 1.
     """
 
     bars: tuple[LedBar, LedBar, LedBar] = MINI_BARS
@@ -123,12 +134,14 @@ class LedOptics(Optics):
         if not (0 <= self.ambient <= 1 and 0 <= self.shadow <= 1):
             raise RobotConfigError(f"ambient and shadow must be 0 to 1, got {self.ambient} and {self.shadow}")
         if any(abs(sum(row) - 1) > 1e-6 or min(row) < 0 for row in self.mix):
-            raise RobotConfigError(f"each row of mix must be shares that add up to 1, got {self.mix}")
+            raise RobotConfigError(f"each row of mix must be fractions that add up to 1, got {self.mix}")
 
     def backdrop(self, field: Field) -> Array:
+        """Return the three backdrops (rows, cols, 3)."""
         return _backdrop(self.backdrops, field)
 
     def colours(self, surface: Surface, slopes: tuple[Array, Array]) -> Array:
+        """Return the picture of the surface lit by the bars (rows, cols, 3)."""
         field = surface.field
         (leds, strengths), (x, y) = _leds(self.bars, field), field.positions()
         shades = np.ones((len(self.bars), field.rows, field.cols), np.float32)
@@ -143,15 +156,16 @@ class LedOptics(Optics):
 
 @lru_cache(maxsize=16)
 def _backdrop(backdrops: tuple[GaussianBackdrop, ...], field: Field) -> Array:
-    whole = np.stack([glow(field) for glow in backdrops], axis=-1)
+    whole = np.stack([backdrop(field) for backdrop in backdrops], axis=-1)
     whole.flags.writeable = False
     return whole
 
 
 @lru_cache(maxsize=16)
 def _leds(bars: tuple[LedBar, ...], field: Field) -> tuple[Array, Array]:
-    """Places (bars, points, 3) of the LEDs, and what each gives to a facet (bars, points, rows, cols), for shade_by_bars;
-    of a bar with fewer points than the longest the rest give nothing.
+    """Return places (bars, points, 3) and strengths (bars, points, rows, cols) of the LEDs, for `shade_by_bars`.
+
+    Bars with fewer points than the longest are padded with LEDs of strength 0.
     """
     points = max(bar.points for bar in bars)
     places = np.zeros((len(bars), points, 3), np.float32)
@@ -163,8 +177,9 @@ def _leds(bars: tuple[LedBar, ...], field: Field) -> tuple[Array, Array]:
 
 
 def led_strengths(bar: LedBar, field: Field) -> Array:
-    """(points, rows, cols): the factor by which the product of a normal and the way to an LED is its share of
-    w / w_flat.
+    """Return the strength (points, rows, cols) of each LED at each pixel.
+
+    Strength times (normal . vector to the LED) is the LED's contribution to w / w_flat.
     """
     middle = np.array([0.0, 0.0, 0.0])
     x, y = (axis.astype(np.float64) for axis in field.positions())
@@ -182,13 +197,13 @@ def led_strengths(bar: LedBar, field: Field) -> Array:
 
 # Shadows ---------------------------------------------------------------------------------------------------
 
-_SHADOW_STEP = 4  # image pixels per point of the shadow's grid: penumbras are wider than that
-_REACHES_MM = (0.4, 0.8, 1.4, 2.2)  # how far towards the bar a higher surface is looked for
-_PENUMBRA_MM = 0.5  # how far a surface must stand into the light to take all of it: bars are long, light soft
+_SHADOW_STEP = 4  # image pixels per point of the shadow grid; penumbras are wider
+_REACHES_MM = (0.4, 0.8, 1.4, 2.2)  # distances towards the bar at which the surface height is sampled
+_PENUMBRA_MM = 0.5  # height above the ray at which the light is fully blocked: bars are long, light soft
 
 
 def cast_shadows(surface: Surface, bars: tuple[LedBar, ...]) -> list[Array]:
-    """For each bar the share (0 to 1) of its light that the surface itself keeps from each pixel."""
+    """Return the fraction (0 to 1) of each bar's light that the surface itself blocks at each pixel."""
     heights = surface.coarse(_SHADOW_STEP)
     full = (surface.field.rows, surface.field.cols)
     out = []
@@ -206,7 +221,7 @@ def cast_shadows(surface: Surface, bars: tuple[LedBar, ...]) -> list[Array]:
 def _shadow_samples(
     bars: tuple[LedBar, ...], field: Field, shape: tuple[int, int]
 ) -> tuple[list[tuple[Array, Array, Array]], ...]:
-    """For each bar and reach: where to look (x, y maps) and how high the light's ray is there (mm)."""
+    """Return, for each bar and reach, the x and y maps of the samples and the height (mm) of the light ray there."""
     grid = Field(shape[0], shape[1], 1.0)
     steps = (field.size_mm[1] / shape[1], field.size_mm[0] / shape[0])
     x, y = (axis * np.float32(step) for axis, step in zip(grid.positions(), steps, strict=True))

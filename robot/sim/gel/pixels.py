@@ -1,4 +1,4 @@
-"""What is done to every pixel of a gel image, compiled: light of the LEDs, and the camera's noise."""
+"""Compiled loops over the pixels of a gel image: light of the LEDs, and camera noise."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +10,18 @@ Array = NDArray[np.float32]
 
 @jit
 def shade_by_bars(slopes, leds, strengths, axes, shades, mix, ambient, backdrop, out):  # type: ignore[no-untyped-def]
-    """The picture (rows, cols, 3) of LedOptics into `out`, which is of float32 as everything here.
+    """Write the picture (rows, cols, 3) of LedOptics into `out`; all arrays are float32.
 
-    slopes: of the surface, (2, rows, cols). leds (bars, points, 3) mm and strengths (bars, points, rows, cols): what an
-    LED gives is its strength times the product of the normal and the way to it, or 0. axes: x (cols,) and y (rows,)
-    of the pixels in mm. shades: (bars, rows, cols) share of a bar's light that a pixel gets. mix (3, bars).
+    Args:
+        slopes: (2, rows, cols) slopes of the surface.
+        leds: (bars, points, 3) places of the LEDs, mm.
+        strengths: (bars, points, rows, cols); an LED contributes its strength times (normal . vector to it), or 0.
+        axes: x (cols,) and y (rows,) of the pixels in mm.
+        shades: (bars, rows, cols) fraction of a bar's light that reaches a pixel.
+        mix: (3, bars) contribution of each bar to each channel.
+        ambient: fraction of the light from all directions.
+        backdrop: (rows, cols, 3) picture of the flat gel.
+        out: (rows, cols, 3) result.
     """
     bars, points = leds.shape[0], leds.shape[1]
     rows, cols = slopes.shape[1], slopes.shape[2]
@@ -44,7 +51,15 @@ def shade_by_bars(slopes, leds, strengths, axes, shades, mix, ambient, backdrop,
 
 @jit
 def add_camera_noise(clean, noise, read, shot, out):  # type: ignore[no-untyped-def]
-    """Grey levels (rows, cols, 3) plus noise, given with variance 1, of variance read^2 + shot * level; rounded."""
+    """Write rounded grey levels with noise of variance read^2 + shot * level into `out`.
+
+    Args:
+        clean: (rows, cols, 3) grey levels.
+        noise: (rows, cols, 3) noise of variance 1.
+        read: standard deviation of the read noise.
+        shot: variance of the shot noise per grey level.
+        out: (rows, cols, 3) uint8 result.
+    """
     square = read * read
     for row in range(out.shape[0]):
         for column in range(out.shape[1]):

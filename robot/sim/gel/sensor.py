@@ -1,11 +1,11 @@
-"""The simulated gel sensor: a displacement map in, the picture that its camera takes out.
+"""The simulated gel sensor: it turns a displacement map into the picture of its camera.
 
     sensor = draw_sensor(seed=3, finger="a")
     before = sensor.background(seed=1)
     during = sensor.render(contact.displacement_mm, seed=2)
 
-A sensor is what was built: its gel, its lamps, its dust. Pictures of one sensor differ by the surface and, through
-their seed, by the camera's noise alone.
+A sensor is one physical device: its gel, its lamps, its dust. Pictures of one sensor differ only by the surface and by
+the camera noise of their seed.
 """
 
 import math
@@ -36,7 +36,7 @@ THICKNESS_MM = (2.0, 4.0)
 
 @dataclass(frozen=True)
 class Noise:
-    """The camera's noise in grey levels: variance = read^2 + shot * grey level."""
+    """Camera noise in grey levels: variance = read^2 + shot * grey level."""
 
     read: float = 0.8
     shot: float = 0.006
@@ -47,10 +47,23 @@ _PLAIN_LED, _PLAIN_NOISE, _UNKNOWN_GEL = LedOptics(), Noise(), GelSettings()
 
 @dataclass(frozen=True)
 class GelSensor:
-    """One gel with its lamps and camera; frozen, hashable, and the same whenever it is drawn again.
+    """One gel with its lamps and camera; frozen and hashable.
 
-    `tint` and `exposure` scale the channels, `blur_px` is the camera's point spread (standard deviation).
-    Raises RobotConfigError for settings out of range.
+    Attributes:
+        layer: the elastic gel.
+        optics: how the surface becomes colours.
+        rows: rows of the image.
+        cols: columns of the image.
+        pixel_mm: side of a pixel on the gel.
+        tint: factor of each channel.
+        exposure: factor of all channels.
+        blur_px: standard deviation of the camera's point spread.
+        noise: camera noise.
+        flaws: dust, hairs, grains and roughness, or None.
+        markers: printed dots, or None.
+
+    Raises:
+        RobotConfigError: A setting is out of range.
     """
 
     layer: Layer
@@ -75,48 +88,52 @@ class GelSensor:
 
     @property
     def gel(self) -> GelSettings:
-        """What the gel is made of."""
+        """Thickness and elasticity of the gel."""
         return GelSettings(self.layer.thickness_mm, self.layer.modulus_mpa, self.layer.poisson)
 
     @property
     def field(self) -> Field:
-        """The part of the gel that the camera sees."""
+        """The part of the gel in the camera's view."""
         return Field(self.rows, self.cols, self.pixel_mm)
 
     def background(self, seed: int) -> Picture:
-        """The untouched gel: (rows, cols, 3) uint8 RGB; the same as render() of no displacement."""
+        """Return the no-contact frame, (rows, cols, 3) uint8 RGB; equal to render() of zero displacement."""
         return self.capture(_no_contact_image(self), seed)
 
     def render(self, displacement_mm: NDArray[Any], seed: int) -> Picture:
-        """The picture of a pressed gel: (rows, cols, 3) uint8 RGB.
+        """Return the picture of a pressed gel, (rows, cols, 3) uint8 RGB.
 
-        `displacement_mm`: (r, c), inwards, on any grid that covers the field. `seed` makes the noise alone.
-        Raises SceneError for a map that is empty, has another number of axes, or is not finite.
+        Args:
+            displacement_mm: (r, c), inwards, on any grid that covers the field.
+            seed: seed of the camera noise.
+
+        Raises:
+            SceneError: The map is empty, has another number of axes, or is not finite.
         """
         return self.capture(self.render_clean(displacement_mm), seed)
 
     def render_clean(self, displacement_mm: NDArray[Any]) -> Array:
-        """Grey levels (rows, cols, 3) before noise and clipping, with which all pictures of one press begin."""
+        """Return grey levels (rows, cols, 3) before noise and clipping; pictures of one press share them."""
         surface = Surface(displacement_mm, self.field)
         return self._render_surface(surface) if surface.displacement_mm.any() else _no_contact_image(self)
 
     def _render_surface(self, surface: Surface) -> Array:
         slope_x, slope_y = surface.slopes
-        dark: Array | None = None
+        darkening: Array | None = None
         if self.flaws is not None:
             maps = flaw_maps(self.flaws, self.field)
-            slope_x, slope_y, dark = slope_x + maps.slope_x, slope_y + maps.slope_y, maps.darkening
+            slope_x, slope_y, darkening = slope_x + maps.slope_x, slope_y + maps.slope_y, maps.darkening
         image = self.optics.colours(surface, (slope_x, slope_y))
         if self.markers is not None:
-            printed = marker_darkening(self.markers, surface)
-            dark = printed if dark is None else dark * printed
-        if dark is not None:
-            image *= dark[..., None]
+            dots = marker_darkening(self.markers, surface)
+            darkening = dots if darkening is None else darkening * dots
+        if darkening is not None:
+            image *= darkening[..., None]
         image *= np.array(self.tint, np.float32) * np.float32(self.exposure)
         return cv2.GaussianBlur(image, (0, 0), self.blur_px) if self.blur_px > 0 else image
 
     def capture(self, clean: Array, seed: int) -> Picture:
-        """The picture that the camera takes of what `render_clean` gives: with noise, rounded and clipped to 0..255."""
+        """Return the camera's picture of `clean`: with noise, rounded and clipped to 0..255."""
         if self.noise.read == 0 and self.noise.shot == 0:
             return np.clip(np.rint(clean), 0, 255).astype(np.uint8)
         out = np.empty(clean.shape, np.uint8)
@@ -146,10 +163,10 @@ def _tile(sign: int, rows: int, cols: int) -> Array:
 
 
 def _noise_tile(rows: int, cols: int, seed: int) -> Array:
-    """Standard normal noise (rows, cols, 3): a window of one large tile, placed and turned by the seed.
+    """Return standard normal noise (rows, cols, 3): a window of one large tile, placed and flipped by the seed.
 
-    Drawing each value anew costs more than the optics; 64 x 64 places, mirrored and of either sign, do not repeat
-    in any picture a person or a tower compares.
+    Fresh random values would cost more than the optics. 64 x 64 places, mirrored and of either sign, do not repeat
+    visibly for a person or a tower.
     """
     rng = np.random.default_rng([seed, 0x7015E])
     down, right = (int(value) for value in rng.integers(0, _TILE_MARGIN, 2))
@@ -162,17 +179,25 @@ def _noise_tile(rows: int, cols: int, seed: int) -> Array:
 
 
 def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings = _UNKNOWN_GEL) -> GelSensor:
-    """A sensor as one comes from the factory, and after some use: its own gel, lamps, tint and dust.
+    """Draw a used sensor with its own gel, lamps, tint and dust.
 
-    The same seed, finger and optics give the same sensor. `optics`: led, grey, or the name of a fitted sensor. `gel`:
-    what is not to be drawn; all else is drawn as without it.
-    Raises UnknownName for other optics and RobotConfigError for an empty finger.
+    The same seed, finger and optics give the same sensor.
+
+    Args:
+        seed: seed of the sensor.
+        finger: name of its finger.
+        optics: led, grey, or the name of a fitted sensor.
+        gel: known properties of the gel; all others are drawn as without it.
+
+    Raises:
+        UnknownName: There are no optics of this name.
+        RobotConfigError: `finger` is empty.
 
     >>> robot.draw_sensor(seed=0, finger="a") == robot.draw_sensor(seed=0, finger="a")
     True
     """
     if optics not in OPTICS:
-        raise UnknownName(f"no optics is called {optics!r}; known are {', '.join(sorted(OPTICS))}")
+        raise UnknownName(f"there are no optics {optics!r}; known are {', '.join(sorted(OPTICS))}")
     if not finger:
         raise RobotConfigError("a finger must have a name, got an empty one; use a or b")
     rng = np.random.default_rng([seed, *finger.encode(), 0x6E1])
@@ -208,10 +233,12 @@ def _draw_flaws(rng: np.random.Generator) -> Flaws:
 
 
 def _draw_led(rng: np.random.Generator) -> LedOptics:
-    """Lamps a little askew (5 degrees, a millimetre) and of unequal power (4 %)."""
+    """Draw LEDs slightly misaligned (5 degrees, a millimetre) and of unequal power (4 %)."""
     power = np.exp(0.04 * rng.standard_normal(3))
     bars = tuple(_draw_bar(bar, rng) for bar in MINI_BARS)
-    backdrops = tuple(_draw_backdrop(glow, float(gain), rng) for glow, gain in zip(MINI_BACKDROPS, power, strict=True))
+    backdrops = tuple(
+        _draw_backdrop(backdrop, float(gain), rng) for backdrop, gain in zip(MINI_BACKDROPS, power, strict=True)
+    )
     return LedOptics(
         bars,  # type: ignore[arg-type]
         backdrops,  # type: ignore[arg-type]
@@ -221,11 +248,11 @@ def _draw_led(rng: np.random.Generator) -> LedOptics:
 
 
 def _draw_grey(rng: np.random.Generator) -> LedOptics:
-    """Another maker's sensor: white lamps in other places, seen by a grey camera; hence three equal channels."""
+    """Draw the sensor of another maker: white lamps in other places and a grey camera, so three equal channels."""
     bars = tuple(_draw_bar(replace(bar, angle_rad=bar.angle_rad + math.radians(40)), rng) for bar in MINI_BARS)
-    glow = _draw_backdrop(MINI_BACKDROPS[1], float(np.exp(0.04 * rng.standard_normal())), rng)
-    share = 0.55, 0.3, 0.15
-    return LedOptics(bars, (glow,) * 3, (share,) * 3, ambient=0.45, shadow=0.2)  # type: ignore[arg-type]
+    backdrop = _draw_backdrop(MINI_BACKDROPS[1], float(np.exp(0.04 * rng.standard_normal())), rng)
+    row = 0.55, 0.3, 0.15
+    return LedOptics(bars, (backdrop,) * 3, (row,) * 3, ambient=0.45, shadow=0.2)  # type: ignore[arg-type]
 
 
 def _draw_bar(bar: LedBar, rng: np.random.Generator) -> LedBar:
@@ -239,19 +266,19 @@ def _draw_bar(bar: LedBar, rng: np.random.Generator) -> LedBar:
     )
 
 
-def _draw_backdrop(glow: GaussianBackdrop, gain: float, rng: np.random.Generator) -> GaussianBackdrop:
-    """The same glow by a lamp of `gain` times the power, moved, wider or narrower, and slanted a little."""
+def _draw_backdrop(backdrop: GaussianBackdrop, gain: float, rng: np.random.Generator) -> GaussianBackdrop:
+    """Return the backdrop of a lamp of `gain` times the power, moved, wider or narrower, and slightly slanted."""
     x, y, slant_x, slant_y = rng.standard_normal(4) * (0.05, 0.05, 2.5, 2.5)
     wide = np.exp(0.06 * rng.standard_normal(2))
     return GaussianBackdrop(
-        glow.floor * gain,
-        glow.span * gain,
-        float(glow.x0 + x),
-        float(glow.y0 + y),
-        float(glow.width_x * wide[0]),
-        float(glow.width_y * wide[1]),
-        float(glow.slant_x + slant_x),
-        float(glow.slant_y + slant_y),
+        backdrop.floor * gain,
+        backdrop.span * gain,
+        float(backdrop.x0 + x),
+        float(backdrop.y0 + y),
+        float(backdrop.width_x * wide[0]),
+        float(backdrop.width_y * wide[1]),
+        float(backdrop.slant_x + slant_x),
+        float(backdrop.slant_y + slant_y),
     )
 
 

@@ -1,1 +1,1 @@
-"""Objects of the simulated rig: shape, relief, material and looks."""
+"""Objects of the simulated rig: shape, relief, material and appearance."""

@@ -1,4 +1,4 @@
-"""Colour and paint, drawn from numbers of their own: nothing that touch can feel tells of them, nor they of it."""
+"""Colour and paint, drawn from a separate random stream: they are independent of all tactile properties."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,15 @@ _WAVES = 8
 
 @dataclass(frozen=True)
 class Paint:
-    """A second colour where a random field in space is high: `stretch` makes blotches into stripes."""
+    """A second colour where a random field in space is high.
+
+    Attributes:
+        colour: linear RGB, 0 to 1.
+        waves_per_mm: wave vectors of the field.
+        phases: phase of each wave.
+        threshold: field value at the edge of the paint.
+        edge: width of the edge in units of the field.
+    """
 
     colour: tuple[float, float, float]
     waves_per_mm: tuple[tuple[float, float, float], ...]
@@ -20,7 +28,7 @@ class Paint:
     edge: float
 
     def cover(self, points: NDArray[np.floating]) -> Colours:
-        """Opacity (N,) from 0 to 1 at points (N, 3) in mm."""
+        """Return the opacity (N,) from 0 to 1 at points (N, 3) in mm."""
         field = np.zeros(len(points), np.float32)
         for wave, phase in zip(self.waves_per_mm, self.phases, strict=True):
             field += np.sin(points @ np.array(wave, np.float32) + np.float32(phase))
@@ -30,7 +38,7 @@ class Paint:
 
 @dataclass(frozen=True)
 class Label:
-    """A printed rectangle at a height and an angle, with lines of another colour in it."""
+    """A printed rectangle at a height and an angle, with lines in another colour."""
 
     colour: tuple[float, float, float]
     ink: tuple[float, float, float]
@@ -51,7 +59,7 @@ class Appearance:
     label: Label | None = None
 
     def albedo(self, points: NDArray[np.floating]) -> Colours:
-        """Reflectance (N, 3) in 0..1 at points (N, 3) of the object's frame, mm."""
+        """Return the reflectance (N, 3) in 0..1 at points (N, 3) of the object's frame, mm."""
         place = np.asarray(points, np.float32)
         colour = np.broadcast_to(np.array(self.colour, np.float32), (len(place), 3))
         if self.paint is not None:
@@ -64,7 +72,7 @@ class Appearance:
 
 
 def _speckle(place: Colours) -> Colours:
-    """Specks of some 4 mm, -1 to 1: finer ones would flicker between a camera's pixels."""
+    """Return a pattern of specks of about 4 mm, -1 to 1; finer ones would flicker between a camera's pixels."""
     one = np.sin(place @ np.array([1.1, 0.5, 0.9], np.float32)) * np.sin(place @ np.array([-0.4, 1.0, 0.6], np.float32))
     return np.asarray(one * np.sin(place @ np.array([0.7, -0.8, 1.2], np.float32)))
 
@@ -79,14 +87,14 @@ def _labelled(colour: Colours, label: Label, place: Colours) -> Colours:
     z = place[:, 2]
     inside = (angle < label.half_angle_rad) & (z > label.bottom_mm) & (z < label.top_mm)
     row = (z - np.float32(label.bottom_mm)) / np.float32(label.line_mm)
-    short = 0.35 + 0.5 * np.abs(np.sin(np.floor(row) * 12.9898))
-    inked = inside & (row - np.floor(row) < 0.45) & (angle < short * label.half_angle_rad)
+    line_length = 0.35 + 0.5 * np.abs(np.sin(np.floor(row) * 12.9898))
+    inked = inside & (row - np.floor(row) < 0.45) & (angle < line_length * label.half_angle_rad)
     colour = _over(colour, label.colour, inside.astype(np.float32))
     return _over(colour, label.ink, inked.astype(np.float32))
 
 
 def draw_appearance(rng: np.random.Generator) -> Appearance:
-    """Hue and lightness uniform; half of the objects painted, a quarter labelled."""
+    """Draw uniform hue and lightness; half of the objects are painted, a quarter are labelled."""
     colour = _draw_colour(rng)
     paint = _draw_paint(rng) if rng.random() < 0.5 else None
     label = _draw_label(rng) if rng.random() < 0.25 else None
@@ -94,7 +102,7 @@ def draw_appearance(rng: np.random.Generator) -> Appearance:
 
 
 def _draw_colour(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Uniform in hue, saturation and lightness; by the HSL formula with f(n) = l - a max(-1, min(k-3, 9-k, 1))."""
+    """Draw uniform hue, saturation and lightness; convert by HSL with f(n) = l - a max(-1, min(k-3, 9-k, 1))."""
     hue, saturation, lightness = rng.uniform(0, 12), rng.uniform(0, 0.9), rng.uniform(0.15, 0.85)
     k = (np.array([0, 8, 4]) + hue) % 12
     mix = np.clip(np.minimum(k - 3, 9 - k), -1, 1)
@@ -103,7 +111,7 @@ def _draw_colour(rng: np.random.Generator) -> tuple[float, float, float]:
 
 
 def _draw_paint(rng: np.random.Generator) -> Paint:
-    """Blotches of 8 to 60 mm, or stripes where all waves run one way."""
+    """Draw blotches of 8 to 60 mm, or stripes, where all waves have one direction."""
     scale = np.exp(rng.uniform(np.log(8), np.log(60)))
     axis = rng.standard_normal(3)
     axis /= np.linalg.norm(axis)

@@ -1,6 +1,6 @@
-"""What rays meet: the contract of a body, and bodies given by a signed distance and a baked relief.
+"""Geometry of objects: the base class Body, and bodies from a signed distance and a baked relief.
 
-Frame: the object's, in mm, z up, base at z = 0. Camera and gel see the same geometry through `Body.cast`.
+Frame: the object's, in mm, z up, base at z = 0. Camera and gel use the same geometry through `Body.cast`.
 """
 
 import math
@@ -26,8 +26,14 @@ GEL_STEP_MM = 0.1
 
 @dataclass(frozen=True)
 class ClippedRays:
-    """Rays (N, 3) and where they enter and leave the bounding box; one that passes it by enters after it leaves.
-    `step_mm` is the finest detail that matters.
+    """Rays clipped to the bounding box; a ray that misses the box has near_mm > far_mm.
+
+    Attributes:
+        origins: (N, 3) start points.
+        directions: (N, 3) unit vectors.
+        near_mm: (N,) distance at which the ray enters the box.
+        far_mm: (N,) distance at which it leaves the box.
+        step_mm: finest detail of interest.
     """
 
     origins: Vectors
@@ -38,27 +44,31 @@ class ClippedRays:
 
     @property
     def arrays(self) -> Rays:
-        """All but the detail."""
+        """The four arrays, for compiled code."""
         return self.origins, self.directions, self.near_mm, self.far_mm
 
 
 class Body(ABC):
-    """A solid that can be seen and touched. Subclasses set the bounds and write `_cast` and `_normals`."""
+    """Base class of solids. Subclasses set the bounds and write `_cast` and `_normals`."""
 
     lower: Vectors
     upper: Vectors
 
     def cast(self, origins: Points, directions: Points, step_mm: float = GEL_STEP_MM) -> Vectors:
-        """Distance in mm along each ray to the first hit, (N,) float64, inf for a miss.
+        """Return the distance in mm along each ray to the first hit, (N,) float64, inf for a miss.
 
-        `origins`, `directions`: (N, 3), directions of unit length; a ray that starts inside hits at 0.
-        `step_mm`: the finest detail that matters; a camera gives the size of its pixel on the object, and is served
-        faster. Raises SceneError.
+        Args:
+            origins: (N, 3) start points; a ray that starts inside hits at 0.
+            directions: (N, 3) unit vectors.
+            step_mm: finest detail of interest. A camera passes the size of its pixel on the object, which is faster.
+
+        Raises:
+            SceneError: The arrays have the wrong shape, an origin is not finite, or a direction is not of unit length.
         """
         return self._cast(self._clip_rays(origins, directions, step_mm))
 
     def hit(self, origins: Points, directions: Points, step_mm: float = GEL_STEP_MM) -> NDArray[np.bool_]:
-        """Which rays hit, (N,), as by `cast`; where they do is left out. Raises SceneError."""
+        """Return which rays hit, (N,), without the distance. Raise SceneError as `cast` does."""
         return self._hit(self._clip_rays(origins, directions, step_mm))
 
     def _clip_rays(self, origins: Points, directions: Points, step_mm: float) -> ClippedRays:
@@ -69,7 +79,7 @@ class Body(ABC):
         return ClippedRays(start, along, near, far, step_mm)
 
     def normals(self, points: Points, step_mm: float = GEL_STEP_MM) -> Vectors:
-        """Outward unit normals (N, 3) at points (N, 3) on the surface, relief included, smoothed over `step_mm`."""
+        """Return the outward unit normals (N, 3) at surface points (N, 3), with relief, smoothed over `step_mm`."""
         array = _contiguous(points)
         if array.ndim != 2 or array.shape[1] != 3:
             raise SceneError(f"points must be an array of shape (N, 3), got {array.shape}")
@@ -79,23 +89,23 @@ class Body(ABC):
 
     @abstractmethod
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
-        """Volume of the solid, and of its outermost `shell_mm` alone."""
+        """Return the volume of the solid, and of its outermost `shell_mm` alone."""
 
     @abstractmethod
     def _cast(self, rays: ClippedRays) -> Vectors:
-        """Distances from the rays' origins, (N,); inf for a miss."""
+        """Return distances from the rays' origins, (N,); inf for a miss."""
 
     def _hit(self, rays: ClippedRays) -> NDArray[np.bool_]:
-        """Whether there is a hit, (N,); a subclass may know without the distance."""
+        """Return whether there is a hit, (N,); a subclass may find this without the distance."""
         return np.isfinite(self._cast(rays))
 
     @abstractmethod
     def _normals(self, points: Vectors, step_mm: float) -> Vectors:
-        """Outward normals of any length."""
+        """Return outward normals of any length."""
 
 
 def _contiguous(array: Points) -> Vectors:
-    """In one layout, so that packets are compiled for one."""
+    """Return a C-contiguous float64 array, so that packets are compiled for one layout."""
     return np.require(array, np.float64, ["C", "W"])
 
 
@@ -110,7 +120,7 @@ class SdfBody(Body):
 
     @cached_property
     def wall(self) -> ReliefLevels | None:
-        """The baked relief; None for a bare shape. Drawn when first used, not pickled."""
+        """The baked relief; None for a smooth shape. Computed on first use, not pickled."""
         return bake(self.shape, self.relief)
 
     @cached_property
@@ -118,7 +128,7 @@ class SdfBody(Body):
         return trace_formula(self.chart_coordinates, 3)
 
     def chart_coordinates(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats]:
-        """Where on the wall a point is, and how much relief there belongs on it."""
+        """Return the chart coordinates of a point, and the weight of relief there."""
         mask = self.shape.mask(x, y, z)
         return *self.shape.chart.locate(x, y, z), np.full_like(x, 1.0) if mask is None else mask
 
@@ -126,7 +136,7 @@ class SdfBody(Body):
         return {key: value for key, value in self.__dict__.items() if key not in ("wall", "_chart_formula")}
 
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
-        """Counted on a grid of 28^3 cells, relief left out: within some 3 % of the true volume."""
+        """Count cells on a 28^3 grid, without relief: within about 3 % of the true volume."""
         axes = [low + (high - low) * (np.arange(28) + 0.5) / 28 for low, high in zip(*self._shape_bounds, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         distance = self.shape.distance(grid)
@@ -138,9 +148,9 @@ class SdfBody(Body):
         return self.shape.lower, self.shape.upper
 
     def field(self, x: Floats, y: Floats, z: Floats, step_mm: float = GEL_STEP_MM) -> Floats:
-        """F in mm at points in float32: below 0 inside, above 0 outside; near the surface close to the distance.
+        """Return f in mm at float32 points: below 0 inside, above 0 outside; near the surface close to the distance.
 
-        In plain numpy, what rays meet by compiled formulas of the same functions.
+        This is plain numpy; rays use compiled formulas of the same functions.
         """
         base = self.shape.distance_xyz(x, y, z)
         if self.wall is None:
@@ -149,7 +159,7 @@ class SdfBody(Body):
         return base - self.wall.level(step_mm).at(s, t) * weight
 
     def displaced_solid(self, step_mm: float) -> DisplacedSolid:
-        """The body as rays see it that ask for detail of `step_mm`."""
+        """Return the body as compiled formulas and arrays, at the relief level for detail of `step_mm`."""
         level = self.wall.level(step_mm) if self.wall else _NO_RELIEF
         return DisplacedSolid(
             self.shape.formula,

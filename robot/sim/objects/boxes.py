@@ -1,4 +1,4 @@
-"""Where rays enter and leave a bounding box."""
+"""Intersection of rays with a bounding box."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,20 +10,21 @@ Vectors = NDArray[np.float64]
 
 
 def clip_to_box(origins: Vectors, directions: Vectors, lower: Vectors, upper: Vectors) -> tuple[Vectors, Vectors]:
-    """Where rays (n, 3) enter and leave a box, (n,) each, at least 0; a miss enters after it leaves.
+    """Return where rays (n, 3) enter and leave a box, (n,) each, at least 0; a miss enters after it leaves.
 
-    Raises SceneError for an origin that is not finite, or a direction that is not of unit length.
+    Raises:
+        SceneError: An origin is not finite, or a direction is not of unit length.
     """
     near, far = np.empty(len(origins)), np.empty(len(origins))
-    wrong = _clip(origins, directions, lower, upper, near, far)
-    if wrong:
-        raise SceneError(wrong)
+    reason = _clip(origins, directions, lower, upper, near, far)
+    if reason:
+        raise SceneError(reason)
     return near, far
 
 
 @jit
 def _clip(origins, directions, lower, upper, near, far):  # type: ignore[no-untyped-def]
-    """Fill near and far; what is wrong with a ray, if anything is."""
+    """Fill near and far; return the reason if a ray is invalid, else an empty string."""
     for number in range(len(near)):
         enters, leaves, square = 0.0, np.inf, 0.0
         for axis in range(3):

@@ -1,8 +1,8 @@
-"""Objects of the simulated rig: `draw_object(seed, index)` gives the same one wherever it is called.
+"""Objects of the simulated rig: `draw_object(seed, index)` always returns the same object.
 
-Four separate streams of numbers draw the shape, the relief, the material and the looks, so that neither colour nor
-paint says anything about what touch can feel. Families and reliefs come like cards: within one deck (as many
-objects as there are families) each comes once, in an order of its own.
+Four separate random streams draw the shape, the relief, the material and the appearance, so that neither colour nor
+paint carries information about tactile properties. Families and reliefs are permuted: in each round of as many objects
+as there are families, each family occurs once, in a random order.
 """
 
 from collections.abc import Mapping
@@ -19,16 +19,16 @@ from robot.sim.objects.materials import ObjectMaterial, draw_material
 from robot.sim.objects.relief import RELIEFS, Relief, draw_relief
 from robot.sim.objects.shapes import SHAPES
 
-STROKE_MM = 110.0  # of the simulated gripper, into which every object fits
+STROKE_MM = 110.0  # stroke of the simulated gripper; every object fits into it
 SHELL_MM = 3.0
 MAX_SOLID_KG = 0.6
-# Streams of random numbers; a new purpose takes a new number, and no other object changes.
+# Random streams. A new purpose takes a new number, so that existing objects do not change.
 _SHAPE, _RELIEF, _MATERIAL, _APPEARANCE, _FAMILY_ORDER, _RELIEF_ORDER = range(6)
 
 
 @dataclass(frozen=True)
 class SimObject:
-    """A thing on the table. `relief.amplitude_mm` is 0 for a smooth one."""
+    """An object on the table. `relief.amplitude_mm` is 0 for a smooth one."""
 
     object_id: str
     family: str
@@ -39,12 +39,12 @@ class SimObject:
 
     @cached_property
     def mass_kg(self) -> float:
-        """Solid while that weighs at most 0.6 kg; beyond, hollow with a wall of 3 mm, as bottles and castings are."""
+        """Mass as a solid up to 0.6 kg; above, as hollow with a wall of 3 mm, like bottles and castings."""
         solid, shell = (volume * 1e-9 * self.material.density_kg_m3 for volume in self.body.volumes_mm3(SHELL_MM))
         return solid if solid <= MAX_SOLID_KG else min(solid, shell)
 
     def labels(self) -> dict[str, float | bool | str]:
-        """What is known of shape and relief, in plain values: what touch can feel and a photo can show."""
+        """Return shape and relief as plain values, the properties that both touch and photo can show."""
         relief = self.relief
         return {
             "shape": self.family,
@@ -62,9 +62,19 @@ class SimObject:
 
 
 def draw_object(seed: int, index: int, *, family: str | None = None, relief: str | None = None) -> SimObject:
-    """Object `index` of the world `seed`; `family` and `relief` can be fixed.
+    """Draw object `index` of the object set `seed`.
 
-    A pure function of its arguments, cheap until the body is used. Raises UnknownName, RobotConfigError.
+    A pure function of its arguments; expensive work starts when the body is used.
+
+    Args:
+        seed: number of the object set.
+        index: number of the object in it.
+        family: shape family; drawn if None.
+        relief: relief family; drawn if None.
+
+    Raises:
+        UnknownName: There is no such family or relief.
+        RobotConfigError: `seed` or `index` is not a whole number from 0.
 
     >>> robot.draw_object(seed=0, index=0).object_id.endswith("-0000-00000")
     True
@@ -87,7 +97,7 @@ def draw_object(seed: int, index: int, *, family: str | None = None, relief: str
 
 
 def _choose_name(table: Mapping[str, Any], name: str | None, what: str, seed: int, index: int, stream: int) -> str:
-    """The name asked for, or the next card of the deck."""
+    """Return the given name, or the next one of the random permutation."""
     if name is None:
         round_number, place = divmod(index, len(table))
         return list(table)[int(np.random.default_rng([seed, round_number, stream]).permutation(len(table))[place])]

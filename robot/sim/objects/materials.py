@@ -1,6 +1,6 @@
-"""What objects are made of: stiffness and grip for touch, gloss and roughness for the photo.
+"""Materials of objects: stiffness and friction for touch, gloss and roughness for the photo.
 
-Numbers are typical room-temperature values of the class; each object draws its own around them.
+Values are typical of the class at room temperature; each object draws its own around them.
 """
 
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ from robot.settings import TypedSettings, bounded
 
 @dataclass(frozen=True)
 class ObjectMaterial(TypedSettings):
-    """Isotropic linear elasticity, density, friction against gel, and two numbers for shading (0 to 1)."""
+    """Isotropic linear elasticity, density, friction against gel, and gloss and roughness for shading (0 to 1)."""
 
     name: str
     modulus_mpa: float = bounded(1e-3, 1e6)
@@ -46,7 +46,7 @@ MATERIALS: Mapping[str, ObjectMaterial] = MappingProxyType({material.name: mater
 
 
 def draw_material(rng: np.random.Generator, name: str | None = None) -> ObjectMaterial:
-    """One of the table (or the one named), its numbers jittered. Raises UnknownName."""
+    """Draw a material of the table (or the named one) with jittered values. Raise UnknownName."""
     chosen = str(rng.choice(list(MATERIALS))) if name is None else name
     if chosen not in MATERIALS:
         raise UnknownName(f"material must be one of {', '.join(MATERIALS)}; got {chosen!r}")

@@ -1,8 +1,8 @@
 """Scanned or drawn meshes (STL, OBJ, PLY) as objects of the simulated rig; needs the extra `touch-retrieval[mesh]`.
 
-Scans are too coarse for a gel (a triangle of a scanned can is some mm wide), so that a mesh wears procedural relief
-like any other object: the hit is moved along the ray by the height of the relief over the cosine of the angle. Only
-geometry is read: no materials, textures, or files that a mesh names.
+Scans are too coarse for a gel (a triangle of a scanned can is a few mm wide), so a mesh gets procedural relief like any
+other object: the hit is moved along the ray by the height of the relief over the cosine of the angle. Only geometry is
+read: no materials, textures, or files that a mesh names.
 """
 
 import io
@@ -37,7 +37,12 @@ Faces = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Mesh:
-    """A closed surface in mm, its faces counter-clockwise from outside: vertices (V, 3), faces (F, 3)."""
+    """A closed surface in mm.
+
+    Attributes:
+        vertices: (V, 3) points.
+        faces: (F, 3) vertex numbers, counter-clockwise from outside.
+    """
 
     vertices: Vectors
     faces: Faces
@@ -59,10 +64,10 @@ class Mesh:
 
     @cached_property
     def corner_normals(self) -> Vectors:
-        """A normal for each corner of each face, (F, 3, 3): the vertex's mean, or the face's own beside a crease.
+        """A normal for each corner of each face, (F, 3, 3): the vertex's mean, or the face's own at a crease.
 
-        Faces count by their angle at the vertex (Thuermer and Wuethrich 1998), so that how a flat side was cut
-        into triangles does not matter.
+        Faces are weighted by their angle at the vertex (Thuermer and Wuethrich 1998), so the triangulation of a flat
+        side has no effect.
         """
         total = np.zeros_like(self.vertices)
         for corner in range(3):
@@ -72,8 +77,8 @@ class Mesh:
             np.add.at(total, self.faces[:, corner], angle[:, None] * self.face_normals)
         total /= np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)
         shared, own = total[self.faces], self.face_normals[:, None, :]
-        calm = np.sum(shared * own, axis=2, keepdims=True) > _CREASE_COSINE
-        return np.where(calm, shared, own)
+        is_smooth = np.sum(shared * own, axis=2, keepdims=True) > _CREASE_COSINE
+        return np.where(is_smooth, shared, own)
 
     @cached_property
     def areas(self) -> Vectors:
@@ -82,42 +87,42 @@ class Mesh:
 
     @cached_property
     def volume_mm3(self) -> float:
-        """Signed volume, by the divergence theorem: positive if the faces look outwards."""
+        """Signed volume, by the divergence theorem: positive if the faces point outwards."""
         return float(np.einsum("ij,ij->", *self._tetrahedra) / 6)
 
     @property
     def centre_of_mass(self) -> Vectors:
-        """(3,) of the homogeneous solid."""
+        """Centre of mass (3,) of the homogeneous solid."""
         weight = np.einsum("ij,ij->i", *self._tetrahedra) / (6 * self.volume_mm3)
         middle = self.vertices.mean(axis=0)
         return np.asarray(middle + weight @ (self.corners - middle).sum(axis=1) / 4)
 
     @property
     def _tetrahedra(self) -> tuple[Vectors, Vectors]:
-        """Of each face with the vertices' middle, an edge and the cross product of the two others, (F, 3) each."""
+        """For each face and the vertices' middle: an edge and the cross product of the two others, (F, 3) each."""
         a, b, c = (self.corners - self.vertices.mean(axis=0)).transpose(1, 0, 2)
         return a, np.cross(b, c)
 
     def rest_on_table(self, up: Vectors) -> "Mesh":
-        """Turned until the unit direction `up` points up, its foot on z = 0, centred."""
+        """Return the mesh turned until the unit direction `up` is vertical, centred, with its lowest point at z = 0."""
         vertices = self.vertices if up is UP else self.vertices @ rotation_to_up(up).T
         low, high = vertices.min(axis=0), vertices.max(axis=0)
         return Mesh(vertices - [*(low + high)[:2] / 2, low[2]], self.faces)
 
     def normals_at(self, face: Faces, points: Vectors) -> Vectors:
-        """Normals mixed from the corners', at points (N, 3) on the faces."""
+        """Interpolate the corner normals at points (N, 3) on the faces."""
         a, b, c = self.corners[face].transpose(1, 0, 2)
-        whole = self._crosses[face]
-        square = np.maximum(np.einsum("ij,ij->i", whole, whole), 1e-300)
-        v = np.einsum("ij,ij->i", np.cross(points - a, c - a), whole) / square
-        w = np.einsum("ij,ij->i", np.cross(b - a, points - a), whole) / square
-        share = np.clip(np.stack([1 - v - w, v, w], axis=1), 0, 1)
-        mixed = np.einsum("ij,ijk->ik", share, self.corner_normals[face])
+        cross = self._crosses[face]
+        square = np.maximum(np.einsum("ij,ij->i", cross, cross), 1e-300)
+        v = np.einsum("ij,ij->i", np.cross(points - a, c - a), cross) / square
+        w = np.einsum("ij,ij->i", np.cross(b - a, points - a), cross) / square
+        weights = np.clip(np.stack([1 - v - w, v, w], axis=1), 0, 1)
+        mixed = np.einsum("ij,ijk->ik", weights, self.corner_normals[face])
         return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-300))
 
 
 class MeshBody(Body):
-    """A mesh under relief. A ray that starts inside hits at 0; relief does not widen the outline."""
+    """A mesh with relief. A ray that starts inside hits at 0; relief does not widen the outline."""
 
     def __init__(self, mesh: Mesh, relief: Relief) -> None:
         self.mesh, self.relief = mesh, relief
@@ -132,7 +137,7 @@ class MeshBody(Body):
 
     @cached_property
     def wall(self) -> ReliefLevels | None:
-        """The relief on a cylinder round the mesh."""
+        """The relief on a cylinder around the mesh."""
         return bake_plain(self.chart, self.relief)
 
     @cached_property
@@ -148,18 +153,18 @@ class MeshBody(Body):
         rng = np.random.default_rng(5)
         ends = np.cumsum(self.mesh.areas)
         face = np.minimum(np.searchsorted(ends, rng.uniform(0, ends[-1], count)), len(ends) - 1)
-        share = rng.dirichlet(np.ones(3), count)
-        places = np.einsum("ij,ijk->ik", share, self.mesh.corners[face])
+        weights = rng.dirichlet(np.ones(3), count)
+        places = np.einsum("ij,ijk->ik", weights, self.mesh.corners[face])
         return cKDTree(places), places, self.mesh.face_normals[face]
 
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
-        """Exact volume; the shell's is area times thickness, at most the whole."""
+        """Return the exact volume; the shell's volume is area times thickness, at most the whole."""
         return self.mesh.volume_mm3, min(self.mesh.volume_mm3, float(self.mesh.areas.sum()) * shell_mm)
 
     def _cast(self, rays: ClippedRays) -> Vectors:
         ahead = np.flatnonzero(rays.near_mm <= rays.far_mm)
         origins, directions, near = rays.origins[ahead], rays.directions[ahead], rays.near_mm[ahead]
-        # A face that lies in the bounding box would be missed by rays that start on it.
+        # Rays that start on a face of the bounding box would miss it, so start earlier.
         start = near - np.minimum(near, _RAY_OFFSET_MM)
         face, distance = self.first_faces(origins + start[:, None] * directions, directions)
         hit = np.flatnonzero(face >= 0)
@@ -175,7 +180,7 @@ class MeshBody(Body):
         return distances
 
     def first_faces(self, origins: Vectors, directions: Vectors) -> tuple[Faces, Vectors]:
-        """First face of the bare mesh along each ray (-1: none), and for those with one the distance to its plane."""
+        """Return the first mesh face along each ray (-1: none), and for each hit the distance to its plane."""
         face = np.asarray(self._caster.intersects_first(origins, directions), np.int64)
         hit = face >= 0
         normal, corner = self.mesh.face_normals[face[hit]], self.mesh.corners[face[hit], 0]
@@ -184,20 +189,20 @@ class MeshBody(Body):
         return face, offset / np.where(np.abs(speed) < 1e-12, 1e-12, speed)
 
     def _lift(self, face: Faces, origins: Vectors, directions: Vectors, distance: Vectors, step_mm: float) -> Vectors:
-        """How much earlier (or, engraved, later) rays meet the relief than the mesh."""
+        """Return how much earlier (or, if engraved, later) rays meet the relief than the mesh."""
         if self.wall is None:
             return np.zeros(len(face))
         normals = self.mesh.normals_at(face, origins + distance[:, None] * directions)
         cosine = np.maximum(-np.einsum("ij,ij->i", directions, normals), 0.35)
         lift = np.zeros(len(face))
-        # Twice, as where the ray meets the relief is not above where it meets the mesh.
+        # Twice, because the ray meets the relief at another place than the mesh.
         for _ in range(2):
             points = origins + (distance - lift)[:, None] * directions
             lift = self._height(points, normals, step_mm) / cosine
         return lift
 
     def _height(self, points: Vectors, normals: Vectors, step_mm: float) -> Vectors:
-        """Relief in mm, faded where the surface turns away from the cylinder and at foot and top."""
+        """Return relief in mm, faded at foot and top and where the surface turns away from the cylinder."""
         assert self.wall is not None
         x, y, z = np.ascontiguousarray(points.T, np.float32)
         height: Floats = self.wall.level(step_mm).at(*self.chart.locate(x, y, z))
@@ -208,7 +213,7 @@ class MeshBody(Body):
         return np.asarray(height * weight * ends_weight(z, self.chart.height_mm, fade), np.float64)
 
     def _normals(self, points: Vectors, step_mm: float) -> Vectors:
-        """The mesh's normal n, tilted by the relief: n - (grad h - n (n . grad h))."""
+        """Return the mesh's normal n, tilted by the relief: n - (grad h - n (n . grad h))."""
         normals = self._mesh_normals(points)
         if self.wall is None:
             return normals
@@ -220,20 +225,20 @@ class MeshBody(Body):
         return np.asarray(normals - gradient + normals * np.einsum("ij,ij->i", gradient, normals)[:, None])
 
     def _mesh_normals(self, points: Vectors) -> Vectors:
-        """Smoothed normals of the faces under the points, found from just outside."""
-        guess = self._nearest_sample_normals(points)
+        """Return smoothed normals of the faces under the points, found with rays from just outside."""
+        normals = self._nearest_sample_normals(points)
         reach = self.relief.amplitude_mm + 2 * _RAY_OFFSET_MM
-        face, distance = self.first_faces(points + reach * guess, -guess)
+        face, distance = self.first_faces(points + reach * normals, -normals)
         found = np.flatnonzero(face >= 0)
         depth = reach - distance
         near = np.abs(depth) < reach
         face, found, depth = face[found][near], found[near], depth[near]
-        place = points[found] + depth[:, None] * guess[found]
-        guess[found] = self.mesh.normals_at(face, place)
-        return guess
+        place = points[found] + depth[:, None] * normals[found]
+        normals[found] = self.mesh.normals_at(face, place)
+        return normals
 
     def _nearest_sample_normals(self, points: Vectors) -> Vectors:
-        """Normal of the nearest sample that does not have the point behind it, as the far side of a thin wall has."""
+        """Return the normal of the nearest sample, avoiding samples that have the point behind them (a thin wall)."""
         tree, places, normals = self._samples
         apart, nearest = tree.query(points, k=6)
         behind = -np.einsum("nkj,nkj->nk", points[:, None, :] - places[nearest], normals[nearest])
@@ -246,10 +251,12 @@ class MeshBody(Body):
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read a closed solid and stand it on the table.
+    """Read a closed solid and place it on the table.
 
-    The file's z axis points up, and its unit is the metre if its largest extent is below 2, else the mm. Raises
-    SceneError for a file that is no closed solid, and SceneError naming the extra where its packages are missing.
+    The file's z axis is up. Its unit is the metre if its largest extent is below 2, else the mm.
+
+    Raises:
+        SceneError: The file is not a closed solid, or the packages of the extra are missing.
     """
     file = Path(path)
     return _place_on_table(_read(file), file)
@@ -258,9 +265,18 @@ def read_mesh(path: str | Path) -> Mesh:
 def mesh_object(
     file: Path, mesh: Mesh, seed: int, *, up: Vectors = UP, relief: str | None = None, material: str | None = None
 ) -> SimObject:
-    """Give a mesh relief, material and looks drawn from `seed` and the file's name, and rest it with `up` (3,) up.
+    """Draw relief, material and appearance for a mesh from `seed` and the file's name.
 
-    Raises UnknownName.
+    Args:
+        file: the mesh file.
+        mesh: its surface.
+        seed: seed of the draws.
+        up: (3,) unit direction of the mesh that points up.
+        relief: relief family; drawn if None.
+        material: material; drawn if None.
+
+    Raises:
+        UnknownName: There is no such relief or material.
     """
     stream = [seed, zlib.crc32(file.stem.encode())]
     relief_name = str(np.random.default_rng([*stream, 0]).choice(list(RELIEFS))) if relief is None else relief
@@ -277,63 +293,63 @@ def mesh_object(
 
 
 def object_prefix(file: Path) -> str:
-    """What the object_id of this file's object begins with."""
+    """Return the beginning of the object_id of this file's object."""
     return f"mesh.{re.sub(r'[^A-Za-z0-9._]+', '_', file.stem)}-"
 
 
 def _import_packages() -> tuple[Any, Any]:
-    """Trimesh and its ray caster on embree. Raises SceneError where one is missing."""
+    """Return trimesh and its ray caster on embree. Raise SceneError if one is missing."""
     try:
         import trimesh
         from trimesh.ray.ray_pyembree import RayMeshIntersector
     except ImportError as error:
         raise SceneError(
-            f"meshes need trimesh and embreex, and {error.name or error} is missing; "
-            "run pip install 'touch-retrieval[mesh]'"
+            f"meshes need trimesh and embreex; {error.name or error} is missing. "
+            "Run pip install 'touch-retrieval[mesh]'"
         ) from error
     return trimesh, RayMeshIntersector
 
 
 def _read(file: Path) -> Mesh:
-    """Vertices and faces of the file, equal vertices merged, faces without area dropped. Raises SceneError."""
+    """Read vertices and faces; merge equal vertices and drop faces without area. Raise SceneError."""
     kind = file.suffix.lower().lstrip(".")
     if kind not in FORMATS:
         raise SceneError(f"a mesh must be a file of {', '.join(FORMATS)}, got {file.name!r}")
     trimesh, _ = _import_packages()
     try:
         data = file.read_bytes()
-        # From memory and without a resolver: the reader cannot open what the file names.
+        # From memory and without a resolver: the reader cannot open files that the mesh names.
         loaded = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False, skip_materials=True)
         vertices, faces = np.array(loaded.vertices, np.float64), np.array(loaded.faces, np.int64)
     except OSError as error:
         raise SceneError(f"{file} cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # a damaged file raises whatever the parser stumbles over
-        reason = "it is neither whole nor text" if isinstance(error, ImportError) else error  # a guesser of encodings
-        raise SceneError(f"{file} must be a mesh in {kind.upper()}, and cannot be read as one: {reason}") from error
+    except Exception as error:  # a damaged file can raise any exception in the parser
+        reason = "it is damaged and not text" if isinstance(error, ImportError) else error  # encoding detection
+        raise SceneError(f"{file} is not a readable {kind.upper()} mesh: {reason}") from error
     _check_arrays(file, vertices, faces)
     return _merge_vertices(vertices, faces)
 
 
 def _check_arrays(file: Path, vertices: Vectors, faces: Faces) -> None:
     if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces) or vertices.ndim != 2:
-        raise SceneError(f"{file} must hold triangles, and holds none; export the surface, not points or curves")
+        raise SceneError(f"{file} has no triangles; export the surface, not points or curves")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise SceneError(f"{file} has faces of vertices that it does not have; export it again")
+        raise SceneError(f"{file} has faces that refer to missing vertices; export it again")
     if not np.isfinite(vertices[faces]).all():
-        raise SceneError(f"{file} must have finite vertices, and some are NaN or infinite; export it again")
+        raise SceneError(f"{file} has vertices that are NaN or infinite; export it again")
 
 
 def _merge_vertices(vertices: Vectors, faces: Faces) -> Mesh:
-    """One vertex for each place, and no face that has lost its area by that."""
+    """Merge vertices at one place and drop faces that lose their area."""
     size = float(np.ptp(vertices[faces].reshape(-1, 3), axis=0).max()) or 1.0
     _, first, number = np.unique(np.rint(vertices / (1e-7 * size)), axis=0, return_index=True, return_inverse=True)
     faces = number.reshape(-1)[faces]
-    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return Mesh(vertices[first], faces[whole])
+    has_area = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return Mesh(vertices[first], faces[has_area])
 
 
 def _place_on_table(mesh: Mesh, file: Path) -> Mesh:
-    """The mesh in mm, foot on z = 0, centred, faces outwards, after all checks. Raises SceneError."""
+    """Return the mesh in mm, centred on z = 0, with outward faces, after all checks. Raise SceneError."""
     _check_closed(mesh, file)
     scale = 1000.0 if np.ptp(mesh.vertices, axis=0).max() < _MAX_METRE_EXTENT else 1.0
     standing = Mesh(mesh.vertices * scale, mesh.faces).rest_on_table(UP)
@@ -344,28 +360,30 @@ def _place_on_table(mesh: Mesh, file: Path) -> Mesh:
     if standing.volume_mm3 < 0:
         standing = Mesh(standing.vertices, np.ascontiguousarray(mesh.faces[:, ::-1]))
     if standing.volume_mm3 < 1.0:
-        raise SceneError(f"{file} must enclose a volume, got {standing.volume_mm3:g} mm3; is it a flat surface?")
+        raise SceneError(
+            f"{file} must enclose a volume, got {standing.volume_mm3:g} mm3; export a solid, not a flat surface"
+        )
     return standing
 
 
 def _check_closed(mesh: Mesh, file: Path) -> None:
-    """Each edge must lie between an even number of faces, half of which run along it and half against it."""
+    """Check that each edge borders an even number of faces, half of them in each direction."""
     if not len(mesh.faces):
-        raise SceneError(f"{file} must hold triangles with an area, and holds none")
+        raise SceneError(f"{file} has no triangles with an area; export the surface again")
     edges = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     _, number, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     if opened := int((counts % 2).sum()):
         raise SceneError(
-            f"{file} must be a closed surface, and {opened} edges lie beside a hole; close it first, for example "
+            f"{file} must be a closed surface, but {opened} edges border a hole. Close it, for example "
             "with trimesh.repair.fill_holes, the 3D print tools of Blender or MeshLab's Close Holes"
         )
     balance = np.bincount(number.reshape(-1), np.where(edges[:, 0] < edges[:, 1], 1, -1))
     if balance.any():
-        raise SceneError(f"{file} must have all faces turned outwards; set them right with trimesh.repair.fix_normals")
+        raise SceneError(f"{file} must have all faces turned outwards; repair it with trimesh.repair.fix_normals")
 
 
 def _min_width(vertices: Vectors) -> float:
-    """Smallest horizontal width, over the directions square to the sides of the outline's convex hull."""
+    """Return the smallest horizontal width, over the directions normal to the sides of the outline's convex hull."""
     flat = vertices[:, :2]
     try:
         hull = flat[ConvexHull(flat).vertices]

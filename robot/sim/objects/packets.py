@@ -1,5 +1,6 @@
-"""Formulas at work: rays and points in packets of `LANES`, by compiled code. All that it calls stands here (see
-robot.sim.jit).
+"""Execution of formulas on rays and points in packets of `LANES`, by compiled code.
+
+All functions that compiled code calls are in this file (see robot.sim.jit).
 """
 
 from typing import NamedTuple
@@ -20,18 +21,19 @@ OPERATIONS = (
     *("add", "subtract", "multiply", "divide", "maximum", "minimum", "absolute", "sqrt", "rint"),
     *("floor", "copysign", "greater", "sin", "cos", "exp", "log", "log1p", "where"),
 )
-"""Names of the operations; a formula calls them by their place here."""
+"""Names of the operations; a formula refers to them by index."""
 
 (_ADD, _SUBTRACT, _MULTIPLY, _DIVIDE, _MAXIMUM, _MINIMUM, _ABSOLUTE, _SQRT, _RINT) = range(9)
 (_FLOOR, _COPYSIGN, _GREATER, _SIN, _COS, _EXP, _LOG, _LOG1P, _WHERE) = range(9, 18)
 
 
 class Formula(NamedTuple):
-    """Operations on rows of `LANES` numbers (robot.sim.objects.formula makes them).
+    """Operations on rows of `LANES` numbers (made by robot.sim.objects.formula).
 
-    code      (operations, 5) int64: the operation, the row of its result and of its one to three operands
-    start     (rows,) float32: constants, in the rows that hold them; the first rows are the operands
-    results   (n,) int64: the rows that hold what the function returns when the code has run
+    Attributes:
+        code: (operations, 5) int64: the operation, the row of its result and of its one to three operands.
+        start: (rows,) float32: constants, in their rows; the first rows are the operands.
+        results: (n,) int64: the rows of the function's results after the code has run.
     """
 
     code: NDArray[np.int64]
@@ -40,11 +42,16 @@ class Formula(NamedTuple):
 
 
 class DisplacedSolid(NamedTuple):
-    """A solid under relief: f = distance(x, y, z) - height(s, t) * mask, in mm.
+    """A solid with relief: f = distance(x, y, z) - height(s, t) * mask, in mm.
 
-    distance: formula of (x, y, z). place: formula of (x, y, z) to map coordinates s, t and the mask. height_mm: the map
-    (rows, columns), empty for none; per_s, per_t: its pixels per mm; max_height_mm: of its points; slope: how fast
-    relief can change, mm per mm.
+    Attributes:
+        distance: formula of (x, y, z).
+        place: formula of (x, y, z) to map coordinates s, t and the mask.
+        height_mm: height map (rows, columns), empty for none.
+        per_s: pixels of the map per mm along s.
+        per_t: pixels of the map per mm along t.
+        max_height_mm: greatest height of the map.
+        slope: upper bound on the slope of the relief, mm per mm.
     """
 
     distance: Formula
@@ -57,10 +64,10 @@ class DisplacedSolid(NamedTuple):
 
 
 def evaluate_formula(formula: Formula, *operands: Floats) -> tuple[Floats, ...]:
-    """What the function of the formula returns for arrays (n,) of float32."""
-    given = np.stack(operands)
-    results = np.empty((len(formula.results), given.shape[1]), np.float32)
-    _evaluate_all(formula.code, _rows(formula), formula.results, given, results)
+    """Evaluate the formula on float32 arrays (n,); return its results."""
+    values = np.stack(operands)
+    results = np.empty((len(formula.results), values.shape[1]), np.float32)
+    _evaluate_all(formula.code, _rows(formula), formula.results, values, results)
     return tuple(results)
 
 
@@ -69,12 +76,12 @@ def _rows(formula: Formula) -> Floats:
 
 
 @jit
-def _evaluate_all(code, rows, places, given, results):  # type: ignore[no-untyped-def]
-    for first in range(0, given.shape[1], LANES):
-        count = min(LANES, given.shape[1] - first)
-        for row in range(given.shape[0]):
+def _evaluate_all(code, rows, places, values, results):  # type: ignore[no-untyped-def]
+    for first in range(0, values.shape[1], LANES):
+        count = min(LANES, values.shape[1] - first)
+        for row in range(values.shape[0]):
             for i in range(count):
-                rows[row, i] = given[row, first + i]
+                rows[row, i] = values[row, first + i]
         _evaluate(code, rows)
         for number in range(len(places)):
             for i in range(count):
@@ -83,7 +90,7 @@ def _evaluate_all(code, rows, places, given, results):  # type: ignore[no-untype
 
 @jit
 def _evaluate(code, r):  # type: ignore[no-untyped-def]
-    """Carry out the code on all lanes of the rows."""
+    """Execute the code on all lanes of the rows."""
     for line in range(len(code)):
         name, d, a, b, c = code[line, 0], code[line, 1], code[line, 2], code[line, 3], code[line, 4]
         if name == _ADD:
@@ -143,30 +150,35 @@ def _evaluate(code, r):  # type: ignore[no-untyped-def]
                 r[d, i] = np.log1p(r[a, i])
 
 
-# A solid under relief ----------------------------------------------------------------------------------------
+# A solid with relief -----------------------------------------------------------------------------------------
 
 
 def interpolate_heights(height_mm: Floats, u: Floats, v: Floats) -> Floats:
-    """The map (rows, columns) between its pixels at columns u and rows v, (n,) each; beyond its border as on it."""
+    """Interpolate the map (rows, columns) at columns u and rows v, (n,) each; clamped at its border."""
     out = np.empty(len(u), np.float32)
     _interpolate_heights(height_mm, u, v, out)
     return out
 
 
 def gradients(solid: DisplacedSolid, points: Vectors, step_mm: float) -> Vectors:
-    """Differences of f, (n, 3), over the corners of a tetrahedron of that size: four evaluations instead of six."""
+    """Return differences of f, (n, 3), over the corners of a tetrahedron of that size: four evaluations, not six."""
     out = np.zeros(points.shape)
     _gradients(solid, _rows_of(solid), points, np.float32(step_mm / 2), out)
     return out
 
 
 Rays = tuple[Vectors, Vectors, Vectors, Vectors]
-"""Origins and directions (n, 3); from where to where along them a hit is looked for, (n,) mm each."""
+"""Origins and directions (n, 3), and the range along them in which a hit is searched, (n,) mm each."""
 
 
 def first_hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int = MAX_STEPS) -> Vectors:
-    """Distance (n,) along each ray to the first place where f is 0; inf: none. `step_mm` is the finest detail that
-    matters; a ray that has found nothing after `max_steps` is a miss.
+    """Return the distance (n,) along each ray to the first zero of f; inf: none.
+
+    Args:
+        solid: the solid.
+        rays: the rays.
+        step_mm: finest detail of interest.
+        max_steps: a ray without a hit after this many steps is a miss.
     """
     origins, directions, near, _ = rays
     rows, found = _rows_of(solid), _find_crossings(solid, rays, step_mm, max_steps)
@@ -176,19 +188,19 @@ def first_hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int
 
 
 def hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int = MAX_STEPS) -> NDArray[np.bool_]:
-    """Which rays have such a first hit, (n,)."""
+    """Return which rays have a first hit, (n,)."""
     return np.asarray(np.isfinite(_find_crossings(solid, rays, step_mm, max_steps)[0]))
 
 
 def _find_crossings(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int) -> Floats:
-    """What `_march` finds, (4, n)."""
+    """Return the brackets of the zeros that `_march` finds, (4, n)."""
     found = np.full((4, len(rays[0])), np.inf, np.float32)
     _march(solid, _rows_of(solid), *rays, np.float32(0.5 * step_mm), max_steps, found)
     return found
 
 
 def _rows_of(solid: DisplacedSolid) -> tuple[Floats, Floats]:
-    """Rows of the two formulas, to work on."""
+    """Return working rows for the two formulas."""
     return _rows(solid.distance), _rows(solid.place)
 
 
@@ -214,7 +226,7 @@ def _interpolate_heights(height, u, v, out):  # type: ignore[no-untyped-def]
 
 @jit
 def _relief_heights(solid, rows, count):  # type: ignore[no-untyped-def]
-    """Relief at the points in the rows, into the first row."""
+    """Write relief at the points in the rows into the first row."""
     _evaluate(solid.place.code, rows)
     s, t, mask = solid.place.results[0], solid.place.results[1], solid.place.results[2]
     per_s, per_t = np.float32(solid.per_s), np.float32(solid.per_t)
@@ -224,7 +236,7 @@ def _relief_heights(solid, rows, count):  # type: ignore[no-untyped-def]
 
 @jit
 def _evaluate_field(solid, rows, count):  # type: ignore[no-untyped-def]
-    """F at the points in the first rows of rows[0], into its row of results."""
+    """Write f at the points in the first rows of rows[0] into its row of results."""
     base, relief_rows = rows
     if solid.height_mm.size:
         for row in range(3):
@@ -261,11 +273,11 @@ _ORIGIN, _DIRECTION, _T, _BEFORE, _F_BEFORE, _ROOM, _STEPS, _LANE_ROWS = 0, 3, 6
 
 @jit
 def _march(solid, rows, origins, directions, near, far, finest, max_steps, found):  # type: ignore[no-untyped-def]
-    """Sphere tracing until f changes sign: `found` is t and f just inside (inf: a miss), t and f just outside.
+    """Trace spheres until f changes sign; fill `found` with t and f just inside (inf: a miss), t and f just outside.
 
-    Outside the shell that relief can reach, the step is the distance to it. Within, f / L is safe (L bounds the
-    slope of f), and no step is shorter than a stride: `finest`, and up to four times that for rays that graze for
-    long. A lane whose ray has ended takes the next ray, so that packets stay full.
+    Outside the shell that relief can reach, the step is the distance to it. Within, f / L is safe (L bounds the slope
+    of f), and the shortest step is a stride: `finest`, or up to four times that for rays that graze for long. When a
+    lane's ray ends, the lane takes the next ray, so packets stay full.
     """
     base, relief_rows = rows
     result, has_relief = solid.distance.results[0], solid.height_mm.size > 0
@@ -322,7 +334,7 @@ def _march(solid, rows, origins, directions, near, far, finest, max_steps, found
             stride = finest * min(max(lanes[_STEPS, i] / np.float32(40), np.float32(1)), np.float32(4))
             forward = f / bound if f / bound > gap else gap
             forward += stride if outside else np.float32(0)
-            # f is not known outside the shell: 0 asks for it to be worked out.
+            # f is unknown outside the shell: 0 requests its computation later.
             lanes[_F_BEFORE, i] = np.float32(0) if outside else f
             lanes[_BEFORE, i] = t + gap if outside else t
             lanes[_T, i] = t + (forward if forward > stride else stride)
@@ -340,7 +352,7 @@ def _march(solid, rows, origins, directions, near, far, finest, max_steps, found
 
 @jit
 def _refine(solid, rows, origins, directions, near, found, out):  # type: ignore[no-untyped-def]
-    """Close in on the zero between a point outside and one inside, by false position, twice and once more."""
+    """Narrow the bracket of the zero by false position: two refinements and a final interpolation."""
     base, result = rows[0], solid.distance.results[0]
     ray = np.empty(LANES, np.int64)
     upcoming = 0
@@ -374,7 +386,7 @@ def _refine(solid, rows, origins, directions, near, found, out):  # type: ignore
 
 @jit
 def _zero_crossing(found, number):  # type: ignore[no-untyped-def]
-    """Where the chord from f > 0 before to f <= 0 at the hit meets 0."""
+    """Return where the chord from f > 0 before to f <= 0 at the hit meets 0."""
     high, f_high, low, f_low = found[0, number], found[1, number], found[2, number], found[3, number]
-    share = f_low / max(f_low - f_high, np.float32(1e-9))
-    return low + min(max(share, np.float32(0)), np.float32(1)) * (high - low)
+    fraction = f_low / max(f_low - f_high, np.float32(1e-9))
+    return low + min(max(fraction, np.float32(0)), np.float32(1)) * (high - low)

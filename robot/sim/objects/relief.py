@@ -1,7 +1,7 @@
-"""Relief: what the wall of an object wears, 0.1 to 6 mm high, drawn on the unrolled wall.
+"""Relief on the wall of an object, 0.1 to 6 mm high, drawn on the unrolled wall.
 
-A pattern fills a `Sheet` (rows along t, columns along s, periodic in s) with numbers from 0 to 1; `Relief` says
-how high, how wide, in which direction, how drawn out and how sharp, and whether it stands out or is engraved.
+A pattern fills a `Sheet` (rows along t, columns along s, periodic in s) with numbers from 0 to 1. `Relief` sets height,
+width, direction, elongation and sharpness, and whether the pattern is raised or engraved.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,10 +20,17 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Relief:
-    """One instance of a family.
+    """One instance of a relief family.
 
-    angle_rad: direction across which a directed pattern repeats (0: round the object). aspect >= 1: how much
-    longer than wide its elements are. sharpness: 0 rounded to 1 flat tops with steep edges.
+    Attributes:
+        name: the family.
+        amplitude_mm: greatest height or depth.
+        pitch_mm: distance between elements.
+        angle_rad: direction across which a directed pattern repeats (0: around the object).
+        aspect: length of the elements over their width, at least 1.
+        sharpness: 0 for rounded elements, up to 1 for flat tops with steep edges.
+        engraved: whether the pattern goes inwards.
+        seed: seed of random patterns.
     """
 
     name: str
@@ -44,7 +51,7 @@ class Relief:
             )
 
     def height(self, sheet: "Sheet") -> Floats | None:
-        """Height in mm over the sheet, at most `amplitude_mm` out or, engraved, in; None where it is 0."""
+        """Return the height in mm over the sheet, at most `amplitude_mm` out or, if engraved, in; None if it is 0."""
         if self.amplitude_mm == 0:
             return None
         unit = np.clip(RELIEFS[self.name](self, sheet, np.random.default_rng([self.seed, 7])), 0, 1)
@@ -53,7 +60,7 @@ class Relief:
 
 @dataclass(frozen=True)
 class Sheet:
-    """An unrolled wall, `width_mm` round (periodic) by `height_mm`, at (rows, columns) nodes."""
+    """An unrolled wall, `width_mm` around (periodic) by `height_mm`, at (rows, columns) nodes."""
 
     width_mm: float
     height_mm: float
@@ -67,14 +74,16 @@ class Sheet:
 
     @property
     def s(self) -> Floats:
+        """Positions of the columns in mm."""
         return np.arange(self.columns, dtype=np.float32) * np.float32(self.pixel_mm[1])
 
     @property
     def t(self) -> Floats:
+        """Positions of the rows in mm."""
         return np.arange(self.rows, dtype=np.float32) * np.float32(self.pixel_mm[0])
 
     def phase(self, pitch_mm: float, angle_rad: float, *, multiple: int = 1) -> Floats:
-        """Number of the wave at each node, (rows, columns); a whole number of waves (a multiple) goes round."""
+        """Return the wave number at each node, (rows, columns); the waves around are a multiple of `multiple`."""
         waves = multiple * round(self.width_mm * np.cos(angle_rad) / pitch_mm / multiple)
         along = np.float32(waves / self.width_mm) * self.s
         return along[None, :] + (np.float32(np.sin(angle_rad) / pitch_mm) * self.t)[:, None]
@@ -88,9 +97,9 @@ class Sheet:
         return np.asarray(blurred[:, pad : pad + self.columns])
 
     def scatter(self, rng: Rng, pitch_mm: float, *, aspect: float = 1.0, jitter: float = 0.35) -> Floats:
-        """Distance in mm to the nearest of points about one pitch apart, drawn out by `aspect` along t.
+        """Return the distance in mm to the nearest of points about one pitch apart, stretched by `aspect` along t.
 
-        Points lie on a staggered grid and are jittered by a share of the pitch.
+        Points are on a staggered grid, with a random shift of up to `jitter` pitches.
         """
         columns, rows = max(round(self.width_mm / pitch_mm), 2), max(round(self.height_mm / aspect / pitch_mm), 1)
         i, j = np.meshgrid(np.arange(columns), np.arange(-1, rows + 2))
@@ -106,19 +115,19 @@ class Sheet:
         ] = 0
         wide = cv2.copyMakeBorder(mask, 0, 0, pad, pad, cv2.BORDER_WRAP)
         rough = cv2.distanceTransform(wide, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[pad:-pad, pad:-pad]
-        # OpenCV's last bits hang on where memory lies and on its threads; squares of distances are whole numbers.
+        # OpenCV's last bits depend on memory alignment and threads; squares of distances are whole numbers.
         distance = np.sqrt(np.rint(rough * rough))
         return np.asarray(cv2.resize(distance, (self.columns, self.rows)) * np.float32(self.pixel_mm[1]), np.float32)
 
 
 def _crest(wave: Floats, sharpness: float) -> Floats:
-    """Shape a wave of -1..1 into 0..1: rounded at 0, flat tops and steep edges at 1."""
+    """Map a wave of -1..1 to 0..1: rounded at sharpness 0, flat tops and steep edges at 1."""
     gain = np.float32(0.4 + 4 * sharpness**2)
     return np.asarray(np.float32(0.5) + np.tanh(wave * gain) / np.float32(2 * np.tanh(gain)))
 
 
 def _edge_blur_mm(relief: Relief) -> float:
-    """Blur in mm of a step's edge: no steeper than a mould or a tool leaves it."""
+    """Return the blur in mm of a step's edge, as a mould or a tool leaves it."""
     return 0.1 + 0.25 * (1 - relief.sharpness) + 0.2 * relief.amplitude_mm
 
 
@@ -127,7 +136,7 @@ def _cosine(phase: Floats) -> Floats:
 
 
 def _triangle(phase: Floats) -> Floats:
-    """1 at whole numbers, 0 half way between."""
+    """Return 1 at whole numbers, 0 halfway between."""
     return np.abs(2 * (phase - np.floor(phase)) - 1)
 
 
@@ -135,7 +144,7 @@ def _triangle(phase: Floats) -> Floats:
 
 
 def smooth(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
-    """Nothing."""
+    """No relief."""
     return np.zeros((sheet.rows, sheet.columns), np.float32)
 
 
@@ -164,35 +173,35 @@ def weave(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
 
 def pebble(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
     """Irregular domes side by side, like leather or cobbles."""
-    share = sheet.scatter(rng, relief.pitch_mm, aspect=relief.aspect) / np.float32(0.72 * relief.pitch_mm)
-    return np.asarray(np.sqrt(np.maximum(1 - share * share, 0)) ** np.float32(1.2 - 0.7 * relief.sharpness))
+    distance = sheet.scatter(rng, relief.pitch_mm, aspect=relief.aspect) / np.float32(0.72 * relief.pitch_mm)
+    return np.asarray(np.sqrt(np.maximum(1 - distance * distance, 0)) ** np.float32(1.2 - 0.7 * relief.sharpness))
 
 
 def bumps(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
-    """Single domes on a staggered grid, with plain ground between them."""
+    """Single domes on a staggered grid, with flat ground between them."""
     radius = relief.pitch_mm * (0.26 + 0.16 * relief.sharpness)
-    share = sheet.scatter(rng, relief.pitch_mm, aspect=relief.aspect, jitter=0.0) / np.float32(radius)
-    return np.asarray(np.sqrt(np.maximum(1 - share * share, 0)))
+    distance = sheet.scatter(rng, relief.pitch_mm, aspect=relief.aspect, jitter=0.0) / np.float32(radius)
+    return np.asarray(np.sqrt(np.maximum(1 - distance * distance, 0)))
 
 
 def dimples(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
-    """Rounded hollows, as on a golf ball, scattered."""
-    share = sheet.scatter(rng, relief.pitch_mm, aspect=relief.aspect, jitter=0.2)
+    """Scattered rounded hollows, as on a golf ball."""
+    distance = sheet.scatter(rng, relief.pitch_mm, aspect=relief.aspect, jitter=0.2)
     return np.asarray(
-        1 - np.clip(np.float32(1.15) - share / np.float32(0.42 * relief.pitch_mm), 0, 1) ** np.float32(1.5)
+        1 - np.clip(np.float32(1.15) - distance / np.float32(0.42 * relief.pitch_mm), 0, 1) ** np.float32(1.5)
     )
 
 
 def honeycomb(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
-    """Walls round six-sided cells: three sets of waves at 60 degrees."""
+    """Walls around six-sided cells: three sets of waves at 60 degrees."""
     waves = [sheet.phase(relief.pitch_mm, angle, multiple=2) for angle in (0.0, np.pi / 3, -np.pi / 3)]
-    waves[0] = waves[1] + waves[2]  # exact, whatever the rounding to whole waves did
+    waves[0] = waves[1] + waves[2]  # exact in spite of rounding to whole waves
     total = np.sum([_cosine(wave) for wave in waves], axis=0)
     return _crest(np.float32(0.45) - total / np.float32(1.5), 0.3 + 0.5 * relief.sharpness)
 
 
 def hammered(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
-    """Random rolling ground: stucco, beaten metal, bark when drawn out."""
+    """Random rolling ground: stucco, beaten metal, or bark when stretched."""
     noise = rng.standard_normal((sheet.rows // 4 + 1, sheet.columns // 4), dtype=np.float32)
     coarse = Sheet(sheet.width_mm, sheet.height_mm, *noise.shape)
     image = coarse.blur(noise, relief.pitch_mm * 0.22)
@@ -219,7 +228,7 @@ def scratches(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
 
 
 def layers(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
-    """Beads on one another, as a printer lays them, each a little off."""
+    """Beads on one another, as from a 3D printer, each slightly shifted."""
     count = int(np.ceil(sheet.height_mm / relief.pitch_mm)) + 1
     phase = sheet.t / np.float32(relief.pitch_mm)
     size = rng.uniform(0.6, 1, count).astype(np.float32)[np.clip(phase.astype(int), 0, count - 1)]
@@ -229,7 +238,7 @@ def layers(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
 
 
 def glyphs(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
-    """Rows of letters and digits, each row once round the object."""
+    """Rows of letters and digits, each row once around the object."""
     canvas, font = _canvas(sheet), cv2.FONT_HERSHEY_SIMPLEX
     down = sheet.pixel_mm[0]
     size = relief.pitch_mm / down / 21  # cv2's capitals are 21 px high at scale 1
@@ -257,14 +266,14 @@ def scales(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
 
 
 def waffle(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
-    """A grid of ridges round square or oblong pits."""
+    """A grid of ridges around square or oblong pits."""
     one = _cosine(sheet.phase(relief.pitch_mm, 0.0))
     two = _cosine(sheet.phase(relief.pitch_mm * relief.aspect, np.pi / 2))
     return _crest(np.maximum(one, two) - np.float32(0.25), relief.sharpness)
 
 
 def chevron(relief: Relief, sheet: Sheet, rng: Rng) -> Floats:
-    """Ridges that zigzag: a tyre, herringbone."""
+    """Zigzag ridges, as on a tyre or in herringbone."""
     zigzag = _triangle(sheet.phase(relief.pitch_mm * 3, 0.0))
     phase = (sheet.t / np.float32(relief.pitch_mm))[:, None] + zigzag * np.float32(relief.aspect)
     return _crest(_cosine(phase), relief.sharpness)
@@ -280,7 +289,7 @@ def _enlarge(image: Floats, sheet: Sheet) -> Floats:
 
 
 def _canvas(sheet: Sheet) -> NDArray[np.uint8]:
-    """An empty sheet twice as wide, so that what is drawn across the seam can be folded back."""
+    """Return an empty sheet of twice the width, so that drawings across the seam can be folded back."""
     return np.zeros((sheet.rows, 2 * sheet.columns), np.uint8)
 
 
@@ -299,7 +308,7 @@ RELIEFS: Mapping[str, Pattern] = MappingProxyType(
         )
     }
 )
-# How an instance is drawn: pitch in mm, amplitude in mm, most amplitude per pitch, chance of being engraved.
+# Ranges of the draws: pitch in mm, amplitude in mm, greatest amplitude per pitch, probability of engraving.
 _RANGES: Mapping[str, tuple[float, float, float, float, float, float]] = MappingProxyType(
     {
         "smooth": (2, 2, 0, 0, 0, 0),
@@ -322,21 +331,21 @@ _RANGES: Mapping[str, tuple[float, float, float, float, float, float]] = Mapping
 
 
 def check_relief_name(name: str) -> str:
-    """The name, if there is such a family. Raises UnknownName."""
+    """Return the name if there is such a family. Raise UnknownName otherwise."""
     if name not in RELIEFS:
         raise UnknownName(f"relief must be one of {', '.join(RELIEFS)}; got {name!r}")
     return name
 
 
 def draw_relief(name: str, rng: Rng, limit_mm: float) -> Relief:
-    """An instance of the family, no higher than the shape allows (`limit_mm`). Raises UnknownName."""
-    short, long, low, high, steep, chance = _RANGES[check_relief_name(name)]
+    """Draw an instance of the family, no higher than the shape allows (`limit_mm`). Raise UnknownName."""
+    short, long, low, high, max_ratio, engraved_probability = _RANGES[check_relief_name(name)]
     pitch = float(np.exp(rng.uniform(np.log(short), np.log(long))))
-    top = max(min(high, steep * pitch, limit_mm), min(low, limit_mm))
+    top = max(min(high, max_ratio * pitch, limit_mm), min(low, limit_mm))
     amplitude = float(min(low, top) * (top / max(min(low, top), 1e-9)) ** rng.uniform())
     angle = float(rng.choice([0, np.pi / 2, rng.uniform(-np.pi / 2, np.pi / 2)], p=[0.3, 0.3, 0.4]))
     aspect = 1.0 if rng.random() < 0.4 else float(rng.uniform(1, 2.2))
-    # A flank of 60 degrees is the steepest: pi amplitude gain / pitch at most 1.7.
-    most = np.sqrt(np.clip((1.7 * pitch / (np.pi * max(amplitude, 0.05)) - 0.4) / 4, 0, 1))
-    sharpness, engraved = float(rng.uniform() * most), bool(rng.random() < chance)
+    # The steepest flank is 60 degrees: pi amplitude gain / pitch at most 1.7.
+    max_sharpness = np.sqrt(np.clip((1.7 * pitch / (np.pi * max(amplitude, 0.05)) - 0.4) / 4, 0, 1))
+    sharpness, engraved = float(rng.uniform() * max_sharpness), bool(rng.random() < engraved_probability)
     return Relief(name, amplitude, pitch, angle, aspect, sharpness, engraved, int(rng.integers(2**31)))

@@ -1,7 +1,8 @@
-"""How a solid may rest on the table: the sides on which it stands without falling over.
+"""Stable resting poses of a solid on the table.
 
 A solid rests on a side of its convex hull if its centre of mass lies above the polygon of the points that touch the
-table there (Goldberg 1999). Scans are not flat to a micrometre, so that points within a millimetre of the table touch.
+table there (Goldberg 1999). Scans are not flat to a micrometre, so points within a millimetre of the table count as
+touching.
 """
 
 import math
@@ -15,31 +16,36 @@ UP = np.array([0.0, 0.0, 1.0])
 
 _CONTACT_TOLERANCE_MM = 1.0
 _MIN_TIPPING_RAD = math.radians(4.0)
-"""A solid that falls over when it is tilted by less does not rest."""
+"""A pose is not stable if a smaller tilt tips the solid over."""
 
 _SAME_COSINE = math.cos(math.radians(20.0))
-"""Sides whose normals are nearer to each other than this are one side, of which the steadiest resting pose counts."""
+"""Sides with normals closer than this count as one side; its most stable pose is used."""
 
 _MAX_POSES = 6
 
 
 def stable_up_directions(vertices: Array, centre_of_mass: Array) -> list[Array]:
-    """Directions (3,) of the solid that point up when it rests: its own z first or one near it, then the steadiest.
+    """Return directions (3,) of the solid that point up at rest: its own z or one near it first, then the most stable.
 
-    vertices (V, 3). A solid that rests nowhere stands as it is.
+    Args:
+        vertices: (V, 3) vertices of the solid.
+        centre_of_mass: (3,) its centre of mass.
+
+    Returns:
+        At most 6 directions; its own z alone if no pose is stable.
     """
     try:
         hull = ConvexHull(vertices)
     except QhullError:
         return [UP]
     corners = vertices[hull.vertices] - centre_of_mass
-    # Scans have thousands of sides: of those that point the same way to about a degree, one is tried.
+    # Scans have thousands of sides. Try one of those that point the same way to about a degree.
     _, first = np.unique(np.rint(hull.equations[:, :3] / 0.02), axis=0, return_index=True)
-    tried = [UP, *-hull.equations[np.sort(first), :3]]
-    angles = [tipping_angle(corners, -up) for up in tried]
-    steady = sorted((number == 0, angle, number) for number, angle in enumerate(angles) if angle > _MIN_TIPPING_RAD)
+    candidates = [UP, *-hull.equations[np.sort(first), :3]]
+    angles = [tipping_angle(corners, -up) for up in candidates]
+    stable = sorted((number == 0, angle, number) for number, angle in enumerate(angles) if angle > _MIN_TIPPING_RAD)
     poses: list[Array] = []
-    for up in (tried[number] for *_, number in reversed(steady)):
+    for up in (candidates[number] for *_, number in reversed(stable)):
         if all(up @ other < _SAME_COSINE for other in poses):
             poses.append(up)
     upright_first = sorted(poses, key=lambda up: bool(up @ UP < _SAME_COSINE))
@@ -47,22 +53,24 @@ def stable_up_directions(vertices: Array, centre_of_mass: Array) -> list[Array]:
 
 
 def tipping_angle(corners: Array, down: Array) -> float:
-    """How far (rad) a solid can be tilted before it falls over; below 0 where it does not rest.
+    """Return how far (rad) a solid can be tilted before it tips over; below 0 if it does not rest.
 
-    corners (N, 3): of its convex hull, from the centre of mass. down (3,): unit direction of the table.
+    Args:
+        corners: (N, 3) corners of its convex hull, from the centre of mass.
+        down: (3,) unit direction of the table.
     """
     depth = corners @ down
     height = float(depth.max())
     touching = corners[depth >= height - _CONTACT_TOLERANCE_MM] @ rotation_to_up(-down).T
     try:
         edges = ConvexHull(touching[:, :2]).equations if len(touching) > 2 else None
-    except QhullError:  # they lie in a line
+    except QhullError:  # the points are collinear
         edges = None
     return -1.0 if edges is None else math.atan2(-float(edges[:, 2].max()), height)
 
 
 def rotation_to_up(up: Array) -> Array:
-    """(3, 3): the shortest rotation that brings the unit direction `up` (3,) to z."""
+    """Return the shortest rotation (3, 3) that maps the unit direction `up` (3,) to z."""
     x, y, z = up
     if z < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])

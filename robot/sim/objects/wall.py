@@ -1,7 +1,7 @@
-"""The wall of an object, unrolled: its relief baked into height maps from fine to coarse.
+"""Relief on the unrolled wall of an object, baked into height maps from fine to coarse.
 
-A height map is drawn once per object and looked up bilinearly. Where the shape turns away from its chart (rims,
-caps, poles, the far side of a handle) relief fades out, so that it never tears at an edge.
+A height map is computed once per object and interpolated bilinearly. Where the shape turns away from its chart (rims,
+caps, poles, the far side of a handle), relief fades out, so that it never tears at an edge.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,16 @@ _CELL_MM = 1.5
 
 @dataclass(frozen=True)
 class ReliefLevel:
-    """One height map in mm, with its highest point and how fast relief can change with place (mm per mm)."""
+    """One height map.
+
+    Attributes:
+        height_mm: (rows, columns) heights.
+        per_s: columns per mm.
+        per_t: rows per mm.
+        max_height_mm: greatest height.
+        slope: upper bound on the slope of the relief, mm per mm.
+        pixel_mm: size of a pixel.
+    """
 
     height_mm: Floats
     per_s: float
@@ -32,24 +41,24 @@ class ReliefLevel:
     pixel_mm: float
 
     def at(self, s: Floats, t: Floats) -> Floats:
-        """Heights at map coordinates in mm, (N,) each."""
+        """Interpolate heights at map coordinates in mm, (N,) each."""
         return interpolate_heights(self.height_mm, s * np.float32(self.per_s), t * np.float32(self.per_t))
 
 
 @dataclass(frozen=True)
 class ReliefLevels:
-    """The baked relief of a shape, in levels of halved resolution."""
+    """The baked relief of a shape; each level has half the resolution of the one before."""
 
     levels: tuple[ReliefLevel, ...]
 
     def level(self, step_mm: float) -> ReliefLevel:
-        """The coarsest level whose pixels are not wider than `step_mm` (or the finest)."""
+        """Return the coarsest level whose pixels are at most `step_mm` wide, or the finest level."""
         fitting = [level for level in self.levels if level.pixel_mm <= step_mm]
         return fitting[-1] if fitting else self.levels[0]
 
 
 def bake(shape: Shape, relief: Relief) -> ReliefLevels | None:
-    """Draw relief and the shape's own pattern on its wall; None for a bare shape."""
+    """Draw relief and the shape's own pattern on its wall; return None for a smooth shape."""
     sheet = _sheet(shape.chart)
     height, wall_pattern = relief.height(sheet), shape.wall_pattern(sheet.s, sheet.t)
     if height is None and wall_pattern is None:
@@ -60,14 +69,14 @@ def bake(shape: Shape, relief: Relief) -> ReliefLevels | None:
 
 
 def bake_plain(chart: Chart, relief: Relief) -> ReliefLevels | None:
-    """Relief alone, everywhere; None for a smooth one."""
+    """Draw relief alone, everywhere; return None for a smooth one."""
     sheet = _sheet(chart)
     height = relief.height(sheet)
     return None if height is None else ReliefLevels(tuple(_levels(height, sheet, np.ones(2, np.float32), 0.0)))
 
 
 def _sheet(chart: Chart) -> Sheet:
-    """Nodes for a wall; columns and rows can be halved `_LEVELS` times."""
+    """Return nodes for a wall; columns and rows can be halved `_LEVELS` times."""
     width, height = chart.width_mm, chart.height_mm
     pixel = max(MIN_PIXEL_MM, np.sqrt(width * height / _MAX_NODES))
     block = 2 ** (_LEVELS - 1)
@@ -90,27 +99,27 @@ def _levels(height: Floats, sheet: Sheet, stretch: Floats, mask_slope: float) ->
 
 
 def _downsample(height: Floats) -> Floats:
-    """Every other node after a binomial blur; the blur is periodic along s and keeps the ends of t."""
+    """Return every other node after a binomial blur; the blur is periodic along s and clamped at the ends of t."""
     wide = cv2.copyMakeBorder(height, 0, 0, 2, 2, cv2.BORDER_WRAP)
     kernel = np.array([1, 4, 6, 4, 1], np.float32) / 16
     return np.asarray(cv2.sepFilter2D(wide, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)[::2, 2:-2:2])
 
 
 def _max_slope(padded: Floats, per_s: float, per_t: float, stretch: Floats) -> float:
-    """The largest slope of the bilinear surface, measured on the object and not on the map."""
+    """Return the largest slope of the bilinear surface, measured on the object and not on the map."""
     across = cv2.absdiff(padded[:, 1:], padded[:, :-1]).max(axis=1) * per_s
     rows = np.linspace(0, len(stretch) - 1, len(across)).round().astype(int)
     along = cv2.absdiff(padded[1:], padded[:-1]).max() * per_t
     return float(np.hypot((across * stretch[rows]).max(), along))
 
 
-# Where relief belongs ----------------------------------------------------------------------------------------
+# Weight of relief --------------------------------------------------------------------------------------------
 
 
 def _relief_weights(shape: Shape, sheet: Sheet, amplitude_mm: float) -> tuple[Floats, Floats]:
-    """Weight of relief at each node (rows, columns), and how much the map is stretched, by coarse row.
+    """Return the weight of relief at each node (rows, columns), and the stretch of the map, by coarse row.
 
-    The wall is looked at from outside, along the chart's rays, on a coarse grid.
+    The wall is sampled from outside, along the chart's rays, on a coarse grid.
     """
     rows = max(int(sheet.height_mm / _CELL_MM), 12) + 1
     columns = max(int(sheet.width_mm / _CELL_MM), 24)
@@ -127,7 +136,7 @@ def _relief_weights(shape: Shape, sheet: Sheet, amplitude_mm: float) -> tuple[Fl
 
 
 def _cast_chart_rays(shape: Shape, s: Floats, t: Floats) -> tuple[Points, NDArray[np.bool_], Points, Points]:
-    """What the chart's rays meet: points, hits, cosine to the ray, and the distance's own slope there."""
+    """Return points, hits, cosine to the ray and slope of the distance where the chart's rays meet the wall."""
     origins, directions = shape.chart.rays(s, t)
     p, d = origins.astype(np.float32), directions.astype(np.float32)
     far, travelled = np.float32(np.linalg.norm(shape.upper - shape.lower) + 4), np.zeros(len(p), np.float32)
@@ -151,23 +160,23 @@ def _gradient(shape: Shape, points: Points, step_mm: float) -> Points:
 
 
 def smoothstep(x: Points, low: float, high: float) -> Points:
-    """0 below `low`, 1 above `high`, smooth between."""
+    """Return 0 below `low`, 1 above `high`, smooth between."""
     u = np.clip((x - low) / (high - low), 0, 1)
     return np.asarray(u * u * (3 - 2 * u))
 
 
 def ends_weight(t: Points, height_mm: float, fade_mm: float) -> Points:
-    """0 at the lowest and the highest place, so that an object keeps its foot on the table; 1 further in."""
+    """Return 0 at the lowest and highest place, so that the foot stays on the table; 1 further in."""
     return smoothstep(np.minimum(t, height_mm - t), 0.3, 0.3 + fade_mm)
 
 
 def _upsample_weights(weight: Floats, coarse: Sheet, sheet: Sheet, amplitude_mm: float) -> Floats:
-    """Weights on the fine nodes, drawn back from where they end and softened."""
+    """Interpolate the weights at the fine nodes, shrunk from their edges and smoothed."""
     wide = cv2.copyMakeBorder(weight, 0, 0, 4, 4, cv2.BORDER_WRAP)
-    calm = cv2.erode(wide, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    calm = cv2.GaussianBlur(calm, (0, 0), sigmaX=max(0.7, 0.4 * amplitude_mm / _CELL_MM))
+    shrunk = cv2.erode(wide, np.ones((3, 3), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    shrunk = cv2.GaussianBlur(shrunk, (0, 0), sigmaX=max(0.7, 0.4 * amplitude_mm / _CELL_MM))
     u = 4 + np.arange(sheet.columns, dtype=np.float32) * np.float32(coarse.columns / sheet.columns)
     v = np.arange(sheet.rows, dtype=np.float32) * np.float32((coarse.rows - 1) / (sheet.rows - 1))
     x, y = np.meshgrid(u, v)
-    fine = cv2.remap(calm, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    fine = cv2.remap(shrunk, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(fine * ends_weight(sheet.t, sheet.height_mm, 1.0)[:, None], np.float32)

@@ -1,15 +1,16 @@
-"""Two force-controlled jaws close on an object that is free to shift between them: a stiff equation of motion.
+"""Two force-controlled jaws close on an object that can shift between them: a stiff equation of motion.
 
     m s'' = F - c s' - N(depth)     for each jaw's travel s      depth_a = s_a - o - clearance_a
     M o'' = N_a - N_b - C o'        for the object's shift o     depth_b = s_b + o - clearance_b
 
 A contact of k N/m between masses of m kg oscillates with sqrt(k/m): at 1e9 N/m ten thousand times faster than the jaws
-close. An explicit method must follow that or blow up; the implicit one here is L-stable (Alexander 1977, SDIRK of
-order 2), so what is faster than the step dies out. Where only the end matters, `settle` gives it without a step.
+close. An explicit method must resolve that oscillation or it diverges. The implicit method here is L-stable (Alexander
+1977, SDIRK of order 2), so oscillations faster than the step are damped out. `settle` computes the end state alone,
+without a step.
 
-The simulated rig does not use it: a recording holds no moment of the way, and at its end each finger carries the
-commanded force, with which the rig presses at once (robot.sim.pinch). This is the reference for that: a test lets jaws
-close on the rig's own gels and finds the depths that the rig shows.
+The simulated rig does not use it. A recording has no image from the closing motion, and at its end each finger carries
+the commanded force, with which the rig presses at once (robot.sim.pinch). This module is the reference: a test closes
+jaws on the rig's own gels and compares the depths with the rig's.
 """
 
 import math
@@ -25,26 +26,29 @@ from robot.sim.contact.layer import Layer, press
 
 Floats = npt.NDArray[np.float64]
 
-_GAMMA = 1.0 - math.sqrt(0.5)  # of the SDIRK method: L-stable and of order 2
+_GAMMA = 1.0 - math.sqrt(0.5)  # of the SDIRK method, which is L-stable and of order 2
 _MM_PER_M = 1e3
 _NEWTON_STEPS, _NEWTON_TOLERANCE = 25, 1e-12
 _HALVINGS = 30
-_START, _TRAVEL = np.zeros(6), np.array([[1.0, 0.0, -1.0], [0.0, 1.0, 1.0]])  # of (s_a, s_b, o) in the depths
+_START, _TRAVEL = (
+    np.zeros(6),
+    np.array([[1.0, 0.0, -1.0], [0.0, 1.0, 1.0]]),
+)  # coefficients of (s_a, s_b, o) in the depths
 
 
 class ForceLaw(ABC):
-    """Force of a finger against its depth in N and mm: 0 where nothing touches, and never falling."""
+    """Force of a finger against its depth in N and mm: 0 without contact, and never decreasing."""
 
     def __call__(self, depth_mm: float) -> tuple[float, float]:
-        """Force in N and its slope in N/mm."""
+        """Return the force in N and its slope in N/mm."""
         return (0.0, 0.0) if depth_mm <= 0.0 else self._force(depth_mm)
 
     @abstractmethod
     def _force(self, depth_mm: float) -> tuple[float, float]:
-        """The same for a depth above 0."""
+        """Return force and slope for a depth above 0."""
 
     def depth_at(self, force_n: float) -> float:
-        """The depth in mm at which the finger pushes back with `force_n` >= 0."""
+        """Return the depth in mm at which the finger pushes back with `force_n` >= 0."""
         if force_n <= 0.0:
             return 0.0
         deep = 1.0
@@ -64,7 +68,7 @@ class LinearLaw(ForceLaw):
 
 
 class TabulatedLaw(ForceLaw):
-    """A smooth rising curve through (0, 0) and `depths_mm`, `forces_n`; straight beyond the last."""
+    """A smooth increasing curve through (0, 0) and `depths_mm`, `forces_n`; linear beyond the last."""
 
     def __init__(self, depths_mm: npt.ArrayLike, forces_n: npt.ArrayLike) -> None:
         depths, forces = (np.concatenate([[0.0], np.asarray(v, np.float64)]) for v in (depths_mm, forces_n))
@@ -80,7 +84,7 @@ class TabulatedLaw(ForceLaw):
 def press_law(
     gap_mm: npt.ArrayLike, pixel_mm: float, layer: Layer, max_depth_mm: float, *, points: int = 8
 ) -> TabulatedLaw:
-    """The law of a gel against a height map, from `points` presses down to `max_depth_mm` beyond first touch."""
+    """Return the law of a gel against a height map, from `points` presses down to `max_depth_mm` beyond first touch."""
     lowest = float(np.min(gap_mm))
     depths = max_depth_mm * np.linspace(0.0, 1.0, points + 1)[1:]
     return TabulatedLaw(depths, [press(gap_mm, pixel_mm, layer, depth_mm=lowest + d).force_n for d in depths])
@@ -88,7 +92,7 @@ def press_law(
 
 @dataclass(frozen=True)
 class Jaws:
-    """What moves: each jaw is driven by `force_n`, moving parts are slowed by viscous damping."""
+    """Moving parts: `force_n` drives each jaw, viscous damping slows jaws and object."""
 
     force_n: float
     jaw_mass_kg: float = 0.3
@@ -99,14 +103,14 @@ class Jaws:
 
 @dataclass(frozen=True)
 class Motion:
-    """The jaws' equation of motion for a state (6,): travels s_a, s_b and shift o in mm, then their rates in mm/s."""
+    """Equation of motion for a state (6,): travels s_a, s_b and shift o in mm, then their rates in mm/s."""
 
     jaws: Jaws
     laws: tuple[ForceLaw, ForceLaw]
     clearance_mm: tuple[float, float] = (0.0, 0.0)
 
     def rate(self, state: Floats) -> tuple[Floats, Floats]:
-        """d state / dt (6,) and its Jacobian (6, 6)."""
+        """Return d state / dt (6,) and its Jacobian (6, 6)."""
         depths = _TRAVEL @ state[:3] - self.clearance_mm
         contacts = [law(float(depth)) for law, depth in zip(self.laws, depths, strict=True)]
         forces, slopes = np.array(contacts).T
@@ -122,21 +126,21 @@ class Motion:
         return np.concatenate([state[3:], acceleration]), jacobian
 
     def contact_forces(self, state: Floats) -> tuple[float, float]:
-        """Of fingers a and b on the object in N."""
+        """Return the forces of fingers a and b on the object in N."""
         depth_a, depth_b = _TRAVEL @ state[:3] - self.clearance_mm
         return self.laws[0](float(depth_a))[0], self.laws[1](float(depth_b))[0]
 
     def step(self, state: Floats, step_s: float) -> Floats | None:
-        """One step of Alexander's method; None if Newton's iteration does not settle."""
+        """Take one step of Alexander's method; return None if Newton's iteration does not converge."""
         first = self._stage(state, _GAMMA * step_s, state)
         if first is None:
             return None
         slope = (first - state) / (_GAMMA * step_s)
         return self._stage(state + (1.0 - _GAMMA) * step_s * slope, _GAMMA * step_s, first)
 
-    def _stage(self, base: Floats, length: float, guess: Floats) -> Floats | None:
-        """y with y = base + length rate(y)."""
-        state = guess
+    def _stage(self, base: Floats, length: float, start: Floats) -> Floats | None:
+        """Return y with y = base + length rate(y)."""
+        state = start
         for _ in range(_NEWTON_STEPS):
             rate, jacobian = self.rate(state)
             change = np.linalg.solve(np.eye(6) - length * jacobian, base + length * rate - state)
@@ -147,7 +151,7 @@ class Motion:
 
 
 def close(motion: Motion, duration_s: float, step_s: float, start: Floats = _START) -> tuple[Floats, Floats]:
-    """Times (n,) in s and states (n, 6) from `start` (default: at rest), n - 1 steps of about `step_s`."""
+    """Return times (n,) in s and states (n, 6) from `start` (default: at rest), n - 1 steps of about `step_s`."""
     times = np.linspace(0.0, duration_s, math.ceil(duration_s / step_s - 1e-9) + 1)
     states = [np.asarray(start, np.float64)]
     for length in np.diff(times):
@@ -156,16 +160,16 @@ def close(motion: Motion, duration_s: float, step_s: float, start: Floats = _STA
 
 
 def _advance(motion: Motion, state: Floats, step_s: float, halvings: int) -> Floats:
-    """One step, in halves where Newton's iteration does not settle (a kink of the force law)."""
+    """Take one step, in halves if Newton's iteration does not converge (a kink of the force law)."""
     reached = motion.step(state, step_s)
     if reached is not None and np.isfinite(reached).all():
         return reached
-    assert halvings > 0, f"the jaws' motion must be solvable, got stuck at {step_s} s; use a smoother force law"
+    assert halvings > 0, f"Newton's iteration does not converge at a step of {step_s} s; use a smoother force law"
     middle = _advance(motion, state, step_s / 2.0, halvings - 1)
     return _advance(motion, middle, step_s / 2.0, halvings - 1)
 
 
 def settle(motion: Motion) -> tuple[float, float]:
-    """Depths of fingers a and b in mm at rest: each carries the commanded force, however stiff."""
+    """Return the depths of fingers a and b in mm at rest: each carries the commanded force, at any stiffness."""
     depth_a, depth_b = (law.depth_at(motion.jaws.force_n) for law in motion.laws)
     return depth_a, depth_b

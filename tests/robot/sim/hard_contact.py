@@ -16,15 +16,15 @@ _CONTACT, _KERNEL, _CLOSING = "contact solver", "layer kernel", "gripper closing
 
 
 def hard_cases() -> Iterator[HardCase]:
-    """Cases of contact and closing, in about ten seconds."""
+    """Yield cases of contact and closing, in about ten seconds."""
     yield _overflow()
     yield _cancellation()
     yield _far_patch()
     yield _one_pixel()
     yield _pin_in_a_plate()
     yield _wrap_around()
-    yield _nothing_there()
-    yield _locked_volume()
+    yield _no_object()
+    yield _incompressible_layer()
     yield _every_scale()
     yield _every_shape()
     yield _stiff_closing()
@@ -34,7 +34,7 @@ def hard_cases() -> Iterator[HardCase]:
 
 
 def naive_symbol(x: Floats, poisson: float) -> Floats:
-    """S as it is printed: overflows for a thick layer, cancels for a thin incompressible one."""
+    """S as printed: overflows for a thick layer, cancels for a thin incompressible one."""
     k = 3.0 - 4.0 * poisson
     rest = 2.0 * x * x + 5.0 - 12.0 * poisson + 8.0 * poisson**2
     return np.asarray((k * np.sinh(2.0 * x) - 2.0 * x) / (k * np.cosh(2.0 * x) + rest))
@@ -85,16 +85,16 @@ def _overflow() -> HardCase:
 def _cancellation() -> HardCase:
     x, exact = np.array([1e-8]), 2.0 / 3.0 * 1e-24
     naive, ours = float(naive_symbol(x, 0.5)[0]), float(layer_symbol(x, 0.5)[0])
-    wanted, near = f"2 x^3/3 = {exact:.6g}", [math.isclose(value, exact) for value in (naive, ours)]
-    return HardCase(_KERNEL, "S(x) at x = 1e-8, nu = .5", wanted, f"{naive:.6g}", f"{ours:.6g}", near[1], near[0])
+    expected, near = f"2 x^3/3 = {exact:.6g}", [math.isclose(value, exact) for value in (naive, ours)]
+    return HardCase(_KERNEL, "S(x) at x = 1e-8, nu = .5", expected, f"{naive:.6g}", f"{ours:.6g}", near[1], near[0])
 
 
 def _far_patch() -> HardCase:
     far, exact = 10_000, 1.0 / (math.pi * 10_000)
     naive, ours = naive_patch(0.0, -far) / exact - 1.0, float(love_patch((far + 1, 1))[far, 0]) / exact - 1.0
     near = [abs(error) < 1e-8 for error in (naive, ours)]
-    case, wanted = "Love's patch, 10,000 pixels away", "1/(pi r) to 1e-8"
-    return HardCase(_KERNEL, case, wanted, f"off by {naive:.1e}", f"{ours:.1e}", near[1], near[0])
+    case, expected = "Love's patch, 10,000 pixels away", "1/(pi r) to 1e-8"
+    return HardCase(_KERNEL, case, expected, f"off by {naive:.1e}", f"{ours:.1e}", near[1], near[0])
 
 
 # Contact ---------------------------------------------------------------------------------------------------
@@ -103,7 +103,7 @@ _SIDE = 32
 
 
 def _squares() -> Floats:
-    """(_SIDE, _SIDE) squared distance from pixel (_SIDE / 2, _SIDE / 2), in pixels."""
+    """Return the squared distance (_SIDE, _SIDE) from pixel (_SIDE / 2, _SIDE / 2), in pixels."""
     across = np.arange(_SIDE) - _SIDE // 2
     return np.asarray(across[:, None] ** 2.0 + across**2.0)
 
@@ -112,7 +112,7 @@ _NAIVE_CAP = 300
 
 
 def _naive(gap: Floats, layer: Layer, force_n: float) -> tuple[str, bool]:
-    """What the unsafeguarded iteration comes to, for a pixel of 1 mm, and whether it ends in numbers."""
+    """Return the outcome of the unsafeguarded iteration for a pixel of 1 mm, and whether it ends in numbers."""
     operator = Operator(influence(gap.shape, layer.thickness_mm, layer.poisson), gap.shape)
     pressure, iterations = naive_solve(operator, gap, force_n / layer.plane_modulus_mpa, _NAIVE_CAP)
     finite = bool(np.isfinite(pressure).all())
@@ -125,7 +125,7 @@ def _outcome(contact: Contact) -> str:
 
 
 def is_finite(contact: Contact) -> bool:
-    """Whether no number of it is NaN or infinite."""
+    """Return whether all its numbers are finite."""
     numbers = (contact.approach_mm, contact.force_n, contact.area_mm2, contact.residual)
     return bool(np.isfinite(contact.pressure_mpa).all() and np.isfinite(contact.displacement_mm).all()) and all(
         math.isfinite(number) for number in numbers
@@ -141,23 +141,23 @@ def _one_pixel() -> HardCase:
     contact = press(gap, 1.0, layer, force_n=force, tolerance=1e-6)
     holds = _solved(contact, force) and "unresolved" in contact.flags
     naive, naive_holds = _naive(gap, layer, force)
-    case, wanted = "ball touching one pixel, nu = .5", "solved, said unresolved"
-    return HardCase(_CONTACT, case, wanted, naive, _outcome(contact), holds, naive_holds)
+    case, expected = "ball touching one pixel, nu = .5", "solved, flagged unresolved"
+    return HardCase(_CONTACT, case, expected, naive, _outcome(contact), holds, naive_holds)
 
 
 def _pin_in_a_plate() -> HardCase:
-    """The pin takes 0.1 N, then the plate around it."""
+    """The pin takes 0.1 N, then the plate around it takes over."""
     layer, gap, force = Layer(0.75, 0.5), np.full((_SIDE, _SIDE), 0.1), 0.1
     gap[_SIDE // 2, _SIDE // 2] = 0.0
     contact = press(gap, 1.0, layer, force_n=force, tolerance=1e-6)
-    wanted = "converges: the plate carries its share"
+    expected = "converges: the plate carries part of the force"
     holds = _solved(contact, force) and contact.area_mm2 > 1.0
     naive, naive_holds = _naive(gap, layer, force)
-    return HardCase(_CONTACT, "pin of one pixel in a plate", wanted, naive, _outcome(contact), holds, naive_holds)
+    return HardCase(_CONTACT, "pin of one pixel in a plate", expected, naive, _outcome(contact), holds, naive_holds)
 
 
 def _wrap_around() -> HardCase:
-    """A half-space's influence falls like 1/r: a periodic grid feels its neighbours."""
+    """A half-space's influence falls like 1/r: on a periodic grid the neighbouring copies have an effect."""
     layer, gap, force = Layer(0.75, 0.5), _squares() / 200.0, 1.0
     depth = hertz(force, 100.0, layer.plane_modulus_mpa)[1]
     errors = [
@@ -168,28 +168,28 @@ def _wrap_around() -> HardCase:
     return HardCase(_CONTACT, "Hertz without padding", "depth to 2 %", naive, ours, near[1], near[0])
 
 
-def _nothing_there() -> HardCase:
+def _no_object() -> HardCase:
     layer, empty = Layer(0.75, 0.5), np.full((_SIDE, _SIDE), np.inf)
     contact, at_rest = press(empty, 1.0, layer, force_n=1.0), press(_squares(), 1.0, layer, force_n=0.0)
     holds = is_finite(contact) and not contact.converged and contact.flags == ("no_contact",)
     holds = holds and at_rest.converged and at_rest.force_n == 0.0
     naive, naive_holds = _naive(empty, layer, 1.0)
-    wanted = "no pressure, not converged"
-    return HardCase(_CONTACT, "no object, 1 N", wanted, naive, _outcome(contact), holds, naive_holds)
+    expected = "no pressure, not converged"
+    return HardCase(_CONTACT, "no object, 1 N", expected, naive, _outcome(contact), holds, naive_holds)
 
 
-def _locked_volume() -> HardCase:
-    """An incompressible periodic layer keeps its volume: it cannot be pressed by a plane."""
+def _incompressible_layer() -> HardCase:
+    """An incompressible periodic layer keeps its volume: a plane cannot press into it."""
     layer = Layer(0.75, 0.5, 2.0)
     contact = press(np.zeros((_SIDE, _SIDE)), 1.0, layer, depth_mm=0.1, padded=False)
     holds = is_finite(contact) and not contact.converged and contact.flags == ("rigid_volume",)
     naive = float(np.divide(0.1, layer_compliance(np.zeros(1), layer.thickness_mm, 0.5)[0]))
-    case, said = "plane on a periodic layer, nu = .5, to a depth", f"{naive} E*/mm"
-    return HardCase(_CONTACT, case, "refused", said, _outcome(contact), holds, math.isfinite(naive))
+    case, naive_text = "plane on a periodic layer, nu = .5, to a depth", f"{naive} E*/mm"
+    return HardCase(_CONTACT, case, "refused", naive_text, _outcome(contact), holds, math.isfinite(naive))
 
 
 def _every_scale() -> HardCase:
-    """E 1e3 to 1e12 Pa, force 1e-6 to 1e4 N, radius 1e-6 to 1e3 m, on a fixed grid and on one that fits."""
+    """E 1e3 to 1e12 Pa, force 1e-6 to 1e4 N, radius 1e-6 to 1e3 m, on a fixed grid and on one that fits the contact."""
     wrong, count, flagged = 0, 0, 0
     scales = itertools.product(10.0 ** np.arange(-3, 7, 3), 10.0 ** np.arange(-6, 5, 2), 10.0 ** np.arange(-3, 7, 3))
     for modulus, force, radius in scales:
@@ -201,14 +201,14 @@ def _every_scale() -> HardCase:
             exact = math.isclose(contact.approach_mm, depth, rel_tol=0.05)
             count, flagged = count + 1, flagged + (not trusted)
             wrong += not _solved(contact, force) or (trusted and not exact)
-    wanted = "converged; depth within 5 % of Hertz or flagged"
+    expected = "converged; depth within 5 % of Hertz or flagged"
     ours = f"{count - wrong} of {count} right, {flagged} of them flagged"
     naive, naive_holds = _naive_at_every_scale()
-    return HardCase(_CONTACT, "ball at every scale", wanted, naive, ours, wrong == 0, naive_holds)
+    return HardCase(_CONTACT, "ball at every scale", expected, naive, ours, wrong == 0, naive_holds)
 
 
 def _naive_at_every_scale() -> tuple[str, bool]:
-    """A ball of 1 m on 0.3 MPa by the unsafeguarded iteration, which carries no flags: how often its depth is right."""
+    """Count correct depths of the unsafeguarded iteration, which has no flags, for a ball of 1 m on 0.3 MPa."""
     forces, modulus, radius = 10.0 ** np.arange(-6, 5, 2), 0.3 / 0.75, 1e3
     gap, right = _squares() * (0.1 * 0.1 / radius / 2.0), 0
     operator = Operator(influence(gap.shape, math.inf, 0.5), gap.shape)
@@ -220,7 +220,7 @@ def _naive_at_every_scale() -> tuple[str, bool]:
 
 
 def hard_gaps() -> dict[str, Floats]:
-    """Height maps that are hard, in pixels of 1 mm."""
+    """Return hard height maps, in pixels of 1 mm."""
     squares, plane = _squares(), np.zeros((_SIDE, _SIDE))
     y, x = np.indices(plane.shape) - _SIDE / 2.0
     pin, alone, islands = plane + 1.0, plane + np.inf, plane + np.inf
@@ -248,7 +248,7 @@ def hard_gaps() -> dict[str, Floats]:
 
 
 def hard_layers() -> tuple[Layer, ...]:
-    """The half-space, layers thick and thin, compressible and not."""
+    """Return the half-space and layers thick and thin, compressible and not."""
     kinds = (
         (0.5, math.inf),
         (0.48, math.inf),
@@ -268,17 +268,17 @@ def _every_shape() -> HardCase:
         for force in (1e-6, 1e-2, 1.0, 40.0, 1e4):
             contact = press(gap, 1.0, layer, force_n=force)
             count, wrong = count + 1, wrong + (not _solved(contact, force))
-    wanted = "converged, nothing NaN, the force carried"
+    expected = "converged, nothing NaN, the force carried"
     solved = [_naive(gap, hard_layers()[0], 1.0)[1] for gap in hard_gaps().values()]
     naive, ours = f"{sum(solved)} of {len(solved)} on the half-space, 1 N", f"{count - wrong} of {count}"
-    return HardCase(_CONTACT, "hard shapes on hard layers", wanted, naive, ours, wrong == 0, all(solved))
+    return HardCase(_CONTACT, "hard shapes on hard layers", expected, naive, ours, wrong == 0, all(solved))
 
 
 # Closing ---------------------------------------------------------------------------------------------------
 
 
 def naive_close(motion: Motion, duration_s: float, step_s: float) -> Floats:
-    """The state (6,) at the end by explicit Euler: blows up unless the step follows the contact's oscillation."""
+    """Return the end state (6,) by explicit Euler: it diverges unless the step resolves the contact's oscillation."""
     state = np.zeros(6)
     for _ in range(round(duration_s / step_s)):
         state = state + step_s * motion.rate(state)[0]

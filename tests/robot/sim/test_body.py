@@ -1,4 +1,4 @@
-"""Casting and normals against closed forms, a slow march that misses nothing, and the contract of every body."""
+"""Casting and normals against closed forms and a slow march that misses nothing; the contract of every body."""
 
 import pickle
 
@@ -35,7 +35,7 @@ def unit(vectors):
 
 
 def random_rays(body, count, seed=0, level=False):
-    """Rays from far away to places in the bounding box."""
+    """Return rays from far away to places in the bounding box."""
     rng = np.random.default_rng(seed)
     directions = rng.standard_normal((count, 3)) * ([1, 1, 0] if level else [1, 1, 1])
     directions = unit(directions)
@@ -43,7 +43,7 @@ def random_rays(body, count, seed=0, level=False):
 
 
 def wall_rays(body, rows=24, columns=32, z=40.0, pitch=0.5):
-    """Parallel rays from the front."""
+    """Return parallel rays from the front."""
     x, up = np.meshgrid((np.arange(columns) - columns / 2) * pitch, z + (np.arange(rows) - rows / 2) * pitch)
     origins = np.stack([x, np.full_like(x, body.lower[1] - 7.3), up], axis=-1).reshape(-1, 3)
     return origins, np.broadcast_to([0.0, 1.0, 0.0], origins.shape)
@@ -52,7 +52,7 @@ def wall_rays(body, rows=24, columns=32, z=40.0, pitch=0.5):
 # Closed forms ----------------------------------------------------------------------------------------------
 
 
-def test_rays_meet_a_sphere_where_the_quadratic_says():
+def test_rays_meet_a_sphere_at_the_root_of_the_quadratic():
     body = ball()
     origins, directions = random_rays(body, 3000)
     offset = origins - [0, 0, 25]
@@ -79,7 +79,7 @@ def test_rays_from_above_meet_the_lid():
     np.testing.assert_allclose(found, [220, 1, np.inf], atol=ATOL)
 
 
-def test_a_ray_that_looks_away_or_passes_by_misses():
+def test_a_ray_that_points_away_or_passes_by_misses():
     found = can().cast(
         np.array([[50.0, 0, 40], [50, 0, 40], [0, -60, 90]]), np.array([[1.0, 0, 0], [0, 1, 0], [0, 1, 0]])
     )
@@ -143,7 +143,7 @@ def test_ribs_on_a_flat_wall_have_the_height_and_slope_of_a_cosine():
     np.testing.assert_allclose(normals[:, 2] / -normals[:, 1], -slope, atol=0.03)
 
 
-# Nothing is stepped through --------------------------------------------------------------------------------
+# No step passes through a surface --------------------------------------------------------------------------
 
 
 def slow_first_hits(body, origins, directions, step=0.02):
@@ -191,7 +191,7 @@ def test_sphere_tracing_without_the_slope_of_the_relief_passes_through_it():
         f = float(body.field(*np.float32(start + t * direction)[:, None])[0])
         if f < 0.01:
             break
-        t += 2 * f  # the over-long step of a march that trusts a displaced field
+        t += 2 * f  # too long: the displaced field is not a distance
     naive_inside = f < -0.05
     found = body.cast(start[None], direction[None])[0]
     assert abs(found - exact) < 0.05
@@ -206,7 +206,7 @@ def test_casting_agrees_with_a_slow_march(index):
     hit = np.isfinite(exact) & np.isfinite(found)
     agree = np.isinf(exact) & np.isinf(found)
     agree[hit] = np.abs(exact[hit] - found[hit]) < 0.05
-    # A ray that grazes a crest by less than the stride of 0.05 mm may pass over it.
+    # A ray that grazes a crest by less than the stride of 0.05 mm may miss it.
     assert agree.mean() >= 0.98
 
 
@@ -227,7 +227,7 @@ def test_the_slope_of_a_level_bounds_how_fast_its_field_changes(index):
 
 @pytest.mark.parametrize("family", SHAPES)
 @pytest.mark.parametrize("relief", ["knurl", "glyphs"])
-def test_every_family_is_met_on_its_surface_and_within_its_bounds(family, relief):
+def test_rays_meet_every_family_on_its_surface_within_its_bounds(family, relief):
     body = draw_object(1, 7, family=family, relief=relief).body
     origins, directions = random_rays(body, 1200)
     t = body.cast(origins, directions)
@@ -237,7 +237,7 @@ def test_every_family_is_met_on_its_surface_and_within_its_bounds(family, relief
     assert (points >= body.lower - 1e-3).all()
     assert (points <= body.upper + 1e-3).all()
     inner = ((points > body.lower + 0.05) & (points < body.upper - 0.05)).all(axis=1)
-    # Off the box's faces, as a ray that enters through one may start on the surface. Within a corner, behind a
+    # Not on the box's faces: a ray that enters through one may start on the surface. Inside a corner, behind a
     # bracket's web, relief of two sides may meet in a step, where f jumps over 0.
     assert np.mean(np.abs(body.field(*np.float32(points[inner].T))) < 0.02) > 0.995
     normals = body.normals(points)
@@ -269,7 +269,7 @@ def test_every_relief_changes_the_gap_of_a_can(relief):
         assert 0.3 * body.relief.amplitude_mm < lifted < 1.4 * body.relief.amplitude_mm
 
 
-def test_a_ray_hits_the_same_whatever_is_cast_with_it():
+def test_a_hit_does_not_depend_on_the_other_rays():
     body = draw_object(0, 14).body
     origins, directions = random_rays(body, 4000)
     together = body.cast(origins, directions)
@@ -277,7 +277,7 @@ def test_a_ray_hits_the_same_whatever_is_cast_with_it():
     np.testing.assert_allclose(apart, together, atol=1e-5)
 
 
-def test_a_camera_that_asks_for_less_detail_gets_nearly_the_same():
+def test_less_detail_gives_nearly_the_same_distances():
     body = can(Relief("knurl", 0.5, 4.0))
     origins, directions = wall_rays(body, pitch=0.6)
     fine, coarse = body.cast(origins, directions), body.cast(origins, directions, step_mm=0.6)
@@ -287,7 +287,7 @@ def test_a_camera_that_asks_for_less_detail_gets_nearly_the_same():
     assert body.wall.level(0.1).pixel_mm >= MIN_PIXEL_MM * 0.99
 
 
-def test_normals_over_a_pixel_are_calmer_than_those_of_the_gel():
+def test_normals_over_a_pixel_are_smoother_than_those_of_the_gel():
     body = can(Relief("ribs", 0.3, 1.5, angle_rad=np.pi / 2))
     origins, directions = wall_rays(body, rows=50, columns=4, pitch=0.13)
     points = origins + body.cast(origins, directions)[:, None] * directions
@@ -298,12 +298,12 @@ def test_normals_over_a_pixel_are_calmer_than_those_of_the_gel():
 
 def test_relief_fades_before_the_edges():
     """The foot and the lid of a ribbed can are as round as those of a smooth one."""
-    body, bare = can(Relief("ribs", 2.0, 9.0, angle_rad=0.0)), can()
+    body, smooth = can(Relief("ribs", 2.0, 9.0, angle_rad=0.0)), can()
     angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
     directions = -np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     for z in (0.1, 79.9):
         origins = -60 * directions + [0, 0, z]
-        np.testing.assert_allclose(body.cast(origins, directions), bare.cast(origins, directions), atol=0.02)
+        np.testing.assert_allclose(body.cast(origins, directions), smooth.cast(origins, directions), atol=0.02)
     middle = body.cast(-60 * directions + [0, 0, 40], directions)
     assert np.ptp(middle) > 1.5
 
@@ -312,7 +312,7 @@ def test_relief_fades_before_the_edges():
 
 
 @pytest.mark.parametrize(
-    ("origins", "directions", "says"),
+    ("origins", "directions", "message"),
     [
         (np.zeros((3, 3)), np.ones((3, 3)), "unit length"),
         (np.zeros((3, 3)), np.full((3, 3), np.nan), "unit length"),
@@ -323,19 +323,19 @@ def test_relief_fades_before_the_edges():
         (np.zeros(3), np.array([1.0, 0, 0]), r"shape \(N, 3\)"),
     ],
 )
-def test_wrong_rays_are_refused(origins, directions, says):
-    with pytest.raises(SceneError, match=says):
+def test_wrong_rays_are_refused(origins, directions, message):
+    with pytest.raises(SceneError, match=message):
         can().cast(origins, directions)
 
 
-def test_wrong_points_are_refused_and_none_are_fine():
+def test_wrong_points_are_refused_and_no_points_are_accepted():
     with pytest.raises(SceneError, match="points"):
         can().normals(np.zeros(3))
     assert can().cast(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
     assert can().normals(np.zeros((0, 3))).shape == (0, 3)
 
 
-def test_a_body_travels_without_its_bitmap():
+def test_a_pickled_body_has_no_bitmap():
     body = can(Relief("pebble", 0.8, 5.0, seed=2))
     origins, directions = wall_rays(body)
     expected = body.cast(origins, directions)

@@ -1,4 +1,4 @@
-"""The camera sees what stands on the table, where geometry says it must."""
+"""Photo and depth agree with the geometry of the scene on the table."""
 
 import dataclasses
 import math
@@ -37,7 +37,7 @@ def test_each_ray_goes_through_the_centre_of_its_pixel():
     assert (x, y) == pytest.approx((201, 37), abs=1e-6)
 
 
-def test_the_object_is_seen_where_it_stands():
+def test_the_object_appears_at_its_projected_position():
     view = cast_camera_rays(POST, Placement(30.0, -10.0, 0.4), CAMERA)
     middle = project(CAMERA, (30.0, -10.0, HEIGHT_MM / 2)).round().astype(int)
     mask = view.is_object.reshape(CAMERA.px, CAMERA.px)
@@ -49,7 +49,7 @@ def test_the_object_is_seen_where_it_stands():
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_casting_only_the_rays_near_the_object_leaves_nothing_of_it_out(index):
+def test_casting_only_the_rays_near_the_object_gives_the_whole_object(index):
     obj, place = draw_object(0, index), Placement(12.0, -9.0, 0.3 + index)
     view, rays = cast_camera_rays(obj, place, CAMERA), CAMERA.rays
     origins = np.broadcast_to(place.to_object(np.array([CAMERA.position_mm])), rays.shape)
@@ -61,7 +61,7 @@ def test_casting_only_the_rays_near_the_object_leaves_nothing_of_it_out(index):
 
 
 @pytest.mark.parametrize("index", range(4))
-def test_casting_only_the_shadow_rays_near_the_object_leaves_no_shadow_out(index):
+def test_casting_only_the_shadow_rays_near_the_object_gives_the_whole_shadow(index):
     obj, place = draw_object(0, index), Placement(12.0, -9.0, 0.3 + index)
     light = np.asarray(Lighting.draw(np.random.default_rng(index)).direction)
     view = cast_camera_rays(obj, place, CAMERA)
@@ -72,13 +72,15 @@ def test_casting_only_the_shadow_rays_near_the_object_leaves_no_shadow_out(index
     assert len(dark) > 50
     assert set(dark) <= set(near)
     assert len(near) < 0.7 * len(table)
-    assert not len(cameras.shadow_pixels(view, np.array([0.6, 0.8, 0.0])))  # nor does a lamp on the horizon light it
+    assert not len(
+        cameras.shadow_pixels(view, np.array([0.6, 0.8, 0.0]))
+    )  # a lamp on the horizon does not light the table
 
 
-def test_a_thing_that_reaches_behind_the_camera_may_be_anywhere_in_the_picture():
+def test_a_body_partly_behind_the_camera_may_be_anywhere_in_the_picture():
     pixels = CAMERA.pixels_around(np.array([[0.0, 0, 0], [0, -900, 800]]))
     np.testing.assert_array_equal(pixels, np.arange(CAMERA.px**2))
-    assert len(CAMERA.pixels_around(np.array([[5e3, 0, 80.0], [6e3, 0, 80]]))) == 0  # beside the picture
+    assert len(CAMERA.pixels_around(np.array([[5e3, 0, 80.0], [6e3, 0, 80]]))) == 0  # outside the picture
 
 
 def test_depth_of_the_bare_table_is_the_distance_of_its_plane_along_the_axis():
@@ -101,9 +103,9 @@ def test_depth_has_holes_flying_pixels_and_whole_millimetres():
     np.testing.assert_allclose(known, np.round(known), atol=1e-3)
     assert 0.001 < np.isnan(depth).mean() < 0.2
     exact = (view.distance_mm * (CAMERA.rays @ CAMERA.to_rig[:3, 2])).reshape(depth.shape)
-    away = np.abs(depth * 1000.0 - exact)
-    assert np.nanmedian(away) < 2
-    assert np.nanmax(away) > 10  # pixels that fly between the object and what is behind it
+    error_mm = np.abs(depth * 1000.0 - exact)
+    assert np.nanmedian(error_mm) < 2
+    assert np.nanmax(error_mm) > 10  # flying pixels between the object and its background
 
 
 def test_the_shadow_darkens_the_table_on_the_side_away_from_the_lamp():
@@ -153,11 +155,11 @@ def test_relief_that_is_large_enough_for_the_pixels_shows():
         {"position_mm": (0.0, math.nan, 500.0)},
     ],
 )
-def test_a_camera_that_cannot_be_is_refused(settings):
+def test_an_impossible_camera_is_refused(settings):
     with pytest.raises(SceneError):
         PinholeCamera(**settings)
 
 
-def test_a_camera_that_sees_past_the_table_is_refused():
-    with pytest.raises(SceneError, match="nothing but the table"):
+def test_a_camera_with_the_horizon_in_its_picture_is_refused():
+    with pytest.raises(SceneError, match="every pixel of the camera must meet the table"):
         cast_camera_rays(POST, Placement(), PinholeCamera(position_mm=(0.0, -560.0, 80.0)))

@@ -1,4 +1,4 @@
-"""Jaws that close on an object: closed forms, order of the method, and where an explicit method blows up."""
+"""Jaws that close on an object: closed forms, order of the method, and an explicit method that diverges."""
 
 import math
 
@@ -19,7 +19,7 @@ from tests.robot.sim.closing_jaws import (
 
 
 def spring_closing(jaws, stiffness_n_mm, times_s):
-    """Travel in mm of a jaw that starts at rest on a spring: m s'' + c s' + k s = F, underdamped."""
+    """Return the travel in mm of a jaw that starts at rest on a spring: m s'' + c s' + k s = F, underdamped."""
     mass = jaws.jaw_mass_kg / 1e3
     decay = jaws.jaw_damping_n_s_mm / (2.0 * mass)
     turn = math.sqrt(stiffness_n_mm / mass - decay**2)
@@ -74,7 +74,7 @@ def test_every_stiffness_ends_at_the_commanded_force_in_steps_of_ten_millisecond
 
 
 def test_a_fast_oscillation_dies_out_within_long_steps():
-    # 1e9 N/m, started 1 um too deep at both fingers: a thousand newton too much, gone after ten steps of 10 ms.
+    # 1e9 N/m, started 1 um too deep at both fingers: an excess of 1000 N decays in ten steps of 10 ms.
     motion = on_springs(1e6)
     start = np.array([1e-3 + 2e-5, 1e-3 + 2e-5, 0.0, 0.0, 0.0, 0.0])
     _, states = close(motion, 0.1, 1e-2, start)
@@ -92,8 +92,8 @@ def test_at_rest_each_finger_carries_the_force(stiffness_n_mm):
 # Force laws ------------------------------------------------------------------------------------------------
 
 
-def test_the_rig_shows_the_gels_where_closing_jaws_come_to_rest():
-    """The rig presses with the commanded force at once; the way there changes nothing of what it records."""
+def test_the_rig_shows_the_gels_at_the_rest_position_of_closing_jaws():
+    """The rig presses with the commanded force at once; the closing motion does not change the recording."""
     with SimRig(4, families=["cylinder"]) as rig:
         rig.prepare(rig.object_ids(1)[0], 0)
         at = rig.sim_state.scene.placement
@@ -114,10 +114,10 @@ def test_the_rig_shows_the_gels_where_closing_jaws_come_to_rest():
     _, states = close(motion, 2.0, 0.01)
     assert motion.contact_forces(states[-1]) == pytest.approx((12.0, 12.0), abs=1e-3)
     depths = np.array([[1.0, 0.0, -1.0], [0.0, 1.0, 1.0]]) @ states[-1][:3]
-    assert depths == pytest.approx([one.approach_mm for one in pressed], rel=0.01)  # of the table's interpolation
+    assert depths == pytest.approx([one.approach_mm for one in pressed], rel=0.01)  # error of the table's interpolation
 
 
-def test_a_pressed_law_is_the_solver_s_force_at_each_depth_of_its_table_and_near_between():
+def test_a_press_law_matches_the_solver_at_and_between_the_depths_of_its_table():
     gap = (np.arange(-20.0, 21.0)[:, None] ** 2 + np.arange(-20.0, 21.0) ** 2) * 0.15**2 / 8.0 + 3.0
     layer = Layer(0.2, 0.48, 2.0)
     law = press_law(gap, 0.15, layer, 0.8)

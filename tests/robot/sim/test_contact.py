@@ -24,7 +24,7 @@ def bowl(rows=40, cols=48, radius=4.0, pixel=PIXEL):
 
 
 def matrix(layer, shape, pixel):
-    """Displacement of each pixel (mm) by unit pressure (MPa) on each other one, entry by entry."""
+    """Return the displacement of each pixel (mm) by unit pressure (MPa) on each other one, entry by entry."""
     table = influence(shape, layer.thickness_mm / pixel, layer.poisson) * pixel / layer.plane_modulus_mpa
     cells = [(i, j) for i in range(shape[0]) for j in range(shape[1])]
     return np.array([[table[abs(i - k), abs(j - m)] for i, j in cells] for k, m in cells])
@@ -38,7 +38,7 @@ def table():
     return closed_form_table()
 
 
-def test_the_solver_is_within_the_prototype_s_error_of_every_closed_form(table):
+def test_the_solver_is_within_the_tolerance_of_every_closed_form(table):
     assert [f"{check.case}, {check.quantity}, {check.grid}: {check.error}" for check in table if not check.holds] == []
 
 
@@ -62,18 +62,18 @@ def test_errors_fall_with_the_grid(table):
 @pytest.mark.parametrize("layer", [HALF_SPACE, GEL, Layer(0.2, 0.5, 0.3), Layer(0.2, 0.0, 0.05), Layer(5.0, 0.3, 1.0)])
 @pytest.mark.parametrize("kind", ["ball", "rough", "holes"])
 def test_pressure_is_that_of_an_active_set_method(layer, kind):
-    # min 1/2 p.K p + p.(gap - d), p >= 0, is the least squares problem of K's Cholesky factor.
+    # min 1/2 p.K p + p.(gap - d), p >= 0, is a least squares problem with K's Cholesky factor.
     shape, depth = (9, 8), 0.1
     rough = np.random.default_rng([5]).random(shape) * 0.2
     gap = {"ball": bowl(*shape, radius=1.0), "rough": rough, "holes": np.where(rough > 0.1, np.inf, rough)}[kind]
-    there = np.isfinite(gap).ravel()
-    factor = np.linalg.cholesky(matrix(layer, shape, PIXEL)[np.ix_(there, there)])
-    wanted = np.zeros(gap.size)
-    wanted[there] = nnls(factor.T, np.linalg.solve(factor, depth - gap.ravel()[there]))[0]
+    has_object = np.isfinite(gap).ravel()
+    factor = np.linalg.cholesky(matrix(layer, shape, PIXEL)[np.ix_(has_object, has_object)])
+    expected = np.zeros(gap.size)
+    expected[has_object] = nnls(factor.T, np.linalg.solve(factor, depth - gap.ravel()[has_object]))[0]
     contact = press(gap, PIXEL, layer, depth_mm=depth, tolerance=1e-9)
     assert contact.converged
-    assert contact.pressure_mpa.ravel() == pytest.approx(wanted, abs=1e-6 * wanted.max())  # K's condition, 1e3
-    assert contact.force_n == pytest.approx(wanted.sum() * PIXEL**2, rel=1e-8)
+    assert contact.pressure_mpa.ravel() == pytest.approx(expected, abs=1e-6 * expected.max())  # K has condition 1e3
+    assert contact.force_n == pytest.approx(expected.sum() * PIXEL**2, rel=1e-8)
 
 
 @pytest.mark.parametrize("layer", [HALF_SPACE, GEL, Layer(0.2, 0.5, 0.3)])
@@ -93,10 +93,10 @@ def test_displacement_is_the_influence_of_the_pressure():
     assert contact.displacement_mm.ravel() == pytest.approx(exact, rel=1e-10)
 
 
-# CoarseScorer grid and window ------------------------------------------------------------------------------------
+# Coarse grid and window ------------------------------------------------------------------------------------
 
 
-def test_starting_from_a_coarse_grid_changes_nothing_but_the_time(monkeypatch):
+def test_a_start_from_a_coarse_grid_does_not_change_the_result(monkeypatch):
     gap = bowl(61, 83) + 0.02 * np.random.default_rng([6]).random((61, 83))
     nested = press(gap, PIXEL, GEL, force_n=0.5, tolerance=1e-8)
     monkeypatch.setattr(pressing, "_MIN_NESTED_PIXELS", 1000)
@@ -111,12 +111,12 @@ def test_only_a_window_around_the_contact_is_iterated_on(monkeypatch):
     monkeypatch.setattr(kernels.Operator, "__call__", lambda self, p: sizes.append(p.shape) or original(self, p))
     contact = press(bowl(120, 160), PIXEL, GEL, force_n=0.05)
     assert contact.converged
-    assert sizes.count((120, 160)) == 1  # one look at the whole field, for the answer
+    assert sizes.count((120, 160)) == 1  # one check of the whole field at the end
     assert max(rows for rows, cols in sizes if (rows, cols) != (120, 160)) <= 45
 
 
-def test_what_the_coarse_grid_does_not_see_is_found():
-    # A needle of one pixel is 1/16 of its coarse pixel: the mean says it is far away.
+def test_a_needle_missed_by_the_coarse_grid_is_found():
+    # A needle of one pixel is 1/16 of its coarse pixel: in the mean it is far away.
     gap = bowl(64, 64)
     gap[5, 60] = -0.05
     contact = press(gap, PIXEL, GEL, force_n=0.2, tolerance=1e-6)
@@ -160,9 +160,9 @@ def test_two_half_spaces_touch_like_one_of_the_composite_modulus():
     rigid = press(bowl(), PIXEL, Layer(composite, 0.0), force_n=0.3)
     assert soft.pressure_mpa == pytest.approx(rigid.pressure_mpa, rel=1e-9)
     assert soft.approach_mm == pytest.approx(rigid.approach_mm, rel=1e-9)
-    # The gel's share of the displacement is its share of the compliance.
-    share = composite * (1.0 - 0.48**2) / 0.2
-    assert soft.displacement_mm == pytest.approx(share * rigid.displacement_mm, rel=1e-9)
+    # The gel's part of the displacement is its part of the compliance.
+    fraction = composite * (1.0 - 0.48**2) / 0.2
+    assert soft.displacement_mm == pytest.approx(fraction * rigid.displacement_mm, rel=1e-9)
 
 
 def test_a_softer_object_touches_more_and_indents_less():
@@ -173,7 +173,7 @@ def test_a_softer_object_touches_more_and_indents_less():
     assert presses[2].displacement_mm == pytest.approx(presses[3].displacement_mm, rel=1e-4)
 
 
-def test_a_rigid_object_costs_no_operator_of_its_own(monkeypatch):
+def test_a_rigid_object_needs_no_separate_operator(monkeypatch):
     made = []
     original = pressing._operator
     monkeypatch.setattr(pressing, "_operator", lambda *key: made.append(key[2]) or original(*key))
@@ -208,7 +208,7 @@ def test_a_resolved_light_press_has_no_flags():
         ("no_contact", bowl(), {"depth_mm": -1.0}),
     ],
 )
-def test_what_must_be_known_is_flagged(flag, gap, options):
+def test_untrustworthy_results_are_flagged(flag, gap, options):
     contact = press(gap, PIXEL, GEL, **options)
     assert contact.converged
     assert flag in contact.flags
@@ -227,7 +227,7 @@ def test_early_stop_is_flagged_and_carries_the_force():
     assert contact.force_n == pytest.approx(0.3, rel=1e-12)
 
 
-def test_an_empty_map_carries_no_force_and_says_so():
+def test_an_empty_map_carries_no_force_and_is_flagged():
     contact = press(np.full((6, 7), np.inf), PIXEL, GEL, force_n=1.0)
     assert (contact.converged, contact.flags, contact.force_n, contact.approach_mm) == (
         False,
@@ -271,8 +271,8 @@ def test_a_plane_on_an_incompressible_periodic_layer_cannot_go_deeper():
         ({"force_n": None}, SceneError, "a force or a depth, got None N and None mm; give one"),
         ({"depth_mm": 1.0}, SceneError, "a force or a depth, got 1.0 N and 1.0 mm; give one"),
         ({"force_n": None, "depth_mm": math.nan}, SceneError, "depth must be finite, got nan"),
-        ({"force_n": 1e-300}, SceneError, "units that agree"),
-        ({"force_n": 1e300}, SceneError, "units that agree"),
+        ({"force_n": 1e-300}, SceneError, "consistent units"),
+        ({"force_n": 1e300}, SceneError, "consistent units"),
         ({"pixel_mm": 0.0}, RobotConfigError, "above 0 and finite, got 0.0"),
         ({"pixel_mm": math.nan}, RobotConfigError, "above 0 and finite, got nan"),
         ({"pixel_mm": math.inf}, RobotConfigError, "above 0 and finite, got inf"),
@@ -283,7 +283,7 @@ def test_a_plane_on_an_incompressible_periodic_layer_cannot_go_deeper():
         ({"object_poisson": -1.0}, RobotConfigError, "an object's Poisson's ratio must be in \\(-1, 0.5\\], got -1.0"),
     ],
 )
-def test_wrong_input_is_refused_with_what_to_do(change, error, message):
+def test_wrong_input_is_refused_with_a_message(change, error, message):
     settings = {"gap_mm": bowl(4, 4), "pixel_mm": PIXEL, "layer": GEL, "force_n": 1.0, **change}
     with pytest.raises(error, match=message):
         press(settings.pop("gap_mm"), settings.pop("pixel_mm"), settings.pop("layer"), **settings)
@@ -297,10 +297,10 @@ def test_wrong_input_is_refused_with_what_to_do(change, error, message):
         ({"modulus_mpa": math.inf}, "must be finite, got inf"),
         ({"modulus_mpa": 0.2, "poisson": 0.51}, "in \\(-1, 0.5\\], got 0.51"),
         ({"modulus_mpa": 0.2, "poisson": math.nan}, "in \\(-1, 0.5\\], got nan"),
-        ({"modulus_mpa": 0.2, "thickness_mm": 0.0}, "thickness must be above 0 mm, got 0.0"),
-        ({"modulus_mpa": 0.2, "thickness_mm": math.nan}, "thickness must be above 0 mm, got nan"),
+        ({"modulus_mpa": 0.2, "thickness_mm": 0.0}, "thickness must be above 0 mm .*, got 0.0"),
+        ({"modulus_mpa": 0.2, "thickness_mm": math.nan}, "thickness must be above 0 mm .*, got nan"),
     ],
 )
-def test_a_layer_that_cannot_be_is_refused(options, message):
+def test_an_impossible_layer_is_refused(options, message):
     with pytest.raises(RobotConfigError, match=message):
         Layer(**options)

@@ -13,11 +13,11 @@ from robot.sim.contact.kernels import Operator, influence, periodic_influence
 from robot.sim.contact.layer import SINGLE_PRECISION_TOLERANCE, Layer, press
 from tests.robot.sim.hard_contact import hard_gaps, hard_layers, is_finite, naive_solve
 
-# Contact conditions, checked apart from the solver ---------------------------------------------------------
+# Contact conditions, checked independently of the solver ---------------------------------------------------
 
 
 def conditions(gap, layer, contact, padded):
-    """Relative errors: of s = 0 in the contact, of s >= 0 outside, of p >= 0, with u from the whole grid's operator."""
+    """Return relative errors of s = 0 in the contact, s >= 0 outside and p >= 0, with u on the whole grid."""
     thickness = layer.thickness_mm  # pixels of 1 mm
     table = influence(gap.shape, thickness, layer.poisson)
     if not padded:
@@ -29,12 +29,12 @@ def conditions(gap, layer, contact, padded):
     rounding = 1e-12 * operator.bound * contact.pressure_mpa.max() / layer.plane_modulus_mpa
     scale = max(np.abs(displacement).max(), rounding) or 1.0
     inside = math.sqrt(float(np.mean(distance[touching] ** 2))) if touching.any() else 0.0
-    beside = -float(distance[~touching].min(initial=0.0))
-    return inside / scale, beside / scale, -float(contact.pressure_mpa.min())
+    outside = -float(distance[~touching].min(initial=0.0))
+    return inside / scale, outside / scale, -float(contact.pressure_mpa.min())
 
 
 @pytest.mark.parametrize("name", hard_gaps())
-def test_hard_shapes_meet_them_with_products_in_float32_as_far_as_the_tolerance_asks(name):
+def test_hard_shapes_meet_the_conditions_to_the_tolerance_with_float32_products(name):
     gap, rough = hard_gaps()[name], 2 * SINGLE_PRECISION_TOLERANCE
     for layer, force in itertools.product(hard_layers(), (1e-6, 0.1, 1e4)):
         contact = press(gap, 1.0, layer, force_n=force, tolerance=rough)
@@ -54,7 +54,7 @@ def test_hard_shapes_meet_the_contact_conditions(name, padded):
         assert is_finite(contact)
         assert contact.converged
         assert contact.force_n == pytest.approx(force, rel=1e-9)
-        # Gap and approach of meters cancel to what is left of their rounding.
+        # The difference of gap and approach, both metres, has a rounding error.
         rounding = 1e-13 * abs(contact.approach_mm) / max(contact.displacement_mm.max(), 1e-300)
         assert max(conditions(gap, layer, contact, padded)) <= 1e-5 + rounding
 
@@ -80,14 +80,14 @@ def test_every_depth_is_reached(name, depth):
         assert max(conditions(hard_gaps()[name], layer, contact, True)) <= 1e-5
 
 
-def test_what_is_farther_than_numbers_can_tell_is_not_there():
-    """Means over blocks and steps down the gradient overflow among gaps of 1e300 mm."""
+def test_gaps_too_large_for_float64_are_treated_as_infinite():
+    """Block means and gradient steps overflow with gaps of 1e300 mm."""
     far = np.random.default_rng(0).random((60, 50)) < 0.5
     layer = Layer(0.3, 0.5, 1e-6)
     with np.errstate(all="raise", under="ignore"):
-        contact, bare = (press(np.where(far, gap, 0.0), 0.1, layer, force_n=10.0) for gap in (1e300, math.inf))
+        contact, infinite = (press(np.where(far, gap, 0.0), 0.1, layer, force_n=10.0) for gap in (1e300, math.inf))
     assert contact.converged
-    assert np.array_equal(contact.pressure_mpa, bare.pressure_mpa)
+    assert np.array_equal(contact.pressure_mpa, infinite.pressure_mpa)
 
 
 @settings(max_examples=60)
@@ -108,10 +108,10 @@ def test_any_small_map_is_solved(data):
         assert max(conditions(gap, layer, contact, padded)) <= 2e-4
 
 
-# The pin that gives way ------------------------------------------------------------------------------------
+# A pin that yields -----------------------------------------------------------------------------------------
 
 
-def test_a_pin_in_a_plate_shares_the_force_as_two_pressures_can_be_found_by_hand():
+def test_a_pin_and_its_plate_carry_the_pressures_computed_by_hand():
     # Two pixels, the pin and one neighbour: K [p, q] + [0, g] = d [1, 1], p + q = F.
     layer, force, step = Layer(0.75, 0.5), 1.0, 0.1
     own, other = influence((1, 2), math.inf, 0.5)[0]
@@ -122,7 +122,7 @@ def test_a_pin_in_a_plate_shares_the_force_as_two_pressures_can_be_found_by_hand
     assert contact.approach_mm == pytest.approx(own * contact.pressure_mpa[0, 0] + other * contact.pressure_mpa[0, 1])
 
 
-def test_without_the_safeguard_the_pin_cycles_to_the_cap_and_with_it_the_energy_never_rises():
+def test_without_the_safeguard_the_pin_cycles_and_with_it_the_energy_never_rises():
     gap = np.full((32, 32), 0.1)
     gap[16, 16] = 0.0
     operator = Operator(influence(gap.shape, math.inf, 0.5), gap.shape)
@@ -139,14 +139,14 @@ def test_without_the_safeguard_the_pin_cycles_to_the_cap_and_with_it_the_energy_
 def test_the_nearest_pressure_of_a_given_sum_beats_every_other():
     values = np.array([3.0, -1.0, 0.5, 2.0])
     nearest = project_to_simplex(values, 2.0)
-    # 3 and 2 stay, each less 1.5; the others go: by hand.
+    # By hand: 3 and 2 remain, each less 1.5; the others become 0.
     assert nearest == pytest.approx([1.5, 0.0, 0.0, 0.5])
     rng = np.random.default_rng([7])
     others = rng.dirichlet(np.ones(4), 200) * 2.0
     assert (np.linalg.norm(others - values, axis=1) >= np.linalg.norm(nearest - values)).all()
 
 
-def test_a_press_does_not_depend_on_what_was_pressed_before():
+def test_a_press_does_not_depend_on_earlier_presses():
     gap = hard_gaps()["rough"]
     first = press(gap, 1.0, Layer(0.2, 0.48, 10.0), force_n=1.0)
     for other in hard_gaps().values():

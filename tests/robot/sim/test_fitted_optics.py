@@ -1,4 +1,4 @@
-"""Optics fitted to real presses: what the polynomial draws, where it is held, and its file."""
+"""Optics fitted to real presses: the polynomial, its limits, and its file."""
 
 import json
 import math
@@ -44,7 +44,7 @@ def fitted(degree=2, places=3, reaches=(1.0,), seed=0, **limits):
     )
 
 
-def test_fitted_colours_are_the_sum_that_is_written_down():
+def test_fitted_colours_are_the_documented_sum():
     model, surface = fitted(reaches=()), Surface(dome(), SMALL)
     picture = model.colours(surface, surface.slopes)
     weights = np.array(model.weights).reshape(5, 3, 3)
@@ -52,14 +52,14 @@ def test_fitted_colours_are_the_sum_that_is_written_down():
         slope = np.array([surface.slopes[0][row, col], surface.slopes[1][row, col]], float)
         nx, ny = -slope / math.sqrt(1 + slope @ slope)
         x, y = (2 * col - 31) / 32, (2 * row - 23) / 24
-        wanted = np.array([100 + 5 * x, 90 + 5 * y, 80])
+        expected = np.array([100 + 5 * x, 90 + 5 * y, 80])
         for feature, one in zip((nx, ny, nx * nx, nx * ny, ny * ny), weights, strict=True):
             for place, weight in zip((1, x, y), one, strict=True):
-                wanted = wanted + feature * place * weight
-        np.testing.assert_allclose(picture[row, col], wanted, atol=0.01)
+                expected = expected + feature * place * weight
+        np.testing.assert_allclose(picture[row, col], expected, atol=0.01)
 
 
-def test_fitted_colours_are_held_at_what_the_presses_showed():
+def test_fitted_colours_are_clipped_to_the_limits_of_the_presses():
     steep = Surface(10 * dome(), SMALL)
     limit = fitted(reaches=(), steepest=0.3)
     nx, ny = limit._tilts(steep.slopes)
@@ -67,12 +67,12 @@ def test_fitted_colours_are_held_at_what_the_presses_showed():
     gentle = Surface(0.1 * dome(), SMALL)
     free = fitted(reaches=())
     np.testing.assert_allclose(limit.colours(gentle, gentle.slopes), free.colours(gentle, gentle.slopes), atol=1e-3)
-    held = fitted(highest=(0.2, 9.0, 9.0))
-    assert held._neighbourhood(steep)[0].max() <= 0.3  # cubic interpolation overshoots a little
+    clipped = fitted(highest=(0.2, 9.0, 9.0))
+    assert clipped._neighbourhood(steep)[0].max() <= 0.3  # cubic interpolation overshoots slightly
     assert fitted()._neighbourhood(steep)[0].max() > 1
 
 
-def test_places_outside_those_pressed_take_the_nearest_ones_weights():
+def test_places_outside_the_presses_use_the_nearest_weights():
     model = fitted(degree=1, places=3, reaches=(), left=-0.2, right=0.2, top=-0.2, bottom=0.2)
     tilted = Surface(0.2 * np.broadcast_to(SMALL.positions()[0], (24, 32)), SMALL)
     change = model.colours(tilted, tilted.slopes) - model.backdrop(SMALL)
@@ -96,8 +96,8 @@ def test_fitted_optics_survive_their_file_and_damaged_ones_are_refused():
 
 @pytest.mark.parametrize("place", ["weights", "flat", "limits"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_fitted_numbers_that_are_not_finite_are_refused_where_they_are_read(place, value):
-    """JSON as Python reads it knows NaN; a sensor of NaN would render black."""
+def test_fitted_numbers_that_are_not_finite_are_refused_by_the_reader(place, value):
+    """Python's JSON reader accepts NaN; a sensor with NaN would render black."""
     model = fitted_optics.optics_to_json(fitted())
     part = model["limits"] if place == "limits" else model[place][1]
     part["steepest" if place == "limits" else 2] = value

@@ -1,4 +1,4 @@
-"""Formulas against the numpy functions that they were recorded from, and a body in packets against plain numpy."""
+"""Formulas against the numpy functions that they were recorded from; a body in packets against plain numpy."""
 
 import numba
 import numpy as np
@@ -22,7 +22,7 @@ def numbers(count, size, seed=0):
 
 
 def everything(a, b):
-    """Each operation once, and constants of every kind."""
+    """Use each operation once, and constants of every kind."""
     inside = np.where(np.abs(a) > np.float32(3), b, 2.0 * a)
     angle = np.copysign(np.rint(inside / 7), -b) + np.floor(a)
     angle *= 0.5
@@ -35,7 +35,7 @@ def everything(a, b):
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_a_formula_gives_what_its_function_gives(size):
+def test_a_formula_gives_the_result_of_its_function(size):
     operands = numbers(2, size)
     formula = trace_formula(everything, 2)
     for ours, exact in zip(evaluate_formula(formula, *operands), everything(*operands), strict=True):
@@ -43,13 +43,13 @@ def test_a_formula_gives_what_its_function_gives(size):
     assert {OPERATIONS[name] for name in formula.code[:, 0]} == set(OPERATIONS)
 
 
-def test_operations_without_rounding_of_their_own_are_equal_bit_by_bit():
+def test_exactly_rounded_operations_are_bitwise_equal():
     operands = numbers(2, 1000)
     for function in (lambda a, b: rounded_corner(a, b, 1.5), arctan2):
         np.testing.assert_array_equal(evaluate_formula(trace_formula(function, 2), *operands)[0], function(*operands))
 
 
-def test_what_is_written_twice_is_worked_out_once_and_rows_are_used_again():
+def test_a_repeated_expression_is_computed_once_and_rows_are_reused():
     formula = trace_formula(lambda a: (a + 1) * (a + 1) + (a + 1), 1)
     assert [OPERATIONS[name] for name in formula.code[:, 0]] == ["add", "multiply", "add"]
 
@@ -58,11 +58,11 @@ def test_what_is_written_twice_is_worked_out_once_and_rows_are_used_again():
             a = a * 0.5 + 1
         return a
 
-    assert len(trace_formula(long, 1).start) == 5  # the operand, two constants, two that take turns
+    assert len(trace_formula(long, 1).start) == 5  # the operand, two constants, two alternating rows
 
 
-def test_no_operation_writes_over_what_it_reads():
-    """The compiled loops are vectorised on that condition."""
+def test_no_operation_overwrites_its_operands():
+    """The compiled loops are vectorised on this condition."""
     for name in SHAPES:
         shape = draw_object(0, 1, family=name).body.shape
         for function in (shape.distance_xyz, shape.chart.locate):
@@ -87,7 +87,7 @@ def test_any_number_comes_through_comparisons_as_in_numpy(values, limit):
 
 
 @pytest.mark.parametrize(
-    ("function", "says"),
+    ("function", "message"),
     [
         (lambda a: np.arctan(a), "arctan"),
         (lambda a: np.add.reduce(a), "add"),
@@ -95,8 +95,8 @@ def test_any_number_comes_through_comparisons_as_in_numpy(values, limit):
         (lambda a: np.clip(a, 0, 1, out=a), "clip"),
     ],
 )
-def test_a_function_of_other_operations_is_refused_by_name(function, says):
-    with pytest.raises(SceneError, match=f"(?s)a formula must be made of.*{says}"):
+def test_a_function_of_other_operations_is_refused_by_name(function, message):
+    with pytest.raises(SceneError, match=f"(?s)a formula may only use.*{message}"):
         trace_formula(function, 1)
 
 
@@ -104,7 +104,7 @@ def test_a_function_of_other_operations_is_refused_by_name(function, says):
 
 
 @pytest.mark.parametrize("family", SHAPES)
-def test_every_family_is_in_packets_what_it_is_in_numpy(family):
+def test_every_family_is_the_same_in_packets_and_in_numpy(family):
     body = draw_object(3, 5, family=family, relief="knurl").body
     rng = np.random.default_rng(1)
     points = rng.uniform(body.lower - 3, body.upper + 3, (2000, 3)).astype(np.float32).T
@@ -113,7 +113,7 @@ def test_every_family_is_in_packets_what_it_is_in_numpy(family):
         for ours, numpys in zip(
             evaluate_formula(trace_formula(function, 3), *points), np.atleast_2d(exact), strict=True
         ):
-            np.testing.assert_allclose(ours, numpys, atol=5e-5)  # float32's sines and powers of some 100 mm
+            np.testing.assert_allclose(ours, numpys, atol=5e-5)  # float32 sines and powers of about 100 mm
 
 
 def test_normals_in_packets_are_differences_of_the_field():
@@ -133,7 +133,7 @@ def test_heights_lie_between_pixels_and_end_at_the_border():
     assert interpolate_heights(grid, u[:0], v[:0]).shape == (0,)
 
 
-def test_rays_meet_the_same_whatever_their_order():
+def test_hits_do_not_depend_on_the_order_of_rays():
     body = draw_object(0, 14).body
     width = np.linspace(*body.lower[[0]], *body.upper[[0]], 400)
     origins = np.stack([width, np.full(400, -300.0), np.full(400, 0.5 * body.upper[2])], axis=1)
@@ -145,7 +145,7 @@ def test_rays_meet_the_same_whatever_their_order():
 
 
 def test_code_without_a_cache_folder_is_compiled_in_the_process():
-    function = eval("lambda a: a + 1")  # which stands in no file, so that there is no place beside it
+    function = eval("lambda a: a + 1")  # it is in no file, so there is no folder for its cache
     with pytest.raises(RuntimeError, match="no locator"):
         numba.njit(cache=True)(function)
     assert jit(function)(2) == 3

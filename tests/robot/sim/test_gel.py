@@ -38,7 +38,7 @@ def dome(field=SMALL, radius_mm=6.0, depth_mm=1.0):
 
 
 @pytest.mark.parametrize("grid", [(24, 32), (12, 16), (48, 64), (30, 20)])
-def test_the_slopes_of_a_plane_are_its_slopes_whatever_the_grid(grid):
+def test_the_slopes_of_a_plane_are_right_on_every_grid(grid):
     field = Field(grid[0], grid[1], 1.0)
     x, y = field.positions()
     across, down = SMALL.size_mm[1] / grid[1], SMALL.size_mm[0] / grid[0]
@@ -48,7 +48,7 @@ def test_the_slopes_of_a_plane_are_its_slopes_whatever_the_grid(grid):
     np.testing.assert_allclose(slope_y, -0.2, atol=1e-5)
 
 
-def test_slopes_are_taken_before_they_are_interpolated_because_heights_interpolated_ripple():
+def test_slopes_are_interpolated_rather_than_heights_which_would_ripple():
     field, coarse = Field(240, 320, 0.05), Field(60, 80, 0.2)
     x, y = (axis.astype(np.float64) for axis in coarse.positions())
     fine_x, _ = field.positions()
@@ -57,7 +57,7 @@ def test_slopes_are_taken_before_they_are_interpolated_because_heights_interpola
     ours = Surface(bowl, field).slopes[0]
     naive = np.gradient(cv2.resize(bowl, (320, 240), interpolation=cv2.INTER_CUBIC), 0.05, axis=1)
     truth = np.broadcast_to(fine_x / 4, ours.shape)
-    assert np.abs(ours - truth)[inside].max() < 3e-3  # cv2's cubic kernel does not quite keep a straight line
+    assert np.abs(ours - truth)[inside].max() < 3e-3  # cv2's cubic kernel does not reproduce a straight line exactly
     assert np.abs(naive - truth)[inside].max() > 5 * np.abs(ours - truth)[inside].max()
 
 
@@ -68,7 +68,7 @@ def test_resized_averages_a_finer_grid_and_returns_an_equal_one():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("wrong", "message"),
     [
         (np.full((4, 4), np.nan), "finite, got 16"),
         (np.array([[0.0, np.inf]]), "finite, got 1"),
@@ -79,8 +79,8 @@ def test_resized_averages_a_finer_grid_and_returns_an_equal_one():
         (np.zeros((2, 2), complex), "map of numbers"),
     ],
 )
-def test_what_is_no_displacement_is_refused(wrong, says):
-    with pytest.raises(SceneError, match=says):
+def test_a_wrong_displacement_map_is_refused(wrong, message):
+    with pytest.raises(SceneError, match=message):
         small_sensor().render(wrong, 0)
 
 
@@ -113,14 +113,14 @@ def test_a_grey_sensor_gives_grey_pictures_of_other_light():
     heights = 0.3 * np.exp(-((np.indices((24, 32)) - 12) ** 2).sum(0) / 20.0)
     grey = replace(draw_sensor(0, "a", optics="grey"), rows=24, cols=32, pixel_mm=0.5, markers=Markers())
     clean = grey._render_surface(Surface(heights, grey.field))
-    for channel in (1, 2):  # but for a white balance that is a little off
+    for channel in (1, 2):  # up to a slightly wrong white balance
         assert np.allclose(
             clean[..., channel] / clean[..., 0], np.median(clean[..., channel] / clean[..., 0]), atol=0.02
         )
-    assert np.ptp(clean[..., 0]) > 10  # it feels the bump
+    assert np.ptp(clean[..., 0]) > 10  # the bump is visible
 
 
-def test_the_naive_normal_of_a_cliff_is_no_number():
+def test_the_naive_normal_of_a_cliff_is_not_finite():
     slope = np.float32(1e25)
     with np.errstate(over="ignore"):
         assert not np.isfinite(1 + slope * slope)
@@ -131,7 +131,7 @@ def test_the_naive_normal_of_a_cliff_is_no_number():
 
 
 def by_two_loops(bar, field, slope_x, slope_y):
-    """w / w_flat of the docstring, point by point."""
+    """Return w / w_flat of the module docstring, point by point."""
     out = np.empty((field.rows, field.cols))
     xs, ys = field.positions()
     for row in range(field.rows):
@@ -170,7 +170,7 @@ def test_led_positions_match_their_settings():
     np.testing.assert_allclose(right.positions(), [[10, 0, 4]], atol=1e-12)
 
 
-def test_the_side_of_a_bump_that_faces_a_bar_has_its_colour():
+def test_the_side_of_a_bump_towards_a_bar_has_its_colour():
     sensor = small_sensor(optics=LedOptics(shadow=0.0))
     change = sensor.render(dome(), 0).astype(int) - sensor.background(0)
     rows, cols = np.indices((24, 32))
@@ -182,7 +182,7 @@ def test_the_side_of_a_bump_that_faces_a_bar_has_its_colour():
         assert change[near & (towards < 0), channel].mean() < -10
 
 
-def test_a_bump_throws_a_shadow_away_from_the_bar_and_a_flat_gel_none():
+def test_a_bump_casts_a_shadow_away_from_the_bar_and_a_flat_gel_none():
     field = Field(80, 80, 0.1)
     bump = np.zeros((80, 80))
     bump[36:44, 36:44] = 1.0
@@ -193,9 +193,9 @@ def test_a_bump_throws_a_shadow_away_from_the_bar_and_a_flat_gel_none():
     assert not cast_shadows(Surface(np.zeros((4, 4)), field), (LedBar(0.0),))[0].any()
 
 
-def test_shadows_are_not_computed_where_nothing_asks_for_them(monkeypatch):
+def test_shadows_are_computed_only_on_demand(monkeypatch):
     calls = []
-    monkeypatch.setattr(optics, "cast_shadows", lambda *given: calls.append(given) or cast_shadows(*given))
+    monkeypatch.setattr(optics, "cast_shadows", lambda *args: calls.append(args) or cast_shadows(*args))
     small_sensor(optics=LedOptics(shadow=0.0)).render(dome(), 0)
     small_sensor().background(0)
     assert not calls
@@ -224,7 +224,7 @@ def test_a_uniform_displacement_gives_the_no_contact_image():
     np.testing.assert_array_equal(sensor.render(np.full((24, 32), 0.7), 0), sensor.background(0))
 
 
-def test_the_seed_of_a_picture_makes_its_noise_and_nothing_else():
+def test_the_seed_of_a_picture_changes_only_its_noise():
     sensor = draw_sensor(2, "a")
     press = dome(Field(120, 160, 0.1268))
     one, again, other = (sensor.render(press, seed).astype(float) for seed in (3, 3, 4))
@@ -239,15 +239,15 @@ def press_like(picture):
     return cv2.GaussianBlur(picture[..., 0], (0, 0), 3).ravel()
 
 
-def test_noise_has_the_variance_that_is_written_down():
+def test_noise_has_the_documented_variance():
     sensor = GelSensor(LAYER, noise=Noise(1.5, 0.02))
     many = np.stack([sensor.background(seed) for seed in range(60)]).astype(float)
     clean = gel._no_contact_image(sensor)
-    wanted = 1.5**2 + 0.02 * clean + 1 / 12  # rounding adds a twelfth
-    assert np.mean(many.var(axis=0)) == pytest.approx(wanted.mean(), rel=0.05)
+    expected = 1.5**2 + 0.02 * clean + 1 / 12  # rounding adds 1/12
+    assert np.mean(many.var(axis=0)) == pytest.approx(expected.mean(), rel=0.05)
 
 
-def test_sensors_are_drawn_alike_from_the_same_seed_and_differ_by_seed_and_finger():
+def test_equal_seeds_draw_equal_sensors_and_seed_and_finger_make_a_difference():
     assert draw_sensor(4, "a") == draw_sensor(4, "a")
     assert len({draw_sensor(seed, finger) for seed in range(5) for finger in "ab"}) == 10
     again = pickle.loads(pickle.dumps(draw_sensor(4, "b")))  # noqa: S301
@@ -256,13 +256,13 @@ def test_sensors_are_drawn_alike_from_the_same_seed_and_differ_by_seed_and_finge
 
 def test_given_gel_settings_replace_drawn_ones_only():
     drawn = draw_sensor(4, "a")
-    said = draw_sensor(4, "a", gel=GelSettings(thickness_mm=2.5, modulus_mpa=0.3))
-    assert said == replace(drawn, layer=replace(drawn.layer, thickness_mm=2.5, modulus_mpa=0.3))
-    assert said.gel == GelSettings(2.5, 0.3, drawn.layer.poisson)
+    changed = draw_sensor(4, "a", gel=GelSettings(thickness_mm=2.5, modulus_mpa=0.3))
+    assert changed == replace(drawn, layer=replace(drawn.layer, thickness_mm=2.5, modulus_mpa=0.3))
+    assert changed.gel == GelSettings(2.5, 0.3, drawn.layer.poisson)
     assert draw_sensor(4, "a", gel=GelSettings()) == drawn
 
 
-def test_drawn_gels_lie_in_their_ranges_and_their_pictures_stay_off_the_ends():
+def test_drawn_gels_lie_in_their_ranges_and_their_pictures_are_rarely_saturated():
     for seed in range(12):
         sensor = draw_sensor(seed, "a")
         assert 0.2 <= sensor.layer.modulus_mpa <= 0.8
@@ -280,7 +280,7 @@ def test_the_field_is_that_of_a_mini():
 
 
 @pytest.mark.parametrize(
-    ("wrong", "says"),
+    ("wrong", "message"),
     [
         ({"rows": 0}, "1 to 2\\^26 pixels"),
         ({"pixel_mm": math.nan}, "pixel_mm"),
@@ -290,8 +290,8 @@ def test_the_field_is_that_of_a_mini():
         ({"noise": Noise(-1.0, 0.0)}, "noise"),
     ],
 )
-def test_settings_of_a_sensor_out_of_range_are_refused(wrong, says):
-    with pytest.raises(RobotConfigError, match=says):
+def test_sensor_settings_out_of_range_are_refused(wrong, message):
+    with pytest.raises(RobotConfigError, match=message):
         small_sensor(**wrong)
 
 
@@ -344,7 +344,7 @@ def test_markers_rest_on_a_grid_and_a_press_spreads_them():
     assert np.abs(moved).max() < 0.5
 
 
-def test_markers_are_off_by_default_and_dark_where_they_are():
+def test_markers_are_off_by_default_and_dark():
     sensor = draw_sensor(0, "a")
     assert sensor.markers is None
     printed = replace(sensor, markers=Markers())

@@ -23,14 +23,14 @@ from tests.robot.sim.hard_contact import naive_symbol
 POISSON = (-0.9, 0.0, 0.3, 0.48, 0.5)
 
 
-def whole(quadrant):
-    """The quadrant mirrored to (2 rows - 1, 2 cols - 1)."""
+def mirrored(quadrant):
+    """Return the quadrant mirrored to (2 rows - 1, 2 cols - 1)."""
     half = np.concatenate([quadrant[:0:-1], quadrant])
     return np.concatenate([half[:, :0:-1], half], axis=1)
 
 
 def by_loops(table, pressure):
-    """Displacement from each pixel's pressure in turn."""
+    """Return the displacement, summed over each pixel's pressure."""
     rows, cols = pressure.shape
     total = np.zeros(pressure.shape)
     for i in range(rows):
@@ -64,20 +64,20 @@ def test_a_thin_incompressible_layer_yields_with_the_cube_of_its_thickness():
 
 
 @pytest.mark.parametrize("poisson", POISSON)
-def test_the_layer_formula_is_the_printed_one_where_that_can_be_computed(poisson):
+def test_the_layer_formula_equals_the_printed_one_where_that_is_computable(poisson):
     x = np.array([0.05, 0.2, 0.24999, 0.25001, 0.5, 1.0, 3.0, 10.0])
     assert layer_symbol(x, poisson) == pytest.approx(naive_symbol(x, poisson), rel=1e-11)
 
 
 @pytest.mark.parametrize("poisson", POISSON)
 @pytest.mark.parametrize("rho", [0.0, 0.37, 2.0, 7.77])
-def test_the_correction_is_the_transform_that_it_claims_to_be(poisson, rho):
+def test_the_correction_is_the_documented_transform(poisson, rho):
     exact = quad(lambda x: (1.0 - layer_symbol(np.array([x]), poisson)[0]) * j0(x * rho), 0.0, 25.0, limit=400)[0]
-    assert float(layer_correction(poisson)(rho)) == pytest.approx(exact, abs=1e-8)  # quad's own 1.5e-8
+    assert float(layer_correction(poisson)(rho)) == pytest.approx(exact, abs=1e-8)  # quad has an error of 1.5e-8
 
 
 @pytest.mark.parametrize("poisson", POISSON)
-def test_where_influence_is_cut_off_nothing_was_left(poisson):
+def test_influence_is_negligible_at_its_cut_off(poisson):
     assert float(layer_correction(poisson)(REACH)) * REACH == pytest.approx(1.0, abs=1e-9)
 
 
@@ -94,7 +94,7 @@ def test_love_s_patch_is_the_sum_of_point_forces_over_the_pixel(row, col):
     assert love_patch((4, 6))[row, col] == pytest.approx(total, rel=1e-12)
 
 
-def test_the_loaded_pixel_itself_sinks_by_the_known_amount():
+def test_the_loaded_pixel_sinks_by_the_known_amount():
     # Centre of a uniformly loaded square of side 1: 4 ln(1 + sqrt 2) / pi / E*.
     assert love_patch((1, 1))[0, 0] == pytest.approx(4.0 * math.log(1.0 + math.sqrt(2.0)) / math.pi, rel=1e-14)
 
@@ -107,7 +107,7 @@ def test_the_loaded_pixel_itself_sinks_by_the_known_amount():
 def test_uniform_pressure_on_a_layer_compresses_springs(thickness, poisson):
     side = math.ceil(REACH * thickness) + 2
     springs = thickness * (1.0 - 2.0 * poisson) / (1.0 - poisson) ** 2
-    assert whole(influence((side, side), thickness, poisson)).sum() == pytest.approx(springs, abs=1e-7)
+    assert mirrored(influence((side, side), thickness, poisson)).sum() == pytest.approx(springs, abs=1e-7)
 
 
 def test_a_very_thick_layer_is_a_half_space_but_for_its_finite_depth():
@@ -118,7 +118,7 @@ def test_a_very_thick_layer_is_a_half_space_but_for_its_finite_depth():
 
 
 @pytest.mark.parametrize("poisson", POISSON)
-def test_pixels_and_waves_agree_where_one_takes_over_from_the_other(poisson):
+def test_pixels_and_waves_agree_at_the_switch_between_them(poisson):
     x = np.arange(48) - 24.0
     pressure = np.exp(-(x[:, None] ** 2 + x**2) / (2.0 * 5.0**2))
     just_thin, just_thick = (
@@ -128,7 +128,7 @@ def test_pixels_and_waves_agree_where_one_takes_over_from_the_other(poisson):
     assert just_thin == pytest.approx(just_thick, abs=3e-3 * just_thick.max())
 
 
-def test_a_table_is_made_once_and_cannot_be_written():
+def test_a_table_is_cached_and_read_only():
     table = influence((5, 7), 3.0, 0.48)
     assert influence((5, 7), 3.0, 0.48) is table
     with pytest.raises(ValueError, match="read-only"):
@@ -146,7 +146,7 @@ def test_the_operator_is_the_sum_over_pixels(thickness, shape):
     assert Operator(table, shape)(pressure) == pytest.approx(by_loops(table, pressure), abs=1e-13)
 
 
-def test_a_window_feels_no_neighbours_and_is_a_corner_of_the_grid():
+def test_a_window_does_not_wrap_around_and_is_a_corner_of_the_grid():
     table = influence((9, 11), 4.0, 0.48)
     pressure = np.random.default_rng([2]).random((3, 5))
     large = np.zeros((9, 11))
@@ -180,7 +180,7 @@ def test_the_operator_is_symmetric_positive_and_within_its_bound(thickness, pois
 def test_two_operators_add_with_a_weight():
     gel, body = (Operator(influence((4, 5), h, 0.4), (4, 5)) for h in (3.0, math.inf))
     pressure = np.random.default_rng([4]).random((4, 5))
-    both = gel.plus(body, 0.25)
-    assert both(pressure) == pytest.approx(gel(pressure) + 0.25 * body(pressure), abs=1e-14)
-    assert both.peak == gel.peak + 0.25 * body.peak
+    combined = gel.plus(body, 0.25)
+    assert combined(pressure) == pytest.approx(gel(pressure) + 0.25 * body(pressure), abs=1e-14)
+    assert combined.peak == gel.peak + 0.25 * body.peak
     assert gel.peak == influence((4, 5), 3.0, 0.4)[0, 0]

@@ -1,4 +1,4 @@
-"""Shading and developing in one compiled pass against the same formulas array by array in float64."""
+"""Shading and developing in one compiled pass, against the same formulas array by array in float64."""
 
 import cv2
 import numpy as np
@@ -14,20 +14,20 @@ def surfaces_and_lamps(count=5000, seed=0):
     rng = np.random.default_rng(seed)
     unit = rng.standard_normal((3, count, 3))
     unit /= np.linalg.norm(unit, axis=2, keepdims=True)
-    shares = rng.uniform(size=(2, count)).astype(np.float32)
+    fractions = rng.uniform(size=(2, count)).astype(np.float32)
     is_object, colour = rng.uniform(size=count) < 0.5, rng.uniform(size=(count, 3)).astype(np.float32)
     colour[:7] = 0
-    surfaces = GBuffer(unit[0], unit[1].astype(np.float32), is_object, *shares, colour)
+    surfaces = GBuffer(unit[0], unit[1].astype(np.float32), is_object, *fractions, colour)
     return surfaces, Lamps(unit[2, 0], np.array([0.9, 0.8, 0.7]), np.array([0.2, 0.25, 0.3]), (1.1, 0.04), 60.0)
 
 
 def test_radiance_is_that_of_lambert_blinn_and_the_sky():
     surfaces, lamps = surfaces_and_lamps()
     ours, exact = radiance(surfaces, lamps), shaded(surfaces, lamps)
-    np.testing.assert_allclose(ours, exact, atol=2e-6, rtol=1e-5)  # sixty times a logarithm of float32
+    np.testing.assert_allclose(ours, exact, atol=2e-6, rtol=1e-5)  # sixty times a float32 logarithm
 
 
-def test_what_no_light_reaches_is_black():
+def test_a_point_without_light_is_black():
     surfaces, lamps = surfaces_and_lamps()
     dark = lamps._replace(sky=np.zeros(3))
     assert not radiance(surfaces._replace(lamp_visibility=np.zeros(5000, np.float32)), dark).any()
@@ -52,9 +52,9 @@ def test_developed_pictures_are_those_of_powers_in_float64():
 @pytest.mark.parametrize("px", [64, 256, 512])
 def test_the_sky_that_an_object_hides_is_blurred_as_on_the_full_grid(px):
     view = cast_camera_rays(draw_object(0, 3), Placement(), PinholeCamera(px=px, focal_px=860 * px / 256))
-    shares = view.is_object.reshape(px, px).astype(np.float64)
-    exact = cv2.GaussianBlur(shares, (0, 0), 0.03 * px).ravel()
+    mask = view.is_object.reshape(px, px).astype(np.float64)
+    exact = cv2.GaussianBlur(mask, (0, 0), 0.03 * px).ravel()
     error = np.abs(sky_occlusion(view.is_object.reshape(px, px)).ravel() - exact)[~view.is_object]
-    # Of 0.45 of the sky's light, which is 0.3 of all: a hundredth is a third of a grey level.
+    # It scales 0.45 of the sky's light, which is 0.3 of all: an error of 0.01 is a third of a grey level.
     assert error.max() < 0.02
     assert error.mean() < 1e-3

@@ -1,4 +1,4 @@
-"""Materials: the table, its spread, and paint that knows nothing of either."""
+"""Materials: the table and its spread, and paint that is independent of both."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_impossible_numbers_are_refused(field, value):
         ObjectMaterial("x", **{**numbers, field: value})
 
 
-# Looks -----------------------------------------------------------------------------------------------------
+# Appearance ------------------------------------------------------------------------------------------------
 
 
 def test_albedo_is_between_0_and_1_and_the_same_again():

@@ -1,4 +1,4 @@
-"""Meshes: what is read, what is refused and why, and casting against closed forms."""
+"""Meshes: valid files, refused files with the reason, and casting against closed forms."""
 
 import builtins
 import functools
@@ -41,7 +41,7 @@ def test_small_numbers_are_metres(tmp_path):
     assert load_mesh_object(path, 0).body.mesh.volume_mm3 == pytest.approx(64000)
 
 
-def test_faces_that_look_inwards_are_turned(tmp_path):
+def test_inward_faces_are_turned(tmp_path):
     path = obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE[:, ::-1])
     assert load_mesh_object(path, 0).body.mesh.volume_mm3 == pytest.approx(64000)
 
@@ -78,22 +78,22 @@ def with_nan():
 
 
 @pytest.mark.parametrize(
-    ("vertices", "faces", "says"),
+    ("vertices", "faces", "message"),
     [
-        (20 * CORNERS, CUBE[:-1], "3 edges lie beside a hole.*fill_holes"),
+        (20 * CORNERS, CUBE[:-1], "3 edges border a hole.*fill_holes"),
         (with_nan(), CUBE, "NaN or infinite"),
-        (20 * CORNERS, CUBE[:0], "holds none"),
+        (20 * CORNERS, CUBE[:0], "has no triangles"),
         (CORNERS * [20, 20, 0], CUBE, "at least 2 mm thick"),
         (20 * CORNERS, np.where(np.arange(12)[:, None] == 0, CUBE[:, ::-1], CUBE), "turned outwards.*fix_normals"),
         (20 * CORNERS[:4], np.array([[0, 1, 2], [0, 2, 1]]), "at least 2 mm thick"),
     ],
 )
-def test_what_is_no_closed_solid_is_refused(tmp_path, vertices, faces, says):
-    with pytest.raises(SceneError, match=says):
+def test_a_surface_that_is_not_a_closed_solid_is_refused(tmp_path, vertices, faces, message):
+    with pytest.raises(SceneError, match=message):
         load_mesh_object(ply(tmp_path / "bad.ply", vertices, faces), 0)
 
 
-def test_a_box_that_is_wide_in_one_direction_only_is_welcome_even_when_turned(tmp_path):
+def test_a_box_that_is_wide_in_one_direction_only_is_accepted_even_when_turned(tmp_path):
     turn = np.array([[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])
     item = load_mesh_object(obj(tmp_path / "plank.obj", (CORNERS * [100, 10, 30]) @ turn, CUBE), 0)
     assert item.body.upper[0] - item.body.lower[0] > 150
@@ -110,20 +110,19 @@ def test_broken_files_are_one_clear_error(tmp_path, name, content):
 
 
 def test_a_binary_file_cut_off_is_not_blamed_on_a_missing_package(tmp_path):
-    """trimesh takes it for text and asks a guesser of encodings, which need not be there; where it is, no triangle is
-    found."""
+    """trimesh reads it as text and imports an optional encoding detector; with that, it finds no triangle."""
     path = tmp_path / "cut.stl"
     path.write_bytes(bytes([0xFF, 0xFE, 0x9D]) * 100)
-    with pytest.raises(SceneError, match=r"must (be a mesh in STL|hold triangles), and") as caught:
+    with pytest.raises(SceneError, match=r"not a readable STL mesh|has no triangles") as caught:
         load_mesh_object(path, 0)
     assert "No module" not in str(caught.value)
 
 
 def test_truncated_files_never_load_as_something_else(tmp_path):
     vertices, faces = sphere(8)
-    whole = stl(tmp_path / "ball.stl", 30 * vertices, faces).read_bytes()
-    for length in range(0, len(whole) - 1, 371):
-        (tmp_path / "cut.stl").write_bytes(whole[:length])
+    content = stl(tmp_path / "ball.stl", 30 * vertices, faces).read_bytes()
+    for length in range(0, len(content) - 1, 371):
+        (tmp_path / "cut.stl").write_bytes(content[:length])
         with pytest.raises(SceneError):
             load_mesh_object(tmp_path / "cut.stl", 0)
 
@@ -139,7 +138,7 @@ def test_other_kinds_missing_files_and_wrong_settings_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("package", ["trimesh", "embreex"])
-def test_a_missing_package_is_a_sentence_that_names_the_extra(tmp_path, monkeypatch, package):
+def test_the_message_for_a_missing_package_names_the_extra(tmp_path, monkeypatch, package):
     path = obj(tmp_path / "cube.obj", 20 * CORNERS, CUBE)
     monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.delitem(sys.modules, "trimesh.ray.ray_pyembree", raising=False)
@@ -157,7 +156,7 @@ def rays_at(body, count, seed=0):
     return rng.uniform(body.lower, body.upper, (count, 3)) - 200 * directions, directions
 
 
-def test_rays_meet_a_ball_where_the_quadratic_says(ball):
+def test_rays_meet_a_ball_at_the_root_of_the_quadratic(ball):
     origins, directions = rays_at(ball.body, 2000)
     offset = origins - [0, 0, 30]
     half = np.einsum("ij,ij->i", offset, directions)
@@ -187,20 +186,20 @@ def test_a_cube_keeps_its_edges_and_faces(tmp_path):
 def test_relief_moves_hits_by_its_height_and_tilts_normals(tmp_path):
     vertices, faces = sphere()
     path = stl(tmp_path / "ball.stl", 30 * vertices, faces)
-    worn = load_mesh_object(path, 1, relief="ribs").body
-    bare = load_mesh_object(path, 1, relief="smooth").body
+    textured = load_mesh_object(path, 1, relief="ribs").body
+    smooth = load_mesh_object(path, 1, relief="smooth").body
     z = np.linspace(24, 36, 300)
     x = np.linspace(-6, 6, 300)
     origins = np.concatenate([np.stack([0 * z, 0 * z - 60, z], 1), np.stack([x, 0 * x - 60, 0 * x + 30], 1)])
     directions = np.tile([0.0, 1, 0], (600, 1))
-    lift = bare.cast(origins, directions) - worn.cast(origins, directions)
-    amplitude = worn.relief.amplitude_mm
-    low, high = (-amplitude, 0) if worn.relief.engraved else (0, amplitude)
+    lift = smooth.cast(origins, directions) - textured.cast(origins, directions)
+    amplitude = textured.relief.amplitude_mm
+    low, high = (-amplitude, 0) if textured.relief.engraved else (0, amplitude)
     assert low - 0.1 <= lift.min()
     assert lift.max() <= high + 0.1 * amplitude + 0.05
     assert np.ptp(lift) > 0.6 * amplitude
-    points = origins + worn.cast(origins, directions)[:, None] * directions
-    assert np.abs(worn.normals(points) - bare.normals(points)).max() > 0.1
+    points = origins + textured.cast(origins, directions)[:, None] * directions
+    assert np.abs(textured.normals(points) - smooth.normals(points)).max() > 0.1
 
 
 def test_casting_is_the_same_again_and_after_a_pickle(ball):
@@ -228,17 +227,19 @@ def test_corner_normals_are_smooth_on_a_ball_and_sharp_on_a_cube():
     assert cube.areas.sum() == pytest.approx(24)
 
 
-def test_hidden_files_beside_meshes_are_none_and_two_of_one_name_are_refused(tmp_path):
+def test_hidden_files_are_not_meshes_and_two_meshes_of_one_name_are_refused(tmp_path):
     stl(tmp_path / "cube.stl", 20 * CORNERS, CUBE)
     (tmp_path / "._cube.stl").write_bytes(b"Mac OS X")
     rig = load_rig("sim", seed=0, meshes=str(tmp_path))
     assert [name.split("-")[0] for name in rig.object_ids(1)] == ["mesh.cube"]
     stl(tmp_path / "cube.STL", 25 * CORNERS, CUBE)
-    with pytest.raises(RobotConfigError, match=r"must not hold two meshes of one name, got 'mesh\.cube-.*; rename one"):
+    with pytest.raises(
+        RobotConfigError, match=r"must not contain two meshes of one name, got 'mesh\.cube-.*\. Rename one"
+    ):
         rig.object_ids(2)
 
 
-def test_a_rig_of_meshes_grasps_them_and_goes_on_with_the_same_files_only(tmp_path):
+def test_a_rig_of_meshes_grasps_them_and_continues_only_with_the_same_files(tmp_path):
     folder, make_rig = tmp_path / "meshes", functools.partial(load_rig, "sim", seed=0, meshes=str(tmp_path / "meshes"))
     folder.mkdir()
     for name, size in (("cube", 20), ("larger", 25)):
@@ -247,7 +248,7 @@ def test_a_rig_of_meshes_grasps_them_and_goes_on_with_the_same_files_only(tmp_pa
     tallies = collect(make_rig, tmp_path / "recording", objects=2, seed=0, settings=settings)
     assert [tally.object_id.split("-")[0] for tally in tallies] == ["mesh.cube", "mesh.larger"]
     assert sum(tally.attempts for tally in tallies) > 0
-    with pytest.raises(RobotConfigError, match="must hold as many STL, OBJ or PLY"):
+    with pytest.raises(RobotConfigError, match="must contain at least 3 STL, OBJ or PLY"):
         make_rig().object_ids(3)
     stl(folder / "larger.stl", 30 * CORNERS, CUBE)
     with pytest.raises(RecordingError, match="meshes sha256"):

@@ -1,4 +1,4 @@
-"""Resting poses, and grasps of meshes from above and from the sides: what must hold for solids known by hand."""
+"""Resting poses, and grasps of meshes from above and from the sides, for solids with answers known by hand."""
 
 import dataclasses
 import functools
@@ -34,7 +34,7 @@ def grasps_of(tmp_path, vertices, faces, up=UP):
 
 
 def surface(mesh, per_mm2=0.3):
-    """Points all over a mesh."""
+    """Return points all over a mesh."""
     rng = np.random.default_rng(0)
     count = int(per_mm2 * mesh.areas.sum())
     face = rng.choice(len(mesh.areas), count, p=mesh.areas / mesh.areas.sum())
@@ -44,7 +44,7 @@ def surface(mesh, per_mm2=0.3):
 # Resting poses ----------------------------------------------------------------------------------------------
 
 
-def test_a_box_rests_on_its_six_sides_as_it_stands_first_and_then_the_steadiest():
+def test_a_box_rests_on_its_six_sides_upright_first_then_the_most_stable():
     vertices, _ = box(60, 90, 180)
     ups = stable_up_directions(vertices, np.zeros(3))
     assert ups[0] is UP
@@ -60,7 +60,7 @@ def test_a_box_falls_over_when_its_centre_passes_the_edge():
     assert tipping_angle(vertices, np.array([0.6, 0, 0.8])) < 0  # on an edge
 
 
-def test_what_leans_in_its_file_is_set_on_the_side_that_it_nearly_stands_on(tmp_path):
+def test_a_leaning_mesh_is_placed_on_its_nearest_side(tmp_path):
     vertices, faces = box(60, 90, 180)
     lean = rotation_to_up(np.array([math.sin(0.1), 0.0, math.cos(0.1)]))
     mesh = Mesh(vertices @ lean, faces)
@@ -74,7 +74,7 @@ def test_a_pencil_on_end_lies_down():
     assert np.ptp(mesh.rest_on_table(stable_up_directions(vertices, np.zeros(3))[0]).vertices[:, 2]) == pytest.approx(6)
 
 
-def test_the_centre_of_mass_is_that_of_the_solid_wherever_it_is():
+def test_the_centre_of_mass_is_that_of_the_solid_at_any_position():
     (vertices, faces), away = box(60, 90, 180), [500, -7, 90]
     np.testing.assert_allclose(Mesh(vertices + np.array(away), faces).centre_of_mass, away, atol=1e-9)
     cone = Mesh(*revolved([(30, 0), (0.001, 80)]))
@@ -82,7 +82,7 @@ def test_the_centre_of_mass_is_that_of_the_solid_wherever_it_is():
 
 
 @pytest.mark.parametrize("up", [[0, 0, 1.0], [0, 0, -1.0], [1.0, 0, 0], [0.6, -0.64, 0.48]])
-def test_the_direction_that_is_to_point_up_does(up):
+def test_the_rotation_maps_the_given_direction_to_up(up):
     turn = rotation_to_up(np.array(up))
     np.testing.assert_allclose(turn @ up, [0, 0, 1], atol=1e-12)
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
@@ -110,10 +110,11 @@ def test_a_box_is_grasped_across_its_flat_sides_from_above_and_from_the_sides(tm
 
 @pytest.mark.parametrize("solid", [box(60, 90, 180), revolved(BOTTLE), box(40, 200, 30)], ids=["box", "bottle", "bar"])
 def test_neither_fingers_nor_hand_sweep_over_the_object_or_the_table(tmp_path, solid):
-    """Held to points all over the surface, in the frame of the open gripper, on its whole way."""
+    """Checked with points all over the surface, in the frame of the open gripper, along its whole path."""
     mesh, grasps = grasps_of(tmp_path, *solid)
     assert len(grasps) > 100
-    points, inside, coarse = surface(mesh), STROKE_MM / 2, 3.0  # of the grid: what lies between its rays may be met
+    # Between rays of the grid, 3 mm apart, the fingers may meet the object.
+    points, inside, coarse = surface(mesh), STROKE_MM / 2, 3.0
     for number in np.random.default_rng(1).choice(len(grasps), 100, replace=False):
         pose = Pose(*grasps.points[number], grasps.yaw_rad[number], grasps.tilt_rad[number])
         x, y, z = ((points - pose.as_tuple()[:3]) @ pose.rotation()).T
@@ -127,7 +128,7 @@ def test_neither_fingers_nor_hand_sweep_over_the_object_or_the_table(tmp_path, s
         back = np.array([[0, side * HAND_MM / 2, SETTINGS.reach_mm] for side in (-1, 1)])
         corners = np.concatenate([tips, back]) @ pose.rotation().T + pose.as_tuple()[:3]
         assert corners[:, 2].min() >= 0
-        withdrawn = z - grasps.retreat_mm[number]  # from there, everything lies ahead of the fingertips
+        withdrawn = z - grasps.retreat_mm[number]  # from there, the whole object is ahead of the fingertips
         assert withdrawn.max() < -SETTINGS.floor_mm + coarse
 
 
@@ -156,7 +157,7 @@ def test_a_box_that_is_too_wide_on_two_axes_is_grasped_when_it_rests_on_edge(tmp
     assert all(attempt.fit["width_mm"] < 80 for attempt in attempts)
 
 
-def test_a_ball_that_is_too_large_has_no_grasp_and_the_reason_says_by_how_much(tmp_path):
+def test_a_ball_that_is_too_large_has_no_grasp_and_the_reason_has_its_width(tmp_path):
     vertices, faces = sphere()
     stl(tmp_path / "globe.stl", 70 * vertices, faces)
     with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
@@ -165,13 +166,13 @@ def test_a_ball_that_is_too_large_has_no_grasp_and_the_reason_says_by_how_much(t
             rig.planner.plan(rig, None, SETTINGS, np.random.default_rng(0))
 
 
-def test_slopes_that_the_fingers_would_slip_off_are_no_opposite_sides(tmp_path):
-    """A cone whose wall goes 15 mm inwards for 10 mm up: the friction cone ends at 3 for 10."""
+def test_slopes_beyond_the_friction_cone_are_not_opposite_sides(tmp_path):
+    """A cone whose wall goes 15 mm inwards for 10 mm up; the friction cone ends at 3 for 10."""
     _, grasps = grasps_of(tmp_path, *revolved([(46, 0), (1, 30)]))
     assert (len(grasps), grasps.min_width_mm) == (0, math.inf)
 
 
-def test_what_no_force_of_the_settings_can_lift_is_named_too_heavy(tmp_path):
+def test_an_object_that_no_allowed_force_lifts_is_reported_as_too_heavy(tmp_path):
     stl(tmp_path / "brick.stl", *box(60, 90, 180))
     with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
         rig.prepare(rig.object_ids(1)[0], 0)
@@ -179,8 +180,8 @@ def test_what_no_force_of_the_settings_can_lift_is_named_too_heavy(tmp_path):
         lead = dataclasses.replace(scene.obj.material, name="lead", density_kg_m3=11340.0, friction=0.3)
         rig.sim_state.scene = dataclasses.replace(scene, obj=dataclasses.replace(scene.obj, material=lead))
         mass = (60 * 90 + 60 * 180 + 90 * 180) * 2 * 3 * 11340e-9  # a shell of 3 mm
-        said = rf"too heavy to lift: {mass:.2f} kg of lead need {1.5 * mass * 9.81 / 0.6:.0f} N .* ends at 25 N"
-        with pytest.raises(UngraspableError, match=said):
+        message = rf"too heavy to lift: {mass:.2f} kg of lead need {1.5 * mass * 9.81 / 0.6:.0f} N .* ends at 25 N"
+        with pytest.raises(UngraspableError, match=message):
             rig.planner.plan(rig, None, SETTINGS, np.random.default_rng(0))
 
 
@@ -192,14 +193,14 @@ def attempts(tmp_path_factory):
     folder = tmp_path_factory.mktemp("meshes")
     stl(folder / "box.stl", *box(60, 90, 180))
     with load_rig("sim", seed=2, meshes=str(folder)) as rig:
-        attempter, name, moves = AttemptRunner(rig, 2, rig.attempt), rig.object_ids(1)[0], []
+        runner, name, moves = AttemptRunner(rig, 2, rig.attempt), rig.object_ids(1)[0], []
         move = rig.arm._move_to
         rig.arm._move_to = lambda pose, speed: moves.append(pose) or move(pose, speed)
-        made = []
+        results = []
         for number in range(12):
             moves.clear()
-            made.append((attempter.run(name, number), list(moves)))
-        return made
+            results.append((runner.run(name, number), list(moves)))
+        return results
 
 
 def test_attempts_come_from_above_and_from_the_sides_and_most_hold(attempts):
@@ -208,7 +209,7 @@ def test_attempts_come_from_above_and_from_the_sides_and_most_hold(attempts):
     assert sum(attempt.outcome == "held" for attempt, _ in attempts) >= 8
 
 
-def test_a_tilted_hand_goes_down_beside_the_object_comes_and_withdraws_level_and_lifts_straight_up(attempts):
+def test_a_tilted_hand_descends_next_to_the_object_moves_level_and_lifts_straight_up(attempts):
     held = [each for each in attempts if each[0].outcome == "held" and len(each[0].fields["pose"]) == 5]
     assert held
     for attempt, moves in held:
@@ -226,8 +227,8 @@ def test_a_tilted_hand_goes_down_beside_the_object_comes_and_withdraws_level_and
         assert moves[-1] == start
 
 
-def test_touch_sees_what_the_photo_shows(tmp_path):
-    """A box 60 mm by 90 mm: as the jaws close across one or the other, so wide they stand."""
+def test_touch_agrees_with_the_photo(tmp_path):
+    """A box of 60 mm by 90 mm: the opening is the width across which the jaws close."""
     stl(tmp_path / "box.stl", *box(60, 90, 120))
     with load_rig("sim", seed=0, meshes=str(tmp_path), localisation_mm=[0.0, 0.0]) as rig:
         name = rig.object_ids(1)[0]
@@ -237,24 +238,24 @@ def test_touch_sees_what_the_photo_shows(tmp_path):
                 width = 60 if attempt.fit["width_mm"] < 75 else 90
                 assert (
                     width - 25 < attempt.fields["opening_mm"] < width + 2 * 3 + 0.1
-                )  # gels give way, relief stands out
+                )  # gels are compressed, relief adds height
 
 
-def test_a_mallet_is_taken_from_the_end_of_its_handle_and_not_through_its_head(tmp_path):
-    """Turned as it may be, the hand comes from where there is room: half a turn of the jaws swaps the fingers only."""
+def test_a_mallet_is_grasped_from_the_end_of_its_handle_and_not_through_its_head(tmp_path):
+    """At any rotation the hand comes from the free side; half a turn of the jaws swaps only the fingers."""
     (handle, faces), (head, _) = box(20, 160, 80), box(120, 40, 80)
     vertices = np.concatenate([handle, head + np.array([0, 100, 0])])
     stl(tmp_path / "mallet.stl", vertices, np.concatenate([faces, faces + 8]))
     with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
-        name, ways = rig.object_ids(1)[0], []
+        name, approach_directions = rig.object_ids(1)[0], []
         for number in range(40):
             rig.prepare(name, number)
             plan = rig.planner.plan(rig, None, SETTINGS, np.random.default_rng(number))
             across_handle = plan.fit["width_mm"] < 30
             if plan.pose.tilt_rad and across_handle:
-                ways.append(-plan.pose.rotation()[:, 2] @ rig.sim_state.scene.placement.rotation())
-    assert len(ways) > 5
-    np.testing.assert_allclose(np.array(ways)[:, 1] > 0.95, True)
+                approach_directions.append(-plan.pose.rotation()[:, 2] @ rig.sim_state.scene.placement.rotation())
+    assert len(approach_directions) > 5
+    np.testing.assert_allclose(np.array(approach_directions)[:, 1] > 0.95, True)
 
 
 def three(folder):
@@ -270,7 +271,7 @@ def files(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_collection_skips_and_names_what_cannot_be_grasped_and_goes_on(tmp_path):
+def test_a_collection_skips_and_names_ungraspable_objects_and_continues(tmp_path):
     make_rig, settings = three(tmp_path / "meshes"), CollectSettings(grasps=2)
     tallies = collect(make_rig, tmp_path / "r", objects=3, seed=1, settings=settings)
     assert [each.accepted for each in tallies] == [2, 0, 2]
@@ -293,7 +294,7 @@ def test_several_jobs_skip_the_same_objects_and_write_the_same_bytes(tmp_path):
     assert files(tmp_path / "r") == files(tmp_path / "s")
 
 
-def test_a_file_chooses_the_planner_of_meshes_and_refuses_that_of_meshes_without_meshes(tmp_path):
+def test_a_file_chooses_the_planner_and_the_mesh_planner_needs_meshes(tmp_path):
     three(tmp_path / "meshes")
     assert type(load_rig("sim", seed=0, meshes=str(tmp_path / "meshes")).planner).__name__ == "MeshPlanner"
     (tmp_path / "rig.toml").write_text(f'rig = "sim"\nmeshes = "{tmp_path}/meshes"\n[planner]\nname = "cylinder"\n')
@@ -303,7 +304,7 @@ def test_a_file_chooses_the_planner_of_meshes_and_refuses_that_of_meshes_without
         load_rig(str(tmp_path / "rig.toml"), seed=0)
 
 
-def test_a_mesh_that_stands_in_its_file_is_not_turned(tmp_path):
+def test_a_mesh_that_is_upright_in_its_file_is_not_turned(tmp_path):
     vertices, faces = box(60, 90, 180)
     path = stl(tmp_path / "box.stl", vertices, faces)
     with load_rig("sim", seed=0, meshes=str(tmp_path)) as rig:
@@ -312,7 +313,7 @@ def test_a_mesh_that_stands_in_its_file_is_not_turned(tmp_path):
     np.testing.assert_array_equal(body.mesh.vertices, load_mesh_object(path, 0).body.mesh.vertices)
 
 
-def test_a_recording_of_meshes_says_that_poses_may_be_tilted(tmp_path):
+def test_a_recording_of_meshes_documents_tilted_poses(tmp_path):
     rig = three(tmp_path / "meshes")()
     assert "tilt in radian" in rig.info["units"]["pose"]
     assert "units" not in load_rig("sim", seed=0).info

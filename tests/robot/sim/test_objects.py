@@ -1,4 +1,4 @@
-"""Objects: drawn again alike, dealt evenly, of a size that fits, with paint that tells nothing of what is felt."""
+"""Objects: reproducible, evenly distributed, small enough, with paint independent of tactile properties."""
 
 import pickle
 import re
@@ -40,10 +40,10 @@ def test_the_same_seed_and_index_give_the_same_object():
 
 
 def test_an_object_does_not_depend_on_which_others_were_drawn():
-    alone = draw_object(0, 40)
+    first = draw_object(0, 40)
     for index in range(40):
         draw_object(0, index)
-    assert draw_object(0, 40).relief == alone.relief
+    assert draw_object(0, 40).relief == first.relief
 
 
 def test_98_objects_show_every_family_and_relief_several_times():
@@ -59,11 +59,11 @@ def test_98_objects_show_every_family_and_relief_several_times():
 def test_thousands_of_objects_differ():
     objects = [draw_object(1, index) for index in range(2000)]
     assert len({item.object_id for item in objects}) == 2000
-    felt = {(*np.round(item.body.upper, 2), round(item.relief.pitch_mm, 3)) for item in objects}
-    assert len(felt) == 2000
+    sizes = {(*np.round(item.body.upper, 2), round(item.relief.pitch_mm, 3)) for item in objects}
+    assert len(sizes) == 2000
 
 
-def test_ids_can_be_read_and_name_a_file():
+def test_ids_are_readable_and_valid_file_names():
     found = draw_object(3, 17, family="bottle", relief="knurl").object_id
     assert found == "bottle-knurl-0003-00017"
     assert re.fullmatch(r"[a-z]+-[a-z]+-\d{4}-\d{5}", draw_object(0, 0).object_id)
@@ -76,7 +76,7 @@ def test_all_of_them_fit_between_the_fingers():
 
 
 @pytest.mark.parametrize(
-    ("settings", "error", "says"),
+    ("settings", "error", "message"),
     [
         ({"family": "teapot"}, UnknownName, r"family must be one of box.*'teapot'"),
         ({"relief": "fur"}, UnknownName, r"relief must be one of smooth.*'fur'"),
@@ -84,12 +84,12 @@ def test_all_of_them_fit_between_the_fingers():
         ({"seed": 1.5}, RobotConfigError, "seed must be a whole number from 0"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(settings, error, says):
-    with pytest.raises(error, match=says):
+def test_impossible_draws_are_refused(settings, error, message):
+    with pytest.raises(error, match=message):
         draw_object(**{"seed": 0, "index": 0, **settings})
 
 
-def test_nothing_is_baked_until_a_ray_asks_and_pickles_stay_small():
+def test_relief_is_baked_for_the_first_ray_and_pickles_stay_small():
     item = draw_object(0, 14)
     assert "wall" not in item.body.__dict__
     assert len(pickle.dumps(item)) < 20_000
@@ -100,7 +100,7 @@ def test_nothing_is_baked_until_a_ray_asks_and_pickles_stay_small():
     assert len(pickle.dumps(item)) < 20_000
 
 
-# No shortcut between paint and touch -----------------------------------------------------------------------
+# Paint is independent of touch -----------------------------------------------------------------------------
 
 
 def test_appearance_and_material_do_not_depend_on_shape_and_relief():
@@ -118,7 +118,7 @@ def test_colour_is_not_correlated_with_tactile_properties():
     appearance = np.array(
         [[*item.appearance.colour, item.appearance.paint is None, item.appearance.label is None] for item in objects]
     )
-    felt = np.array(
+    tactile = np.array(
         [
             [
                 list(SHAPES).index(item.family),
@@ -131,8 +131,8 @@ def test_colour_is_not_correlated_with_tactile_properties():
             for item in objects
         ]
     )
-    correlation = np.corrcoef(appearance.T.astype(float), felt.T)[: appearance.shape[1], appearance.shape[1] :]
-    # Of 40 independent pairs of 1500 samples the largest is below 0.11 but once in a thousand worlds.
+    correlation = np.corrcoef(appearance.T.astype(float), tactile.T)[: appearance.shape[1], appearance.shape[1] :]
+    # Of 40 independent pairs of 1500 samples, the largest exceeds 0.11 once in a thousand object sets.
     assert np.abs(correlation).max() < 0.11
 
 

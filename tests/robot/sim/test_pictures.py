@@ -1,4 +1,4 @@
-"""Photos and presses of simulated objects, with what is known of each."""
+"""Photos and presses of simulated objects, with their labels."""
 
 import json
 
@@ -19,7 +19,7 @@ def files(folder):
     return {path.relative_to(folder): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
-def test_every_object_has_a_photo_and_what_is_known_of_it(tmp_path):
+def test_every_object_has_a_photo_and_its_labels(tmp_path):
     assert collect_pictures("photo", tmp_path / "p", objects=3, seed=5) == 3
     rig, found = load_rig("sim", seed=5), rows(tmp_path / "p")
     assert [row["object_id"] for row in found] == rig.object_ids(3)
@@ -29,13 +29,13 @@ def test_every_object_has_a_photo_and_what_is_known_of_it(tmp_path):
         assert cv2.imread(str(tmp_path / "p" / row["file_name"])).shape == (256, 256, 3)
 
 
-def test_a_photo_is_the_one_that_the_rig_takes(tmp_path):
+def test_a_photo_equals_that_of_the_rig(tmp_path):
     collect_pictures("photo", tmp_path / "p", objects=1, seed=5)
     rig, row = load_rig("sim", seed=5), rows(tmp_path / "p")[0]
     rig.prepare(row["object_id"], 0)
     with rig:
-        seen = rig.camera.read(depth=False).colour
-    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "p" / row["file_name"]))[..., ::-1], seen)
+        photo = rig.camera.read(depth=False).colour
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "p" / row["file_name"]))[..., ::-1], photo)
 
 
 def test_every_press_has_both_fingers_with_a_no_contact_frame(tmp_path):
@@ -51,13 +51,13 @@ def test_every_press_has_both_fingers_with_a_no_contact_frame(tmp_path):
     assert max(differences) > 40
 
 
-def test_no_camera_looks_where_only_touches_are_wanted():
+def test_a_press_renders_no_camera_image():
     rig = load_rig("sim", seed=5)
     rig.press(rig.object_ids(1)[0], 0)
     assert rig.sim_state.current_scene().passes["view"] == rig.sim_state.current_scene().passes["photo"] == 0
 
 
-def test_what_was_stopped_goes_on_and_ends_the_same(tmp_path):
+def test_an_interrupted_run_continues_and_writes_the_same_files(tmp_path):
     collect_pictures("photo", tmp_path / "whole", objects=4, seed=5)
     collect_pictures("photo", tmp_path / "parts", objects=2, seed=5)
     with open(tmp_path / "parts" / "metadata.jsonl", "a") as file:
@@ -67,21 +67,21 @@ def test_what_was_stopped_goes_on_and_ends_the_same(tmp_path):
 
 
 @pytest.mark.parametrize("left", [".metadata.jsonl.0a.tmp", ".pictures.json.0a.tmp"])
-def test_what_was_killed_while_its_folder_was_made_can_be_begun_again(tmp_path, left):
+def test_a_run_killed_while_creating_its_folder_can_be_started_again(tmp_path, left):
     (tmp_path / left).write_bytes(b'{"ki')
     assert collect_pictures("photo", tmp_path, objects=1, seed=5) == 1
     assert not (tmp_path / left).exists()
 
 
-def test_pictures_made_otherwise_and_other_folders_are_left_alone(tmp_path):
+def test_pictures_of_other_settings_and_other_folders_are_not_changed(tmp_path):
     collect_pictures("photo", tmp_path / "p", objects=1, seed=5)
     before = files(tmp_path / "p")
     for kind, seed in (("photo", 6), ("touch", 5)):
-        with pytest.raises(RecordingError, match="made otherwise"):
+        with pytest.raises(RecordingError, match="made with other settings"):
             collect_pictures(kind, tmp_path / "p", objects=1, seed=seed)
     assert files(tmp_path / "p") == before
     (tmp_path / "p" / "metadata.jsonl").write_text("{}\n")
-    with pytest.raises(RecordingError, match="no picture's"):
+    with pytest.raises(RecordingError, match="does not describe a picture"):
         collect_pictures("photo", tmp_path / "p", objects=1, seed=5)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("dear")
@@ -89,12 +89,12 @@ def test_pictures_made_otherwise_and_other_folders_are_left_alone(tmp_path):
         collect_pictures("photo", tmp_path / "other", objects=1, seed=5)
 
 
-def test_a_rig_that_does_not_know_its_objects_has_no_labels(tmp_path):
+def test_an_unknown_kind_of_picture_is_refused(tmp_path):
     with pytest.raises(RobotConfigError, match="kind photo or touch"):
         collect_pictures("depth", tmp_path / "p", objects=1, seed=5)
 
 
 def test_progress_counts_objects(tmp_path):
-    told = []
-    collect_pictures("photo", tmp_path / "p", objects=2, seed=5, progress=lambda *counts: told.append(counts))
-    assert told == [(1, 2), (2, 2)]
+    reports = []
+    collect_pictures("photo", tmp_path / "p", objects=2, seed=5, progress=lambda *counts: reports.append(counts))
+    assert reports == [(1, 2), (2, 2)]

@@ -1,4 +1,4 @@
-"""What two closing fingers meet, and whether they hold it: against analytic bodies whose answer is known."""
+"""Contact of two closing fingers and whether they hold, against analytic bodies with known answers."""
 
 import dataclasses
 import math
@@ -27,15 +27,17 @@ class Slanted(Body):
         self.lower, self.upper = np.array([-80.0, -half_y_mm, 0.0]), np.array([80.0, half_y_mm, 100.0])
 
     def _cast(self, rays):
-        """Only from outside and across, which is how fingers look: at a plane n.p = c, t = (c - n.o) / n.d."""
+        """Rays come from outside, across the solid, like those of fingers: at a plane n.p = c, t = (c - n.o) / n.d."""
         distance = np.full(len(rays.origins), np.inf)
         for sign, slope in zip((-1.0, 1.0), self.slopes, strict=True):
             normal = np.array([sign, 0.0, slope])
             speed = rays.directions @ normal
             towards = speed < -1e-9
             reach = (10.0 + 50.0 * slope - rays.origins @ normal) / np.where(towards, speed, -1.0)
-            there = rays.origins + reach[:, None] * rays.directions
-            inside = (np.abs(there[:, 1]) <= self.upper[1]) & (there[:, 2] >= 0) & (there[:, 2] <= 100) & (reach >= 0)
+            points = rays.origins + reach[:, None] * rays.directions
+            inside = (
+                (np.abs(points[:, 1]) <= self.upper[1]) & (points[:, 2] >= 0) & (points[:, 2] <= 100) & (reach >= 0)
+            )
             distance = np.where(towards & inside, np.minimum(distance, reach), distance)
         return distance
 
@@ -47,7 +49,7 @@ class Slanted(Body):
 
 
 def thing(body, *, friction=0.6, modulus_mpa=1e4, density_kg_m3=1000.0):
-    """An object of 1e5 mm3: at 1000 kg/m3 it weighs 0.1 kg."""
+    """Return an object of 1e5 mm3: at 1000 kg/m3 it weighs 0.1 kg."""
     material = dataclasses.replace(
         ANY.material, friction=friction, modulus_mpa=modulus_mpa, density_kg_m3=density_kg_m3, poisson=0.3
     )
@@ -66,11 +68,11 @@ def pinch(obj, *, yaw=0.0, force_n=12.0, sensors=None, placement=None, opening_m
     )
 
 
-def test_flat_sides_end_square_to_the_fingers_but_for_a_trifle():
+def test_flat_sides_end_nearly_square_to_the_fingers():
     block = thing(Slanted())
     for degrees in (-25, -7, 0, 7, 25):
-        final_placement = pinch(block, yaw=math.radians(degrees)).final_placement
-        assert math.degrees(final_placement.yaw_rad) == pytest.approx(degrees, abs=0.6)
+        placement = pinch(block, yaw=math.radians(degrees)).final_placement
+        assert math.degrees(placement.yaw_rad) == pytest.approx(degrees, abs=0.6)
 
 
 def test_the_jaws_end_at_the_width_less_both_approaches():
@@ -82,10 +84,10 @@ def test_the_jaws_end_at_the_width_less_both_approaches():
     assert made.final_opening_mm == pytest.approx(width - approach, abs=0.02)
 
 
-def test_a_finger_meets_what_lies_far_behind_the_first_touch():
+def test_the_gap_includes_surfaces_far_behind_the_first_touch():
     gap = pinch(thing(Slanted(math.radians(50)))).gap("a")
     assert gap.max() > 12
-    for steps in (np.diff(gap, axis=0), np.diff(gap, axis=1)):  # no edge on the way, which soft foam would show
+    for steps in (np.diff(gap, axis=0), np.diff(gap, axis=1)):  # no edge within the gap, which would show in soft foam
         np.testing.assert_allclose(steps, steps.mean(), atol=1e-6)
 
 
@@ -131,13 +133,13 @@ def test_contacts_that_are_far_apart_along_the_fingers_slip():
     assert made.slip_reason in ("the fingers press past each other", "the side is too steep")
 
 
-def test_an_object_beside_the_fingers_is_missed():
+def test_an_object_next_to_the_fingers_is_missed():
     made = pinch(thing(Slanted(half_y_mm=5.0)), y_mm=30.0)
     assert made.miss_reason == "the object is not between the fingers"
     assert made.passes["contact"] == 0
 
 
-def test_a_finger_lands_on_an_object_that_stands_beside_the_middle():
+def test_a_finger_lands_on_an_object_that_is_off_the_middle():
     made = pinch(thing(Slanted()), placement=Placement(x_mm=50.0))
     assert made.miss_reason == "a finger comes down on the object"
 
@@ -148,9 +150,11 @@ def test_an_opening_beyond_the_stroke_is_refused(opening_mm):
         pinch(thing(Slanted()), opening_mm=opening_mm)
 
 
-def test_a_thing_that_is_grasped_far_from_its_middle_is_turned_where_it_is_grasped():
-    """Jaws that close 30 mm from the middle of a block, 10 degrees off square, meet the same place of it when it has
-    turned; turned about its own middle it would have moved aside by 30 sin(10 deg) = 5 mm."""
+def test_an_object_grasped_far_from_its_middle_turns_about_the_grip():
+    """Jaws close 30 mm from the middle of a block, 10 degrees off square, and meet the same place after the turn.
+
+    A turn about the block's own middle would move that place aside by 30 sin(10 deg) = 5 mm.
+    """
     block, angle = thing(Slanted()), math.radians(10)
     moved = {}
     for about_grip in (True, False):
@@ -165,8 +169,8 @@ def test_a_thing_that_is_grasped_far_from_its_middle_is_turned_where_it_is_grasp
 
 
 @pytest.mark.parametrize("tilt", [math.pi / 2, -math.pi / 2])
-def test_from_the_side_the_gel_meets_an_upright_cylinder_turned_by_a_quarter(tilt):
-    """From above its wall runs along the rows' direction, so that every row is the same; from a side every column."""
+def test_from_the_side_the_gap_of_an_upright_cylinder_is_turned_by_a_quarter(tilt):
+    """From above the wall is parallel to the columns, so every row is the same; from a side every column."""
     post = dataclasses.replace(draw_object(0, 0, family="cylinder", relief="smooth"))
     upright = pinch(post, yaw=0.3, z_mm=40.0).gap("a")
     grip = Grip(Pose(0.0, 0.0, 40.0, 0.3, tilt), 12.0)
@@ -176,9 +180,9 @@ def test_from_the_side_the_gel_meets_an_upright_cylinder_turned_by_a_quarter(til
 
 
 def test_a_tilted_pose_points_its_fingers_across_the_closing_direction():
-    """By hand: closing along x, tilted by a quarter turn the fingers point along y, by half of that down as well."""
+    """By hand: closing along x, tilted by 90 degrees, the fingers point along y; at 45 degrees also down."""
     down = [-Pose(0, 0, 0, 0, tilt).rotation()[:, 2] for tilt in (0.0, math.pi / 2, -math.pi / 2, math.pi / 4)]
     half = math.sqrt(0.5)
     np.testing.assert_allclose(down, [[0, 0, -1], [0, 1, 0], [0, -1, 0], [0, half, -half]], atol=1e-12)
-    final_placement = Pose(0, 0, 0, math.pi / 2, math.pi / 2).rotation()
-    np.testing.assert_allclose(final_placement, [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)
+    rotation = Pose(0, 0, 0, math.pi / 2, math.pi / 2).rotation()
+    np.testing.assert_allclose(rotation, [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)

@@ -1,4 +1,4 @@
-"""The contact sheet of a simulated recording holds what it says."""
+"""The contact sheet of a simulated recording shows its images."""
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ def test_a_row_for_each_object_and_a_tile_for_each_picture(collected, tmp_path):
     assert 2 * TILE_PX < sheet.shape[0] < 2 * (TILE_PX + 24) + 30
 
 
-def test_the_photo_stands_in_the_first_tile(collected, tmp_path):
+def test_the_photo_is_in_the_first_tile(collected, tmp_path):
     sheet = cv2.imread(str(write_preview(collected, tmp_path / "preview.png")))
     grasp = next(grasp for grasp in read_recording(collected).grasps if grasp.grasped)
     photo = cv2.imread(str(collected / grasp.photo))
@@ -33,8 +33,8 @@ def test_the_photo_stands_in_the_first_tile(collected, tmp_path):
     np.testing.assert_array_equal(sheet[below_the_header : below_the_header + TILE_PX - 4, 2 : TILE_PX - 2], small)
 
 
-def test_the_walls_are_those_that_the_gels_met(collected):
-    """Simulated again from the recording, they give the same opening of the jaws."""
+def test_walls_are_simulated_again_from_the_recording(collected):
+    """The walls simulated from the recording are reproducible."""
     rig = load_rig("sim", seed=3)
     grasp = next(grasp for grasp in read_recording(collected).grasps if grasp.grasped)
     walls = rig.walls(grasp)
@@ -44,14 +44,14 @@ def test_the_walls_are_those_that_the_gels_met(collected):
     np.testing.assert_array_equal(rig.walls(grasp)["a"], walls["a"])
 
 
-def test_a_recording_of_another_rig_is_refused_in_words(tmp_path):
+def test_a_recording_of_another_rig_is_refused_with_a_message(tmp_path):
     with RecordingWriter(tmp_path / "r", {"source": "hands", "sensor": "DIGIT", "rig": "bench"}):
         pass
     with pytest.raises(RecordingError, match="simulated rig"):
         write_preview(tmp_path / "r", tmp_path / "p.png")
 
 
-def test_an_empty_recording_is_refused_in_words(tmp_path):
+def test_an_empty_recording_is_refused_with_a_message(tmp_path):
     with RecordingWriter(tmp_path / "r", {"source": "x", "sensor": "y", "rig": "sim", "seed": 0, "rig_settings": {}}):
         pass
     with pytest.raises(RecordingError, match="at least one grasp"):

@@ -8,14 +8,14 @@ from robot.errors import RobotConfigError, UnknownName
 from robot.sim.objects.relief import RELIEFS, Relief, Sheet, draw_relief
 
 SHEET = Sheet(120.0, 60.0, 401, 800)
-WORN = [name for name in RELIEFS if name != "smooth"]
+NOT_SMOOTH = [name for name in RELIEFS if name != "smooth"]
 
 
 def height(name, sheet=SHEET, **settings):
     return Relief(name, **{"amplitude_mm": 1.0, "pitch_mm": 6.0, "seed": 3, **settings}).height(sheet)
 
 
-@pytest.mark.parametrize("name", WORN)
+@pytest.mark.parametrize("name", NOT_SMOOTH)
 def test_heights_lie_between_0_and_the_amplitude_and_use_most_of_it(name):
     found = height(name, amplitude_mm=0.8)
     assert found.shape == (401, 800)
@@ -25,7 +25,7 @@ def test_heights_lie_between_0_and_the_amplitude_and_use_most_of_it(name):
     assert np.ptp(found) > 0.4
 
 
-@pytest.mark.parametrize("name", WORN)
+@pytest.mark.parametrize("name", NOT_SMOOTH)
 def test_relief_meets_itself_at_the_seam(name):
     for settings in ({}, {"angle_rad": 0.6, "aspect": 1.7, "sharpness": 0.8}):
         found = height(name, **settings)
@@ -33,14 +33,14 @@ def test_relief_meets_itself_at_the_seam(name):
         assert np.abs(found[:, 0] - found[:, -1]).max() <= 1.3 * across + 1e-3, settings
 
 
-@pytest.mark.parametrize("name", WORN)
+@pytest.mark.parametrize("name", NOT_SMOOTH)
 def test_the_same_relief_is_the_same_again_and_another_seed_or_pitch_is_not(name):
     np.testing.assert_array_equal(height(name), height(name))
     assert np.abs(height(name) - height(name, pitch_mm=9.0, seed=4)).max() > 0.1
 
 
-@pytest.mark.parametrize("name", WORN)
-def test_a_relief_is_the_same_whatever_the_number_of_threads(name):
+@pytest.mark.parametrize("name", NOT_SMOOTH)
+def test_a_relief_does_not_depend_on_the_number_of_threads(name):
     threads = cv2.getNumThreads()
     found = []
     try:
@@ -53,7 +53,7 @@ def test_a_relief_is_the_same_whatever_the_number_of_threads(name):
     np.testing.assert_array_equal(found[2], found[0])
 
 
-def test_engraving_goes_in():
+def test_engraving_goes_inwards():
     np.testing.assert_array_equal(height("glyphs", engraved=True), -height("glyphs"))
 
 
@@ -70,12 +70,12 @@ def test_ribs_repeat_after_their_pitch_in_their_direction():
     assert np.ptp(upright, axis=1).max() < 1e-4
 
 
-def test_a_whole_number_of_waves_goes_round_even_if_the_pitch_does_not_fit():
+def test_the_number_of_waves_around_is_whole_even_if_the_pitch_does_not_fit():
     found = height("ribs", pitch_mm=7.0, angle_rad=0.0)[200]
     assert np.abs(np.fft.rfft(found))[1:].argmax() + 1 == 17  # 120 / 7 is 17.1
 
 
-def test_sharp_ribs_have_flat_tops_and_round_ones_have_not():
+def test_sharp_ribs_have_flat_tops_and_round_ones_do_not():
     flat = [np.mean(height("ribs", sharpness=sharpness) > 0.95) for sharpness in (0.0, 1.0)]
     assert flat[0] < 0.2
     assert flat[1] > 0.3
@@ -88,7 +88,7 @@ def test_a_scatter_gives_the_distance_to_its_nearest_point():
     i, j = np.meshgrid(np.arange(61), np.arange(80), indexing="ij")
     sides = np.minimum(np.abs(j[..., None] - columns), 80 - np.abs(j[..., None] - columns)) * 0.5
     slow = np.hypot(sides, (i[..., None] - rows) * 0.5).min(axis=-1)
-    # Points beyond the upper and lower ends count in the scatter, and cannot be seen here.
+    # The scatter also counts points beyond the upper and lower ends, which are not visible here.
     middle = slice(16, 45)
     assert np.mean(np.abs(found - slow)[middle] < 0.05) > 0.9
 
@@ -122,8 +122,8 @@ def test_unknown_names_and_impossible_settings_are_refused():
             Relief("ribs", **{"amplitude_mm": 1.0, "pitch_mm": 5.0, **settings})
 
 
-@pytest.mark.parametrize("name", WORN)
-def test_drawn_reliefs_keep_to_the_shape_and_to_what_a_gel_can_follow(name):
+@pytest.mark.parametrize("name", NOT_SMOOTH)
+def test_drawn_reliefs_stay_within_the_limits_of_shape_and_gel(name):
     for seed in range(40):
         relief = draw_relief(name, np.random.default_rng(seed), 1.2)
         assert 0.1 <= relief.amplitude_mm <= 1.2
@@ -132,6 +132,8 @@ def test_drawn_reliefs_keep_to_the_shape_and_to_what_a_gel_can_follow(name):
 
 
 def test_most_drawn_amplitudes_lie_between_a_third_and_2_mm():
-    drawn = [draw_relief(name, np.random.default_rng([seed]), 6.0).amplitude_mm for name in WORN for seed in range(60)]
+    drawn = [
+        draw_relief(name, np.random.default_rng([seed]), 6.0).amplitude_mm for name in NOT_SMOOTH for seed in range(60)
+    ]
     assert np.mean([0.3 <= amplitude <= 2 for amplitude in drawn]) > 0.6
     assert max(drawn) > 2.5

@@ -1,4 +1,4 @@
-"""The simulated rig is a rig: its devices say what the scene holds, and an attempt depends on nothing but its name."""
+"""The simulated rig follows the rig contract, and an attempt depends only on seed, object and number."""
 
 import functools
 import math
@@ -22,12 +22,12 @@ def rig():
         yield made
 
 
-def pinch(rig, z_mm=None, force_n=12.0, yaw=0.3, beside_mm=0.0):
-    """Close over the object on the table; returns what the gripper says."""
+def pinch(rig, z_mm=None, force_n=12.0, yaw=0.3, offset_mm=0.0):
+    """Close over the object on the table; return the state of the gripper."""
     placement, obj = rig.sim_state.scene.placement, rig.sim_state.scene.obj
     z_mm = max(10.0, 0.5 * obj.body.upper[2]) if z_mm is None else z_mm
     rig.gripper.open(STROKE_MM)
-    rig.arm.move_to(Pose(placement.x_mm + beside_mm, placement.y_mm, z_mm, yaw), 100.0)
+    rig.arm.move_to(Pose(placement.x_mm + offset_mm, placement.y_mm, z_mm, yaw), 100.0)
     return rig.gripper.grasp(force_n)
 
 
@@ -37,7 +37,7 @@ def lift(rig):
     return rig.gripper.state()
 
 
-def test_the_jaws_stop_at_the_objects_width_less_what_the_gels_give(rig):
+def test_the_jaws_stop_at_the_objects_width_less_the_compression_of_the_gels(rig):
     rig.prepare(rig.object_ids(1)[0], 0)
     state = pinch(rig)
     width = 2 * float(rig.sim_state.scene.obj.body.upper[0])
@@ -48,7 +48,7 @@ def test_the_jaws_stop_at_the_objects_width_less_what_the_gels_give(rig):
 def test_closing_on_nothing_gives_no_part_and_no_contact_frames(rig):
     rig.prepare(rig.object_ids(1)[0], 0)
     before = rig.sensors["a"].read().pixels.astype(float)
-    assert pinch(rig, beside_mm=100.0).status == "no_part"
+    assert pinch(rig, offset_mm=100.0).status == "no_part"
     assert np.abs(rig.sensors["a"].read().pixels - before).mean() < 3
     assert lift(rig).status == "no_part"
 
@@ -79,18 +79,18 @@ def test_a_heavy_slippery_object_is_lost_in_the_lift_and_gives_a_no_contact_fram
     assert np.abs(rig.sensors["a"].read().pixels - before).mean() < 3
 
 
-def test_an_attempt_depends_on_seed_object_and_number_alone(rig):
+def test_an_attempt_depends_only_on_seed_object_and_number(rig):
     first, second = rig.object_ids(2)
     rig.prepare(first, 3)
-    wanted = rig.camera.read()
+    expected = rig.camera.read()
     rig.prepare(second, 0)
     rig.camera.read()
     rig.prepare(first, 3)
     again = rig.camera.read()
-    np.testing.assert_array_equal(wanted.colour, again.colour)
-    np.testing.assert_array_equal(wanted.depth_m, again.depth_m)
+    np.testing.assert_array_equal(expected.colour, again.colour)
+    np.testing.assert_array_equal(expected.depth_m, again.depth_m)
     rig.prepare(first, 4)
-    assert not np.array_equal(wanted.colour, rig.camera.read().colour)
+    assert not np.array_equal(expected.colour, rig.camera.read().colour)
 
 
 def test_without_depth_no_depth_is_computed(rig):
@@ -122,13 +122,13 @@ def test_one_finger_is_enough():
 
 def test_several_pairs_of_gels_alternate_over_the_objects():
     with SimRig(0, gels=3) as rig:
-        looks = set()
+        brightnesses = set()
         for name in rig.object_ids(12):
             rig.prepare(name, 0)
-            looks.add(rig.sensors["a"].read().pixels.astype(float).mean().round())
+            brightnesses.add(rig.sensors["a"].read().pixels.astype(float).mean().round())
             scene = rig.sim_state.scene
             assert scene.sensors["a"] != scene.sensors["b"]
-        assert len(looks) == 3
+        assert len(brightnesses) == 3
 
 
 def test_markers_are_black_dots_on_the_same_gels():
@@ -142,24 +142,24 @@ def test_markers_are_black_dots_on_the_same_gels():
     assert abs(np.median(darker)) < 3
 
 
-def test_force_and_manner_of_a_grasp_are_set_in_the_file(tmp_path):
+def test_the_file_sets_force_and_attempts_of_grasps(tmp_path):
     path = tmp_path / "sim.toml"
     path.write_text('rig = "sim"\n[grasp]\nforce_n = [10.0, 11.0]\n[attempt]\nsettle_s = 0.25\noutputs = ["before"]\n')
     with load_rig(str(path), seed=0) as rig:
         assert (rig.attempt.settle_s, rig.attempt.retries) == (0.25, AttemptSettings.retries)
-        attempter = AttemptRunner(rig, 0, rig.attempt)
-        attempts = [attempter.run(rig.object_ids(1)[0], number) for number in range(6)]
+        runner = AttemptRunner(rig, 0, rig.attempt)
+        attempts = [runner.run(rig.object_ids(1)[0], number) for number in range(6)]
     tried = [attempt for attempt in attempts if attempt.images]
     assert tried
     assert all(10.0 <= attempt.fields["force_n"] <= 11.0 for attempt in tried)
     assert set(tried[0].images) == {"photo", "touch_a", "touch_a_before", "touch_b", "touch_b_before"}
 
 
-def test_without_these_tables_attempts_are_made_as_by_default():
+def test_without_these_tables_attempts_use_the_defaults():
     assert SimRig(0).attempt == AttemptSettings()
 
 
-def test_a_softer_gel_gives_way_further():
+def test_a_softer_gel_is_compressed_further():
     openings = []
     for modulus in (0.2, 0.8):
         gel = {finger: {"modulus_mpa": modulus, "thickness_mm": 3.0, "poisson": 0.48} for finger in "ab"}
@@ -169,20 +169,20 @@ def test_a_softer_gel_gives_way_further():
     assert openings[0] < openings[1] - 0.1
 
 
-def test_a_recording_says_what_each_pair_of_gels_is_made_of(tmp_path):
-    made = {"thickness_mm": 3.0, "modulus_mpa": 0.35, "poisson": 0.48}
-    rig = functools.partial(load_rig, "sim", seed=0, gels=2, gel={"a": made, "b": {"thickness_mm": 2.0}})
+def test_a_recording_has_the_materials_of_each_pair_of_gels(tmp_path):
+    gel = {"thickness_mm": 3.0, "modulus_mpa": 0.35, "poisson": 0.48}
+    rig = functools.partial(load_rig, "sim", seed=0, gels=2, gel={"a": gel, "b": {"thickness_mm": 2.0}})
     settings = CollectSettings(1, attempt=AttemptSettings(outputs=("before",)))
     collect(rig, tmp_path / "r", objects=1, seed=0, settings=settings)
     first, second = read_recording(tmp_path / "r").info["gels"]
-    assert first["a"] == second["a"] == made
+    assert first["a"] == second["a"] == gel
     assert first["b"]["thickness_mm"] == second["b"]["thickness_mm"] == 2.0
     layers = [pair["b"].layer for pair in rig()._gels]
     assert [pair["b"]["modulus_mpa"] for pair in (first, second)] == [layer.modulus_mpa for layer in layers]
 
 
-def test_devices_say_when_nothing_stands_on_the_table(rig):
-    with pytest.raises(DeviceError, match="call prepare"):
+def test_devices_raise_when_the_table_is_empty(rig):
+    with pytest.raises(DeviceError, match="Call prepare"):
         rig.camera.read()
 
 
@@ -218,6 +218,6 @@ def test_an_object_of_another_seed_raises(rig):
         ({"gel": {"b": {}}, "fingers": ["a"]}, RobotConfigError),
     ],
 )
-def test_settings_that_no_rig_has_are_refused(settings, error):
+def test_impossible_settings_are_refused(settings, error):
     with pytest.raises(error):
         load_rig("sim", seed=0, **settings)

@@ -1,4 +1,4 @@
-"""A scene computes what its outputs need, and nothing else; what it computes is right where it can be known by hand."""
+"""A scene computes only what its outputs need; its results agree with answers known by hand."""
 
 import dataclasses
 import math
@@ -26,12 +26,12 @@ ALL = {
 
 
 def scene(outputs, **changes):
-    given = {"obj": BOTTLE, "sensors": SENSORS, "grip": GRIP, "seed": 5, "outputs": frozenset(outputs)} | changes
-    return Scene(**given)
+    settings = {"obj": BOTTLE, "sensors": SENSORS, "grip": GRIP, "seed": 5, "outputs": frozenset(outputs)} | changes
+    return Scene(**settings)
 
 
-def work(outputs, **changes):
-    """What was done for these outputs, by name and number."""
+def passes_of(outputs, **changes):
+    """Return the computations done for these outputs, by name and number."""
     made = scene(outputs, **changes)
     images = made.run()
     assert set(images) == set(outputs)
@@ -39,7 +39,7 @@ def work(outputs, **changes):
 
 
 def test_a_whole_scene_does_each_thing_once_for_each_finger():
-    assert work(ALL) == {
+    assert passes_of(ALL) == {
         "view": 1,
         "photo": 1,
         "shadow": 1,
@@ -52,49 +52,49 @@ def test_a_whole_scene_does_each_thing_once_for_each_finger():
     }
 
 
-def test_nothing_is_done_when_nothing_is_wanted():
-    assert work(()) == {}
+def test_no_outputs_need_no_work():
+    assert passes_of(()) == {}
 
 
-def test_the_photo_alone_needs_neither_depth_nor_touch():
-    assert work(["photo"]) == {"view": 1, "photo": 1, "shadow": 1}
-    assert work(["photo"], shadow=False) == {"view": 1, "photo": 1}
+def test_a_photo_needs_neither_depth_nor_touch():
+    assert passes_of(["photo"]) == {"view": 1, "photo": 1, "shadow": 1}
+    assert passes_of(["photo"], shadow=False) == {"view": 1, "photo": 1}
 
 
-def test_the_depth_alone_needs_no_shading():
-    assert work(["depth"]) == {"view": 1, "depth": 1}
+def test_a_depth_image_needs_no_shading():
+    assert passes_of(["depth"]) == {"view": 1, "depth": 1}
 
 
 def test_photo_and_depth_share_one_geometry_pass():
-    assert work(["photo", "depth"])["view"] == 1
+    assert passes_of(["photo", "depth"])["view"] == 1
 
 
-def test_touch_alone_needs_no_camera():
-    assert not set(work(["touch_a", "touch_b"])) & {"view", "photo", "depth", "shadow"}
+def test_touches_need_no_camera():
+    assert not set(passes_of(["touch_a", "touch_b"])) & {"view", "photo", "depth", "shadow"}
 
 
 def test_a_no_contact_frame_needs_no_contact_solve_and_no_grip():
-    assert work(["touch_a_before"], grip=None) == {"background": 1}
+    assert passes_of(["touch_a_before"], grip=None) == {"background": 1}
 
 
 def test_a_sensor_on_one_finger_solves_one_contact():
-    done = work(["touch_a", "touch_a_after"], sensors={"a": SENSORS["a"]})
+    done = passes_of(["touch_a", "touch_a_after"], sensors={"a": SENSORS["a"]})
     assert done["contact"] == done["wall"] == done["bare_finger"] == 1
 
 
-def test_one_finger_wanted_of_two_solves_one_contact_until_the_lift_asks_for_the_other():
-    assert work(["touch_a"])["contact"] == 1
-    assert work(["touch_a", "touch_a_after"])["contact"] == 2
+def test_one_of_two_fingers_solves_one_contact_until_the_lift_needs_the_other():
+    assert passes_of(["touch_a"])["contact"] == 1
+    assert passes_of(["touch_a", "touch_a_after"])["contact"] == 2
 
 
 def test_a_missed_grasp_solves_no_contact():
-    beside = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
-    done = work(["touch_a", "touch_b", "touch_a_after"], grip=beside)
+    miss = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
+    done = passes_of(["touch_a", "touch_b", "touch_a_after"], grip=miss)
     assert "contact" not in done
     assert "gel" not in done
 
 
-def test_a_finger_that_comes_down_on_the_object_is_a_miss_that_says_so():
+def test_a_finger_that_comes_down_on_the_object_is_a_miss_with_this_reason():
     narrow = dataclasses.replace(GRIP, opening_mm=0.5 * float(BOTTLE.body.upper[0]))
     pinch = scene([], grip=narrow).pinch
     assert pinch.miss_reason == pinch.slip_reason == "a finger comes down on the object"
@@ -102,8 +102,8 @@ def test_a_finger_that_comes_down_on_the_object_is_a_miss_that_says_so():
 
 
 def test_a_missed_grasp_shows_the_no_contact_frame():
-    beside = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
-    images = scene(["touch_a", "touch_a_before"], grip=beside).run()
+    miss = Grip(Pose(140.0, 0.0, MIDDLE_MM, 0.3), force_n=12.0)
+    images = scene(["touch_a", "touch_a_before"], grip=miss).run()
     difference = images["touch_a"].astype(float) - images["touch_a_before"].astype(float)
     assert abs(difference.mean()) < 0.3
     assert np.abs(difference).max() < 25
@@ -116,7 +116,7 @@ def test_the_same_seed_makes_the_same_pictures_and_another_one_does_not():
         assert not np.array_equal(first[name], other[name], equal_nan=True)
 
 
-def test_asking_in_another_order_or_alone_changes_no_pixel():
+def test_the_order_of_outputs_changes_no_pixel():
     whole = scene(ALL).run()
     for name in sorted(ALL, reverse=True):
         np.testing.assert_array_equal(scene([name]).run()[name], whole[name])
@@ -138,11 +138,11 @@ def test_both_gels_carry_the_clamping_force():
 
 
 def test_turning_hand_and_object_together_changes_no_gel_image():
-    turned = math.radians(70)
-    c, s = math.cos(turned), math.sin(turned)
+    angle = math.radians(70)
+    c, s = math.cos(angle), math.sin(angle)
     here = scene([], placement=Placement(4.0, -3.0, 0.2), grip=Grip(Pose(2.0, 1.0, MIDDLE_MM, 0.3), 12.0))
-    pose = Pose(2 * c - 1 * s, 2 * s + 1 * c, MIDDLE_MM, 0.3 + turned)
-    there = scene([], placement=Placement(4 * c + 3 * s, 4 * s - 3 * c, 0.2 + turned), grip=Grip(pose, 12.0))
+    pose = Pose(2 * c - 1 * s, 2 * s + 1 * c, MIDDLE_MM, 0.3 + angle)
+    there = scene([], placement=Placement(4 * c + 3 * s, 4 * s - 3 * c, 0.2 + angle), grip=Grip(pose, 12.0))
     np.testing.assert_allclose(here.pinch.gap("a"), there.pinch.gap("a"), atol=2e-3)
 
 
@@ -154,7 +154,7 @@ def test_turning_the_hand_half_round_swaps_the_fingers():
 
 
 @pytest.mark.parametrize(
-    ("changes", "words"),
+    ("changes", "message"),
     [
         ({"outputs": {"sound"}}, "outputs are photo, depth"),
         ({"outputs": {"touch_c"}}, "needs a sensor on finger c"),
@@ -164,8 +164,8 @@ def test_turning_the_hand_half_round_swaps_the_fingers():
         ({"sensors": {"c": SENSORS["a"]}}, "fingers a and b"),
     ],
 )
-def test_a_scene_that_cannot_be_is_refused_at_once(changes, words):
-    with pytest.raises(SceneError, match=words):
+def test_an_impossible_scene_is_refused_at_once(changes, message):
+    with pytest.raises(SceneError, match=message):
         scene(changes.pop("outputs", ()), **changes)
 
 

@@ -1,4 +1,4 @@
-"""Shapes: distances by hand, the bound that sphere tracing rests on, sizes a gripper can hold, unrolled walls."""
+"""Shapes: distances by hand, the bound for sphere tracing, sizes that fit the gripper, unrolled walls."""
 
 import numpy as np
 import pytest
@@ -27,12 +27,12 @@ def can(radius=20.0, height=80.0, rim=0.0):
 
 def test_a_point_10_mm_outside_a_cylinder_is_10_mm_away():
     found = distance(can(), [30, 0, 40], [0, -30, 40], [0, 0, 90], [0, 0, -10], [15, 0, 40], [0, 0, 75])
-    np.testing.assert_allclose(found, [10, 10, 10, 10, -5, -5], atol=1e-5)  # float32 of some 100 mm
+    np.testing.assert_allclose(found, [10, 10, 10, 10, -5, -5], atol=1e-5)  # float32 of about 100 mm
 
 
-def test_beside_an_edge_the_distance_is_to_the_edge():
+def test_next_to_an_edge_the_distance_is_to_the_edge():
     np.testing.assert_allclose(distance(can(), [23, 0, 84]), [5], atol=1e-5)
-    # A rim of 2 mm leaves the arc round (18, 78).
+    # A rim of 2 mm is an arc around (18, 78).
     np.testing.assert_allclose(distance(can(rim=2), [23, 0, 90]), [13 - 2], atol=1e-5)
 
 
@@ -53,7 +53,7 @@ def test_distances_from_a_hexagon_are_those_of_its_faces_and_corners():
 def test_distances_from_a_ball_a_cone_a_ring_and_a_link():
     np.testing.assert_allclose(distance(Revolution((Ball(15, 15),), 30), [0, -20, 15], [9, 12, 15]), [5, 0], atol=1e-5)
     cone = Revolution((Cone(20, 10, 0, 40),), 40)
-    # Half way up the radius is 15; the side leans by 1 in 4.
+    # Halfway up, the radius is 15; the side leans by 1 in 4.
     np.testing.assert_allclose(distance(cone, [16, 0, 20]), [1 / np.hypot(1, 0.25)], atol=1e-5)
     ring = Ring(20, 5, stretch_mm=30)
     found = distance(ring, [30, 0, ring.middle_mm], [20, 8, ring.middle_mm + 15], [0, 0, ring.middle_mm])
@@ -67,7 +67,7 @@ def test_the_distance_from_an_ellipsoid_is_exact_for_a_ball_and_never_too_large(
     assert 0 < distance(long, [0, 0, long.upper[2] + 10])[0] <= 10
 
 
-def test_slots_and_bristles_are_where_their_pitch_says():
+def test_slots_and_bristles_follow_their_pitch():
     slab = Brick((0, 0), (30, 5), 0, 60, 0.5)
     comb = Comb(slab, pitch_mm=10, gap_mm=4, slot_mm=-10, lying=False)
     inside = distance(comb, [0, 0, 40], [5, 0, 40], [10, 0, 40], [0, 0, 15], [29, 0, 40])
@@ -76,7 +76,7 @@ def test_slots_and_bristles_are_where_their_pitch_says():
     np.testing.assert_allclose(distance(brush, [0, 0, 50], [8, 8, 50], [4, 0, 50]), [-2, -2, 2], atol=1e-5)
 
 
-def test_an_even_number_of_bristles_stands_astride_the_middle():
+def test_an_even_number_of_bristles_has_none_in_the_middle():
     brush = Brush(Brick((0, 0), (14, 6.5), 0, 20, 1), bristle_mm=2, pitch_mm=8, top_mm=60)
     assert (distance(brush, [4, 4, 50], [-4, -4, 50], [12, 4, 50]) < 0).all()
     assert distance(brush, [0, 4, 50])[0] > 0
@@ -87,7 +87,7 @@ def test_a_union_of_bars_is_the_nearer_one():
     np.testing.assert_allclose(distance(shape, [10, -5, 20], [10, 10, 20]), [8, 3], atol=1e-5)
 
 
-# What sphere tracing needs ---------------------------------------------------------------------------------
+# Condition for sphere tracing ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("family", SHAPES)
@@ -98,7 +98,7 @@ def test_no_distance_grows_faster_than_its_point_moves(family):
         p = rng.uniform(shape.lower - 0.4 * size, shape.upper + 0.4 * size, (4000, 3))
         q = p + rng.standard_normal((4000, 3)) * np.exp(rng.uniform(np.log(0.05), np.log(60), (4000, 1)))
         change, moved = np.abs(shape.distance(p) - shape.distance(q)), np.linalg.norm(p - q, axis=1)
-        # float32 coordinates of some 200 mm are known to 2e-5 mm, and a distance sums a few of them.
+        # float32 coordinates of about 200 mm have errors of 2e-5 mm, and a distance sums a few of them.
         assert (change <= moved * (1 + 1e-4) + 3e-4).all(), (seed, (change - moved).max())
 
 
@@ -141,7 +141,7 @@ def test_instances_of_a_family_differ():
 @pytest.mark.parametrize("outline", [RoundedRectangle(20, 12, 5), RoundedRectangle(20, 12, 12), Polygon(5, 18, 4)])
 def test_arc_length_comes_back_from_its_point(outline):
     s = np.linspace(0, outline.length_mm, 400, endpoint=False) + 0.03
-    points, normals = outline.place(s)
+    points, normals = outline.points_at(s)
     x, y = (points + 0.5 * normals).astype(np.float32).T
     np.testing.assert_allclose(outline.locate(x, y), s, atol=2e-4)
     np.testing.assert_allclose(outline.distance(x, y), 0.5, atol=1e-4)
@@ -149,7 +149,7 @@ def test_arc_length_comes_back_from_its_point(outline):
     np.testing.assert_allclose(steps, outline.length_mm / 400, rtol=0.01)
 
 
-def test_charts_look_at_the_places_that_they_name():
+def test_chart_rays_meet_their_coordinates():
     s, t = np.meshgrid(np.linspace(1, 100, 30), np.linspace(5, 45, 9))
     twisted = Extrusion(Polygon(4, 18, 4), 50, twist_rad=1.0, taper=0.3)
     for chart in (CylindricalChart(20, 50), twisted.chart, TwoSidedChart(30, 50, 8)):
@@ -159,7 +159,7 @@ def test_charts_look_at_the_places_that_they_name():
         np.testing.assert_allclose(found, [s.ravel(), t.ravel()], atol=1e-3)
 
 
-def test_maps_run_to_the_right_when_seen_from_the_front():
+def test_maps_run_to_the_right_in_a_front_view():
     x, y, z = np.array([[-3, 3], [-20, -20], [10, 10]], np.float32)
     for chart in (
         CylindricalChart(20, 50),

@@ -1,4 +1,4 @@
-"""Outlines pulled up from the table: boxes, prisms, ovals; tapered or twisted."""
+"""Outlines extruded from the table: boxes, prisms, ovals; tapered or twisted."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from robot.sim.objects.shapes.shape import (
 
 
 class Outline(ABC):
-    """A flat closed curve round the origin, with a signed distance, extents and an arc length, in mm."""
+    """A flat closed curve around the origin, with a signed distance, extents and an arc length, in mm."""
 
     reach_x_mm: float
     reach_y_mm: float
@@ -29,20 +29,20 @@ class Outline(ABC):
 
     @abstractmethod
     def distance(self, x: Floats, y: Floats) -> Floats:
-        """Signed distance in mm, exact outside."""
+        """Return the signed distance in mm, exact outside."""
 
     @abstractmethod
     def locate(self, x: Floats, y: Floats) -> Floats:
-        """Arc length in mm of the curve's point next to (x, y), in [0, length_mm)."""
+        """Return the arc length in mm of the curve's point nearest to (x, y), in [0, length_mm)."""
 
     @abstractmethod
     def points_at(self, s: Floats) -> tuple[Points, Points]:
-        """Points of the curve at arc length s and outward normals there, (N, 2) each."""
+        """Return points of the curve at arc length s and outward normals there, (N, 2) each."""
 
 
 @dataclass(frozen=True)
 class RoundedRectangle(Outline):
-    """2 half_x by 2 half_y with corners of radius `corner_mm` > 0; an oval when that is the smaller half."""
+    """2 half_x by 2 half_y with corners of radius `corner_mm` > 0; an oval if the radius equals the smaller half."""
 
     half_x_mm: float
     half_y_mm: float
@@ -50,14 +50,17 @@ class RoundedRectangle(Outline):
 
     @property
     def reach_x_mm(self) -> float:  # type: ignore[override]
+        """Extent along x."""
         return self.half_x_mm
 
     @property
     def reach_y_mm(self) -> float:  # type: ignore[override]
+        """Extent along y."""
         return self.half_y_mm
 
     @property
     def radius_mm(self) -> float:  # type: ignore[override]
+        """Distance of the farthest point from the origin."""
         return float(np.hypot(*self._inner)) + self.corner_mm
 
     @property
@@ -66,18 +69,20 @@ class RoundedRectangle(Outline):
 
     @property
     def length_mm(self) -> float:  # type: ignore[override]
+        """Arc length of the curve."""
         return 4 * sum(self._inner) + 2 * np.pi * self.corner_mm
 
     def distance(self, x: Floats, y: Floats) -> Floats:
+        """Return the signed distance in mm."""
         return rounded_corner(
             np.abs(x) - np.float32(self.half_x_mm), np.abs(y) - np.float32(self.half_y_mm), self.corner_mm
         )
 
     def locate(self, x: Floats, y: Floats) -> Floats:
-        """From the middle of the back (+y) over the left to the front, so that s grows to the right in front."""
+        """Return the arc length from the middle of the back (+y) over the left; s grows to the right in front."""
         a, b = (np.float32(value) for value in self._inner)
         p, q = np.abs(x) - a, np.abs(y) - b
-        # Deep inside, the nearer face counts: p and q are shifted so that the larger one is an edge's.
+        # Deep inside, the nearer face counts: shift p and q so that the larger one belongs to an edge.
         depth = np.maximum(np.minimum(-p, -q), 0) + np.float32(1e-6)
         angle = arctan2(np.maximum(p + depth, 0), np.maximum(q + depth, 0))
         along = np.clip(a + p, 0, a) + angle * np.float32(self.corner_mm) + np.clip(-q, 0, b)
@@ -87,6 +92,7 @@ class RoundedRectangle(Outline):
         return unrolled
 
     def points_at(self, s: Floats) -> tuple[Points, Points]:
+        """Return points and outward normals at arc length s, (N, 2) each."""
         a, b = self._inner
         half = self.length_mm / 2
         folded = np.where(s > half, 2 * half - s, s)
@@ -101,7 +107,13 @@ class RoundedRectangle(Outline):
 
 @dataclass(frozen=True)
 class Polygon(Outline):
-    """A regular polygon of `sides`, `apothem_mm` from its middle to a face, corners rounded by `corner_mm` > 0."""
+    """A regular polygon with rounded corners.
+
+    Attributes:
+        sides: number of sides.
+        apothem_mm: distance from its middle to a face.
+        corner_mm: radius of the corners, above 0.
+    """
 
     sides: int
     apothem_mm: float
@@ -109,27 +121,31 @@ class Polygon(Outline):
 
     @property
     def reach_x_mm(self) -> float:  # type: ignore[override]
+        """Extent along x."""
         return float((self.apothem_mm - self.corner_mm) / np.cos(np.pi / self.sides) + self.corner_mm)
 
     @property
     def reach_y_mm(self) -> float:  # type: ignore[override]
+        """Extent along y."""
         return self.reach_x_mm
 
     @property
     def radius_mm(self) -> float:  # type: ignore[override]
+        """Distance of the farthest point from the origin."""
         return self.reach_x_mm
 
     @property
     def _half(self) -> float:
-        """Half of a face's straight part."""
+        """Half the length of a face's straight part."""
         return float((self.apothem_mm - self.corner_mm) * np.tan(np.pi / self.sides))
 
     @property
     def length_mm(self) -> float:  # type: ignore[override]
+        """Arc length of the curve."""
         return self.sides * 2 * self._half + 2 * np.pi * self.corner_mm
 
     def _fold(self, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-        """The face's number, and coordinates along and across it; face 0 looks to the front (-y)."""
+        """Return the face's number, and coordinates along and across it; face 0 is in front (-y)."""
         wedge = np.float32(2 * np.pi / self.sides)
         face = np.rint(arctan2(x, -y) / wedge)
         turn = face * wedge
@@ -137,6 +153,7 @@ class Polygon(Outline):
         return face, x * cosine + y * sine, x * sine - y * cosine
 
     def distance(self, x: Floats, y: Floats) -> Floats:
+        """Return the signed distance in mm."""
         _, u, v = self._fold(x, y)
         side = np.abs(u) - np.float32(self._half)
         height = v - np.float32(self.apothem_mm - self.corner_mm)
@@ -144,6 +161,7 @@ class Polygon(Outline):
         return np.where(height > 0, corner, height) - np.float32(self.corner_mm)
 
     def locate(self, x: Floats, y: Floats) -> Floats:
+        """Return the arc length of the nearest point of the curve."""
         face, u, v = self._fold(x, y)
         side = np.abs(u) - np.float32(self._half)
         height = np.maximum(v - np.float32(self.apothem_mm - self.corner_mm), np.float32(1e-6))
@@ -153,6 +171,7 @@ class Polygon(Outline):
         return np.where(s < 0, s + np.float32(self.length_mm), s)
 
     def points_at(self, s: Floats) -> tuple[Points, Points]:
+        """Return points and outward normals at arc length s, (N, 2) each."""
         shifted = s - self.length_mm / 2
         face = np.rint(shifted / (self.length_mm / self.sides))
         u = shifted - face * (self.length_mm / self.sides)
@@ -174,10 +193,12 @@ class OutlineChart(Chart):
         self.width_mm, self.height_mm = shape.outline.length_mm, shape.height_mm
 
     def locate(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
+        """Return map coordinates of points on or near the wall."""
         u, v, _ = self._shape.straighten(x, y, z)
         return self._shape.outline.locate(u, v), z
 
     def rays(self, s: Floats, t: Floats) -> tuple[Points, Points]:
+        """Return rays towards the wall from outside, at map coordinates (s, t)."""
         point, normal = self._shape.outline.points_at(s)
         start = point * self._shape.scale(t)[:, None] + normal
         turn = self._shape.twist_per_mm * t
@@ -188,9 +209,14 @@ class OutlineChart(Chart):
 
 
 class Extrusion(Shape):
-    """An outline from z = 0 to `height_mm`, upper and lower edges rounded by `rim_mm`.
+    """An outline from z = 0 to `height_mm`, with rounded upper and lower edges.
 
-    `taper`: share by which the outline has shrunk at the top; `twist_rad`: how far it has turned there.
+    Args:
+        outline: the outline at the base.
+        height_mm: height.
+        rim_mm: radius of the edges.
+        taper: relative shrinkage of the outline at the top.
+        twist_rad: rotation of the outline at the top.
     """
 
     def __init__(
@@ -203,17 +229,17 @@ class Extrusion(Shape):
         self.lower, self.upper = bounds(*wide, height_mm)
         self.chart = OutlineChart(self)
         self._upright = taper == 0 and twist_rad == 0
-        # How much faster than the point itself the straightened one can move.
+        # Upper bound on how much faster the straightened point moves than the point itself.
         self._stretch = np.float32(np.hypot(1, reach * taper / height_mm) + reach * abs(self.twist_per_mm))
         narrow = 2 * min(outline.reach_x_mm, outline.reach_y_mm) * (1 - taper)
         self.relief_limit_mm = relief_limit(narrow, (95 - 2 * min(wide)) / 2)
 
     def scale(self, z: Floats) -> Floats:
-        """Size of the outline at height z, relative to the one at the base."""
+        """Return the size of the outline at height z, relative to the base."""
         return 1 - np.float32(self.taper / self.height_mm) * np.clip(z, 0, np.float32(self.height_mm))
 
     def straighten(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats | None]:
-        """Undo twist and taper: coordinates in the outline's plane, and its size there (None: 1)."""
+        """Undo twist and taper; return coordinates in the outline's plane, and its relative size (None: 1)."""
         if self.twist_per_mm:
             turn = np.float32(self.twist_per_mm) * np.clip(z, 0, np.float32(self.height_mm))
             sine, cosine = np.sin(turn), np.cos(turn)
@@ -224,6 +250,7 @@ class Extrusion(Shape):
         return x / size, y / size, size
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        """Return a lower bound on the signed distance."""
         u, v, size = self.straighten(x, y, z)
         side = self.outline.distance(u, v)
         if size is not None:
@@ -232,5 +259,5 @@ class Extrusion(Shape):
         ends = np.abs(z - half) - half
         if self._upright:
             return rounded_corner(side, ends, self.rim_mm)
-        # Leaning sides do not meet the ends at right angles: see Cone.
+        # Leaning sides do not meet the ends at right angles, as in Cone.
         return -smooth_min(-side / self._stretch, -ends, 2 * self.rim_mm)

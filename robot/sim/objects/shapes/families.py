@@ -1,4 +1,4 @@
-"""The families and how their sizes are drawn: 8 to 95 mm in the narrow direction, 25 to 200 mm high."""
+"""Shape families and the ranges of their sizes: 8 to 95 mm in the narrow direction, 25 to 200 mm high."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -18,7 +18,7 @@ def _between(rng: Rng, low: float, high: float) -> float:
 
 
 def _skewed(rng: Rng, low: float, high: float) -> float:
-    """Log-uniform: as many small ones as large ones."""
+    """Draw from a log-uniform distribution."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
@@ -30,7 +30,7 @@ def box(rng: Rng) -> Shape:
 
 
 def slab(rng: Rng) -> Shape:
-    """Something thin and upright: a book, a phone, a tile."""
+    """A thin upright object: a book, a phone, a tile."""
     x, y = _between(rng, 22, 50), _between(rng, 4.5, 10)
     return Extrusion(RoundedRectangle(x, y, _between(rng, 1.5, 0.9 * y)), _between(rng, 50, 150), rim_mm=1.2)
 
@@ -71,7 +71,7 @@ def cylinder(rng: Rng) -> Shape:
 
 
 def tin(rng: Rng) -> Shape:
-    """A jar with a lid or rims that stand out."""
+    """A jar with a protruding lid or rims."""
     radius, height = _between(rng, 14, 40), _between(rng, 35, 120)
     lid, out = height * _between(rng, 0.62, 0.85), _between(rng, 1, 4)
     parts = (Drum(radius, 0, height, rim_mm=2), Drum(radius + out, lid, height, rim_mm=_between(rng, 0.6, 2)))
@@ -93,7 +93,7 @@ def bottle(rng: Rng) -> Shape:
 
 
 def vase(rng: Rng) -> Shape:
-    """Balls in a row, melted into a curved outline."""
+    """Balls in a row, blended into a curved outline."""
     height, count = _between(rng, 60, 170), int(rng.integers(2, 5))
     places = np.linspace(0.12, 0.92, count) * height
     sizes = rng.uniform(11, min(38, 0.75 * height / count + 8), count)
@@ -103,7 +103,7 @@ def vase(rng: Rng) -> Shape:
 
 
 def cone(rng: Rng) -> Shape:
-    """A cup turned over, or a funnel that stands on its narrow end."""
+    """An upside-down cup, or a funnel that stands on its narrow end."""
     wide, height = _between(rng, 16, 42), _between(rng, 40, 140)
     ends = (wide, wide * _between(rng, 0.3, 0.75))
     base, head = ends if rng.random() < 0.6 else ends[::-1]
@@ -152,7 +152,7 @@ def tube(rng: Rng) -> Shape:
 
 
 def knob(rng: Rng) -> Shape:
-    """A fluted grip: lobes round a cylinder."""
+    """A fluted grip: lobes around a cylinder."""
     radius, height = _between(rng, 12, 38), _between(rng, 30, 130)
     count = int(np.clip(round(2 * np.pi * radius / _skewed(rng, 7, 24)), 3, 24))
     depth = min(6.0, 0.22 * 2 * np.pi * radius / count, 0.25 * radius) * _between(rng, 0.5, 1)
@@ -182,7 +182,7 @@ def superquadric(rng: Rng) -> Shape:
 
 
 def blob(rng: Rng) -> Shape:
-    """Balls melted together: a potato, a root, a figurine."""
+    """Blended balls: a potato, a root, a figurine."""
     count, radius = int(rng.integers(3, 7)), _between(rng, 10, 24)
     balls, place = [], np.array([0.0, 0.0, 0.8 * radius])
     for _ in range(count):
@@ -190,7 +190,7 @@ def blob(rng: Rng) -> Shape:
         place = place + radius * rng.uniform([-0.9, -0.6, 0.3], [0.9, 0.6, 1.0])
     array = np.array(balls)
     array[:, :2] -= (array[:, :2].max(axis=0) + array[:, :2].min(axis=0)) / 2
-    array[:, 2] -= (array[:, 2] - array[:, 3]).min() + 0.12 * radius  # sunk into the table: a flat foot
+    array[:, 2] -= (array[:, 2] - array[:, 3]).min() + 0.12 * radius  # sink it into the table for a flat foot
     return Blobs(tuple((float(x), float(y), float(z), float(r)) for x, y, z, r in array), blend_mm=_between(rng, 6, 16))
 
 
@@ -201,11 +201,11 @@ def ring(rng: Rng) -> Shape:
 
 
 def mug(rng: Rng) -> Shape:
-    """A cup with an ear."""
+    """A cup with a handle."""
     radius, height = _between(rng, 22, 36), _between(rng, 60, 110)
     inside = Drum(radius - _between(rng, 2.8, 5), _between(rng, 4, 8), height + 20, rim_mm=4)
-    ear = height * _between(rng, 0.22, 0.32), _between(rng, 3.5, 6)
-    return Mug(Drum(radius, 0, height, rim_mm=1.2), inside, ear)
+    handle = height * _between(rng, 0.22, 0.32), _between(rng, 3.5, 6)
+    return Mug(Drum(radius, 0, height, rim_mm=1.2), inside, handle)
 
 
 def bracket(rng: Rng) -> Shape:
@@ -220,14 +220,13 @@ def bracket(rng: Rng) -> Shape:
 
 
 def steps(rng: Rng) -> Shape:
-    """Blocks of falling size on one another."""
+    """Stacked blocks of decreasing size."""
     count, height = int(rng.integers(2, 5)), _between(rng, 40, 130)
     tops = height * np.cumsum(rng.dirichlet(np.full(count, 4.0)))
-    shares = np.sort(rng.uniform(0.35, 1, count))[::-1] / 1.0
+    sizes = np.sort(rng.uniform(0.35, 1, count))[::-1] / 1.0
     x, y, rim = _between(rng, 20, 44), _between(rng, 16, 40), _between(rng, 0.8, 2.5)
     bars = [
-        Brick((0, 0), (x * s / shares[0], y * s / shares[0]), 0, float(t), rim)
-        for s, t in zip(shares, tops, strict=True)
+        Brick((0, 0), (x * s / sizes[0], y * s / sizes[0]), 0, float(t), rim) for s, t in zip(sizes, tops, strict=True)
     ]
     return Bricks(tuple(bars))
 

@@ -25,12 +25,12 @@ class Profile(ABC):
 
     @abstractmethod
     def distance(self, r: Floats, z: Floats) -> Floats:
-        """Signed distance in mm."""
+        """Return the signed distance in mm."""
 
 
 @dataclass(frozen=True)
 class Drum(Profile):
-    """A cylinder from `bottom_mm` to `top_mm` whose edges are rounded by `rim_mm`."""
+    """A cylinder from `bottom_mm` to `top_mm` with edges rounded by `rim_mm`."""
 
     radius_mm: float
     bottom_mm: float
@@ -38,6 +38,7 @@ class Drum(Profile):
     rim_mm: float = 0.0
 
     def distance(self, r: Floats, z: Floats) -> Floats:
+        """Return the signed distance in mm."""
         middle, half = (self.top_mm + self.bottom_mm) / 2, (self.top_mm - self.bottom_mm) / 2
         return rounded_corner(
             r - np.float32(self.radius_mm), np.abs(z - np.float32(middle)) - np.float32(half), self.rim_mm
@@ -46,7 +47,7 @@ class Drum(Profile):
 
 @dataclass(frozen=True)
 class Ball(Profile):
-    """A sphere centred on the axis; with `ring_mm`, a torus of that radius lying flat."""
+    """A sphere centred on the axis; with `ring_mm`, a horizontal torus of that radius."""
 
     size_mm: float
     height_mm: float
@@ -54,13 +55,16 @@ class Ball(Profile):
 
     @property
     def top_mm(self) -> float:  # type: ignore[override]
+        """Height of the highest point."""
         return self.height_mm + self.size_mm
 
     @property
     def radius_mm(self) -> float:  # type: ignore[override]
+        """Greatest distance from the axis."""
         return self.ring_mm + self.size_mm
 
     def distance(self, r: Floats, z: Floats) -> Floats:
+        """Return the signed distance in mm."""
         return length(r - np.float32(self.ring_mm), z - np.float32(self.height_mm)) - np.float32(self.size_mm)
 
 
@@ -76,20 +80,29 @@ class Cone(Profile):
 
     @property
     def radius_mm(self) -> float:  # type: ignore[override]
+        """Greatest distance from the axis."""
         return max(self.base_mm, self.head_mm)
 
     def distance(self, r: Floats, z: Floats) -> Floats:
+        """Return a lower bound on the signed distance."""
         half = np.float32((self.top_mm - self.bottom_mm) / 2)
         height = z - np.float32((self.top_mm + self.bottom_mm) / 2)
         slope = (self.base_mm - self.head_mm) / (self.top_mm - self.bottom_mm)
         cosine = np.float32(1 / np.sqrt(1 + slope**2))
         side = (r - np.float32((self.base_mm + self.head_mm) / 2) + height * np.float32(slope)) * cosine
-        # Side and ends do not meet at right angles: the rounded maximum stays below the distance all the same.
+        # Side and ends do not meet at right angles, but the rounded maximum stays below the distance.
         return -smooth_min(-side, half - np.abs(height), 2 * self.rim_mm)
 
 
 class Revolution(Shape):
-    """Union of `parts`, seams rounded over `blend_mm`, minus `hollow`; cut flat at z = 0 and at `height_mm`."""
+    """Union of parts, minus a hollow; cut flat at z = 0 and at the top.
+
+    Args:
+        parts: the parts.
+        height_mm: height of the upper cut.
+        blend_mm: width of the rounded seams.
+        hollow: the part to subtract, or None.
+    """
 
     def __init__(
         self, parts: tuple[Profile, ...], height_mm: float, *, blend_mm: float = 0.0, hollow: Profile | None = None
@@ -106,6 +119,7 @@ class Revolution(Shape):
         self._cut_top = len(parts) > 1 or parts[0].top_mm > height_mm
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        """Return a lower bound on the signed distance."""
         r = length(x, y)
         distance = self.parts[0].distance(r, z)
         for part in self.parts[1:]:
@@ -121,6 +135,7 @@ class Revolution(Shape):
         return 0.6 * (self.radius_mm - self.hollow.radius_mm) if self.hollow is not None else 1.0
 
     def mask(self, x: Floats, y: Floats, z: Floats) -> Floats | None:
+        """Return 0 inside the hollow, 1 on the outer wall; None without a hollow."""
         if self.hollow is None:
             return None
         inner = length(x, y) - np.float32(self.hollow.radius_mm)
@@ -129,7 +144,16 @@ class Revolution(Shape):
 
 
 class ThreadedRod(Revolution):
-    """A cylinder with a screw thread cut by `depth_mm` (profile: a trapezoid), and a plain foot of `foot_mm`."""
+    """A cylinder with a screw thread.
+
+    Args:
+        radius_mm: radius of the crests.
+        height_mm: height.
+        pitch_mm: distance between neighbouring crests.
+        depth_mm: depth of the thread; its profile is a trapezoid.
+        starts: number of threads.
+        foot: a part without thread at the bottom.
+    """
 
     def __init__(
         self, radius_mm: float, height_mm: float, *, pitch_mm: float, depth_mm: float, starts: int, foot: Profile
@@ -140,15 +164,24 @@ class ThreadedRod(Revolution):
         self.relief_limit_mm = min(0.25, relief_limit(2 * radius_mm))
 
     def wall_pattern(self, s: Floats, t: Floats) -> Floats | None:
+        """Return the height (len(t), len(s)) of the thread, 0 at the crests."""
         phase = t[:, None] / self.pitch_mm - self.starts * s[None, :] / self.chart.width_mm
         wave = np.abs(2 * (phase - np.floor(phase)) - 1).astype(np.float32)
-        # Flanks of 30 degrees to the radius need half a pitch for the depth of an ISO thread; crests are flat.
+        # Flanks at 30 degrees to the radius need half a pitch for the depth of an ISO thread; crests are flat.
         free = np.clip((t - self.foot.top_mm) / self.pitch_mm, 0, 1).astype(np.float32)
         return np.asarray(-np.float32(self.depth_mm) * free[:, None] * (1 - np.clip(wave * 1.4 - 0.2, 0, 1)))
 
 
 class FlutedCylinder(Revolution):
-    """A cylinder with `count` lobes of `depth_mm` round it, straight or twisted: a knob, a column, a grip."""
+    """A cylinder with lobes around it, straight or twisted: a knob, a column, a grip.
+
+    Args:
+        drum: the cylinder.
+        count: number of lobes.
+        depth_mm: depth between lobes.
+        turns: twist over the height, in lobes.
+        sharpness: exponent of the lobes' profile.
+    """
 
     def __init__(self, drum: Drum, *, count: int, depth_mm: float, turns: float = 0.0, sharpness: float = 1.0) -> None:
         super().__init__((drum,), drum.top_mm)
@@ -156,6 +189,7 @@ class FlutedCylinder(Revolution):
         self.relief_limit_mm = min(self.relief_limit_mm, 1.0)
 
     def wall_pattern(self, s: Floats, t: Floats) -> Floats | None:
+        """Return the height (len(t), len(s)) of the lobes, 0 at their tops."""
         phase = self.count * s[None, :] / self.chart.width_mm + self.turns * t[:, None] / self.height_mm
         wave = np.abs(np.sin(np.pi * phase)) ** self.sharpness
         return np.asarray(-self.depth_mm * (1 - wave), np.float32)

@@ -1,8 +1,8 @@
-"""What every shape offers: a signed distance, bounds, and a chart that unrolls its wall.
+"""Base classes of shapes: a signed distance, bounds, and a chart that unrolls the wall.
 
-A shape is the bare solid, in mm, standing on z = 0 with its axis on x = y = 0. Its distance never claims more
-than there is: |d(p) - d(q)| <= |p - q|, the condition under which sphere tracing cannot pass through a surface
-(Hart 1996, "Sphere tracing", theorem 1). Relief is added by `robot.sim.objects.wall`, along the chart.
+A shape is the smooth solid, in mm, on z = 0 with its axis on x = y = 0. Its distance function satisfies |d(p) - d(q)|
+<= |p - q|, the condition under which sphere tracing cannot pass through a surface (Hart 1996, "Sphere tracing", theorem
+1). `robot.sim.objects.wall` adds relief along the chart.
 """
 
 from abc import ABC, abstractmethod
@@ -20,18 +20,18 @@ Points = NDArray[np.floating]
 
 
 class Chart(ABC):
-    """A map of the wall: (s, t) in mm, s round the object in [0, width), t along it in [0, height]."""
+    """A map of the wall: (s, t) in mm, s around the object in [0, width), t along it in [0, height]."""
 
     width_mm: float
     height_mm: float
 
     @abstractmethod
     def locate(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
-        """Map coordinates of points on or near the wall; s is periodic."""
+        """Return map coordinates of points on or near the wall; s is periodic."""
 
     @abstractmethod
     def rays(self, s: Floats, t: Floats) -> tuple[Points, Points]:
-        """Rays that look at the wall from outside where the map says (s, t): origins and directions (N, 3)."""
+        """Return rays towards the wall from outside, at map coordinates (s, t): origins and directions (N, 3)."""
 
 
 class CylindricalChart(Chart):
@@ -44,9 +44,11 @@ class CylindricalChart(Chart):
         self._reach_mm = radius_mm + 1 if reach_mm is None else reach_mm
 
     def locate(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
+        """Return map coordinates of points on or near the wall."""
         return (arctan2(x, -y) + np.float32(np.pi)) * np.float32(self.radius_mm), z
 
     def rays(self, s: Floats, t: Floats) -> tuple[Points, Points]:
+        """Return horizontal rays towards the axis, at map coordinates (s, t)."""
         angle = s / self.radius_mm
         directions = np.stack([np.sin(angle), -np.cos(angle), np.zeros_like(s)], axis=1)
         origins = -self._reach_mm * directions
@@ -55,61 +57,61 @@ class CylindricalChart(Chart):
 
 
 class Shape(ABC):
-    """A solid by its signed distance. Subclasses set the attributes and write `_distance`."""
+    """A solid defined by its signed distance. Subclasses set the attributes and write `distance_xyz`."""
 
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     chart: Chart
-    # The most that relief may add to or take from the surface without ruining the shape.
+    # Greatest height or depth of relief that keeps the shape recognisable.
     relief_limit_mm: float
 
     @cached_property
     def formula(self) -> Formula:
-        """Of `distance_xyz`, for compiled code."""
+        """Formula of `distance_xyz`, for compiled code."""
         return trace_formula(self.distance_xyz, 3)
 
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in self.__dict__.items() if key != "formula"}
 
     def distance(self, points: Points) -> Floats:
-        """Signed distance in mm of points (N, 3), negative inside; never more than the true one."""
+        """Return the signed distance in mm of points (N, 3), negative inside; never more than the true one."""
         return evaluate_formula(self.formula, *np.asarray(points, np.float32).T)[0]
 
     @abstractmethod
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        """The same for coordinates in three arrays (N,) of float32, by functions that `trace_formula` knows."""
+        """Return the signed distance for coordinates in three float32 arrays (N,); see `trace_formula`."""
 
     def wall_pattern(self, s: Floats, t: Floats) -> Floats | None:
-        """Height in mm of what the shape itself wears on its wall, such as a thread: (len(t), len(s)) or None."""
+        """Return the shape's own pattern on its wall in mm, such as a thread: (len(t), len(s)) or None."""
         return None
 
     def mask(self, x: Floats, y: Floats, z: Floats) -> Floats | None:
-        """Where relief belongs, 1, and where it does not, 0, such as inside a mug. None: everywhere."""
+        """Return the weight of relief, 1 to 0, such as 0 inside a mug; None for 1 everywhere."""
         return None
 
-    # The steepest slope of `mask`, per mm.
+    # Greatest slope of `mask`, per mm.
     mask_slope: float = 0.0
 
 
 def bounds(x: float, y: float, top: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The box [-x, x] x [-y, y] x [0, top]."""
+    """Return the corners of the box [-x, x] x [-y, y] x [0, top]."""
     return np.array([-x, -y, 0.0]), np.array([x, y, top])
 
 
 def relief_limit(narrow_mm: float, *others: float) -> float:
-    """A sixth of the narrow width, what the gripper's 95 mm leave on each side, and 6 mm at most."""
+    """Return the relief limit: a sixth of the narrow width, the free space in the 95 mm gripper, at most 6 mm."""
     return max(min(6.0, narrow_mm / 6, (95 - narrow_mm) / 2, *others), 0.0)
 
 
 def length(a: Floats, b: Floats) -> Floats:
-    """Euclidean norm; plain, as nothing here is near overflow and np.hypot takes six times as long."""
+    """Return the Euclidean norm; plain, because nothing here is near overflow and np.hypot takes six times as long."""
     return np.sqrt(a * a + b * b)
 
 
 def arctan2(y: Floats, x: Floats) -> Floats:
-    """Angle in (-pi, pi], float32, within 2e-6 of np.arctan2, which takes five times as long.
+    """Return the angle in (-pi, pi], float32, within 2e-6 of np.arctan2, which takes five times as long.
 
-    An odd polynomial on [0, 1], least maximal error (Hastings 1955 gives the form), and the octants.
+    An odd polynomial on [0, 1] of least maximal error (the form is from Hastings 1955), extended by octants.
     """
     a, b = np.abs(x), np.abs(y)
     ratio = np.minimum(a, b) / np.maximum(np.maximum(a, b), np.float32(1e-30))
@@ -125,7 +127,7 @@ def arctan2(y: Floats, x: Floats) -> Floats:
 
 
 def _fit_arctan(terms: int = 8) -> NDArray[np.float32]:
-    """Coefficients of arctan(r) / r in r^2 on [0, 1], through Chebyshev points."""
+    """Fit coefficients of arctan(r) / r in r^2 on [0, 1], through Chebyshev points."""
     nodes = (1 - np.cos(np.pi * (np.arange(64) + 0.5) / 64)) / 2
     roots = np.sqrt(nodes)
     fit = np.polynomial.Chebyshev.fit(nodes, np.arctan(roots) / roots, terms - 1, domain=[0, 1])
@@ -136,9 +138,10 @@ _ARCTAN = _fit_arctan()
 
 
 def smooth_min(a: Floats, b: Floats, blend_mm: float) -> Floats:
-    """Minimum rounded over `blend_mm`: the quadratic smooth minimum, at most blend_mm / 4 below the sharp one.
+    """Return the minimum rounded over `blend_mm`.
 
-    Its gradient is a convex mixture of the two, so that it keeps the Lipschitz bound.
+    This quadratic smooth minimum is at most blend_mm / 4 below the sharp one. Its gradient is a convex combination of
+    the two gradients, so it keeps the Lipschitz bound.
     """
     if blend_mm <= 0:
         return np.minimum(a, b)
@@ -148,7 +151,7 @@ def smooth_min(a: Floats, b: Floats, blend_mm: float) -> Floats:
 
 
 def rounded_corner(a: Floats, b: Floats, radius: float) -> Floats:
-    """Corner of two half-spaces with distances a and b, rounded by `radius`: exact outside and inside."""
+    """Return the distance to the rounded corner of two half-spaces at distances a and b: exact outside and inside."""
     p, q = a + np.float32(radius), b + np.float32(radius)
     outside = length(np.maximum(p, 0), np.maximum(q, 0))
     corner: Floats = outside + np.minimum(np.maximum(p, q), 0) - np.float32(radius)

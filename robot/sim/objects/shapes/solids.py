@@ -1,4 +1,4 @@
-"""Solids that are neither turned nor extruded: ellipsoids, superquadrics, blobs, rings, mugs, combs, brushes."""
+"""Other solids: ellipsoids, superquadrics, blobs, rings, mugs, combs, brushes."""
 
 from dataclasses import dataclass
 
@@ -20,18 +20,20 @@ from robot.sim.objects.shapes.shape import (
 
 
 class TwoSidedChart(Chart):
-    """The front and the back of something flat: s = x across the front, then back across the back; t = z."""
+    """Front and back of a flat object: s = x across the front, then back across the back; t = z."""
 
     def __init__(self, half_x_mm: float, height_mm: float, reach_mm: float) -> None:
         self.half_x_mm, self.width_mm, self.height_mm = half_x_mm, 4 * half_x_mm, height_mm
         self._reach_mm = reach_mm + 1
 
     def locate(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats]:
+        """Return map coordinates of points on or near the wall."""
         half = np.float32(self.half_x_mm)
         across = np.clip(x, -half, half) + half
         return np.where(y < 0, across, 4 * half - across), z
 
     def rays(self, s: Floats, t: Floats) -> tuple[Points, Points]:
+        """Return rays towards front or back, at map coordinates (s, t)."""
         front = s < 2 * self.half_x_mm
         x = np.where(front, s, 4 * self.half_x_mm - s) - self.half_x_mm
         side = np.where(front, -1.0, 1.0)
@@ -40,9 +42,9 @@ class TwoSidedChart(Chart):
 
 
 class Superquadric(Shape):
-    """((|x/a|^e + |y/b|^e)^(f/e) + |z/c|^f)^(1/f) = 1 with e, f >= 2, on a foot cut flat; e = f = 2: an ellipsoid.
+    """((|x/a|^e + |y/b|^e)^(f/e) + |z/c|^f)^(1/f) = 1 with e, f >= 2, cut flat at the foot; e = f = 2: an ellipsoid.
 
-    The left side is a norm, so that min(a, b, c) times its excess over 1 never overstates the distance.
+    The left side is a norm, so min(a, b, c) times its excess over 1 never exceeds the distance.
     """
 
     def __init__(
@@ -55,6 +57,7 @@ class Superquadric(Shape):
         self.relief_limit_mm = relief_limit(2 * min(half_mm[:2]))
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        """Return a lower bound on the signed distance."""
         a, b, c = (np.float32(1 / half) for half in self.half_mm)
         e, f = self.round_power, self.upright_power
         norm = _norm(_norm(x * a, y * b, e), (z - np.float32(self.middle_mm)) * c, f)
@@ -63,18 +66,23 @@ class Superquadric(Shape):
 
 
 def _norm(a: Floats, b: Floats, power: float) -> Floats:
-    """(|a|^power + |b|^power)^(1/power), scaled by the larger one so that no power overflows."""
+    """Return (|a|^power + |b|^power)^(1/power), scaled by the larger term so that no power overflows."""
     if power == 2:
         return length(a, b)
     a, b = np.abs(a), np.abs(b)
     large = np.maximum(np.maximum(a, b), np.float32(1e-9))
     ratio = np.maximum(np.minimum(a, b) / large, np.float32(1e-9))
-    # exp and log of float32 are vectorised in numpy, and power is not: a tenth of the time.
+    # numpy vectorises exp and log of float32 but not power; this takes a tenth of the time.
     return large * np.exp(np.log1p(np.exp(np.log(ratio) * np.float32(power))) * np.float32(1 / power))
 
 
 class Blobs(Shape):
-    """Balls (x, y, z, radius) melted into one another over `blend_mm`, cut flat at z = 0."""
+    """Blended balls, cut flat at z = 0.
+
+    Args:
+        balls: (x, y, z, radius) of each, mm.
+        blend_mm: width of the seams.
+    """
 
     def __init__(self, balls: tuple[tuple[float, float, float, float], ...], *, blend_mm: float) -> None:
         self.balls, self.blend_mm = balls, blend_mm
@@ -88,6 +96,7 @@ class Blobs(Shape):
         self.relief_limit_mm = relief_limit(float((high - low)[:2].min()), 2.0)
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        """Return a lower bound on the signed distance."""
         distance = None
         for bx, by, bz, radius in self.balls:
             p, q, r = x - np.float32(bx), y - np.float32(by), z - np.float32(bz)
@@ -99,7 +108,13 @@ class Blobs(Shape):
 
 
 class Ring(Shape):
-    """A torus that stands on a flat foot, its hole seen from the front: radius `ring_mm` of the tube's middle."""
+    """A torus on a flat foot, with its hole to the front, optionally stretched upwards.
+
+    Args:
+        ring_mm: radius of the tube's centre line.
+        tube_mm: radius of the tube.
+        stretch_mm: length of the straight parts.
+    """
 
     def __init__(self, ring_mm: float, tube_mm: float, *, stretch_mm: float = 0.0) -> None:
         self.ring_mm, self.tube_mm, self.stretch_mm = ring_mm, tube_mm, stretch_mm
@@ -110,6 +125,7 @@ class Ring(Shape):
         self.relief_limit_mm = relief_limit(2 * tube_mm)
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        """Return the signed distance."""
         half = np.float32(self.stretch_mm / 2)
         rise = z - np.float32(self.middle_mm)
         rise = rise - np.clip(rise, -half, half)
@@ -119,7 +135,13 @@ class Ring(Shape):
 
 
 class Mug(Revolution):
-    """A cup open at the top with an ear at its right: (radius of the ear's middle line, thickness) in mm."""
+    """A cup, open at the top, with a handle on its right.
+
+    Args:
+        outside: outer wall.
+        inside: inner wall.
+        ear_mm: radius of the handle's centre line, and its thickness.
+    """
 
     def __init__(self, outside: Drum, inside: Drum, ear_mm: tuple[float, float]) -> None:
         super().__init__((outside,), outside.top_mm, hollow=inside)
@@ -128,17 +150,18 @@ class Mug(Revolution):
         self.chart = CylindricalChart(outside.radius_mm, outside.top_mm, self.upper[0] + 1)
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        """Return a lower bound on the signed distance."""
         assert self.hollow is not None
         cup = self.parts[0].distance(length(x, y), z)
         ring, tube = (np.float32(value) for value in self.ear_mm)
         around = length(x - np.float32(self.radius_mm), z - np.float32(self.height_mm / 2))
-        both = smooth_min(cup, length(around - ring, y) - tube, 2.0)
-        return np.maximum(np.maximum(both, -self.hollow.distance(length(x, y), z)), -z)
+        union = smooth_min(cup, length(around - ring, y) - tube, 2.0)
+        return np.maximum(np.maximum(union, -self.hollow.distance(length(x, y), z)), -z)
 
 
 @dataclass(frozen=True)
 class Brick:
-    """An upright box: middle (x, y), half sizes (x, y), from `bottom_mm` to `top_mm`, edges rounded."""
+    """An upright box: middle (x, y), half sizes (x, y), from `bottom_mm` to `top_mm`, with rounded edges."""
 
     middle_mm: tuple[float, float]
     half_mm: tuple[float, float]
@@ -147,7 +170,7 @@ class Brick:
     rim_mm: float
 
     def distance(self, x: Floats, y: Floats, z: Floats) -> Floats:
-        """Signed distance in mm, exact outside."""
+        """Return the signed distance in mm, exact outside."""
         p = np.abs(x - np.float32(self.middle_mm[0])) - np.float32(self.half_mm[0])
         q = np.abs(y - np.float32(self.middle_mm[1])) - np.float32(self.half_mm[1])
         rise = np.abs(z - np.float32((self.top_mm + self.bottom_mm) / 2))
@@ -170,6 +193,7 @@ class Bricks(Shape):
         self.relief_limit_mm = relief_limit(float((high - low).min()), 3 * float(half.min()) / 4)
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        """Return the signed distance to the nearest box."""
         distance = self.bars[0].distance(x, y, z)
         for bar in self.bars[1:]:
             distance = np.minimum(distance, bar.distance(x, y, z))
@@ -177,9 +201,14 @@ class Bricks(Shape):
 
 
 class Comb(Shape):
-    """A slab with slots, `gap_mm` wide, every `pitch_mm`, open at the top or, if `lying`, at the right.
+    """A slab with slots.
 
-    They begin `slot_mm` above (to the right of) the slab's middle.
+    Args:
+        slab: the slab.
+        pitch_mm: distance between slots.
+        gap_mm: width of a slot.
+        slot_mm: start of the slots above (to the right of) the slab's middle.
+        lying: whether the slots are open at the right instead of the top.
     """
 
     def __init__(self, slab: Brick, *, pitch_mm: float, gap_mm: float, slot_mm: float, lying: bool) -> None:
@@ -189,6 +218,7 @@ class Comb(Shape):
         self.relief_limit_mm = min(relief_limit(2 * slab.half_mm[1]), (pitch_mm - gap_mm) / 8)
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        """Return a lower bound on the signed distance."""
         half = self.slab.top_mm / 2
         along, across = (z - np.float32(half), x) if self.lying else (x, z - np.float32(half))
         room = (half if self.lying else self.slab.half_mm[0]) - self.pitch_mm
@@ -200,7 +230,14 @@ class Comb(Shape):
 
 
 class Brush(Shape):
-    """A block with upright bristles of radius `bristle_mm` every `pitch_mm`, up to `top_mm`."""
+    """A block with upright bristles.
+
+    Args:
+        block: the block.
+        bristle_mm: radius of a bristle.
+        pitch_mm: distance between bristles.
+        top_mm: height of the bristles' tops.
+    """
 
     def __init__(self, block: Brick, *, bristle_mm: float, pitch_mm: float, top_mm: float) -> None:
         self.block, self.bristle_mm, self.pitch_mm, self.top_mm = block, bristle_mm, pitch_mm, top_mm
@@ -209,10 +246,10 @@ class Brush(Shape):
         self.relief_limit_mm = min(relief_limit(2 * block.half_mm[1]), bristle_mm / 4)
 
     def _fold(self, x: Floats, half: float) -> Floats:
-        """Distance from the nearest row of bristles, along one axis."""
+        """Return the distance from the nearest row of bristles, along one axis."""
         pitch = np.float32(self.pitch_mm)
         rows = max((half - self.bristle_mm) / self.pitch_mm, 0)
-        if int(2 * rows) % 2:  # an even number of rows stands astride the middle
+        if int(2 * rows) % 2:  # an even number of rows has none in the middle
             x = np.abs(x) - pitch / 2
             row: Floats = np.clip(np.rint(x / pitch), 0, np.float32(int(rows - 0.5)))
         else:
@@ -220,6 +257,7 @@ class Brush(Shape):
         return x - pitch * row
 
     def distance_xyz(self, x: Floats, y: Floats, z: Floats) -> Floats:
+        """Return a lower bound on the signed distance."""
         across = length(self._fold(x, self.block.half_mm[0]), self._fold(y, self.block.half_mm[1]))
         middle = np.float32((self.top_mm + self.block.top_mm) / 2)
         rise = np.abs(z - middle) - np.float32((self.top_mm - self.block.top_mm) / 2 + self.block.rim_mm)
