@@ -8,7 +8,7 @@ Every other touch chooses the settings and the number of candidates that contain
 touches. `MARGIN` times as many are used, because a hundred touches hardly determine the last percent. The reported
 recall is that of the other touches.
 
-The cost model, for h = hidden, d = embedding_dim, k candidates, L = 4 sqrt(N) lists of which p are visited:
+The cost model, for h = hidden, d = embedding_dim, k candidates, L = 4 sqrt(N) lists and p visited lists:
 
     stage        flops                  bytes read                    grows as
     exhaustive   2 h^2 N                2 h N (float16 partials)      N

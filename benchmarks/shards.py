@@ -183,7 +183,7 @@ def compare(crowd: BlendedPhotos, folder: Shard, cluster: Shard, touches: int, r
         found
         | agreement
         | {"all_scored": reranked, "all_scored_top1": exhaustive_top1 / reranked, "all_scored_same": exact / reranked}
-        | {"all_judged_error": error, "all_judged_folder_s": float(folder_s), "all_judged_shards_s": float(shards_s)}
+        | {"all_scored_error": error, "all_scored_folder_s": float(folder_s), "all_scored_shards_s": float(shards_s)}
     )
 
 
@@ -253,9 +253,7 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", type=float, default=[1e4, 1e5, 1e6])
     parser.add_argument("--shards", type=int, default=8)
     parser.add_argument("--touches", type=int, default=TOUCHES)
-    parser.add_argument(
-        "--judged", dest="reranked", type=int, default=3, help="touches for which all photos are scored"
-    )
+    parser.add_argument("--reranked", type=int, default=3, help="touches for which all photos are scored")
     parser.add_argument("--model", type=Path, default=shipped_model())
     parser.add_argument("--ray", action="store_true", help="also measure Ray, with the first of the sizes")
     parser.add_argument("--json", action="store_true", help="one JSON document per line")

@@ -115,7 +115,7 @@ def touches(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[tuple[Pa
 
 @pytest.fixture
 def catalogue_with_touches(catalogue_copy: Path, touches: dict[str, list[tuple[Path, ...]]]) -> Path:
-    """The catalogue with two touches of each of its first four objects, the third of which has no photo."""
+    """The catalogue with two touches of each of its first four objects; the third has no photo."""
     names = sorted(touches)[:4]
     for name in names:
         for number, files in enumerate(touches[name][:2]):

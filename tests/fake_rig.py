@@ -38,7 +38,7 @@ class FakeRigState:
         """Record a call and fail on purpose: `faults` maps a call to the numbers of its failures."""
         self.calls.append(name)
         if self.calls.count(name) in self.faults.get(name, ()):
-            raise DeviceError(f"the fake {name} was told to fail")
+            raise DeviceError(f"the fake {name} fails on purpose")
 
     def chord(self):
         """Return the width of the cylinder between the fingers, 0 for a miss."""
@@ -62,128 +62,128 @@ class FakeRig(Rig):
     can_run_jobs = True
 
     def __init__(self, seed=0, *, fingers=("a", "b"), faults=None):
-        self.world = FakeRigState(seed)
-        self.world.faults = {} if faults is None else faults
+        self.state = FakeRigState(seed)
+        self.state.faults = {} if faults is None else faults
         super().__init__(
-            FakeArm(self.world),
-            FakeGripper(self.world),
-            {finger: FakeSensor(self.world, finger) for finger in fingers},
-            FakeCamera(self.world),
+            FakeArm(self.state),
+            FakeGripper(self.state),
+            {finger: FakeSensor(self.state, finger) for finger in fingers},
+            FakeCamera(self.state),
             info={"source": "fake rig", "sensor": "fake gel", "rig": "fake"},
-            clock=self.world.clock,
-            sleep=self.world.sleep,
+            clock=self.state.clock,
+            sleep=self.state.sleep,
         )
 
     def object_ids(self, count):
         return [f"round-{number}" for number in range(count)]
 
     def prepare(self, object_id, number):
-        world, kind = self.world, object_id.split("-")[0]
+        state, kind = self.state, object_id.split("-")[0]
         shape = np.random.default_rng([1, zlib.crc32(object_id.encode())])
         radius = {"round": shape.uniform(18, 40), "wide": 70.0, "thin": 9.0, "none": 1e-3}[kind]
-        rng = np.random.default_rng([2, world.seed, zlib.crc32(object_id.encode()), number])
+        rng = np.random.default_rng([2, state.seed, zlib.crc32(object_id.encode()), number])
         x, y = rng.uniform(-20, 20, 2)
-        world.solid = views.UprightCylinder(radius, shape.uniform(60, 140), float(x), float(y))
-        world.slips, world.noise = bool(rng.uniform() < 0.2), int(rng.integers(2**31))
-        world.force, world.now_s = None, 100.0 * number
+        state.solid = views.UprightCylinder(radius, shape.uniform(60, 140), float(x), float(y))
+        state.slips, state.noise = bool(rng.uniform() < 0.2), int(rng.integers(2**31))
+        state.force, state.now_s = None, 100.0 * number
 
 
 class FakeArm(Arm):
-    def __init__(self, world):
-        super().__init__("fake arm", WORKSPACE, clock=world.clock)
-        self.world = world
+    def __init__(self, state):
+        super().__init__("fake arm", WORKSPACE, clock=state.clock)
+        self.state = state
 
     def _connect(self):
-        self.world.record_call("arm.connect")
+        self.state.record_call("arm.connect")
 
     def _close(self):
-        self.world.record_call("arm.close")
+        self.state.record_call("arm.close")
 
     def _stop(self):
-        self.world.record_call("arm.stop")
+        self.state.record_call("arm.stop")
 
     def _move_to(self, pose, speed_mm_s):
-        self.world.record_call("arm")
-        self.world.sleep(math.dist(self.world.pose.as_tuple()[:3], pose.as_tuple()[:3]) / speed_mm_s)
-        self.world.pose = pose
+        self.state.record_call("arm")
+        self.state.sleep(math.dist(self.state.pose.as_tuple()[:3], pose.as_tuple()[:3]) / speed_mm_s)
+        self.state.pose = pose
         return pose
 
     def _pose(self):
-        return self.world.pose
+        return self.state.pose
 
 
 class FakeGripper(Gripper):
-    def __init__(self, world):
+    def __init__(self, state):
         low, high = FORCE_N
-        super().__init__("fake gripper", stroke_mm=STROKE_MM, min_force_n=low, max_force_n=high, clock=world.clock)
-        self.world = world
+        super().__init__("fake gripper", stroke_mm=STROKE_MM, min_force_n=low, max_force_n=high, clock=state.clock)
+        self.state = state
 
     def _connect(self):
-        self.world.record_call("gripper.connect")
+        self.state.record_call("gripper.connect")
 
     def _close(self):
-        self.world.record_call("gripper.close")
+        self.state.record_call("gripper.close")
 
     def _stop(self):
-        self.world.record_call("gripper.stop")
+        self.state.record_call("gripper.stop")
 
     def _settings(self):
         return {"stroke_mm": self.stroke_mm}
 
     def _state(self):
-        world = self.world
-        status = world.status()
-        opening = world.opening if status == "idle" else world.chord()
-        return GripperState(opening, world.force or 0.0, status)
+        state = self.state
+        status = state.status()
+        opening = state.opening if status == "idle" else state.chord()
+        return GripperState(opening, state.force or 0.0, status)
 
     def _open(self, opening_mm):
-        self.world.record_call("open")
-        self.world.opening, self.world.force = opening_mm, None
+        self.state.record_call("open")
+        self.state.opening, self.state.force = opening_mm, None
         return self._state()
 
     def _grasp(self, force_n, speed_mm_s):
-        self.world.record_call("grasp")
-        self.world.grip_at, self.world.force = self.world.pose, force_n
-        self.world.sleep(self.world.opening / speed_mm_s)
+        self.state.record_call("grasp")
+        self.state.grip_at, self.state.force = self.state.pose, force_n
+        self.state.sleep(self.state.opening / speed_mm_s)
         return self._state()
 
 
 class FakeSensor(TactileSensor):
-    def __init__(self, world, finger):
-        super().__init__(f"fake gel {finger}", finger, clock=world.clock)
-        self.world = world
+    def __init__(self, state, finger):
+        super().__init__(f"fake gel {finger}", finger, clock=state.clock)
+        self.state = state
 
     def _connect(self):
-        self.world.record_call(f"gel {self.finger}.connect")
+        self.state.record_call(f"gel {self.finger}.connect")
 
     def _close(self):
-        self.world.record_call(f"gel {self.finger}.close")
+        self.state.record_call(f"gel {self.finger}.close")
 
     def _read(self):
-        world = self.world
-        world.record_call(f"gel {self.finger}")
-        touching = world.status() == "holding"
-        rng = np.random.default_rng([3, world.noise, ord(self.finger), touching])
+        state = self.state
+        state.record_call(f"gel {self.finger}")
+        touching = state.status() == "holding"
+        rng = np.random.default_rng([3, state.noise, ord(self.finger), touching])
         image = np.full((24, 32, 3), 90.0) + rng.normal(0, 2, (24, 32, 3))
         if touching:
-            size = 2 + int(world.force / 8)
+            size = 2 + int(state.force / 8)
             image[12 - size : 12 + size, 16 - size : 16 + size] += [60, -40, 20]
-        return Frame(np.clip(image, 0, 255).astype(np.uint8), world.now_s)
+        return Frame(np.clip(image, 0, 255).astype(np.uint8), state.now_s)
 
 
 class FakeCamera(Camera):
-    def __init__(self, world):
-        super().__init__("fake camera", views.camera_pose(), clock=world.clock)
-        self.world = world
+    def __init__(self, state):
+        super().__init__("fake camera", views.camera_pose(), clock=state.clock)
+        self.state = state
 
     def _connect(self):
-        self.world.record_call("camera.connect")
+        self.state.record_call("camera.connect")
 
     def _close(self):
-        self.world.record_call("camera.close")
+        self.state.record_call("camera.close")
 
     def _read(self, depth):
-        world = self.world
-        world.record_call("depth" if depth else "camera")
-        image = views.view(world.solid, seed=world.noise, lens=LENS, px=PX)
-        return type(image)(image.colour, image.depth_m if depth else None, LENS, world.now_s)
+        state = self.state
+        state.record_call("depth" if depth else "camera")
+        image = views.view(state.solid, seed=state.noise, lens=LENS, px=PX)
+        return type(image)(image.colour, image.depth_m if depth else None, LENS, state.now_s)

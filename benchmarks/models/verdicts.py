@@ -164,7 +164,7 @@ def measured(ratios: OpenSetRatios) -> dict[str, Any]:
     accepted, accepted_absent = (part[:, 1:].max(1) > part[:, 0] for part in (present, absent))
     known, unknown = -present[:, 0], -absent[:, 0]
     found: dict[str, Callable[[NDArray[np.int64]], float]] = {
-        "first_guess": lambda rows: float(first_right[rows].mean()),
+        "top1": lambda rows: float(first_right[rows].mean()),
         "match_and_right": lambda rows: float((accepted & first_right)[rows].mean()),
         "match_and_wrong": lambda rows: float((accepted & ~first_right)[rows].mean()),
         "none_though_there": lambda rows: float((~accepted)[rows].mean()),
@@ -307,7 +307,7 @@ def other_optics(folder: Path, jobs: int, files: Callable[[Sequence[Path]], Read
 def as_markdown(document: dict[str, Any]) -> Iterator[str]:
     """Yield the lines of both tables."""
     columns = {
-        "first_guess": "R@1",
+        "top1": "R@1",
         "match_and_right": "match, right",
         "match_and_wrong": "match, wrong",
         "none_though_there": "none, though present",

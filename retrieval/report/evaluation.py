@@ -122,7 +122,7 @@ def _everything(builder: Builder) -> Iterator[Block | None]:
 
 SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
     "Comparison of methods": method_comparison.method_overview,
-    "Top-N accuracy": method_comparison.guess_curves,
+    "Top-N accuracy": method_comparison.topn_curves,
     "Several grasps, several photos": method_comparison.grasps_and_photos,
     "Accuracy and time": method_comparison.time,
     "Full gallery": method_comparison.gallery,

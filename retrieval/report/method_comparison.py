@@ -49,7 +49,7 @@ def method_overview(builder: Builder) -> Iterator[Block | None]:
     yield Text(INTERVALS)
 
 
-def guess_curves(builder: Builder) -> Iterator[Block | None]:
+def topn_curves(builder: Builder) -> Iterator[Block | None]:
     """Yield the top-N accuracy: how often the object is among the first N answers."""
     if not builder.any("topn_k5", "topn_k10"):
         return
@@ -59,7 +59,7 @@ def guess_curves(builder: Builder) -> Iterator[Block | None]:
         f"Rising curves. {builder.values('topn_k5')}. {builder.values('topn_k10')}.",
         "How often the object is among the first N answers, with K − 1 other objects as candidates. Bands: 95 % "
         "intervals. On the page, click a point to see grasps with this rank.",
-        plots.guess_curves,
+        plots.topn_curves,
         builder.results,
         spots={
             f"{name} topn_k{k}": [

@@ -47,7 +47,7 @@ def _percents(fractions: Sequence[float | None]) -> NDArray[np.float64]:
     return 100 * np.array([math.nan if fraction is None else fraction for fraction in fractions])
 
 
-def guess_curves(results: Results) -> Figure:
+def topn_curves(results: Results) -> Figure:
     """Plot the top-N accuracy for 5 candidates and, if there are enough objects, for 10."""
     all_keys = ("topn_k5", "topn_k10")
     keys = [key for key in all_keys if any(results.summary(name, key) for name in results.methods)] or all_keys

@@ -312,7 +312,7 @@ def reliability(entry: Entry) -> Table | None:
     if not rows:
         return None
     note = (
-        "Top-1 answers to one touch, among objects with one photo each, one of which is known to be the true object. "
+        "Top-1 answers to one touch, among objects with one photo each; the true object is one of them. "
         "The posterior is fitted on held-out training objects of each fold."
     )
     header = ("method", "gallery", "confidence", "mean confidence", "accuracy", "difference", "answers")

@@ -1,4 +1,4 @@
-"""An arm moved by a person, who is asked for each pose, so that data can be collected with a gripper alone."""
+"""An arm that a person moves to each requested pose, to collect data with a gripper only."""
 
 import math
 import time

@@ -72,7 +72,7 @@ def test_the_tables_have_a_row_for_every_plan(monkeypatch):
 
 @pytest.mark.slow
 def test_shards_answer_as_one_folder_does(monkeypatch, capsys):
-    options = ["--sizes", "1e3", "--shards", "2", "--touches", "4", "--judged", "2", "--json"]
+    options = ["--sizes", "1e3", "--shards", "2", "--touches", "4", "--reranked", "2", "--json"]
     monkeypatch.setattr(sys, "argv", ["shards", *options])
     shards.main()
     measured, opened = map(json.loads, capsys.readouterr().out.splitlines())

@@ -1,4 +1,4 @@
-"""A pack of the benchmark: four real objects, of which 10 precedes 100, and a split by objects.
+"""A pack of the benchmark: four real objects (10 precedes 100), and a split by objects.
 
 `write_samples`: two samples of ObjectFolder Real, with the table of names.
 """

@@ -30,7 +30,7 @@ WORDS_OF_NAMES = {
     "deck": "permutation",
     "said told": "feedback, message, output, printed",
     "keeping kept": "history_writer, stored, cached",
-    "most least": "max, min",
+    "most": "max",
     "guessed guesses": "top1, topn",
 }
 """Words that are no part of a name in the code -> names to use instead."""
@@ -54,20 +54,20 @@ PHRASES = {
     r"\bfaint(est)?\b": "low-contact",
     r"\buntouched (gel|frame|touch|picture|image)s?\b": "no-contact frame",
     r"\bblur(red)? (control|touch|touches)\b": "low-pass control",
-    r"\bworlds?\b": "object set, scene, rig",
+    r"\bworlds?\b(?! size)": "object set, scene, rig",
     r"\b(believe|believes|believed|belief)\b": "posterior probability",
     r"\blet(s|ting)? go\b": "close, release",
     r"\bcan be had\b": "is available",
     r"\bdear(er)?\b": "expensive, slow",
     r"\bwho(ever)? asked\b": "client",
     r"\bwhoever\b": "name who",
-    r"\bof which\b": "two sentences",
+    r", of which\b": "two sentences",
     r"\bthat which\b": "name the thing",
     r"\bwhat (is|was|are) (asked|wanted|given|said|told|kept|judged|felt|seen)\b": "name the thing",
     r"\bso (much|many) as\b": "a plain number or condition",
     r"\bbeside (it|them|the|a|an|its|each)\b": "next to, in addition to, compared with",
     r"\bnot to be had\b": "not available",
-    r"\bis none\b": "is not a ..., there is no ...",
+    r"\b(it|that|this|given) is none\b": "is not a ..., there is no ...",
 }
 """Phrases of the former dialect -> what to write instead."""
 

@@ -10,7 +10,7 @@ ORDER = ["arm", "gripper", "gel a", "gel b", "camera"]
 
 
 def events(rig, what):
-    return [call.removesuffix(f".{what}") for call in rig.world.calls if call.endswith(f".{what}")]
+    return [call.removesuffix(f".{what}") for call in rig.state.calls if call.endswith(f".{what}")]
 
 
 def test_all_devices_are_connected_in_order_and_closed_in_reverse():
@@ -59,7 +59,7 @@ def test_closing_twice_and_before_connecting_does_nothing():
 def test_a_failure_to_close_does_not_hide_the_first_error():
     with pytest.raises(ZeroDivisionError) as caught, FakeRig(faults={"arm.close": {1}}):
         _ = 1 / 0
-    assert "while the rig was closed: the fake arm.close was told to fail" in caught.value.__notes__[0]
+    assert "while the rig was closed: the fake arm.close fails on purpose" in caught.value.__notes__[0]
 
 
 def test_settings_are_read_back_from_every_device():
@@ -68,7 +68,7 @@ def test_settings_are_read_back_from_every_device():
         assert set(rig.settings()) == {device.name for device in rig.devices}
 
 
-def test_a_person_is_asked_when_the_object_changes_and_only_then():
+def test_a_prompt_appears_only_when_the_object_changes():
     requests = []
     fake = FakeRig()
     rig = Rig(fake.arm, fake.gripper, fake.sensors, fake.camera, info={}, ask=requests.append)
@@ -101,7 +101,7 @@ FAKE = "tests.fake_rig:FakeRig"
 def test_a_rig_is_built_by_its_name_and_its_info_rebuilds_it():
     rig = load_rig(FAKE, seed=7, fingers=["a"])
     assert isinstance(rig, FakeRig)
-    assert rig.world.seed == 7
+    assert rig.state.seed == 7
     assert list(rig.sensors) == ["a"]
     assert rig.info["rig_settings"] == {"fingers": ["a"]}
     assert load_rig(rig.info["rig"], seed=7, **rig.info["rig_settings"]).info == rig.info

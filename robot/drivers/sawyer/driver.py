@@ -252,7 +252,7 @@ class Sawyer(Arm):
         return pose
 
     def _solve(self, poses: Sequence[Pose], start: Joints) -> Joints:
-        """Return the joint angles (N, 7) of way-points, of which the first is the arm's pose."""
+        """Return the joint angles (N, 7) of way-points; the first is the arm's pose."""
         found = [start]
         for pose in poses[1:]:
             found.append(self._solve_one(pose, found[-1], start))

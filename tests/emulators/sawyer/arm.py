@@ -1,4 +1,4 @@
-"""An arm for the rosbridge emulator: seven joints, of which four move the hand and one turns it.
+"""An arm for the rosbridge emulator: seven joints; four move the hand and one turns it.
 
 It is not a Sawyer: link lengths are rounded, right_j2 and right_j4 stay at zero, and only poses with the hand straight
 down have an inverse. It has the properties that a driver depends on: joint names, joint speeds scaled by a ratio,

@@ -324,7 +324,7 @@ def test_a_number_of_photos_is_used_only_if_every_candidate_has_as_many_besides_
     assert {photos_metric_name(1), photos_metric_name(2), photos_metric_name(3)} <= set(taken)
     assert photos_metric_name(5) not in taken
     fewer = table.select(np.arange(24), np.delete(np.arange(24), [4, 5]))
-    assert fewer.min_photos == 1  # the second object has two photos, one of which is a row's own
+    assert fewer.min_photos == 1  # the second object has two photos; one is a row's own
 
 
 # Chance and certainty --------------------------------------------------------------------------------------

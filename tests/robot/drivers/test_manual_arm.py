@@ -77,7 +77,7 @@ def test_the_pose_is_unknown_before_the_first_motion_after_a_stop_and_after_reco
         arm.pose()
 
 
-def test_a_person_who_interrupts_is_asked_again():
+def test_an_interrupted_prompt_is_repeated():
     def interrupt(_):
         raise KeyboardInterrupt
 

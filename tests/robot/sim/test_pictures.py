@@ -84,7 +84,7 @@ def test_pictures_of_other_settings_and_other_folders_are_not_changed(tmp_path):
     with pytest.raises(RecordingError, match="does not describe a picture"):
         collect_pictures("photo", tmp_path / "p", objects=1, seed=5)
     (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "letter.txt").write_text("dear")
+    (tmp_path / "other" / "letter.txt").write_text("hello")
     with pytest.raises(RecordingError, match="something else"):
         collect_pictures("photo", tmp_path / "other", objects=1, seed=5)
 
