@@ -3,7 +3,7 @@
 Number of candidates that contain the exhaustive top-1, against the number of photos. Catalogues are drawn as in
 `benchmarks.scale`, block by block, each the beginning of the next. No block is stored, so only time grows. First the
 exhaustive top-1 of each touch is found, the photo with the greatest match logit of all; then its rank by the candidate
-encoder. As in `benchmarks.scale`, one half of the checkpoint's touches chooses k: `MARGIN` times the number of
+encoder. As in `benchmarks.scale`, one part of the checkpoint's touches chooses k: `MARGIN` times the number of
 candidates that contain the exhaustive top-1 for 99 % of them. The other touches evaluate the choice.
 
 All photos are scored in bfloat16, and also in float32 if their logit is close to the best so far: within `SAFE` times

@@ -341,7 +341,7 @@ def hostile(bench, fraction):
     try:
         url = os.read(reader, 100).decode()
         httpx.post(f"{url}/v1/query", json=bench.body, timeout=60)
-        before, most = resident_mb(child), 0.0
+        before, peak = resident_mb(child), 0.0
         for number in range(count):
             kind = kinds[number % len(kinds)]
             start = time.perf_counter()
@@ -350,7 +350,7 @@ def hostile(bench, fraction):
             statuses[status] += 1
             if status is not None and not 400 <= status < 500:
                 wrong.append((kind, status))
-            most = max(most, resident_mb(child))
+            peak = max(peak, resident_mb(child))
         alive = httpx.post(f"{url}/v1/query", json=bench.body, timeout=60).status_code
     finally:
         os.kill(child, signal.SIGKILL)
@@ -360,7 +360,7 @@ def hostile(bench, fraction):
     report(
         "hostile",
         f"{count} bodies: statuses {dict(statuses)} (None: attacker disconnected first), not 4xx {wrong[:3]}; p99 "
-        f"{ms(every, 0.99):.0f} ms, slowest by kind {slowest} ms; memory {most - before:+.0f} MB; then {alive}",
+        f"{ms(every, 0.99):.0f} ms, slowest by kind {slowest} ms; memory {peak - before:+.0f} MB; then {alive}",
         f"4xx in under 500 ms (slow bodies have {BODY_S} s here), within 100 MB, alive",
     )
 

@@ -109,10 +109,10 @@ def _timed(
     return counts, seconds
 
 
-def sets_of(owner: Rows, grasps: int, most: int) -> Rows:
-    """Return (S, grasps) rows, each set of one object with enough grasps, at most `most` sets."""
+def sets_of(owner: Rows, grasps: int, maximum: int) -> Rows:
+    """Return (S, grasps) rows, each set of one object with enough grasps, at most `maximum` sets."""
     enough = np.flatnonzero(np.bincount(owner)[owner] >= grasps)
-    return np.random.default_rng(0).permutation(enough[next_rows_of_object(owner[enough], grasps)])[:most]
+    return np.random.default_rng(0).permutation(enough[next_rows_of_object(owner[enough], grasps)])[:maximum]
 
 
 def line(figures: dict[str, Any]) -> str:

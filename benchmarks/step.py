@@ -27,7 +27,7 @@ Index = np.ndarray
 
 
 def measure(config: Config, touches: int = 6, photos_each: int = 8, repetitions: int = 3) -> Iterator[ResultLine]:
-    """Yield one line. One half of the photos of a touch show its object; no other touch uses the other half."""
+    """Yield one line. Each touch has as many photos of its own object as of other objects."""
     matcher, pre, pairs = matcher_of(config), config.preprocessing, touches * photos_each
     set_training_mode(matcher, config.training)
     for norm in (matcher.touch_norm, matcher.photo_norm):

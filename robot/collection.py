@@ -80,7 +80,7 @@ class Progress:
     Attributes:
         objects: Number of objects.
         objects_done: Objects that need no further attempt.
-        grasps_wanted: Number of accepted grasps to collect, over all objects.
+        grasps_target: Number of accepted grasps to collect, over all objects.
         grasps_done: Accepted grasps, plus the missing grasps of objects that need no further attempt.
         accepted: Accepted grasps.
         attempts: Attempts made.
@@ -89,7 +89,7 @@ class Progress:
 
     objects: int
     objects_done: int
-    grasps_wanted: int
+    grasps_target: int
     grasps_done: int
     accepted: int
     attempts: int
@@ -321,21 +321,21 @@ class _Collection:
         return logged(accepted=accepted, grasp_id=grasp_id, score=score, fit=attempt.fit)
 
     def _count_done(self) -> int:
-        grasps_wanted = self.settings.grasps
-        return sum(self.tallies[name].accepted if self._needs_attempt(name) else grasps_wanted for name in self.names)
+        grasps_target = self.settings.grasps
+        return sum(self.tallies[name].accepted if self._needs_attempt(name) else grasps_target for name in self.names)
 
     def _report(self) -> None:
         if self._progress is None:
             return
         tallies = [self.tallies[name] for name in self.names]
-        grasps_wanted, grasps_done = len(tallies) * self.settings.grasps, self._count_done()
+        grasps_target, grasps_done = len(tallies) * self.settings.grasps, self._count_done()
         fresh = grasps_done - self._done_at_start
-        left = (grasps_wanted - grasps_done) * (time.monotonic() - self._start) / fresh if fresh else None
+        left = (grasps_target - grasps_done) * (time.monotonic() - self._start) / fresh if fresh else None
         self._progress(
             Progress(
                 objects=len(tallies),
                 objects_done=sum(not self._needs_attempt(name) for name in self.names),
-                grasps_wanted=grasps_wanted,
+                grasps_target=grasps_target,
                 grasps_done=grasps_done,
                 accepted=sum(each.accepted for each in tallies),
                 attempts=sum(each.attempts for each in tallies),

@@ -179,10 +179,10 @@ def with_opening(features: Features, recording: Path) -> Features:
     return dataclasses.replace(features, touch=np.concatenate([features.touch, column], axis=2))
 
 
-def first_grasps(features: Features, most: int) -> Features:
+def first_grasps(features: Features, maximum: int) -> Features:
     """Return the first grasps of each object, at most this many."""
     place = [features.object_ids[:row].count(name) for row, name in enumerate(features.object_ids)]
-    return features.select(np.flatnonzero(np.array(place) < most))
+    return features.select(np.flatnonzero(np.array(place) < maximum))
 
 
 def score_methods(

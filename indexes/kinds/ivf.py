@@ -35,7 +35,7 @@ class IVFParameters(vector_index.Parameters):
     query 10 to 50 % faster.
 
     Attributes:
-        lists: Number of lists; None: sqrt(N). It is lowered to N / 39, the most that N points can train.
+        lists: Number of lists; None: sqrt(N). It is lowered to N / 39, the maximum that N points can train.
         probes: Number of visited lists; None: an eighth of the lists, at least 8.
     """
 
@@ -78,8 +78,8 @@ class IVFFlatIndex(FaissIndex):
     def resolve_parameters(cls, parameters: Any, count: int, dim: int) -> Any:
         """Fill in `lists` and `probes` for `count` vectors."""
         parameters = super().resolve_parameters(parameters, count, dim)
-        most = max(1, count // POINTS_PER_CENTRE)
-        lists = min(most, parameters.lists or round(math.sqrt(count)))
+        maximum = max(1, count // POINTS_PER_CENTRE)
+        lists = min(maximum, parameters.lists or round(math.sqrt(count)))
         probes = min(lists, parameters.probes or max(8, math.ceil(lists / 8)))
         return replace(parameters, lists=lists, probes=probes)
 
@@ -88,10 +88,10 @@ class IVFFlatIndex(FaissIndex):
         return self._prepared(structure)
 
     def _training(self) -> Floats:
-        most = MAX_POINTS_PER_CENTRE * self._lists
-        if self.count <= most:
+        maximum = MAX_POINTS_PER_CENTRE * self._lists
+        if self.count <= maximum:
             return super()._training()
-        drawn = np.random.default_rng(self.seed).choice(self.count, most, replace=False)
+        drawn = np.random.default_rng(self.seed).choice(self.count, maximum, replace=False)
         return np.ascontiguousarray(self._vectors[np.sort(drawn)])
 
     def _centres(self) -> Any:
@@ -165,5 +165,5 @@ class IVFPQIndex(IVFFlatIndex):
 
 
 def _default_bytes(dim: int) -> int:
-    most = max(8, dim // 8)
-    return max(parts for parts in range(1, min(most, dim) + 1) if dim % parts == 0)
+    maximum = max(8, dim // 8)
+    return max(parts for parts in range(1, min(maximum, dim) + 1) if dim % parts == 0)

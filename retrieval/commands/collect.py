@@ -77,9 +77,9 @@ def collect(
             gate=decide,
             gate_name=gate_name,
             jobs=jobs,
-            progress=lambda now: bar(now.grasps_done, now.grasps_wanted, str(now)),
+            progress=lambda now: bar(now.grasps_done, now.grasps_target, str(now)),
         )
-    for line in acceptance_table(tallies, grasps_wanted=settings.grasps).splitlines():
+    for line in acceptance_table(tallies, grasps_target=settings.grasps).splitlines():
         say(line)
     accepted = sum(tally.accepted for tally in tallies)
     if accepted == 0:

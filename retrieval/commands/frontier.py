@@ -96,6 +96,6 @@ def _recording(recording: Path | None, out: Path, quick: bool) -> Path:
             seed=SEED,
             settings=CollectSettings(grasps=grasps),
             jobs=os.cpu_count() or 1,
-            progress=lambda now: bar(now.grasps_done, now.grasps_wanted, str(now)),
+            progress=lambda now: bar(now.grasps_done, now.grasps_target, str(now)),
         )
     return folder

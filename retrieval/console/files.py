@@ -143,7 +143,7 @@ def require_ours(path: Path, kind: Kind) -> None:
         reason = reason if reason.startswith(("is ", "has ")) else f"cannot be opened ({reason})"
         raise BadInput(f"{path} {reason}. Name a file for {kind.name}.") from error
     raise BadInput(
-        f"{path} is not {kind.name} that this program wrote, so it is not overwritten. Name another file, or move it away."
+        f"{path} is not {kind.name} that this program wrote, so it is not overwritten. Name another file, or move it."
     )
 
 

@@ -71,7 +71,7 @@ def topn_curves(builder: Builder) -> Iterator[Block | None]:
         },
     )
     for k in (5, 10):
-        if table := tables.guesses(builder.results, f"topn_k{k}"):
+        if table := tables.ranks(builder.results, f"topn_k{k}"):
             yield Details(f"Numbers for {k} candidates", (table,))
 
 

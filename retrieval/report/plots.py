@@ -57,12 +57,12 @@ def topn_curves(results: Results) -> Figure:
             if (summary := results.summary(name, key)) is None:
                 continue
             value, low, high = (_percents(summary[part]) for part in ("value", "low", "high"))
-            guesses, style = np.arange(1, len(value) + 1), style_of(name)
-            panel.plot(guesses, _percents(summary["chance"]), color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
-            (line,) = panel.plot(guesses, value, color=style.colour, marker=style.marker, ls=style.line)
+            ranks, style = np.arange(1, len(value) + 1), style_of(name)
+            panel.plot(ranks, _percents(summary["chance"]), color=MUTED_COLOUR, ls="--", lw=1.2, zorder=1)
+            (line,) = panel.plot(ranks, value, color=style.colour, marker=style.marker, ls=style.line)
             line.set_gid(f"{name} {key}")
             if name not in TRIVIAL_BASELINES:
-                panel.fill_between(guesses, low, high, color=style.colour, alpha=0.13, lw=0)
+                panel.fill_between(ranks, low, high, color=style.colour, alpha=0.13, lw=0)
         panel.set_title(f"{key.removeprefix('topn_k')} candidate objects")
         panel.set_xlabel("N")
         panel.xaxis.get_major_locator().set_params(integer=True)

@@ -196,7 +196,7 @@ def numbers(entry: Entry) -> Table:
     if counted:
         notes.append(
             "Right: number of right top-1 answers, mean over the seeds, with an exact binomial interval, for "
-            f"{labels[next(row['counted']['measure'] for row in entry['rows'].values() if row['counted'])]}."
+            f"{labels[next(row['correct_counts']['measure'] for row in entry['rows'].values() if row['correct_counts'])]}."
         )
     if any(FEW_OBJECTS_MARK in cell for row in rows for cell in row):
         notes.append(FEW_OBJECTS_NOTE)
@@ -212,14 +212,14 @@ def _counts(counted: Mapping[str, Any] | None, has_column: bool) -> list[str]:
     if not has_column or counted is None:
         return [""] if has_column else []
     right = sum(counted["right"]) / len(counted["right"])
-    return [f"{right:.3g} of {counted['asked']} [{percent(counted['low'])}, {percent(counted['high'])}]"]
+    return [f"{right:.3g} of {counted['queries']} [{percent(counted['low'])}, {percent(counted['high'])}]"]
 
 
 def controls(entry: Entry) -> Table:
     """Return the description and the main measure of each control."""
     rows = [("low_pass", "each gel image is low-pass filtered to 8 x 6 pixels, in training and test", "see above")]
     for name, one in entry["controls"].items():
-        value = with_interval(one["measures"].get(entry["main"])) if one["measures"] else f"none: {one['why_not']}"
+        value = with_interval(one["measures"].get(entry["main"])) if one["measures"] else f"none: {one['reason']}"
         rows.append((name, one["description"], value))
     header = ("control", "description", f"{entry['labels'][entry['main']]}, %")
     return Table(header, tuple(rows), words=frozenset({1, 2}))
@@ -300,9 +300,9 @@ def reliability(entry: Entry) -> Table | None:
             _label(name, row),
             SEARCH_SPACES[searched],
             f"{one['from']:.1f} to {one['to']:.1f}",
-            f"{one['stated']:.3f}",
-            f"{one['true']:.3f}",
-            f"{one['stated'] - one['true']:+.3f}",
+            f"{one['confidence']:.3f}",
+            f"{one['accuracy']:.3f}",
+            f"{one['confidence'] - one['accuracy']:+.3f}",
             f"{one['count']:,}",
         )
         for name, row in entry["rows"].items()
@@ -312,7 +312,11 @@ def reliability(entry: Entry) -> Table | None:
     if not rows:
         return None
     note = (
+<<<<<<< HEAD
         "Top-1 answers to one touch, among objects with one photo each; the true object is one of them. "
+=======
+        "Top-1 answers to one touch, among objects with one photo each that include the true object. "
+>>>>>>> room-E
         "The posterior is fitted on held-out training objects of each fold."
     )
     header = ("method", "gallery", "confidence", "mean confidence", "accuracy", "difference", "answers")

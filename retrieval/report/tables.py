@@ -36,7 +36,7 @@ def measures(results: Results, keys: Sequence[str]) -> Table | None:
     return _table(results, [(measure_label(key), key, 0) for key in keys])
 
 
-def guesses(results: Results, measure: str) -> Table | None:
+def ranks(results: Results, measure: str) -> Table | None:
     """Return the top-N accuracies, with a column for each N; None if there are none."""
     lengths = [len(found["value"]) for name in results.methods if (found := results.summary(name, measure))]
     return _table(results, [(f"N = {place + 1}", measure, place) for place in range(max(lengths, default=0))])

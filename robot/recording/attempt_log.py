@@ -163,19 +163,19 @@ def tally(attempts: Iterable[LoggedAttempt]) -> dict[str, Tally]:
     return tallies
 
 
-def acceptance_table(tallies: Sequence[Tally], grasps_wanted: int | None = None) -> str:
+def acceptance_table(tallies: Sequence[Tally], grasps_target: int | None = None) -> str:
     """Return a plain-text table with a line for each object and one for all.
 
     Args:
         tallies: Counts by object.
-        grasps_wanted: Objects with fewer accepted grasps are marked "gave up"; None: no marks. Ungraspable objects show
+        grasps_target: Objects with fewer accepted grasps are marked "gave up"; None: no marks. Ungraspable objects show
             their reason.
     """
     width = max([len(each.object_id) for each in tallies] + [6])
     lines = [f"{'object':{width}}  accepted  of  {'  '.join(OUTCOMES)}"]
     total = Tally("all")
     for each in tallies:
-        gave_up = "  gave up" if grasps_wanted is not None and each.accepted < grasps_wanted else ""
+        gave_up = "  gave up" if grasps_target is not None and each.accepted < grasps_target else ""
         lines.append(_line(each, width) + (f"  skipped: {each.skipped}" if each.skipped else gave_up))
         total.attempts, total.accepted = total.attempts + each.attempts, total.accepted + each.accepted
         total.outcomes += each.outcomes

@@ -93,8 +93,8 @@ def test_the_opening_of_the_jaws_is_one_more_feature_of_each_finger(tmp_path, mo
     assert touch.tolist() == [[[1, 7], [1, 7]], [[1, 31.5], [1, 31.5]]]
 
 
-@pytest.mark.parametrize(("most", "rows"), [(1, [0, 1]), (2, [0, 1, 2, 3]), (9, [0, 1, 2, 3, 4])])
-def test_the_first_grasps_of_each_object_are_selected(most, rows):
+@pytest.mark.parametrize(("maximum", "rows"), [(1, [0, 1]), (2, [0, 1, 2, 3]), (9, [0, 1, 2, 3, 4])])
+def test_the_first_grasps_of_each_object_are_selected(maximum, rows):
     touch, photo = np.zeros((5, 2, 3), np.float32), np.zeros((5, 4), np.float32)
     features = Features(tuple("vwxyz"), ("b", "a", "a", "b", "a"), touch, photo)
-    assert scaling.first_grasps(features, most).grasp_ids == tuple("vwxyz"[row] for row in rows)
+    assert scaling.first_grasps(features, maximum).grasp_ids == tuple("vwxyz"[row] for row in rows)

@@ -121,7 +121,7 @@ def test_candidates_are_four_times_as_many_as_the_choosing_touches_need():
 
 def test_two_ways_to_find_candidates_of_several_grasps_are_compared(crowd, tmp_path, monkeypatch):
     made = IndexStore(tmp_path / "index").write_blocks(crowd.blocks(0, 300, 0), fingerprint={}, kind="flat")
-    sets = several.sets_of(np.array([0, 0, 0, 1, 1, 1, 1, 2]), 3, most=5)
+    sets = several.sets_of(np.array([0, 0, 0, 1, 1, 1, 1, 2]), 3, maximum=5)
     assert len(sets) == 5
     assert all(set(row) <= {0, 1, 2} or set(row) <= {3, 4, 5, 6} for row in sets.tolist())
     together, each = several.measure(crowd, made, crowd.touches, sets, k=20)

@@ -54,11 +54,11 @@ def test_only_slots_near_rank_k_are_scored_again(monkeypatch):
     monkeypatch.setattr(
         faiss_index, "grid_scores", lambda query, table: scored.append(len(table)) or scores(query, table)
     )
-    for kind, most in (("flat", 3), ("ivf_sq8", 0)):
+    for kind, maximum in (("flat", 3), ("ivf_sq8", 0)):
         index, query = load_kind(kind).build(unit(N, D, seed=3), threads=1), unit(1, D, seed=6)
         scored.clear()
         index.candidates(query, 100)
-        assert sum(scored) <= most
+        assert sum(scored) <= maximum
         index.search(query, 100)
         assert sum(scored) >= 100
 

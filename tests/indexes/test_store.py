@@ -156,15 +156,15 @@ def test_unchanged_rows_reuse_their_vectors(tmp_path, kind):
     partials = np.arange(count, dtype=np.float32)[:, None]
     first = store.write(rows_of(names(count)), unit(count), {"partials": partials}, kind=kind, **MORE)
     # p00000 goes, p00001 changes, "new" comes; the rest stays, in another order and with other metadata.
-    kept = [row | {"price": 3} for row in rows_of(names(count - 2, start=2))][::-1]
-    wanted = [{"id": "new", "digest": "1"}, *kept, {"id": "p00001", "digest": "2"}]
-    reuse = first.reusable({row["id"]: row["digest"] for row in wanted})
+    unchanged = [row | {"price": 3} for row in rows_of(names(count - 2, start=2))][::-1]
+    new_rows = [{"id": "new", "digest": "1"}, *unchanged, {"id": "p00001", "digest": "2"}]
+    reuse = first.reusable({row["id"]: row["digest"] for row in new_rows})
     assert sorted(reuse) == names(count - 2, start=2)
     assert reuse["p00005"] == 5
     fresh, extra = unit(2, seed=9), np.array([[-1.0], [-2.0]], np.float32)
-    second = store.write(wanted, fresh, {"partials": extra}, kind=kind, parent=first, **MORE)
+    second = store.write(new_rows, fresh, {"partials": extra}, kind=kind, parent=first, **MORE)
     assert second.manifest.parent == "gen-000001"
-    assert second.rows == wanted
+    assert second.rows == new_rows
     expected = np.concatenate([fresh[:1], unit(count)[2:][::-1], fresh[1:]])
     assert np.array_equal(second.embeddings[second.slots], expected)
     assert np.asarray(second.arrays["partials"])[:, 0].tolist() == [-1.0, *range(count - 1, 1, -1), -2.0]

@@ -190,7 +190,7 @@ def test_progress_is_reported_after_every_attempt(tmp_path):
     assert [each.attempts for each in reports] == list(range(len(reports)))
     first, last = reports[0], reports[-1]
     assert (first.grasps_done, first.objects_done, first.seconds_left, first.accept_rate) == (0, 0, None, 0.0)
-    assert (last.objects, last.objects_done, last.grasps_wanted, last.grasps_done, last.accepted) == (2, 2, 4, 4, 2)
+    assert (last.objects, last.objects_done, last.grasps_target, last.grasps_done, last.accepted) == (2, 2, 4, 4, 2)
     assert last.accept_rate == 2 / last.attempts
     assert str(last) == f"2 of 2 objects, {2 / last.attempts:.0%} of {last.attempts} attempts accepted"
     assert last.seconds_left == 0.0

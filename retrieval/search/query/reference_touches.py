@@ -128,10 +128,10 @@ class References:
             ).sum(0)
         return found
 
-    def nearest_objects(self, similarities: Nearness, most: int) -> Numbers:
-        """Return the objects with the largest similarities, at most `most`."""
+    def nearest_objects(self, similarities: Nearness, maximum: int) -> Numbers:
+        """Return the objects with the largest similarities, at most `maximum`."""
         order = np.argsort(-similarities[self._objects], kind="stable")
-        return np.asarray(self._objects[order[:most]])
+        return np.asarray(self._objects[order[:maximum]])
 
     def combine(
         self,

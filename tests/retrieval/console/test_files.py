@@ -136,7 +136,7 @@ def test_the_next_write_removes_the_files_of_a_killed_writer(tmp_path):
     code = (
         "import os, signal, sys\nfrom pathlib import Path\nfrom _touch_retrieval import files\n"
         "files.os.fsync = lambda _: os.kill(os.getpid(), signal.SIGKILL)\n"
-        "files.write_atomically(Path(sys.argv[1]), b'half')"
+        "files.write_atomically(Path(sys.argv[1]), b'partial')"
     )
     done = subprocess.run([sys.executable, "-c", code, str(path)], cwd=ROOT, timeout=60, check=False)
     assert done.returncode == -signal.SIGKILL

@@ -12,7 +12,7 @@ from retrieval.serve.connections import MAX_CONNECTIONS, MAX_CONNECTIONS_OF_ADDR
 from tests.serving import listening
 from tests.waiting import wait_until
 
-HALF = b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\nx-a: "
+HALF_SENT = b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\nx-a: "
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def service_at(index):
 
 
 @contextmanager
-def opened(address, count, sent=HALF, source="127.0.0.1"):
+def opened(address, count, sent=HALF_SENT, source="127.0.0.1"):
     """Open `count` connections from an address and send `sent` on each."""
     with ExitStack() as stack:
         lines = []
@@ -69,8 +69,8 @@ def health_latency(url, source="127.0.0.1"):
 def test_half_sent_headers_end_at_a_deadline_and_a_silent_connection_too(service_at, monkeypatch):
     _, address, _ = service_at
     monkeypatch.setattr(connections, "HEADERS_S", 0.3)
-    with opened(address, 1) as (half,), opened(address, 1, b"") as (silent,):
-        response = received(half)
+    with opened(address, 1) as (partial,), opened(address, 1, b"") as (silent,):
+        response = received(partial)
         assert response.startswith(b"HTTP/1.1 408 ")
         assert b"urn:touch-retrieval:problem:too-slow" in response
         assert b"within 0.3 s" in response
@@ -94,7 +94,7 @@ def test_headers_that_come_byte_by_byte_do_not_outlive_the_deadline(service_at, 
 def test_a_half_sent_second_request_ends_at_a_deadline(service_at, monkeypatch):
     _, address, _ = service_at
     monkeypatch.setattr(connections, "HEADERS_S", 0.5)
-    with opened(address, 1, b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n" + HALF) as (line,):
+    with opened(address, 1, b"GET /healthz HTTP/1.1\r\nhost: 127.0.0.1\r\n\r\n" + HALF_SENT) as (line,):
         response = received(line)
         assert response.startswith(b"HTTP/1.1 200 ")
         assert b"HTTP/1.1 408 " in response

@@ -256,8 +256,8 @@ def test_trial_run_counts_human_and_model_choices(client_with_trials):
 
 def test_too_few_unseen_objects_are_reported(index, folder, recording, tmp_path):
     """The model was trained on most objects of that recording."""
-    shutil.copytree(recording, tmp_path / "seen")
-    with with_history(index, folder, tmp_path / "seen") as client:
+    shutil.copytree(recording, tmp_path / "recording")
+    with with_history(index, folder, tmp_path / "recording") as client:
         assert "requires 10 objects that the model was not trained on" in problem(
             client.post("/v1/trials", json={}), 422, "bad-input"
         )

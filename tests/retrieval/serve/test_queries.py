@@ -104,6 +104,6 @@ def test_other_content_types_and_broken_json_are_refused(client):
     problem(client.post("/v1/query", content=b"x"), 415, "unsupported-type")
     broken = client.post("/v1/query", content=b"{", headers={"content-type": "application/json"})
     problem(broken, 400, "malformed")
-    half = client.post("/v1/query", content=b"--x\r\n", headers={"content-type": "multipart/form-data; boundary=x"})
-    problem(half, 422, "bad-input")
+    partial = client.post("/v1/query", content=b"--x\r\n", headers={"content-type": "multipart/form-data; boundary=x"})
+    problem(partial, 422, "bad-input")
     problem(client.post("/v1/query", content=b"x", headers={"content-type": "multipart/form-data"}), 400, "malformed")

@@ -140,7 +140,7 @@ PART = b'\r\n--x\r\ncontent-disposition: form-data; name="top"\r\n\r\n3'
         (PART[:-1] + b"1" * 2000 + b"\r\n--x--", "'top' must be a short text"),
         (b"", "The form is incomplete"),
     ],
-    ids=["parts", "headers", "half boundaries", "no name", "long", "empty"],
+    ids=["parts", "headers", "partial boundaries", "no name", "long", "empty"],
 )
 def test_a_hostile_form_is_refused_soon(client, body, message):
     begun = time.process_time()

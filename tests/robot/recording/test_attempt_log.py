@@ -43,7 +43,7 @@ def test_an_ungraspable_object_is_in_the_log_and_the_table_without_attempts(tmp_
     tallies = list(tally(read_attempts(tmp_path, GRASPS)).values())
     assert (tallies[2].attempts, tallies[2].skipped) == (0, "wider than the gripper opens")
     assert [each.skipped for each in tallies[:2]] == [None, None]
-    assert acceptance_table(tallies, grasps_wanted=2).splitlines()[1:] == [
+    assert acceptance_table(tallies, grasps_target=2).splitlines()[1:] == [
         "mug               1   3     1       1        0        1  gave up",
         "cup, blue         1   1     0       0        1        0  gave up",
         "ball              0   0     0       0        0        0  skipped: wider than the gripper opens",
@@ -152,10 +152,10 @@ def test_attempts_are_counted_by_object():
 
 
 def test_the_table_has_a_line_for_each_object_and_marks_missing_grasps():
-    assert acceptance_table(list(tally(ALL).values()), grasps_wanted=1).splitlines() == [
+    assert acceptance_table(list(tally(ALL).values()), grasps_target=1).splitlines() == [
         "object     accepted  of  held  missed  slipped  no_plan",
         "mug               1   3     1       1        0        1",
         "cup, blue         1   1     0       0        1        0",
         "all               2   4     1       1        1        1",
     ]
-    assert acceptance_table(list(tally(ALL).values()), grasps_wanted=2).count("gave up") == 2
+    assert acceptance_table(list(tally(ALL).values()), grasps_target=2).count("gave up") == 2

@@ -104,11 +104,11 @@ function card(part, answer, open) {
       h("span", { class: "if-present" }, `${percent(match.probability_if_present)} if present`),
     kind === "object" && p === null && h("span", { class: "p muted" }, `match logit ${match.logit.toFixed(2)}`),
   ];
-  const given = { class: `photo ${kind}${chosen ? " first" : ""}${p !== null && p < MIN_SHOWN ? " unlikely" : ""}` };
+  const attributes = { class: `photo ${kind}${chosen ? " first" : ""}${p !== null && p < MIN_SHOWN ? " unlikely" : ""}` };
   if (kind !== "object") {
     return h(
       "li",
-      given,
+      attributes,
       h(
         "div",
         { class: "tile" },
@@ -120,7 +120,7 @@ function card(part, answer, open) {
   const image = picture(thumbnailURL(match.photo), "", { loading: "lazy" });
   return h(
     "li",
-    given,
+    attributes,
     h(
       "button",
       { type: "button", class: "tile", onclick: () => open(match) },

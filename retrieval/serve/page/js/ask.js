@@ -194,13 +194,13 @@ function waiting(tray) {
 
 /** Options for experts. */
 function optionsPanel(index, tray, options) {
-  const number = (name, text, given, read) => {
+  const number = (name, text, attributes, read) => {
     const id = `option-${name}`;
     const input = h("input", {
       id,
       type: "number",
       value: options[name] === null ? "" : String(options[name]),
-      ...given,
+      ...attributes,
     });
     input.addEventListener("change", () => {
       if (!input.checkValidity()) {

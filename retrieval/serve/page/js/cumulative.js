@@ -94,7 +94,7 @@ function plot(answers, lines) {
     const anchor = step === 0 ? "start" : step === answers.length - 1 ? "end" : "middle";
     return svg("text", { x: x(step), y: HEIGHT - 8, "text-anchor": anchor }, step === 0 ? "1 grasp" : `${step + 1}`);
   });
-  const drawn = [...lines].reverse().map(({ name, kind, values }) => {
+  const groups = [...lines].reverse().map(({ name, kind, values }) => {
     const points = values.flatMap((p, step) => (p === null ? [] : [[x(step), y(p)]]));
     return svg(
       "g",
@@ -109,7 +109,7 @@ function plot(answers, lines) {
     { viewBox: `0 0 ${width} ${HEIGHT}`, "aria-hidden": "true", class: "plot" },
     grid.flat(),
     steps,
-    drawn,
+    groups,
   );
 }
 
