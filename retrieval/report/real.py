@@ -312,11 +312,7 @@ def reliability(entry: Entry) -> Table | None:
     if not rows:
         return None
     note = (
-<<<<<<< HEAD
-        "Top-1 answers to one touch, among objects with one photo each; the true object is one of them. "
-=======
         "Top-1 answers to one touch, among objects with one photo each that include the true object. "
->>>>>>> room-E
         "The posterior is fitted on held-out training objects of each fold."
     )
     header = ("method", "gallery", "confidence", "mean confidence", "accuracy", "difference", "answers")
