@@ -254,7 +254,7 @@ def _points_within_time(
 
 
 def _best_point(points: Sequence[SearchPoint], requirements: SearchRequirements) -> SearchPoint:
-    """Return the best of points of which none is sufficient.
+    """Return the best of several insufficient points.
 
     With a time bound only, this is the point with the highest recall within the time. Otherwise, or if no point is
     within the time, it is the fastest point with the recall.
