@@ -252,7 +252,7 @@ def test_few_live_slots_are_all_found(built):
 
 
 @pytest.mark.parametrize("live", [np.ones(3, bool), np.ones(COUNT)])
-def test_a_live_mask_of_another_shape_or_type_is_refused(built, live):
+def test_a_live_mask_of_another_shape_or_type_raises(built, live):
     with pytest.raises(ParameterError, match="live must be bool"):
         built.search(unit(1), 1, live)
 

@@ -157,14 +157,14 @@ def test_unchanged_rows_reuse_their_vectors(tmp_path, kind):
     first = store.write(rows_of(names(count)), unit(count), {"partials": partials}, kind=kind, **MORE)
     # p00000 goes, p00001 changes, "new" comes; the rest stays, in another order and with other metadata.
     unchanged = [row | {"price": 3} for row in rows_of(names(count - 2, start=2))][::-1]
-    new_rows = [{"id": "new", "digest": "1"}, *unchanged, {"id": "p00001", "digest": "2"}]
-    reuse = first.reusable({row["id"]: row["digest"] for row in new_rows})
+    rows = [{"id": "new", "digest": "1"}, *unchanged, {"id": "p00001", "digest": "2"}]
+    reuse = first.reusable({row["id"]: row["digest"] for row in rows})
     assert sorted(reuse) == names(count - 2, start=2)
     assert reuse["p00005"] == 5
     fresh, extra = unit(2, seed=9), np.array([[-1.0], [-2.0]], np.float32)
-    second = store.write(new_rows, fresh, {"partials": extra}, kind=kind, parent=first, **MORE)
+    second = store.write(rows, fresh, {"partials": extra}, kind=kind, parent=first, **MORE)
     assert second.manifest.parent == "gen-000001"
-    assert second.rows == new_rows
+    assert second.rows == rows
     expected = np.concatenate([fresh[:1], unit(count)[2:][::-1], fresh[1:]])
     assert np.array_equal(second.embeddings[second.slots], expected)
     assert np.asarray(second.arrays["partials"])[:, 0].tolist() == [-1.0, *range(count - 1, 1, -1), -2.0]
@@ -425,14 +425,14 @@ def test_any_sequence_of_changes_gives_the_result_of_a_new_build(tmp_path_factor
         partials = fresh[:, :2].astype(np.float16)
         generation = store.write(rows, fresh, {"partials": partials}, parent=generation, **more)
         whole = contents[[int(row["digest"]) for row in rows]]
-        anew = IndexStore(folder / "fresh").write(rows, whole, {"partials": whole[:, :2].astype(np.float16)}, **more)
-        assert generation.rows == anew.rows
-        assert np.array_equal(generation.arrays["partials"], anew.arrays["partials"])
+        rebuilt = IndexStore(folder / "fresh").write(rows, whole, {"partials": whole[:, :2].astype(np.float16)}, **more)
+        assert generation.rows == rebuilt.rows
+        assert np.array_equal(generation.arrays["partials"], rebuilt.arrays["partials"])
         for k in (1, 2, 12):
             # Approximate kinds are exhaustive if k covers all slots.
             if k < 12 and kind not in ("exact", "flat"):
                 continue
-            for a, b in zip(generation.search(contents, k), anew.search(contents, k), strict=True):
+            for a, b in zip(generation.search(contents, k), rebuilt.search(contents, k), strict=True):
                 assert np.array_equal(a[0], b[0])
                 assert np.array_equal(a[1], b[1])
 

@@ -67,7 +67,7 @@ class _Photo:
 
 @dataclass
 class BuildPart:
-    """Consecutive photos of a catalogue; at most one batch of them was encoded.
+    """Consecutive photos of a catalogue, at most one batch of them newly encoded.
 
     Attributes:
         rows: Rows of the photos that could be read.
