@@ -6,7 +6,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 README, CONTRIBUTING = ROOT / "README.md", ROOT / "CONTRIBUTING.md"
-SITE = tuple(sorted((ROOT / "docs").glob("*.md")))
+SITE = tuple(sorted((ROOT / "docs").rglob("*.md")))
 """The pages of docs/, from which `make docs` builds the site."""
 PAGES = (README, *SITE)
 RUN_TOGETHER = tuple(page for page in PAGES if page.stem != "extending")

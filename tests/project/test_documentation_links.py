@@ -25,7 +25,10 @@ def test_every_link_leads_to_a_file_and_to_a_heading_in_it(page):
 
 def test_pages_of_the_site_link_within_the_site():
     for page in SITE:
-        assert not [link for link in links(page) if link.startswith("..")], page.name
+        targets = [
+            (page.parent / link.partition("#")[0]).resolve() for link in links(page) if not link.startswith("http")
+        ]
+        assert all(target.is_relative_to(ROOT / "docs") for target in targets), page.name
 
 
 def test_every_page_and_picture_is_linked():
