@@ -101,7 +101,7 @@ def _require_known(document: Any, kind: Any, name: str, complete: bool) -> None:
         raise ValueError(f"{name or 'it'} must have {', '.join(known)}; {lacking[0]} is missing")
     for key, value in document.items():
         if key not in known:
-            raise ValueError(f"{name or 'it'} has no setting {key!r}; its settings are {', '.join(sorted(known))}")
+            raise ValueError(f"{name or 'it'} has no setting {key!r}; known settings: {', '.join(sorted(known))}")
         _require_known(value, known[key], f"{name}.{key}" if name else key, complete)
 
 

@@ -204,7 +204,7 @@ class TrainingConfig:
         rest = {name: value for name, value in table.items() if not name.endswith(WEIGHT_SUFFIX)}
         known = {*cls().to_dict(), *LOADER_SETTINGS}
         if unknown := [name for name in rest if name not in known]:
-            raise ConfigError(f"training has no setting {unknown[0]!r}; use one of {', '.join(sorted(known))}")
+            raise ConfigError(f"training has no setting {unknown[0]!r}; known settings: {', '.join(sorted(known))}")
         return cls(**rest, weights=weights)
 
     def with_iterations(self, iterations: int) -> "TrainingConfig":

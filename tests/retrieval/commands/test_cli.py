@@ -46,7 +46,7 @@ def test_the_two_commands_of_the_readme_work(workplace, capsys):
     assert output.out == ""
     assert "trained on: simulated rig" in output.err
     assert output.err.splitlines()[-1].startswith(
-        "not a gel image: what was given for grasp 1 does not look like a gel"
+        "not a gel image: an image of grasp 1 does not look like the gels of the model"
     )
 
 

@@ -349,7 +349,7 @@ def test_the_state_of_a_training_is_not_a_checkpoint(saved, name):
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ({"config": {"matcher": {"colour": 1}}}, "matcher has no setting 'colour'; it knows"),
+        ({"config": {"matcher": {"colour": 1}}}, "matcher has no setting 'colour'; known settings:"),
         ({"config": {"matcher": {"tower": "vgg"}}}, "tower must be one of"),
         ({"config": [1]}, "it must be a table"),
         ({"split": {"train": ["a"]}}, "split must hold seed, train, validation, test; validation is missing"),
