@@ -134,7 +134,7 @@ def test_a_file_without_read_permission_is_named(tmp_path, monkeypatch):
 
 
 def test_an_unknown_table_is_refused_with_the_known_ones():
-    with pytest.raises(ConfigError, match="it has no setting 'model'; known settings: matcher, preprocessing, training"):
+    with pytest.raises(ConfigError, match="it has no setting 'model'; known settings: matcher, preproc"):
         Config.from_dict({"model": {}})
 
 
