@@ -42,9 +42,15 @@ def test_tables_become_dataclasses_lists_become_tuples_and_integers_become_float
         ({"gel": {"pitch_mm": True}}, "[sensor].gel.pitch_mm must be a number, got True"),
         ({"gel": {}}, "[sensor].gel: object missing required field `pitch_mm`"),
         ({"gel": [2]}, "[sensor].gel must be a table, got [2]"),
-        ({"gel": {"pitch_mm": 2, "lamp": 1}}, "[sensor].gel has no setting 'lamp'; known settings: markers"),
-        ({"spares": [{"pitch_mm": 2, "lamp": 1}]}, "[sensor].spares has no setting 'lamp'; known settings: markers"),
-        ({"by_name": {"a": {"pitch_mm": 2, "lamp": 1}}}, "[sensor].by_name has no setting 'lamp'"),
+        ({"gel": {"pitch_mm": 2, "lamp": 1}}, "[sensor].gel has no setting 'lamp'; known settings: markers, pitch_mm"),
+        (
+            {"spares": [{"pitch_mm": 2, "lamp": 1}]},
+            "[sensor].spares has no setting 'lamp'; known settings: markers, pitch_mm",
+        ),
+        (
+            {"by_name": {"a": {"pitch_mm": 2, "lamp": 1}}},
+            "[sensor].by_name has no setting 'lamp'; known settings: markers",
+        ),
         ({"sides": [1]}, "[sensor].sides must be a list of length 2, got [1]"),
         ({"sides": [1, "x"]}, "[sensor].sides[1] must be a number, got 'x'"),
         ({"name": 3}, "[sensor].name must be a text in quotes or nothing, got 3"),
