@@ -194,9 +194,10 @@ def numbers(entry: Entry) -> Table:
         f"{queries} {'in total' if over_choices else 'per seed'}. Gallery: {basis['gallery']}.",
     ]
     if counted:
+        measure = next(row["correct_counts"]["measure"] for row in entry["rows"].values() if row["correct_counts"])
         notes.append(
             "Right: number of right top-1 answers, mean over the seeds, with an exact binomial interval, for "
-            f"{labels[next(row['correct_counts']['measure'] for row in entry['rows'].values() if row['correct_counts'])]}."
+            f"{labels[measure]}."
         )
     if any(FEW_OBJECTS_MARK in cell for row in rows for cell in row):
         notes.append(FEW_OBJECTS_NOTE)
