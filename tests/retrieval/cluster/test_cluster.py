@@ -460,4 +460,4 @@ def test_without_a_cluster_the_service_says_what_to_do(index, capsys):
     from retrieval.commands.main import main
 
     assert main(["serve", "--index", str(index), "--cluster", "--no-history"]) == 2
-    assert "is one index folder; make a cluster by `retrieve build-index --shards`" in capsys.readouterr().err
+    assert "has no shards; build a sharded index with `retrieve build-index --shards`" in capsys.readouterr().err

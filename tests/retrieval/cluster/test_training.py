@@ -76,7 +76,7 @@ def test_an_unfinished_training_is_not_overwritten_and_workers_are_one_or_more(r
     with pytest.raises(BadInput, match="workers must be 1 or more; got 0"):
         train_on_ray(recording, out, TINY, workers=0)
     state_path(out).touch()
-    with pytest.raises(CheckpointError, match="go on with --resume"):
+    with pytest.raises(CheckpointError, match="continue it with --resume"):
         train_on_ray(recording, out, TINY)
 
 

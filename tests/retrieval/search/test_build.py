@@ -232,7 +232,7 @@ def test_long_lists_are_truncated_in_text_and_complete_in_json(catalogue_copy, c
     (catalogue_copy / "metadata.jsonl").write_text('{"object_id": "nobody", "price": 3}\n')
     report = build_index(catalogue_copy, checkpoint, index, quiet=True)
     lines = list(report.lines())
-    assert "  metadata.jsonl speaks of nobody, which is not in the catalogue" in lines
+    assert "  metadata.jsonl names nobody, which is not in the catalogue" in lines
     assert "  and 10 more (--json lists them all)" in lines
     assert len(lines) < 42
     assert len(report.to_dict()["skipped"]) == len(report.to_dict()["ignored"]) == 30

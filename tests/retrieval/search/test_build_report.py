@@ -52,7 +52,7 @@ def test_the_layout_of_a_data_set_gives_a_warning_and_a_pattern_corrects_it(tmp_
     )
     report = build_index(own, checkpoint, index, quiet=True)
     assert set(objects(index).values()) == {"train", "test"}
-    assert any(line.startswith("warning: test, train are taken for the name of an object") for line in report.lines())
+    assert any(line.startswith("warning: test, train are used as the name of an object") for line in report.lines())
     report = build_index(own, checkpoint, index, objects_from="{split}/{object}/{photo}", quiet=True)
     assert set(objects(index).values()) == {"mug", "cup"}
     assert (report.written, report.embedded, report.warnings) == (True, 0, [])
@@ -119,5 +119,5 @@ def test_objects_without_a_readable_photo_are_listed_and_give_exit_code_1(tmp_pa
     printed = capsys.readouterr()
     assert json.loads(printed.out)["without_photo"] == ["ball", "cup"]
     assert "2 of 3 objects are not in the index, because none of their images can be read: ball, cup" in printed.err
-    assert "the index is written, but 2 object(s) have no photo that can be read" in printed.err
+    assert "the index is written, but 2 object(s) have no readable photo" in printed.err
     assert objects(index) == {"mug/0.jpg": "mug"}

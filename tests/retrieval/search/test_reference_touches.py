@@ -158,7 +158,7 @@ def test_pages_and_tables_show_the_nearest_touch(catalogue_with_touches, calibra
     result = query_new_index(catalogue_with_touches, calibrated_model, tmp_path / "index", touches[NAMES[0]][2])
     page = query_html(result, catalogue_with_touches)
     assert page.count('alt="reference touch"') == 8  # two fingers of each of four objects
-    assert "no photo: by touches alone" in page
+    assert "no photo: scored by its touches only" in page
     assert "fitted on 40 touches of 20 objects" in page
     print_table(result)
     table = capsys.readouterr().out

@@ -119,7 +119,7 @@ def test_ctrl_c_keeps_the_finished_embeddings_and_reports_it(
     monkeypatch.setattr(embed.UnfinishedBuild, "add", interrupted)
     command = ["build-index", str(catalogue_copy), "--model", str(model), "--out", str(index)]
     assert main(command) == 1
-    assert f"what was embedded is kept in {index}; the same command goes on with it" in capsys.readouterr().err
+    assert f"embedded photos are stored in {index}; run the same command to continue" in capsys.readouterr().err
     done = sum(embedded)
     monkeypatch.setattr(embed.UnfinishedBuild, "add", keep)
     assert main(command) == 0

@@ -461,7 +461,7 @@ def test_a_model_that_uses_a_background_needs_one_for_each_finger(subtracting, s
     for count in (1, 3):
         with pytest.raises(BadInput, match=rf"2 gel image\(s\) for one background; got {count}"):
             subtracting.query([touch], background=(*touch, *touch)[:count])
-    with pytest.raises(BadInput, match="would not look at --background"):
+    with pytest.raises(BadInput, match="would ignore --background"):
         searcher.query([touch], background=touch)
 
 
@@ -598,5 +598,5 @@ def test_a_damaged_model_is_distinguished_from_another_one(moved):
     data = bytearray(there.read_bytes())
     data[-3] ^= 1
     there.write_bytes(data)
-    with pytest.raises(CheckpointError, match="is damaged: its checksum does not fit"):
+    with pytest.raises(CheckpointError, match="is damaged: its checksum does not match"):
         Searcher.open(index, model=there)

@@ -185,7 +185,7 @@ def test_no_photo_or_a_bad_one_raises(catalogue, model):
         retrieval.embed_photos("catalog/mug/1.jpg", model=model)
     with pytest.raises(ImageError, match=r"photo 1: an image must be a path, .*, got int"):
         retrieval.embed_photos([5], model=model)
-    with pytest.raises(ImageError, match=r"photo 2: an array must hold uint8"):
+    with pytest.raises(ImageError, match=r"photo 2: an array must contain uint8"):
         retrieval.embed_photos([sorted(catalogue.rglob("*.jpg"))[0], np.zeros((4, 4, 3))], model=model)
 
 

@@ -76,7 +76,7 @@ def test_bad_queries_raise_the_errors_of_the_searcher(client, touch, tmp_path):
         client.query(touch, top=0)
     with pytest.raises(BadInput, match="tip: Extra inputs are not permitted"):
         client.query(touch, tip=3)
-    with pytest.raises(ImageError, match="an array must hold uint8"):
+    with pytest.raises(ImageError, match="an array must contain uint8"):
         client.query([np.zeros((4, 4, 3))] * 2)
 
 

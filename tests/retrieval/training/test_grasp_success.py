@@ -312,7 +312,7 @@ def test_a_matcher_is_not_a_gate_and_a_gate_is_not_a_matcher(model, trained):
     ):
         load_gate(model)
     with pytest.raises(
-        CheckpointError, match="is a grasp-success classifier, not a matcher; `retrieve collect --gate`"
+        CheckpointError, match="is a grasp-success classifier, not a matcher; use it with `retrieve collect --gate`"
     ):
         load_checkpoint(trained[0])
 

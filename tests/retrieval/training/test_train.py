@@ -70,7 +70,7 @@ def test_labelled_pairs_are_for_training_only(recording, tmp_path):
 
 
 def test_labelled_photos_without_touches_are_refused():
-    with pytest.raises(ConfigError, match="labelled photos are paired with labelled touches"):
+    with pytest.raises(ConfigError, match="labelled photos and labelled touches must be given together"):
         with_training(TINY, photos="photos")
 
 
