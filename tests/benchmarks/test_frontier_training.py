@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from packaging.version import Version
 from torch import nn
 
 from benchmarks.frontier import training
@@ -23,15 +22,14 @@ def sample(model, recording, tmp_path_factory):
 
 
 @needs_bfloat16
-@pytest.mark.skipif(
-    Version(torch.__version__) < Version("2.7"), reason="this PyTorch rounds a small model more with float32 layers"
-)
-def test_the_format_of_training_is_the_default_and_has_less_error_than_all_bfloat16(sample):
+def test_the_format_of_training_is_the_default_and_both_bfloat16_formats_have_a_small_error(sample):
+    """The order of the two errors depends on the processor for a model this small (measurements/speed.md: larger ones)."""
     (panel,) = training_formats(sample).panels
     exact, mixed, all_rounded = panel.points
     assert (exact.name, exact.error) == ("float32", 0)
     assert panel.default == mixed
-    assert 0 < mixed.error < all_rounded.error < 1
+    assert 0 < mixed.error < training.TOLERANCE
+    assert 0 < all_rounded.error < training.TOLERANCE
 
 
 def test_without_bfloat16_the_row_has_float32_alone_and_the_reason(sample, monkeypatch):
