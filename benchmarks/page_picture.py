@@ -44,7 +44,7 @@ def main():
     ):
         opened.set_viewport_size(SIZE)
         ask(opened, files)
-        opened.locator(".answer").get_by_text("would tell most").wait_for()
+        opened.locator(".answer").get_by_text("gives the most information").wait_for()
         opened.wait_for_load_state("networkidle")
         Image.open(io.BytesIO(opened.screenshot())).convert("RGB").save(OUT, quality=86, optimize=True)
 

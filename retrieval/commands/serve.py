@@ -198,7 +198,7 @@ def _feedback_writer(folder: Path, index: str | Path, stack: ExitStack) -> "Reco
     if folder.exists() and not folder.is_dir():
         raise BadInput(f"the history must be a folder, but {folder} is a file; name another one with --history")
     stored = read_checkpoint_info(model_of(manifest_of(index)))
-    info = {"source": "what people said of queries", "sensor": f"as {stored.provenance.get('source', 'unknown')}"}
+    info = {"source": "feedback on queries", "sensor": f"as {stored.provenance.get('source', 'unknown')}"}
     say(f"queries and feedback are stored in {folder}")
     return stack.enter_context(RecordingWriter(folder / "recording", info))
 

@@ -23,7 +23,7 @@ def sample(model, recording, tmp_path_factory):
 
 @needs_bfloat16
 def test_the_format_of_training_is_the_default_and_both_bfloat16_formats_have_a_small_error(sample):
-    """The order of the two errors depends on the processor for a model this small (measurements/speed.md: larger ones)."""
+    """The order of the two errors depends on the processor if the model is small."""
     (panel,) = training_formats(sample).panels
     exact, mixed, all_rounded = panel.points
     assert (exact.name, exact.error) == ("float32", 0)
