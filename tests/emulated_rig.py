@@ -146,7 +146,7 @@ class WatchedWSG50(WSG50):
 
     def __init__(self, state, **settings):
         super().__init__(**settings)
-        self.state = state
+        self.rig_state = state  # `state` is a method of Gripper
 
     def open(self, opening_mm):
         with self._watched():
@@ -165,7 +165,7 @@ class WatchedWSG50(WSG50):
         try:
             yield
         finally:
-            self.state.left_moving += self.state.emulator.moves
+            self.rig_state.left_moving += self.rig_state.emulator.moves
 
 
 @contextlib.contextmanager

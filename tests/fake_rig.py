@@ -116,35 +116,35 @@ class FakeGripper(Gripper):
     def __init__(self, state):
         low, high = FORCE_N
         super().__init__("fake gripper", stroke_mm=STROKE_MM, min_force_n=low, max_force_n=high, clock=state.clock)
-        self.state = state
+        self.rig_state = state  # `state` is a method of Gripper
 
     def _connect(self):
-        self.state.record_call("gripper.connect")
+        self.rig_state.record_call("gripper.connect")
 
     def _close(self):
-        self.state.record_call("gripper.close")
+        self.rig_state.record_call("gripper.close")
 
     def _stop(self):
-        self.state.record_call("gripper.stop")
+        self.rig_state.record_call("gripper.stop")
 
     def _settings(self):
         return {"stroke_mm": self.stroke_mm}
 
     def _state(self):
-        state = self.state
+        state = self.rig_state
         status = state.status()
         opening = state.opening if status == "idle" else state.chord()
         return GripperState(opening, state.force or 0.0, status)
 
     def _open(self, opening_mm):
-        self.state.record_call("open")
-        self.state.opening, self.state.force = opening_mm, None
+        self.rig_state.record_call("open")
+        self.rig_state.opening, self.rig_state.force = opening_mm, None
         return self._state()
 
     def _grasp(self, force_n, speed_mm_s):
-        self.state.record_call("grasp")
-        self.state.grip_at, self.state.force = self.state.pose, force_n
-        self.state.sleep(self.state.opening / speed_mm_s)
+        self.rig_state.record_call("grasp")
+        self.rig_state.grip_at, self.rig_state.force = self.rig_state.pose, force_n
+        self.rig_state.sleep(self.rig_state.opening / speed_mm_s)
         return self._state()
 
 

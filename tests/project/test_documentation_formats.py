@@ -102,7 +102,7 @@ def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
     documented = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}
     touch_to_touch = next(iter(results["protocols"]["physiclear"]["rows"].values()))
-    keys = {*row, *row["verdict"], *row["differences"]["pair_auc"], *touch_to_touch}
+    keys = {*row, *row["verdict"], *row["low_pass_differences"]["pair_auc"], *touch_to_touch}
     assert keys == set(re.findall(r"`(\w+)`", documented["rows"])) - {"rows"}
     assert set(control) == set(re.findall(r"`(\w+)`", documented["controls"])) - {"controls"}
 
@@ -115,6 +115,6 @@ def test_the_history_of_a_service(tmp_path):
             name: {row[1] for row in database.execute(f"PRAGMA table_info({name})")}
             for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         }
-    section = text_of(PAGE).partition("## What a service keeps")[2]
+    section = text_of(PAGE).partition("## History of a service")[2]
     rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", section, re.M)
     assert {name: set(re.findall(r"`(\w+)`", text)) for name, text in rows} == columns

@@ -500,7 +500,7 @@ def test_ctrl_c_during_an_attempt_leaves_open_jaws_a_closed_rig_and_a_complete_r
 
     def interrupted(self, force_n, speed_mm_s):
         state = real(self, force_n, speed_mm_s)
-        if self.state.calls.count("grasp") == 3:
+        if self.rig_state.calls.count("grasp") == 3:
             raise KeyboardInterrupt
         return state
 

@@ -174,7 +174,7 @@ def test_a_force_out_of_range_never_reaches_the_gripper(force):
     with FakeGripper(FakeRigState(0)) as gripper:
         with pytest.raises(DeviceError, match="fake gripper: force must be from 5 to 80 N, got"):
             gripper.grasp(force)
-        assert "grasp" not in gripper.state.calls
+        assert "grasp" not in gripper.rig_state.calls
 
 
 @pytest.mark.parametrize("opening", [-0.1, STROKE_MM + 0.1, math.nan])
@@ -182,7 +182,7 @@ def test_an_opening_beyond_the_stroke_never_reaches_the_gripper(opening):
     with FakeGripper(FakeRigState(0)) as gripper:
         with pytest.raises(DeviceError, match="opening must be from 0 to 110 mm"):
             gripper.open(opening)
-        assert "open" not in gripper.state.calls
+        assert "open" not in gripper.rig_state.calls
         assert gripper.open(STROKE_MM) == GripperState(STROKE_MM, 0.0, "idle")
 
 
