@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from typing import ClassVar
 
 import cv2
 import pytest
@@ -162,7 +163,7 @@ def test_the_page_of_commands_contains_their_help(monkeypatch, capsys):
 class FakeGel:
     """A camera with one picture (BGR) of the gel, whose driver buffers four black images while the program waits."""
 
-    opened: list["FakeGel"] = []
+    opened: ClassVar[list["FakeGel"]] = []
 
     def __init__(self, device):
         self.picture = cv2.imread({"/dev/gel-a": "a.png", "/dev/gel-b": "b.png"}[device])
