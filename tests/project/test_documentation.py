@@ -7,12 +7,14 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from typing import ClassVar
 
 import cv2
 import pytest
 import torch
 import typer
 
+import retrieval
 from benchmarks.reference import COMMANDS
 from benchmarks.reference import commands as commands_page
 from retrieval import load_config
@@ -159,31 +161,67 @@ def test_the_page_of_commands_contains_their_help(monkeypatch, capsys):
 
 
 class FakeGel:
-    """A camera that returns one picture (BGR)."""
+    """A camera with one picture (BGR) of the gel, whose driver buffers four black images while the program waits."""
+
+    opened: ClassVar[list["FakeGel"]] = []
 
     def __init__(self, device):
         self.picture = cv2.imread({"/dev/gel-a": "a.png", "/dev/gel-b": "b.png"}[device])
+        self.buffered, self.is_stale = 4, True
+        self.opened.append(self)
 
-    def read(self):
-        return True, self.picture
+    def grab(self):
+        self.is_stale, self.buffered = self.buffered > 0, max(self.buffered - 1, 0)
+        return True
+
+    def retrieve(self):
+        return True, self.picture * 0 if self.is_stale else self.picture
+
+
+def run_program_of_readme(keys, monkeypatch):
+    """Run the loop with these answers to its prompts."""
+
+    def wait_for_key(prompt):
+        for gel in FakeGel.opened:
+            gel.buffered = 4
+        return next(keys)
+
+    (program,) = blocks("python", README)
+    monkeypatch.setattr(FakeGel, "opened", [])
+    monkeypatch.setattr(cv2, "VideoCapture", FakeGel)
+    monkeypatch.setattr("builtins.input", wait_for_key)
+    exec(compile(program, "README.md", "exec"), {})
 
 
 def test_the_program_of_the_readme_gives_the_same_answers_as_the_command(home, model, monkeypatch, capsys):
-    """Two grasps, then the next object with one grasp."""
-    (program,) = blocks("python", README)
+    """Two grasps, then the next object with one grasp; the images of each are newer than the key press."""
     assert main(["build-index", "catalog", "--out", "demo/index", "--model", str(model)]) == 0
-    keys = iter(["", "", "n", "", "q"])
-    monkeypatch.setattr(cv2, "VideoCapture", FakeGel)
-    monkeypatch.setattr("builtins.input", lambda prompt: next(keys))
     capsys.readouterr()
-    exec(compile(program, "README.md", "exec"), {})
+    run_program_of_readme(iter(["", "", "n", "", "q"]), monkeypatch)
     output = capsys.readouterr().out.splitlines()
     grasp = ["--gelsight", "a.png", "b.png"]
     for grasps, line in zip((1, 2, 1), output, strict=True):
         main(["query", *grasp * grasps, "--index", "demo/index", "--json"])
         document = json.loads(capsys.readouterr().out)
-        best = document["results"][0]
-        assert line == f"{document['verdict']} {best['object_id']}, {best['probability']:.2f}"
+        best, (start, _, probability) = document["results"][0], line.rpartition(" ")
+        assert start == f"{document['verdict']} {best['object_id']}"
+        assert float(probability) == pytest.approx(best["probability"], abs=1e-4)
+
+
+def test_the_program_of_the_readme_runs_with_an_uncalibrated_model(home, model, monkeypatch, capsys):
+    assert main(["build-index", "catalog", "--out", "demo/index", "--model", str(model)]) == 0
+    capsys.readouterr()
+    real_open = retrieval.open
+
+    def open_uncalibrated(path):
+        searcher = real_open(path)
+        searcher.posterior = None
+        return searcher
+
+    monkeypatch.setattr(retrieval, "open", open_uncalibrated)
+    run_program_of_readme(iter(["", "q"]), monkeypatch)
+    verdict, _, probability = capsys.readouterr().out.split()
+    assert (verdict, probability) == ("uncalibrated", "None")
 
 
 def test_all_programs_are_in_pages_that_are_tested():

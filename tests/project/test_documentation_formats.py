@@ -102,7 +102,7 @@ def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
     documented = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}
     touch_to_touch = next(iter(results["protocols"]["physiclear"]["rows"].values()))
-    keys = {*row, *row["verdict"], *row["differences"]["pair_auc"], *touch_to_touch}
+    keys = {*row, *row["verdict"], *row["low_pass_differences"]["pair_auc"], *touch_to_touch}
     assert keys == set(re.findall(r"`(\w+)`", documented["rows"])) - {"rows"}
     assert set(control) == set(re.findall(r"`(\w+)`", documented["controls"])) - {"controls"}
 
