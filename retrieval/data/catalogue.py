@@ -54,7 +54,7 @@ class CataloguePhoto:
 class PhotoTable(Sequence[CataloguePhoto]):
     """Photos stored in columns; indexing makes a `CataloguePhoto`.
 
-    The garbage collector would traverse a hundred thousand separate objects again and again.
+    Columns are used because the garbage collector would otherwise traverse 100,000 Python objects again and again.
 
     Attributes:
         paths: N paths relative to the catalogue.
@@ -281,10 +281,12 @@ def _no_photo_error(where: str, found: _FileGroups, naming: Naming) -> DatasetEr
             f"no photo in {where} fits --objects-from {naming.text}; the first of {len(found.unfit)}: "
             f"{found.unfit[0]}. Use folder, stem, or a pattern for paths like this one"
         )
-    others = f"{len(found.ignored)} other files" + (f" such as {found.ignored[0]}" if found.ignored else "")
+    others = f", only {len(found.ignored)} other file(s) such as {found.ignored[0]}" if found.ignored else ""
+    if not found.ignored and not found.skipped:
+        others = ", and no other file"
     left_out = "".join(f"; {item.path}: {item.reason}" for item in found.skipped[:1])
     kinds = ", ".join(sorted(EXTENSIONS))
-    return DatasetError(f"no photo ({kinds}) in the catalogue {where}, only {others}{left_out}: {_LAYOUT}")
+    return DatasetError(f"no photo ({kinds}) in the catalogue {where}{others}{left_out}: {_LAYOUT}")
 
 
 def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | SkippedPhoto:

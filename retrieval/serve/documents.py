@@ -106,7 +106,7 @@ class BatchDocument(BaseModel):
 class CumulativeQueryDocument(BaseModel):
     """Answers to a cumulative query: after the first grasp, after the first two, and so on.
 
-    per_grasp: the answer to each grasp alone; empty unless the request has `per_grasp=true`.
+    per_grasp: the answer to each single grasp; empty unless the request has `per_grasp=true`.
     """
 
     answers: list[QueryDocument]

@@ -106,7 +106,7 @@ def train_relief(
         The accuracy on held-out objects.
 
     Raises:
-        DatasetError, ConfigError, CheckpointError: The data or settings cannot be trained with.
+        DatasetError, ConfigError, CheckpointError: Training is not possible with the data or settings.
         JobInterrupted: After Ctrl-C.
     """
     if config.preprocessing.background == "difference":
