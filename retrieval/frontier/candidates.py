@@ -28,7 +28,7 @@ def candidates(sample: Sample) -> ApproximationResult:
         )
     return ApproximationResult(
         "Candidates",
-        "The full classifier reranks only the k photos nearest in embedding. The reference reranks every photo. The "
+        "The fusion head reranks only the k photos nearest in embedding. The reference reranks every photo. The "
         "exhaustive top-1 is the photo that the reference ranks first.",
         (_missed_top1_panel(sample), _lost_top1_panel(sample)),
     )

@@ -193,7 +193,7 @@ class Sample:
 
     @cached_property
     def exhaustive_top1(self) -> NDArray[np.int64]:
-        """The photo of `catalogue` that the full classifier ranks first, for each of `queries`.
+        """The photo of `catalogue` that the fusion head ranks first, for each of `queries`.
 
         It is stored in `folder`, because it takes the longest.
         """

@@ -37,7 +37,8 @@ class GelCheck:
         contact_above: A grasp has contact if the largest log-odds of contact over its fingers is at least this.
         level_above: A grasp has contact if the largest difference of a finger's gel image from its no-contact frame
             (`contact_level`, in grey levels of 255) is at least this. Used instead of `contact_above` if available.
-        rates: Fractions of validation touches, no-contact gels and foreign pictures that were refused.
+        rates: Fractions of validation touches and foreign pictures that were refused, and of no-contact gels that were
+            accepted.
     """
 
     foreign_above: Bounded | None

@@ -133,7 +133,10 @@ class Options(RequestBody):
 
     top: int = Field(10, ge=1, le=1000, description="Number of objects to return.")
     candidates: int | None = Field(
-        None, ge=1, le=10_000_000, description="Photos that the full classifier scores; null: the index's own number."
+        None,
+        ge=1,
+        le=10_000_000,
+        description="Photos that the fusion head scores; null for the index's own number.",
     )
     none_prior: float = Field(
         NONE_PRIOR, gt=0, lt=1, description="Prior probability that the catalogue lacks the object."

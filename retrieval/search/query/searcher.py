@@ -90,9 +90,9 @@ class Searcher:
             index: Its folder; or the URL of a sharded index, whose shards are fetched once into the user's cache.
             model: Path of the checkpoint, if it was moved.
             verify: Compare the checksums of the index's files.
-            threads: Number of threads that encode a touch; None: the library's choice. With PyTorch it applies to the
-                whole process.
-            shards: Opens the shards of a sharded index; None: in this process.
+            threads: Number of threads that encode a touch. Default: the library's choice. With PyTorch it applies to
+                the whole process.
+            shards: Function that opens the shards of a sharded index. Default: open them in this process.
 
         Raises:
             IndexesError: The index is missing, damaged, or of another model.
@@ -158,8 +158,8 @@ class Searcher:
     ) -> QueryResult:
         """Rank the objects of the catalogue by one or more grasps of the object in the hand.
 
-        Only grasps with contact count. Match logits of several grasps add up; `retrieval.model.posterior` converts
-        the sums to probabilities of the objects and of "none of these".
+        Grasps without contact are ignored. If any image is not a gel image, nothing is ranked. Match logits of grasps
+        add up; `retrieval.model.posterior` converts the sums to probabilities of the objects and of "none of these".
 
         Args:
             touches: One grasp, a list with an image for each finger in their order; or a list of such grasps. For a
@@ -168,9 +168,9 @@ class Searcher:
                 with `image[..., ::-1]`. A file and its decoded array give the same answer.
             background: The fingers' no-contact frames, for a model that uses them.
             top: Number of objects to return.
-            candidates: Number of photos to rerank, at least `top`: the nearest to all grasps together; None: as
-                measured for the index. All photos are scored if there are no more, or if the model has no trained
-                embeddings.
+            candidates: Number of photos to rerank in each shard, at least `top`: those nearest to the sum of the
+                grasps' embeddings, and the rest of the best objects. Default: as measured by `build-index`. All are
+                scored if the catalogue has no more photos, or if the model has no trained embeddings.
             none_prior: Prior probability that the catalogue lacks the object.
 
         Raises:
@@ -333,7 +333,7 @@ class Searcher:
         )
 
     def _more_grasps(self, scored: "_ScoredQuery", none_prior: float) -> int | None:
-        """Return the number of further grasps until a match is expected; None if the ranking is not clear."""
+        """Return the number of further grasps until a match is expected; None if there is no clear first object."""
         mass, probabilities = scored.found.mass, scored.probabilities
         if self.posterior is None or probabilities is None or mass is None:
             return None

@@ -1,11 +1,11 @@
 """Shards: the photos of one index folder, or of several that together form one catalogue.
 
-A query sends the codes of touches and receives the best objects and the evidence mass of all objects. A result has
-this size for any number of photos: partial activations of photos, candidates and logits of other objects stay in the
-shard.
+A shard receives encoded touches. It returns its best objects, and the sums of the likelihoods of all its objects
+(`EvidenceMass`). The size of the result does not depend on the number of photos: partial activations of photos,
+candidates and logits of other objects stay in the shard.
 
 All photos of an object are in one shard, which therefore computes the object's logit. The best objects of all shards
-include the best of the catalogue, and their evidence masses add up to the total.
+include the best of the catalogue, and their likelihoods add up to those of the catalogue.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -118,8 +118,9 @@ class Shard(Protocol):
         Args:
             query: The grasps.
             top: Number of objects to return.
-            candidates: Number of photos that each index folder reranks, at least `top`; None: as measured there.
-            posterior: Converts logits to probabilities; None: the model is not calibrated.
+            candidates: Number of photos that each index folder reranks, raised to `top` if smaller. Default: the number
+                that was measured when that folder was built.
+            posterior: Converts logits to probabilities; None if the model is not calibrated.
 
         Raises:
             NumericalError: A logit is not finite.
@@ -133,7 +134,7 @@ class Shard(Protocol):
 
         Args:
             words: Lower-case words.
-            object_id: Return only photos of this object; None: of all objects.
+            object_id: Return only photos of this object. Default: photos of all objects.
             offset: Number of photos to skip.
             limit: Largest number of photos to return.
         """
@@ -197,7 +198,7 @@ class FolderShard:
         if self.references is None:
             return found
         images = map(self.references.image, ids)
-        # A gel image in place of a photo has rows of both kinds.
+        # A gel image that represents an object without photos has a photo's row too; merge both.
         return [row if image is None else {**image, **(row or {})} for row, image in zip(found, images, strict=True)]
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
@@ -223,11 +224,11 @@ class FolderShard:
         return found
 
     def limit(self, top: int, candidates: int | None) -> int:
-        """Return the number of photos to rerank: `candidates`, else as measured for the index, else 1000.
+        """Return the number of photos to rerank: `candidates`, else the measured number, else `DEFAULT_CANDIDATES`.
 
         Args:
-            top: Number of objects to return, the smallest limit.
-            candidates: The user's number; None: as measured.
+            top: Number of objects to return; a smaller result is raised to it.
+            candidates: The user's number; None for the number that was measured for the index.
         """
         measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
         return max(top, int(measured["k"]) if candidates is None else candidates)
@@ -309,7 +310,7 @@ def combined_embedding(embeddings: Floats) -> Floats:
 
 
 class Shards:
-    """Several shards of this process as one: searched one after another, with results merged as for remote shards.
+    """Several shards of this process as one shard: a search visits one after another and merges their results.
 
     Args:
         shards: The shards.

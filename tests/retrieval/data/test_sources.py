@@ -211,7 +211,9 @@ def test_a_url_without_a_file_system_is_refused():
 
 def test_a_url_without_a_photo_is_refused(memory):
     memory.pipe_file("/bucket/readme.txt", b"")
-    with pytest.raises(DatasetError, match=r"no photo \(.*\) in the catalogue memory://bucket, only 1 other file\(s\) "):
+    with pytest.raises(
+        DatasetError, match=r"no photo \(.*\) in the catalogue memory://bucket, only 1 other file\(s\) "
+    ):
         list_photos("memory://bucket")
 
 
