@@ -20,8 +20,8 @@ def check_unit(
 
     Args:
         vectors: Array (M, d) float32.
-        dim: Required d; None: any.
-        names: Names (M,) of the rows in messages; None: the row numbers.
+        dim: Required d; None for any.
+        names: Names (M,) of the rows in messages; None for the row numbers.
         what: Word before the name in messages.
 
     Raises:

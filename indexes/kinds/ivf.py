@@ -35,8 +35,8 @@ class IVFParameters(vector_index.Parameters):
     query 10 to 50 % faster.
 
     Attributes:
-        lists: Number of lists; None: sqrt(N). It is lowered to N / 39, the maximum that N points can train.
-        probes: Number of visited lists; None: an eighth of the lists, at least 8.
+        lists: Number of lists; None for sqrt(N). It is lowered to N / 39, the maximum that N points can train.
+        probes: Number of visited lists; None for an eighth of the lists, at least 8.
     """
 
     lists: int | None = None
@@ -51,7 +51,7 @@ class IVFPQParameters(IVFParameters):
     """Lists and product-quantization codes.
 
     Attributes:
-        code_bytes: Bytes of each code, a divisor of the vector size; None: the largest divisor up to an eighth of it
+        code_bytes: Bytes of each code, a divisor of the vector size; None for the largest divisor up to an eighth of it
             (or up to 8).
         refine: `refine` times k candidates are scored exactly.
     """

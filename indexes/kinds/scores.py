@@ -64,7 +64,7 @@ def scan(vectors: Floats, queries: Floats, k: int, live: Mask | None = None) -> 
         vectors: Unit vectors (M, d), read block by block.
         queries: Unit queries (Q, d).
         k: Number of results, at most the number of live slots.
-        live: Mask (M,) of the slots to search; None: all.
+        live: Mask (M,) of the slots to search; None for all.
 
     Returns:
         Scores (Q, k) float32 and slots (Q, k) int64, ordered by (-score, slot).

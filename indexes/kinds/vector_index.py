@@ -117,7 +117,7 @@ class VectorIndex(ABC):
             parameters: Settings. Default: the kind's defaults. `.parameters` of the result has every None filled in.
             names: Names (M,) of the rows in messages.
             seed: Seed of all random choices.
-            threads: Number of threads; None: the library's own setting.
+            threads: Number of threads; None for the library's own setting.
 
         Raises:
             VectorError: A vector is invalid, or there is none.
@@ -164,7 +164,7 @@ class VectorIndex(ABC):
             vectors: The same vectors (M, d), perhaps memory-mapped; they are not checked.
             parameters: The parameters of the saved index.
             seed: The seed of the saved index.
-            threads: Number of threads; None: the library's own setting.
+            threads: Number of threads; None for the library's own setting.
 
         Raises:
             CorruptIndex: The file is unreadable or does not fit the vectors.
@@ -214,7 +214,7 @@ class VectorIndex(ABC):
         Args:
             queries: Unit queries (Q, d) float32.
             k: Number of results, at least 1.
-            live: Mask (M,) of the slots to search; None: all.
+            live: Mask (M,) of the slots to search; None for all.
 
         Returns:
             Scores (Q, k') float32 and slots (Q, k') int64; k' = min(k, number of live slots).
@@ -235,7 +235,7 @@ class VectorIndex(ABC):
         Args:
             queries: Unit queries (Q, d) float32.
             k: Number of slots, at least 1.
-            live: Mask (M,) of the slots to search; None: all.
+            live: Mask (M,) of the slots to search; None for all.
         """
         table, count = self._check_query(queries, k, live)
         if count == 0:

@@ -73,10 +73,10 @@ class IndexStore:
         """Open and check a generation.
 
         Args:
-            name: Its name; None: the current generation.
+            name: Its name; None for the current generation.
             verify: Compare the SHA-256 of the files; sizes are always checked.
             expect: Required values of the fingerprint.
-            threads: Number of threads of a search; None: the library's own setting.
+            threads: Number of threads of a search; None for the library's own setting.
 
         Raises:
             NoIndex: There is no index.
@@ -161,13 +161,13 @@ class IndexStore:
             fingerprint: Origin of the vectors, compared by `open(expect=...)`.
             about: Further entries of the manifest.
             kind: Name of the kind of index.
-            parameters: Its parameters; None: the defaults.
+            parameters: Its parameters; None for the defaults.
             parent: Generation whose rows may be reused (`Block`).
             software: Version of the writing software.
             seed: Seed of all random choices.
-            threads: Number of threads; None: the library's own setting.
+            threads: Number of threads; None for the library's own setting.
             choose_kind: Chooses kind, parameters and further entries of `about` when all rows are on the disk.
-            queries: Unit vectors (Q, d) to measure recall with; None: drawn near the vectors of the index.
+            queries: Unit vectors (Q, d) to measure recall with; None to draw them near the vectors of the index.
             self_check: Number of new rows that must be found by their own vectors before the switch. Of the rows that
                 the parent had in the same structure, a sixteenth of this number is checked (`Generation.self_check`).
             keep: Number of earlier generations that stay on the disk for readers that are opening them.

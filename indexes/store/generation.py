@@ -260,7 +260,7 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
     Args:
         folder: The folder.
         verify: Compare the SHA-256 of the files.
-        threads: Number of threads of a search; None: the library's own setting.
+        threads: Number of threads of a search; None for the library's own setting.
     """
     manifest = read_manifest(folder)
     check_files(folder, manifest, verify=verify)

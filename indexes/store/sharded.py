@@ -158,7 +158,7 @@ def open_shard(
         entry: Manifest entry of the shard.
         fingerprint: Fingerprint of the sharded index.
         verify: Compare the SHA-256 of the files.
-        threads: Number of threads of a search; None: the library's own setting.
+        threads: Number of threads of a search; None for the library's own setting.
 
     Raises:
         IndexesError: The shard is missing, damaged, or not the generation in the manifest.

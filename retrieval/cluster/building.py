@@ -64,8 +64,8 @@ def ray_runner(cpus: int | None = None, workers: int | None = None) -> ShardRunn
     """Return a function that builds shards on a Ray cluster (`retrieval.cluster.session`).
 
     Args:
-        cpus: CPUs of a Ray that is started here; None: all.
-        workers: Largest number of concurrent processes; None: one for each GPU of the cluster, or for each CPU if it
+        cpus: CPUs of a Ray that is started here; None for all.
+        workers: Largest number of concurrent processes; by default one for each GPU of the cluster, or for each CPU if it
             has no GPU.
     """
 

@@ -55,7 +55,7 @@ class ReplicaSettings:
 
     Attributes:
         replicas: Smallest number of replicas of each shard.
-        max_replicas: Largest number when requests wait; None: `replicas`.
+        max_replicas: Largest number when requests wait; None for `replicas`.
         cpus: CPUs that Ray reserves for each replica.
         max_ongoing_requests: Largest number of concurrent requests of a replica.
         wait_s: Longest wait for an answer, in seconds.

@@ -110,8 +110,8 @@ def decode_rgb(data: bytes, name: str | Path, min_side: int | None = None) -> Rg
         data: Bytes of the file.
         name: Name of the picture in messages.
         min_side: A JPEG file is decoded at 1/8, 1/4 or 1/2 of its size by its cosine transform, as long as the shorter
-            side keeps this many pixels; each pixel is then nearly the mean of its area. None: only a picture that is
-            too large is decoded smaller.
+            side keeps this many pixels; each pixel is then nearly the mean of its area. None to decode only pictures
+            smaller that are too large.
 
     Raises:
         ImageError: The bytes are not a picture that can be decoded.

@@ -200,7 +200,7 @@ def tile_views(image: Samples, names: Sequence[str], px: int, box: PixelBox | No
         image: The photo.
         names: Names of the views.
         px: Side of each view in pixels.
-        box: The object's box; None searches it.
+        box: The object's box; None to search for it.
     """
     if box is None:
         box = PixelBox(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)

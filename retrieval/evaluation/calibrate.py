@@ -202,7 +202,7 @@ def draw_k_way_tests(
         table: The scores.
         choice: The kind of test.
         seed: Seed of the draw.
-        posterior: Combines the scores of a candidate's photos into one logit; None takes their mean.
+        posterior: Combines the scores of a candidate's photos into one logit; None for their mean.
 
     Returns:
         Scores (Q, k) of the candidates, the true one first. With fewer than k objects all of them are candidates.

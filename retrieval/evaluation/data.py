@@ -60,7 +60,7 @@ def prepare(
         config: Configuration. With a model, the model's own configuration replaces it, except for the number of
             iterations and the paths of labelled pairs.
         model: A checkpoint.
-        split: The split; None takes the model's own, or draws one.
+        split: The split; None for the split of the model, or without a model for a random one.
         quiet: No progress on stderr.
 
     Raises:

@@ -86,7 +86,7 @@ def score_low_contact(
     """Return "low_contact" of results.json: measures of low-contact and other touches, by method.
 
     Args:
-        low_contact: The low-contact test touches; None gives None.
+        low_contact: The low-contact test touches; None if there are none, and then the result is None.
         queries: The queries of the evaluation.
         predictions: Predictions of each training seed, by method.
         draws: Resamples of an interval.

@@ -41,7 +41,7 @@ def measure_frontier(
 
     Args:
         out: Folder of the results.
-        model: A checkpoint; None takes the shipped one.
+        model: A checkpoint; None for the shipped one.
         recording: Grasps of unseen objects; a function that returns the folder is called only if a row needs it.
         only: Names of rows; empty takes all.
         photos: Number of photos of the catalogue that is blended from the recording.

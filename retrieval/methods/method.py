@@ -25,7 +25,7 @@ class MethodSettings:
     Attributes:
         config: Towers, head and training.
         seed: Seed of the fit.
-        folder: Where the method may store files, such as a checkpoint; None: it stores nothing.
+        folder: Folder in which the method may store files, such as a checkpoint; None to store nothing.
         quiet: Show no progress on stderr.
         fit_on_validation: A method that can (`cca_towers`, `cca`, `cca_pca`) also fits on validation objects once its
             settings are chosen. A calibration on their scores is then overconfident.

@@ -136,7 +136,7 @@ def object_scores(
         draws: Repetitions.
         seed: Seed of the draws.
         pool: Combines the scores of the photos, such as a posterior's logit of the object
-            (`Posterior.object_logits`); None takes their mean.
+            (`Posterior.object_logits`); None for their mean.
 
     Returns:
         Scores with the objects in the order of `table.objects`.

@@ -211,7 +211,7 @@ class Posterior:
 
             slope * n / (1 + dependence * (n - 1)) * l / g + offset  >  log objects + log (p / (1 - p))
 
-        From n = 1 on, the term with l grows at most by the factor 1 / dependence (trials: docs/measurements/answers.md).
+        The term with l grows at most by the factor 1 / dependence from n = 1 (trials: docs/measurements/answers.md).
 
         Args:
             logit: Logit l of the best object, which is not more likely than none yet.

@@ -57,7 +57,7 @@ def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str
     """Return the checkpoint to use, and the reason.
 
     Args:
-        choice: A path or one of `SHIPPED_NAMES`; None: the checkpoint of `index`, else the last one trained in this
+        choice: A path or one of `SHIPPED_NAMES`; None for the checkpoint of `index`, else the last one trained in this
             folder, else the shipped one.
         index: Index folder, or URL of a sharded index.
 
@@ -128,7 +128,7 @@ def find_index(choice: str | None) -> tuple[str | Path, str]:
     """Return the index to use, a folder or a URL, and the reason.
 
     Args:
-        choice: A folder or URL; None: ./index, else the last index built from this folder.
+        choice: A folder or URL; None for ./index, else the last index built from this folder.
 
     Raises:
         BadInput: There is no index.

@@ -200,7 +200,7 @@ class RequestPictures:
 
     Attributes:
         files: One file for each finger of each grasp of each object.
-        background: One no-contact frame for each finger; None: none.
+        background: One no-contact frame for each finger; None without them.
         is_batch: Whether messages name the object.
         images: The decoded `files`.
         frames: The decoded `background`.
@@ -255,7 +255,7 @@ def pictures_of(
 
     Args:
         objects: One file for each finger of each grasp of each object.
-        background: One no-contact frame for each finger; None: none.
+        background: One no-contact frame for each finger; None without them.
         is_batch: Whether messages name the object.
 
     Returns:

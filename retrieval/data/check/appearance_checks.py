@@ -30,9 +30,9 @@ COMPARED_COPIES = "compared-copies"
 """Kind of the finding that reports how many pictures were compared for near copies."""
 _MIN_GRASPS = 4
 _MAX_BY_LIGHT, _MAX_BY_TOUCH = 0.35, 0.6
-"""Accepted accuracy of identifying the object from light alone, as a fraction of the way from chance to 1: from
-no-contact frames, and from the mean colour of touches. The mean colour depends a little on the touched object (0.2 to
-0.35 of the way on simulated recordings)."""
+"""Thresholds of (accuracy - chance) / (1 - chance) of a classifier that sees only the illumination: the first one on
+no-contact frames, the second one on the mean colour of touches. The mean colour depends a little on the touched object
+(0.2 to 0.35 on simulated recordings)."""
 
 
 def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
@@ -53,7 +53,8 @@ def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> 
         yield Finding(
             "error",
             "swapped",
-            "touches and photos look swapped throughout (the photos are the more alike); exchange the columns",
+            "touches and photos look swapped throughout (the photos resemble each other more than the touches do, "
+            "usually it is the reverse); exchange the columns",
             tuple(grasp.grasp_id for grasp in grasps),
         )
         return
@@ -87,7 +88,10 @@ def check_fingers(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
 
 
 def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Find touches and no-contact frames that look exchanged."""
+    """Find touches and no-contact frames that look exchanged.
+
+    The moment of a frame is "before" (before contact: a no-contact frame) or "touch" (during contact).
+    """
     both = [grasp for grasp in grasps if grasp.backgrounds and len(grasp.backgrounds) == len(grasp.touches)]
     if len(both) < _MIN_GRASPS:
         return
@@ -99,8 +103,9 @@ def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
             yield Finding(
                 "error",
                 "swapped-moments",
-                f"touches of finger {ascii_lowercase[finger]} look swapped throughout with the no-contact frames "
-                "(the latter are the less alike); exchange the columns",
+                f"touches of finger {ascii_lowercase[finger]} look swapped throughout with the no-contact frames (the "
+                "no-contact frames differ from each other more than the touches do, usually it is the reverse); "
+                "exchange the columns",
                 tuple(grasp.grasp_id for grasp in both),
             )
             return
@@ -116,7 +121,7 @@ def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
 
 
 def check_light(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Find lamps or gels that changed from object to object, so that light identifies the object."""
+    """Find lamps or gels that changed from object to object, so that the illumination identifies the object."""
     objects = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)[1] if grasps else np.zeros(0, int)
     repeated = Counter(objects.tolist())
     if len(repeated) < 2 or max(repeated.values()) < 2:

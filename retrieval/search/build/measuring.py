@@ -218,7 +218,7 @@ def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch
 
     Args:
         checkpoint: The model.
-        count: Number of touches; None: all.
+        count: Number of touches; None for all.
 
     Returns:
         Partial activations (Q, partial_width) and unit embeddings (Q, d), float32.

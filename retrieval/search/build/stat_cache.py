@@ -76,7 +76,7 @@ def unchanged_runs(photos: PhotoTable, known: Slots, parent: Generation | None) 
     Args:
         photos: The photos, N of them.
         known: The parent's row of each photo whose file need not be read (N,), else -1.
-        parent: The current generation; None: no runs.
+        parent: The current generation; without one (None) there are no runs.
     """
     if parent is None:
         return

@@ -99,8 +99,8 @@ class QueryResult:
         posterior: Formula of the probabilities and its numbers (`retrieval.model.posterior`).
         results: The ranking.
         more_grasps: If the verdict is "none of these" and the ranking is clear (`is_clear`): number of further grasps
-            like these after which "match" is expected (`Posterior.more_grasps`). None if too many are needed, and
-            otherwise.
+            like these after which "match" is expected (`Posterior.more_grasps`). None otherwise, and if too many are
+            needed.
         embeddings: Embeddings (G, embedding_dim) of the grasps, if they were encoded in this process; absent from JSON.
 
     >>> with retrieval.open("index") as searcher:

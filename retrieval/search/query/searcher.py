@@ -333,7 +333,7 @@ class Searcher:
         )
 
     def _more_grasps(self, scored: "_ScoredQuery", none_prior: float) -> int | None:
-        """Return the number of further grasps until a match is expected; None if there is no clear first object."""
+        """Return the number of further grasps until a match is expected; None if unclear or too many."""
         mass, probabilities = scored.found.mass, scored.probabilities
         if self.posterior is None or probabilities is None or mass is None:
             return None

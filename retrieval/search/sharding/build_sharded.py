@@ -134,7 +134,7 @@ def build_sharded(
         max_unreadable: Largest fraction of photos that may be unreadable.
         verify: As for `build_index`.
         quiet: Show no progress.
-        run: Builds the shards; None: this process, one after another.
+        run: Builds the shards; None to build them in this process, one after another.
 
     Returns:
         One report of all shards together.
@@ -212,7 +212,7 @@ def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBui
 
     Args:
         job: The shard.
-        checkpoint: The model; None: loaded from `job.model`.
+        checkpoint: The model; None to load it from `job.model`.
 
     Raises:
         IndexesError: The shard could not be written.
