@@ -2,7 +2,7 @@
 
 The key of a record is the digest of the content, with a digest of the fingerprint and the array layout, so codes of
 another model are never reused. Records are committed immediately, with a checksum: after a kill or a full disk, a
-record is complete or counts as missing. The file belongs to no generation, and queries do not read it. It may be
+record is complete or treated as missing. The file belongs to no generation, and queries do not read it. It may be
 deleted at any time; a build deletes it after writing a generation.
 """
 

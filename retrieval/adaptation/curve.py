@@ -75,7 +75,7 @@ def learning_curve(
     """Fit to fewer touches of fewer objects and measure the accuracy on held-out objects.
 
     For comparison the curve includes the unadapted model and, with all objects and touches, the low-pass control and
-    fits to each of the combined towers alone.
+    fits to each single one of the combined towers.
 
     Args:
         data: The own grasps and their features.

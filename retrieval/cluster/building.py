@@ -65,8 +65,8 @@ def ray_runner(cpus: int | None = None, workers: int | None = None) -> ShardRunn
 
     Args:
         cpus: CPUs of a Ray that is started here; None for all.
-        workers: Largest number of concurrent processes; by default one for each GPU of the cluster, or for each CPU if it
-            has no GPU.
+        workers: Largest number of concurrent processes. Default: one for each GPU of the cluster, or for each CPU if
+            it has no GPU.
     """
 
     def run(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterator[ShardBuild]:

@@ -125,7 +125,7 @@ def _accuracy_summary(index: Path, queries: "dict[str, list[Grasp]]") -> str:
         touches = [[grasp.touches for grasp in grasps] for grasps in queries.values()]
         answers = searcher.query_many(touches, top=gallery)
     ranked = [[match.object_id for match in answer.results] for answer in answers]
-    # Without contact an answer has no results: such a query counts as ranked after all objects.
+    # Without contact an answer has no results: such a query gets the rank after all objects.
     ranks = [names.index(name) if name in names else gallery for name, names in zip(queries, ranked, strict=True)]
     matched = [rank for rank, answer in zip(ranks, answers, strict=True) if answer.verdict == MATCH]
     count, first, five = len(ranks), ranks.count(0), sum(rank < 5 for rank in ranks)

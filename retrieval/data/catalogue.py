@@ -160,7 +160,7 @@ def list_catalogue(
 
     Args:
         folder: The catalogue folder.
-        naming: Rule that names the object of each photo; by folder where None.
+        naming: Rule that names the object of each photo; None for the rule "folder".
         folder_cache: Names that earlier builds listed in unchanged folders; this call updates it.
 
     Raises:
@@ -306,7 +306,7 @@ def decode_photo(file: PhotoBytes, decode: Callable[[bytes, str], RgbImage] = de
         decode: Function of (bytes, name in messages).
 
     Returns:
-        The result of `decode`, by default (H, W, 3) float32 in 0..1; a SkippedPhoto where it raises ImageError.
+        The result of `decode`, by default (H, W, 3) float32 in 0..1; a SkippedPhoto if it raises ImageError.
     """
     try:
         return decode(file.data, file.photo.path)

@@ -1,8 +1,8 @@
 """Decode picture files to float32 RGB in 0..1.
 
 Pillow reads and checks every file. Pillow keeps only the high byte of 16-bit colour, so OpenCV decodes such samples a
-second time, after Pillow has loaded the whole file. (OpenCV alone would fill the missing part of a truncated JPEG with
-grey, without an error.) Colour profiles and gamma chunks are not applied.
+second time, after Pillow has loaded the whole file. (OpenCV fills the missing part of a truncated JPEG with grey,
+without an error.) Colour profiles and gamma chunks are not applied.
 """
 
 import io
@@ -195,8 +195,8 @@ def _reason(error: BaseException) -> str:
 def _register_decoder(data: bytes, name: str | Path) -> str | None:
     """Register the decoder of HEIF or AVIF bytes with Pillow and return its name; None for any other picture.
 
-    Both kinds of file begin with a box of type "ftyp" that lists their brands. Raises ImageError where the decoder is
-    not installed.
+    Both kinds of file begin with a box of type "ftyp" that lists their brands. Raises ImageError if the decoder is not
+    installed.
     """
     if data[4:8] != b"ftyp":
         return None

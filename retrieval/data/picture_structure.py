@@ -1,6 +1,6 @@
 """Bounds on the structure of a picture file, checked before decoding.
 
-The size of a file alone does not bound the work. A JPEG file of 1.5 MB can contain 40,000 scans, and each scan
+The size of a file does not bound the work. A JPEG file of 1.5 MB can contain 40,000 scans, and each scan
 processes all pixels. A PNG file of 19 MB can contain 1.6 million empty chunks, and Pillow parses each one in Python.
 Every check here takes time in proportion to the file, most of it in C.
 """

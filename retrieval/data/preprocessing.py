@@ -28,7 +28,7 @@ _SUBTRACT: dict[str, Callable[[RgbImage, RgbImage], RgbImage]] = {
     "abs": lambda touch, reference: np.abs(touch - reference),
 }
 BACKGROUNDS = ("none", *_SUBTRACT)
-"""Policies for a touch T and its no-contact frame R: T alone; T - R in -1..1; T - R + 0.5, clipped; |T - R|."""
+"""Policies for a touch T and its no-contact frame R: T; T - R in -1..1; T - R + 0.5, clipped; |T - R|."""
 
 
 def subtract_background(touch: RgbImage, reference: RgbImage | None, policy: str) -> RgbImage:

@@ -3,7 +3,7 @@
 Ranking does not need calibration. A pair of a touch and a photo has calibrated log-odds, `slope * score + intercept`.
 The posterior over objects and "none of these" is that of queries (`retrieval.model.posterior`). Both are fitted
 separately for each number of grasps, because each method combines the scores of several grasps in its own way: a set
-counts as one grasp with the score of the set.
+is treated as one grasp with the score of the set.
 """
 
 from collections.abc import Mapping, Sequence
@@ -141,7 +141,7 @@ def has_enough_objects(table: ScoreTable) -> bool:
 
 
 def posterior_questions(table: ScoreTable, seed: int = 0) -> IdentificationTrials:
-    """Return an identification trial for every row that has a target photo; a row counts as one grasp.
+    """Return an identification trial for every row that has a target photo; a row is one grasp.
 
     Args:
         table: The scores.

@@ -20,7 +20,7 @@ from retrieval.metrics.measure import Measure
 from retrieval.metrics.registry import MethodScoreTables, compute
 
 LOW_CONTACT_FRACTION = 0.05
-"""Fraction of the touches with the smallest gel change that counts as low-contact."""
+"""Fraction of the touches, those with the smallest gel change, that are called low-contact."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,1 +1,1 @@
-"""Measures of rankings and probabilities, with confidence intervals, in numpy alone."""
+"""Measures of rankings and probabilities, with confidence intervals, only with numpy."""

@@ -79,7 +79,7 @@ def k_way(table: ScoreTable, k: int, *, photos: int = 1, draws: int = 16, seed: 
     true = np.take_along_axis(scores, np.searchsorted(queries.objects, queries.touch_owner)[None, :, None], 2)
     higher, equal = (scores > true).sum(2).ravel(), (scores == true).sum(2).ravel() - 1
     curves = k_way_accuracies(higher, equal, len(queries.objects) - 1, k).reshape(draws, -1, k).mean(0)
-    shown = "a photo" if photos == 1 else f"{photos} photos (fewer where it has no more)"
+    shown = "a photo" if photos == 1 else f"{photos} photos (fewer if it has no more)"
     words = f"{k} of these objects, each with {shown}: {table.gallery}"
     return Measure(curves, queries.touch_owner, np.arange(1, k + 1) / k, words)
 

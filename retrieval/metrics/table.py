@@ -19,8 +19,8 @@ class ScoreTable:
         scores: (T, N) floating, higher is better.
         touch_owner: (T,) object of each row.
         photo_owner: (N,) object of each column.
-        own: (T, N) whether the photo was taken in a grasp of that row. Such photos are not shown to it, except where a
-            protocol includes them.
+        own: (T, N) whether the photo was taken in a grasp of that row. The row's gallery excludes these photos, unless
+            a protocol includes them.
         object_words: Noun for the objects in descriptions of the gallery.
         row_words: The same for the rows.
         column_words: The same for the columns.

@@ -237,7 +237,7 @@ def autocast(device: torch.device, precision: str) -> AbstractContextManager[Any
 
     Args:
         device: Where the towers compute.
-        precision: "float32", "bfloat16", or "auto": bfloat16 where the hardware multiplies it, else float32. A CPU
+        precision: "float32", "bfloat16", or "auto": bfloat16 if the hardware multiplies it, else float32. A CPU
             without such instructions emulates bfloat16, ten times slower than float32.
 
     Raises:

@@ -66,7 +66,7 @@ class Standardise(nn.BatchNorm1d):
         return mean, torch.rsqrt(self._floored_variance(mean, variance))
 
     def _floored_variance(self, mean: Tensor, variance: Tensor) -> Tensor:
-        """Return variances (F,), raised where a feature hardly varies."""
+        """Return variances (F,), raised for features that hardly vary."""
         return torch.maximum(variance + self.eps, (MIN_RELATIVE_DEVIATION * mean).square())
 
 

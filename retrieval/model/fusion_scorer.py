@@ -29,7 +29,7 @@ Bounded = Annotated[float, Meta(ge=-1e6, le=1e6)]
 
 @dataclass(frozen=True)
 class GelCheck:
-    """Thresholds of the gel check, chosen on validation objects; None where the recording had no examples.
+    """Thresholds of the gel check, chosen on validation objects; None if the recording had no examples.
 
     Attributes:
         foreign_above: An image is foreign (not a gel image), and its grasp is refused, if a finger's log-odds of "no

@@ -20,7 +20,7 @@ Objects that were not scored keep their part of the probability, estimated from 
     P(o | present) = exp(w * l(o)) / sum of exp(w * l(o')) over all objects o' of the catalogue
 
 P(o | present) is the probability of o given that the catalogue has the object. p and offset cancel out. It is computed
-from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 where P(none) rounds to 1.
+from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 if P(none) rounds to 1.
 
 A query passes through four files: `fusion_scorer.py` sums the match logits z of a photo over the grasps;
 `search/query/objects.py` computes l(o) of each object, which reference touches change (`reference_calibration.py`);

@@ -57,8 +57,8 @@ class ReferenceCalibration:
 
     Attributes:
         touch_only: Posterior of objects without photos.
-        weight: Weight of C for objects with photos; None where no object had both.
-        with_photos: Posterior of objects with photos; None where no object had both.
+        weight: Weight of C for objects with photos; None if no object had both.
+        with_photos: Posterior of objects with photos; None if no object had both.
         objects: Number of objects of the fit.
         touches: Number of their query touches.
     """
@@ -145,7 +145,7 @@ def fit_reference_calibration(*parts: ReferenceTouches, seed: int = 0) -> Refere
 
     References come from the first half of an object's touches, or from the first quarter if that suffices, at most
     `MAX_REFERENCES`. The queries are the second half, so with enough touches no query neighbours a reference. All
-    trials are repeated with one reference per object, because a fit to three alone is overconfident for one.
+    trials are repeated with one reference per object, because a fit to three references is overconfident for one.
 
     Args:
         parts: Touches of one matcher or several, as in `retrieval.model.posterior.fit_posterior`.

@@ -72,7 +72,7 @@ def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str
 
     here = _last_model()
     manifest: Manifest | ShardedManifest | None = None
-    with suppress(IndexesError):  # an unusable index counts as none
+    with suppress(IndexesError):  # an unusable index is ignored
         manifest = manifest_of(index)
     if manifest is not None:
         own = model_of(manifest)

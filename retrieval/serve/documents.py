@@ -146,7 +146,7 @@ class NearPhotosDocument(BaseModel):
 
 
 class AgreementDocument(BaseModel):
-    """Occlusion map of a photo: by how much the match logit falls if one square of the photo is hidden.
+    """Occlusion map of a photo: the decrease of the match logit if a square of the photo is hidden.
 
     falls: rows from the top, columns from the left; negative if hiding the square raises the logit.
     """

@@ -76,7 +76,7 @@ class Server(uvicorn.Server):
                 signal.signal(number, handler)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """End the streams, which never end by themselves, and the server."""
+        """End the streams, which otherwise never end, and the server."""
         self._parts.stopping.set()
         super().handle_exit(sig, frame)
 

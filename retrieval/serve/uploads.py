@@ -26,7 +26,7 @@ from retrieval.serve.settings import MAX_BODY_BYTES, MAX_PICTURES, MAX_SMALL_BOD
 PICTURE_PATHS = frozenset({"/v1/query", "/v1/query/batch", "/v1/query/cumulative", "/v1/agreement"})
 """Routes whose bodies contain pictures: up to `MAX_BODY_BYTES`. All others: up to `MAX_SMALL_BODY_BYTES`."""
 LARGE_BYTES = 1_000_000
-"""A body above this size counts as large."""
+"""Size in bytes above which a body is treated as large."""
 MAX_LARGE_BODIES = 2
 """Maximum number of concurrent large bodies."""
 MAX_SMALL_BODIES_BYTES = 20_000_000

@@ -320,7 +320,7 @@ class _FeatureCache(Generic[T]):
 
 
 def _read_cached(path: Path) -> Tensor | None:
-    """Return cached features, or None where there are none or the file is damaged."""
+    """Return cached features, or None if there are none or the file is damaged."""
     if not path.is_file():
         return None
     try:

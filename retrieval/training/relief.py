@@ -342,7 +342,7 @@ def _sample_grid(images: Tensor, maps: Tensor, visible: float) -> Tensor:
 
 
 def _correlation(predictions: NDArray[np.float32], targets: NDArray[np.float32]) -> float:
-    """Return Pearson's correlation, or 0 where one side does not vary."""
+    """Return Pearson's correlation, or 0 if one side does not vary."""
     if len(predictions) < 2 or predictions.std() == 0 or targets.std() == 0:
         return 0.0
     return float(np.corrcoef(predictions, targets)[0, 1])

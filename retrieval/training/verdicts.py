@@ -150,7 +150,7 @@ class GelCheckFeatures:
 
     Attributes:
         touch: (G, fingers, F) of touches.
-        no_contact: (U, fingers, F) of no-contact frames; U = 0 where none are recorded.
+        no_contact: (U, fingers, F) of no-contact frames; U = 0 if none are recorded.
         foreign: (N, F) of foreign pictures.
         is_plainly_foreign: (N,) False for gel images in false colours.
     """

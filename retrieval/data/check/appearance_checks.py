@@ -1,8 +1,8 @@
 """Checks of a recording by the appearance of its pictures; each yields findings on its grasps.
 
 Each check compares a minority with the majority of the recording. A note reports the cases that cannot be decided.
-Pictures alone do not distinguish two fingers with similar gels, the no-contact frame from the touch where nothing was
-touched, or two objects whose photos were all exchanged.
+Three cases cannot be decided from the pictures: two fingers with similar gels, a no-contact frame and a touch without
+contact, and two objects whose photos were all exchanged.
 """
 
 from collections import Counter
@@ -150,7 +150,7 @@ def check_light(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Find
             yield Finding(
                 "warning",
                 "light",
-                f"{what} alone identifies the object in {found.accuracy:.0%} of {found.grasps} grasps (chance "
+                f"{what} is enough to identify the object in {found.accuracy:.0%} of {found.grasps} grasps (chance "
                 f"{found.chance:.0%}): light or gel changed from object to object, and a model can learn that instead "
                 "of touch; mix the objects while recording, and compare with the controls of `retrieve evaluate`",
             )

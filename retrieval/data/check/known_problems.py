@@ -20,9 +20,9 @@ _MAX_QUERIES = 5000
 _BLOCK = 512
 _OWN_QUANTILE, _OTHER_QUANTILE = 0.75, 0.05
 """Quantiles of the distance to the nearest touch of the same object, and of another object. Neighbouring frames can be
-recognised where the first quantile is below the second."""
+recognised if the first quantile is below the second."""
 _MIN_FRACTION, _MIN_COUNT = 0.1, 3
-"""Held-out grasps with such a neighbour in training that cause a warning: fraction and number."""
+"""Smallest fraction and number of held-out grasps with such a neighbour in training that cause a warning."""
 
 _Rows = NDArray[np.float32]
 _Pixels = dict[str, _Rows]
@@ -89,7 +89,7 @@ def check_sequences_in_training(grasps: Sequence[Grasp], split: Split, records: 
 
     Where the split cuts recorded sequences, count the touches whose nearest training touch is of their own sequence.
     Elsewhere, count the touches that have a training touch as near as touches of one object are to each other. This
-    second count is meaningful only where touches of two objects are rarely that near.
+    second count is meaningful only if touches of two objects are rarely that near.
     """
     pixels = {grasp.grasp_id: _grey(records, grasp) for grasp in grasps}
     train = split.select(grasps, "train")

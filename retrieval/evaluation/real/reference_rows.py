@@ -26,7 +26,7 @@ ANY_WIDTH_METHODS = ("cca_towers", "cca_pca", "cca", "plsca", "chance", "constan
 
 
 def assign_references(grasps: Sequence[Grasp]) -> dict[str, Grasp]:
-    """Assign to each query a reference touch, its catalogue entry; the references of an object are used in turn.
+    """Assign to each query a reference touch, its catalogue entry; the references of an object are used cyclically.
 
     Args:
         grasps: All grasps, in the order of capture.

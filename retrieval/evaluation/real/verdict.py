@@ -22,7 +22,7 @@ RULE = (
 CONTROL_NAMES = {
     "low_pass_differences": "the low-pass control",
     "order_differences": "the order of capture",
-    "no_contact_differences": "the no-contact frame alone",
+    "no_contact_differences": "the no-contact frame as input",
 }
 """Key of a row's paired differences -> name of the control."""
 CONFIDENCE_BINS = 10

@@ -46,7 +46,7 @@ def agreement(
     model: Checkpoint | None = None,
     squares: int = 8,
 ) -> Agreement:
-    """Hide each square of a photo in turn and measure the match logit (Zeiler and Fergus, ECCV 2014).
+    """Hide one square of a photo after another and measure the match logit (Zeiler and Fergus, ECCV 2014).
 
     A hidden square has the photo's mean colour. The photo tower encodes squares^2 + 1 images.
 

@@ -131,7 +131,7 @@ def test_light_that_changes_from_object_to_object_is_found_on_the_no_contact_fra
     lamps(broken, ("touch_a", "touch_b", "touch_a_before", "touch_b_before"))
     severity, kind, message = one(broken.findings())
     assert (severity, kind) == ("warning", "light")
-    assert "the no-contact frame alone identifies the object in" in message
+    assert "the no-contact frame is enough to identify the object in" in message
     assert "(chance 10%)" in message  # 4 other grasps of the object among 39
 
 
