@@ -73,7 +73,7 @@ class Attempt:
     """One closing of the gripper, successful or not.
 
     Attributes:
-        outcome: "held"; or the failure: "missed", "slipped", "no_plan", or "failed" for an unspecified one; "unknown" if
+        outcome: "held"; or the failure: "missed", "slipped", "no_plan", or "failed" for another one; "unknown" if
             nothing is recorded.
         accepted: Whether a matcher is trained on it.
         after: Frames after the lift, one file per finger in order, or empty.

@@ -79,7 +79,7 @@ def test_the_information_of_an_answer_is_shown_as_the_service_sends_it(opened, f
     sentence = section.get_by_text("gives the most information").inner_text()
     assert "grasp 2 gives the most information: 3.1 of the 4.0 bits" in sentence
     section.get_by_text("As numbers").click()
-    row = section.get_by_role("row", name="Information of this single grasp").get_by_role("cell")
+    row = section.get_by_role("row", name="Information of each single grasp").get_by_role("cell")
     assert row.all_inner_texts() == ["0.50 bits", "3.13 bits"]
 
 

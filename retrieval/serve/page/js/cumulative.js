@@ -138,7 +138,7 @@ function numbers(answers, lines, gainedBits) {
     ),
   );
   const bits = gainedBits.map((one) => h("td", {}, `${one.toFixed(2)} bits`));
-  rows.push(h("tr", {}, h("th", { scope: "row" }, "Information of this single grasp"), bits));
+  rows.push(h("tr", {}, h("th", { scope: "row" }, "Information of each single grasp"), bits));
   return h(
     "details",
     {},
