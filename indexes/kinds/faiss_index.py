@@ -168,6 +168,6 @@ class FaissIndex(VectorIndex):
         must = (self.structure_type, self.count, self.dim, faiss.METRIC_INNER_PRODUCT)
         if got != must:
             raise CorruptIndex(
-                f"{path}: must have (type, count, size, metric) {must}, got {got}; build the index again"
+                f"{path}: the structure must have (type, count, size, metric) {must}, got {got}; build the index again"
             )
         self._structure = structure

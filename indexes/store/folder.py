@@ -208,7 +208,7 @@ class IndexStore:
                 return self._publish(name, blocks, job, self_check, keep)
         except OSError as error:
             where = error.filename or self.path
-            raise WriteFailed(f"{where}: the disk refused ({error.strerror or error}); write again") from error
+            raise WriteFailed(f"{where}: writing failed ({error.strerror or error}); write again") from error
 
     def _require_index_folder(self) -> None:
         """Refuse a folder without generations that has a file called CURRENT: it belongs to something else."""

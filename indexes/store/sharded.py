@@ -139,7 +139,7 @@ def read_sharded_manifest(folder: Path) -> ShardedManifest:
         raise NoIndex(f"{folder}: there is no sharded index here; run `retrieve build-index --shards` first")
     manifest = read_document(path, FORMAT, ShardedManifest)
     if len({shard.folder for shard in manifest.shards}) < len(manifest.shards):
-        raise CorruptIndex(f"{path}: every shard must have its own folder, two shards have the same; {AGAIN}")
+        raise CorruptIndex(f"{path}: every shard must have its own folder, but two have the same; {AGAIN}")
     return manifest
 
 

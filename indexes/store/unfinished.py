@@ -98,7 +98,7 @@ class UnfinishedBuild:
             with self._lock, self._connection or self._open() as connection:
                 connection.executemany("INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?)", rows)
         except (OSError, sqlite3.Error) as error:
-            raise WriteFailed(f"{self.path}: the disk refused ({error}); build again") from error
+            raise WriteFailed(f"{self.path}: writing failed ({error}); build again") from error
 
     def clear(self) -> None:
         """Delete all records, after a generation contains them. Files that cannot be deleted stay."""

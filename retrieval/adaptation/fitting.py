@@ -1,4 +1,4 @@
-"""Write a fit into a checkpoint: projections from all own objects, calibration from held-out objects."""
+"""Write a fit into a checkpoint: projections from all recorded objects, calibration from held-out objects."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -24,7 +24,7 @@ from retrieval.training.verdicts import with_verdicts
 
 @one_thread()
 def fit_matcher(data: AdaptationData, estimate: Estimate | None, out: Path) -> Checkpoint:
-    """Fit codes to all own objects and return them as a checkpoint.
+    """Fit codes to all recorded objects and return them as a checkpoint.
 
     Args:
         data: The own grasps and their features.
@@ -121,7 +121,7 @@ def calibrate_fit(
 
 
 def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estimate, *, quiet: bool) -> Checkpoint:
-    """Return the start model with a gel check and a posterior fitted to own objects.
+    """Return the start model with a gel check and a posterior fitted to the recorded objects.
 
     Args:
         start: The start model.

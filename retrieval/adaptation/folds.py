@@ -1,4 +1,4 @@
-"""Cross-validation over own objects: they are few, so each is left out once."""
+"""Cross-validation over the recorded objects: they are few, so each is left out once."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from retrieval.training.features import Features
 GALLERY = 9
 """Approximate number of objects of a fold, which are the candidates of its touches."""
 MIN_OBJECTS = 6
-"""Minimum number of own objects: two folds of three."""
+"""Minimum number of recorded objects: two folds of three."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -160,7 +160,7 @@ def _make_remote_catalogue(
         elif photo.path in paths_seen:
             skipped.append(SkippedPhoto(photo.path, "is listed twice"))
         elif not is_inside(photo.path):
-            skipped.append(SkippedPhoto(photo.path, "its name leads out of the catalogue"))
+            skipped.append(SkippedPhoto(photo.path, "its path is outside the catalogue"))
         elif not name:
             skipped.append(SkippedPhoto(photo.path, f"does not fit --objects-from {naming.text}"))
         else:

@@ -63,7 +63,7 @@ def _rival_weights(table: ScoreTable) -> NDArray[np.float64]:
     weights = np.where(table.relevant, 0, columns)
     total = weights.sum(1, keepdims=True)
     if not total.all():
-        raise BadInput(f"a test needs {table.column_words} of at least two objects; a row has only its own")
+        raise BadInput(f"a test needs {table.column_words} of at least two objects; a row has those of one")
     return np.asarray(weights / total)
 
 

@@ -59,7 +59,9 @@ def _checked(relevant: Mask, shown: Mask) -> Mask:
     good = relevant & shown
     empty = np.flatnonzero(~good.any(1))
     if len(empty):
-        raise BadInput(f"every query must be shown a relevant item; row {empty[0]} is not: leave it out, and report it")
+        raise BadInput(
+            f"every query needs a relevant item in its gallery; row {empty[0]} has none: leave it out, and report it"
+        )
     return good
 
 

@@ -52,7 +52,7 @@ class ScoreTable:
                 f"every score must be finite; row {row}, column {column} is {self.scores[row, column]}"
             )
         if (self.own & ~self.relevant).any():
-            raise BadInput("a photo of a row's own grasp must show the row's object; one shows another: check the ids")
+            raise BadInput("a photo of a row's own grasp must show the row's object, but one does not: check the ids")
 
     @cached_property
     def relevant(self) -> NDArray[np.bool_]:
@@ -145,7 +145,7 @@ def object_scores(
         BadInput: A row's own object has no photo left. Leave such rows out first.
     """
     if not (table.has_target | ~table.relevant.any(1)).all():
-        raise BadInput("every row must leave its object a photo; one has only its own: leave the row out")
+        raise BadInput("every row needs a photo of its object from another grasp; one has none: leave the row out")
     rng = np.random.default_rng([seed, photos])
     found = np.empty((draws, len(table.touch_owner), len(table.objects)))
     for draw in range(draws):

@@ -395,5 +395,5 @@ def _blocks(image: GelImage) -> RgbImage:
 def _finite(values: Floats, name: str) -> Floats:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
-        raise NumericalError(f"the {name} of touch {bad[0] + 1} contains a NaN or infinite number; the model is unfit")
+        raise NumericalError(f"the {name} of touch {bad[0] + 1} contains a NaN or infinite number; use another model")
     return values

@@ -111,7 +111,7 @@ def train_relief(
     """
     if config.preprocessing.background == "difference":
         raise ConfigError(
-            "this training uses 8-bit pictures, which cannot store negative differences; "
+            "relief training uses 8-bit pictures, which cannot store negative differences; "
             'set background = "difference+0.5"'
         )
     if iterations < 1:
@@ -289,7 +289,7 @@ class ReliefTraining:
         """Continue from the state of `out`.
 
         Raises:
-            CheckpointError: There is no state, or it belongs to another training.
+            CheckpointError: There is no state, or it belongs to another training run.
         """
         self.step = load_state(out, self.modules, self.optimizer, self._identity())["step"]
 

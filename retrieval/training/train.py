@@ -350,7 +350,7 @@ class Trainer:
         # The configuration changes when the candidate encoder is added.
         if not mine or stored.config not in (self.config_without_encoder, self.config):
             raise CheckpointError(
-                f"{self.out} does not belong to the training to resume; restore its checkpoint or start a new training"
+                f"{self.out} does not belong to the training run to resume; restore its checkpoint or start a new run"
             )
         return stored
 

@@ -207,7 +207,7 @@ def test_a_pickled_array_is_not_loaded(folder):
 @pytest.mark.parametrize(
     ("fields", "error", "words"),
     [
-        ({"format": 6}, UnsupportedFormat, "newer format 6, this software reads 5; update"),
+        ({"format": 6}, UnsupportedFormat, "newer format 6, but this software reads 5; update"),
         *(({"format": old}, UnsupportedFormat, f"older format {old}.*build-index") for old in (4, 3, 2, 0, -1)),
         *(({"format": odd}, CorruptIndex, "must have a format version") for odd in (None, "1", True, 1.5, [1])),
         ({"kind": "quantum"}, UnsupportedFormat, r"quantum.*Update the software"),

@@ -215,14 +215,18 @@ def check_near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: 
                 pairs[tuple(sorted((row, int(found.row[row]))))] = f"{grasp.grasp_id} and {other.grasp_id}"
         if pairs:
             text = f"{len(pairs)} pair(s) of images ({kind}) of two objects are near copies of each other"
-            severity, or_else = ("error", "") if kind == "photo" else ("warning", ", or the objects feel alike")
+            severity, or_else = (
+                ("error", "") if kind == "photo" else ("warning", ", or the touches of these objects are similar")
+            )
             yield Finding(severity, "near-copy", f"{text}{or_else}: {abbreviate_list(list(pairs.values()))}")
         counts.append(f"{found.checked.sum()} of {len(every)} images ({kind})")
         low_contact += int((~found.checked).sum())
         left_out += len(every) - len(items)
     reasons = []
     if low_contact:
-        reasons.append(f"{low_contact} show too little to recognise a copy (a light contact, or too many similar ones)")
+        reasons.append(
+            f"{low_contact} show too little to recognise a copy (little contact, or too many similar pictures)"
+        )
     if left_out:
         reasons.append(f"{left_out} belong to grasps that are named above")
     yield Finding("note", COMPARED_COPIES, f"near copies were searched in {'; '.join([', '.join(counts), *reasons])}")

@@ -113,9 +113,9 @@ def _sequence_leakage(part: str, cut: Sequence[Grasp], total: int, train: Sequen
     return Finding(
         "error",
         "sequences-in-training",
-        f"{len(cut)} of {total} {part} grasps are of sequences that are also in training, and for "
+        f"{len(cut)} of {total} {part} grasps belong to sequences that are also in training, and for "
         f"{np.mean(correct):.0%} of them the nearest training touch by raw pixels is of the same sequence (chance "
-        f"{chance:.0%}): a score on them measures memory; keep every sequence in one part of the split",
+        f"{chance:.0%}): a score on them measures memorisation; keep every sequence in one part of the split",
     )
 
 

@@ -29,8 +29,8 @@ class EncodedBatch(NamedTuple):
 class Loss(nn.Module):
     """A term of the training loss, possibly with parameters of its own.
 
-    The optimiser trains its parameters together with the matcher's. The state of an unfinished training stores them; a
-    checkpoint does not. A subclass implements `forward`.
+    The optimiser trains its parameters together with the matcher's. The state of an unfinished training run stores
+    them; a checkpoint does not. A subclass implements `forward`.
 
     >>> import torch
     >>> class Proxies(retrieval.Loss):
