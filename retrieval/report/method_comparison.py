@@ -127,7 +127,8 @@ def controls(builder: Builder) -> Iterator[Block | None]:
     """Yield the controls: the same method on inputs that lack information about the answer."""
     if builder.results.data.get("controls"):
         yield Text(
-            "The same method on inputs that lack information about the answer. Permuted touches and no-contact frames should be at chance. Low-pass touches contain light and coarse shape, so they may be above chance."
+            "The same method on inputs that lack information about the answer. Permuted touches and no-contact frames "
+            "should be at chance. Low-pass touches contain light and coarse shape, so they may be above chance."
         )
         yield tables.controls(builder.results)
 
