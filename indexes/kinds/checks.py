@@ -63,7 +63,9 @@ def check_slots(found: Slots, count: int, minimum: int = 0) -> Slots:
     if found.size:
         if found.min() < minimum or found.max() >= count:
             odd = found[(found < minimum) | (found >= count)][0]
-            raise CorruptIndex(f"a search found slot {odd} of {count}: the structure of the index is damaged; {AGAIN}")
+            raise CorruptIndex(
+                f"a search found slot {odd}, but the index has {count}: its structure is damaged; {AGAIN}"
+            )
         ranked = np.sort(found, axis=1)
         if ((ranked[:, 1:] == ranked[:, :-1]) & (ranked[:, 1:] >= 0)).any():
             raise CorruptIndex(f"a search found one slot twice: the structure of the index is damaged; {AGAIN}")

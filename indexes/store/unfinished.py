@@ -79,7 +79,7 @@ class UnfinishedBuild:
         """Write records; skip those with numbers that are not finite.
 
         Args:
-            digests: Content digests, n of them.
+            digests: The n content digests.
             arrays: Name to array (n, ...).
 
         Raises:

@@ -23,7 +23,7 @@ from retrieval.model.encode import default_device
 from retrieval.search.sharding.build_sharded import ShardBuild, ShardJob, ShardRunner, build_shard
 
 RELEASE_TIMEOUT_S, MAX_FAILURES = 60.0, 3
-"""Time until a lost process releases its shard; largest number of failures without a finished shard in between."""
+"""Time until a lost process releases its shard, and largest number of failures without a finished shard in between."""
 
 
 class BuildWorkerPool(NamedTuple):

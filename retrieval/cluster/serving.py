@@ -44,7 +44,7 @@ from retrieval.search.sharding.object_store import local_folder
 OWNERS = "touch-retrieval"
 APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
 RETRY_S, MIN_RESULT_TIMEOUT_S = 0.05, 0.005
-"""Pause before a call to a lost replica is repeated; shortest timeout for a result that may already be available."""
+"""Pause before a call to a lost replica is repeated, and shortest timeout for a result that may be available."""
 
 MAX_WAIT_S = 86_400
 

@@ -151,7 +151,7 @@ def finger_count(grasps: Sequence[Grasp]) -> int:
 
 
 def data_digest(grasps: Iterable[Grasp]) -> str:
-    """Return the SHA-256 (hex) of ids and image bytes; recordings with equal digests give equal trainings."""
+    """Return the SHA-256 (hex) of ids and image bytes; training on recordings with equal digests is equal."""
     digest = hashlib.sha256()
     for grasp in grasps:
         digest.update(json.dumps([grasp.grasp_id, grasp.object_id, grasp.sequence_id]).encode())

@@ -107,7 +107,7 @@ class Preprocessing:
         content = {"version": PREPROCESSING_VERSION, **self.to_dict()}
         if self.views == ("whole",):  # keeps the digest of checkpoints without this setting
             del content["views"]
-        if not self.reduced:  # likewise
+        if not self.reduced:  # as above
             del content["reduced"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

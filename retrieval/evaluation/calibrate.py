@@ -118,7 +118,7 @@ def pair_rule(best_params: Mapping[str, Any], validation: ScoreTable, *, seed: i
     Args:
         best_params: Parameters of the method; "pair_threshold" is the checkpoint's own threshold.
         validation: Scores of validation objects. Fewer than `MIN_THRESHOLD_OBJECTS` objects give no rule, because a
-            threshold between so few objects is arbitrary.
+            threshold for so few objects is arbitrary.
         seed: Seed of the drawn pairs.
     """
     if (own := best_params.get("pair_threshold")) is not None:

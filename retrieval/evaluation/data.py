@@ -25,7 +25,7 @@ class EvaluationData:
         source: Source of the recording.
         digest: Digest of the grasps.
         grasps: All grasps.
-        pairs: Labelled pairs that train in addition to the training objects of the split.
+        pairs: Labelled pairs to train on, in addition to the training objects of the split.
         split: Training, validation and test objects.
         split_from: Origin of the split, in words.
         config: Configuration of the heads that are fitted.

@@ -213,7 +213,7 @@ def _compare_methods(measures: Mapping[str, list[Measures]], seed: int) -> list[
 
 def _timings(data: EvaluationData, predictions: PredictionsByMethod) -> dict[str, Any]:
     found = {name: _method_times([one.seconds for one in by_seed]) for name, by_seed in predictions.items()}
-    if {"late_fusion", "retrieve_rerank"} <= set(found):  # one training serves both
+    if {"late_fusion", "retrieve_rerank"} <= set(found):  # both use one training run
         found["retrieve_rerank"]["fit_s"] = found["late_fusion"]["fit_s"]
     return {
         "machine": {"cpus": os.cpu_count(), "threads": 1},

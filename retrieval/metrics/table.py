@@ -94,7 +94,7 @@ class ScoreTable:
 
     @cached_property
     def min_photos(self) -> int:
-        """Smallest number of photos of any object that a query is shown, without its own."""
+        """Smallest number of photos of an object in the gallery of a query, which excludes its own photos."""
         owners = np.unique(self.with_targets.photo_owner, return_counts=True)[1]
         return int(min(owners.min(), (self.with_targets.relevant & ~self.with_targets.own).sum(1).min()))
 
@@ -114,12 +114,13 @@ class ScoreTable:
         )  # fmt: skip
 
     def with_own(self) -> "ScoreTable":
-        """Return the table for a protocol that shows a row its own photos too."""
+        """Return the table for a protocol whose galleries include a row's own photos."""
         return replace(self, own=np.zeros_like(self.own))
 
 
 Pooling = Callable[[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
-"""From scores of shown photos (P,), the row of each (P,) and their number by row (T,) to the rows' scores (T,)."""
+"""Function of the scores of photos (P,), the row of each (P,) and their number by row (T,); returns the rows' scores
+(T,)."""
 
 
 def object_scores(
@@ -157,13 +158,13 @@ def object_scores(
     return found
 
 
-ShownScores = tuple[NDArray[np.float64], NDArray[np.bool_]]
-"""Scores (T, p) of rows with photos of one object, and whether each is shown to the row."""
+GalleryScores = tuple[NDArray[np.float64], NDArray[np.bool_]]
+"""Scores (T, p) of rows with photos of one object, and whether each is in the row's gallery."""
 
 
 def _window(
     scores: NDArray[np.float32], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
-) -> ShownScores:
+) -> GalleryScores:
     """Give every row its own window over the shuffled columns: sampling without replacement at low cost."""
     start = rng.integers(len(columns), size=len(scores))
     window = (start[:, None] + np.arange(min(photos, len(columns)))) % len(columns)
@@ -173,15 +174,17 @@ def _window(
 
 def _without_own(
     table: ScoreTable, mine: NDArray[np.int64], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
-) -> ShownScores:
-    """Return photos for the object's own rows: in a random order per row, its own ones last and never shown."""
+) -> GalleryScores:
+    """Return photos for the object's own rows: in a random order per row, its own ones last and not in the gallery."""
     own, scores = table.own[mine][:, columns], table.scores[mine][:, columns].astype(np.float64)
     order = np.argsort(rng.random(own.shape) + own, axis=1)[:, :photos]
     return np.take_along_axis(scores, order, 1), ~np.take_along_axis(own, order, 1)
 
 
-def _pooled_scores(scores: NDArray[np.float64], shown: NDArray[np.bool_], pool: Pooling | None) -> NDArray[np.float64]:
-    """Return the scores (T,) of the photos that each row is shown."""
+def _pooled_scores(
+    scores: NDArray[np.float64], in_gallery: NDArray[np.bool_], pool: Pooling | None
+) -> NDArray[np.float64]:
+    """Return the scores (T,) of each row with the photos in its gallery."""
     if pool is None:
-        return np.asarray((scores * shown).sum(1) / shown.sum(1))
-    return pool(scores[shown], np.nonzero(shown)[0], shown.sum(1))
+        return np.asarray((scores * in_gallery).sum(1) / in_gallery.sum(1))
+    return pool(scores[in_gallery], np.nonzero(in_gallery)[0], in_gallery.sum(1))

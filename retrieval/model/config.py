@@ -208,7 +208,7 @@ class TrainingConfig:
         return cls(**rest, weights=weights)
 
     def with_iterations(self, iterations: int) -> "TrainingConfig":
-        """Return a copy with so many optimiser steps, and at most as many distillation steps."""
+        """Return a copy with `iterations` optimiser steps, and at most as many distillation steps."""
         return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
 
 
@@ -221,7 +221,7 @@ SCHEDULES: dict[str, Callable[[int, int], float]] = {
     "cosine": lambda step, steps: 0.5 * (1 + math.cos(math.pi * step / steps)),
     "halving": lambda step, steps: 0.5 ** (4 * step // steps),
 }
-"""Name -> factor of the learning rate at a step (from 0) of so many steps; "halving" halves after each quarter."""
+"""Name -> factor of the learning rate at a step (from 0) of all `steps`; "halving" halves after each quarter."""
 NEGATIVES = ("auto", "batch", "dataset")
 PRECISIONS = ("auto", "float32", "bfloat16")
 

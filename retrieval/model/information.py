@@ -73,7 +73,7 @@ def unlisted_probability(none: float, listed: Sequence[float]) -> float:
 
 
 def effective_grasps(posterior: Posterior, grasps: int) -> float:
-    """Return the number of independent grasps that are equivalent to this many grasps of one object, w(n)."""
+    """Return the number of independent grasps that are equivalent to `grasps` grasps of one object, w(n)."""
     return grasps * posterior.weight(grasps) / posterior.slope
 
 

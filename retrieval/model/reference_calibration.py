@@ -178,7 +178,7 @@ def fit_reference_calibration(*parts: ReferenceTouches, seed: int = 0) -> Refere
 
 
 def _reference_trials(part: ReferenceTouches, max_references: int) -> _ReferenceTrials | None:
-    """Return the trials with at most so many references per object; None for too few objects."""
+    """Return the trials with at most `max_references` references per object; None for too few objects."""
     scored = part.scored
     rows = [np.flatnonzero(scored.touch_owner == name) for name in np.unique(scored.touch_owner)]
     rows = [mine for mine in rows if len(mine) > 1]
@@ -202,7 +202,7 @@ def _reference_trials(part: ReferenceTouches, max_references: int) -> _Reference
 
 
 def _evenly_spaced(rows: Numbers, max_references: int) -> Numbers:
-    """Return at most so many of the rows, evenly spaced."""
+    """Return at most `max_references` of the rows, evenly spaced."""
     places = np.linspace(0, len(rows) - 1, min(max_references, len(rows)))
     return np.asarray(rows[places.round().astype(np.int64)])
 

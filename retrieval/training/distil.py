@@ -155,7 +155,7 @@ def distillation_loss(scores: Tensor, logits: Tensor) -> Tensor:
 
     Args:
         scores: (T, N) scores of the student; a constant added to a row has no effect.
-        logits: (T, N) match logits of the head, likewise.
+        logits: (T, N) match logits of the head; a constant added to a row has no effect.
     """
     divergence = functional.kl_div(
         functional.log_softmax(scores, 1), functional.log_softmax(logits, 1), log_target=True, reduction="batchmean"

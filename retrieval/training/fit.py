@@ -18,7 +18,7 @@ Batch = TypeVar("Batch")
 
 @dataclass(frozen=True)
 class Plan:
-    """Length and speed of a training.
+    """Length and learning rate of a training run.
 
     Attributes:
         steps: Number of optimiser steps.
@@ -52,7 +52,7 @@ def fit(
 
     Args:
         optimizer: The optimiser.
-        plan: Length and speed of the training.
+        plan: Length and learning rate of the training run.
         batches: The remaining batches.
         loss: Returns the loss of a batch.
         bar: Progress bar.
@@ -126,7 +126,7 @@ def fit_best(
 
     Args:
         module: The module.
-        plan: Length and speed of the training.
+        plan: Length and learning rate of the training run.
         loss: Returns the loss of the step with this number.
         score: Returns the validation score; higher is better.
         bar: Progress bar.

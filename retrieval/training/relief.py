@@ -279,7 +279,7 @@ class ReliefTraining:
         )
 
     def _identity(self) -> dict[str, Any]:
-        """Return the settings that must not change between a training and its resumption."""
+        """Return the settings that must not change between a training run and its resumption."""
         return {"config": self.config.to_dict(), "iterations": self.iterations, "pictures": self.labels}
 
     def _save(self, out: Path) -> None:

@@ -57,7 +57,7 @@ def save_state(
     """Write the state of an unfinished training run of `out`.
 
     Args:
-        out: The output of the training.
+        out: The output of the training run.
         modules: Everything with parameters.
         optimizer: The optimiser of these parameters.
         header: The step, and the settings that `load_state` compares; JSON types.
@@ -83,7 +83,7 @@ def load_state(
     """Load the state that `save_state` wrote into `modules` and `optimizer`.
 
     Args:
-        out: The output of the training.
+        out: The output of the training run.
         modules: As in `save_state`.
         optimizer: As in `save_state`.
         identity: Settings that the header must contain unchanged.

@@ -150,7 +150,7 @@ def test_an_id_out_of_range_in_a_structure_raises_in_the_search(tmp_path, kind, 
     forge(folder)
     generation = IndexStore(tmp_path).open()
     for search in (generation.search, generation.candidates):
-        with pytest.raises(CorruptIndex, match=rf"found slot {wrong}, the index has 650.*build-index"):
+        with pytest.raises(CorruptIndex, match=rf"found slot {wrong}, but the index has 650.*build-index"):
             search(unit(3), 4)
 
 
@@ -166,7 +166,7 @@ def test_slots_of_a_users_own_kind_are_checked_too():
         def _search(self, queries, k, live):
             return np.ones((len(queries), k), np.float32), np.full((len(queries), k), 99)
 
-    with pytest.raises(CorruptIndex, match="found slot 99, the index has 20"):
+    with pytest.raises(CorruptIndex, match="found slot 99, but the index has 20"):
         Wrong.build(unit(20)).search(unit(1), 1)
 
 

@@ -46,7 +46,7 @@ class Loss(nn.Module):
     """
 
     def __init__(self, embedding_dim: int, objects: int) -> None:
-        """Make the loss for a training.
+        """Make the loss for a training run.
 
         Args:
             embedding_dim: Length of an embedding.

@@ -180,7 +180,7 @@ class Searcher:
         """
         opened = self._snapshot()
         grasps = parse_grasps(touches, opened.reader.fingers)
-        return opened._answers(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
+        return opened._results(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
 
     def query_cumulative(
         self,
@@ -201,7 +201,7 @@ class Searcher:
         opened = self._snapshot()
         grasps = parse_grasps(touches, opened.reader.fingers)
         spans = [slice(count) for count in range(1, len(grasps) + 1)]
-        return opened._answers(grasps, spans, background, top, candidates, none_prior)
+        return opened._results(grasps, spans, background, top, candidates, none_prior)
 
     def query_many(
         self,
@@ -212,7 +212,7 @@ class Searcher:
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
     ) -> list[QueryResult]:
-        """Return the result for each of several objects in the hand, each as `query` takes it.
+        """Return the result for each of several objects in the hand, each in the form that `query` accepts.
 
         Touches are encoded in batches, so logits differ by at most 1e-4 from single queries. If the touches of one
         object are invalid, the error names the object and no query runs.
@@ -223,7 +223,7 @@ class Searcher:
         ends = np.cumsum([len(grasps) for grasps in parsed]).tolist()
         spans = [slice(end - len(grasps), end) for end, grasps in zip(ends, parsed, strict=True)]
         every = [grasp for grasps in parsed for grasp in grasps]
-        return opened._answers(every, spans, background, top, candidates, none_prior)
+        return opened._results(every, spans, background, top, candidates, none_prior)
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> EncodedTouches:
         """Return the unit embeddings (G, embedding_dim) and partial activations (G, partial_width) of G grasps.
@@ -232,8 +232,8 @@ class Searcher:
         a probability. `searcher.scorer.logits(partials, photo_partials)` gives match logits, summed over the grasps.
 
         Args:
-            touches: As `query` takes them.
-            background: As `query` takes it.
+            touches: As for `query`.
+            background: As for `query`.
         """
         opened = self._snapshot()
         grasps = parse_grasps(touches, opened.reader.fingers)
@@ -248,7 +248,7 @@ class Searcher:
             raise BadInput(f"this searcher of {self.index} is closed; open the index again")
         return opened
 
-    def _answers(
+    def _results(
         self,
         grasps: Sequence[Sequence[InputImage]],
         spans: Sequence[slice],
@@ -264,17 +264,17 @@ class Searcher:
             return []
         clock = Stopwatch()
         codes = self.reader.encode(grasps, self.reader.no_contact_frames(background), clock)
-        shown = np.full(len(codes.partials), CONTACT)
+        classes = np.full(len(codes.partials), CONTACT)
         if self.gel_check is not None and codes.readings is not None:
-            shown = np.array(self.gel_check.classify(codes.readings, codes.levels))
+            classes = np.array(self.gel_check.classify(codes.readings, codes.levels))
         scored = []
         for span in spans:
-            in_contact = (shown[span] == CONTACT) & (shown[span] != NOT_A_GEL).all()
+            in_contact = (classes[span] == CONTACT) & (classes[span] != NOT_A_GEL).all()
             query = ShardQuery(codes.embeddings[span][in_contact], codes.partials[span][in_contact])
             scored.append(self._score(query, top, candidates, none_prior, clock))
         timing_ms = clock.finish(len(spans))
         return [
-            self._answer(grasps[span], shown[span].tolist(), codes.embeddings[span], timing_ms, found, none_prior)
+            self._result(grasps[span], classes[span].tolist(), codes.embeddings[span], timing_ms, found, none_prior)
             for span, found in zip(spans, scored, strict=True)
         ]
 
@@ -294,22 +294,22 @@ class Searcher:
             probabilities = self.posterior.probabilities_given(logits, found.mass, grasps, none_prior)
         return _ScoredQuery(found, grasps, probabilities)
 
-    def _answer(
+    def _result(
         self,
         grasps: Sequence[Sequence[InputImage]],
-        shown: list[str],
+        classes: list[str],
         embeddings: Floats,
         timing_ms: dict[str, float],
         scored: "_ScoredQuery | None",
         none_prior: float,
     ) -> QueryResult:
         info, probabilities = self.info, scored.probabilities if scored else None
-        verdict = _verdict(shown, probabilities)
+        verdict = _verdict(classes, probabilities)
         searched = scored.found.searched if scored else info.photos
         sharding = {"shards": info.shards, "searched": searched / info.photos} if info.shards > 1 else {}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
-            grasps=shown,
+            grasps=classes,
             index={
                 "path": str(self.index),
                 "generation": info.name,
@@ -374,10 +374,10 @@ class _ScoredQuery(NamedTuple):
     probabilities: PosteriorProbabilities | None
 
 
-def _verdict(shown: Sequence[str], probabilities: PosteriorProbabilities | None) -> str:
-    if NOT_A_GEL in shown:
+def _verdict(classes: Sequence[str], probabilities: PosteriorProbabilities | None) -> str:
+    if NOT_A_GEL in classes:
         return NOT_A_GEL
-    if CONTACT not in shown:
+    if CONTACT not in classes:
         return NO_CONTACT
     if probabilities is None:
         return UNCALIBRATED

@@ -89,7 +89,7 @@ class ShardBuild:
     Attributes:
         folder: Folder of the shard.
         entry: Its entry in the manifest; None if none of its photos can be read.
-        report: Its report; None likewise.
+        report: Its report; None in the same case.
         counts: Number of photos of each object.
         skipped: Photos that could not be read.
     """
