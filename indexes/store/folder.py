@@ -1,6 +1,6 @@
 """The index on disk: a folder of generations, one of them current.
 
-    CURRENT               name of the current generation; the only file that is ever replaced
+    CURRENT               name of the current generation; apart from caches, the only file that is replaced
     gen-000007/           a generation: written under a temporary name, checked, renamed; immutable afterwards
       manifest.json       its description, and size and SHA-256 of every other file; written last
       rows.jsonl          rows as lines of JSON

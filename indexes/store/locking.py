@@ -1,4 +1,4 @@
-"""The writer lock of an index, which the operating system releases when the writer dies."""
+"""The writer lock of an index, which the operating system releases when the writer ends or is killed."""
 
 import fcntl
 import os

@@ -1,10 +1,10 @@
 """A sharded index: several index folders that together form one catalogue, and the file that lists them.
 
-    SHARDS.json           the shards: folder, generation, SHA-256 of its manifest; the only file that is replaced
+    SHARDS.json           the shards: folder, generation, SHA-256 of its manifest; the only replaced file
     shard-00-of-04/       an ordinary index folder with its own CURRENT; empty shards have no folder
     LOCK                  locked by the build
 
-The generations in this file are current, whatever CURRENT contains in the folders: one rename switches all shards. The
+The generations in this file are current, and the CURRENT file of each folder is ignored: one rename switches all. The
 digest of a generation's manifest covers every byte of the generation, so no folder can be mistaken for another.
 Opening a sharded index reads only this file. Its length depends on the number of shards, not on the number of photos.
 """

@@ -1,4 +1,4 @@
-"""Inputs of a fit: own grasps, encoded by the frozen towers of the start model and a published tower."""
+"""Inputs of a fit: the recorded grasps, encoded by the frozen towers of the start model and a published tower."""
 
 import dataclasses
 from dataclasses import dataclass

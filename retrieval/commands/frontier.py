@@ -1,4 +1,4 @@
-"""`retrieve frontier`: measure error against run time of every approximation, for one model and recording."""
+"""`retrieve frontier`: measure the error and the run time of each approximation, for one model and recording."""
 
 import os
 from collections.abc import Collection, Mapping, Sequence
@@ -35,7 +35,7 @@ def frontier(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Measure error against run time of every approximation; write plots and a page. Resumes a stopped run."""
+    """Plot the error of each approximation against its run time, on a page. Resumes a stopped run."""
     document = run_frontier(out, model=model, recording=recording, only=only or (), quick=quick)
     if json:
         print_json(document)

@@ -35,7 +35,7 @@ def measure_frontier(
     model_free: Collection[str] = (),
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Measure error against run time of every approximation; write frontier.json, frontier.html and figures/.
+    """Measure the error and the run time of each approximation; write frontier.json, frontier.html and figures/.
 
     Stored rows are reused if software, model, recording, scale and machine are the same.
 

@@ -1,1 +1,1 @@
-"""Measures of rankings and probabilities, with confidence intervals, only with numpy."""
+"""Measures of rankings and probabilities, with confidence intervals; they need only numpy."""

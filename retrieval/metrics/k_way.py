@@ -1,4 +1,4 @@
-"""Top-n accuracy of K-way tests, and exact intervals; tied scores count by their expected rank."""
+"""Top-n accuracy of K-way tests, and exact intervals; tied scores get their expected rank."""
 
 from collections.abc import Sequence
 from math import comb

@@ -1,4 +1,4 @@
-"""Settings of a matcher and of its training: frozen dataclasses, read from TOML, unknown keys refused."""
+"""Settings of a matcher and of its training: frozen dataclasses, read from TOML; unknown keys are errors."""
 
 import dataclasses
 import math

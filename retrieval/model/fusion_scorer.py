@@ -24,6 +24,7 @@ from retrieval.errors import BadInput, NumericalError
 
 CONTACT, NO_CONTACT, NOT_A_GEL = "contact", "no contact", "not a gel image"
 BLOCKS = 16
+"""Image blocks along each side for `contact_level`."""
 Bounded = Annotated[float, Meta(ge=-1e6, le=1e6)]
 
 
@@ -89,6 +90,7 @@ def contact_level(touch: RgbImage, no_contact: RgbImage) -> float:
 Floats = NDArray[np.float32]
 Partials = NDArray[np.floating[Any]]
 BLOCK = 2048
+"""Number of photos that are scored together."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""Reference touches: catalogue entries that are touches, alone or with photos.
+"""Reference touches: catalogue entries that are touches, without or with photos.
 
 An object's touches are split in the order of capture: the first quarter are references, the last half are queries. The
 touches between them are left out, so that no query is next to a reference. A catalogue entry is a reference touch,
-alone or with the photo of its grasp. With photos `cca_towers` weights both by validation accuracy. Alone, reference
-touches are matched as photos otherwise are, so that training needs no photo.
+without or with the photo of its grasp. With photos, `cca_towers` weights both by validation accuracy. Without photos,
+reference touches are matched like photos, and training needs no photo.
 """
 
 import dataclasses

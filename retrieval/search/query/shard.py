@@ -82,7 +82,7 @@ class IndexInfo:
         kind: Kind of index of candidate search.
         photos: Number of photos.
         objects: Number of objects.
-        fingerprint: Origin of the codes.
+        fingerprint: Digests of the checkpoint and the preprocessing that the vectors come from.
         about: Further manifest entries, such as the catalogue and the checkpoint.
         calibration: The posterior as stored in the index; None without one.
         shards: Number of index folders.
