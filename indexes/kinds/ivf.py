@@ -15,13 +15,13 @@ POINTS_PER_CENTRE = 39
 """Smallest number of training points of each centre that FAISS accepts without a warning."""
 
 MAX_POINTS_PER_CENTRE = 64
-"""Largest number of training points of each centre: more improve the centres too little for their time."""
+"""Largest number of training points of each centre: more points improve the centres little and take longer."""
 
 MIN_CODED_VECTORS = 16 * POINTS_PER_CENTRE
 """Vectors that train compressed codes: enough for the smallest codebook and for the range of each component."""
 
 SPARE_CODES = 64
-"""Candidates beyond k that are scored exactly: one byte for each component swaps the order of near-copies."""
+"""Candidates beyond k that are scored exactly, because codes of a byte per component swap the order of near-copies."""
 
 MIN_REFINED = 64
 """Smallest k for the number of refined candidates: compressed scores are too coarse to trust the first few."""

@@ -179,7 +179,7 @@ class IndexStore:
             MismatchedIndex: The parent has another fingerprint.
             LockedIndex: Another writer is writing the index.
             SelfRetrievalFailed: A row is not found by its own vector.
-            WriteFailed: The disk refuses.
+            WriteFailed: A file could not be written.
         """
         job = WriteJob(
             documents=check_documents(documents or {}),
@@ -211,7 +211,7 @@ class IndexStore:
             raise WriteFailed(f"{where}: writing failed ({error.strerror or error}); write again") from error
 
     def _require_index_folder(self) -> None:
-        """Refuse a folder without generations that has a file called CURRENT: it belongs to something else."""
+        """Raise NoIndex for a folder without generations that has a file CURRENT: it belongs to another program."""
         path = self.path / "CURRENT"
         try:
             if not self._numbers() and read_regular(path).strip():

@@ -176,7 +176,7 @@ class RayShardGroup:
         from ray.serve.exceptions import RayServeException
 
         while True:
-            try:  # a result that arrived while another shard was awaited counts, even after the deadline
+            try:  # a result that arrived while another shard was awaited is used, even after the deadline
                 return response.result(timeout_s=max(MIN_RESULT_TIMEOUT_S, until - time.monotonic()))
             except TimeoutError:
                 response.cancel()

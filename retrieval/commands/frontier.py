@@ -56,7 +56,7 @@ def run_frontier(
     Args:
         out: Folder of the results. A second run continues from them.
         model: The value of `--model`.
-        recording: Grasps of objects that the model was not trained on. None collects a few on the simulated rig, if
+        recording: Grasps of objects that the model was not trained on. None to collect a few on the simulated rig, if
             a row needs them.
         only: Names of rows; empty for all.
         quick: Measure the smallest sizes only.

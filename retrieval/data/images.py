@@ -29,9 +29,9 @@ _AVIF_BRANDS = frozenset({b"avif", b"avis"})
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
 MAX_PIXELS = 20_000_000
-"""Of a decoded picture: 240 MB in float32. A larger JPEG file is decoded at 1/2, 1/4 or 1/8 of its size."""
+"""Maximum pixels of a decoded picture: 240 MB in float32. Larger JPEG files are decoded at 1/2, 1/4 or 1/8 of its size."""
 MAX_DRAFT_PIXELS = 160_000_000
-"""Of a JPEG file that is decoded at a smaller size."""
+"""Maximum pixels of a JPEG file that is decoded at a smaller size."""
 MAX_SIDE, MAX_ASPECT = 65_535, 200
 """Largest side in pixels (the limit of JPEG), and largest ratio of the longer to the shorter side."""
 MAX_BYTES = 512 * 2**20

@@ -184,7 +184,7 @@ class TorchEncoder:
 
         Args:
             matcher: The model.
-            threads: Threads that PyTorch computes with from then on, in the whole process; None changes nothing.
+            threads: Threads that PyTorch computes with from then on, in the whole process; None for no change.
         """
         self._fast, self._threads = for_inference(matcher, ["touch_tower"]), threads
 

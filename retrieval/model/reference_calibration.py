@@ -11,9 +11,9 @@ whose touches are references and the others queries:
     an object with photos, too        log likelihood ratio = w_b (l_b + weight C) + offset_b
 
 w_a, offset_a and w_b, offset_b are those of two posteriors, and l_b is the object's logit over its photos by the second
-one. The second is fitted on the sums, because photo and reference meet the same touch and are not independent evidence.
-Each ratio is converted to the logit at which an object with photos only would have it. One formula then ranks all
-objects of a catalogue and gives their probabilities, whatever represents them.
+one. The second is fitted on the sums, because photo and reference are compared with the same touch and are not
+independent evidence. Each ratio is converted to the logit of an object with photos only and the same ratio. One formula
+then ranks all objects of a catalogue and gives their probabilities, with photos, references or both.
 """
 
 import dataclasses
@@ -46,7 +46,7 @@ SHARPNESS = 16.0
 """Weight of the nearest of an object's references relative to the others. With 8, with 16 and with only the nearest,
 unseen simulated objects were found equally often."""
 MAX_REFERENCES = 3
-"""Largest number of references of an object in the fit: as many as a user takes who takes few."""
+"""Largest number of references of an object in the fit: a typical number if a user records few."""
 WEIGHT_BOUNDS = (0.01, 1000.0)
 """Search range of the weight of C next to photos."""
 

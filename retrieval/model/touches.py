@@ -2,7 +2,7 @@
 
 An image is a file, bytes, a Pillow image or an array. A query has one grasp or several.
 
-The nesting of the lists decides, so nothing is guessed:
+The nesting of the lists determines which:
 
     [a, b]             one grasp: an image for each finger of the model
     [[a, b], [a, b]]   several grasps of one object

@@ -1,8 +1,8 @@
 """The default model and index of a command: those of the working folder, else the shipped model.
 
 The last trained model and the last built index are remembered separately for each working folder, in
-`$XDG_STATE_HOME/touch-retrieval/last.json` (`~/.local/state` if it is not set). A training in one folder never changes
-the commands in another one.
+`$XDG_STATE_HOME/touch-retrieval/last.json` (`~/.local/state` if it is not set). A training run in one folder does not
+change the defaults in another one.
 """
 
 import json
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SHIPPED = {2: "simulated-mobilenet.safetensors", 1: "simulated-mobilenet-one-finger.safetensors"}
 """Shipped checkpoints by the number of gel images of a touch."""
 SHIPPED_NAMES = {"shipped": 2, "shipped-one-finger": 1}
-"""Their names in options that take a checkpoint."""
+"""Names of the shipped checkpoints in options that take a checkpoint."""
 INDEX = Path("index")
 """Default index folder of `build-index` and `query`."""
 

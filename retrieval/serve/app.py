@@ -36,7 +36,7 @@ from retrieval.version import __version__
 
 log = logging.getLogger(__name__)
 THREADS = 4
-"""Threads that read files and make thumbnails. The model and the rig have their own."""
+"""Number of threads that read files and make thumbnails; the model and the rig have other threads."""
 MAX_RIG_GRASPS = 4
 """Maximum number of pending rig grasps, including the one in progress."""
 MAX_FRAMES = 8

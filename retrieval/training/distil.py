@@ -35,7 +35,7 @@ from retrieval.training.features import Features
 from retrieval.training.fit import Plan, fit
 
 BATCH_TOUCHES, BATCH_PHOTOS = 32, 2048
-"""In a batch; every touch is scored with every photo."""
+"""Numbers of touches and photos in a batch; every touch is scored with every photo."""
 LEARNING_RATE = 2e-3
 SQUARED_ERROR_WEIGHT = 0.3
 """Weight of the squared error of all scores, in addition to the divergence; it stabilises the start."""

@@ -121,7 +121,7 @@ def fit_best(
 ) -> BestStep:
     """Train `module` by `fit` with AdamW, and restore the weights of its best step.
 
-    Weight decay applies to matrices only, since a bias or a temperature has no reason to be small. The module ends in
+    Weight decay applies to matrices only, since biases and temperatures need not be small. The module ends in
     evaluation mode.
 
     Args:

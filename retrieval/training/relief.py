@@ -1,8 +1,8 @@
 """Pretrain one tower on relief and shape labels, from labelled pictures without touch-photo pairs.
 
-A photo-only object costs a tenth of the time of a grasped one, and a matcher's photo tower mostly lacks objects. The
-tower learns the relief and shape families of an object, and the pitch, amplitude, aspect and sharpness of its relief. A
-matcher starts from its weights (`init_photo`, `init_touch`), and its head is trained on touched objects.
+A photo-only object takes a tenth of the time of a grasped one, and a photo tower is limited mainly by the number of
+objects. The tower learns the relief and shape families of an object, and the pitch, amplitude, aspect and sharpness of
+its relief. A matcher starts from its weights (`init_photo`, `init_touch`), and its head is trained on touched objects.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ HEAD_RATE_FACTOR = 5.0
 VALIDATION, MAX_VALIDATION_OBJECTS = 0.05, 400
 SAVE_EVERY = 200
 BACKGROUNDS = ("none", "difference+0.5")
-"""Background policies of training touches, drawn at random, so that the weights serve matchers of both policies."""
+"""Background policies of training touches, drawn at random, so that the weights suit matchers of both policies."""
 VISIBLE_FRACTION = 0.8
 """Fraction of a photo's side that a training step uses; a gel image is used whole."""
 

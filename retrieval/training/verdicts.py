@@ -90,9 +90,7 @@ def with_verdicts(
     )
     if len(validation) < MIN_GRASPS:
         return made
-    train_touches, _ = recorded_features(
-        matcher, source, train, what="check of touches", quiet=quiet, should_stop=should_stop
-    )
+    train_touches, _ = recorded_features(matcher, source, train, what="gel check", quiet=quiet, should_stop=should_stop)
     preprocessing = made.config.preprocessing
     fitting = GelCheckFeatures.of(matcher, preprocessing, train, train_touches, foreign, seed)
     test = GelCheckFeatures.of(matcher, preprocessing, validation, touches, foreign // 2, seed + 1)
@@ -141,7 +139,7 @@ def posterior_touches(
     return ReferenceTouches(ScoredTouches(logits, touch_owner, photo_owner, own), embeddings)
 
 
-# The check of touches --------------------------------------------------------------------------------------
+# The gel check ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ _MIN_FRACTION, _MIN_COUNT = 0.1, 3
 
 _Rows = NDArray[np.float32]
 _Pixels = dict[str, _Rows]
-"""By grasp_id."""
+"""Pixels of each grasp, by grasp_id."""
 _Item = TypeVar("_Item")
 
 
@@ -87,8 +87,8 @@ def check_shared_backgrounds(grasps: Sequence[Grasp], records: ImageRecords) -> 
 def check_sequences_in_training(grasps: Sequence[Grasp], split: Split, records: ImageRecords) -> Iterator[Finding]:
     """Find held-out touches whose neighbouring frames are in the training part, by nearest neighbours in raw pixels.
 
-    Where the split cuts recorded sequences, count the touches whose nearest training touch is of their own sequence.
-    Elsewhere, count the touches that have a training touch as near as touches of one object are to each other. This
+    If the split cuts recorded sequences, count the touches whose nearest training touch is of their own sequence.
+    Otherwise, count the touches that have a training touch as near as touches of one object are to each other. This
     second count is meaningful only if touches of two objects are rarely that near.
     """
     pixels = {grasp.grasp_id: _grey(records, grasp) for grasp in grasps}

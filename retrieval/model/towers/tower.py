@@ -134,7 +134,7 @@ def without_autocast(images: Tensor) -> AbstractContextManager[Any]:
 def stage_statistics(maps: Iterable[Tensor]) -> Tensor:
     """Return mean, standard deviation and maximum over each map (B, C, H, W), concatenated: (B, 3 * all C).
 
-    The mean alone dilutes a feature that covers a small part of an image; deviation and maximum preserve it.
+    The mean dilutes a feature that covers a small part of an image; deviation and maximum preserve it.
     """
     parts = []
     for x in maps:

@@ -38,7 +38,7 @@ class StatCache:
     Args:
         catalogue: The catalogue.
         index: Folder of the index.
-        verify: Read all files, whatever their stat.
+        verify: Read all files, even if their stat did not change.
 
     Attributes:
         photos: The photos.

@@ -52,9 +52,9 @@ def agreement(
 
     Args:
         searcher: The opened index.
-        touches: As `Searcher.query` takes them.
-        photo: As `retrieval.embed_photos` takes one.
-        background: As `Searcher.query` takes it.
+        touches: As for `Searcher.query`.
+        photo: One photo, in a form that `retrieval.embed_photos` accepts.
+        background: As for `Searcher.query`.
         model: The searcher's checkpoint, if it is already loaded.
         squares: Number of squares along each side, from 1 to 32.
 
