@@ -78,7 +78,7 @@ def learning_curve(
     fits to each single one of the combined towers.
 
     Args:
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         start: The start model.
         cache: Folder of the features of the unadapted model.
         seed: Seed of folds and drawn touches.
@@ -137,7 +137,7 @@ def one_tower(data: AdaptationData, place: int) -> tuple[Features, TowerWidths]:
     """Return the features of one of the combined towers, and their widths.
 
     Args:
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         place: Place of the tower among the combined ones.
     """
 

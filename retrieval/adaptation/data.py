@@ -27,7 +27,7 @@ NO_TOWER = "none"
 
 @dataclass(frozen=True, eq=False)
 class AdaptationData:
-    """Own grasps, the combined towers, and the features.
+    """The recorded grasps, the combined towers, and the features.
 
     Attributes:
         grasps: The grasps.

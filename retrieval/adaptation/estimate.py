@@ -75,7 +75,7 @@ class Estimate:
 
     @property
     def verdict(self) -> str:
-        """Whether the fit uses the touch itself, in words."""
+        """A sentence on whether the fit is better than its low-pass control."""
         gain = compare([self.top1], [self.low_pass_top1])
         if gain["low"] > 0:
             return "Better than the low-pass control: the fit uses more than light and coarse shape."
@@ -113,7 +113,7 @@ def estimate_accuracy(
     """Estimate the accuracy on held-out objects.
 
     Args:
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         start: The start model.
         cache: Folder of the features of the unadapted model.
         seed: Seed of the folds.

@@ -27,7 +27,7 @@ def fit_matcher(data: AdaptationData, estimate: Estimate | None, out: Path) -> C
     """Fit codes to all recorded objects and return them as a checkpoint.
 
     Args:
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         estimate: Contains the selected settings; without it the largest ridge is used.
         out: Path of the checkpoint.
     """
@@ -103,7 +103,7 @@ def calibrate_fit(
 
     Args:
         checkpoint: The fitted checkpoint.
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         estimate: Contains the held-out touches; without it the checkpoint has no posterior.
         quiet: No progress on stderr.
     """
@@ -125,7 +125,7 @@ def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estima
 
     Args:
         start: The start model.
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         estimate: The estimate with the unadapted baseline.
         quiet: No progress on stderr.
     """

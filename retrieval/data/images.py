@@ -29,7 +29,7 @@ _AVIF_BRANDS = frozenset({b"avif", b"avis"})
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
 MAX_PIXELS = 20_000_000
-"""Maximum pixels of a decoded picture: 240 MB in float32. Larger JPEG files are decoded at 1/2, 1/4 or 1/8 of its size."""
+"""Maximum pixels of a decoded picture: 240 MB in float32. Larger JPEG files are decoded at 1/2, 1/4 or 1/8 size."""
 MAX_DRAFT_PIXELS = 160_000_000
 """Maximum pixels of a JPEG file that is decoded at a smaller size."""
 MAX_SIDE, MAX_ASPECT = 65_535, 200

@@ -58,7 +58,7 @@ def gel_change(grasp: Grasp) -> float:
     """Return the mean absolute difference between gel image and no-contact frame, grey levels.
 
     Args:
-        grasp: A grasp with no-contact frames; of two fingers the larger change counts.
+        grasp: A grasp with no-contact frames; of two fingers, the larger change is returned.
 
     Raises:
         DatasetError: The two images differ in size.

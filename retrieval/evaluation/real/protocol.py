@@ -1,4 +1,4 @@
-"""Protocols: how to split a data set, which gallery to search, and what to measure."""
+"""Benchmark protocols: the split of a data set, the galleries, and the measures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
