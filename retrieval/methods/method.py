@@ -150,7 +150,7 @@ class Method(ABC):
 
 
 def sum_over_sets(scores: Array, sets: NDArray[np.int64]) -> Array:
-    """Return sums (S, N) over sets (S, G) of rows of scores (T, N), in float64: near-ties must not depend on the order."""
+    """Return sums (S, N) over sets (S, G) of rows of scores (T, N); in float64, near-ties do not depend on order."""
     total = np.zeros((len(sets), scores.shape[1]))
     for rows in sets.T:
         total += scores[rows]

@@ -66,7 +66,7 @@ function linesOf(answers) {
 function mostInformativeGrasp(perGrasp, gainedBits) {
   const best = gainedBits.indexOf(Math.max(...gainedBits));
   const possible = perGrasp[best].information.possible_bits;
-  return `On its own, grasp ${best + 1} gives the most information: ${gainedBits[best].toFixed(1)} of the ${possible.toFixed(1)} bits that identify an object with certainty.`;
+  return `Queried separately, grasp ${best + 1} gives the most information: ${gainedBits[best].toFixed(1)} of the ${possible.toFixed(1)} bits that identify an object with certainty.`;
 }
 
 /** A sentence on the grasp after which the probabilities changed most. */
