@@ -268,7 +268,7 @@ def select_queries(touch_partials: Tensor, seed: int) -> NDArray[np.float16] | N
 
 
 def with_candidate_encoder(
-    made: Checkpoint,
+    checkpoint: Checkpoint,
     config: Config,
     train: tuple[Tensor, Tensor],
     validation: tuple[Tensor, Tensor] | None = None,
@@ -276,12 +276,12 @@ def with_candidate_encoder(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Checkpoint:
-    """Return the checkpoint `made` with a distilled candidate encoder, queries, and the encoder's metric.
+    """Return `checkpoint` with a distilled candidate encoder, queries, and the encoder's metric.
 
-    The matcher of `made` is reused and modified.
+    The matcher of `checkpoint` is reused and modified.
 
     Args:
-        made: The checkpoint.
+        checkpoint: The checkpoint.
         config: The configuration, which sets the size of the candidate encoder.
         train: Partial activations (N, P) of touches and of photos of training objects.
         validation: The same of validation objects, if any. The metric uses their touches among the photos of all.
@@ -292,7 +292,7 @@ def with_candidate_encoder(
         JobInterrupted: As for `distil`.
         NumericalError: As for `distil`.
     """
-    settings, matcher, metrics = config.training, made.matcher, made.provenance["metrics"]
+    settings, matcher, metrics = config.training, checkpoint.matcher, checkpoint.provenance["metrics"]
     width, linear, steps = config.matcher.candidate_width, config.matcher.candidate_linear, settings.distil_steps
     seed = settings.seed
     distil(matcher, *train, width=width, linear=linear, steps=steps, seed=seed, quiet=quiet, should_stop=should_stop)
@@ -300,12 +300,12 @@ def with_candidate_encoder(
     if validation is not None and queries is not None:
         touches = torch.from_numpy(queries).to(validation[1].device).float()
         metrics = metrics | agreement_metrics(matcher, touches, torch.cat([train[1], validation[1]]))
-    about = made.provenance | {"metrics": metrics}
-    return dataclasses.replace(made, matcher=matcher, config=config, provenance=about, queries=queries)
+    about = checkpoint.provenance | {"metrics": metrics}
+    return dataclasses.replace(checkpoint, matcher=matcher, config=config, provenance=about, queries=queries)
 
 
 def add_candidate_encoder(
-    made: Checkpoint,
+    checkpoint: Checkpoint,
     config: Config,
     source: FeatureSource,
     train: Sequence[Grasp],
@@ -314,10 +314,10 @@ def add_candidate_encoder(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Checkpoint:
-    """Return the checkpoint `made` with a candidate encoder distilled on recorded grasps.
+    """Return `checkpoint` with a candidate encoder distilled on recorded grasps.
 
     Args:
-        made: The checkpoint. Its matcher is reused and modified; it must be on the device of `source`.
+        checkpoint: The checkpoint. Its matcher is reused and modified; it must be on the device of `source`.
         config: The configuration, which sets the size of the candidate encoder.
         source: The source of features.
         train: Grasps of training objects.
@@ -330,9 +330,11 @@ def add_candidate_encoder(
         NumericalError: As for `distil`.
     """
     partials = [
-        recorded_partials(made.matcher, source, grasps, config.training.seed, quiet=quiet, should_stop=should_stop)
+        recorded_partials(
+            checkpoint.matcher, source, grasps, config.training.seed, quiet=quiet, should_stop=should_stop
+        )
         for grasps in (train, validation)
         if grasps
     ]
     with source.step_context():
-        return with_candidate_encoder(made, config, *partials, quiet=quiet, should_stop=should_stop)
+        return with_candidate_encoder(checkpoint, config, *partials, quiet=quiet, should_stop=should_stop)

@@ -26,7 +26,7 @@ from retrieval.model.reference_calibration import REFERENCE_ROWS
 from retrieval.model.touches import Stopwatch
 from retrieval.search.query.answer import NearestReference
 from retrieval.search.query.objects import ListedPhoto, Objects, ScoredObjects, listed_photo
-from retrieval.search.query.reference_touches import Nearness, References
+from retrieval.search.query.reference_touches import References, Similarities
 
 DEFAULT_CANDIDATES = 1000
 MIN_COMPLETED_OBJECTS = 20
@@ -181,7 +181,7 @@ class FolderShard:
         clock = Stopwatch()
         with clock("candidates"):
             limit = self.limit(top, candidates)
-            similarities = None if self.references is None else self.references.nearness_to_objects(query.partials)
+            similarities = None if self.references is None else self.references.similarities_to_objects(query.partials)
             rows = self._candidates(query.embeddings, similarities, limit)
         with clock("rerank"):
             objects, photos = self._score_objects(query.partials, rows, top, posterior or Posterior(), similarities)
@@ -233,7 +233,7 @@ class FolderShard:
         measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
         return max(top, int(measured["k"]) if candidates is None else candidates)
 
-    def _candidates(self, embeddings: Floats, similarities: Nearness | None, k: int) -> Rows:
+    def _candidates(self, embeddings: Floats, similarities: Similarities | None, k: int) -> Rows:
         """Return the rows to score.
 
         These are the k photos nearest to all grasps together, and the photos of the k objects with the nearest
@@ -254,7 +254,7 @@ class FolderShard:
         return RankedObject(logit, photo, self.references.nearest(number, partials, logit, photo_logits))
 
     def _objects_of(
-        self, rows: Rows, logits: Floats, posterior: Posterior, grasps: int, similarities: Nearness | None
+        self, rows: Rows, logits: Floats, posterior: Posterior, grasps: int, similarities: Similarities | None
     ) -> ScoredObjects:
         """Return the objects of these photos, scored by photos and reference touches."""
         objects = self.objects.aggregate(rows, logits, posterior, grasps)
@@ -265,7 +265,7 @@ class FolderShard:
         return self.references.combine(objects, both, similarities, posterior, grasps)
 
     def _score_objects(
-        self, partials: Floats, rows: Rows, top: int, posterior: Posterior, similarities: Nearness | None
+        self, partials: Floats, rows: Rows, top: int, posterior: Posterior, similarities: Similarities | None
     ) -> tuple[ScoredObjects, int]:
         """Return the scored objects, and the number of scored photos."""
         logits = self._logits(partials, rows)
@@ -281,7 +281,7 @@ class FolderShard:
         return self._objects_of(rows, logits, posterior, len(partials), similarities), len(rows)
 
     def _mass(
-        self, partials: Floats, objects: ScoredObjects, posterior: Posterior, similarities: Nearness | None
+        self, partials: Floats, objects: ScoredObjects, posterior: Posterior, similarities: Similarities | None
     ) -> EvidenceMass:
         unscored = self.objects.count - len(objects.numbers)
         # A sample of unscored objects estimates their mass. Without a sample, use the lowest logit of the scored ones,
