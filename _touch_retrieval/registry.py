@@ -34,7 +34,7 @@ class Registry(Collection[str], Generic[T]):
             kind: Last part of the group of entry points, such as "towers".
             table: Built-in name to "module:Class".
             error: Exception type for an unknown or unusable name.
-            base: "module:Class"; each entry is a subclass or an instance of it. None: each entry is a function.
+            base: "module:Class"; each entry is a subclass or an instance of it. None for entries that are functions.
         """
         self.noun, self.group, self.table = noun, f"touch_retrieval.{kind}", table
         self._error, self._base = error, base

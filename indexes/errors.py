@@ -9,11 +9,11 @@ A message contains the requirement, the value and the remedy. Each class has the
     +-- NoIndex                   there is no index at the path
     +-- CorruptIndex              a file of the index is missing, truncated or damaged
     +-- MismatchedIndex           the index was made with another model or preprocessing than required
-    +-- UnsupportedFormat         the index has a newer or older format than this software reads
+    +-- UnsupportedFormat         the index has a newer or older format than this software supports
     +-- LockedIndex               another writer is writing the index
     +-- JobFailed                 the job ran and failed (exit code 1)
         +-- SelfRetrievalFailed   a search for the vector of a row does not find the row
-        +-- WriteFailed           the disk refused a write
+        +-- WriteFailed           a file could not be written
         +-- EngineError           the vector library failed
 """
 
@@ -68,7 +68,7 @@ class MismatchedIndex(IndexesError):
 
 
 class UnsupportedFormat(IndexesError):
-    """The index has a newer or an older format than this software reads."""
+    """The index has a newer or an older format than this software supports."""
 
 
 class LockedIndex(IndexesError):
@@ -94,7 +94,7 @@ class SelfRetrievalFailed(JobFailed):
 
 
 class WriteFailed(JobFailed):
-    """The disk refused a write. The index is complete: either the old one or the new one."""
+    """A file could not be written. The index is complete: either the old one or the new one."""
 
 
 class EngineError(JobFailed):

@@ -20,8 +20,8 @@ def check_unit(
 
     Args:
         vectors: Array (M, d) float32.
-        dim: Required d; None: any.
-        names: Names (M,) of the rows in messages; None: the row numbers.
+        dim: Required d; None for any.
+        names: Names (M,) of the rows in messages; None for the row numbers.
         what: Word before the name in messages.
 
     Raises:
@@ -63,7 +63,9 @@ def check_slots(found: Slots, count: int, minimum: int = 0) -> Slots:
     if found.size:
         if found.min() < minimum or found.max() >= count:
             odd = found[(found < minimum) | (found >= count)][0]
-            raise CorruptIndex(f"a search found slot {odd}, the index has {count}: its structure is damaged; {AGAIN}")
+            raise CorruptIndex(
+                f"a search found slot {odd}, but the index has {count}: its structure is damaged; {AGAIN}"
+            )
         ranked = np.sort(found, axis=1)
         if ((ranked[:, 1:] == ranked[:, :-1]) & (ranked[:, 1:] >= 0)).any():
             raise CorruptIndex(f"a search found one slot twice: the structure of the index is damaged; {AGAIN}")

@@ -103,7 +103,8 @@ class FaissIndex(VectorIndex):
     def _candidate_slots(self, query: Floats, k: int, live: Mask | None) -> Slots:
         """Return the slots of the first round if they suffice.
 
-        An exact kind scores only those again that rounding may have put on the wrong side of rank k, usually none.
+        An exact kind scores only those slots again that rounding may have put on the wrong side of rank k; usually
+        there are none.
         """
         dilution = 1.0 if live is None else self.count / np.count_nonzero(live)
         fetch = math.ceil(self._first_fetch(k) * dilution)
@@ -168,6 +169,6 @@ class FaissIndex(VectorIndex):
         must = (self.structure_type, self.count, self.dim, faiss.METRIC_INNER_PRODUCT)
         if got != must:
             raise CorruptIndex(
-                f"{path}: must have (type, count, size, metric) {must}, got {got}; build the index again"
+                f"{path}: the structure must have (type, count, size, metric) {must}, got {got}; build the index again"
             )
         self._structure = structure

@@ -15,13 +15,13 @@ POINTS_PER_CENTRE = 39
 """Smallest number of training points of each centre that FAISS accepts without a warning."""
 
 MAX_POINTS_PER_CENTRE = 64
-"""Largest number of training points of each centre: more improve the centres too little for their time."""
+"""Largest number of training points of each centre: more points improve the centres little and take longer."""
 
 MIN_CODED_VECTORS = 16 * POINTS_PER_CENTRE
 """Vectors that train compressed codes: enough for the smallest codebook and for the range of each component."""
 
 SPARE_CODES = 64
-"""Candidates beyond k that are scored exactly: one byte for each component swaps the order of near-copies."""
+"""Candidates beyond k that are scored exactly, because codes of a byte per component swap the order of near-copies."""
 
 MIN_REFINED = 64
 """Smallest k for the number of refined candidates: compressed scores are too coarse to trust the first few."""
@@ -35,8 +35,8 @@ class IVFParameters(vector_index.Parameters):
     query 10 to 50 % faster.
 
     Attributes:
-        lists: Number of lists; None: sqrt(N). It is lowered to N / 39, the maximum that N points can train.
-        probes: Number of visited lists; None: an eighth of the lists, at least 8.
+        lists: Number of lists; None for sqrt(N). It is lowered to N / 39, the maximum that N points can train.
+        probes: Number of visited lists; None for an eighth of the lists, at least 8.
     """
 
     lists: int | None = None
@@ -51,7 +51,7 @@ class IVFPQParameters(IVFParameters):
     """Lists and product-quantization codes.
 
     Attributes:
-        code_bytes: Bytes of each code, a divisor of the vector size; None: the largest divisor up to an eighth of it
+        code_bytes: Bytes of each code, a divisor of the vector size; None for the largest divisor up to an eighth of it
             (or up to 8).
         refine: `refine` times k candidates are scored exactly.
     """

@@ -40,7 +40,8 @@ def sample_queries(vectors: Floats, count: int, *, seed: int = 0, noise: float =
 def recall_against_exact(index: VectorIndex, queries: Floats, k: int = 10) -> float:
     """Return the recall@k of an index: the mean fraction of the exact best k that it returns.
 
-    A result counts if its score reaches the exact k-th score, so ties at rank k count. An exact index has recall 1.
+    A result is correct if its score reaches the exact k-th score, so ties at rank k are correct. An exact index has
+    recall 1.
 
     Args:
         index: The index.

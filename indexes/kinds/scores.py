@@ -1,7 +1,7 @@
 """Bitwise reproducible inner products of unit vectors.
 
 A sum of floating-point products depends on its order. The same pair then scores differently in a batch of 1 and a
-batch of 1000, on one thread and on eight, and identical vectors are no ties. Here every component is first rounded
+batch of 1000, on one thread and on eight, and identical vectors do not tie. Here every component is first rounded
 to a multiple of 2^-26. A product of two components is then a multiple of 2^-52. By Cauchy-Schwarz, every partial
 sum of products of two vectors with norms up to 1.001 stays below 1.003 in size, that is below 2^53 such multiples.
 Float64 represents each of them exactly, so nothing is rounded and every order gives the same sum.
@@ -64,7 +64,7 @@ def scan(vectors: Floats, queries: Floats, k: int, live: Mask | None = None) -> 
         vectors: Unit vectors (M, d), read block by block.
         queries: Unit queries (Q, d).
         k: Number of results, at most the number of live slots.
-        live: Mask (M,) of the slots to search; None: all.
+        live: Mask (M,) of the slots to search; None for all.
 
     Returns:
         Scores (Q, k) float32 and slots (Q, k) int64, ordered by (-score, slot).

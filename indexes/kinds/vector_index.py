@@ -72,17 +72,18 @@ class VectorIndex(ABC):
     exact: ClassVar[bool] = False
     """Whether a search always finds the true best k."""
     auto_try: ClassVar[bool] = False
-    """Whether `retrieve build-index` tries this kind by itself if exact search takes too long."""
+    """Whether `retrieve build-index` may choose this kind if a bound for recall or time is set and exact search is too
+    slow."""
     retrain_growth: ClassVar[float | None] = None
-    """Growth, as a multiple of the trained size, beyond which the structure is rebuilt; None: never."""
+    """Growth, as a multiple of the trained size, beyond which the structure is rebuilt; None for never."""
     structure_file: ClassVar[bool] = True
     """Whether `save` writes a file; without one, the vectors are the whole index."""
     search_settings: ClassVar[frozenset[str]] = frozenset()
     """Parameters of a search, on which the structure does not depend."""
     search_ladder: ClassVar[Ladder | None] = None
-    """The search setting that trades time for recall, with values from the fastest on."""
+    """The search setting that trades time for recall, and the values to try, the fastest first."""
     build_ladder: ClassVar[Ladder | None] = None
-    """The structure parameter that trades memory for recall; `retrieve frontier` compares its values."""
+    """The structure parameter that trades memory for recall, and the values that `retrieve frontier` compares."""
     parameters_type: ClassVar[type[Parameters]] = Parameters
     min_vectors: ClassVar[int] = 1
     """Smallest number of vectors for a build."""
@@ -113,10 +114,10 @@ class VectorIndex(ABC):
 
         Args:
             vectors: Unit vectors (M, d) float32, M >= 1.
-            parameters: Settings; None: the defaults. `.parameters` of the result has every None filled in.
+            parameters: Settings. Default: the kind's defaults. `.parameters` of the result has every None filled in.
             names: Names (M,) of the rows in messages.
             seed: Seed of all random choices.
-            threads: Number of threads; None: the library's own setting.
+            threads: Number of threads; None for the library's own setting.
 
         Raises:
             VectorError: A vector is invalid, or there is none.
@@ -163,7 +164,7 @@ class VectorIndex(ABC):
             vectors: The same vectors (M, d), perhaps memory-mapped; they are not checked.
             parameters: The parameters of the saved index.
             seed: The seed of the saved index.
-            threads: Number of threads; None: the library's own setting.
+            threads: Number of threads; None for the library's own setting.
 
         Raises:
             CorruptIndex: The file is unreadable or does not fit the vectors.
@@ -213,7 +214,7 @@ class VectorIndex(ABC):
         Args:
             queries: Unit queries (Q, d) float32.
             k: Number of results, at least 1.
-            live: Mask (M,) of the slots to search; None: all.
+            live: Mask (M,) of the slots to search; None for all.
 
         Returns:
             Scores (Q, k') float32 and slots (Q, k') int64; k' = min(k, number of live slots).
@@ -226,15 +227,15 @@ class VectorIndex(ABC):
         return scores, check_slots(slots, self.count)
 
     def candidates(self, queries: Floats, k: int, live: Mask | None = None) -> list[Slots]:
-        """Return the slots that `search` finds for each query, unordered and without scores, for a caller that reranks.
+        """Return candidate slots for each query, unordered and without scores, for a caller that reranks.
 
-        An exact kind returns exactly these slots, an approximate kind at least k' of its best. This is faster than
-        `search`, because few slots are scored exactly.
+        An exact kind returns the k' slots of `search`. An approximate kind returns k' or more: the best by the scores
+        of its structure. This is faster than `search`, because few slots are scored exactly.
 
         Args:
             queries: Unit queries (Q, d) float32.
             k: Number of slots, at least 1.
-            live: Mask (M,) of the slots to search; None: all.
+            live: Mask (M,) of the slots to search; None for all.
         """
         table, count = self._check_query(queries, k, live)
         if count == 0:
@@ -296,7 +297,7 @@ class VectorIndex(ABC):
         return other
 
     def search_variants(self) -> Iterator[Self]:
-        """Yield the same structure with each value of its `search_ladder`; without a ladder, yield this index."""
+        """Yield the same structure with each value of `search_ladder`; without a `search_ladder`, yield this index."""
         if self.search_ladder is None:
             yield self
             return

@@ -1,6 +1,6 @@
 """The index on disk: a folder of generations, one of them current.
 
-    CURRENT               name of the current generation; the only file that is ever replaced
+    CURRENT               name of the current generation; apart from caches, the only file that is replaced
     gen-000007/           a generation: written under a temporary name, checked, renamed; immutable afterwards
       manifest.json       its description, and size and SHA-256 of every other file; written last
       rows.jsonl          rows as lines of JSON
@@ -73,10 +73,10 @@ class IndexStore:
         """Open and check a generation.
 
         Args:
-            name: Its name; None: the current generation.
+            name: Its name; None for the current generation.
             verify: Compare the SHA-256 of the files; sizes are always checked.
             expect: Required values of the fingerprint.
-            threads: Number of threads of a search; None: the library's own setting.
+            threads: Number of threads of a search; None for the library's own setting.
 
         Raises:
             NoIndex: There is no index.
@@ -161,13 +161,13 @@ class IndexStore:
             fingerprint: Origin of the vectors, compared by `open(expect=...)`.
             about: Further entries of the manifest.
             kind: Name of the kind of index.
-            parameters: Its parameters; None: the defaults.
+            parameters: Its parameters; None for the defaults.
             parent: Generation whose rows may be reused (`Block`).
             software: Version of the writing software.
             seed: Seed of all random choices.
-            threads: Number of threads; None: the library's own setting.
+            threads: Number of threads; None for the library's own setting.
             choose_kind: Chooses kind, parameters and further entries of `about` when all rows are on the disk.
-            queries: Unit vectors (Q, d) to measure recall with; None: drawn near the vectors of the index.
+            queries: Unit vectors (Q, d) to measure recall with; None to draw them near the vectors of the index.
             self_check: Number of new rows that must be found by their own vectors before the switch. Of the rows that
                 the parent had in the same structure, a sixteenth of this number is checked (`Generation.self_check`).
             keep: Number of earlier generations that stay on the disk for readers that are opening them.
@@ -179,7 +179,7 @@ class IndexStore:
             MismatchedIndex: The parent has another fingerprint.
             LockedIndex: Another writer is writing the index.
             SelfRetrievalFailed: A row is not found by its own vector.
-            WriteFailed: The disk refuses.
+            WriteFailed: A file could not be written.
         """
         job = WriteJob(
             documents=check_documents(documents or {}),
@@ -208,10 +208,10 @@ class IndexStore:
                 return self._publish(name, blocks, job, self_check, keep)
         except OSError as error:
             where = error.filename or self.path
-            raise WriteFailed(f"{where}: the disk refused ({error.strerror or error}); write again") from error
+            raise WriteFailed(f"{where}: writing failed ({error.strerror or error}); write again") from error
 
     def _require_index_folder(self) -> None:
-        """Refuse a folder without generations that has a file called CURRENT: it belongs to something else."""
+        """Raise NoIndex for a folder without generations that has a file CURRENT: it belongs to another program."""
         path = self.path / "CURRENT"
         try:
             if not self._numbers() and read_regular(path).strip():

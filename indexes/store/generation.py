@@ -32,7 +32,7 @@ DOCUMENT_BYTES, DOCUMENT_BYTES_PER_ROW = 2**18, 2**12
 SHOWN_IDS = 5
 MAX_CHECKED_RESULTS = 1000
 OLD_SAMPLE_DIVISOR = 16
-"""Factor by which fewer rows are checked if the parent already had them."""
+"""Factor by which fewer rows are checked if the parent (the generation whose rows are reused) already had them."""
 
 
 class Generation:
@@ -104,10 +104,12 @@ class Generation:
         return number
 
     def codes(self, field: str) -> Slots:
-        """Return a number for each row (N,) that is equal for rows with the same text in a field; no row is parsed.
+        """Return integer labels (N,) of a field: equal for rows with the same text. No row is parsed.
+
+        Labels are numbered from 0 by first appearance, as in `pandas.factorize`.
 
         Args:
-            field: One of `indexes.store.rows.KEYS`. Numbers count up from 0 in the order of their first rows.
+            field: One of `indexes.store.rows.KEYS`.
         """
         _, first, code = np.unique(self.rows.keys(field), return_index=True, return_inverse=True)
         rank = np.empty(len(first), np.int64)
@@ -125,7 +127,7 @@ class Generation:
             For each query, row numbers (n,) and scores (n,) float32. A slot stands for all its rows, so n may exceed k.
         """
         k = check_k(k)
-        scores, slots = self.index.search(queries, k + 1, self._live)
+        scores, slots = self.index.search(queries, k + 1, self._live)  # one more shows whether rank k is tied
         return [self._best_rows(*found, k) for found in zip(queries, scores, slots, strict=True)]
 
     def candidates(self, queries: Floats, k: int) -> list[Slots]:
@@ -161,13 +163,15 @@ class Generation:
     def self_check(self, sample: int = 256, seed: int = 0, *, since: int = 0) -> None:
         """Search for the vectors of sampled rows, and check that each row is found.
 
-        A row passes if its slot, or a near-copy with the same score, is at rank 1 for k = 1, or else for k = 1 % of
-        all rows: queries use hundreds of candidates, and compressed codes cannot distinguish near-copies.
+        A row passes if a search for its vector ranks the row's slot, or a near-copy with the same score, first. Rows
+        that fail with k = 1 are searched again with k = 1 % of the rows (at most `MAX_CHECKED_RESULTS`), similar to
+        the numbers of candidates of queries: compressed kinds then score more slots exactly.
 
         Args:
             sample: Number of rows in new slots. Of rows in older slots, `sample` / `OLD_SAMPLE_DIVISOR` are checked.
             seed: Seed of the sample.
-            since: First new slot: the parent has checked the slots before it in the same structure.
+            since: First slot that is new in this generation. Earlier slots were checked in the same structure when the
+                parent was written.
 
         Raises:
             SelfRetrievalFailed: Some rows are not found.
@@ -188,13 +192,13 @@ class Generation:
             )
 
     def _rows_not_found(self, numbers: Slots, k: int) -> Slots:
-        """Return the rows for whose vectors a search for k slots ranks a slot with a lower score first."""
+        """Return the rows that are not found: the best score of a search (k slots) is below the row's own score."""
         if not len(numbers):
             return numbers
         own = np.ascontiguousarray(self.embeddings[self.slots[numbers]])
         top = self.index.search(own, k, self._live)[0][:, 0]
-        must = np.array([grid_scores(vector, vector[None])[0] for vector in to_grid(own)])
-        return numbers[top < must]
+        expected = np.array([grid_scores(vector, vector[None])[0] for vector in to_grid(own)])
+        return numbers[top < expected]
 
     def _best_rows(self, query: Floats, scores: Floats, slots: Slots, k: int) -> tuple[Slots, Floats]:
         """Return the rows of the best k of k + 1 slots; ties at rank k are broken by id."""
@@ -205,28 +209,28 @@ class Generation:
             scores, slots = found_scores[0], found[0]
         if fetched == k:
             return self._rows_and_scores(scores[:k], slots[:k])
-        rows, spread = self._rows_and_scores(scores, slots)
+        rows, row_scores = self._rows_and_scores(scores, slots)
         _, first = np.unique(self.slots[rows], return_index=True)
-        stay = np.isin(self.slots[rows], self.slots[rows[np.sort(first)[:k]]])
-        return rows[stay], spread[stay]
+        is_best = np.isin(self.slots[rows], self.slots[rows[np.sort(first)[:k]]])
+        return rows[is_best], row_scores[is_best]
 
     def _rows_of(self, slots: Slots) -> tuple[Slots, Slots]:
         """Return the number of rows of each slot, and all these rows, slot by slot."""
         counts = self._per_slot[slots]
-        inside = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
-        return counts, self._by_slot[np.repeat(self._starts[slots], counts) + inside]
+        offsets = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+        return counts, self._by_slot[np.repeat(self._starts[slots], counts) + offsets]
 
     def _rows_and_scores(self, scores: Floats, slots: Slots) -> tuple[Slots, Floats]:
         """Return all rows of slots, ordered by (-score, id), and their scores."""
         counts, rows = self._rows_of(slots)
-        spread = np.repeat(scores, counts)
-        edges = np.flatnonzero(np.diff(spread)) + 1
-        starts, ends = np.concatenate([[0], edges]), np.append(edges, len(spread))
+        row_scores = np.repeat(scores, counts)
+        edges = np.flatnonzero(np.diff(row_scores)) + 1
+        starts, ends = np.concatenate([[0], edges]), np.append(edges, len(row_scores))
         tied = ends - starts > 1
         for start, end in zip(starts[tied], ends[tied], strict=True):
             ids = self.rows.ids(rows[start:end])
             rows[start:end] = rows[start:end][sorted(range(len(ids)), key=ids.__getitem__)]
-        return rows, spread
+        return rows, row_scores
 
 
 def check_fingerprint(where: str | Path, fingerprint: Mapping[str, str], expect: Mapping[str, str]) -> None:
@@ -256,7 +260,7 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
     Args:
         folder: The folder.
         verify: Compare the SHA-256 of the files.
-        threads: Number of threads of a search; None: the library's own setting.
+        threads: Number of threads of a search; None for the library's own setting.
     """
     manifest = read_manifest(folder)
     check_files(folder, manifest, verify=verify)
@@ -273,14 +277,14 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
             raise CorruptIndex(f"{folder}: slots must be below {counts.slots}, but are not; {AGAIN}")
         tombstones = counts.slots - int(np.count_nonzero(np.bincount(slots)))
         got = {"rows": len(slots), "slots": len(embeddings), "tombstones": tombstones, "dim": embeddings.shape[1]}
-        must = {**asdict(counts), "dim": manifest.dim}
-        if any(must[name] != number for name, number in got.items()):
-            raise CorruptIndex(f"{folder}: the manifest states {must}, the files have {got}; {AGAIN}")
+        expected = {**asdict(counts), "dim": manifest.dim}
+        if any(expected[name] != number for name, number in got.items()):
+            raise CorruptIndex(f"{folder}: the manifest states {expected}, but the files have {got}; {AGAIN}")
         if verify:
             if not (np.abs(row_norms(embeddings) - 1.0) <= NORM_TOLERANCE).all():
-                raise CorruptIndex(f"{folder}: every vector must be finite and have norm 1, one does not; {AGAIN}")
+                raise CorruptIndex(f"{folder}: every vector must be finite and have norm 1, but one is not; {AGAIN}")
             if not are_distinct(rows.keys("id")):
-                raise CorruptIndex(f"{folder}: the ids of the rows must be distinct, one occurs twice; {AGAIN}")
+                raise CorruptIndex(f"{folder}: the ids of the rows must be distinct, but one occurs twice; {AGAIN}")
         kind = load_kind(manifest.kind)
         index = kind.load(
             folder / STRUCTURE if kind.structure_file else None,
@@ -316,10 +320,10 @@ def _tables(folder: Path, manifest: Manifest) -> tuple[Rows, dict[str, NDArray[A
     # Plain arrays over the mapped files: reading one record of a `np.memmap` takes several times longer.
     text, table = np.asarray(np.memmap(folder / ROWS, np.uint8, "r")), np.asarray(open_array(folder / TABLE))
     arrays = {name: open_array(folder / f"{name}.npy") for name in manifest.arrays}
-    must = {"fields": RECORD} | dict.fromkeys(arrays, len(table))
+    expected = {"fields": RECORD} | dict.fromkeys(arrays, len(table))
     got = {"fields": table.dtype} | {name: len(array) for name, array in arrays.items()}
-    if got != must:
-        raise CorruptIndex(f"{folder}: the tables must have {must}, got {got}; {AGAIN}")
+    if got != expected:
+        raise CorruptIndex(f"{folder}: the tables must have {expected}, got {got}; {AGAIN}")
     stops = table["stop"]
     if not (np.diff(stops, prepend=0) > 0).all() or stops[-1] != len(text):
         raise CorruptIndex(f"{folder}: the lines of {ROWS} must cover its text exactly, but do not; {AGAIN}")

@@ -1,4 +1,4 @@
-"""The writer lock of an index, which the operating system releases when the writer dies."""
+"""The writer lock of an index, which the operating system releases when the writer ends or is killed."""
 
 import fcntl
 import os
@@ -16,7 +16,7 @@ class WriterLock:
     """A lock file: `with WriterLock(path):` locks it for this process, or raises `LockedIndex` immediately.
 
     The block may enter the lock again. The file stays after the release and contains the process id of the last
-    writer, for messages; its existence means nothing.
+    writer, for messages; a file that exists is not necessarily locked.
     """
 
     def __init__(self, path: Path) -> None:

@@ -115,9 +115,9 @@ def read_document(path: Path, version: int, kind: type[T]) -> T:
         raise CorruptIndex(f"{path}: must have a format version, got {found!r}; {AGAIN}")
     if found != version:
         age, remedy = ("newer", f"update the software, or {AGAIN}") if found > version else ("older", AGAIN)
-        raise UnsupportedFormat(f"{path}: has the {age} format {found}, this software reads {version}; {remedy}")
+        raise UnsupportedFormat(f"{path}: has the {age} format {found}, but this software reads {version}; {remedy}")
     if content.pop("sha256", None) != content_digest(content):
-        raise CorruptIndex(f"{path}: the content does not match its SHA-256, the file was altered; {AGAIN}")
+        raise CorruptIndex(f"{path}: the content does not match its SHA-256: the file was altered; {AGAIN}")
     del content["format"]
     try:  # check every field: software that alters the file can also write the right digest
         return typed(content, kind, path.stem)
@@ -138,9 +138,9 @@ def check_files(folder: Path, manifest: Manifest, *, verify: bool) -> None:
             with open_regular(path) as file:
                 size = os.fstat(file.fileno()).st_size
             if size != checksum.bytes:
-                raise CorruptIndex(f"{path}: must have {checksum.bytes} bytes, has {size}; {AGAIN}")
+                raise CorruptIndex(f"{path}: must have {checksum.bytes} bytes, but has {size}; {AGAIN}")
             if verify and file_digest(path) != checksum.sha256:
-                raise CorruptIndex(f"{path}: the SHA-256 differs from the manifest, the file was altered; {AGAIN}")
+                raise CorruptIndex(f"{path}: the SHA-256 differs from the manifest: the file was altered; {AGAIN}")
         except OSError as error:
             raise CorruptIndex(f"{path}: cannot be read ({error.strerror}); {AGAIN}") from error
 

@@ -1,10 +1,10 @@
 """A sharded index: several index folders that together form one catalogue, and the file that lists them.
 
-    SHARDS.json           the shards: folder, generation, SHA-256 of its manifest; the only file that is replaced
+    SHARDS.json           the shards: folder, generation, SHA-256 of its manifest; the only replaced file
     shard-00-of-04/       an ordinary index folder with its own CURRENT; empty shards have no folder
     LOCK                  locked by the build
 
-The generations in this file are current, whatever CURRENT contains in the folders: one rename switches all shards. The
+The generations in this file are current, and the CURRENT file of each folder is ignored: one rename switches all. The
 digest of a generation's manifest covers every byte of the generation, so no folder can be mistaken for another.
 Opening a sharded index reads only this file. Its length depends on the number of shards, not on the number of photos.
 """
@@ -139,7 +139,7 @@ def read_sharded_manifest(folder: Path) -> ShardedManifest:
         raise NoIndex(f"{folder}: there is no sharded index here; run `retrieve build-index --shards` first")
     manifest = read_document(path, FORMAT, ShardedManifest)
     if len({shard.folder for shard in manifest.shards}) < len(manifest.shards):
-        raise CorruptIndex(f"{path}: every shard must have its own folder, two shards have the same; {AGAIN}")
+        raise CorruptIndex(f"{path}: every shard must have its own folder, but two have the same; {AGAIN}")
     return manifest
 
 
@@ -158,7 +158,7 @@ def open_shard(
         entry: Manifest entry of the shard.
         fingerprint: Fingerprint of the sharded index.
         verify: Compare the SHA-256 of the files.
-        threads: Number of threads of a search; None: the library's own setting.
+        threads: Number of threads of a search; None for the library's own setting.
 
     Raises:
         IndexesError: The shard is missing, damaged, or not the generation in the manifest.

@@ -1,4 +1,4 @@
-"""The stat cache of photos' files and folders. Files and folders with the same stat need not be read or listed again.
+"""The stat cache of photos' files and folders. Files and folders with the same stat are not read or listed again.
 
     files.stat      for each file: keys of its row's id and of its content digest, size, times and inode
     folders.stat    for each folder without folders and links in it: times, inode, device, and the names in it

@@ -47,7 +47,7 @@ class Tables:
         slots: Slot of each row (N,).
         objects: Keys (N,) of the rows' "object_id" (`indexes.store.rows`).
         arrays: Name to per-row array (N, ...).
-        parent: Generation from which rows were reused; None: none were.
+        parent: Generation from which rows were reused; None if no row was reused.
         renumbered: Whether the slots have other numbers than in the parent.
     """
 

@@ -2,7 +2,7 @@
 
 The key of a record is the digest of the content, with a digest of the fingerprint and the array layout, so codes of
 another model are never reused. Records are committed immediately, with a checksum: after a kill or a full disk, a
-record is complete or counts as missing. The file belongs to no generation, and queries do not read it. It may be
+record is complete or treated as missing. The file belongs to no generation, and queries do not read it. It may be
 deleted at any time; a build deletes it after writing a generation.
 """
 
@@ -79,7 +79,7 @@ class UnfinishedBuild:
         """Write records; skip those with numbers that are not finite.
 
         Args:
-            digests: Content digests, n of them.
+            digests: The n content digests.
             arrays: Name to array (n, ...).
 
         Raises:
@@ -98,7 +98,7 @@ class UnfinishedBuild:
             with self._lock, self._connection or self._open() as connection:
                 connection.executemany("INSERT OR REPLACE INTO records VALUES (?, ?, ?, ?)", rows)
         except (OSError, sqlite3.Error) as error:
-            raise WriteFailed(f"{self.path}: the disk refused ({error}); build again") from error
+            raise WriteFailed(f"{self.path}: writing failed ({error}); build again") from error
 
     def clear(self) -> None:
         """Delete all records, after a generation contains them. Files that cannot be deleted stay."""

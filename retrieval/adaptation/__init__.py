@@ -1,1 +1,1 @@
-"""Adaptation of a matcher to a new sensor and a few own objects, with an accuracy estimate."""
+"""Adaptation of a matcher to a new sensor and a few of your objects, with an accuracy estimate."""

@@ -20,7 +20,7 @@ from retrieval.training.features import Features, encode_recording
 
 @dataclass(frozen=True, eq=False)
 class UnadaptedBaseline:
-    """A start model without any fit, and the features of own grasps in its own preprocessing.
+    """A start model without any fit, and the features of the recorded grasps with its own preprocessing.
 
     Attributes:
         start: The model.

@@ -1,4 +1,4 @@
-"""Learning curve: accuracy on held-out objects of fits to fewer own objects and fewer touches."""
+"""Learning curve: accuracy on held-out objects of fits to fewer recorded objects and fewer touches."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -25,7 +25,7 @@ from retrieval.training.features import Features
 from retrieval.version import __version__
 
 OBJECTS, TOUCHES = (5, 10, 20, 1000), (5, 20, 100)
-"""Numbers of own objects, at most all outside the fold, and of touches of each object to fit."""
+"""Numbers of recorded objects to fit (at most all outside the fold), and of touches of each object."""
 SETTINGS = CcaSettings()
 """Settings of every fit on the curve: few objects leave none for validation."""
 ADAPTED, START_TOWERS, PUBLISHED_TOWERS = "adapted", "only the towers of the model", "only the published towers"
@@ -75,10 +75,10 @@ def learning_curve(
     """Fit to fewer touches of fewer objects and measure the accuracy on held-out objects.
 
     For comparison the curve includes the unadapted model and, with all objects and touches, the low-pass control and
-    fits to each of the combined towers alone.
+    fits to each single one of the combined towers.
 
     Args:
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         start: The start model.
         cache: Folder of the features of the unadapted model.
         seed: Seed of folds and drawn touches.
@@ -137,7 +137,7 @@ def one_tower(data: AdaptationData, place: int) -> tuple[Features, TowerWidths]:
     """Return the features of one of the combined towers, and their widths.
 
     Args:
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         place: Place of the tower among the combined ones.
     """
 
@@ -165,7 +165,7 @@ def write_curve(folder: Path, points: Sequence[CurvePoint]) -> Path:
 
 
 def _text(points: Sequence[CurvePoint]) -> Iterator[str]:
-    yield from (GENERATOR_COMMENT, "# Accuracy by number of own objects and touches", "")
+    yield from (GENERATOR_COMMENT, "# Accuracy by number of fitted objects and touches", "")
     yield "Top-1 accuracy and pair accuracy of one touch on objects that were left out of the fit. Intervals resample"
     yield f"objects; chance is {points[0].chance:.3f} and 0.500.\n"
     yield "| fit | objects | touches of each | top-1 accuracy | pair accuracy |\n|---|---|---|---|---|"
@@ -192,7 +192,7 @@ def _figure(points: Sequence[CurvePoint]) -> Figure:
             alpha=0.12,
             lw=0,
         )
-        panel.plot(across, [100 * p.top1[0] for p in line], "o-", color=colour, label=f"{objects} own objects")
+        panel.plot(across, [100 * p.top1[0] for p in line], "o-", color=colour, label=f"{objects} objects")
     for label, dashes in ((UNADAPTED, ":"), (LOW_PASS, "--")):
         level = next(100 * point.top1[0] for point in points if point.label == label)
         panel.axhline(level, color=MUTED_COLOUR, ls=dashes, lw=1.2, label=label)
@@ -201,7 +201,7 @@ def _figure(points: Sequence[CurvePoint]) -> Figure:
     ticks = sorted({point.touches for point in fitted})
     panel.set_xticks(ticks, [str(tick) for tick in ticks])
     panel.minorticks_off()
-    panel.set_xlabel("touches of each own object")
+    panel.set_xlabel("touches of each fitted object")
     percent_axis(panel, "top-1 accuracy, held-out objects (%)")
     panel.legend(fontsize=8, frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     return figure

@@ -1,4 +1,4 @@
-"""Inputs of a fit: own grasps, encoded by the frozen towers of the start model and a published tower."""
+"""Inputs of a fit: the recorded grasps, encoded by the frozen towers of the start model and a published tower."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ NO_TOWER = "none"
 
 @dataclass(frozen=True, eq=False)
 class AdaptationData:
-    """Own grasps, the combined towers, and the features.
+    """The recorded grasps, the combined towers, and the features.
 
     Attributes:
         grasps: The grasps.
@@ -84,7 +84,7 @@ def load_adaptation_data(
     if split is not None:
         grasps = [grasp for grasp in grasps if grasp.object_id not in split.test]
     if len({grasp.object_id for grasp in grasps}) < 2:
-        raise BadInput("A fit needs at least 2 own objects. Record more.")
+        raise BadInput("A fit needs a recording of at least 2 objects. Record more.")
     config = config_for(start, finger_count(grasps), None if init == NO_TOWER else tower, seed=seed)
     matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
     load_start_weights(matcher.touch_tower, start.matcher.touch_tower, init)

@@ -69,18 +69,18 @@ class Estimate:
         lines.append(f"unadapted model: top-1 accuracy {baseline[0]}, pair accuracy {baseline[1]}")
         if self.is_baseline_better:
             lines.append(
-                "  The unadapted model is used: it is more accurate than the fit. Its probabilities are fitted."
+                "  The unadapted model is used: it is more accurate than the fit. Only its probabilities are fitted."
             )
         return lines
 
     @property
     def verdict(self) -> str:
-        """Whether the fit uses the touch itself, in words."""
+        """A sentence on whether the fit is better than its low-pass control."""
         gain = compare([self.top1], [self.low_pass_top1])
         if gain["low"] > 0:
-            return "The touch beats its low-pass control: the fit uses more than light and coarse shape."
+            return "Better than the low-pass control: the fit uses more than light and coarse shape."
         return (
-            "The touch does not beat its low-pass control, so the result is not shown to be touch. Record more objects."
+            "Not better than the low-pass control: there is no evidence that the fit uses touch. Record more objects."
         )
 
     def to_dict(self) -> dict[str, float]:
@@ -113,7 +113,7 @@ def estimate_accuracy(
     """Estimate the accuracy on held-out objects.
 
     Args:
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         start: The start model.
         cache: Folder of the features of the unadapted model.
         seed: Seed of the folds.

@@ -1,4 +1,4 @@
-"""Write a fit into a checkpoint: projections from all own objects, calibration from held-out objects."""
+"""Write a fit into a checkpoint: projections from all recorded objects, calibration from held-out objects."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -24,10 +24,10 @@ from retrieval.training.verdicts import with_verdicts
 
 @one_thread()
 def fit_matcher(data: AdaptationData, estimate: Estimate | None, out: Path) -> Checkpoint:
-    """Fit codes to all own objects and return them as a checkpoint.
+    """Fit codes to all recorded objects and return them as a checkpoint.
 
     Args:
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         estimate: Contains the selected settings; without it the largest ridge is used.
         out: Path of the checkpoint.
     """
@@ -103,7 +103,7 @@ def calibrate_fit(
 
     Args:
         checkpoint: The fitted checkpoint.
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         estimate: Contains the held-out touches; without it the checkpoint has no posterior.
         quiet: No progress on stderr.
     """
@@ -121,11 +121,11 @@ def calibrate_fit(
 
 
 def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estimate, *, quiet: bool) -> Checkpoint:
-    """Return the start model with a gel check and a posterior fitted to own objects.
+    """Return the start model with a gel check and a posterior fitted to the recorded objects.
 
     Args:
         start: The start model.
-        data: The own grasps and their features.
+        data: The recorded grasps and their features.
         estimate: The estimate with the unadapted baseline.
         quiet: No progress on stderr.
     """

@@ -1,4 +1,4 @@
-"""Cross-validation over own objects: they are few, so each is left out once."""
+"""Cross-validation over the recorded objects: they are few, so each is left out once."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from retrieval.training.features import Features
 GALLERY = 9
 """Approximate number of objects of a fold, which are the candidates of its touches."""
 MIN_OBJECTS = 6
-"""Minimum number of own objects: two folds of three."""
+"""Minimum number of recorded objects: two folds of three."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
     """Draw folds of about `GALLERY` objects; objects that share a sequence stay together.
 
     Args:
-        grasps: The own grasps.
+        grasps: The recorded grasps.
         seed: Seed of the draw.
 
     Raises:
@@ -69,7 +69,7 @@ def fit_folds(
     Args:
         features: Features of all grasps.
         folds: Objects of each fold.
-        data: The own grasps.
+        data: The recorded grasps.
         seed: Seed of the selection.
         label: Kind of touches, for the progress bar.
         quiet: No progress on stderr.
@@ -94,7 +94,7 @@ class FoldAccuracy:
 
     Attributes:
         object_ids: (n,) touched objects.
-        top1: (n,) whether the photo of the own object ranks first; 1/m if m photos tie.
+        top1: (n,) whether the photo of the touched object ranks first; 1/m if m photos tie.
         pair_accuracy: (n,) fraction of the other objects' photos with a lower score; ties count 1/2.
         objects: Number of candidate objects.
     """
@@ -115,7 +115,7 @@ def fold_accuracy(fold: Fold, seed: int = 0) -> FoldAccuracy:
     """Return the accuracy of each touch of a fold with one random photo of each object of the fold.
 
     Args:
-        fold: The fold. The photo of the own object is of another grasp if there is one.
+        fold: The fold. The photo of the touched object is of another grasp if there is one.
         seed: Seed of the drawn photos.
     """
     return score_accuracy(fold.cosines(), fold.left_out, seed)

@@ -1,8 +1,8 @@
-"""Adapt a model to a new sensor and own objects.
+"""Adapt a model to a new sensor and to your objects.
 
-The towers are frozen: those of the start model, pretrained on relief in simulation, combined with a published tower,
-pretrained on photos. The fit is linear (`retrieval.methods.cca_towers`). Every reported number comes from objects that
-were left out of the fit.
+Two kinds of frozen towers are used together: the towers of the start model (pretrained on relief in simulation) and one
+published tower (pretrained on photos). The fit is linear (`retrieval.methods.cca_towers`). Every reported number comes
+from objects that were left out of the fit.
 """
 
 from dataclasses import dataclass
@@ -67,19 +67,19 @@ def adapt(
     seed: int = 0,
     quiet: bool = False,
 ) -> Adaptation:
-    """Fit a model to a recording of another sensor and own objects, and write the checkpoint `out`.
+    """Fit a model to a recording from another sensor with your objects, and write the checkpoint `out`.
 
-    If the unadapted model is more accurate on held-out objects than the fit, it is written instead, and only its
-    probabilities are fitted.
+    If the start model is more accurate on held-out objects than the fitted model, `out` is a copy of the start model
+    with a new calibration of its probabilities.
 
     Args:
         recording: A folder, or the object that `robot.read_recording` returns.
         out: The checkpoint (.safetensors).
-        start: The start model; None takes the shipped one for the same number of fingers.
+        start: The start model. Default: the shipped model for the same number of fingers.
         tower: The published tower to combine with those of the model: a name, "module:Class", or a class.
-        init: Weights of that tower: "imagenet", a file, or "none" for no such tower.
-        split: Its test objects are left out of everything.
-        report: Folder of the learning curve, the accuracy by number of objects and touches.
+        init: Weights of that tower: "imagenet", a file, or "none" to use the towers of the start model only.
+        split: A split whose test objects are not used at all.
+        report: Folder for the learning curve: accuracy by number of objects and touches.
         cache: Folder of encoded features, so that a stopped run resumes.
         seed: Seed of the folds.
         quiet: No progress on stderr.

@@ -23,7 +23,7 @@ from retrieval.model.encode import default_device
 from retrieval.search.sharding.build_sharded import ShardBuild, ShardJob, ShardRunner, build_shard
 
 RELEASE_TIMEOUT_S, MAX_FAILURES = 60.0, 3
-"""Time until a lost process releases its shard; largest number of failures without a finished shard in between."""
+"""Time until a lost process releases its shard, and largest number of failures without a finished shard in between."""
 
 
 class BuildWorkerPool(NamedTuple):
@@ -64,9 +64,9 @@ def ray_runner(cpus: int | None = None, workers: int | None = None) -> ShardRunn
     """Return a function that builds shards on a Ray cluster (`retrieval.cluster.session`).
 
     Args:
-        cpus: CPUs of a Ray that is started here; None: all.
-        workers: Largest number of concurrent processes; None: one for each GPU of the cluster, or for each CPU if it
-            has no GPU.
+        cpus: CPUs of a Ray that is started here; None for all.
+        workers: Largest number of concurrent processes. Default: one for each GPU of the cluster, or for each CPU if
+            it has no GPU.
     """
 
     def run(jobs: Sequence[ShardJob], checkpoint: Checkpoint) -> Iterator[ShardBuild]:

@@ -44,7 +44,7 @@ from retrieval.search.sharding.object_store import local_folder
 OWNERS = "touch-retrieval"
 APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
 RETRY_S, MIN_RESULT_TIMEOUT_S = 0.05, 0.005
-"""Pause before a call to a lost replica is repeated; shortest timeout for a result that may already be available."""
+"""Pause before a call to a lost replica is repeated, and shortest timeout for a result that may be available."""
 
 MAX_WAIT_S = 86_400
 
@@ -55,7 +55,7 @@ class ReplicaSettings:
 
     Attributes:
         replicas: Smallest number of replicas of each shard.
-        max_replicas: Largest number when requests wait; None: `replicas`.
+        max_replicas: Largest number when requests wait; None for `replicas`.
         cpus: CPUs that Ray reserves for each replica.
         max_ongoing_requests: Largest number of concurrent requests of a replica.
         wait_s: Longest wait for an answer, in seconds.
@@ -176,7 +176,7 @@ class RayShardGroup:
         from ray.serve.exceptions import RayServeException
 
         while True:
-            try:  # a result that arrived while another shard was awaited counts, even after the deadline
+            try:  # a result that arrived while another shard was awaited is used, even after the deadline
                 return response.result(timeout_s=max(MIN_RESULT_TIMEOUT_S, until - time.monotonic()))
             except TimeoutError:
                 response.cancel()

@@ -42,7 +42,7 @@ def ray_session(cpus: int | None = None) -> Iterator[Any]:
     here, on 127.0.0.1 only, and ends with the block. An existing connection of this process is reused and stays open.
 
     Args:
-        cpus: CPUs of a Ray that is started here; None: all.
+        cpus: CPUs of a Ray that is started here; None for all.
 
     Raises:
         BadInput: Ray is not installed.

@@ -42,7 +42,7 @@ def train_on_ray(
         resume: As for `train`.
         cache: As for `train`.
         workers: Number of ranks.
-        cpus: CPUs of a Ray that is started here; None: all.
+        cpus: CPUs of a Ray that is started here; None for all.
 
     Raises:
         BadInput: Ray is not installed, or `workers` is less than 1.

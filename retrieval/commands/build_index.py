@@ -33,9 +33,9 @@ def build_index(
         str | None,
         typer.Option(
             metavar="RULE",
-            help="where a photo's path names its object: folder (first folder, else the file name), stem (file name "
-            "without its number), or a pattern such as {split}/{object}/{photo} or {object}_{view}.jpg (default: the "
-            "rule of the existing index, else folder)",
+            help="rule that finds the object's name in a photo's path. folder: the first folder, or the file name if "
+            "there is none; stem: the file name without its number; or a pattern such as {split}/{object}/{photo} or "
+            "{object}_{view}.jpg (default: the rule of the existing index, else folder)",
         ),
     ] = None,
     model: Model = None,
@@ -43,7 +43,8 @@ def build_index(
     kind: Annotated[
         str | None,
         typer.Option(
-            help=f"candidate index: {', '.join(KINDS)} (default: exact, unless --min-recall or --max-ms needs another)"
+            help=f"kind of the candidate index: {', '.join(KINDS)} (default: flat, exact search with FAISS; with "
+            "--min-recall or --max-ms a faster kind if needed)"
         ),
     ] = None,
     min_recall: Annotated[

@@ -1,4 +1,4 @@
-"""`retrieve collect`: a recording, by a rig on its own; or labelled pictures of simulated objects."""
+"""`retrieve collect`: collect a recording with a rig, or labelled pictures of simulated objects."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -40,7 +40,7 @@ def collect(
         ),
     ] = False,
 ) -> None:
-    """Collect a recording with an unattended rig. Resumes a stopped run."""
+    """Collect a recording with a rig, or resume it. A real rig asks you to change the objects; stay next to it."""
     if dry_run:
         ignored = {"gate": gate, "preview": preview, "photos_only": photos_only, "touches_only": touches_only}
         refuse_options("has no effect with --dry-run, which moves and records nothing; leave it out", **ignored)
@@ -60,7 +60,8 @@ def collect(
     from robot.recording.attempt_log import acceptance_table
     from robot.rig import load_rig
 
-    # Next to the recording: every image inside belongs to a grasp. "." and ".." have no name to extend.
+    # The contact sheet is written next to the recording folder, because every image inside it belongs to a grasp. The
+    # paths "." and ".." have no name to extend.
     folder = out if out.name not in ("", "..") else out.resolve()
     sheet = folder.with_name(f"{folder.name}-preview.png")
     if preview:

@@ -1,4 +1,4 @@
-"""`retrieve demo`: the whole job on the simulated rig, with the commands that a user would type.
+"""`retrieve demo`: all steps on the simulated rig, with the commands that a user would type.
 
 The rig collects grasps of objects that the shipped checkpoint was not trained on. The photos of each object's first
 grasps make up the catalogue, the touches of its last grasps are the queries. No grasp provides both.
@@ -41,7 +41,7 @@ def demo(
         bool, typer.Option("--serve", help="then serve the index and open its page, until Ctrl-C")
     ] = False,
 ) -> None:
-    """Run the whole job on the simulated rig and write an HTML page."""
+    """Run all steps on the simulated rig, from collection to query, and write an HTML page."""
     from retrieval.data.dataset import load_grasps
 
     demo_files = {"recording", "recording-preview.png", "catalog", "index", "index-history", "state", "query.html"}
@@ -125,7 +125,7 @@ def _accuracy_summary(index: Path, queries: "dict[str, list[Grasp]]") -> str:
         touches = [[grasp.touches for grasp in grasps] for grasps in queries.values()]
         answers = searcher.query_many(touches, top=gallery)
     ranked = [[match.object_id for match in answer.results] for answer in answers]
-    # Without contact an answer has no results: such a query counts as ranked after all objects.
+    # Without contact an answer has no results: such a query gets the rank after all objects.
     ranks = [names.index(name) if name in names else gallery for name, names in zip(queries, ranked, strict=True)]
     matched = [rank for rank, answer in zip(ranks, answers, strict=True) if answer.verdict == MATCH]
     count, first, five = len(ranks), ranks.count(0), sum(rank < 5 for rank in ranks)

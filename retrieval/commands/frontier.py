@@ -1,4 +1,4 @@
-"""`retrieve frontier`: measure error against run time of every approximation, for one model and recording."""
+"""`retrieve frontier`: measure the error and the run time of each approximation, for one model and recording."""
 
 import os
 from collections.abc import Collection, Mapping, Sequence
@@ -35,7 +35,7 @@ def frontier(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Measure error against run time of every approximation; write plots and a page. Resumes a stopped run."""
+    """Plot the error of each approximation against its run time, on a page. Resumes a stopped run."""
     document = run_frontier(out, model=model, recording=recording, only=only or (), quick=quick)
     if json:
         print_json(document)
@@ -56,7 +56,7 @@ def run_frontier(
     Args:
         out: Folder of the results. A second run continues from them.
         model: The value of `--model`.
-        recording: Grasps of objects that the model was not trained on. None collects a few on the simulated rig, if
+        recording: Grasps of objects that the model was not trained on. None to collect a few on the simulated rig, if
             a row needs them.
         only: Names of rows; empty for all.
         quick: Measure the smallest sizes only.

@@ -76,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code.
 
     Args:
-        argv: Words after the program name; None reads `sys.argv`.
+        argv: Words after the program name; None for those of `sys.argv`.
     """
     # A stream that the shell closed (`2>&-`) is None, and printing to None prints to stdout.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115

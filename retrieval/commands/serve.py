@@ -63,7 +63,9 @@ def serve(
     ] = None,
     queue: Annotated[
         int,
-        typer.Option(parser=COUNT, help="maximum number of waiting and running requests; further ones get status 429"),
+        typer.Option(
+            parser=COUNT, help="maximum number of waiting and running requests; further requests are answered with 429"
+        ),
     ] = 8,
     workers: Annotated[int, typer.Option(parser=WORKERS, help="requests that run in parallel")] = 1,
     batch_ms: Annotated[

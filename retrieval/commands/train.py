@@ -52,7 +52,7 @@ def train(
         typer.Option(parser=SEED, help="seed of split, pairs and weights (default: that of the configuration)"),
     ] = None,
     split: SplitFile = None,
-    resume: Annotated[bool, typer.Option("--resume", help="continue an unfinished training of --out")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="continue an unfinished training run of --out")] = False,
     cache: Annotated[
         Path | None,
         typer.Option(help="folder that stores decoded images for later training runs; for towers that are not frozen"),

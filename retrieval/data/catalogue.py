@@ -54,7 +54,7 @@ class CataloguePhoto:
 class PhotoTable(Sequence[CataloguePhoto]):
     """Photos stored in columns; indexing makes a `CataloguePhoto`.
 
-    The garbage collector would traverse a hundred thousand separate objects again and again.
+    Columns are used because the garbage collector would otherwise traverse 100,000 Python objects again and again.
 
     Attributes:
         paths: N paths relative to the catalogue.
@@ -160,7 +160,7 @@ def list_catalogue(
 
     Args:
         folder: The catalogue folder.
-        naming: Rule that names the object of each photo; by folder where None.
+        naming: Rule that names the object of each photo; None for the rule "folder".
         folder_cache: Names that earlier builds listed in unchanged folders; this call updates it.
 
     Raises:
@@ -281,10 +281,12 @@ def _no_photo_error(where: str, found: _FileGroups, naming: Naming) -> DatasetEr
             f"no photo in {where} fits --objects-from {naming.text}; the first of {len(found.unfit)}: "
             f"{found.unfit[0]}. Use folder, stem, or a pattern for paths like this one"
         )
-    others = f"{len(found.ignored)} other files" + (f" such as {found.ignored[0]}" if found.ignored else "")
+    others = f", only {len(found.ignored)} other file(s) such as {found.ignored[0]}" if found.ignored else ""
+    if not found.ignored and not found.skipped:
+        others = ", and no other file"
     left_out = "".join(f"; {item.path}: {item.reason}" for item in found.skipped[:1])
     kinds = ", ".join(sorted(EXTENSIONS))
-    return DatasetError(f"no photo ({kinds}) in the catalogue {where}, only {others}{left_out}: {_LAYOUT}")
+    return DatasetError(f"no photo ({kinds}) in the catalogue {where}{others}{left_out}: {_LAYOUT}")
 
 
 def read_photo(catalogue: Catalogue, photo: CataloguePhoto) -> PhotoBytes | SkippedPhoto:
@@ -304,7 +306,7 @@ def decode_photo(file: PhotoBytes, decode: Callable[[bytes, str], RgbImage] = de
         decode: Function of (bytes, name in messages).
 
     Returns:
-        The result of `decode`, by default (H, W, 3) float32 in 0..1; a SkippedPhoto where it raises ImageError.
+        The result of `decode`, by default (H, W, 3) float32 in 0..1; a SkippedPhoto if it raises ImageError.
     """
     try:
         return decode(file.data, file.photo.path)

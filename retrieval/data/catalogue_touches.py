@@ -35,7 +35,7 @@ class CatalogueTouch:
 def touch_name(path: str, naming: Naming) -> tuple[str, str] | None:
     """Return a gel image's touch name (with its folder) and finger ("" for one finger), or None for a photo.
 
-    A picture outside every folder is a photo, and so is every picture where the file stem names the object.
+    A picture outside every folder is a photo, and so is every picture if the file stem names the object.
     """
     if "/touch_" not in path or naming.text == STEM:
         return None

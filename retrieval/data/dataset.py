@@ -73,8 +73,8 @@ class Attempt:
     """One closing of the gripper, successful or not.
 
     Attributes:
-        outcome: "held"; or the failure: "missed", "slipped", "no_plan", or "failed" for an unspecified one; "unknown"
-            where nothing is recorded.
+        outcome: "held"; or the failure: "missed", "slipped", "no_plan", or "failed" for another one; "unknown" if
+            nothing is recorded.
         accepted: Whether a matcher is trained on it.
         after: Frames after the lift, one file per finger in order, or empty.
     """
@@ -151,7 +151,7 @@ def finger_count(grasps: Sequence[Grasp]) -> int:
 
 
 def data_digest(grasps: Iterable[Grasp]) -> str:
-    """Return the SHA-256 (hex) of ids and image bytes; recordings with equal digests give equal trainings."""
+    """Return the SHA-256 (hex) of ids and image bytes; training on recordings with equal digests is equal."""
     digest = hashlib.sha256()
     for grasp in grasps:
         digest.update(json.dumps([grasp.grasp_id, grasp.object_id, grasp.sequence_id]).encode())
@@ -279,8 +279,8 @@ class PairSampler:
 
     With `share_photos`, the negatives of a training batch are positives of its other objects. The probability of each
     object and photo stays the same, since a batch draws both uniformly. But 6 touches need 24 encoded photos instead of
-    up to 48. The variance of the head's gradient over batches is 0.6 times the other's at the start of training and
-    1.06 times at its end (shipped checkpoint's features). Use it where training encodes photos with a tower.
+    up to 48. The variance of the head's gradient over batches is 0.6 times that without `share_photos` at the start of
+    training and 1.06 times at its end (shipped checkpoint's features). Use it if training encodes photos with a tower.
     """
 
     def __init__(
@@ -368,7 +368,7 @@ class PairSampler:
             yield [(index, photo, 1.0) for photo in drawn] + [(*negative, 0.0) for negative in negatives]
 
     def _positives(self, index: int, rng: np.random.Generator) -> list[Path]:
-        """Draw matching photos, without replacement where the object has enough of them."""
+        """Draw matching photos, without replacement if the object has enough of them."""
         photos = self.photos[index]
         chosen = rng.choice(len(photos), self.positives, replace=len(photos) < self.positives)
         return [photos[int(row)] for row in chosen]

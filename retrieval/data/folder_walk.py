@@ -39,8 +39,8 @@ class FolderWalk:
     def walk(self, folder: str, prefix: str) -> None:
         """Add the files of a folder and its subfolders to `names`, with `prefix` before each name.
 
-        A link to a folder is followed when it leads out of the catalogue. Each target is walked once, so no loop
-        can hang.
+        A link to a folder is followed when it leads out of the catalogue. Each target is walked once, so links
+        that form a loop cause no endless walk.
 
         Raises:
             DatasetError: The folder cannot be listed.

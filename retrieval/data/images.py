@@ -1,8 +1,8 @@
 """Decode picture files to float32 RGB in 0..1.
 
 Pillow reads and checks every file. Pillow keeps only the high byte of 16-bit colour, so OpenCV decodes such samples a
-second time, after Pillow has loaded the whole file. (OpenCV alone would fill the missing part of a truncated JPEG with
-grey, without an error.) Colour profiles and gamma chunks are not applied.
+second time, after Pillow has loaded the whole file. (OpenCV fills the missing part of a truncated JPEG with grey,
+without an error.) Colour profiles and gamma chunks are not applied.
 """
 
 import io
@@ -29,9 +29,9 @@ _AVIF_BRANDS = frozenset({b"avif", b"avis"})
 _HEIC_BRANDS = frozenset({b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1"})
 EXTENSIONS = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"}) | AVIF_EXTENSIONS | HEIC_EXTENSIONS
 MAX_PIXELS = 20_000_000
-"""Of a decoded picture: 240 MB in float32. A larger JPEG file is decoded at 1/2, 1/4 or 1/8 of its size."""
+"""Maximum pixels of a decoded picture: 240 MB in float32. Larger JPEG files are decoded at 1/2, 1/4 or 1/8 size."""
 MAX_DRAFT_PIXELS = 160_000_000
-"""Of a JPEG file that is decoded at a smaller size."""
+"""Maximum pixels of a JPEG file that is decoded at a smaller size."""
 MAX_SIDE, MAX_ASPECT = 65_535, 200
 """Largest side in pixels (the limit of JPEG), and largest ratio of the longer to the shorter side."""
 MAX_BYTES = 512 * 2**20
@@ -110,8 +110,8 @@ def decode_rgb(data: bytes, name: str | Path, min_side: int | None = None) -> Rg
         data: Bytes of the file.
         name: Name of the picture in messages.
         min_side: A JPEG file is decoded at 1/8, 1/4 or 1/2 of its size by its cosine transform, as long as the shorter
-            side keeps this many pixels; each pixel is then nearly the mean of its area. None: only a picture that is
-            too large is decoded smaller.
+            side keeps this many pixels; each pixel is then nearly the mean of its area. None to decode only pictures
+            smaller that are too large.
 
     Raises:
         ImageError: The bytes are not a picture that can be decoded.
@@ -195,8 +195,8 @@ def _reason(error: BaseException) -> str:
 def _register_decoder(data: bytes, name: str | Path) -> str | None:
     """Register the decoder of HEIF or AVIF bytes with Pillow and return its name; None for any other picture.
 
-    Both kinds of file begin with a box of type "ftyp" that lists their brands. Raises ImageError where the decoder is
-    not installed.
+    Both kinds of file begin with a box of type "ftyp" that lists their brands. Raises ImageError if the decoder is not
+    installed.
     """
     if data[4:8] != b"ftyp":
         return None

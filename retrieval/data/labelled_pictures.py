@@ -28,7 +28,7 @@ KINDS = ("photo", "touch")
 FAMILIES = ("relief", "shape")
 SIZES = ("pitch_mm", "amplitude_mm", "aspect", "sharpness")
 MIN_AMPLITUDE_MM = 0.05
-"""A smaller amplitude counts as this one."""
+"""Smaller amplitudes are raised to this one."""
 SIZE_WEIGHTS = (2.0, 1.0, 1.0, 0.5)
 """Weights of the squared differences in `LabelledPicture.size_targets`, each in standard deviations. The pitch is most
 visible in photos and gel images."""
@@ -136,7 +136,7 @@ def pair_by_label(photos: Path, touches: Path, fingers: int) -> list[Grasp]:
     """Make grasps of labelled pictures: pair each touch with the photo of the most similar object, and vice versa.
 
     The most similar object has the same relief and the nearest sizes; another shape adds SHAPE_MISMATCH_DISTANCE. A
-    picture is left out where no object on the other side has its relief. The photographed object names the grasp's
+    picture is left out if no object on the other side has its relief. The photographed object names the grasp's
     object, `like <object_id>`, so that two touches with one photo have one object.
 
     Args:

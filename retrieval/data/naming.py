@@ -62,7 +62,7 @@ class Naming:
             raise BadInput(f"two words of a pattern must have text between them, {example}; got {self.text!r}")
 
     def object_of(self, path: str) -> str | None:
-        """Return the object of the photo at `path` (forward slashes), or None where the path does not fit the rule."""
+        """Return the object of the photo at `path` (forward slashes), or None if the path does not fit the rule."""
         if self.text == FOLDER:
             first, _, rest = path.partition("/")
             if first not in ("", ".") and rest.strip("./"):  # fast way for most paths

@@ -1,6 +1,6 @@
 """Bounds on the structure of a picture file, checked before decoding.
 
-The size of a file alone does not bound the work. A JPEG file of 1.5 MB can contain 40,000 scans, and each scan
+The size of a file does not bound the work. A JPEG file of 1.5 MB can contain 40,000 scans, and each scan
 processes all pixels. A PNG file of 19 MB can contain 1.6 million empty chunks, and Pillow parses each one in Python.
 Every check here takes time in proportion to the file, most of it in C.
 """
@@ -13,16 +13,17 @@ from pathlib import Path
 from retrieval.errors import ImageError
 
 MAX_SCANS = 50
-"""Of a JPEG file. Encoders write 1 to 20."""
+"""Maximum number of scans of a JPEG file; encoders write 1 to 20."""
 MAX_SEGMENTS = 256
-"""Segments of a JPEG file, and chunks of a PNG file, before its pixels: 16 MB at 64 kB each."""
+"""Maximum number of segments (JPEG) or chunks (PNG) before the pixels of a file: 16 MB at 64 kB each."""
 MAX_STRAY_BYTES = 1 << 16
-"""Between the segments before a JPEG file's pixels, where Pillow reads them one by one."""
+"""Maximum number of bytes between the segments before a JPEG file's pixels; Pillow reads them one by one."""
 BYTES_PER_CHUNK = 1024
 """Smallest mean size of a PNG chunk after the first MAX_SEGMENTS chunks. Encoders write 8 kB or more."""
 MAX_TIFF_TAGS = 1000
 MAX_TIFF_NUMBERS = 500_000
-"""In all tags together, such as the offsets of strips: 20 million pixels in tiles of 16 x 16 need 156,250."""
+"""Maximum number of values (such as offsets of strips) in all tags together: 20 million pixels in tiles of 16 x 16 need
+156,250."""
 
 _JPEG, _PNG, _SCAN = b"\xff\xd8", b"\x89PNG\r\n\x1a\n", 0xDA
 _MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")

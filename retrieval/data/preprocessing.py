@@ -28,7 +28,7 @@ _SUBTRACT: dict[str, Callable[[RgbImage, RgbImage], RgbImage]] = {
     "abs": lambda touch, reference: np.abs(touch - reference),
 }
 BACKGROUNDS = ("none", *_SUBTRACT)
-"""Policies for a touch T and its no-contact frame R: T alone; T - R in -1..1; T - R + 0.5, clipped; |T - R|."""
+"""Policies for a touch T and its no-contact frame R: T; T - R in -1..1; T - R + 0.5, clipped; |T - R|."""
 
 
 def subtract_background(touch: RgbImage, reference: RgbImage | None, policy: str) -> RgbImage:
@@ -107,7 +107,7 @@ class Preprocessing:
         content = {"version": PREPROCESSING_VERSION, **self.to_dict()}
         if self.views == ("whole",):  # keeps the digest of checkpoints without this setting
             del content["views"]
-        if not self.reduced:  # likewise
+        if not self.reduced:  # as above
             del content["reduced"]
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 

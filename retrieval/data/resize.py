@@ -1,4 +1,4 @@
-"""Resize pictures: the mean of the area where an axis shrinks, linear interpolation where it grows."""
+"""Resize pictures: the mean of the area along an axis that shrinks, linear interpolation along one that grows."""
 
 from typing import TypeAlias
 

@@ -97,7 +97,7 @@ def list_photos(where: str | Path, naming: Naming | None = None, folder_cache: F
 
     Args:
         where: A folder or URL, as described at the top of this module.
-        naming: Rule that names the object of each photo; by folder where None.
+        naming: Rule that names the object of each photo; None for the rule "folder".
         folder_cache: As for `list_catalogue`; for folders on this machine only.
 
     Raises:
@@ -151,7 +151,7 @@ def _list_folder(url: str, naming: Naming) -> Catalogue:
 def _make_remote_catalogue(
     url: str, photos: Sequence[tuple[CataloguePhoto, str | None]], naming: Naming, source: Source
 ) -> RemoteCatalogue:
-    """Return the catalogue of photos, each with an object id or None; the naming rule applies where it is None."""
+    """Return the catalogue of photos, each with an object id or None; the naming rule applies if it is None."""
     found, skipped, paths_seen = list[CataloguePhoto](), list[SkippedPhoto](), set[str]()
     for photo, object_id in photos:
         name = object_id or naming.object_of(photo.path)
@@ -160,7 +160,7 @@ def _make_remote_catalogue(
         elif photo.path in paths_seen:
             skipped.append(SkippedPhoto(photo.path, "is listed twice"))
         elif not is_inside(photo.path):
-            skipped.append(SkippedPhoto(photo.path, "its name leads out of the catalogue"))
+            skipped.append(SkippedPhoto(photo.path, "its path is outside the catalogue"))
         elif not name:
             skipped.append(SkippedPhoto(photo.path, f"does not fit --objects-from {naming.text}"))
         else:
@@ -262,7 +262,7 @@ _Row = tuple[CataloguePhoto, str | None, tuple[str, int, int]]
 
 
 def _list_parquet(file: str) -> tuple[str, list[_Row]]:
-    """Return the column with pictures ("" where rows name files), and the rows.
+    """Return the column with pictures ("" if rows name files), and the rows.
 
     Each row is (photo, object id or None, place), with the place as in `ParquetSource`.
     """

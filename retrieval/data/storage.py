@@ -54,7 +54,7 @@ def file_system(url: str) -> tuple[Any, str]:
 
 
 def retry(what: str, function: Callable[[], T]) -> T:
-    """Return the result of `function`, and retry it where the storage fails.
+    """Return the result of `function`, and retry it if the storage fails.
 
     Args:
         what: Name of the request in messages.

@@ -27,11 +27,11 @@ _SIDE = 128
 _RING = 6
 _GAMMA = 2.2
 _SHADE_TINT = 0.22
-"""Largest shift of the ground's colour between red and blue under sky light alone."""
+"""Largest shift of the ground's colour between red and blue if only the sky lights it."""
 _DARKEST_SHADE = -1.6
 """Logarithm of the darkest shadow's lightness relative to the ground."""
 _DIFFERENCE_THRESHOLDS = (4.0, 3.5)
-"""Deviations of the ground's colour, and lightness, from which a pixel counts as the object's."""
+"""Deviations of the ground's colour, and lightness, from which a pixel is assigned to the object."""
 
 Grey = NDArray[np.float32]
 
@@ -200,7 +200,7 @@ def tile_views(image: Samples, names: Sequence[str], px: int, box: PixelBox | No
         image: The photo.
         names: Names of the views.
         px: Side of each view in pixels.
-        box: The object's box; None searches it.
+        box: The object's box; None to search for it.
     """
     if box is None:
         box = PixelBox(0, 0, 0, 0) if set(names) == {"whole"} else find_object(image)

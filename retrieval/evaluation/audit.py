@@ -50,10 +50,10 @@ def audit(grasps: Sequence[Grasp], split: Split, *, quiet: bool = False) -> dict
         * shared: sentences about objects and sequences that are in two parts.
         * identical: {"count": files with equal bytes in two parts, "examples": lists of "part: grasp_id kind"}.
         * frames: by kind {"test", "train_validation": counts, "to_train_validation", "within_object": distances at
-          `quantiles`, null where there is no pair to compare, "checked": test frames with enough detail to recognise a
+          `quantiles`, null if there is no pair to compare, "checked": test frames with enough detail to recognise a
           copy, "near_copies": checked frames that have one, "nearest": the nearest pairs of checked frames, one for
           each test object}. "train_validation" means training and validation objects together.
-        * quantiles, unit: what the distances mean.
+        * quantiles, unit: definition of the distances.
         * clean: whether the audit found no leakage; verdict: the result as a sentence.
 
     Raises:

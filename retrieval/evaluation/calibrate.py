@@ -3,7 +3,7 @@
 Ranking does not need calibration. A pair of a touch and a photo has calibrated log-odds, `slope * score + intercept`.
 The posterior over objects and "none of these" is that of queries (`retrieval.model.posterior`). Both are fitted
 separately for each number of grasps, because each method combines the scores of several grasps in its own way: a set
-counts as one grasp with the score of the set.
+is treated as one grasp with the score of the set.
 """
 
 from collections.abc import Mapping, Sequence
@@ -118,7 +118,7 @@ def pair_rule(best_params: Mapping[str, Any], validation: ScoreTable, *, seed: i
     Args:
         best_params: Parameters of the method; "pair_threshold" is the checkpoint's own threshold.
         validation: Scores of validation objects. Fewer than `MIN_THRESHOLD_OBJECTS` objects give no rule, because a
-            threshold between so few objects is arbitrary.
+            threshold for so few objects is arbitrary.
         seed: Seed of the drawn pairs.
     """
     if (own := best_params.get("pair_threshold")) is not None:
@@ -141,7 +141,7 @@ def has_enough_objects(table: ScoreTable) -> bool:
 
 
 def posterior_questions(table: ScoreTable, seed: int = 0) -> IdentificationTrials:
-    """Return an identification trial for every row that has a target photo; a row counts as one grasp.
+    """Return an identification trial for every row that has a target photo; a row is one grasp.
 
     Args:
         table: The scores.
@@ -202,7 +202,7 @@ def draw_k_way_tests(
         table: The scores.
         choice: The kind of test.
         seed: Seed of the draw.
-        posterior: Combines the scores of a candidate's photos into one logit; None takes their mean.
+        posterior: Combines the scores of a candidate's photos into one logit; None for their mean.
 
     Returns:
         Scores (Q, k) of the candidates, the true one first. With fewer than k objects all of them are candidates.

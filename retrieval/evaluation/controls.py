@@ -1,7 +1,7 @@
 """Controls and ceilings, reported next to the result.
 
-A control runs the same method on inputs without the information that the method should use. A ceiling measures how well
-each modality alone identifies the object, and so which modality limits the result.
+A control runs the same method on inputs that lack information that the method should use. A ceiling measures how well
+each single modality identifies the object, and so which modality limits the result.
 """
 
 import dataclasses

@@ -25,7 +25,7 @@ class EvaluationData:
         source: Source of the recording.
         digest: Digest of the grasps.
         grasps: All grasps.
-        pairs: Labelled pairs that train in addition to the training objects of the split.
+        pairs: Labelled pairs to train on, in addition to the training objects of the split.
         split: Training, validation and test objects.
         split_from: Origin of the split, in words.
         config: Configuration of the heads that are fitted.
@@ -60,7 +60,7 @@ def prepare(
         config: Configuration. With a model, the model's own configuration replaces it, except for the number of
             iterations and the paths of labelled pairs.
         model: A checkpoint.
-        split: The split; None takes the model's own, or draws one.
+        split: The split; None for the split of the model, or without a model for a random one.
         quiet: No progress on stderr.
 
     Raises:

@@ -40,7 +40,7 @@ from retrieval.training.batches import BatchImages
 from retrieval.training.features import encode_recording
 from retrieval.version import __version__
 
-BySeed = Mapping[str, Sequence[Predictions]]
+PredictionsByMethod = Mapping[str, Sequence[Predictions]]
 """Predictions by method, one for each training seed."""
 DRAWS = 10_000
 COMPARED_MEASURES = ("pair_accuracy", "topn_k5")
@@ -70,12 +70,12 @@ def evaluate(
         out: Folder of the results.
         config: Towers, heads and split: a `Config` (`Config.using` accepts your own towers and losses), or an argument
             of `load_config`. Its seed is the seed of every random draw.
-        preset: Name of the configuration in the report; None takes its own name.
+        preset: Name of the configuration in the report. Default: the configuration's name.
         methods: Names, or your own classes, which the report lists by class name.
         model: A checkpoint to evaluate instead of one that is fitted here.
-        seeds: Number of trainings of each method; the first seed is that of `config`.
-        split: Objects of each part; None takes the model's own split, or draws one.
-        cache: Folder of encoded features; None takes `out`/features.
+        seeds: Number of training runs of each method; the first seed is that of `config`.
+        split: Objects of each part. Default: the split of `model`; without a model, a random split.
+        cache: Folder of encoded features. Default: `out`/features.
         quiet: No progress on stderr.
 
     Returns:
@@ -187,7 +187,7 @@ def _about(data: EvaluationData, experiment: Experiment, preset: str, seeds: lis
     }
 
 
-def _score_methods(experiment: Experiment, predictions: BySeed, seed: int, quiet: bool) -> dict[str, Any]:
+def _score_methods(experiment: Experiment, predictions: PredictionsByMethod, seed: int, quiet: bool) -> dict[str, Any]:
     """Return "methods" and "comparisons" of results.json."""
     entries: dict[str, Any] = {}
     measures: dict[str, list[Measures]] = {}
@@ -211,9 +211,9 @@ def _compare_methods(measures: Mapping[str, list[Measures]], seed: int) -> list[
     ]
 
 
-def _timings(data: EvaluationData, predictions: BySeed) -> dict[str, Any]:
+def _timings(data: EvaluationData, predictions: PredictionsByMethod) -> dict[str, Any]:
     found = {name: _method_times([one.seconds for one in by_seed]) for name, by_seed in predictions.items()}
-    if {"late_fusion", "retrieve_rerank"} <= set(found):  # one training serves both
+    if {"late_fusion", "retrieve_rerank"} <= set(found):  # both use one training run
         found["retrieve_rerank"]["fit_s"] = found["late_fusion"]["fit_s"]
     return {
         "machine": {"cpus": os.cpu_count(), "threads": 1},

@@ -33,9 +33,9 @@ class Experiment:
         config: Configuration of the heads.
         split: Training, validation and test objects.
         features: Tower features of all grasps.
-        pairs: Features of labelled pairs that train in addition to the training objects.
+        pairs: Features of labelled pairs to train on, in addition to the training objects.
         queries: Touches and photos to score.
-        checkpoint: A whole model, which late fusion and methods with its weights then use; None fits them.
+        checkpoint: A whole model, which late fusion and methods with its weights then use; None to fit them.
         shuffled: Whether touches are permuted among the objects of each part before fitting, as a control.
         quiet: No progress on stderr.
         fit_on_validation: As in `MethodSettings`.

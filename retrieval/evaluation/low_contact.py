@@ -20,7 +20,7 @@ from retrieval.metrics.measure import Measure
 from retrieval.metrics.registry import MethodScoreTables, compute
 
 LOW_CONTACT_FRACTION = 0.05
-"""Fraction of the touches with the smallest gel change that counts as low-contact."""
+"""Fraction of the touches, those with the smallest gel change, that are called low-contact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ def gel_change(grasp: Grasp) -> float:
     """Return the mean absolute difference between gel image and no-contact frame, grey levels.
 
     Args:
-        grasp: A grasp with no-contact frames; of two fingers the larger change counts.
+        grasp: A grasp with no-contact frames; of two fingers, the larger change is returned.
 
     Raises:
         DatasetError: The two images differ in size.
@@ -86,7 +86,7 @@ def score_low_contact(
     """Return "low_contact" of results.json: measures of low-contact and other touches, by method.
 
     Args:
-        low_contact: The low-contact test touches; None gives None.
+        low_contact: The low-contact test touches; None if there are none, and then the result is None.
         queries: The queries of the evaluation.
         predictions: Predictions of each training seed, by method.
         draws: Resamples of an interval.

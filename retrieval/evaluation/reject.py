@@ -2,7 +2,7 @@
 
 Every row is scored twice: with its object in the gallery and without it. Both galleries have the same number of
 objects: a random rival is dropped from the gallery with the row's own object. In a larger gallery the best score is
-higher by chance alone, so that an uninformative scorer would seem better than chance.
+higher by chance, so that an uninformative scorer would seem better than chance.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Error against run time of every approximation of a search, measured with one model on one recording.
+"""Error and run time of every approximation of a search, measured with one model on one recording.
 
 A new approximation is one function from a `Sample` to an `ApproximationResult`, one row of `APPROXIMATIONS` and one
 test parameter. Approximations of kernels, which need no recording, are in `benchmarks/frontier/` of the repository.

@@ -28,7 +28,7 @@ def candidates(sample: Sample) -> ApproximationResult:
         )
     return ApproximationResult(
         "Candidates",
-        "The full classifier reranks only the k photos nearest in embedding. The reference reranks every photo. The "
+        "The fusion head reranks only the k photos nearest in embedding. The reference reranks every photo. The "
         "exhaustive top-1 is the photo that the reference ranks first.",
         (_missed_top1_panel(sample), _lost_top1_panel(sample)),
     )
@@ -105,7 +105,7 @@ def ranks(queries: Array, embeddings: Array, exhaustive_top1: NDArray[np.int64])
 
 
 def _lost_top1_panel(sample: Sample) -> Panel:
-    """Measure correct top-1 answers that fewer candidates lose; on real photos, as a blend has no object."""
+    """Measure the correct top-1 answers that are lost with fewer candidates, on real photos: blends have no object."""
     rows = sample.touch_rows[: sample.scale.queries]
     queries, partials, count = sample.touch_encodings(rows), sample.real_photo_codes["partial"], len(sample.photo_rows)
     points, works = list[Tradeoff](), list[Callable[[], object]]()

@@ -20,8 +20,8 @@ def time_points(
 ) -> tuple[Tradeoff, ...]:
     """Return the points, each with the median seconds of its work.
 
-    All works take turns, so that a busy moment slows all of them. Each runs once for warm-up. Short works are timed
-    over several runs together. Everything runs on one thread.
+    All works are run alternately, so that a busy moment slows all of them. Each runs once for warm-up. Short works are
+    timed over several runs together. Everything runs on one thread.
 
     Args:
         points: The points.

@@ -22,7 +22,7 @@ TimedPoint = tuple[Tradeoff, Callable[[], object]]
 
 
 def index_kinds(sample: Sample) -> ApproximationResult:
-    """Measure every kind and its ladder of settings on the blended catalogue, with the embedding in use."""
+    """Measure every kind with several settings on the blended catalogue, with the embedding in use."""
     used = [name for name in sample.catalogue.embeddings if is_used(sample, name)]
     if not used:
         return ApproximationResult("Kind of index", "", skipped="this model has no trained embeddings")
@@ -46,9 +46,9 @@ def index_kinds(sample: Sample) -> ApproximationResult:
     return ApproximationResult(
         "Kind of index",
         f"Search over {len(embeddings):,} blended photos by the {used[0]}. An answer needs the exhaustive top-1 of the "
-        "classifier among the candidates. Recall of nearest neighbours is the usual measure of such indexes, but a "
-        "different one. Exact search is the default unless `build-index` gets a time bound: it needs no training, and "
-        "its recall does not depend on the catalogue.",
+        "fusion head among the candidates. The usual measure of such indexes is another one: recall of nearest "
+        "neighbours. Exact search is the default unless `build-index` gets a bound for recall or time: it needs no "
+        "training, and its recall does not depend on the catalogue.",
         (
             _panel(
                 f"missed exhaustive top-1, k = {k:,} candidates", k, "every photo reranked", 100 / len(queries), of_top1

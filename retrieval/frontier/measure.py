@@ -35,15 +35,15 @@ def measure_frontier(
     model_free: Collection[str] = (),
     quiet: bool = False,
 ) -> dict[str, Any]:
-    """Measure error against run time of every approximation; write frontier.json, frontier.html and figures/.
+    """Measure the error and the run time of each approximation; write frontier.json, frontier.html and figures/.
 
     Stored rows are reused if software, model, recording, scale and machine are the same.
 
     Args:
         out: Folder of the results.
-        model: A checkpoint; None takes the shipped one.
+        model: A checkpoint; None for the shipped one.
         recording: Grasps of unseen objects; a function that returns the folder is called only if a row needs it.
-        only: Names of rows; empty takes all.
+        only: Names of rows; empty for all.
         photos: Number of photos of the catalogue that is blended from the recording.
         queries: Number of query touches for that catalogue.
         repeats: Number of timings; the result is their median.
@@ -92,7 +92,7 @@ def measure(
     Args:
         sample: Model, grasps and scale.
         out: Folder of the results.
-        only: Names of `table`; empty takes all.
+        only: Names of `table`; empty for all.
         table: Name -> "module:function" of each approximation.
         model_free: Names of rows that depend on neither the model nor the grasps.
 

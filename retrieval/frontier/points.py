@@ -75,7 +75,7 @@ class Panel:
         return next((point for point in self.points if point.is_default), None)
 
     def pareto(self) -> list[Tradeoff]:
-        """Return the points that no other point beats in both time and error, fastest first."""
+        """Return the Pareto front, fastest first: for its points, no other point is better in both time and error."""
         front: list[Tradeoff] = []
         for point in sorted(self.points, key=lambda point: (point.seconds, point.error)):
             if not front or point.error < front[-1].error:

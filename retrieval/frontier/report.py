@@ -23,7 +23,8 @@ _FLOOR = 0.5
 """An error of 0 is drawn at this fraction of the smallest measurable error."""
 
 LEGEND = (
-    "Lower left is better. The line joins the points that no other point beats in both time and error. The star marks "
+    "Lower left is better. The line is the Pareto front: for its points, no other point is better in both time and "
+    "error. The star marks "
     "the recommended point, the fastest within the tolerance (dashed); the ring marks the default. An open marker at "
     "the lower edge is a measured error of 0. Whiskers are 95 % intervals."
 )

@@ -193,7 +193,7 @@ class Sample:
 
     @cached_property
     def exhaustive_top1(self) -> NDArray[np.int64]:
-        """The photo of `catalogue` that the full classifier ranks first, for each of `queries`.
+        """The photo of `catalogue` that the fusion head ranks first, for each of `queries`.
 
         It is stored in `folder`, because it takes the longest.
         """
@@ -218,7 +218,7 @@ class Sample:
         Args:
             touch_partials: (partial_width,) of one touch or (G, partial_width) of several.
             photos: (N, partial_width) of the photos.
-            rows: Rows of `photos` to score; None scores all.
+            rows: Rows of `photos` to score; None for all.
         """
         return score_partials(
             self.checkpoint.matcher.head, torch.from_numpy(np.atleast_2d(touch_partials)), photos, rows

@@ -29,7 +29,7 @@ RANK_CUT = 1e-7
 LEADING_CUT = 1e-6
 """The same for singular values from a squared matrix."""
 MAX_ROWS, MAX_DIRECTIONS = 2048, 512
-"""Above so many items, only so many directions are used: all of them take minutes, and a ridge damps the others."""
+"""With more than MAX_ROWS items, only MAX_DIRECTIONS are used: all would take minutes, and a ridge damps the others."""
 RIDGES = (1e-3, 1e-2, 1e-1, 1e0, 1e1, 1e2)
 COMPONENTS = (8, 16, 32, 64, 128, 256)
 POWERS = (0, 1, 2, 4)

@@ -116,7 +116,7 @@ class ReducedFeatures:
         return cls(tuple(decompose(part, max_directions) for part in parts), tuple(blocks))
 
     def items(self, directions: int) -> Matrix:
-        """Return the items (n, k) in so many directions of each tower; the variances of each tower add up to 1."""
+        """Return the items (n, k) in `directions` directions of each tower; the variances of each tower add up to 1."""
         columns = slice(directions)
         parts = [view.left[:, columns] * view.singular[columns] / _size(view, directions) for view in self.views]
         return np.concatenate(parts, axis=1)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MAX_STEPS, VALIDATE_EVERY = 800, 40
 LEARNING_RATE = 1e-3
 OBJECTS_PER_BATCH, IMAGES_PER_OBJECT = 64, 2
-"""A batch contains each object at most once, with so many of its touches and as many of its photos."""
+"""A batch contains each object at most once, with IMAGES_PER_OBJECT of its touches and of its photos."""
 REGULARISATIONS = ((0.5, 0.0), (0.8, 0.0), (0.9, 0.0), (0.8, 1.0))
 """Pairs of feature dropout and weight decay to choose from."""
 

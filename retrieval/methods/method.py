@@ -25,7 +25,7 @@ class MethodSettings:
     Attributes:
         config: Towers, head and training.
         seed: Seed of the fit.
-        folder: Where the method may store files, such as a checkpoint; None: it stores nothing.
+        folder: Folder in which the method may store files, such as a checkpoint; None to store nothing.
         quiet: Show no progress on stderr.
         fit_on_validation: A method that can (`cca_towers`, `cca`, `cca_pca`) also fits on validation objects once its
             settings are chosen. A calibration on their scores is then overconfident.
@@ -150,7 +150,7 @@ class Method(ABC):
 
 
 def sum_over_sets(scores: Array, sets: NDArray[np.int64]) -> Array:
-    """Return sums (S, N) over sets (S, G) of rows of scores (T, N), in float64: order must not decide near-ties."""
+    """Return sums (S, N) over sets (S, G) of rows of scores (T, N); in float64, near-ties do not depend on order."""
     total = np.zeros((len(sets), scores.shape[1]))
     for rows in sets.T:
         total += scores[rows]

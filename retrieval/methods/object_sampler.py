@@ -36,7 +36,7 @@ class ObjectSampler:
         return torch.randperm(self.objects, generator=self._generator)[:count]
 
     def other_objects(self, objects: Tensor, each: int) -> Tensor:
-        """Return (B, each): for each of `objects` (B,) so many others, uniformly, with replacement."""
+        """Return (B, each): for each of `objects` (B,) other objects, uniformly, with replacement."""
         drawn = torch.randint(self.objects - 1, (len(objects), each), generator=self._generator)
         return drawn + (drawn >= objects[:, None])
 

@@ -36,10 +36,10 @@ def ranking_auc(
         scores: (T, N).
         touch_owner: (T,) objects.
         photo_owner: (N,) objects.
-        excluded: (T, N) photos of the row's own grasps, which do not count unless the object has no other.
+        excluded: (T, N) photos of the row's own grasps, which are ignored unless the object has no other.
 
     Raises:
-        NumericalError: A score is not finite. A NaN would count as a loss.
+        NumericalError: A score is not finite. A NaN would be treated as a loss.
     """
     bad = np.flatnonzero(~np.isfinite(scores).all(axis=1))
     if len(bad):
@@ -98,7 +98,7 @@ def held_out_folds(
     """Return the objects in four folds, or two: of each kind, every second object is in one fold, the rest in another.
 
     A held-out object is easier to identify than a user's next object if all similar objects are in the training set. So
-    half of the objects of a kind are held out together, while the other half trains.
+    half of the objects of a kind are held out together, and the fit uses the other half.
 
     Args:
         features: Features of grasps.

@@ -1,1 +1,1 @@
-"""Measures of rankings and probabilities, with confidence intervals, in numpy alone."""
+"""Measures of rankings and probabilities, with confidence intervals; they need only numpy."""

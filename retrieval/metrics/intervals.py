@@ -138,7 +138,7 @@ def compare(
 def sign_flip_p(differences: NDArray[np.float64], *, draws: int = 10_000, seed: int = 0) -> float:
     """Return the fraction of sign flips of the differences (R,) whose mean is as far from 0 as the observed one."""
     observed = abs(differences.sum())
-    # Sums of the same numbers in another order differ by rounding; they count as equal.
+    # Sums of the same numbers in another order differ by rounding; they are treated as equal.
     threshold = observed - 1e-12 * np.abs(differences).sum()
     if len(differences) <= _EXACT_UP_TO:
         return float((np.abs(_flipped_sums(differences)) >= threshold).mean())

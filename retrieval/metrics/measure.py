@@ -48,7 +48,7 @@ def pooled(parts: Sequence[Measure], units: Sequence[Mapping[int, int]] | None =
     Args:
         parts: The measures.
         units: For each part, the unit that replaces an object's number: the object, or a group of objects that are
-            correlated. None keeps the numbers.
+            correlated. None for the objects' own numbers.
 
     Raises:
         BadInput: There are no parts.

@@ -48,7 +48,7 @@ class Calibration:
         """Return the calibrated log-odds of match logits.
 
         Raises:
-            NumericalError: A logit is not finite. It would exceed no threshold, and count as "no match".
+            NumericalError: A logit is not finite. It would exceed no threshold, and be classified as "no match".
         """
         z = np.asarray(logit, dtype=np.float64)
         if not np.isfinite(z).all():
@@ -162,7 +162,7 @@ def reliability_bins(probability: ArrayLike, outcomes: ArrayLike) -> dict[str, A
 
     Args:
         probability: (P,) predicted probabilities.
-        outcomes: (P,) 1 or 0, or a fraction where ties were broken at random.
+        outcomes: (P,) 1 or 0, or a fraction if ties were broken at random.
 
     Returns:
         {"ece", "bins": [{"probability", "frequency", "count"}]}. The expected calibration error is the mean of

@@ -1,8 +1,9 @@
-"""Protocols: from a table of scores to the values of every query, with gallery and chance.
+"""Evaluation metrics: each turns a score table into one value per query, with its gallery and the value of chance.
 
 The gallery of a row excludes the photos of its own grasps, which have object, light and pose in common with it. The
 protocols `with_own` and `paired` of other benchmarks include them. A row without any other photo of its object is no
-query; the description of the gallery counts such rows. Objects have equal weight: each is as often a rival.
+query; the description of the gallery states their number. Other objects have equal weight, however many photos they
+have.
 """
 
 import numpy as np
@@ -29,7 +30,7 @@ def pair_accuracy(table: ScoreTable, rule: Calibration | Threshold) -> Measure:
     """
     queries = table.with_targets
     odds = rule.log_odds(queries.scores)
-    own, others = _own_and_other_means(queries, (np.sign(odds) + 1) / 2)
+    own, others = _same_and_other_object_means(queries, (np.sign(odds) + 1) / 2)
     return _measure(table, (own + 1 - others) / 2, 0.5)
 
 
@@ -45,12 +46,15 @@ def pair_auc(table: ScoreTable) -> Measure:
     return _measure(table, np.array(values), 0.5)
 
 
-def _own_and_other_means(
+def _same_and_other_object_means(
     table: ScoreTable, values: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return means (T,) of values (T, N) over a row's own object and over the others, without its own photos."""
-    mine = table.relevant & ~table.own
-    return (values * mine).sum(1) / mine.sum(1), (values * _rival_weights(table)).sum(1)
+    """Return means (T,) of values (T, N) over the photos of a row's object and over those of the other objects.
+
+    Photos of the row's own grasps are excluded.
+    """
+    same_object = table.relevant & ~table.own
+    return (values * same_object).sum(1) / same_object.sum(1), (values * _rival_weights(table)).sum(1)
 
 
 def _rival_weights(table: ScoreTable) -> NDArray[np.float64]:
@@ -59,29 +63,29 @@ def _rival_weights(table: ScoreTable) -> NDArray[np.float64]:
     weights = np.where(table.relevant, 0, columns)
     total = weights.sum(1, keepdims=True)
     if not total.all():
-        raise BadInput(f"a test needs {table.column_words} of at least two objects; a row has only its own")
+        raise BadInput(f"a test needs {table.column_words} of at least two objects; a row has those of one")
     return np.asarray(weights / total)
 
 
 def k_way(table: ScoreTable, k: int, *, photos: int = 1, draws: int = 16, seed: int = 0) -> Measure:
-    """Top-n accuracy (m = k) for n in 1..k among k candidates: the row's object and k - 1 others.
+    """Top-n accuracy for n in 1..k among k candidates: the row's object and k - 1 others.
 
     Every candidate is represented by `photos` photos (`object_scores`) and scored by their mean. Photos are drawn
-    `draws` times for every row; over the other candidates the mean is exact (`k_way_accuracy`). Chance is 1/k, 2/k,
-    ..., 1. Raises BadInput for fewer than k objects.
+    `draws` times for every row. The expectation over the random choice of the other objects is computed in closed form
+    (`k_way_accuracies`). Chance is 1/k, 2/k, ..., 1. Raises BadInput for fewer than k objects.
     """
     queries = table.with_targets
     scores = object_scores(queries, photos, draws, seed)
     true = np.take_along_axis(scores, np.searchsorted(queries.objects, queries.touch_owner)[None, :, None], 2)
     higher, equal = (scores > true).sum(2).ravel(), (scores == true).sum(2).ravel() - 1
     curves = k_way_accuracies(higher, equal, len(queries.objects) - 1, k).reshape(draws, -1, k).mean(0)
-    shown = "a photo" if photos == 1 else f"{photos} photos (fewer where it has no more)"
+    shown = "a photo" if photos == 1 else f"{photos} photos (fewer if it has no more)"
     words = f"{k} of these objects, each with {shown}: {table.gallery}"
     return Measure(curves, queries.touch_owner, np.arange(1, k + 1) / k, words)
 
 
 def recall(table: ScoreTable, k: int) -> Measure:
-    """Whether any photo of the object is among the first k of the whole gallery, without own photos.
+    """R@k (hit rate): whether any photo of the object is among the first k of the gallery, without own photos.
 
     For photos as queries and touches as gallery, use `table.transposed()`.
     """

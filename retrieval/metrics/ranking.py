@@ -1,7 +1,8 @@
 """Measures of a ranking by their expected value under ties, and their values by chance, in closed form.
 
-A row ranks the items that it is shown; some are relevant. Recall at k is "any relevant item among the first k". All
-orders of equal scores are equally likely, so a constant scorer has exactly the value of chance.
+Each row is a query; the items of its gallery are ranked by score, and some are relevant. Recall at k is "any relevant
+item among the first k". All orders of equal scores are equally likely, so a constant scorer has exactly the value of
+chance.
 """
 
 from typing import NamedTuple
@@ -19,9 +20,9 @@ class FirstRelevant(NamedTuple):
     """Position of the first relevant item of each row (Q,).
 
     Attributes:
-        before: Items that score higher; none of them is relevant.
-        tied: Items with the same score, itself included.
-        right: Relevant ones among these.
+        before: Number of items with a higher score; they are not relevant.
+        tied: Number of items with the same score, including itself.
+        right: Number of relevant items among these.
     """
 
     before: NDArray[np.int64]
@@ -29,23 +30,23 @@ class FirstRelevant(NamedTuple):
     right: NDArray[np.int64]
 
 
-def first_relevant(scores: Scores, relevant: Mask, shown: Mask) -> FirstRelevant:
+def first_relevant(scores: Scores, relevant: Mask, in_gallery: Mask) -> FirstRelevant:
     """Return the position of the best relevant item of each query.
 
     Args:
         scores: (Q, N).
         relevant: (Q, N).
-        shown: (Q, N) the items that the row ranks.
+        in_gallery: (Q, N) whether the item is in the query's gallery.
 
     Raises:
-        BadInput: A row is shown nothing relevant.
+        BadInput: A query has no relevant item in its gallery.
         NumericalError: A score is not finite.
     """
-    good = _checked(relevant, shown)
+    good = _checked(relevant, in_gallery)
     _require_finite(scores)
     best = np.where(good, scores, -np.inf).max(1, keepdims=True)
-    equal = shown & (scores == best)
-    return FirstRelevant((shown & (scores > best)).sum(1), equal.sum(1), (equal & good).sum(1))
+    equal = in_gallery & (scores == best)
+    return FirstRelevant((in_gallery & (scores > best)).sum(1), equal.sum(1), (equal & good).sum(1))
 
 
 def _require_finite(scores: Scores) -> None:
@@ -55,11 +56,13 @@ def _require_finite(scores: Scores) -> None:
         raise NumericalError(f"every score must be finite for ranking; row {bad[0]} contains a NaN or infinite one")
 
 
-def _checked(relevant: Mask, shown: Mask) -> Mask:
-    good = relevant & shown
+def _checked(relevant: Mask, in_gallery: Mask) -> Mask:
+    good = relevant & in_gallery
     empty = np.flatnonzero(~good.any(1))
     if len(empty):
-        raise BadInput(f"every query must be shown a relevant item; row {empty[0]} is not: leave it out, and report it")
+        raise BadInput(
+            f"every query needs a relevant item in its gallery; row {empty[0]} has none: leave it out, and report it"
+        )
     return good
 
 
@@ -102,24 +105,24 @@ def first_rank(first: FirstRelevant) -> NDArray[np.float64]:
     return np.asarray(first.before + 1 + (first.tied - first.right) / (first.right + 1))
 
 
-def average_precision(scores: Scores, relevant: Mask, shown: Mask) -> NDArray[np.float64]:
+def average_precision(scores: Scores, relevant: Mask, in_gallery: Mask) -> NDArray[np.float64]:
     """Return the expected average precision (Q,) over the FULL ranking (McSherry and Najork 2008, section 2.5).
 
-    Average precision at a cutoff is a different measure; the two do not compare.
+    Average precision at a cutoff is a different measure; do not compare the two.
 
     Args:
         scores: (Q, N).
         relevant: (Q, N).
-        shown: (Q, N) the items that the row ranks.
+        in_gallery: (Q, N) whether the item is in the query's gallery.
 
     Raises:
-        BadInput: A row is shown nothing relevant.
+        BadInput: A query has no relevant item in its gallery.
         NumericalError: A score is not finite.
     """
-    good = _checked(relevant, shown)
+    good = _checked(relevant, in_gallery)
     _require_finite(scores)
     harmonic = np.append(0.0, np.cumsum(1 / np.arange(1.0, scores.shape[1] + 1)))
-    rows = zip(scores, good, shown, strict=True)
+    rows = zip(scores, good, in_gallery, strict=True)
     return np.array([_precision_of_row(row[visible], row[mine], harmonic) for row, mine, visible in rows])
 
 
@@ -139,26 +142,28 @@ def _precision_of_row(every: Scores, relevant: Scores, harmonic: NDArray[np.floa
     return float((r / n * sums).sum() / len(relevant))
 
 
-def chance_of_recall(k: int, relevant: Mask, shown: Mask) -> NDArray[np.float64]:
+def chance_of_recall(k: int, relevant: Mask, in_gallery: Mask) -> NDArray[np.float64]:
     """Return `recall_at` (Q,) of a constant scorer."""
-    return recall_at(k, _all_tied(relevant, shown))
+    return recall_at(k, _all_tied(relevant, in_gallery))
 
 
-def chance_of_reciprocal_rank(relevant: Mask, shown: Mask) -> NDArray[np.float64]:
+def chance_of_reciprocal_rank(relevant: Mask, in_gallery: Mask) -> NDArray[np.float64]:
     """Return `reciprocal_rank` (Q,) of a constant scorer."""
-    return reciprocal_rank(_all_tied(relevant, shown))
+    return reciprocal_rank(_all_tied(relevant, in_gallery))
 
 
-def chance_of_average_precision(relevant: Mask, shown: Mask) -> NDArray[np.float64]:
+def chance_of_average_precision(relevant: Mask, in_gallery: Mask) -> NDArray[np.float64]:
     """Return the average precision (Q,) of a constant scorer.
 
     With R of N relevant it is p + (1 - p) H_N / N, p = (R - 1) / (N - 1).
     """
-    _, count, right = _all_tied(relevant, shown)
-    harmonic = np.cumsum(1 / np.arange(1.0, shown.shape[1] + 1))[count - 1]
+    _, count, right = _all_tied(relevant, in_gallery)
+    harmonic = np.cumsum(1 / np.arange(1.0, in_gallery.shape[1] + 1))[count - 1]
     p = (right - 1) / np.maximum(count - 1, 1)
     return np.asarray(np.where(count == right, 1.0, p + (1 - p) * harmonic / count))
 
 
-def _all_tied(relevant: Mask, shown: Mask) -> FirstRelevant:
-    return FirstRelevant(np.zeros(len(shown), dtype=np.int64), shown.sum(1), _checked(relevant, shown).sum(1))
+def _all_tied(relevant: Mask, in_gallery: Mask) -> FirstRelevant:
+    return FirstRelevant(
+        np.zeros(len(in_gallery), dtype=np.int64), in_gallery.sum(1), _checked(relevant, in_gallery).sum(1)
+    )

@@ -62,12 +62,12 @@ class Metric:
 
 
 def grasps_metric_name(count: int) -> str:
-    """Return the name of the metric of a query of so many grasps, with three photos of each candidate."""
+    """Return the name of the metric of a query of `count` grasps, with three photos of each candidate."""
     return f"topn_k5_g{count}_p{PHOTOS_PER_CANDIDATE}"
 
 
 def photos_metric_name(count: int) -> str:
-    """Return the name of the metric of a query of one grasp, with so many photos of each candidate."""
+    """Return the name of the metric of a query of one grasp, with `count` photos of each candidate."""
     return "topn_k5" if count == 1 else f"topn_k5_p{count}"
 
 

@@ -19,8 +19,8 @@ class ScoreTable:
         scores: (T, N) floating, higher is better.
         touch_owner: (T,) object of each row.
         photo_owner: (N,) object of each column.
-        own: (T, N) whether the photo was taken in a grasp of that row. Such photos are not shown to it, except where a
-            protocol includes them.
+        own: (T, N) whether the photo was taken in a grasp of that row. The row's gallery excludes these photos, unless
+            a protocol includes them.
         object_words: Noun for the objects in descriptions of the gallery.
         row_words: The same for the rows.
         column_words: The same for the columns.
@@ -52,7 +52,7 @@ class ScoreTable:
                 f"every score must be finite; row {row}, column {column} is {self.scores[row, column]}"
             )
         if (self.own & ~self.relevant).any():
-            raise BadInput("a photo of a row's own grasp must show the row's object; one shows another: check the ids")
+            raise BadInput("a photo of a row's own grasp must show the row's object, but one does not: check the ids")
 
     @cached_property
     def relevant(self) -> NDArray[np.bool_]:
@@ -94,7 +94,7 @@ class ScoreTable:
 
     @cached_property
     def min_photos(self) -> int:
-        """Smallest number of photos of any object that a query is shown, without its own."""
+        """Smallest number of photos of an object in the gallery of a query, which excludes its own photos."""
         owners = np.unique(self.with_targets.photo_owner, return_counts=True)[1]
         return int(min(owners.min(), (self.with_targets.relevant & ~self.with_targets.own).sum(1).min()))
 
@@ -114,12 +114,13 @@ class ScoreTable:
         )  # fmt: skip
 
     def with_own(self) -> "ScoreTable":
-        """Return the table for a protocol that shows a row its own photos too."""
+        """Return the table for a protocol whose galleries include a row's own photos."""
         return replace(self, own=np.zeros_like(self.own))
 
 
 Pooling = Callable[[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
-"""From scores of shown photos (P,), the row of each (P,) and their number by row (T,) to the rows' scores (T,)."""
+"""Function of the scores of photos (P,), the row of each (P,) and their number by row (T,); returns the rows' scores
+(T,)."""
 
 
 def object_scores(
@@ -136,7 +137,7 @@ def object_scores(
         draws: Repetitions.
         seed: Seed of the draws.
         pool: Combines the scores of the photos, such as a posterior's logit of the object
-            (`Posterior.object_logits`); None takes their mean.
+            (`Posterior.object_logits`); None for their mean.
 
     Returns:
         Scores with the objects in the order of `table.objects`.
@@ -145,7 +146,7 @@ def object_scores(
         BadInput: A row's own object has no photo left. Leave such rows out first.
     """
     if not (table.has_target | ~table.relevant.any(1)).all():
-        raise BadInput("every row must leave its object a photo; one has only its own: leave the row out")
+        raise BadInput("every row needs a photo of its object from another grasp; one has none: leave the row out")
     rng = np.random.default_rng([seed, photos])
     found = np.empty((draws, len(table.touch_owner), len(table.objects)))
     for draw in range(draws):
@@ -157,13 +158,13 @@ def object_scores(
     return found
 
 
-ShownScores = tuple[NDArray[np.float64], NDArray[np.bool_]]
-"""Scores (T, p) of rows with photos of one object, and whether each is shown to the row."""
+GalleryScores = tuple[NDArray[np.float64], NDArray[np.bool_]]
+"""Scores (T, p) of rows with photos of one object, and whether each is in the row's gallery."""
 
 
 def _window(
     scores: NDArray[np.float32], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
-) -> ShownScores:
+) -> GalleryScores:
     """Give every row its own window over the shuffled columns: sampling without replacement at low cost."""
     start = rng.integers(len(columns), size=len(scores))
     window = (start[:, None] + np.arange(min(photos, len(columns)))) % len(columns)
@@ -173,15 +174,17 @@ def _window(
 
 def _without_own(
     table: ScoreTable, mine: NDArray[np.int64], columns: NDArray[np.int64], photos: int, rng: np.random.Generator
-) -> ShownScores:
-    """Return photos for the object's own rows: in a random order per row, its own ones last and never shown."""
+) -> GalleryScores:
+    """Return photos for the object's own rows: in a random order per row, its own ones last and not in the gallery."""
     own, scores = table.own[mine][:, columns], table.scores[mine][:, columns].astype(np.float64)
     order = np.argsort(rng.random(own.shape) + own, axis=1)[:, :photos]
     return np.take_along_axis(scores, order, 1), ~np.take_along_axis(own, order, 1)
 
 
-def _pooled_scores(scores: NDArray[np.float64], shown: NDArray[np.bool_], pool: Pooling | None) -> NDArray[np.float64]:
-    """Return the scores (T,) of the photos that each row is shown."""
+def _pooled_scores(
+    scores: NDArray[np.float64], in_gallery: NDArray[np.bool_], pool: Pooling | None
+) -> NDArray[np.float64]:
+    """Return the scores (T,) of each row with the photos in its gallery."""
     if pool is None:
-        return np.asarray((scores * shown).sum(1) / shown.sum(1))
-    return pool(scores[shown], np.nonzero(shown)[0], shown.sum(1))
+        return np.asarray((scores * in_gallery).sum(1) / in_gallery.sum(1))
+    return pool(scores[in_gallery], np.nonzero(in_gallery)[0], in_gallery.sum(1))

@@ -1,10 +1,10 @@
 """Candidate encoder: embeddings for candidate search that predict the order of the match logits.
 
 An embedding trained by a contrastive loss orders photos differently from the fusion head: the photo that the head ranks
-first lies deep in that order. The two small networks here are distilled from the head (`retrieval.training.distil`).
-They read partial activations, so an index gets new embeddings without reading a photo again. Where the logit contains
-the cosine of the contrastive embeddings, some of the output components are linear in these embeddings: their principal
-axes, which carry nearly all of that cosine. The networks then learn only the rest.
+first may have a low rank in that order. The two small networks here are distilled from the head
+(`retrieval.training.distil`). They read partial activations, so an index gets new embeddings without reading a photo
+again. If the logit contains the cosine of the contrastive embeddings, some of the output components are linear in these
+embeddings: their principal axes, which carry nearly all of that cosine. The networks then learn only the rest.
 """
 
 from typing import NamedTuple, Self

@@ -62,11 +62,11 @@ class Checkpoint(CheckpointInfo):
         provenance: Step, seed, data digest and metrics of the training.
         gel_check: Thresholds that separate touches, no-contact gels and other images; None without a gel head.
         matcher: The towers, the fusion head and the projections.
-        split: Training, validation and test objects; None where the training had no split.
+        split: Training, validation and test objects; None if the training run had no split.
         posterior: Calibration of the logits; None for an uncalibrated model.
         queries: (Q, partial) partial activations of touches of validation objects, with which an index measures its
             own search.
-        references: Calibration of reference touches; None where the data did not suffice.
+        references: Calibration of reference touches; None if there were too few data.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> checkpoint.config.preprocessing.background, len(checkpoint.digest)

@@ -1,4 +1,4 @@
-"""Settings of a matcher and of its training: frozen dataclasses, read from TOML, unknown keys refused."""
+"""Settings of a matcher and of its training: frozen dataclasses, read from TOML; unknown keys are errors."""
 
 import dataclasses
 import math
@@ -105,13 +105,13 @@ class TrainingConfig:
             files name them `contrastive_weight` and so on.
         shuffle_fingers: Permute the fingers of a touch randomly, like a grip from the other side. Not in the paper.
         negatives: "dataset" draws the negatives of a touch from all photos of other objects, as in the paper. "batch"
-            takes them from the photos of the batch, so half as many are encoded (`PairSampler`). "auto" is "batch"
-            where towers are trained.
+            takes them from the photos of the batch, so half as many are encoded (`PairSampler`). "auto" is "batch" if
+            towers are trained.
         freeze_batch_norm: Keep the batch statistics of the initial weights.
-        freeze_towers: Train only the layers after the towers. Every image is then encoded once per training.
+        freeze_towers: Train only the layers after the towers. Every image is then encoded once per training run.
         distil_steps: Steps that distil the candidate encoder after training (`retrieval.training.distil`).
-        validation_fraction: Fraction of the objects that validate.
-        test_fraction: Fraction of the objects that test.
+        validation_fraction: Fraction of the objects that are validation objects.
+        test_fraction: Fraction of the objects that are test objects.
         validate_every: Steps between two validations.
         precision: "float32", "bfloat16" or "auto" (`retrieval.model.encode.autocast`).
         seed: Seed of all random choices.
@@ -208,7 +208,7 @@ class TrainingConfig:
         return cls(**rest, weights=weights)
 
     def with_iterations(self, iterations: int) -> "TrainingConfig":
-        """Return a copy with so many optimiser steps, and at most as many distillation steps."""
+        """Return a copy with `iterations` optimiser steps, and at most as many distillation steps."""
         return dataclasses.replace(self, iterations=iterations, distil_steps=min(self.distil_steps, iterations))
 
 
@@ -221,7 +221,7 @@ SCHEDULES: dict[str, Callable[[int, int], float]] = {
     "cosine": lambda step, steps: 0.5 * (1 + math.cos(math.pi * step / steps)),
     "halving": lambda step, steps: 0.5 ** (4 * step // steps),
 }
-"""Name -> factor of the learning rate at a step (from 0) of so many steps; "halving" halves after each quarter."""
+"""Name -> factor of the learning rate at a step (from 0) of all `steps`; "halving" halves after each quarter."""
 NEGATIVES = ("auto", "batch", "dataset")
 PRECISIONS = ("auto", "float32", "bfloat16")
 
@@ -317,7 +317,7 @@ class Config:
 
 
 def load_config(name_or_path: str) -> Config:
-    """Read a named preset (`paper`, `small`, ...) or a TOML file, and import what it names. Raises ConfigError.
+    """Read a named preset (`paper`, `small`, ...) or a TOML file, and import its modules. Raises ConfigError.
 
     >>> retrieval.load_config("small").training.weights["contrastive"] > 0
     True

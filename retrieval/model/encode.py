@@ -184,7 +184,7 @@ class TorchEncoder:
 
         Args:
             matcher: The model.
-            threads: Threads that PyTorch computes with from then on, in the whole process; None changes nothing.
+            threads: Threads that PyTorch computes with from then on, in the whole process; None for no change.
         """
         self._fast, self._threads = for_inference(matcher, ["touch_tower"]), threads
 
@@ -237,7 +237,7 @@ def autocast(device: torch.device, precision: str) -> AbstractContextManager[Any
 
     Args:
         device: Where the towers compute.
-        precision: "float32", "bfloat16", or "auto": bfloat16 where the hardware multiplies it, else float32. A CPU
+        precision: "float32", "bfloat16", or "auto": bfloat16 if the hardware multiplies it, else float32. A CPU
             without such instructions emulates bfloat16, ten times slower than float32.
 
     Raises:

@@ -104,7 +104,7 @@ def export_to_cache(checkpoint: Checkpoint) -> ExportReport | None:
     For checkpoints in the folder of an installed package, which we must not write to. Queries also look in the cache.
 
     Returns:
-        The report; None where an export exists or none can be written. Queries work without it. A cache folder that
+        The report; None if an export exists already or cannot be written. Queries work without it. A cache folder that
         other users can write to is not used; a warning is logged.
     """
     path = cached_export_path(checkpoint.digest)

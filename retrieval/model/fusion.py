@@ -1,8 +1,8 @@
 """The matcher: two towers, the fusion head that scores a pair, and the projections for candidate search.
 
-The first layer of the head is linear in the concatenation of the modalities, so it is stored as two layers:
-`W [t; v] + b = (W_t t + b) + W_v v`. Each term is a partial activation. A photo's partial activation is computed once,
-stored, and added to any touch's. Where the logit adds the cosine of the embeddings (`MatcherConfig.cosine`), a partial
+The first layer of the head is linear in the concatenation of the modalities, so it is stored as two layers: `W [t; v] +
+b = (W_t t + b) + W_v v`. Each term is a partial activation. The partial activation of a photo is computed once, stored,
+and added to that of any touch. If the logit adds the cosine of the embeddings (`MatcherConfig.cosine`), a partial
 activation ends with its embedding times the root of the scale. The index then still stores nothing else of a photo.
 """
 
@@ -66,7 +66,7 @@ class Standardise(nn.BatchNorm1d):
         return mean, torch.rsqrt(self._floored_variance(mean, variance))
 
     def _floored_variance(self, mean: Tensor, variance: Tensor) -> Tensor:
-        """Return variances (F,), raised where a feature hardly varies."""
+        """Return variances (F,), raised for features that hardly vary."""
         return torch.maximum(variance + self.eps, (MIN_RELATIVE_DEVIATION * mean).square())
 
 

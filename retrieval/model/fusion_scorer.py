@@ -1,9 +1,8 @@
-"""Verdicts and match logits from encodings, in numpy.
+"""The gel check (`GelCheck`) and the match logits of the fusion head (`FusionScorer`), in numpy.
 
-Two questions precede matching: is this a gel image, and is there a contact? A linear layer on the touch tower's
-features (`retrieval.model.fusion.GelHead`) classifies each finger's image into the classes of its training: gels in
-contact, no-contact gels, and pictures that are not gel images. With a no-contact frame, contact is the difference from
-that frame, which needs no model.
+The gel check comes first: is this a gel image, and is there contact? A linear layer on the touch tower's features
+(`retrieval.model.fusion.GelHead`) classifies each finger's image: gel in contact, gel without contact, or a picture
+that is not a gel image. With a no-contact frame, contact is the difference from that frame, which needs no model.
 
 Pairs are scored from stored partial activations, with the photos in blocks. The head's layers after the partial
 activations are one matrix product for all photos of a block. The rest is done in place, so the product takes most of
@@ -25,19 +24,22 @@ from retrieval.errors import BadInput, NumericalError
 
 CONTACT, NO_CONTACT, NOT_A_GEL = "contact", "no contact", "not a gel image"
 BLOCKS = 16
+"""Image blocks along each side for `contact_level`."""
 Bounded = Annotated[float, Meta(ge=-1e6, le=1e6)]
 
 
 @dataclass(frozen=True)
 class GelCheck:
-    """Thresholds of the gel check, chosen on validation objects; None where the recording had no examples.
+    """Thresholds of the gel check, chosen on validation objects; None if the recording had no examples.
 
     Attributes:
-        foreign_above: A grasp is refused if a finger's log-odds of "no gel image" exceed this.
-        contact_above: A grasp is a contact from this log-odds of contact on; the larger of the fingers' counts.
-        level_above: The same for the difference of a gel image from its no-contact frame, in grey levels of 255
-            (`contact_level`).
-        rates: Fractions of validation touches, no-contact gels and foreign pictures that were refused.
+        foreign_above: An image is foreign (not a gel image), and its grasp is refused, if a finger's log-odds of "no
+            gel image" exceed this.
+        contact_above: A grasp has contact if the largest log-odds of contact over its fingers is at least this.
+        level_above: A grasp has contact if the largest difference of a finger's gel image from its no-contact frame
+            (`contact_level`, in grey levels of 255) is at least this. Used instead of `contact_above` if available.
+        rates: Fractions of validation touches and foreign pictures that were refused, and of no-contact gels that were
+            accepted.
     """
 
     foreign_above: Bounded | None
@@ -88,14 +90,16 @@ def contact_level(touch: RgbImage, no_contact: RgbImage) -> float:
 Floats = NDArray[np.float32]
 Partials = NDArray[np.floating[Any]]
 BLOCK = 2048
+"""Number of photos that are scored together."""
 
 
 @dataclass(frozen=True)
 class FusionScorer:
     """The layers of a fusion head after its partial activations.
 
-    On the first H numbers: `out . relu(second relu(touch + photo) + bias) + out_bias`. The inner product of the
-    remaining numbers is added.
+    A partial activation is a concatenation [hidden (H), scaled contrastive embedding (E)]. The match logit is
+    `out . relu(second relu(touch_hidden + photo_hidden) + second_bias) + out_bias + touch_embedding . photo_embedding`;
+    the last term is a scaled cosine similarity, and E is 0 for a head without it (`cosine`).
 
     Attributes:
         second: (H, H) weights of the second layer. All arrays are float32.
@@ -112,8 +116,8 @@ class FusionScorer:
     def logits(self, touch_partials: Floats, photo_partials: Partials, rows: NDArray[np.int64] | None = None) -> Floats:
         """Return the match logits of photos, summed over grasps: (len(rows),).
 
-        The sum assumes that grasps are independent given the object, and a flat prior. Photos are read in blocks and
-        converted to float32.
+        A plain sum: the posterior corrects it for the dependence of grasps. Photos are read in blocks and converted to
+        float32.
 
         Args:
             touch_partials: (G, partial) partial activations of G grasps of ONE object.

@@ -5,8 +5,8 @@
     possible   log2(objects / (1 - none_prior)): the gain if one object becomes certain
     next grasp remaining * (1 - exp(w(n) - w(n + 1))),  w(n) = n / (1 + dependence * (n - 1))
 
-w(n) is the number of independent grasps that are equivalent to n grasps of one object. We model that each independent
-grasp leaves 1/e of the remaining bits; docs/service.md compares this estimate with measured grasps.
+w(n) is the number of independent grasps that are equivalent to n grasps of one object. Model: each independent grasp
+reduces the remaining bits to 1/e; docs/service.md compares this estimate with measured grasps.
 
 An answer may list only some of the objects. The others are assumed to have equal probabilities.
 """
@@ -23,7 +23,7 @@ class Information:
     """Information of an answer to n grasps.
 
     Attributes:
-        gained_bits: As above, like the next three.
+        gained_bits: Gained information; all values are defined above.
         remaining_bits: Entropy of the posterior.
         possible_bits: Gain if one object becomes certain.
         next_grasp_bits: Expected gain of one more grasp.
@@ -73,7 +73,7 @@ def unlisted_probability(none: float, listed: Sequence[float]) -> float:
 
 
 def effective_grasps(posterior: Posterior, grasps: int) -> float:
-    """Return the number of independent grasps that are equivalent to this many grasps of one object, w(n)."""
+    """Return the number of independent grasps that are equivalent to `grasps` grasps of one object, w(n)."""
     return grasps * posterior.weight(grasps) / posterior.slope
 
 

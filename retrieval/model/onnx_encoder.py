@@ -43,7 +43,7 @@ class OnnxEncoder:
         Args:
             path: The file, as `read_checked_export` reads it.
             checkpoint: SHA-256 of the checkpoint's file, in hexadecimal.
-            threads: Threads of ONNX Runtime; None leaves the choice to it.
+            threads: Threads of ONNX Runtime; None for its own choice.
             owners: Ids of users that may own the file, in addition to this user and root.
 
         Raises:
@@ -103,7 +103,7 @@ def open_session(model: bytes, name: str, checkpoint: str, threads: int | None) 
         model: The bytes of the ONNX file.
         name: Its name in messages.
         checkpoint: Digest of the checkpoint that it must be exported from.
-        threads: Threads of ONNX Runtime; None leaves the choice to it.
+        threads: Threads of ONNX Runtime; None for its own choice.
 
     Raises:
         CheckpointError: The model cannot be opened, or is of another checkpoint.
@@ -144,7 +144,7 @@ def find_export(checkpoint: CheckpointInfo, threads: int | None = None) -> OnnxE
 
     Args:
         checkpoint: The header of the checkpoint.
-        threads: Threads of ONNX Runtime; None leaves the choice to it.
+        threads: Threads of ONNX Runtime; None for its own choice.
     """
     adjacent = checkpoint.path.with_suffix(EXPORT_SUFFIX)
     path = adjacent if adjacent.is_file() else cached_export_path(checkpoint.digest)

@@ -1,6 +1,6 @@
 """P(object | touches, catalogue), with "none of these" among the hypotheses: the one formula of every probability.
 
-    w = slope / (1 + dependence * (grasps - 1))        weight of a sum of match logits over so many grasps
+    w = slope / (1 + dependence * (grasps - 1))        weight of a sum of match logits over `grasps` grasps
     l(o) = 1 / w * log mean exp(w * z)                 logit of object o: over the summed match logits z of its photos
     P(o)    proportional to  (1 - p) / O * exp(w * l(o) + offset)
     P(none) proportional to  p
@@ -20,7 +20,7 @@ Objects that were not scored keep their part of the probability, estimated from 
     P(o | present) = exp(w * l(o)) / sum of exp(w * l(o')) over all objects o' of the catalogue
 
 P(o | present) is the probability of o given that the catalogue has the object. p and offset cancel out. It is computed
-from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 where P(none) rounds to 1.
+from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 if P(none) rounds to 1.
 
 A query passes through four files: `fusion_scorer.py` sums the match logits z of a photo over the grasps;
 `search/query/objects.py` computes l(o) of each object, which reference touches change (`reference_calibration.py`);
@@ -78,12 +78,12 @@ class PosteriorProbabilities:
 
 @dataclass(frozen=True)
 class EvidenceMass:
-    """Evidence for the objects of a catalogue or of a part of one: logs of sums of exp(w * logit - top).
+    """Log-sum-exp of w * logit over the objects of a catalogue or of a part of one, relative to `top`.
 
     Attributes:
-        scored: Sum over the scored objects.
-        unscored: Sum over the others, estimated from a sample of them.
-        objects: Number of both.
+        scored: Log of the sum of exp(w * logit - top) over the scored objects.
+        unscored: The same over the other objects, estimated from a sample of them.
+        objects: Number of scored and unscored objects.
         top: Largest w * logit. It is stored separately, because a sum with it would lose the digits of the others.
     """
 
@@ -104,7 +104,7 @@ class EvidenceMass:
         )
 
     def extrapolated(self, objects: int) -> "EvidenceMass":
-        """Return the evidence with so many more objects, each with the mean evidence of these."""
+        """Return the evidence with `objects` more objects, each with the mean likelihood of these."""
         if not objects:
             return self
         mean = float(np.logaddexp(self.scored, self.unscored)) - math.log(self.objects)
@@ -128,7 +128,7 @@ class Posterior:
             raise BadInput("posterior.formula is not the one of this version; train again, or build the index again")
 
     def weight(self, grasps: int) -> float:
-        """Return the factor of the summed match logits of so many grasps."""
+        """Return the factor of the summed match logits of `grasps` grasps."""
         return self.slope / (1 + self.dependence * (grasps - 1))
 
     def log_ratio(self, logits: ArrayLike, grasps: int) -> Floats:
@@ -143,8 +143,8 @@ class Posterior:
         """Return the logit (J,) of each object from the summed match logits (N,) of its scored photos.
 
         owner (N,) is the index of each photo's object, 0 to J - 1; each object has at least one photo. counts (J,) is
-        the number of photos of each object. Photos that were not scored count as no match, which candidate search makes
-        nearly true. Raises NumericalError for a logit that is not finite.
+        the number of photos of each object. Unscored photos of an object add 0 to its mean likelihood; the error is
+        small because they are not among the candidates. Raises NumericalError for a logit that is not finite.
         """
         weight = self.weight(grasps)
         scaled = weight * _finite(logits, "every logit")
@@ -162,7 +162,7 @@ class Posterior:
         unscored: int = 0,
         sample: ArrayLike = (),
     ) -> PosteriorProbabilities:
-        """Return the posterior over scored objects, unscored ones, and none.
+        """Return the posterior over scored objects, unscored objects, and none.
 
         logits (J,) are those of the scored objects, J >= 1 (`object_logits`); `unscored` counts the other objects.
         sample (S,) are the logits of a random sample of these, required if there are any. Raises BadInput, and
@@ -179,7 +179,7 @@ class Posterior:
         if not len(known) or unscored < 0 or (unscored and not len(drawn)):
             raise BadInput(
                 "a posterior requires a scored object, and a sample of the objects that were not scored; got "
-                f"{len(known)} scored, {unscored} not, and a sample of {len(drawn)}"
+                f"{len(known)} scored, {unscored} unscored, and a sample of {len(drawn)}"
             )
         weighted, others = self.weight(grasps) * known, self.weight(grasps) * drawn
         top = float(max(weighted.max(), others.max() if unscored else -math.inf))
@@ -211,7 +211,7 @@ class Posterior:
 
             slope * n / (1 + dependence * (n - 1)) * l / g + offset  >  log objects + log (p / (1 - p))
 
-        The left side grows at most by the factor 1 / dependence. docs/answers.md compares the estimate with trials.
+        The term with l grows at most by the factor 1 / dependence from n = 1 (trials: docs/measurements/answers.md).
 
         Args:
             logit: Logit l of the best object, which is not more likely than none yet.
@@ -220,7 +220,7 @@ class Posterior:
             none_prior: p, more than 0.
 
         Returns:
-            The number of further grasps, n - g; None where none up to `MAX_GRASPS` in total suffices.
+            The number of further grasps, n - g; None if `MAX_GRASPS` in total do not suffice.
         """
         needed = math.log(objects) + math.log(none_prior) - math.log1p(-none_prior) - self.offset
         for total in range(grasps + 1, MAX_GRASPS + 1):
@@ -269,7 +269,7 @@ class ScoredTouches:
         logits: (T, N) match logits.
         touch_owner: (T,) object of each touch.
         photo_owner: (N,) object of each photo.
-        own: (T, N) whether the photo was taken in a grasp of that touch; such photos are not shown to it.
+        own: (T, N) whether the photo was taken in the grasp of that touch; such photos are masked for that touch.
     """
 
     logits: NDArray[np.floating[Any]]
@@ -279,11 +279,11 @@ class ScoredTouches:
 
 
 def fit_posterior(*parts: ScoredTouches, seed: int = 0) -> Posterior:
-    """Fit on single touches of validation objects and, where objects have more, on sets of up to 5 grasps.
+    """Fit on single touches of validation objects and, if objects have more, on sets of up to `MAX_GRASPS` grasps.
 
-    `parts` come from one matcher or several, such as those of folds, and share no object. If each object has one grasp,
-    the dependence cannot be fitted and is 1. Raises BadInput for fewer than three objects, or if no touch has another
-    photo of its object.
+    `parts` come from one or several matchers (of folds) and share no object. If each object has one grasp, the
+    dependence cannot be fitted and is 1. Raises BadInput for fewer than three objects, or if no touch has another photo
+    of its object.
     """
     return fit_posterior_to_trials([trial for scored in parts for trial in identification_trials(scored, seed)])
 
@@ -292,10 +292,10 @@ def identification_trials(scored: ScoredTouches, seed: int) -> Iterator["Identif
     """Yield the trials of single touches, then of sets of two grasps, three and so on, while objects have enough."""
     for grasps in range(1, MAX_GRASPS + 1):
         rng = np.random.default_rng([seed, grasps])
-        sets = []  # touches of one object each that leave it a photo; for one grasp every touch
+        sets = []  # each of touches of one object that has an unmasked photo; for one grasp every touch
         for name in np.unique(scored.touch_owner):
-            mine = np.flatnonzero(scored.touch_owner == name)
-            draws = mine[:, None] if grasps == 1 else [rng.permutation(mine)[:grasps] for _ in range(_SETS)]
+            touches = np.flatnonzero(scored.touch_owner == name)
+            draws = touches[:, None] if grasps == 1 else [rng.permutation(touches)[:grasps] for _ in range(_SETS)]
             photos = scored.photo_owner == name
             sets += [rows for rows in draws if len(rows) == grasps and (photos & ~scored.own[rows].any(0)).any()]
         if sets or grasps == 1:
@@ -308,8 +308,8 @@ class IdentificationTrials:
 
     Attributes:
         grasps: Touches in a query.
-        scores: (T, N) summed match logits, photos sorted by object, -inf for a photo that is not shown.
-        counts: (T, O) shown photos of each object.
+        scores: (T, N) summed match logits, photos sorted by object, -inf for a masked photo.
+        counts: (T, O) number of unmasked photos of each object.
         starts: (O,) first photo of each object.
         catalogues: (T, K + 1) objects, the true one first. The first K are a catalogue with it, the last K one without.
     """
@@ -331,9 +331,9 @@ class IdentificationTrials:
             )
         order = np.argsort(owner, kind="stable")
         starts = np.searchsorted(owner[order], np.arange(len(objects)))
-        shown = ~np.asarray(scored.own[sets].any(axis=1))[:, order]
-        scores = np.where(shown, scored.logits[:, order].astype(np.float64)[sets].sum(1), -np.inf)
-        counts = np.add.reduceat(shown.astype(np.int64), starts, axis=1)
+        in_gallery = ~np.asarray(scored.own[sets].any(axis=1))[:, order]
+        scores = np.where(in_gallery, scored.logits[:, order].astype(np.float64)[sets].sum(1), -np.inf)
+        counts = np.add.reduceat(in_gallery.astype(np.int64), starts, axis=1)
         true = np.searchsorted(objects, scored.touch_owner[sets[:, 0]])
         keys = np.random.default_rng([seed, 100 + sets.shape[1]]).random(counts.shape)
         keys[np.arange(len(sets)), true] = -1
@@ -344,13 +344,13 @@ class IdentificationTrials:
     def log_ratios(self, posterior: Posterior) -> Floats:
         """Return the log likelihood ratios (T, O) of the objects."""
         scaled = posterior.weight(self.grasps) * self.scores
-        shown = np.maximum(self.counts, 1)  # an object without photos is in no catalogue
+        counts = np.maximum(self.counts, 1)  # an object without photos is in no catalogue
         top = np.maximum.reduceat(scaled, self.starts, axis=1)
         base = np.where(np.isfinite(top), top, 0.0)
         owner = np.repeat(np.arange(len(self.starts)), np.diff(np.append(self.starts, scaled.shape[1])))
         sums = np.add.reduceat(np.exp(scaled - base[:, owner]), self.starts, axis=1)
         with np.errstate(divide="ignore"):
-            return np.asarray(base + (np.log(sums) - np.log(shown)) + posterior.offset)
+            return np.asarray(base + (np.log(sums) - np.log(counts)) + posterior.offset)
 
     def loss(self, posterior: Posterior, smooth: float) -> float:
         """Return the mean cross-entropy over catalogues, at even odds of "none of these".
@@ -370,8 +370,8 @@ class IdentificationTrials:
 def fit_posterior_to_trials(trials: Sequence[IdentificationTrials]) -> Posterior:
     """Return the most likely posterior for all of these trials, each with weight 1.
 
-    Targets are smoothed as Platt's are (1999, section 2.2), so logits without errors have a finite optimum too. The
-    slope stays within `SLOPE_BOUNDS`.
+    Targets are smoothed as in Platt (1999, section 2.2), so the optimum is finite even if the logits separate all
+    trials. The slope stays within `SLOPE_BOUNDS`.
     """
     from scipy.optimize import minimize  # slow to import; queries do not need it
 

@@ -11,9 +11,9 @@ whose touches are references and the others queries:
     an object with photos, too        log likelihood ratio = w_b (l_b + weight C) + offset_b
 
 w_a, offset_a and w_b, offset_b are those of two posteriors, and l_b is the object's logit over its photos by the second
-one. The second is fitted on the sums, because photo and reference meet the same touch and are not independent evidence.
-Each ratio is converted to the logit at which an object with photos only would have it. One formula then ranks all
-objects of a catalogue and gives their probabilities, whatever represents them.
+one. The second is fitted on the sums, because photo and reference are compared with the same touch and are not
+independent evidence. Each ratio is converted to the logit of an object with photos only and the same ratio. One formula
+then ranks all objects of a catalogue and gives their probabilities, with photos, references or both.
 """
 
 import dataclasses
@@ -46,7 +46,7 @@ SHARPNESS = 16.0
 """Weight of the nearest of an object's references relative to the others. With 8, with 16 and with only the nearest,
 unseen simulated objects were found equally often."""
 MAX_REFERENCES = 3
-"""Largest number of references of an object in the fit: as many as a user takes who takes few."""
+"""Largest number of references of an object in the fit: a typical number if a user records few."""
 WEIGHT_BOUNDS = (0.01, 1000.0)
 """Search range of the weight of C next to photos."""
 
@@ -57,8 +57,8 @@ class ReferenceCalibration:
 
     Attributes:
         touch_only: Posterior of objects without photos.
-        weight: Weight of C for objects with photos; None where no object had both.
-        with_photos: Posterior of objects with photos; None where no object had both.
+        weight: Weight of C for objects with photos; None if no object had both.
+        with_photos: Posterior of objects with photos; None if no object had both.
         objects: Number of objects of the fit.
         touches: Number of their query touches.
     """
@@ -145,7 +145,7 @@ def fit_reference_calibration(*parts: ReferenceTouches, seed: int = 0) -> Refere
 
     References come from the first half of an object's touches, or from the first quarter if that suffices, at most
     `MAX_REFERENCES`. The queries are the second half, so with enough touches no query neighbours a reference. All
-    trials are repeated with one reference per object, because a fit to three alone is overconfident for one.
+    trials are repeated with one reference per object, because a fit to three references is overconfident for one.
 
     Args:
         parts: Touches of one matcher or several, as in `retrieval.model.posterior.fit_posterior`.
@@ -178,7 +178,7 @@ def fit_reference_calibration(*parts: ReferenceTouches, seed: int = 0) -> Refere
 
 
 def _reference_trials(part: ReferenceTouches, max_references: int) -> _ReferenceTrials | None:
-    """Return the trials with at most so many references per object; None for too few objects."""
+    """Return the trials with at most `max_references` references per object; None for too few objects."""
     scored = part.scored
     rows = [np.flatnonzero(scored.touch_owner == name) for name in np.unique(scored.touch_owner)]
     rows = [mine for mine in rows if len(mine) > 1]
@@ -202,7 +202,7 @@ def _reference_trials(part: ReferenceTouches, max_references: int) -> _Reference
 
 
 def _evenly_spaced(rows: Numbers, max_references: int) -> Numbers:
-    """Return at most so many of the rows, evenly spaced."""
+    """Return at most `max_references` of the rows, evenly spaced."""
     places = np.linspace(0, len(rows) - 1, min(max_references, len(rows)))
     return np.asarray(rows[places.round().astype(np.int64)])
 

@@ -2,7 +2,7 @@
 
 An image is a file, bytes, a Pillow image or an array. A query has one grasp or several.
 
-The nesting of the lists decides, so nothing is guessed:
+The nesting of the lists determines which:
 
     [a, b]             one grasp: an image for each finger of the model
     [[a, b], [a, b]]   several grasps of one object
@@ -395,5 +395,5 @@ def _blocks(image: GelImage) -> RgbImage:
 def _finite(values: Floats, name: str) -> Floats:
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
-        raise NumericalError(f"the {name} of touch {bad[0] + 1} contains a NaN or infinite number; the model is unfit")
+        raise NumericalError(f"the {name} of touch {bad[0] + 1} contains a NaN or infinite number; use another model")
     return values

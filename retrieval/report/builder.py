@@ -16,7 +16,7 @@ class Builder:
 
     Args:
         results: Results of the evaluation.
-        grasps: Grasps of the recording by id; empty: no galleries.
+        grasps: Grasps of the recording by id; empty for a report without pictures.
         out: Folder of the report.
 
     Attributes:

@@ -132,7 +132,7 @@ def reject(builder: Builder) -> Iterator[Block | None]:
         yield builder.picture(
             "reject.png",
             f"ROC curves, and risk against coverage; areas under the ROC curves: {', '.join(descriptions)}.",
-            "Each query counts twice: with its object in the gallery, and without it. Left: ROC curve of the decision "
+            "Each query is used twice: with its object in the gallery, and without it. Left: ROC curve of the decision "
             "that the gallery contains the object; the grey line marks 95 % true accepts. Right: fraction of wrong "
             "top-1 answers; half of the queries have no right answer, so a method that answers all of them ends on or "
             "above the grey line.",

@@ -39,7 +39,7 @@ def write_report(out: Path, recording: AnyRecording | None) -> list[Path]:
 
     Args:
         out: Folder of results.json, to which the report is written.
-        recording: Recording with the pictures of the galleries; None: no galleries.
+        recording: Recording whose pictures the report shows; None for a report without pictures.
 
     Returns:
         The written files.
@@ -74,8 +74,9 @@ def _lead(builder: Builder) -> Iterator[Block]:
     parts, recording = data["split"], data["recording"]
     yield Text(
         f"{recording['objects']} objects, {recording['grasps']:,} grasps, source: {recording['source']}. "
-        f"Trained on {len(parts['train'])} objects, selected and calibrated on {len(parts['validation'])}, tested on "
-        f"{len(parts['test'])} unseen objects. Seeds: {', '.join(map(str, data['setting']['seeds']))}."
+        f"The methods were trained on {len(parts['train'])} objects. Settings were selected and probabilities "
+        f"calibrated on {len(parts['validation'])} others. The results below are from {len(parts['test'])} unseen "
+        f"objects. Seeds: {', '.join(map(str, data['setting']['seeds']))}."
     )
     keys = ("pair_accuracy", "topn_k5", "topn_k5_g5_p3")
     found = [(key, summary) for key in keys if (summary := builder.results.summary(builder.main, key))]

@@ -98,7 +98,7 @@ def nearest_frames(frames: Mapping[str, Any], grasps: Grasps) -> Figure:
 
 
 def _sheet(width: float, height: float) -> tuple[Figure, Axes]:
-    """Return a figure of this many tiles of 1.15 inch; y points downwards."""
+    """Return a figure of width x height tiles of 1.15 inch; y points downwards."""
     figure = canvas(1.15 * (width + 0.1), 1.15 * (height + 0.3))
     figure.set_layout_engine("none")
     panel = figure.add_axes((0, 0, 1, 1))

@@ -18,7 +18,7 @@ from retrieval.report.results import method_label
 INTERVALS = (
     "Brackets contain 95 % intervals of a bootstrap that resamples objects, because queries of one object are "
     "correlated. Every value is the mean over objects of each object's mean, averaged over seeds. The interval covers "
-    "other objects of this kind; it does not cover another recording, split or rig. Ties count by their expected rank, "
+    "other objects of this kind; it does not cover another recording, split or rig. Ties get their expected rank, "
     "so a constant scorer gets exactly chance."
 )
 
@@ -124,9 +124,12 @@ def comparisons(builder: Builder) -> Iterator[Block | None]:
 
 
 def controls(builder: Builder) -> Iterator[Block | None]:
-    """Yield the controls, in which the input contains no information about the answer."""
+    """Yield the controls: the same method on inputs that lack information about the answer."""
     if builder.results.data.get("controls"):
-        yield Text("The same method on inputs without the information about the answer. The result should be chance.")
+        yield Text(
+            "The same method on inputs that lack information about the answer. Permuted touches and no-contact frames "
+            "should be at chance. Low-pass touches contain light and coarse shape, so they may be above chance."
+        )
         yield tables.controls(builder.results)
 
 
@@ -134,8 +137,8 @@ def ceilings(builder: Builder) -> Iterator[Block | None]:
     """Yield the accuracy within each modality, which bounds the accuracy between them."""
     if builder.results.data.get("ceilings"):
         yield Text(
-            "CCA trained and tested within one modality. Matching between touch and photo is hardly better than the "
-            "worse of both; the gap between that and the result is lost between the modalities."
+            "CCA trained and tested within one modality. Matching between touch and photo can hardly be better than "
+            "the worse of the two. The difference between that ceiling and the result is lost between the modalities."
         )
         yield tables.ceilings(builder.results)
 
@@ -144,8 +147,9 @@ def low_contact(builder: Builder) -> Iterator[Block | None]:
     """Yield the accuracy on low-contact touches, and on all others."""
     if found := builder.results.data.get("low_contact"):
         yield Text(
-            f"The {found['touches']} test touches that changed the gel image least, by at most {found['change']:.1f} "
-            "grey levels on average (of the finger with the larger change), and all others."
+            f"Low-contact: the {found['touches']} test touches that changed the gel image least, by at most "
+            f"{found['change']:.1f} grey levels on average (of the finger with the larger change). Others: all other "
+            "test touches."
         )
         yield tables.low_contact(builder.results)
 

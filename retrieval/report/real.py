@@ -34,11 +34,11 @@ from retrieval.report.terminal import print_columns
 Entry = Mapping[str, Any]
 INTERVALS = (
     "In percent. Brackets contain 95 % intervals that resample {unit}s, because queries of one {unit} are correlated; "
-    "seeds are averaged first. Ties count by their expected rank, so a constant scorer gets exactly chance."
+    "seeds are averaged first. Ties get their expected rank, so a constant scorer gets exactly chance."
 )
 INTERVALS_OVER_CHOICES = (
     "In percent: the mean over choices of test objects. Brackets contain 95 % intervals that cover the choice of test "
-    "and training objects (corrected resampled t-test, because choices share objects). Ties count by their expected "
+    "and training objects (corrected resampled t-test, because choices share objects). Ties get their expected "
     "rank, so a constant scorer gets exactly chance."
 )
 SEARCH_SPACES = {"gallery": "a gallery", "all": "all test objects, including look-alikes"}
@@ -290,7 +290,7 @@ def contact(entry: Entry) -> Table | None:
     if not rows:
         return None
     header = ("by contact", "weakest quartile", "second", "third", "strongest quartile")
-    note = "Quartiles of each object's touches, by the mean difference between gel image and no-contact frame."
+    note = "Quartiles of each object's touches, sorted by the mean difference between gel image and no-contact frame."
     return Table(header, tuple(rows), (note,))
 
 
@@ -313,7 +313,7 @@ def reliability(entry: Entry) -> Table | None:
     if not rows:
         return None
     note = (
-        "Top-1 answers to one touch, among objects with one photo each that include the true object. "
+        "Top-1 answers to one touch. The candidates are objects with one photo each, including the true object. "
         "The posterior is fitted on held-out training objects of each fold."
     )
     header = ("method", "gallery", "confidence", "mean confidence", "accuracy", "difference", "answers")

@@ -82,7 +82,7 @@ def read_results_file(path: Path, version: int | None, command: str) -> dict[str
 
     Args:
         path: The file.
-        version: Required schema version; None: any.
+        version: Required schema version; None for any.
         command: Command that writes the file, for messages.
 
     Returns:

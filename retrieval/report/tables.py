@@ -282,8 +282,8 @@ def times(results: Results) -> Table:
     cpus, threads = (machine.get(key, MISSING_VALUE) for key in ("cpus", "threads"))
     touch_ms, photo_ms = (format_number(towers.get(key)) for key in ("touch_ms", "photo_ms"))
     note = (
-        f"On {cpus} CPU(s) with {threads} thread(s). Times of the methods alone: one query is one touch against the "
-        "whole gallery, with precomputed features. The towers, shared by all methods, take "
+        f"On {cpus} CPU(s) with {threads} thread(s). Times of the methods without the towers: one query is one touch "
+        "against the whole gallery, with precomputed features. The towers, shared by all methods, take "
         f"{touch_ms} ms for a touch and {photo_ms} ms for a photo."
     )
     return Table(("method", *columns.values()), tuple(rows), (note,))

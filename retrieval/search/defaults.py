@@ -1,8 +1,8 @@
 """The default model and index of a command: those of the working folder, else the shipped model.
 
 The last trained model and the last built index are remembered separately for each working folder, in
-`$XDG_STATE_HOME/touch-retrieval/last.json` (`~/.local/state` if it is not set). A training in one folder never changes
-the commands in another one.
+`$XDG_STATE_HOME/touch-retrieval/last.json` (`~/.local/state` if it is not set). A training run in one folder does not
+change the defaults in another one.
 """
 
 import json
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SHIPPED = {2: "simulated-mobilenet.safetensors", 1: "simulated-mobilenet-one-finger.safetensors"}
 """Shipped checkpoints by the number of gel images of a touch."""
 SHIPPED_NAMES = {"shipped": 2, "shipped-one-finger": 1}
-"""Their names in options that take a checkpoint."""
+"""Names of the shipped checkpoints in options that take a checkpoint."""
 INDEX = Path("index")
 """Default index folder of `build-index` and `query`."""
 
@@ -57,7 +57,7 @@ def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str
     """Return the checkpoint to use, and the reason.
 
     Args:
-        choice: A path or one of `SHIPPED_NAMES`; None: the checkpoint of `index`, else the last one trained in this
+        choice: A path or one of `SHIPPED_NAMES`; None for the checkpoint of `index`, else the last one trained in this
             folder, else the shipped one.
         index: Index folder, or URL of a sharded index.
 
@@ -72,7 +72,7 @@ def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str
 
     here = _last_model()
     manifest: Manifest | ShardedManifest | None = None
-    with suppress(IndexesError):  # an unusable index counts as none
+    with suppress(IndexesError):  # an unusable index is ignored
         manifest = manifest_of(index)
     if manifest is not None:
         own = model_of(manifest)
@@ -128,7 +128,7 @@ def find_index(choice: str | None) -> tuple[str | Path, str]:
     """Return the index to use, a folder or a URL, and the reason.
 
     Args:
-        choice: A folder or URL; None: ./index, else the last index built from this folder.
+        choice: A folder or URL; None for ./index, else the last index built from this folder.
 
     Raises:
         BadInput: There is no index.

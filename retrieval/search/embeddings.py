@@ -20,7 +20,7 @@ def embed_photos(photos: Sequence[AnyImage], *, model: str | Path | Checkpoint |
 
     Args:
         photos: N photos: paths, bytes of files, Pillow images or uint8 arrays (height, width, 3), red first.
-        model: A checkpoint or its file; None: the default of `retrieve build-index`.
+        model: A checkpoint or its file; None for the default of `retrieve build-index`.
 
     Returns:
         Embeddings (N, embedding_dim) and partial activations (N, partial_width), float32, in the order of the photos.

@@ -36,7 +36,7 @@ from retrieval.version import __version__
 
 log = logging.getLogger(__name__)
 THREADS = 4
-"""Threads that read files and make thumbnails. The model and the rig have their own."""
+"""Number of threads that read files and make thumbnails; the model and the rig have other threads."""
 MAX_RIG_GRASPS = 4
 """Maximum number of pending rig grasps, including the one in progress."""
 MAX_FRAMES = 8
@@ -66,10 +66,10 @@ def create_app(
 
     Args:
         settings: Options of the operator.
-        rig: Sensors and gripper for the live routes; None: none.
-        recorder: Writes feedback into the recording in the history folder; None: no history is stored.
-        trials: Recording whose unseen objects serve for the human baseline; None: no trials.
-        shards: Opens the shards of a sharded index; None: in this process.
+        rig: Sensors and gripper for the live routes; None without live routes.
+        recorder: Writes feedback into the recording in the history folder; None without a history.
+        trials: Recording with unseen objects for the trials of the human baseline; None without trials.
+        shards: Opens the shards of a sharded index; None to open them in this process.
 
     Raises:
         BadInput: An input cannot be used.

@@ -1,7 +1,7 @@
 """Worker process of `retrieval.serve.decoders`: it decodes pictures from its standard input, one after the other.
 
 A request and its answer are one frame each: the lengths of a JSON document and of a byte string, then both. The module
-imports little, because each process pays for its imports.
+imports little, because each process repeats the imports.
 """
 
 import json

@@ -106,7 +106,7 @@ class BatchDocument(BaseModel):
 class CumulativeQueryDocument(BaseModel):
     """Answers to a cumulative query: after the first grasp, after the first two, and so on.
 
-    per_grasp: the answer to each grasp alone; empty unless the request has `per_grasp=true`.
+    per_grasp: the answer to each single grasp; empty unless the request has `per_grasp=true`.
     """
 
     answers: list[QueryDocument]
@@ -146,7 +146,7 @@ class NearPhotosDocument(BaseModel):
 
 
 class AgreementDocument(BaseModel):
-    """Occlusion map of a photo: by how much the match logit falls if one square of the photo is hidden.
+    """Occlusion map of a photo: the decrease of the match logit if a square of the photo is hidden.
 
     falls: rows from the top, columns from the left; negative if hiding the square raises the logit.
     """

@@ -60,7 +60,7 @@ class Generations:
     Args:
         settings: Options of the service.
         metrics: Metrics of the service.
-        shards: Opens the shards of a sharded index; None: in this process.
+        shards: Opens the shards of a sharded index; None to open them in this process.
     """
 
     def __init__(self, settings: ServiceSettings, metrics: Metrics, shards: OpenShards | None = None) -> None:

@@ -256,7 +256,9 @@ def _resolve_feedback(
         if stored.verdict == NONE_OF_THESE:
             return RIGHT, None, None
         if stored.verdict not in (MATCH, UNCALIBRATED):
-            raise HttpProblem("bad-input", f'The answer "{stored.verdict}" names no object, so it cannot be right.')
+            raise HttpProblem(
+                "bad-input", f'The verdict "{stored.verdict}" names no object, so feedback "right" is not possible.'
+            )
         return RIGHT, results[0]["object_id"], _read_photo(generation, results[0]["photo"])
     if body.feedback == NONE:
         return NONE, body.object_id, None

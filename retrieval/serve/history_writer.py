@@ -32,7 +32,7 @@ MAX_PENDING_WRITES = 64
 DRAIN_TIMEOUT_S = 2.0
 """Maximum time for which a request of the history waits for pending queries."""
 _MAX_FAILURES = 1000
-"""Number of queries that could not be stored whose reasons are remembered."""
+"""Maximum number of failed writes whose reasons are kept in memory."""
 _PNG_OR_JPEG = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
 
 
@@ -64,29 +64,29 @@ class FeedbackRecording:
             except Exception:
                 log.exception("Stored feedback cannot be recorded yet.")
                 return
-            for name, object_id in pending:
-                if self.contains(name):
+            for query_id, object_id in pending:
+                if self.contains(query_id):
                     continue
                 try:
-                    self._record(name, object_id)
+                    self._record(query_id, object_id)
                 except Exception:
                     self._metrics.history_failures.labels("feedback").inc()
-                    log.exception("The stored feedback on query %s cannot be recorded yet.", name)
+                    log.exception("The stored feedback on query %s cannot be recorded yet.", query_id)
 
-    def contains(self, name: str) -> bool:
-        """Whether the grasps of a query are in the recording."""
-        return f"{name}-00" in self._recorder.grasp_ids
+    def contains(self, query_id: str) -> bool:
+        """Whether the grasps of a query are in the recording: checks the first one, which is recorded last."""
+        return f"{query_id}-00" in self._recorder.grasp_ids
 
-    def _record(self, name: str, object_id: str) -> None:
+    def _record(self, query_id: str, object_id: str) -> None:
         """Record each grasp with contact; the first one last, because `contains` checks only that one."""
-        stored, photo = self._store.query(name), self._store.photo(name)
+        stored, photo = self._store.query(query_id), self._store.photo(query_id)
         assert stored is not None, "a foreign key protects queries with feedback"
         assert photo is not None, "recordable feedback has a photo"
-        pictures, gel_checks = self._store.pictures(name), stored.answer["query"]["grasps"]
+        pictures, gel_checks = self._store.pictures(query_id), stored.answer["query"]["grasps"]
         before = {finger: data for (grasp, finger), data in pictures.items() if grasp == BACKGROUND}
         contact_grasps = [number for number, gel_check in enumerate(gel_checks, start=1) if gel_check == CONTACT]
         for place, number in reversed(list(enumerate(contact_grasps))):
-            grasp_id = f"{name}-{place:02}"
+            grasp_id = f"{query_id}-{place:02}"
             if grasp_id in self._recorder.grasp_ids:
                 continue
             images = {"photo": as_png_or_jpeg(photo)}
@@ -94,7 +94,7 @@ class FeedbackRecording:
                 f"touch_{finger}": as_png_or_jpeg(data) for (grasp, finger), data in pictures.items() if grasp == number
             }
             images |= {f"touch_{finger}_before": as_png_or_jpeg(data) for finger, data in before.items()}
-            self._recorder.append(grasp_id, object_id, images, grasped=True, sequence_id=name)
+            self._recorder.append(grasp_id, object_id, images, grasped=True, sequence_id=query_id)
 
 
 def as_png_or_jpeg(data: bytes) -> bytes:
@@ -111,7 +111,7 @@ def as_png_or_jpeg(data: bytes) -> bytes:
 
 
 class HistoryWriter:
-    """Writer of the database and the recording in a folder; one thread writes, and no failed write stops it.
+    """Writer of the database and the recording in a folder. One thread writes; it continues after a failed write.
 
     Args:
         folder: Folder of the history.
@@ -137,26 +137,26 @@ class HistoryWriter:
         if len(self._pending) >= MAX_PENDING_WRITES:
             self._metrics.history_failures.labels("query").inc()
             return None
-        name = new_id()
+        query_id = new_id()
         write = self._writer.submit(
             self._write,
-            name,
+            query_id,
             lambda: self.store.add_query(
-                name, parsed_query.pictures.files[0], parsed_query.pictures.background, *answer
+                query_id, parsed_query.pictures.files[0], parsed_query.pictures.background, *answer
             ),
         )
-        self._pending[name] = write
-        write.add_done_callback(lambda _: self._pending.pop(name, None))
-        return name
+        self._pending[query_id] = write
+        write.add_done_callback(lambda _: self._pending.pop(query_id, None))
+        return query_id
 
-    def _write(self, name: str, write: Callable[[], None]) -> None:
-        """Write a query; a failure is logged and remembered, and does not end the thread."""
+    def _write(self, query_id: str, write: Callable[[], None]) -> None:
+        """Write a query. Log a failure and keep its reason; the thread continues."""
         try:
             write()
         except BaseException as error:
             self._metrics.history_failures.labels("query").inc()
-            log.warning("Query %s is not stored: %s", name, error, exc_info=not isinstance(error, RetrievalError))
-            self._failures[name] = str(error) or type(error).__name__
+            log.warning("Query %s is not stored: %s", query_id, error, exc_info=not isinstance(error, RetrievalError))
+            self._failures[query_id] = str(error) or type(error).__name__
             if len(self._failures) > _MAX_FAILURES:
                 self._failures.popitem(last=False)
 
@@ -165,15 +165,15 @@ class HistoryWriter:
         if pending := [asyncio.wrap_future(write) for write in list(self._pending.values())]:
             await asyncio.wait(pending, timeout=seconds)
 
-    def missing_query_problem(self, name: str) -> HttpProblem:
-        """Return the problem that explains why the history lacks a query with this id."""
-        if name in self._pending:
-            return HttpProblem("not-ready", f"Query {name} is still being stored. Try again.", {"retry-after": "1"})
-        if name in self._failures:
-            return HttpProblem("unknown", f"Query {name} could not be stored: {self._failures[name]}")
-        return HttpProblem("unknown", f"The history has no query {name[:64]!r}. The oldest queries are deleted.")
+    def missing_query_problem(self, query_id: str) -> HttpProblem:
+        """Return the problem to answer with if the history has no query with this id: it says why."""
+        if query_id in self._pending:
+            return HttpProblem("not-ready", f"Query {query_id} is still being stored. Try again.", {"retry-after": "1"})
+        if query_id in self._failures:
+            return HttpProblem("unknown", f"Query {query_id} could not be stored: {self._failures[query_id]}")
+        return HttpProblem("unknown", f"The history has no query {query_id[:64]!r}. Only the newest are kept.")
 
     def close(self) -> None:
-        """Close the database."""
+        """Stop the writer and close the database. Pending queries are not written; call `drain` first."""
         self._writer.shutdown(wait=False, cancel_futures=True)
         self.store.close()

@@ -46,7 +46,7 @@ class Metrics:
         self.generation = Gauge("retrieve_generation", "1 for the served generation", ["name"], registry=self.registry)
 
     def count_answer(self, results: Mapping[str, float] | QueryResult) -> None:
-        """Count a verdict and the stages of its query, or stages alone, in milliseconds by name."""
+        """Count a verdict and the stages of its query, or only stages, in milliseconds by name."""
         if isinstance(results, QueryResult):
             self.verdicts.labels(results.verdict).inc()
             results = results.timing_ms

@@ -41,8 +41,8 @@ async def query(request: Request, parts: Parts) -> DocumentResponse:
     parts.queue.require_capacity()
     parsed_query = await read_query(request, parts.generations.current.fingers)
     answer = await parts.queue.answer(parsed_query, request)
-    name = parts.history_writer.submit(parsed_query, answer) if parts.history_writer else None
-    return DocumentResponse(answer.result.to_dict(), headers={"x-query-id": name} if name else None)
+    query_id = parts.history_writer.submit(parsed_query, answer) if parts.history_writer else None
+    return DocumentResponse(answer.result.to_dict(), headers={"x-query-id": query_id} if query_id else None)
 
 
 @router.post(
@@ -54,21 +54,21 @@ async def query(request: Request, parts: Parts) -> DocumentResponse:
 async def query_cumulative(request: Request, parts: Parts, per_grasp: bool = False) -> DocumentResponse:
     """Return the answers after the first grasp, after the first two, and so on.
 
-    per_grasp: also return the answer to each grasp alone.
+    per_grasp: also return the answer to each single grasp.
     """
     parts.queue.require_capacity()
     parsed_query = await read_query(request, parts.generations.current.fingers)
 
     def work(generation: ServedGeneration) -> dict[str, list[QueryResult]]:
         searcher, (touches,) = generation.searcher, parsed_query.pictures.images
-        each = [[grasp] for grasp in touches if per_grasp]
+        single_grasps = [[grasp] for grasp in touches] if per_grasp else []
         return {
             "answers": searcher.query_cumulative(touches, **parsed_query.keywords),
-            "per_grasp": searcher.query_many(each, **parsed_query.keywords),
+            "per_grasp": searcher.query_many(single_grasps, **parsed_query.keywords),
         }
 
-    found = await parts.queue.submit(work, request, parsed_query.options.deadline_ms, parsed_query.pictures)
-    return DocumentResponse({name: [answer.to_dict() for answer in answers] for name, answers in found.items()})
+    results = await parts.queue.submit(work, request, parsed_query.options.deadline_ms, parsed_query.pictures)
+    return DocumentResponse({key: [result.to_dict() for result in found] for key, found in results.items()})
 
 
 @router.post("/v1/query/batch", response_model=BatchDocument, responses=_PROBLEMS, openapi_extra=json_body("BatchBody"))
@@ -77,15 +77,15 @@ async def query_batch(request: Request, parts: Parts) -> DocumentResponse:
     parts.queue.require_capacity()
     body = await read_json(request, BatchBody)
     parsed_query = ParsedQuery(pictures_of(body.objects, body.background, is_batch=True), body)
-    answers = await parts.queue.submit(
+    results = await parts.queue.submit(
         lambda generation: generation.searcher.query_many(parsed_query.pictures.images, **parsed_query.keywords),
         request,
         body.deadline_ms,
         parsed_query.pictures,
     )
-    for answer in answers:
-        parts.metrics.count_answer(answer)
-    return DocumentResponse({"answers": [answer.to_dict() for answer in answers]})
+    for result in results:
+        parts.metrics.count_answer(result)
+    return DocumentResponse({"answers": [result.to_dict() for result in results]})
 
 
 class AgreementBody(RequestBody):
@@ -104,7 +104,7 @@ class AgreementBody(RequestBody):
     openapi_extra=json_body("AgreementBody"),
 )
 async def agree(request: Request, parts: Parts) -> AgreementDocument:
-    """Return the occlusion map of a photo: the fall of the match logit if one square is hidden, for each square."""
+    """Return the occlusion map of a photo: for each square, the decrease of the match logit if it is hidden."""
     parts.queue.require_capacity()
     body = await read_json(request, AgreementBody)
     pictures = pictures_of([body.touches], body.background)

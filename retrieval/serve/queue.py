@@ -1,8 +1,8 @@
 """Queue of the requests that need the model.
 
-The number of requests in flight is limited; further requests get 429 at once. A request is dropped before its work
-begins if its client disconnects or its deadline passes. Waiting queries with equal options are answered as one batch:
-the encoder takes the same time for each, but the interpreter's work is done once.
+The number of requests in flight is limited; further requests are answered with 429 immediately. A request is dropped
+before its work begins if its client disconnects or its deadline passes. Waiting queries with equal options are answered
+as one batch: the encoder takes the same time for each, but the interpreter's work is done once.
 """
 
 import asyncio
@@ -251,7 +251,7 @@ def _answers(generation: ServedGeneration, jobs: list[_Job]) -> list[Any]:
     """Return the result or the exception of each job; a failing query does not affect the others."""
     parsed_queries = [job.parsed_query for job in jobs if job.parsed_query is not None]
     if len(jobs) > 1:
-        with suppress(BaseException):  # if the batch fails, each query is answered alone
+        with suppress(BaseException):  # if the batch fails, each query is answered separately
             found = generation.searcher.query_many(
                 [one.pictures.images[0] for one in parsed_queries], **parsed_queries[0].keywords
             )

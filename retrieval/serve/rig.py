@@ -1,6 +1,6 @@
 """Live rigs of the service: sensor pictures, and grasps with the simulated rig.
 
-A real rig only shows its sensors: no HTTP request moves it.
+Of a real rig, only sensor pictures are available: no HTTP request moves it.
 """
 
 import random
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 _SIMULATED_OBJECT_ID = re.compile(r".+-(\d{4,})-\d{5,}")
 """Object ids of the simulated rig: prefix, seed, number."""
 _FIRST_UNRECORDED_ATTEMPT = 10_000
-"""No recording contains attempts from this number on."""
+"""First number of the live attempts; recordings contain only attempts with smaller numbers."""
 _MAX_ATTEMPTS = 20
 
 
@@ -60,7 +60,7 @@ def load_live_rig(spec: str, index: str | Path) -> LiveRig:
 
 
 def simulated_live_rig(index: str | Path) -> LiveRig | None:
-    """Return the simulated rig if the index shows its objects and the extra `sim` is installed, else None."""
+    """Return the simulated rig if the index contains its objects and the extra `sim` is installed, else None."""
     seed = _seed(index)
     if seed is None:
         return None
@@ -95,7 +95,7 @@ class _SimulatedGripper:
         self._gels: dict[str, npt.NDArray[np.uint8]] = {}
 
     def grasp(self, names: list[str]) -> GraspResult:
-        """Grasp a random one of these objects, again with another one if the grasp misses."""
+        """Grasp a random one of these objects, and retry with another one if the grasp misses."""
         rng = random.SystemRandom()
         with self._lock:
             for _ in range(_MAX_ATTEMPTS):

@@ -1,7 +1,7 @@
 """Access control, and the security headers of every response.
 
-Without a token the service answers only this machine. Requests that a foreign page in a local browser sends name the
-foreign host or origin, and are refused.
+Without a token, only requests from this machine are answered. Requests that a foreign page in a local browser sends
+name the foreign host or origin, and are refused.
 """
 
 import asyncio

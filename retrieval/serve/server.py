@@ -20,7 +20,7 @@ from retrieval.serve.connections import IDLE_S, MAX_CONNECTIONS, Connection, Con
 from retrieval.serve.service import Service
 
 DRAIN_S = 0.5
-"""Time after the signal in which it still accepts requests: those sent before may lie unread in a socket."""
+"""Time after the signal in which requests are still accepted: those sent before may be unread in a socket."""
 SHUTDOWN_GRACE_S = 4
 """Time limit for requests in flight, after `DRAIN_S`."""
 MAX_SHUTDOWN_S = 7.5
@@ -76,7 +76,7 @@ class Server(uvicorn.Server):
                 signal.signal(number, handler)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """End the streams, which never end by themselves, and the server."""
+        """End the streams, which otherwise never end, and the server."""
         self._parts.stopping.set()
         super().handle_exit(sig, frame)
 

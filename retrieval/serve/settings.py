@@ -25,11 +25,11 @@ class ServiceSettings:
 
     Attributes:
         index: Index folder or URL.
-        model: Checkpoint; None: the one that the index names.
+        model: Checkpoint; None for the one that the index names.
         verify: Whether to verify checksums when the index opens.
         host: Host to listen on; a host other than this machine requires a `token`.
         port: Port to listen on; 0: any free port.
-        token: Access token of at least 16 ASCII characters; None: none.
+        token: Access token of at least 16 ASCII characters; None for a service without one.
         queue: Maximum number of requests in flight.
         workers: Threads that answer queries.
         batch_ms: Time for which a query waits for further queries of its batch.
@@ -37,7 +37,7 @@ class ServiceSettings:
         deadline_s: Time limit for an answer.
         body_s: Time limit for the body of a request to arrive.
         poll_s: Interval of the checks for a new generation of the index.
-        history: Folder for queries and feedback; None: nothing is stored.
+        history: Folder for queries and feedback; None to store nothing.
         history_max_queries: Maximum number of stored queries without feedback.
         history_max_bytes: Maximum total size of the gel images of queries without feedback.
         streams: Maximum number of concurrent sensor streams.

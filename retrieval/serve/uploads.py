@@ -26,7 +26,7 @@ from retrieval.serve.settings import MAX_BODY_BYTES, MAX_PICTURES, MAX_SMALL_BOD
 PICTURE_PATHS = frozenset({"/v1/query", "/v1/query/batch", "/v1/query/cumulative", "/v1/agreement"})
 """Routes whose bodies contain pictures: up to `MAX_BODY_BYTES`. All others: up to `MAX_SMALL_BODY_BYTES`."""
 LARGE_BYTES = 1_000_000
-"""A body above this size counts as large."""
+"""Size in bytes above which a body is treated as large."""
 MAX_LARGE_BODIES = 2
 """Maximum number of concurrent large bodies."""
 MAX_SMALL_BODIES_BYTES = 20_000_000
@@ -133,7 +133,10 @@ class Options(RequestBody):
 
     top: int = Field(10, ge=1, le=1000, description="Number of objects to return.")
     candidates: int | None = Field(
-        None, ge=1, le=10_000_000, description="Photos that the full classifier scores; null: the index's own number."
+        None,
+        ge=1,
+        le=10_000_000,
+        description="Photos that the fusion head scores; null for the index's own number.",
     )
     none_prior: float = Field(
         NONE_PRIOR, gt=0, lt=1, description="Prior probability that the catalogue lacks the object."
@@ -197,7 +200,7 @@ class RequestPictures:
 
     Attributes:
         files: One file for each finger of each grasp of each object.
-        background: One no-contact frame for each finger; None: none.
+        background: One no-contact frame for each finger; None without them.
         is_batch: Whether messages name the object.
         images: The decoded `files`.
         frames: The decoded `background`.
@@ -252,7 +255,7 @@ def pictures_of(
 
     Args:
         objects: One file for each finger of each grasp of each object.
-        background: One no-contact frame for each finger; None: none.
+        background: One no-contact frame for each finger; None without them.
         is_batch: Whether messages name the object.
 
     Returns:

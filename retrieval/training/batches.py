@@ -181,7 +181,7 @@ class FrozenFeatures(BatchImages):
         return LoadedBatch(batch, touches, torch.stack([self._features[path] for path in batch.photos]))
 
     def step_context(self) -> AbstractContextManager[None]:
-        """Return the context of a training step: one thread, since the head's small products gain nothing from more."""
+        """Return the context of a training step: one thread, since more do not speed up the head's small products."""
         return one_thread()
 
     def train_features(self, matcher: Matcher, loaded: LoadedBatch) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""Disk cache of decoded images: memory-mapped files in a folder that all trainings can use.
+"""Disk cache of decoded images: memory-mapped files in a folder that all training runs can use.
 
 Images are stored in parts, `photo-<digest>.npy`, like features (`retrieval.training.features`). The digest covers the
 picture files of a part and their preprocessing, so a changed picture or setting gives a new part. A part is written

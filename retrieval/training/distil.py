@@ -1,11 +1,16 @@
 """Distil the fusion head's ranking of photos into a candidate encoder (Hinton, Vinyals, Dean, arXiv:1503.02531).
 
-The head scores every pair of a batch of touches and photos, and the student's scores learn its softmax over the photos.
-This loss weights the top of the ranking, from which candidates are taken. Touches and photos of each step are random
-blends of two recorded ones: partial activations are affine in features, so a blend of partial activations is the
-partial activation of the blended features. So a few thousand recorded photos represent a large catalogue. In a large
-catalogue many photos score nearly as high as the exhaustive top-1, but a few thousand photos contain few of these. So
-most of a batch are the photos of a large pool that are nearest by the current student.
+The head (teacher) scores every pair of a batch of touches and photos. The candidate encoder (student) learns the
+softmax of these scores over the photos. This loss gives the top of the ranking, from which candidates are taken, a
+large weight.
+
+Training examples are mixup blends of two recorded partial activations, so a few thousand recorded photos represent a
+large catalogue. The head's term is affine in the normalised features: its blend is that of the blended features. The
+embedding part (`cosine`) is blended too, and is then shorter than the embedding of a real image.
+
+In a large catalogue many photos score nearly as high as the exhaustive top-1; a few thousand photos contain few such
+hard negatives. Therefore most photos of a batch are the nearest ones, by the current student, in a large pool of
+blends.
 """
 
 import dataclasses
@@ -30,9 +35,9 @@ from retrieval.training.features import Features
 from retrieval.training.fit import Plan, fit
 
 BATCH_TOUCHES, BATCH_PHOTOS = 32, 2048
-"""In a batch; every touch is scored with every photo."""
+"""Numbers of touches and photos in a batch; every touch is scored with every photo."""
 LEARNING_RATE = 2e-3
-SPREAD_WEIGHT = 0.3
+SQUARED_ERROR_WEIGHT = 0.3
 """Weight of the squared error of all scores, in addition to the divergence; it stabilises the start."""
 MIN_WEIGHT = 0.5
 """Smallest weight of the first of two blended rows."""
@@ -45,7 +50,7 @@ WARMUP_DIVISOR = 6
 CANDIDATE_FRACTION = 0.01
 """Fraction of the photos that are candidates when a candidate encoder is evaluated."""
 MAX_GRASPS = 8192
-"""Grasps whose partial activations are blended."""
+"""Largest number of grasps whose partial activations are blended."""
 MAX_QUERIES = 512
 """Largest number of validation touches stored in a checkpoint."""
 
@@ -62,9 +67,9 @@ def distil(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Train a candidate encoder from `matcher.head` and add it to `matcher`; nothing else of the matcher changes.
+    """Train a candidate encoder from `matcher.head`, and add it and its sizes (`matcher.config`) to `matcher`.
 
-    The matcher is unchanged if an error is raised.
+    The other weights do not change. The matcher is unchanged if an error is raised.
 
     Args:
         matcher: The matcher.
@@ -73,7 +78,7 @@ def distil(
         width: Hidden units of the candidate encoder.
         steps: Number of steps.
         seed: The same seed gives the same candidate encoder.
-        linear: Number of values that are linear in the contrastive embedding
+        linear: Number of output components of the candidate encoder that are linear in the contrastive embedding
             (`retrieval.model.config.MatcherConfig`).
         quiet: No progress on stderr.
         should_stop: Called after each step.
@@ -86,25 +91,25 @@ def distil(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         candidate_encoder = candidate_encoder_of(config).to(touch_partials.device)
-    touch_spread, photo_spread = (
+    touch_statistics, photo_statistics = (
         PartialStatistics.of(part, config.partial_width - config.hidden) for part in (touch_partials, photo_partials)
     )
-    candidate_encoder.initialise_linear(photo_partials, touch_spread, photo_spread)
+    candidate_encoder.initialise_linear(photo_partials, touch_statistics, photo_statistics)
     generator, head = torch.Generator().manual_seed(seed), matcher.head.eval()
-    sampler = _PhotoSampler(candidate_encoder, photo_partials, photo_spread, generator)
+    sampler = _PhotoSampler(candidate_encoder, photo_partials, photo_statistics, generator)
 
     def loss(step: int) -> Tensor:
         touches = blend(touch_partials, BATCH_TOUCHES, generator)
-        standardised = touch_spread(touches)
+        standardised = touch_statistics(touches)
         photos = sampler.photos(step - steps // WARMUP_DIVISOR, standardised)
-        scores = candidate_encoder.scores(standardised, photo_spread(photos))
+        scores = candidate_encoder.scores(standardised, photo_statistics(photos))
         return distillation_loss(scores, all_logits(head, touches, photos))
 
     optimizer, plan = torch.optim.Adam(candidate_encoder.parameters()), Plan(steps, LEARNING_RATE)
     with Bar("distil candidate encoder", steps, "steps", quiet=quiet) as bar:
         if fit(optimizer, plan, range(steps), loss, bar=bar, should_stop=should_stop) < steps:
             raise JobInterrupted("stopped before the candidate encoder was trained")
-    candidate_encoder.fold_statistics(touch_spread, photo_spread)
+    candidate_encoder.fold_statistics(touch_statistics, photo_statistics)
     matcher.config, matcher.candidate_encoder = config, candidate_encoder.eval()
 
 
@@ -115,17 +120,18 @@ class _PhotoSampler:
         self,
         candidate_encoder: CandidateEncoder,
         partials: Tensor,
-        spread: PartialStatistics,
+        statistics: PartialStatistics,
         generator: torch.Generator,
     ) -> None:
-        self._encoder, self._partials, self._spread, self._generator = candidate_encoder, partials, spread, generator
+        self._encoder, self._partials, self._statistics = candidate_encoder, partials, statistics
+        self._generator = generator
         self._pool, self._embeddings = Blends.sample(partials, 0, generator), partials[:0]
 
     @torch.no_grad()
     def photos(self, step: int, touches: Tensor) -> Tensor:
         """Return partial activations (BATCH_PHOTOS, P) for a step and its standardised touches (T, P).
 
-        Before step 0, all of them are random blends.
+        Steps count from the end of the warm-up. Before step 0, all photos are random blends.
         """
         if step < 0:
             return blend(self._partials, BATCH_PHOTOS, self._generator)
@@ -136,7 +142,7 @@ class _PhotoSampler:
                 self._pool.of(self._partials, rows[start : start + BATCH_PHOTOS])
                 for start in range(0, POOL_SIZE, BATCH_PHOTOS)
             )
-            self._embeddings = torch.cat([self._encoder.photo(self._spread(part)) for part in partials])
+            self._embeddings = torch.cat([self._encoder.photo(self._statistics(part)) for part in partials])
         each = max(1, round(POOL_FRACTION * BATCH_PHOTOS / len(touches)))
         near = (self._encoder.touch(touches) @ self._embeddings.T).topk(each).indices
         near = torch.tensor(sorted(set(near.flatten().tolist())), device=near.device)
@@ -149,18 +155,18 @@ def distillation_loss(scores: Tensor, logits: Tensor) -> Tensor:
 
     Args:
         scores: (T, N) scores of the student; a constant added to a row has no effect.
-        logits: (T, N) match logits of the head, likewise.
+        logits: (T, N) match logits of the head; a constant added to a row has no effect.
     """
     divergence = functional.kl_div(
         functional.log_softmax(scores, 1), functional.log_softmax(logits, 1), log_target=True, reduction="batchmean"
     )
     centred = logits - logits.mean(1, keepdim=True)
     error = (scores - scores.mean(1, keepdim=True) - centred).square().mean() / logits.var().clamp(min=1e-6)
-    return divergence + SPREAD_WEIGHT * error
+    return divergence + SQUARED_ERROR_WEIGHT * error
 
 
 class Blends(NamedTuple):
-    """Recipes of n blends of two rows.
+    """Random choices for n blends of two rows.
 
     Attributes:
         pairs: (2, n) rows.
@@ -262,7 +268,7 @@ def select_queries(touch_partials: Tensor, seed: int) -> NDArray[np.float16] | N
 
 
 def with_candidate_encoder(
-    made: Checkpoint,
+    checkpoint: Checkpoint,
     config: Config,
     train: tuple[Tensor, Tensor],
     validation: tuple[Tensor, Tensor] | None = None,
@@ -270,12 +276,12 @@ def with_candidate_encoder(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Checkpoint:
-    """Return the checkpoint `made` with a distilled candidate encoder, queries, and the encoder's metric.
+    """Return `checkpoint` with a distilled candidate encoder, queries, and the encoder's metric.
 
-    The matcher of `made` is reused and modified.
+    The matcher of `checkpoint` is reused and modified.
 
     Args:
-        made: The checkpoint.
+        checkpoint: The checkpoint.
         config: The configuration, which sets the size of the candidate encoder.
         train: Partial activations (N, P) of touches and of photos of training objects.
         validation: The same of validation objects, if any. The metric uses their touches among the photos of all.
@@ -286,7 +292,7 @@ def with_candidate_encoder(
         JobInterrupted: As for `distil`.
         NumericalError: As for `distil`.
     """
-    settings, matcher, metrics = config.training, made.matcher, made.provenance["metrics"]
+    settings, matcher, metrics = config.training, checkpoint.matcher, checkpoint.provenance["metrics"]
     width, linear, steps = config.matcher.candidate_width, config.matcher.candidate_linear, settings.distil_steps
     seed = settings.seed
     distil(matcher, *train, width=width, linear=linear, steps=steps, seed=seed, quiet=quiet, should_stop=should_stop)
@@ -294,12 +300,12 @@ def with_candidate_encoder(
     if validation is not None and queries is not None:
         touches = torch.from_numpy(queries).to(validation[1].device).float()
         metrics = metrics | agreement_metrics(matcher, touches, torch.cat([train[1], validation[1]]))
-    about = made.provenance | {"metrics": metrics}
-    return dataclasses.replace(made, matcher=matcher, config=config, provenance=about, queries=queries)
+    about = checkpoint.provenance | {"metrics": metrics}
+    return dataclasses.replace(checkpoint, matcher=matcher, config=config, provenance=about, queries=queries)
 
 
 def add_candidate_encoder(
-    made: Checkpoint,
+    checkpoint: Checkpoint,
     config: Config,
     source: FeatureSource,
     train: Sequence[Grasp],
@@ -308,10 +314,10 @@ def add_candidate_encoder(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Checkpoint:
-    """Return the checkpoint `made` with a candidate encoder distilled on recorded grasps.
+    """Return `checkpoint` with a candidate encoder distilled on recorded grasps.
 
     Args:
-        made: The checkpoint. Its matcher is reused and modified; it must be on the device of `source`.
+        checkpoint: The checkpoint. Its matcher is reused and modified; it must be on the device of `source`.
         config: The configuration, which sets the size of the candidate encoder.
         source: The source of features.
         train: Grasps of training objects.
@@ -324,9 +330,11 @@ def add_candidate_encoder(
         NumericalError: As for `distil`.
     """
     partials = [
-        recorded_partials(made.matcher, source, grasps, config.training.seed, quiet=quiet, should_stop=should_stop)
+        recorded_partials(
+            checkpoint.matcher, source, grasps, config.training.seed, quiet=quiet, should_stop=should_stop
+        )
         for grasps in (train, validation)
         if grasps
     ]
     with source.step_context():
-        return with_candidate_encoder(made, config, *partials, quiet=quiet, should_stop=should_stop)
+        return with_candidate_encoder(checkpoint, config, *partials, quiet=quiet, should_stop=should_stop)

@@ -175,7 +175,7 @@ def _statistics(counted: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     counts, means, variances = torch.stack(parts, 1)
     weights = counts / counts.sum(0)
     total_mean = (weights * means).sum(0)
-    # Squared differences: the mean square minus the squared mean loses all digits where the mean is far from 0.
+    # Squared differences: the mean square minus the squared mean loses all digits if the mean is far from 0.
     return total_mean, (weights * (variances + (means - total_mean).square())).sum(0), counts.sum(0)[0]
 
 

@@ -193,7 +193,7 @@ def encode_recording(
         matcher: The matcher.
         config: The configuration, for preprocessing and workers.
         cache: Folder of cached parts of 512 images; a later or resumed run reads them. A part's name is a digest of
-            tower, preprocessing, variant and image files. None stores nothing.
+            tower, preprocessing, variant and image files. None to store nothing.
         touch_variant: One of `TOUCH_VARIANTS`.
         photo_variant: One of `PHOTO_VARIANTS`.
         photo_features_from: Features of at least these grasps; their photo features are used without encoding.
@@ -320,7 +320,7 @@ class _FeatureCache(Generic[T]):
 
 
 def _read_cached(path: Path) -> Tensor | None:
-    """Return cached features, or None where there are none or the file is damaged."""
+    """Return cached features, or None if there are none or the file is damaged."""
     if not path.is_file():
         return None
     try:

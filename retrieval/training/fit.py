@@ -18,7 +18,7 @@ Batch = TypeVar("Batch")
 
 @dataclass(frozen=True)
 class Plan:
-    """Length and speed of a training.
+    """Length and learning rate of a training run.
 
     Attributes:
         steps: Number of optimiser steps.
@@ -52,7 +52,7 @@ def fit(
 
     Args:
         optimizer: The optimiser.
-        plan: Length and speed of the training.
+        plan: Length and learning rate of the training run.
         batches: The remaining batches.
         loss: Returns the loss of a batch.
         bar: Progress bar.
@@ -121,12 +121,12 @@ def fit_best(
 ) -> BestStep:
     """Train `module` by `fit` with AdamW, and restore the weights of its best step.
 
-    Weight decay applies to matrices only, since a bias or a temperature has no reason to be small. The module ends in
+    Weight decay applies to matrices only, since biases and temperatures need not be small. The module ends in
     evaluation mode.
 
     Args:
         module: The module.
-        plan: Length and speed of the training.
+        plan: Length and learning rate of the training run.
         loss: Returns the loss of the step with this number.
         score: Returns the validation score; higher is better.
         bar: Progress bar.

@@ -1,4 +1,4 @@
-"""Foreign pictures (not gel images), for training the check of touches.
+"""Foreign pictures (not gel images), for training the gel check.
 
 Synthetic pictures (plain, noise, clouds, ramps, stripes), pieces of photos, and gel images in false colours.
 """

@@ -77,7 +77,7 @@ def _convolution(inputs: int, outputs: int, kernel: int) -> list[nn.Module]:
 
 
 class FingerFrames(Protocol):
-    """One finger's frames, (H, W, 3) uint8 RGB, from `robot.grasping.gates`; None where the rig does not take them."""
+    """One finger's frames, (H, W, 3) uint8 RGB, from `robot.grasping.gates`; None if the rig does not take them."""
 
     @property
     def before(self) -> NDArray[np.uint8] | None:
@@ -127,7 +127,7 @@ class GraspSuccessGate:
         """Return the logits of grasps, each given by its fingers' differences.
 
         Raises:
-            NumericalError: A logit is not finite. A NaN is not above 0, so the grasp would count as failed.
+            NumericalError: A logit is not finite. A NaN is not above 0, so the grasp would be classified as failed.
         """
         with one_thread():
             logits = self.net(touch_batch(differences))

@@ -2,14 +2,14 @@
 
 Like the authors' classifier, it processes one finger at a time and combines the fingers. The differences and reasons:
 
-* It uses the frame AFTER the lift where the recording has it, like the authors' collection code, else the frame during
+* It uses the frame AFTER the lift if the recording has it, like the authors' collection code, else the frame during
   the grasp. An object that slips is absent after the lift, but it presses the gel like any other during the grasp. On
   569 grasps of the simulated rig, the later frame classified all grasps correctly on three splits. The frame during the
   grasp (accuracy 0.60 to 0.71) accepted half of the slips and rejected a fifth of the held grasps, three quarters for
   some objects. `GateSettings(frame="during")` uses the touch itself, for rigs that do not lift.
-* The loss uses the highest logit of the fingers, which alone decides. With the grasp's label on each finger, a finger
-  without contact in a good grasp would teach that an empty gel is a success. And the maximum of two outputs that were
-  fitted separately accepts more grasps than either.
+* The loss uses the highest logit of the fingers, because only this logit decides. With the grasp's label on each
+  finger, a finger without contact in a good grasp would teach that an empty gel is a success. And the maximum of two
+  outputs that were fitted separately accepts more grasps than each of them.
 * Batches contain equal numbers of held and failed grasps, so probability 1/2 means even odds at any success rate.
 
 A gate selects the touches that a matcher later trains on, so it makes them easier: log the grasps that it rejects.
@@ -62,7 +62,7 @@ class GateReport:
         validation_grasps: Number of validation grasps.
         validation_objects: Number of validation objects.
         accuracy: Fraction of validation grasps classified correctly.
-        interval: 95 % interval of the accuracy; grasps of one object count as dependent.
+        interval: 95 % interval of the accuracy; grasps of one object are treated as dependent.
         chance: Accuracy of always predicting the more frequent class.
         accepted: (accepted, all) grasps by outcome.
         lowest_acceptance: The object with the lowest acceptance of held grasps, and that fraction.

@@ -1,8 +1,8 @@
 """Pretrain one tower on relief and shape labels, from labelled pictures without touch-photo pairs.
 
-A photo-only object costs a tenth of the time of a grasped one, and a matcher's photo tower mostly lacks objects. The
-tower learns the relief and shape families of an object, and the pitch, amplitude, aspect and sharpness of its relief. A
-matcher starts from its weights (`init_photo`, `init_touch`), and its head is trained on touched objects.
+A photo-only object takes a tenth of the time of a grasped one, and a photo tower is limited mainly by the number of
+objects. The tower learns the relief and shape families of an object, and the pitch, amplitude, aspect and sharpness of
+its relief. A matcher starts from its weights (`init_photo`, `init_touch`), and its head is trained on touched objects.
 """
 
 import dataclasses
@@ -42,7 +42,7 @@ HEAD_RATE_FACTOR = 5.0
 VALIDATION, MAX_VALIDATION_OBJECTS = 0.05, 400
 SAVE_EVERY = 200
 BACKGROUNDS = ("none", "difference+0.5")
-"""Background policies of training touches, drawn at random, so that the weights serve matchers of both policies."""
+"""Background policies of training touches, drawn at random, so that the weights suit matchers of both policies."""
 VISIBLE_FRACTION = 0.8
 """Fraction of a photo's side that a training step uses; a gel image is used whole."""
 
@@ -106,12 +106,12 @@ def train_relief(
         The accuracy on held-out objects.
 
     Raises:
-        DatasetError, ConfigError, CheckpointError: The data or settings cannot be trained with.
+        DatasetError, ConfigError, CheckpointError: Training is not possible with the data or settings.
         JobInterrupted: After Ctrl-C.
     """
     if config.preprocessing.background == "difference":
         raise ConfigError(
-            "this training uses 8-bit pictures, which cannot store negative differences; "
+            "relief training uses 8-bit pictures, which cannot store negative differences; "
             'set background = "difference+0.5"'
         )
     if iterations < 1:
@@ -279,7 +279,7 @@ class ReliefTraining:
         )
 
     def _identity(self) -> dict[str, Any]:
-        """Return the settings that must not change between a training and its resumption."""
+        """Return the settings that must not change between a training run and its resumption."""
         return {"config": self.config.to_dict(), "iterations": self.iterations, "pictures": self.labels}
 
     def _save(self, out: Path) -> None:
@@ -289,7 +289,7 @@ class ReliefTraining:
         """Continue from the state of `out`.
 
         Raises:
-            CheckpointError: There is no state, or it belongs to another training.
+            CheckpointError: There is no state, or it belongs to another training run.
         """
         self.step = load_state(out, self.modules, self.optimizer, self._identity())["step"]
 
@@ -342,7 +342,7 @@ def _sample_grid(images: Tensor, maps: Tensor, visible: float) -> Tensor:
 
 
 def _correlation(predictions: NDArray[np.float32], targets: NDArray[np.float32]) -> float:
-    """Return Pearson's correlation, or 0 where one side does not vary."""
+    """Return Pearson's correlation, or 0 if one side does not vary."""
     if len(predictions) < 2 or predictions.std() == 0 or targets.std() == 0:
         return 0.0
     return float(np.corrcoef(predictions, targets)[0, 1])

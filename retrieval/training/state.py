@@ -1,4 +1,4 @@
-"""The state of an unfinished training, next to its output: weights, optimiser, step, and fixed settings."""
+"""The state of an unfinished training run, next to its output: weights, optimiser, step, and fixed settings."""
 
 import hashlib
 import inspect
@@ -29,20 +29,20 @@ _MODEL, _OPTIMIZER = "model.", "optimizer."
 
 
 def state_path(out: Path) -> Path:
-    """Return the file of an unfinished training of `out`."""
+    """Return the file of an unfinished training run of `out`."""
     return sibling_file(out, ".state.safetensors")
 
 
 def require_no_unfinished_state(out: Path) -> None:
-    """Check that a new training of `out` overwrites no unfinished one.
+    """Check that a new training run of `out` overwrites no unfinished one.
 
     Raises:
-        CheckpointError: The state of an unfinished training exists.
+        CheckpointError: The state of an unfinished training run exists.
     """
     if state_path(out).exists():
         raise CheckpointError(
-            f"an unfinished training is at {state_path(out)}; continue it with --resume, or delete the file to start "
-            "a new one"
+            f"an unfinished training run is at {state_path(out)}; continue it with --resume, or delete the file to "
+            "start a new one"
         )
 
 
@@ -54,10 +54,10 @@ def save_state(
     *,
     excluded: tuple[str, ...] = (),
 ) -> None:
-    """Write the state of an unfinished training of `out`.
+    """Write the state of an unfinished training run of `out`.
 
     Args:
-        out: The output of the training.
+        out: The output of the training run.
         modules: Everything with parameters.
         optimizer: The optimiser of these parameters.
         header: The step, and the settings that `load_state` compares; JSON types.
@@ -83,7 +83,7 @@ def load_state(
     """Load the state that `save_state` wrote into `modules` and `optimizer`.
 
     Args:
-        out: The output of the training.
+        out: The output of the training run.
         modules: As in `save_state`.
         optimizer: As in `save_state`.
         identity: Settings that the header must contain unchanged.
@@ -93,15 +93,15 @@ def load_state(
         The header.
 
     Raises:
-        CheckpointError: There is no state, or it belongs to another training.
+        CheckpointError: There is no state, or it belongs to another training run.
     """
     path = state_path(out)
     tensors, header = read_tensors(path)
     for name, value in json.loads(json.dumps(identity)).items():
         if header.get(name) != value:
             raise CheckpointError(
-                f"{path} belongs to a training with another {name.replace('_', ' ')}; resume with the same data and "
-                "configuration, or delete the file to start a new training"
+                f"{path} belongs to a training run with another {name.replace('_', ' ')}; resume with the same data "
+                "and configuration, or delete the file to start a new one"
             )
     weights = {name.removeprefix(_MODEL): tensor for name, tensor in tensors.items() if name.startswith(_MODEL)}
     load_weights(modules, weights | dict(excluded()))
@@ -142,7 +142,7 @@ def finish_training(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
 
     Args:
         trainer: A training whose `out` is `unfinished_path(done)`.
-        done: Path of the finished checkpoint. A checkpoint of another training is replaced.
+        done: Path of the finished checkpoint. A checkpoint of another training run is replaced.
         quiet: No progress on stderr.
 
     Raises:
@@ -156,7 +156,7 @@ def finish_training(trainer: "Trainer", done: Path, quiet: bool) -> Checkpoint:
     if state_path(trainer.out).is_file():
         try:
             trainer.resume()
-        except CheckpointError:  # of another training
+        except CheckpointError:  # of another training run
             state_path(trainer.out).unlink()
     trainer.run(quiet)
     for ending in (".md", ".safetensors"):

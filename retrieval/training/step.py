@@ -16,7 +16,7 @@ from retrieval.training.batches import FeatureSource
 
 
 class WeightedLosses(nn.Module):
-    """The losses of a training whose weight is above 0, with their own parameters."""
+    """The losses of a training run whose weight is above 0, with their own parameters."""
 
     def __init__(self, weights: Mapping[str, float], matcher: Matcher, objects: int) -> None:
         """Create the losses with a weight above 0.

@@ -78,13 +78,13 @@ def train(
         recording: A folder, or the result of `robot.read_recording`. It decides the number of fingers.
         out: The checkpoint (.safetensors).
         config: An object (`Config.using` accepts your own towers and losses), or an argument of `load_config`.
-        split: Objects of each part; drawn from the configuration where None.
+        split: Objects of each part. Default: a random split as the configuration sets it.
         resume: Continue from the state next to `out`.
         cache: Folder of decoded images (`retrieval.training.disk_image_cache`), for towers that are trained.
         quiet: No progress on stderr.
 
     Raises:
-        DatasetError, ConfigError, CheckpointError: The data or settings cannot be trained with.
+        DatasetError, ConfigError, CheckpointError: Training is not possible with the data or settings.
         JobInterrupted: After Ctrl-C.
 
     >>> import dataclasses
@@ -150,7 +150,7 @@ class Trainer:
         towers = (module for module in self.matcher.modules() if isinstance(module, Tower))
         self.code = code_digest(*map(type, (*self.losses.terms, *towers)))
         trained = [parameter for parameter in self.modules.parameters() if parameter.requires_grad]
-        # On a CPU PyTorch's default passes over every tensor eight times, and fused once. CUDA's default is fast.
+        # On a CPU, PyTorch's default optimizer reads every tensor eight times, the fused one once. CUDA's is fast.
         self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
@@ -165,7 +165,7 @@ class Trainer:
 
     def _sampler(self, chosen: list[Grasp]) -> PairSampler:
         settings = self.config.training
-        # With cached features, drawing from all objects costs nothing.
+        # Frozen towers have cached features: negatives from all objects cost nothing.
         shared = not settings.freeze_towers if settings.negatives == "auto" else settings.negatives == "batch"
         return PairSampler(
             chosen,
@@ -259,7 +259,8 @@ class Trainer:
                 should_stop = True
         if distributed.any_rank(should_stop, self.device):  # all ranks wait here until the files are written
             raise JobInterrupted(
-                f"stopped before the checkpoint was complete; {self.out} ranks photos, --resume adds the rest"
+                f"stopped before the last parts were fitted; {self.out} can rank photos but is not complete. Run the "
+                "same command with --resume to add these parts"
             )
 
     def _complete(self, stop: threading.Event, quiet: bool) -> None:
@@ -349,7 +350,7 @@ class Trainer:
         # The configuration changes when the candidate encoder is added.
         if not mine or stored.config not in (self.config_without_encoder, self.config):
             raise CheckpointError(
-                f"{self.out} does not belong to the training to resume; restore its checkpoint or start a new training"
+                f"{self.out} does not belong to the training run to resume; restore its checkpoint or start a new run"
             )
         return stored
 

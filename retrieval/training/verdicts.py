@@ -1,8 +1,8 @@
-"""Fit the parts of a checkpoint that verdicts need, after training: a posterior, and a check of touches.
+"""Fit the parts of a checkpoint that verdicts need, after training: a posterior, and the gel check.
 
-The posterior (`retrieval.model.posterior`) is fitted on touches and photos of validation objects. The check
+The posterior (`retrieval.model.posterior`) is fitted on touches and photos of validation objects. The gel check
 (`retrieval.model.fusion_scorer`) uses the touch tower's features. Its linear layer is fitted on touches and no-contact
-frames of training objects and on foreign pictures, its thresholds on those of validation objects.
+frames of training objects and on foreign pictures. Its thresholds are chosen on those of validation objects.
 """
 
 import dataclasses
@@ -31,9 +31,9 @@ from retrieval.training.foreign_images import draw_foreign
 MAX_GRASPS = 400
 """Largest number of grasps from each part of the split."""
 MIN_GRASPS = 40
-"""Validation grasps that a check of touches needs; thresholds of fewer grasps would reject too many touches."""
+"""Number of validation grasps that the gel check needs; thresholds of fewer grasps would reject too many touches."""
 FOREIGN_COUNT = 700
-"""Foreign pictures for fitting; half as many others are for validation."""
+"""Number of foreign pictures for fitting; half as many others are drawn for validation."""
 FALSE_ALARM_RATE = 0.005
 """Fraction of validation gel images that may be classified as foreign, and of no-contact frames as touches."""
 MARGIN = 1.0
@@ -58,9 +58,9 @@ def with_verdicts(
     quiet: bool = False,
     should_stop: StopRequested = lambda: False,
 ) -> Checkpoint:
-    """Return the checkpoint `made` with a posterior and a check of touches, if there are enough validation grasps.
+    """Return the checkpoint `made` with a posterior and a gel check, if there are enough validation grasps.
 
-    A posterior needs three validation objects and a second photo of some touch's object. A check of touches needs
+    A posterior needs three validation objects, and a touch with a second photo of its object. A gel check needs
     `MIN_GRASPS` validation grasps.
 
     Args:
@@ -90,9 +90,7 @@ def with_verdicts(
     )
     if len(validation) < MIN_GRASPS:
         return made
-    train_touches, _ = recorded_features(
-        matcher, source, train, what="check of touches", quiet=quiet, should_stop=should_stop
-    )
+    train_touches, _ = recorded_features(matcher, source, train, what="gel check", quiet=quiet, should_stop=should_stop)
     preprocessing = made.config.preprocessing
     fitting = GelCheckFeatures.of(matcher, preprocessing, train, train_touches, foreign, seed)
     test = GelCheckFeatures.of(matcher, preprocessing, validation, touches, foreign // 2, seed + 1)
@@ -117,7 +115,7 @@ def _sample_grasps(grasps: Sequence[Grasp], seed: int) -> list[Grasp]:
 def posterior_touches(
     matcher: Matcher, grasps: Sequence[Grasp], touches: Tensor, photos: dict[Path, Tensor]
 ) -> ReferenceTouches | None:
-    """Return the data that a posterior is fitted on, or None where there are too few objects or photos.
+    """Return the data that a posterior is fitted on; None if there are too few objects or photos.
 
     Args:
         matcher: The matcher.
@@ -141,7 +139,7 @@ def posterior_touches(
     return ReferenceTouches(ScoredTouches(logits, touch_owner, photo_owner, own), embeddings)
 
 
-# The check of touches --------------------------------------------------------------------------------------
+# The gel check ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +148,7 @@ class GelCheckFeatures:
 
     Attributes:
         touch: (G, fingers, F) of touches.
-        no_contact: (U, fingers, F) of no-contact frames; U = 0 where none are recorded.
+        no_contact: (U, fingers, F) of no-contact frames; U = 0 if none are recorded.
         foreign: (N, F) of foreign pictures.
         is_plainly_foreign: (N,) False for gel images in false colours.
     """
@@ -252,8 +250,8 @@ def fit_gel_head(fitting: GelCheckFeatures, penalty: float = PENALTY) -> GelHead
 def contact_levels(grasps: Sequence[Grasp]) -> tuple[list[float], list[float]]:
     """Return the contact levels, in grey levels, of no-contact frames and of touches; empty without such frames.
 
-    A no-contact frame is compared with the one of the previous grasp, a touch with its own no-contact frame. The
-    finger with the largest level counts.
+    A no-contact frame is compared with the one of the previous grasp, a touch with its own no-contact frame. The level
+    of a grasp is the largest level of its fingers.
     """
     no_contact = [_largest_level(second, first) for first, second in _consecutive_frames(grasps)]
     touched = [_largest_level(grasp.touches, grasp.backgrounds) for grasp in grasps if grasp.backgrounds]
@@ -271,7 +269,7 @@ def fit_gel_check(head: GelHead, test: GelCheckFeatures, levels: tuple[Sequence[
 
     Args:
         head: The linear layer.
-        test: Features of validation pictures. The finger with the highest logit counts.
+        test: Features of validation pictures. The logit of a grasp is the highest logit of its fingers.
         levels: Result of `contact_levels`.
     """
     touch, no_contact = head(test.touch).numpy(), head(test.no_contact).numpy()  # (G, fingers, 2)

@@ -150,7 +150,7 @@ def test_an_id_out_of_range_in_a_structure_raises_in_the_search(tmp_path, kind, 
     forge(folder)
     generation = IndexStore(tmp_path).open()
     for search in (generation.search, generation.candidates):
-        with pytest.raises(CorruptIndex, match=rf"found slot {wrong}, the index has 650.*build-index"):
+        with pytest.raises(CorruptIndex, match=rf"found slot {wrong}, but the index has 650.*build-index"):
             search(unit(3), 4)
 
 
@@ -166,7 +166,7 @@ def test_slots_of_a_users_own_kind_are_checked_too():
         def _search(self, queries, k, live):
             return np.ones((len(queries), k), np.float32), np.full((len(queries), k), 99)
 
-    with pytest.raises(CorruptIndex, match="found slot 99, the index has 20"):
+    with pytest.raises(CorruptIndex, match="found slot 99, but the index has 20"):
         Wrong.build(unit(20)).search(unit(1), 1)
 
 
@@ -207,7 +207,7 @@ def test_a_pickled_array_is_not_loaded(folder):
 @pytest.mark.parametrize(
     ("fields", "error", "words"),
     [
-        ({"format": 6}, UnsupportedFormat, "newer format 6, this software reads 5; update"),
+        ({"format": 6}, UnsupportedFormat, "newer format 6, but this software reads 5; update"),
         *(({"format": old}, UnsupportedFormat, f"older format {old}.*build-index") for old in (4, 3, 2, 0, -1)),
         *(({"format": odd}, CorruptIndex, "must have a format version") for odd in (None, "1", True, 1.5, [1])),
         ({"kind": "quantum"}, UnsupportedFormat, r"quantum.*Update the software"),

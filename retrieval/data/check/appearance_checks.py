@@ -1,8 +1,8 @@
 """Checks of a recording by the appearance of its pictures; each yields findings on its grasps.
 
 Each check compares a minority with the majority of the recording. A note reports the cases that cannot be decided.
-Pictures alone do not distinguish two fingers with similar gels, the no-contact frame from the touch where nothing was
-touched, or two objects whose photos were all exchanged.
+Three cases cannot be decided from the pictures: two fingers with similar gels, a no-contact frame and a touch without
+contact, and two objects whose photos were all exchanged.
 """
 
 from collections import Counter
@@ -30,9 +30,9 @@ COMPARED_COPIES = "compared-copies"
 """Kind of the finding that reports how many pictures were compared for near copies."""
 _MIN_GRASPS = 4
 _MAX_BY_LIGHT, _MAX_BY_TOUCH = 0.35, 0.6
-"""Accepted accuracy of identifying the object from light alone, as a fraction of the way from chance to 1: from
-no-contact frames, and from the mean colour of touches. The mean colour depends a little on the touched object (0.2 to
-0.35 of the way on simulated recordings)."""
+"""Thresholds of (accuracy - chance) / (1 - chance) of a classifier that sees only the illumination: the first one on
+no-contact frames, the second one on the mean colour of touches. The mean colour depends a little on the touched object
+(0.2 to 0.35 on simulated recordings)."""
 
 
 def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
@@ -53,7 +53,8 @@ def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> 
         yield Finding(
             "error",
             "swapped",
-            "touches and photos look swapped throughout (the photos are the more alike); exchange the columns",
+            "touches and photos look swapped throughout (the photos resemble each other more than the touches do, "
+            "usually it is the reverse); exchange the columns",
             tuple(grasp.grasp_id for grasp in grasps),
         )
         return
@@ -87,7 +88,10 @@ def check_fingers(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
 
 
 def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Find touches and no-contact frames that look exchanged."""
+    """Find touches and no-contact frames that look exchanged.
+
+    The moment of a frame is "before" (before contact: a no-contact frame) or "touch" (during contact).
+    """
     both = [grasp for grasp in grasps if grasp.backgrounds and len(grasp.backgrounds) == len(grasp.touches)]
     if len(both) < _MIN_GRASPS:
         return
@@ -99,8 +103,9 @@ def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
             yield Finding(
                 "error",
                 "swapped-moments",
-                f"touches of finger {ascii_lowercase[finger]} look swapped throughout with the no-contact frames "
-                "(the latter are the less alike); exchange the columns",
+                f"touches of finger {ascii_lowercase[finger]} look swapped throughout with the no-contact frames (the "
+                "no-contact frames differ from each other more than the touches do, usually it is the reverse); "
+                "exchange the columns",
                 tuple(grasp.grasp_id for grasp in both),
             )
             return
@@ -116,7 +121,7 @@ def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
 
 
 def check_light(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Find lamps or gels that changed from object to object, so that light identifies the object."""
+    """Find lamps or gels that changed from object to object, so that the illumination identifies the object."""
     objects = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)[1] if grasps else np.zeros(0, int)
     repeated = Counter(objects.tolist())
     if len(repeated) < 2 or max(repeated.values()) < 2:
@@ -145,7 +150,7 @@ def check_light(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Find
             yield Finding(
                 "warning",
                 "light",
-                f"{what} alone identifies the object in {found.accuracy:.0%} of {found.grasps} grasps (chance "
+                f"{what} is enough to identify the object in {found.accuracy:.0%} of {found.grasps} grasps (chance "
                 f"{found.chance:.0%}): light or gel changed from object to object, and a model can learn that instead "
                 "of touch; mix the objects while recording, and compare with the controls of `retrieve evaluate`",
             )
@@ -210,14 +215,18 @@ def check_near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: 
                 pairs[tuple(sorted((row, int(found.row[row]))))] = f"{grasp.grasp_id} and {other.grasp_id}"
         if pairs:
             text = f"{len(pairs)} pair(s) of images ({kind}) of two objects are near copies of each other"
-            severity, or_else = ("error", "") if kind == "photo" else ("warning", ", or the objects feel alike")
+            severity, or_else = (
+                ("error", "") if kind == "photo" else ("warning", ", or the touches of these objects are similar")
+            )
             yield Finding(severity, "near-copy", f"{text}{or_else}: {abbreviate_list(list(pairs.values()))}")
         counts.append(f"{found.checked.sum()} of {len(every)} images ({kind})")
         low_contact += int((~found.checked).sum())
         left_out += len(every) - len(items)
     reasons = []
     if low_contact:
-        reasons.append(f"{low_contact} show too little to recognise a copy (a light contact, or too many similar ones)")
+        reasons.append(
+            f"{low_contact} show too little to recognise a copy (little contact, or too many similar pictures)"
+        )
     if left_out:
         reasons.append(f"{left_out} belong to grasps that are named above")
     yield Finding("note", COMPARED_COPIES, f"near copies were searched in {'; '.join([', '.join(counts), *reasons])}")

@@ -26,7 +26,7 @@ _BINS = 16
 
 
 def swapped_fingers(a: SmallImages, b: SmallImages) -> Rows | None:
-    """Return the grasps whose frames of fingers a and b look exchanged, or None where the gels are too similar.
+    """Return the grasps whose frames of fingers a and b look exchanged, or None if the gels are too similar.
 
     Without contact, the difference of the two gels is the same in every grasp; an exchange changes its sign. The
     direction of the difference is the one with the largest sum of squares. Its normal sign is that of most grasps.

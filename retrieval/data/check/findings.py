@@ -20,7 +20,7 @@ class Finding:
         severity: "error" (do not train on this), "warning", or "note" (something could not be checked).
         kind: Short name for programs.
         message: Sentence for the user.
-        grasps: Ids of the grasps concerned, where the finding concerns single grasps.
+        grasps: Ids of the grasps concerned, if the finding concerns single grasps.
     """
 
     severity: str

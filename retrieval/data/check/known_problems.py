@@ -20,13 +20,13 @@ _MAX_QUERIES = 5000
 _BLOCK = 512
 _OWN_QUANTILE, _OTHER_QUANTILE = 0.75, 0.05
 """Quantiles of the distance to the nearest touch of the same object, and of another object. Neighbouring frames can be
-recognised where the first quantile is below the second."""
+recognised if the first quantile is below the second."""
 _MIN_FRACTION, _MIN_COUNT = 0.1, 3
-"""Held-out grasps with such a neighbour in training that cause a warning: fraction and number."""
+"""Smallest fraction and number of held-out grasps with such a neighbour in training that cause a warning."""
 
 _Rows = NDArray[np.float32]
 _Pixels = dict[str, _Rows]
-"""By grasp_id."""
+"""Pixels of each grasp, by grasp_id."""
 _Item = TypeVar("_Item")
 
 
@@ -87,9 +87,9 @@ def check_shared_backgrounds(grasps: Sequence[Grasp], records: ImageRecords) -> 
 def check_sequences_in_training(grasps: Sequence[Grasp], split: Split, records: ImageRecords) -> Iterator[Finding]:
     """Find held-out touches whose neighbouring frames are in the training part, by nearest neighbours in raw pixels.
 
-    Where the split cuts recorded sequences, count the touches whose nearest training touch is of their own sequence.
-    Elsewhere, count the touches that have a training touch as near as touches of one object are to each other. This
-    second count is meaningful only where touches of two objects are rarely that near.
+    If the split cuts recorded sequences, count the touches whose nearest training touch is of their own sequence.
+    Otherwise, count the touches that have a training touch as near as touches of one object are to each other. This
+    second count is meaningful only if touches of two objects are rarely that near.
     """
     pixels = {grasp.grasp_id: _grey(records, grasp) for grasp in grasps}
     train = split.select(grasps, "train")
@@ -113,9 +113,9 @@ def _sequence_leakage(part: str, cut: Sequence[Grasp], total: int, train: Sequen
     return Finding(
         "error",
         "sequences-in-training",
-        f"{len(cut)} of {total} {part} grasps are of sequences that are also in training, and for "
+        f"{len(cut)} of {total} {part} grasps belong to sequences that are also in training, and for "
         f"{np.mean(correct):.0%} of them the nearest training touch by raw pixels is of the same sequence (chance "
-        f"{chance:.0%}): a score on them measures memory; keep every sequence in one part of the split",
+        f"{chance:.0%}): a score on them measures memorisation; keep every sequence in one part of the split",
     )
 
 

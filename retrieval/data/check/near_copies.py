@@ -8,7 +8,7 @@ the minimum over the four flips of one of them: 0 for a copy, about 1 for unlike
 Each picture has its own limit for the distance of a copy. The picture is saved as JPEG of quality 20, made a tenth
 brighter, and moved by 2 pixels along either diagonal. The limit is `SLACK` times the largest distance of these four. A
 touch that hardly differs from the no-contact frame, or shows only fine relief, loses its shape by such a change. So a
-picture counts as CHECKED only if its limit is less than a quarter of the distance to the third nearest other object.
+picture is CHECKED only if its limit is less than a quarter of the distance to the third nearest other object.
 For the other pictures, only copies as near as the mildest of the four changes are found, such as flips.
 
 Measured on simulated recordings of 12 objects: limits of .002 to .12, other objects from .17 on. JPEG 20 changed 0 to
@@ -45,11 +45,11 @@ SLACK = 1.25
 _FLIPS = ((1, 1), (-1, 1), (1, -1), (-1, -1))
 _MOVES = tuple((rows, columns) for rows in (-1, 0, 1) for columns in (-1, 0, 1))
 _MAX_PICTURES, _MAX_OBJECTS, _MAX_PER_OBJECT = 64, 5, 3
-"""Candidates of the finer comparison: number of nearest pictures considered, objects, and pictures of each object."""
+"""Candidates of the finer comparison: numbers of nearest pictures, of objects, and of pictures of each object."""
 _BLOCK = 512
 _NEIGHBOUR_RANK, _RELATIVE_LIMIT = 3, 0.25
 _MIN_LIMIT, _MAX_LIMIT = 0.02, 0.1
-"""Limits for two pictures compared on their own: the effect of a new size, and a distance below that of unlike pictures
+"""Limits for a comparison of only two pictures: the effect of a new size, and a distance below that of unlike pictures
 (.34 was the smallest between photos and touches on simulated recordings)."""
 
 Greys = NDArray[np.float32]
@@ -237,7 +237,7 @@ class PictureSet:
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
         """Return row and distance of the nearest picture of another object, and the third nearest object's distance.
 
-        The last is 1 where there are fewer than three other objects. `among` must be sorted by object.
+        The last is 1 if there are fewer than three other objects. `among` must be sorted by object.
         """
         distance = self._min_distances(queries, among, [flip_thumbnails(self.greys[queries], flip) for flip in _FLIPS])
         first = np.flatnonzero(np.diff(self.objects[among], prepend=-1))

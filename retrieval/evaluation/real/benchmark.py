@@ -41,7 +41,7 @@ from retrieval.evaluation.real.reference_rows import (
     features_with_references,
 )
 from retrieval.evaluation.real.touch_to_touch import TouchToTouch, touch_to_touch_entry
-from retrieval.evaluation.real.verdict import Aggregation, BySeed, control_entry, reliability_entry, row_entry
+from retrieval.evaluation.real.verdict import Aggregation, MeasuresBySeed, control_entry, reliability_entry, row_entry
 from retrieval.evaluation.scoring import MethodScores
 from retrieval.methods import METHODS, TRIVIAL_BASELINES
 from retrieval.methods.method import Method
@@ -81,12 +81,12 @@ def benchmark(
         protocols: Names, or your own protocols, which are named by their titles.
         config: Frozen towers and heads: a `Config` (`Config.using` accepts your own tower), or an argument of
             `load_config`.
-        preset: Name of the configuration in the report; None takes its own name.
+        preset: Name of the configuration in the report. Default: the configuration's name.
         methods: Names, or your own classes.
         models: Name to checkpoint; each is a separate row, which is not fitted.
         seeds: Number of draws of the folds and of fits.
         skipped: Protocol to the reason why it is left out, for the report.
-        cache: Folder of features and measures; None takes `out`/cache.
+        cache: Folder of features and measures. Default: `out`/cache.
         quiet: No progress on stderr.
 
     Returns:
@@ -299,7 +299,7 @@ class _ProtocolRun:
         test = sum(len(split.test) for split in splits)
         return Aggregation(DRAWS, self.seeds[0], test / sum(len(split.train + split.validation) for split in splits))
 
-    def _measures_by_seed(self, folds_of: Sequence[Sequence[FoldMeasures]]) -> BySeed:
+    def _measures_by_seed(self, folds_of: Sequence[Sequence[FoldMeasures]]) -> MeasuresBySeed:
         """Return the measures of each seed over all folds; with `choices`, those of each fold."""
         if self.protocol.choices:
             return [pool_folds([one]) for folds in folds_of for one in folds]

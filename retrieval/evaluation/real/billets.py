@@ -62,8 +62,8 @@ def _places(facts: RecordingFacts, seed: int) -> list[Split]:
 UNSEEN = Protocol(
     "billets",
     "Billets: a place of an unseen welded billet",
-    "Each welded billet is the test billet once, another one validates settings. The gallery contains the places of "
-    "the test billet.",
+    "Each welded billet is the test billet once; settings are selected on another one. The gallery contains the places "
+    "of the test billet.",
     _unseen,
     {**topn_accuracy(5), **topn_accuracy(10), **topn_accuracy(16), **registered_metrics("pair_auc")},
     allows_own_photos=True,

@@ -21,7 +21,8 @@ CONTROL_METHOD = "cca_pca"
 CONTROLS = {
     "permuted": "touches are randomly assigned to other objects before fitting, so there is nothing to learn",
     "no_contact": "no-contact frames replace the touches, in fitting and in scoring",
-    "order": "the place of the touch in the order of capture replaces it: an upper bound on the information in sensor "
+    "order": "the input is the position of the touch in the order of capture, not its image: an upper bound on the "
+    "information in sensor "
     "drift",
     "background": "only the margin of each photo is used, an eighth of each side, in fitting and in scoring",
 }

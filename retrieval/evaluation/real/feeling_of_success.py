@@ -20,8 +20,8 @@ def _paper(facts: RecordingFacts, seed: int) -> list[Split]:
 PAPER = Protocol(
     "feeling-of-success",
     "The Feeling of Success, by the paper's protocol",
-    "98 random objects: 18 for test and 80 for training. Ten of the 80 validate settings and the pair threshold. Only "
-    "successful grasps. A touch is never compared with the photo of its own grasp.",
+    "98 random objects: 18 for test and 80 for training. Settings and pair threshold are selected on ten of the 80. "
+    "Only successful grasps are used. A touch is never compared with the photo of its own grasp.",
     _paper,
     registered_metrics("topn_k5", "topn_k10", "pair_accuracy", "pair_auc"),
     published_results=(

@@ -34,7 +34,7 @@ class FoldMeasures:
         measures: Measures by name; their owners are numbers in `ResamplingUnits`.
         best_params: Parameters that the method selected.
         examples: Best and worst queries.
-        confidences: (Q, 2) by searched set ("gallery", or "all" test objects if there are several galleries): the
+        confidences: (Q, 2) by gallery ("gallery", or "all" test objects if there are several galleries): the
             probability of the top-1 answer and its accuracy. Empty if the method has no posterior.
     """
 

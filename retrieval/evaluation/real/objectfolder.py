@@ -18,12 +18,12 @@ def _published(facts: RecordingFacts, seed: int) -> list[Split]:
 PUBLISHED = Protocol(
     "objectfolder",
     "ObjectFolder: cross-sensory retrieval",
-    "The published split: its test objects are queries, its validation objects validate settings. Every image of the "
-    "object is a correct answer, also the one with the query's own number.",
+    "The published split: its test objects are queries; settings are selected on its validation objects. Every image "
+    "of the object is a correct answer, also the one with the query's own number.",
     _published,
     registered_metrics("objectfolder_touch_to_photo", "objectfolder_photo_to_touch", "pair_auc", "topn_k10"),
     published_results=(
         "On 100 unseen simulated objects the benchmark's authors report a mAP of 8.50 % (CCA) and 8.80 % (DAR).",
-        "For real objects 64.9 % are reported, on objects that were trained on.",
+        "For real objects, 64.9 % was reported, but on objects that the model was trained on.",
     ),
 )

@@ -1,4 +1,4 @@
-"""Protocols: how to split a data set, which gallery to search, and what to measure."""
+"""Benchmark protocols: the split of a data set, the galleries, and the measures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -85,7 +85,7 @@ class Protocol:
         rule: The split, described in sentences.
         folds: Function from recording and seed to splits. The test objects of all folds together are the same for every
             seed.
-        measures: Measures by name; the first one decides whether a result counts as touch.
+        measures: Measures by name. The first one decides whether a result is evidence of touch (`verdict.RULE`).
         allows_own_photos: Whether a touch is compared with the photo of its own grasp, because the data set pairs them
             at random or has one photo of each object.
         is_by_sequence: Whether a gallery contains the objects of one sequence; intervals then resample sequences.

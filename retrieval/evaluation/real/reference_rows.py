@@ -1,9 +1,9 @@
-"""Reference touches: catalogue entries that are touches, alone or with photos.
+"""Reference touches: catalogue entries that are touches, without or with photos.
 
 An object's touches are split in the order of capture: the first quarter are references, the last half are queries. The
 touches between them are left out, so that no query is next to a reference. A catalogue entry is a reference touch,
-alone or with the photo of its grasp. With photos `cca_towers` weights both by validation accuracy. Alone, reference
-touches are matched as photos otherwise are, so that training needs no photo.
+without or with the photo of its grasp. With photos, `cca_towers` weights both by validation accuracy. Without photos,
+reference touches are matched like photos, and training needs no photo.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ ANY_WIDTH_METHODS = ("cca_towers", "cca_pca", "cca", "plsca", "chance", "constan
 
 
 def assign_references(grasps: Sequence[Grasp]) -> dict[str, Grasp]:
-    """Assign to each query a reference touch, its catalogue entry; the references of an object are used in turn.
+    """Assign to each query a reference touch, its catalogue entry; the references of an object are used cyclically.
 
     Args:
         grasps: All grasps, in the order of capture.

@@ -14,19 +14,20 @@ from retrieval.metrics.measure import Measure
 from retrieval.metrics.resampled_splits import compare_splits, summarise_splits
 
 RULE = (
-    "A result counts as touch only if its first measure is above each control, with the whole interval of the paired "
-    "difference above 0. The controls are the same method on low-pass touches and the order of capture in place of the "
-    "touch; for touch to touch also the no-contact frame in place of the touch."
+    "A result counts as touch only if it is evidence that the relief in the gel identifies the object: its main "
+    "measure must be higher than that of each control, with the whole interval of the paired difference above 0. Two "
+    "controls always apply: the same method on low-pass touches, and the order of capture as input instead of the "
+    "touch. If touches are compared with touches, a third one applies: the no-contact frame as input."
 )
 CONTROL_NAMES = {
     "low_pass_differences": "the low-pass control",
     "order_differences": "the order of capture",
-    "no_contact_differences": "the no-contact frame alone",
+    "no_contact_differences": "the no-contact frame as input",
 }
 """Key of a row's paired differences -> name of the control."""
 CONFIDENCE_BINS = 10
 
-BySeed = Sequence[Mapping[str, Measure]]
+MeasuresBySeed = Sequence[Mapping[str, Measure]]
 
 
 @dataclass(frozen=True)
@@ -36,21 +37,22 @@ class Aggregation:
     Attributes:
         draws: Resamples of an interval.
         seed: Seed of the resamples.
-        ratio: Test objects for each training object of a choice; None if the measures are those of seeds.
+        ratio: Number of test objects divided by the number of training objects, if the measures are from random
+            choices of test objects; None if they are from training seeds.
     """
 
     draws: int
     seed: int
     ratio: float | None = None
 
-    def summaries(self, by_seed: BySeed) -> dict[str, Any]:
+    def summaries(self, by_seed: MeasuresBySeed) -> dict[str, Any]:
         """Return values with intervals, for measures that all seeds have."""
         found = {name: [one[name] for one in by_seed] for name in _shared(by_seed)}
         if self.ratio is not None:
             return {name: summarise_splits(measures, self.ratio) for name, measures in found.items()}
         return {name: summarise(measures, draws=self.draws, seed=self.seed) for name, measures in found.items()}
 
-    def differences(self, a: BySeed, b: BySeed) -> dict[str, Any]:
+    def differences(self, a: MeasuresBySeed, b: MeasuresBySeed) -> dict[str, Any]:
         """Return paired differences `a` - `b`, by name."""
         names = [name for name in _shared(a) if name in _shared(b)]
         pairs = {name: ([one[name] for one in a], [one[name] for one in b]) for name in names}
@@ -59,17 +61,17 @@ class Aggregation:
         return {name: compare(*pair, draws=self.draws, seed=self.seed) for name, pair in pairs.items()}
 
 
-def _shared(by_seed: BySeed) -> list[str]:
+def _shared(by_seed: MeasuresBySeed) -> list[str]:
     return [name for name in by_seed[0] if all(name in one for one in by_seed)]
 
 
 def row_entry(
     protocol: Protocol,
-    touch: BySeed,
-    low_pass: BySeed,
-    order: BySeed,
+    touch: MeasuresBySeed,
+    low_pass: MeasuresBySeed,
+    order: MeasuresBySeed,
     aggregation: Aggregation,
-    no_contact: BySeed = (),
+    no_contact: MeasuresBySeed = (),
 ) -> dict[str, Any]:
     """Return the numbers of a row: measures, low-pass measures, paired differences from the controls, verdict.
 
@@ -77,9 +79,9 @@ def row_entry(
         protocol: The protocol.
         touch: Measures of the touches.
         low_pass: Measures of low-pass touches; empty for a trivial baseline, which has no verdict.
-        order: Measures of the control of that name.
+        order: Measures of the control "order of capture".
         aggregation: How measures are aggregated.
-        no_contact: Measures of the no-contact frames alone, if the verdict uses them.
+        no_contact: Measures with the no-contact frames as input, if the verdict uses this control.
     """
     measures = aggregation.summaries(touch)
     entry: dict[str, Any] = {"measures": measures, "low_pass": None, "verdict": None, **dict.fromkeys(CONTROL_NAMES)}
@@ -98,7 +100,7 @@ def row_entry(
 
 
 def control_entry(
-    protocol: Protocol, description: str, reason: str | None, by_seed: BySeed, aggregation: Aggregation
+    protocol: Protocol, description: str, reason: str | None, by_seed: MeasuresBySeed, aggregation: Aggregation
 ) -> dict[str, Any]:
     """Return the numbers of a control, or the reason why there are none."""
     return {
@@ -110,23 +112,23 @@ def control_entry(
 
 
 def verdict(summary: Mapping[str, Any], *differences: Mapping[str, Any]) -> dict[str, Any]:
-    """Return whether a row's main measure counts as touch, and the reason in words.
+    """Return whether a row's main measure counts as touch (see `RULE`), and the reason in words.
 
     Args:
         summary: The main measure.
         *differences: Paired differences from the controls, in the order of `CONTROL_NAMES`; the whole interval of each
             must be above 0.
     """
-    counts = all(one["low"] > 0 for one in differences)
+    counts_as_touch = all(one["low"] > 0 for one in differences)
     found = [_against(one, name) for one, name in zip(differences, CONTROL_NAMES.values(), strict=False)]
-    words = f"{'counts' if counts else 'does not count'} as touch: {'; '.join(found)}"
+    words = f"{'counts' if counts_as_touch else 'does not count'} as touch: {'; '.join(found)}"
     above = summary["low"][0] > summary["chance"][0]
-    return {"counts_as_touch": counts, "above_chance": bool(above), "words": words}
+    return {"counts_as_touch": counts_as_touch, "above_chance": bool(above), "words": words}
 
 
 def _against(difference: Mapping[str, Any], control: str) -> str:
-    by, low, high = (100 * difference[key] for key in ("difference", "low", "high"))
-    points = f"{by:+.1f} points [{low:+.1f}, {high:+.1f}]"
+    mean, low, high = (100 * difference[key] for key in ("difference", "low", "high"))
+    points = f"{mean:+.1f} points [{low:+.1f}, {high:+.1f}]"
     if low > 0:
         return f"{points} over {control}"
     if high < 0:
@@ -135,13 +137,13 @@ def _against(difference: Mapping[str, Any], control: str) -> str:
 
 
 def reliability_entry(confidences: Sequence[Mapping[str, NDArray[np.float64]]]) -> dict[str, list[dict[str, Any]]]:
-    """Return reliability bins of top-1 confidences, by searched set.
+    """Return reliability bins of top-1 confidences, by gallery.
 
     Args:
-        confidences: For each fold, by searched set, (Q, 2): probability and accuracy of the top-1 answer.
+        confidences: For each fold and gallery (Q, 2): probability and accuracy of the top-1 answer.
 
     Returns:
-        For each non-empty bin of width 0.1 {"from", "to", "confidence", "accuracy", "count"}.
+        For each gallery a dictionary {"from", "to", "confidence", "accuracy", "count"} per non-empty bin of width 0.1.
     """
     names = dict.fromkeys(name for one in confidences for name in one)
     return {name: _bins(np.concatenate([one[name] for one in confidences if name in one])) for name in names}
@@ -162,7 +164,7 @@ def _bins(confidences: NDArray[np.float64]) -> list[dict[str, Any]]:
     ]
 
 
-def _correct_counts(by_seed: BySeed, name: str | None) -> dict[str, Any] | None:
+def _correct_counts(by_seed: MeasuresBySeed, name: str | None) -> dict[str, Any] | None:
     """Return the number of right top-1 answers by seed, and the exact interval of the mean rate.
 
     All seeds have the same queries, so more seeds do not add queries.

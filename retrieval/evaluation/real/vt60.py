@@ -32,7 +32,8 @@ _MEASURES = {
     **registered_metrics("pair_auc"),
 }
 _SPLIT_NOTE = (
-    "08_bottlefull is left out, because it is 02_bottleempty filled. Five of the other objects validate settings."
+    "08_bottlefull is left out, because it is 02_bottleempty filled. Settings are selected on five of the other "
+    "objects."
 )
 _REFERENCE_MEASURES = {
     **topn_accuracy(GALLERY),
@@ -42,7 +43,8 @@ _REFERENCE_MEASURES = {
 }
 _REFERENCE_SPLIT = (
     "The first quarter of each object's touches are references, the last half are queries. Both come from one session "
-    "and one finger, so the order of capture identifies every object; only the loss of the low-pass control is touch."
+    "and one finger, so the order of capture identifies every object. Only the difference from the low-pass control "
+    "is evidence of touch."
 )
 
 

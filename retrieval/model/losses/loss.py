@@ -29,8 +29,8 @@ class EncodedBatch(NamedTuple):
 class Loss(nn.Module):
     """A term of the training loss, possibly with parameters of its own.
 
-    The optimiser trains its parameters together with the matcher's. The state of an unfinished training stores them; a
-    checkpoint does not. A subclass implements `forward`.
+    The optimiser trains its parameters together with the matcher's. The state of an unfinished training run stores
+    them; a checkpoint does not. A subclass implements `forward`.
 
     >>> import torch
     >>> class Proxies(retrieval.Loss):
@@ -46,7 +46,7 @@ class Loss(nn.Module):
     """
 
     def __init__(self, embedding_dim: int, objects: int) -> None:
-        """Make the loss for a training.
+        """Make the loss for a training run.
 
         Args:
             embedding_dim: Length of an embedding.

@@ -1,4 +1,4 @@
-"""The paper's loss of pairs, part of every training."""
+"""The paper's loss of pairs, which every training run includes."""
 
 from torch import Tensor
 from torch.nn import functional

@@ -32,7 +32,7 @@ def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups
 
 
 class InvertedResidual(nn.Module):
-    """1 x 1 expansion, 3 x 3 depthwise, linear 1 x 1 projection; a shortcut where shapes allow."""
+    """1 x 1 expansion, 3 x 3 depthwise, linear 1 x 1 projection; a shortcut if the shapes are equal."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, expansion: int) -> None:
         super().__init__()

@@ -16,7 +16,7 @@ _FLOAT32_LAYERS = 3
 
 
 class GroupNorm(nn.GroupNorm):
-    """Group normalisation in the weights' float32, also where convolutions multiply in bfloat16.
+    """Group normalisation in the weights' float32, even if convolutions multiply in bfloat16.
 
     With channels last, PyTorch's bfloat16 version is so slow on a CPU that a step takes 1.4 times as long.
     """

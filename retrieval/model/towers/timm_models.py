@@ -58,6 +58,6 @@ def _timm() -> Any:
         import timm
     except ImportError as error:
         raise ConfigError(
-            f"a tower of timm needs the package, and it does not import ({error}); `pip install timm`"
+            f"a tower of timm needs the package, which cannot be imported ({error}); run `pip install timm`"
         ) from error
     return timm

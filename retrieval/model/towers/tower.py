@@ -120,7 +120,7 @@ class TowerFamily(Tower, ABC):
 
 
 def without_autocast(images: Tensor) -> AbstractContextManager[Any]:
-    """Return a context that computes the first layers in float32, also where the others use bfloat16.
+    """Return a context that computes the first layers in float32, even if the others use bfloat16.
 
     Gels differ by a few grey levels, which rounding an image to bfloat16 removes. The gradient of MobileNetV2 in
     bfloat16 then has a cosine of 0.75 with the gradient in float32, and of 0.96 with the layers up to stride 4 in
@@ -134,10 +134,10 @@ def without_autocast(images: Tensor) -> AbstractContextManager[Any]:
 def stage_statistics(maps: Iterable[Tensor]) -> Tensor:
     """Return mean, standard deviation and maximum over each map (B, C, H, W), concatenated: (B, 3 * all C).
 
-    The mean alone dilutes a feature that covers a small part of an image; deviation and maximum preserve it.
+    The mean dilutes a feature that covers a small part of an image; deviation and maximum preserve it.
     """
     parts = []
     for x in maps:
-        # Not the root of the variance, whose slope is infinite where a map is constant; the slope of `std` is 0 there.
+        # Not the root of the variance, whose slope is infinite if a map is constant; the slope of `std` is 0 then.
         parts += [x.mean((2, 3)), x.std((2, 3), correction=0), x.amax((2, 3))]
     return torch.cat(parts, dim=1)

@@ -63,7 +63,9 @@ class TransformersTower(TowerFamily):
             raise CheckpointError(f"the weights of transformers:{self.model_name} cannot be read: {error}") from error
         if report["missing_keys"]:
             log.warning(
-                "%s lacks %s: this part starts random", self.model_name, ", ".join(sorted(report["missing_keys"]))
+                "%s lacks %s: this part is initialised randomly",
+                self.model_name,
+                ", ".join(sorted(report["missing_keys"])),
             )
         return {f"model.{name}": value for name, value in found.state_dict().items()}
 
@@ -92,6 +94,6 @@ def _transformers() -> Any:
         import transformers
     except ImportError as error:
         raise ConfigError(
-            "a tower of transformers needs the package; `pip install 'touch-retrieval[transformers]'`"
+            "a tower of transformers needs the package; run `pip install 'touch-retrieval[transformers]'`"
         ) from error
     return transformers

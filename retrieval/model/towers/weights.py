@@ -72,7 +72,7 @@ def load_tower_state(tower: "Tower", state: State, source: str) -> None:
     if bad := [key for key in own if key in state and not bool(torch.isfinite(state[key]).all())]:
         raise CheckpointError(f"{source} contains a NaN or infinite weight in {bad[0]}; give another file")
     if any(key.startswith(classes) and key not in state for key in own):
-        log.warning("%s has no 1000-way layer; that layer starts random", source)
+        log.warning("%s has no 1000-way layer: this layer is initialised randomly", source)
     tower.load_state_dict({key: state.get(key, value) for key, value in own.items()})
 
 

@@ -68,9 +68,9 @@ def build_index(
         folder: The catalogue: a local folder or a URL (`retrieval.data.sources`).
         checkpoint: The model.
         out: The index folder.
-        objects_from: Rule that names the object of a photo (`retrieval.data.naming`); None: the rule of the existing
+        objects_from: Rule that names the object of a photo (`retrieval.data.naming`); None for the rule of the existing
             index, else by folder.
-        kind: Kind of index, a name or a class; None: exact search, unless a bound requires another kind.
+        kind: Kind of index, a name or a class; None for exact search, unless a bound requires another kind.
         min_recall: Smallest agreement with exhaustive search at rank 1 (`retrieval.search.build.operating`).
         max_ms: Longest time of candidate search and reranking for one touch, in milliseconds.
         verify: List every folder and read every file, even if size, times and inode did not change
@@ -202,7 +202,7 @@ def naming_by(rule: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]:
     """Return the rule that names objects, and a note if it replaces another one.
 
     Args:
-        rule: The user's rule; None: the rule of the existing index, else by folder.
+        rule: The user's rule; None for the rule of the existing index, else by folder.
         about: Entries of that index's manifest.
 
     Raises:

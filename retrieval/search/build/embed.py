@@ -160,8 +160,8 @@ class Embedder:
         """Yield the photos of the catalogue, in its order.
 
         Args:
-            catalogue: The photos, N of them.
-            known: The parent's row of each photo whose file need not be read (N,), else -1.
+            catalogue: The N photos.
+            known: The parent's row of each photo whose file is not read again (N,), else -1.
             unchanged: Runs of photos whose rows are consecutive in the parent and do not change.
             quiet: Show no progress.
 

@@ -146,7 +146,7 @@ def embed_references(
     Args:
         catalogue: The catalogue.
         checkpoint: The model.
-        parent: Generation whose encoded touches are reused; None: none.
+        parent: Generation whose encoded touches are reused; None to reuse none.
         quiet: Show no progress.
 
     Raises:

@@ -214,11 +214,11 @@ def can_measure(checkpoint: Checkpoint) -> bool:
 
 @torch.inference_mode()
 def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch.Tensor, Floats]:
-    """Return the codes of the touches that a checkpoint stores to measure with.
+    """Return partial activations and embeddings of the touches that a checkpoint stores to measure with.
 
     Args:
         checkpoint: The model.
-        count: Number of touches; None: all.
+        count: Number of touches; None for all.
 
     Returns:
         Partial activations (Q, partial_width) and unit embeddings (Q, d), float32.
@@ -236,9 +236,9 @@ def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch
 
 
 def _queries(checkpoint: Checkpoint, photos: int) -> tuple[torch.Tensor, Floats]:
-    """Return the codes of as many touches as can score every photo within `MEASUREMENT_FLOPS`, at least `MIN_QUERIES`.
+    """Return `query_codes` of some touches: as many as can score every photo within `MEASUREMENT_FLOPS`.
 
-    One score is a product with a square matrix: 2 hidden^2 operations.
+    At least `MIN_QUERIES` are used. One score is a product with a square matrix: 2 hidden^2 operations.
     """
     affordable = MEASUREMENT_FLOPS / (2.0 * photos * checkpoint.config.matcher.hidden**2)
     return query_codes(checkpoint, max(MIN_QUERIES, int(affordable)))

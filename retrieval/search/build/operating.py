@@ -1,18 +1,21 @@
 """The operating point of an index: the kind that finds candidates, and the number of candidates to rerank.
 
 It is measured on the catalogue, with touches of validation objects that the checkpoint stores for this. The exhaustive
-top-1 of a touch is the photo that the classifier ranks first if it scores every photo. The agreement@k with exhaustive
-search ("recall" below) is the fraction of touches whose exhaustive top-1 is among the k candidates.
+top-1 of a touch is the photo that the fusion head ranks first if it scores every photo ("exact" search, in contrast,
+is exact nearest-neighbour search by embedding). The agreement@k with exhaustive search ("recall" below) is the fraction
+of touches whose exhaustive top-1 is among the k candidates.
 
-    no bound       exact search, and the smallest k of a ladder with a recall of 0.99
-    min_recall     the smallest k with that recall. If exact search takes longer than reranking its candidates,
-                   approximate kinds are tried as well, and the fastest point is chosen
-    max_ms         as without a bound if search and reranking are within the time; else an approximate kind that is;
-                   else the highest recall within the time; else the fastest point with the recall
-    both           a point with both; else the fastest point with the recall
+    no bound       exact search, and the smallest k of `candidate_steps` with a recall of 0.99
+    min_recall     the first point that has this recall and whose search takes no longer than its reranking: exact
+                   search, then approximate kinds. If there is none, the fastest point with this recall
+    max_ms         the first point with a recall of 0.99 within the time: exact search, then approximate kinds. If
+                   there is none, the point with the highest recall within the time. If no point is within the time,
+                   the fastest point with a recall of 0.99
+    both           the first point with this recall within the time; if there is none, the fastest with this recall
 
-The cost of exhaustive search grows with the catalogue, so larger catalogues use fewer touches. A measurement is reused
-until a tenth of the photos has changed.
+A required kind is the only choice; its search may take longer than its reranking. The cost of exhaustive search grows
+with the catalogue, so larger catalogues use fewer touches. A measurement is reused until a tenth of the photos has
+changed.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -82,7 +85,7 @@ class SearchRequirements:
         """Return the requirements.
 
         Args:
-            kind: A name, "module:Class" or a class; None: no requirement.
+            kind: A name, "module:Class" or a class; None for no requirement.
             min_recall: As the attribute.
             max_ms: As the attribute.
 
@@ -160,9 +163,9 @@ def choose_by_agreement(bench: SearchBench, requirements: SearchRequirements) ->
 
 
 def choose_by_neighbours(vectors: Floats, slots: Slots, requirements: SearchRequirements) -> OperatingPoint:
-    """Choose the kind only, by recall of nearest neighbours, for a checkpoint that stores no touches.
+    """Choose only the kind, by recall of nearest neighbours, for a checkpoint that stores no touches.
 
-    Without a time bound nothing is measured.
+    Without a time bound, nothing is measured.
 
     Args:
         vectors: Unit embeddings (S, d) float32.
@@ -228,9 +231,10 @@ def _kind_points(
 
 
 def _is_sufficient(point: SearchPoint, requirements: SearchRequirements) -> bool:
-    """Whether the search for a point can stop here.
+    """Whether the search for a point can stop here: the point has the recall, and also fits the bounds.
 
-    The point has the recall and is within the time. Without a time bound, its search takes no longer than reranking.
+    With a time bound, search and reranking are within it. With only a minimum recall and no required kind, the search
+    takes no longer than reranking.
     """
     if point.recall < requirements.target:
         return False
@@ -321,12 +325,12 @@ def operating_point_sentence(candidates: Mapping[str, Any]) -> str:
     """Return a record as text: the candidates, their agreement with exhaustive search, and unmet requirements."""
     k, photos = candidates["k"], candidates["photos"]
     if not candidates["queries"]:
-        return f"The classifier scores all {photos} photos."
+        return f"The fusion head scores all {photos} photos."
     low, high = candidates["interval"]
     found = round(candidates["top1_agreement"] * candidates["queries"])
     scored = "scores every photo" if k >= photos else f"reranks the best {k} of {photos} photos"
     text = (
-        f"The classifier {scored}: these contain the exhaustive top-1 for {found} of {candidates['queries']} "
+        f"The fusion head {scored}: these contain the exhaustive top-1 for {found} of {candidates['queries']} "
         f"validation touches (95 % interval {low:.3f} to {high:.3f}), in {candidates['ms']:.3g} ms, compared with "
         f"{candidates['exhaustive_ms']:.3g} ms for all."
     )

@@ -38,7 +38,7 @@ class StatCache:
     Args:
         catalogue: The catalogue.
         index: Folder of the index.
-        verify: Read all files, whatever their stat.
+        verify: Read all files, even if their stat did not change.
 
     Attributes:
         photos: The photos.
@@ -57,7 +57,7 @@ class StatCache:
         )
 
     def known(self, parent: Generation | None) -> Slots:
-        """Return the parent's row (N,) of each photo whose file need not be read, else -1."""
+        """Return the parent's row (N,) of each photo whose file is not read again, else -1."""
         if parent is None or self._verify:
             return np.full(len(self.photos), -1)
         digests = self._records.digests(self.ids, self._file_statuses)
@@ -74,9 +74,9 @@ def unchanged_runs(photos: PhotoTable, known: Slots, parent: Generation | None) 
     """Yield long runs of photos whose rows are consecutive in the parent and unchanged.
 
     Args:
-        photos: The photos, N of them.
-        known: The parent's row of each photo whose file need not be read (N,), else -1.
-        parent: The current generation; None: no runs.
+        photos: The N photos.
+        known: The parent's row of each photo whose file is not read again (N,), else -1.
+        parent: The current generation; without one (None) there are no runs.
     """
     if parent is None:
         return

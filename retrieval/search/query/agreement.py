@@ -46,15 +46,15 @@ def agreement(
     model: Checkpoint | None = None,
     squares: int = 8,
 ) -> Agreement:
-    """Hide each square of a photo in turn and measure the match logit (Zeiler and Fergus, ECCV 2014).
+    """Hide one square of a photo after another and measure the match logit (Zeiler and Fergus, ECCV 2014).
 
     A hidden square has the photo's mean colour. The photo tower encodes squares^2 + 1 images.
 
     Args:
         searcher: The opened index.
-        touches: As `Searcher.query` takes them.
-        photo: As `retrieval.embed_photos` takes one.
-        background: As `Searcher.query` takes it.
+        touches: As for `Searcher.query`.
+        photo: One photo, in a form that `retrieval.embed_photos` accepts.
+        background: As for `Searcher.query`.
         model: The searcher's checkpoint, if it is already loaded.
         squares: Number of squares along each side, from 1 to 32.
 

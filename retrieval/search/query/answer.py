@@ -88,19 +88,20 @@ class QueryResult:
 
     Attributes:
         touches: Names of the gel images of each grasp; for files, their paths.
-        grasps: Gel check of each grasp: "contact", "no contact" or "not a gel image". Only grasps with contact count.
+        grasps: Gel check of each grasp: "contact", "no contact" or "not a gel image". Only grasps with contact are
+            used.
         index: The searched index and the model.
         timing_ms: Milliseconds of this query by stage; `Searcher.query_many` divides them equally among its objects.
-        verdict: "match": the best object is more likely than its absence from the catalogue. "none of these": it is
-            not; the ranking lists the nearest objects. "no contact": no grasp shows contact. "not a gel image": an
-            image is unlike the gels of the model. These two have no ranking. "uncalibrated": the model has no
-            probabilities.
+        verdict: "match": the best object is more likely than its absence from the catalogue. "none of these": the
+            absence is at least as likely as the best object; the ranking lists the nearest objects. "no contact": no
+            grasp shows contact. "not a gel image": an image is unlike the gels of the model. These two have no ranking.
+            "uncalibrated": the model has no probabilities.
         none_probability: Probability that the object is out of catalogue.
         posterior: Formula of the probabilities and its numbers (`retrieval.model.posterior`).
         results: The ranking.
         more_grasps: If the verdict is "none of these" and the ranking is clear (`is_clear`): number of further grasps
-            like these after which "match" is expected (`Posterior.more_grasps`). None if too many are needed, and
-            otherwise.
+            like these after which "match" is expected (`Posterior.more_grasps`). None otherwise, and if too many are
+            needed.
         embeddings: Embeddings (G, embedding_dim) of the grasps, if they were encoded in this process; absent from JSON.
 
     >>> with retrieval.open("index") as searcher:

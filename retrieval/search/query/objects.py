@@ -128,7 +128,7 @@ class Objects:
         if self._original is None:
             return logits
         original, of_original = self._original[rows], np.empty(len(self._original), dtype=np.float32)
-        of_original[original[::-1]] = logits[::-1]  # the last assignment counts: that of the first equal photo
+        of_original[original[::-1]] = logits[::-1]  # the last assignment remains: that of the first equal photo
         equal: Floats = of_original[original]
         return equal
 

@@ -26,7 +26,7 @@ def open_index(
         index: A folder, or the URL of a sharded index.
         model: Path of the checkpoint, if it was moved.
         verify: Compare the checksums of the files.
-        shards: Opens the shards; None: in this process.
+        shards: Opens the shards; None to open them in this process.
 
     Returns:
         The index, and the checkpoint's header.

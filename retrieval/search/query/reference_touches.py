@@ -27,7 +27,7 @@ from retrieval.model.reference_calibration import (
 from retrieval.search.query.answer import NearestReference
 from retrieval.search.query.objects import Objects, ScoredObjects
 
-Nearness = NDArray[np.float64]
+Similarities = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class References:
         """Touch and digest of each gel image; queries do not need them."""
         return {path: (one, digest) for one in self._all for path, digest in zip(one.touch, one.digests, strict=True)}
 
-    def nearness_to_objects(self, partials: Floats) -> Nearness:
+    def similarities_to_objects(self, partials: Floats) -> Similarities:
         """Return the similarities (count,) of grasps, given by partial activations (G, partial_width), with objects."""
         found = np.full(len(self._touch_only), np.nan)
         if len(self._objects):
@@ -128,7 +128,7 @@ class References:
             ).sum(0)
         return found
 
-    def nearest_objects(self, similarities: Nearness, maximum: int) -> Numbers:
+    def nearest_objects(self, similarities: Similarities, maximum: int) -> Numbers:
         """Return the objects with the largest similarities, at most `maximum`."""
         order = np.argsort(-similarities[self._objects], kind="stable")
         return np.asarray(self._objects[order[:maximum]])
@@ -137,7 +137,7 @@ class References:
         self,
         scored: ScoredObjects,
         both_logits: ScoredObjects | None,
-        similarities: Nearness,
+        similarities: Similarities,
         posterior: Posterior,
         grasps: int,
     ) -> ScoredObjects:

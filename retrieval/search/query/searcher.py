@@ -90,9 +90,9 @@ class Searcher:
             index: Its folder; or the URL of a sharded index, whose shards are fetched once into the user's cache.
             model: Path of the checkpoint, if it was moved.
             verify: Compare the checksums of the index's files.
-            threads: Number of threads that encode a touch; None: the library's choice. With PyTorch it applies to the
-                whole process.
-            shards: Opens the shards of a sharded index; None: in this process.
+            threads: Number of threads that encode a touch. Default: the library's choice. With PyTorch it applies to
+                the whole process.
+            shards: Function that opens the shards of a sharded index. Default: open them in this process.
 
         Raises:
             IndexesError: The index is missing, damaged, or of another model.
@@ -158,8 +158,8 @@ class Searcher:
     ) -> QueryResult:
         """Rank the objects of the catalogue by one or more grasps of the object in the hand.
 
-        Only grasps with contact count. Match logits of several grasps add up; `retrieval.model.posterior` converts
-        the sums to probabilities of the objects and of "none of these".
+        Grasps without contact are ignored. If any image is not a gel image, nothing is ranked. Match logits of grasps
+        add up; `retrieval.model.posterior` converts the sums to probabilities of the objects and of "none of these".
 
         Args:
             touches: One grasp, a list with an image for each finger in their order; or a list of such grasps. For a
@@ -168,9 +168,9 @@ class Searcher:
                 with `image[..., ::-1]`. A file and its decoded array give the same answer.
             background: The fingers' no-contact frames, for a model that uses them.
             top: Number of objects to return.
-            candidates: Number of photos to rerank, at least `top`: the nearest to all grasps together; None: as
-                measured for the index. All photos are scored if there are no more, or if the model has no trained
-                embeddings.
+            candidates: Number of photos to rerank in each shard, at least `top`: those nearest to the sum of the
+                grasps' embeddings, and the rest of the best objects. Default: as measured by `build-index`. All are
+                scored if the catalogue has no more photos, or if the model has no trained embeddings.
             none_prior: Prior probability that the catalogue lacks the object.
 
         Raises:
@@ -180,7 +180,7 @@ class Searcher:
         """
         opened = self._snapshot()
         grasps = parse_grasps(touches, opened.reader.fingers)
-        return opened._answers(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
+        return opened._results(grasps, [slice(len(grasps))], background, top, candidates, none_prior)[0]
 
     def query_cumulative(
         self,
@@ -201,7 +201,7 @@ class Searcher:
         opened = self._snapshot()
         grasps = parse_grasps(touches, opened.reader.fingers)
         spans = [slice(count) for count in range(1, len(grasps) + 1)]
-        return opened._answers(grasps, spans, background, top, candidates, none_prior)
+        return opened._results(grasps, spans, background, top, candidates, none_prior)
 
     def query_many(
         self,
@@ -212,7 +212,7 @@ class Searcher:
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
     ) -> list[QueryResult]:
-        """Return the result for each of several objects in the hand, each as `query` takes it.
+        """Return the result for each of several objects in the hand, each in the form that `query` accepts.
 
         Touches are encoded in batches, so logits differ by at most 1e-4 from single queries. If the touches of one
         object are invalid, the error names the object and no query runs.
@@ -223,7 +223,7 @@ class Searcher:
         ends = np.cumsum([len(grasps) for grasps in parsed]).tolist()
         spans = [slice(end - len(grasps), end) for end, grasps in zip(ends, parsed, strict=True)]
         every = [grasp for grasps in parsed for grasp in grasps]
-        return opened._answers(every, spans, background, top, candidates, none_prior)
+        return opened._results(every, spans, background, top, candidates, none_prior)
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> EncodedTouches:
         """Return the unit embeddings (G, embedding_dim) and partial activations (G, partial_width) of G grasps.
@@ -232,8 +232,8 @@ class Searcher:
         a probability. `searcher.scorer.logits(partials, photo_partials)` gives match logits, summed over the grasps.
 
         Args:
-            touches: As `query` takes them.
-            background: As `query` takes it.
+            touches: As for `query`.
+            background: As for `query`.
         """
         opened = self._snapshot()
         grasps = parse_grasps(touches, opened.reader.fingers)
@@ -248,7 +248,7 @@ class Searcher:
             raise BadInput(f"this searcher of {self.index} is closed; open the index again")
         return opened
 
-    def _answers(
+    def _results(
         self,
         grasps: Sequence[Sequence[InputImage]],
         spans: Sequence[slice],
@@ -264,17 +264,17 @@ class Searcher:
             return []
         clock = Stopwatch()
         codes = self.reader.encode(grasps, self.reader.no_contact_frames(background), clock)
-        shown = np.full(len(codes.partials), CONTACT)
+        classes = np.full(len(codes.partials), CONTACT)
         if self.gel_check is not None and codes.readings is not None:
-            shown = np.array(self.gel_check.classify(codes.readings, codes.levels))
+            classes = np.array(self.gel_check.classify(codes.readings, codes.levels))
         scored = []
         for span in spans:
-            in_contact = (shown[span] == CONTACT) & (shown[span] != NOT_A_GEL).all()
+            in_contact = (classes[span] == CONTACT) & (classes[span] != NOT_A_GEL).all()
             query = ShardQuery(codes.embeddings[span][in_contact], codes.partials[span][in_contact])
             scored.append(self._score(query, top, candidates, none_prior, clock))
         timing_ms = clock.finish(len(spans))
         return [
-            self._answer(grasps[span], shown[span].tolist(), codes.embeddings[span], timing_ms, found, none_prior)
+            self._result(grasps[span], classes[span].tolist(), codes.embeddings[span], timing_ms, found, none_prior)
             for span, found in zip(spans, scored, strict=True)
         ]
 
@@ -294,22 +294,22 @@ class Searcher:
             probabilities = self.posterior.probabilities_given(logits, found.mass, grasps, none_prior)
         return _ScoredQuery(found, grasps, probabilities)
 
-    def _answer(
+    def _result(
         self,
         grasps: Sequence[Sequence[InputImage]],
-        shown: list[str],
+        classes: list[str],
         embeddings: Floats,
         timing_ms: dict[str, float],
         scored: "_ScoredQuery | None",
         none_prior: float,
     ) -> QueryResult:
         info, probabilities = self.info, scored.probabilities if scored else None
-        verdict = _verdict(shown, probabilities)
+        verdict = _verdict(classes, probabilities)
         searched = scored.found.searched if scored else info.photos
         sharding = {"shards": info.shards, "searched": searched / info.photos} if info.shards > 1 else {}
         return QueryResult(
             touches=[[image.name for image in grasp] for grasp in grasps],
-            grasps=shown,
+            grasps=classes,
             index={
                 "path": str(self.index),
                 "generation": info.name,
@@ -333,7 +333,7 @@ class Searcher:
         )
 
     def _more_grasps(self, scored: "_ScoredQuery", none_prior: float) -> int | None:
-        """Return the number of further grasps until a match is expected; None if the ranking is not clear."""
+        """Return the number of further grasps until a match is expected; None if unclear or too many."""
         mass, probabilities = scored.found.mass, scored.probabilities
         if self.posterior is None or probabilities is None or mass is None:
             return None
@@ -374,10 +374,10 @@ class _ScoredQuery(NamedTuple):
     probabilities: PosteriorProbabilities | None
 
 
-def _verdict(shown: Sequence[str], probabilities: PosteriorProbabilities | None) -> str:
-    if NOT_A_GEL in shown:
+def _verdict(classes: Sequence[str], probabilities: PosteriorProbabilities | None) -> str:
+    if NOT_A_GEL in classes:
         return NOT_A_GEL
-    if CONTACT not in shown:
+    if CONTACT not in classes:
         return NO_CONTACT
     if probabilities is None:
         return UNCALIBRATED

@@ -1,11 +1,11 @@
 """Shards: the photos of one index folder, or of several that together form one catalogue.
 
-A query sends the codes of touches and receives the best objects and the evidence mass of all objects. A result has
-this size for any number of photos: partial activations of photos, candidates and logits of other objects stay in the
-shard.
+A shard receives encoded touches. It returns its best objects, and the sums of the likelihoods of all its objects
+(`EvidenceMass`). The size of the result does not depend on the number of photos: partial activations of photos,
+candidates and logits of other objects stay in the shard.
 
 All photos of an object are in one shard, which therefore computes the object's logit. The best objects of all shards
-include the best of the catalogue, and their evidence masses add up to the total.
+include the best of the catalogue, and their likelihoods add up to those of the catalogue.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +26,7 @@ from retrieval.model.reference_calibration import REFERENCE_ROWS
 from retrieval.model.touches import Stopwatch
 from retrieval.search.query.answer import NearestReference
 from retrieval.search.query.objects import ListedPhoto, Objects, ScoredObjects, listed_photo
-from retrieval.search.query.reference_touches import Nearness, References
+from retrieval.search.query.reference_touches import References, Similarities
 
 DEFAULT_CANDIDATES = 1000
 MIN_COMPLETED_OBJECTS = 20
@@ -82,7 +82,7 @@ class IndexInfo:
         kind: Kind of index of candidate search.
         photos: Number of photos.
         objects: Number of objects.
-        fingerprint: Origin of the codes.
+        fingerprint: Digests of the checkpoint and the preprocessing that the vectors come from.
         about: Further manifest entries, such as the catalogue and the checkpoint.
         calibration: The posterior as stored in the index; None without one.
         shards: Number of index folders.
@@ -118,8 +118,9 @@ class Shard(Protocol):
         Args:
             query: The grasps.
             top: Number of objects to return.
-            candidates: Number of photos that each index folder reranks, at least `top`; None: as measured there.
-            posterior: Converts logits to probabilities; None: the model is not calibrated.
+            candidates: Number of photos that each index folder reranks, raised to `top` if smaller. Default: the number
+                that was measured when that folder was built.
+            posterior: Converts logits to probabilities; None if the model is not calibrated.
 
         Raises:
             NumericalError: A logit is not finite.
@@ -133,7 +134,7 @@ class Shard(Protocol):
 
         Args:
             words: Lower-case words.
-            object_id: Return only photos of this object; None: of all objects.
+            object_id: Return only photos of this object. Default: photos of all objects.
             offset: Number of photos to skip.
             limit: Largest number of photos to return.
         """
@@ -180,7 +181,7 @@ class FolderShard:
         clock = Stopwatch()
         with clock("candidates"):
             limit = self.limit(top, candidates)
-            similarities = None if self.references is None else self.references.nearness_to_objects(query.partials)
+            similarities = None if self.references is None else self.references.similarities_to_objects(query.partials)
             rows = self._candidates(query.embeddings, similarities, limit)
         with clock("rerank"):
             objects, photos = self._score_objects(query.partials, rows, top, posterior or Posterior(), similarities)
@@ -197,7 +198,7 @@ class FolderShard:
         if self.references is None:
             return found
         images = map(self.references.image, ids)
-        # A gel image in place of a photo has rows of both kinds.
+        # A gel image that represents an object without photos has a photo's row too; merge both.
         return [row if image is None else {**image, **(row or {})} for row, image in zip(found, images, strict=True)]
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
@@ -223,16 +224,16 @@ class FolderShard:
         return found
 
     def limit(self, top: int, candidates: int | None) -> int:
-        """Return the number of photos to rerank: `candidates`, else as measured for the index, else 1000.
+        """Return the number of photos to rerank: `candidates`, else the measured number, else `DEFAULT_CANDIDATES`.
 
         Args:
-            top: Number of objects to return, the smallest limit.
-            candidates: The user's number; None: as measured.
+            top: Number of objects to return; a smaller result is raised to it.
+            candidates: The user's number; None for the number that was measured for the index.
         """
         measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
         return max(top, int(measured["k"]) if candidates is None else candidates)
 
-    def _candidates(self, embeddings: Floats, similarities: Nearness | None, k: int) -> Rows:
+    def _candidates(self, embeddings: Floats, similarities: Similarities | None, k: int) -> Rows:
         """Return the rows to score.
 
         These are the k photos nearest to all grasps together, and the photos of the k objects with the nearest
@@ -253,7 +254,7 @@ class FolderShard:
         return RankedObject(logit, photo, self.references.nearest(number, partials, logit, photo_logits))
 
     def _objects_of(
-        self, rows: Rows, logits: Floats, posterior: Posterior, grasps: int, similarities: Nearness | None
+        self, rows: Rows, logits: Floats, posterior: Posterior, grasps: int, similarities: Similarities | None
     ) -> ScoredObjects:
         """Return the objects of these photos, scored by photos and reference touches."""
         objects = self.objects.aggregate(rows, logits, posterior, grasps)
@@ -264,7 +265,7 @@ class FolderShard:
         return self.references.combine(objects, both, similarities, posterior, grasps)
 
     def _score_objects(
-        self, partials: Floats, rows: Rows, top: int, posterior: Posterior, similarities: Nearness | None
+        self, partials: Floats, rows: Rows, top: int, posterior: Posterior, similarities: Similarities | None
     ) -> tuple[ScoredObjects, int]:
         """Return the scored objects, and the number of scored photos."""
         logits = self._logits(partials, rows)
@@ -280,7 +281,7 @@ class FolderShard:
         return self._objects_of(rows, logits, posterior, len(partials), similarities), len(rows)
 
     def _mass(
-        self, partials: Floats, objects: ScoredObjects, posterior: Posterior, similarities: Nearness | None
+        self, partials: Floats, objects: ScoredObjects, posterior: Posterior, similarities: Similarities | None
     ) -> EvidenceMass:
         unscored = self.objects.count - len(objects.numbers)
         # A sample of unscored objects estimates their mass. Without a sample, use the lowest logit of the scored ones,
@@ -309,7 +310,7 @@ def combined_embedding(embeddings: Floats) -> Floats:
 
 
 class Shards:
-    """Several shards of this process as one: searched one after another, with results merged as for remote shards.
+    """Several shards of this process as one shard: a search visits one after another and merges their results.
 
     Args:
         shards: The shards.

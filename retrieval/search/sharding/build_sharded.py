@@ -89,7 +89,7 @@ class ShardBuild:
     Attributes:
         folder: Folder of the shard.
         entry: Its entry in the manifest; None if none of its photos can be read.
-        report: Its report; None likewise.
+        report: Its report; None in the same case.
         counts: Number of photos of each object.
         skipped: Photos that could not be read.
     """
@@ -134,7 +134,7 @@ def build_sharded(
         max_unreadable: Largest fraction of photos that may be unreadable.
         verify: As for `build_index`.
         quiet: Show no progress.
-        run: Builds the shards; None: this process, one after another.
+        run: Builds the shards; None to build them in this process, one after another.
 
     Returns:
         One report of all shards together.
@@ -212,7 +212,7 @@ def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBui
 
     Args:
         job: The shard.
-        checkpoint: The model; None: loaded from `job.model`.
+        checkpoint: The model; None to load it from `job.model`.
 
     Raises:
         IndexesError: The shard could not be written.

@@ -244,7 +244,9 @@ class RemoteShardedIndex:
         try:
             return retry(what, lambda: function(f"{self._root}/{name}".rstrip("/")))
         except PERMANENT_ERRORS as error:
-            raise RemoteStorageError(f"{what}: the storage refuses ({type(error).__name__}: {error})") from error
+            raise RemoteStorageError(
+                f"{what}: the storage refused the request ({type(error).__name__}: {error})"
+            ) from error
 
     def _sizes(self, name: str) -> dict[str, int]:
         """Return {file below `name`: its number of bytes}."""

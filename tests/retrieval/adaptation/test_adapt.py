@@ -259,7 +259,7 @@ def test_too_few_objects_give_a_checkpoint_without_probabilities(recording, mode
         "no accuracy estimate: Leaving each object out once needs at least 6 objects, got 4." in capsys.readouterr().err
     )
     one = Split(0, tuple(names[:1]), (), tuple(names[1:]))
-    with pytest.raises(BadInput, match="at least 2 own objects"):
+    with pytest.raises(BadInput, match="a recording of at least 2 objects"):
         adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=one)
 
 

@@ -131,7 +131,7 @@ def test_light_that_changes_from_object_to_object_is_found_on_the_no_contact_fra
     lamps(broken, ("touch_a", "touch_b", "touch_a_before", "touch_b_before"))
     severity, kind, message = one(broken.findings())
     assert (severity, kind) == ("warning", "light")
-    assert "the no-contact frame alone identifies the object in" in message
+    assert "the no-contact frame is enough to identify the object in" in message
     assert "(chance 10%)" in message  # 4 other grasps of the object among 39
 
 
@@ -272,5 +272,5 @@ def test_the_last_note_counts_the_pictures_compared_for_copies_and_explains_the_
     last = capsys.readouterr().err.splitlines()[-2]
     assert last.startswith(f"{broken.folder}: ")
     assert re.search(rf"searched in \d+ of {total} images \(photo\), 0 of {total} images \(touch a\)", last)
-    assert "show too little to recognise a copy (a light contact, or too many similar ones)" in last
+    assert "show too little to recognise a copy (little contact, or too many similar pictures)" in last
     assert "6 belong to grasps that are named above" in last

@@ -83,9 +83,11 @@ def test_a_missing_folder_a_file_and_an_empty_folder_give_different_errors(tmp_p
     with pytest.raises(DatasetError, match="is a file"):
         list_catalogue(tmp_path / "file.png")
     (tmp_path / "empty" / "mug").mkdir(parents=True)
-    with pytest.raises(DatasetError, match=r"no photo \(\.avif, \.bmp, .*only 0 other files"):
+    with pytest.raises(DatasetError, match=r"no photo \(\.avif, \.bmp, .*/empty, and no other file: put"):
         list_catalogue(tmp_path / "empty")
-    with pytest.raises(DatasetError, match=r"only 1 other files such as b\.txt; a\.gif: \.gif pictures are not read"):
+    with pytest.raises(
+        DatasetError, match=r"only 1 other file\(s\) such as b\.txt; a\.gif: \.gif pictures are not read"
+    ):
         list_catalogue(fill(tmp_path / "wrong", "a.gif", "b.txt"))
 
 

@@ -147,7 +147,7 @@ def test_test_sequences_in_training_are_an_error_with_the_accuracy_of_raw_pixels
     (finding,) = sequence_findings(folder, split_within_videos(folder))
     assert finding.severity == "error"
     assert finding.message.startswith(
-        "30 of 30 test grasps are of sequences that are also in training, and for 100% of them the nearest training "
+        "30 of 30 test grasps belong to sequences that are also in training, and for 100% of them the nearest training "
         "touch by raw pixels is of the same sequence (chance 10%)"
     )
 

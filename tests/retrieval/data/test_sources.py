@@ -179,8 +179,8 @@ def test_names_that_lead_out_of_an_archive_and_duplicates_are_skipped_and_named(
     listed = list_photos(str(tmp_path / "a.tar"))
     assert [photo.path for photo in listed.photos] == ["mug/1.jpg", "tin/1.jpg"]
     assert {item.path: item.reason for item in listed.skipped} == {
-        "../up.jpg": "its name leads out of the catalogue",
-        "/root/1.jpg": "its name leads out of the catalogue",
+        "../up.jpg": "its path is outside the catalogue",
+        "/root/1.jpg": "its path is outside the catalogue",
         "mug/1.jpg": "is listed twice",
     }
 
@@ -211,7 +211,9 @@ def test_a_url_without_a_file_system_is_refused():
 
 def test_a_url_without_a_photo_is_refused(memory):
     memory.pipe_file("/bucket/readme.txt", b"")
-    with pytest.raises(DatasetError, match=r"no photo \(.*\) in the catalogue memory://bucket, only 1 other files"):
+    with pytest.raises(
+        DatasetError, match=r"no photo \(.*\) in the catalogue memory://bucket, only 1 other file\(s\) "
+    ):
         list_photos("memory://bucket")
 
 

@@ -190,7 +190,7 @@ def test_each_representation_is_compared_with_three_controls(out):
             for key in ("low_pass_differences", "order_differences", "no_contact_differences")
         ]
         assert row["verdict"]["counts_as_touch"] == all(low > 0 for low in lows)
-        assert "the no-contact frame alone" in row["verdict"]["words"]
+        assert "the no-contact frame as input" in row["verdict"]["words"]
         assert row["tower_differences"] is None
     assert set(entry["controls"]) == {"no_contact", "order", "permuted"}
     assert len(entry["controls"]["permuted"]["measures"]["recall_1"]["by_seed"]) == 2

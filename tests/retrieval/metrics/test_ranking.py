@@ -142,7 +142,7 @@ def test_a_query_without_a_relevant_item_is_refused_and_named():
     relevant = np.array([[1, 0, 0], [0, 1, 0]], dtype=bool)
     shown[1, 1] = False
     for function in (first_relevant, average_precision):
-        with pytest.raises(BadInput, match="shown a relevant item; row 1 is not"):
+        with pytest.raises(BadInput, match="needs a relevant item in its gallery; row 1 has none"):
             function(scores, relevant, shown)
 
 

@@ -221,7 +221,7 @@ def test_leakage_is_highlighted(report, tmp_path):
 @pytest.mark.usefixtures("text_only")
 def test_low_contact_touches_have_their_own_table(report, tmp_path):
     text = remake(report, tmp_path)[1]
-    assert "The 40 test touches that changed the gel image least, by at most 2.5 grey levels" in text
+    assert "Low-contact: the 40 test touches that changed the gel image least, by at most 2.5 grey levels" in text
     rows = [line.split("|")[1:3] for line in text.splitlines() if "low-contact |" in line or "| others |" in line]
     assert [" late fusion ", " low-contact "] in rows
     assert [" late fusion ", " others "] in rows

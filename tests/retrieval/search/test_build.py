@@ -334,7 +334,7 @@ def test_few_photos_are_all_scored_without_a_measurement(catalogue_copy, queried
     monkeypatch.setattr(operating, "ExhaustiveBench", None)
     report = build_index(catalogue_copy, queried, index, quiet=True)
     assert (report.candidates["k"], report.candidates["queries"]) == (24, 0)
-    assert "candidate search: flat. The classifier scores all 24 photos." in list(report.lines())
+    assert "candidate search: flat. The fusion head scores all 24 photos." in list(report.lines())
 
 
 @pytest.fixture

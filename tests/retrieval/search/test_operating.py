@@ -224,7 +224,9 @@ def test_few_photos_are_all_scored_unless_that_may_be_too_slow():
     assert not needs_measurement(4, SearchRequirements(min_recall=1.0))
     assert needs_measurement(5, SearchRequirements())
     assert needs_measurement(4, SearchRequirements(max_ms=5))
-    assert operating_point_sentence(exhaustive_record(4, SearchRequirements())) == "The classifier scores all 4 photos."
+    assert (
+        operating_point_sentence(exhaustive_record(4, SearchRequirements())) == "The fusion head scores all 4 photos."
+    )
 
 
 def test_a_measurement_is_reused_until_a_tenth_of_the_photos_changed(checkpoint, gallery):
@@ -245,7 +247,7 @@ def test_the_sentence_of_a_point_has_its_interval():
     record = {"k": 500, "top1_agreement": 0.99, "interval": [0.9455, 0.9997], "queries": 100, "ms": 4.5}
     record |= {"exhaustive_ms": 50.0, "requirements": dataclasses.asdict(SearchRequirements()), "photos": 1000}
     assert operating_point_sentence(record) == (
-        "The classifier reranks the best 500 of 1000 photos: these contain the exhaustive top-1 for 99 of 100 "
+        "The fusion head reranks the best 500 of 1000 photos: these contain the exhaustive top-1 for 99 of 100 "
         "validation touches (95 % interval 0.946 to 1.000), in 4.5 ms, compared with 50 ms for all."
     )
 

@@ -435,5 +435,5 @@ def test_another_format_raises(catalogue_copy):
     content.pop("sha256")
     content["sha256"] = content_digest(content)
     path.write_text(json.dumps(content))
-    with pytest.raises(UnsupportedFormat, match="has the newer format 99, this software reads 2; update"):
+    with pytest.raises(UnsupportedFormat, match="has the newer format 99, but this software reads 2; update"):
         Searcher.open(cluster)

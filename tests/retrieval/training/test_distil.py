@@ -82,7 +82,7 @@ def test_the_loss_is_the_divergence_plus_the_weighted_error():
     centred = [row - row.mean() for row in scores], [row - row.mean() for row in logits]
     error = np.mean((np.array(centred[0]) - np.array(centred[1])) ** 2) / logits.var(ddof=1)
     loss = distil.distillation_loss(torch.tensor(scores), torch.tensor(logits))
-    assert loss.item() == pytest.approx(divergence + distil.SPREAD_WEIGHT * error)
+    assert loss.item() == pytest.approx(divergence + distil.SQUARED_ERROR_WEIGHT * error)
 
 
 def test_the_loss_is_finite_for_distant_logits_although_probabilities_give_nan():

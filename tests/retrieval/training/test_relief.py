@@ -112,14 +112,14 @@ def test_an_interrupted_training_ends_like_an_uninterrupted_one(quick, tmp_path,
             train_relief(folder, out, CONFIG, iterations=8, quiet=True)
     with pytest.raises(CheckpointError, match="--resume"):
         train_relief(folder, out, CONFIG, iterations=8, quiet=True)
-    with pytest.raises(CheckpointError, match="belongs to a training with another"):
+    with pytest.raises(CheckpointError, match="belongs to a training run with another"):
         train_relief(folder, out, CONFIG, iterations=9, resume=True, quiet=True)
     others = write_pictures(tmp_path / "others")
     labels = (others / "metadata.jsonl").read_text()
     (others / "metadata.jsonl").write_text(
         labels.replace('"sharpness": 0.3', '"sharpness": 0.9')
     )  # the same number of labels
-    with pytest.raises(CheckpointError, match="belongs to a training with another"):
+    with pytest.raises(CheckpointError, match="belongs to a training run with another"):
         train_relief(others, out, CONFIG, iterations=8, resume=True, quiet=True)
     train_relief(folder, out, CONFIG, iterations=8, resume=True, quiet=True)
     whole, parts = (read_tensors(tmp_path / f"{name}.safetensors")[0] for name in ("whole", "parts"))

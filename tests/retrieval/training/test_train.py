@@ -269,7 +269,7 @@ def test_ctrl_c_after_the_last_step_leaves_a_usable_checkpoint_that_resuming_com
     train(recording, whole, WITH_ENCODER, quiet=True)
     module, name = step.split(".")
     function = getattr(import_module(f"retrieval.training.{module}"), name)
-    message = r"before the checkpoint was complete; .* ranks photos, --resume adds the rest"
+    message = r"before the last parts were fitted; .* can rank photos but is not complete. Run the same .* --resume"
     with monkeypatch.context() as interrupting:
         interrupting.setattr(f"retrieval.training.{step}", interrupted_before(function))
         with pytest.raises(JobInterrupted, match=message):

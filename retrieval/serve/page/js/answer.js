@@ -148,7 +148,7 @@ function searchDetails(answer) {
   const rows = [
     ["Index", `${answer.index.generation}, kind ${answer.index.kind}`],
     ["Model", `${answer.index.model.split("/").at(-1)}, trained on: ${answer.index.trained_on}`],
-    ["Scored", `${answer.index.scored} of ${count(answer.index.photos, "photo")} by the full classifier`],
+    ["Scored", `${answer.index.scored} of ${count(answer.index.photos, "photo")} by the fusion head`],
     [
       "Time",
       Object.entries(answer.timing_ms)

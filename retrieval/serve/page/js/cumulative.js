@@ -62,11 +62,11 @@ function linesOf(answers) {
   ];
 }
 
-/** A sentence on the grasp that alone gives the most information. */
+/** A sentence on the single grasp that gives the most information. */
 function mostInformativeGrasp(perGrasp, gainedBits) {
   const best = gainedBits.indexOf(Math.max(...gainedBits));
   const possible = perGrasp[best].information.possible_bits;
-  return `On its own, grasp ${best + 1} gives the most information: ${gainedBits[best].toFixed(1)} of the ${possible.toFixed(1)} bits that identify an object with certainty.`;
+  return `Queried separately, grasp ${best + 1} gives the most information: ${gainedBits[best].toFixed(1)} of the ${possible.toFixed(1)} bits that identify an object with certainty.`;
 }
 
 /** A sentence on the grasp after which the probabilities changed most. */
@@ -138,7 +138,7 @@ function numbers(answers, lines, gainedBits) {
     ),
   );
   const bits = gainedBits.map((one) => h("td", {}, `${one.toFixed(2)} bits`));
-  rows.push(h("tr", {}, h("th", { scope: "row" }, "Information of the grasp on its own"), bits));
+  rows.push(h("tr", {}, h("th", { scope: "row" }, "Information of each single grasp"), bits));
   return h(
     "details",
     {},

@@ -9,7 +9,7 @@ export function nextGraspSection({ posterior, information }) {
   const expected =
     bits < MIN_SHOWN_BITS
       ? "Another grasp would add almost no information"
-      : `Another grasp would add about ${bits.toFixed(2)} of the ${remaining.toFixed(1)} missing bits`;
+      : `Another grasp would add about ${bits.toFixed(2)} of the ${remaining.toFixed(1)} remaining bits of uncertainty`;
   return h(
     "section",
     { class: "next-grasp", "aria-label": "Another grasp" },
