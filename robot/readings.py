@@ -119,7 +119,7 @@ class GripperState:
 
     Attributes:
         opening_mm: Distance between the fingers.
-        force_n: Clamping force.
+        force_n: Force on each finger.
         status: "holding": an object is clamped. "no_part": the jaws closed without contact. "part_lost": the clamped
             object has slipped out. Else "idle" or "moving".
     """

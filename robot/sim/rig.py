@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 FORCE_N = (5.0, 80.0)
-"""Range of the clamping force of the simulated Weiss WSG-50."""
+"""Range of the force on each finger of the simulated Weiss WSG-50."""
 
 _MESH_UNITS = UNITS | {"pose": f"{UNITS['pose']}; then its tilt in radian, where it does not point straight down"}
 _ATTEMPT_S = 40.0

@@ -55,7 +55,7 @@ class Kinect2Settings(VendorSettings):
 
 
 class Kinect2(VendorCamera):
-    """A Kinect 2; its keywords are those of Kinect2Settings."""
+    """A Kinect 2; the fields of Kinect2Settings are keyword arguments of the constructor."""
 
     Settings = Kinect2Settings
 
