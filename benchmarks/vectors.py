@@ -1,4 +1,4 @@
-"""`python -m benchmarks.vectors [--photos 1e7] [--kinds flat ivf_sq8] [--recording R]`: a large index alone.
+"""`python -m benchmarks.vectors [--photos 1e7] [--kinds flat ivf_sq8] [--recording R]`: a large index, not reranked.
 
 Build, memory, opening and candidates of an index that contains only rows and embeddings, no partial activations: the
 cost of `indexes` alone, while `benchmarks.scale` also measures the reranking of its candidates. Photos are drawn as in

@@ -121,7 +121,7 @@ def collect(
     """Collect grasps into a recording, or continue an existing one.
 
     Args:
-        make_rig: Builds the rig. It is called once, and with jobs > 1 in every process too.
+        make_rig: Builds the rig. It is called once here and, with jobs > 1, once in every process.
         out: Folder of the recording.
         objects: Names, or the number of the rig's objects.
         seed: Seed of the planner's random choices, stored in recording.json; build the rig with the same seed.

@@ -69,7 +69,7 @@ class Device(ABC):
         self._connected = True
 
     def close(self) -> None:
-        """Close the device if it is connected; after a DeviceError it counts as closed."""
+        """Close the device if it is connected; even after a DeviceError, it is not connected any more."""
         if not self._connected:
             return
         self._connected = False
@@ -170,7 +170,7 @@ class Actuator(Device):
 
     @contextlib.contextmanager
     def _moving(self, failure: str) -> Iterator[None]:
-        """Do as `_use`, and stop on any exception; an exception of the stop itself is added as a note."""
+        """Like `_use`, and stop on any exception; an exception of the stop itself is added as a note."""
         with self._use(failure):
             try:
                 yield

@@ -17,7 +17,7 @@ UNKNOWN = "unknown"
 
 @dataclass(frozen=True)
 class GelSettings(TypedSettings):
-    """Thickness, Young's modulus and Poisson's ratio of one gel; None: unknown, drawn at random in simulation."""
+    """Thickness, Young's modulus and Poisson's ratio of one gel; None if unknown (then random in simulation)."""
 
     thickness_mm: float | None = bounded(0.01, 100.0, None)
     modulus_mpa: float | None = bounded(1e-4, 1e3, None)

@@ -80,7 +80,7 @@ def build_named(
         table: A table of a rig's file.
         key: The key whose value is the name of the class.
         where: Name of the table in messages.
-        default: The name if the table has none; None: the key is required.
+        default: Name to use if the table has no name; None if the key is required.
         arguments: Passed to `build`.
 
     Raises:

@@ -41,7 +41,7 @@ class VideoSettings(CropSettings):
 
     Attributes:
         path: The video or folder.
-        fps: Pictures/s; 0: the file's own rate.
+        fps: Pictures/s; 0 for the file's own rate.
         loop: Whether to start again at the end.
     """
 

@@ -169,7 +169,7 @@ class Pinch:
 
     @cached_property
     def miss_reason(self) -> str | None:
-        """Why the fingers miss: one comes down on the object, or the object is not between them. None: no miss."""
+        """Why the fingers miss: one comes down on the object, or it is not between them. None if they meet it."""
         reach = self._coarse_reach[len(_COARSE_RAD) // 2]
         if (reach < _START_MM - self.grip.opening_mm / 2).any():
             return "a finger comes down on the object"

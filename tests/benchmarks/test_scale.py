@@ -101,7 +101,7 @@ def test_exhaustive_top1_by_blocks_equals_that_of_the_whole_catalogue(crowd, mon
     monkeypatch.setattr(scale, "BLOCK", 64)
     sizes, touches = [100, 300], np.concatenate([crowd.touches, crowd.held_out])
     cosines, _ = needed.exhaustive_top1(crowd, touches, sizes)
-    found = needed.places(crowd, touches, sizes, cosines)
+    found = needed.ranks_of(crowd, touches, sizes, cosines)
     blocks = [*crowd.blocks(0, 100, 0), *crowd.blocks(100, 300, 0)]
     partials, photos = (
         np.concatenate(part) for part in zip(*((b.arrays["partials"], b.embeddings) for b in blocks), strict=True)

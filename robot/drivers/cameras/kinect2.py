@@ -40,7 +40,7 @@ class Kinect2Settings(VendorSettings):
     """Settings of a Kinect 2.
 
     Attributes:
-        pipeline: One of PIPELINES, or "auto", the first that this build has.
+        pipeline: One of PIPELINES, or "auto" for the first that this build has.
         upside_down: Whether the camera hangs upside down; picture and intrinsics are then rotated by 180 degrees.
     """
 

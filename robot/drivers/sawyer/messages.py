@@ -103,7 +103,7 @@ class RobotState:
 
     @property
     def blocking_reason(self) -> str | None:
-        """Reason why the arm may not move, with the action for a person; None: it may move."""
+        """Reason why the arm may not move, with the action for a person; None if it may move."""
         if self.stopped:
             source = _SOURCE.get(self.estop_source, "an unknown source")
             button = _BUTTON.get(self.estop_button, "in an unknown state")

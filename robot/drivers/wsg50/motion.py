@@ -1,9 +1,9 @@
 """Supervised motions of a WSG-50: the gripper's state decides, its replies only trigger a read of the state.
 
-A reply can be lost, late or doubled, and a motion command that is sent twice may be executed twice. Therefore a motion
-has ended when the gripper reports that it is still, in a possible end state of the motion. The command is sent again,
-once, only if the gripper is still and has not executed it. During a motion the state arrives as automatic updates every
-few milliseconds; without them the motion is stopped.
+A reply can be lost, late or duplicated, and a motion command that is sent twice may be executed twice. Therefore a
+motion has ended when the gripper reports that it is still, in a possible end state of the motion. The command is sent
+again, once, only if the gripper is still and has not executed it. During a motion the state arrives as automatic
+updates every few milliseconds; without them the motion is stopped.
 """
 
 import logging
@@ -204,7 +204,7 @@ class Motions:
             return
         error = DeviceError(
             f"the state of the moving gripper must be at most {self.max_age_s:g} s old, got {age:.2g} s: sent FAST "
-            "STOP; is the line overloaded?"
+            "STOP; is the link overloaded?"
         )
         try:
             self.link.send_urgent(_FAST_STOP)
