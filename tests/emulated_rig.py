@@ -103,9 +103,9 @@ class EmulatedRigState:
 class EmulatedArm(Arm):
     """An arm that reaches its target at once, unless it fails."""
 
-    def __init__(self, state):
+    def __init__(self, shared):
         super().__init__("emulated arm", WORKSPACE)
-        self.state = state
+        self.shared = shared
 
     def _connect(self): ...
 
@@ -114,39 +114,39 @@ class EmulatedArm(Arm):
     def _stop(self): ...
 
     def _move_to(self, pose, speed_mm_s):
-        kind = self.state.fault("arm", "did not arrive", "link lost")
+        kind = self.shared.fault("arm", "did not arrive", "link lost")
         if kind == "link lost":
             raise OSError(104, "Connection reset by peer")
         if kind:
             raise DeviceError("the emulated arm must arrive within 5 s, it is 40 mm off")
-        self.state.hand_at(pose)
+        self.shared.hand_at(pose)
         return pose
 
     def _pose(self):
-        return self.state.pose
+        return self.shared.pose
 
 
 class TrackedSawyer(Sawyer):
     """The driver of Sawyer, which reports its pose to the common state."""
 
-    def __init__(self, state, port):
+    def __init__(self, shared, port):
         mount = {"base_xyz_mm": [500.0, 0.0, -100.0], "base_yaw_deg": 180.0, "tool_mm": 150.0}
         quick = {"joint_speed_rad_s": 1.5, "max_speed_mm_s": 1000.0, "max_state_age_s": 1.0, "timeout_s": 0.5}
         super().__init__(workspace=LOW_WORKSPACE, host="127.0.0.1", port=port, **mount, **quick)
-        self.state = state
+        self.shared = shared
 
     def _move_to(self, pose, speed_mm_s):
         reached = super()._move_to(pose, speed_mm_s)
-        self.state.hand_at(reached)
+        self.shared.hand_at(reached)
         return reached
 
 
 class WatchedWSG50(WSG50):
     """The driver of the gripper; the common state counts calls that return or fail with moving jaws."""
 
-    def __init__(self, state, **settings):
+    def __init__(self, shared, **settings):
         super().__init__(**settings)
-        self.state = state
+        self.shared = shared
 
     def open(self, opening_mm):
         with self._watched():
@@ -165,19 +165,19 @@ class WatchedWSG50(WSG50):
         try:
             yield
         finally:
-            self.state.left_moving += self.state.emulator.moves
+            self.shared.left_moving += self.shared.emulator.moves
 
 
 @contextlib.contextmanager
-def _at_once(state):
-    yield EmulatedArm(state)
+def _at_once(shared):
+    yield EmulatedArm(shared)
 
 
 @contextlib.contextmanager
-def _sawyer(state):
-    state.arm_faults = rosbridge_emulator.MessageFaults(state.rate, seed=state.seed)
-    with rosbridge_emulator.serve(rosbridge_emulator.EmulatedSawyer(faults=state.arm_faults)) as url:
-        yield TrackedSawyer(state, int(url.rpartition(":")[2]))
+def _sawyer(shared):
+    shared.arm_faults = rosbridge_emulator.MessageFaults(shared.rate, seed=shared.seed)
+    with rosbridge_emulator.serve(rosbridge_emulator.EmulatedSawyer(faults=shared.arm_faults)) as url:
+        yield TrackedSawyer(shared, int(url.rpartition(":")[2]))
 
 
 ARMS = {"at once": _at_once, "sawyer": _sawyer}
@@ -186,20 +186,20 @@ ARMS = {"at once": _at_once, "sawyer": _sawyer}
 class EmulatedCamera(Camera):
     """A camera that shows the cylinder on the table."""
 
-    def __init__(self, state):
+    def __init__(self, shared):
         super().__init__("emulated camera", views.camera_pose())
-        self.state = state
+        self.shared = shared
 
     def _connect(self): ...
 
     def _close(self): ...
 
     def _read(self, depth):
-        kind = self.state.fault("camera", "unplugged", "stale", "blind")
+        kind = self.shared.fault("camera", "unplugged", "stale", "blind")
         if kind == "unplugged":
             raise OSError(19, "No such device")
-        state = self.state
-        image = views.view(*([state.solid] if state.solid else []), seed=state.noise, lens=LENS, px=PX)
+        shared = self.shared
+        image = views.view(*([shared.solid] if shared.solid else []), seed=shared.noise, lens=LENS, px=PX)
         depth_m = np.full(PX, np.nan, np.float32) if kind == "blind" else image.depth_m
         return RGBD(image.colour, depth_m if depth else None, LENS, time.monotonic() - 5 * (kind == "stale"))
 
@@ -209,15 +209,15 @@ class EmulatedGel(FakeVideoDevice):
 
     LASTS_S = 0.3
 
-    def __init__(self, state, finger):
-        self.state, self.finger, self._trouble = state, finger, (None, 0.0)
+    def __init__(self, shared, finger):
+        self.shared, self.finger, self._trouble = shared, finger, (None, 0.0)
         super().__init__(fps=100.0, size=(32, 24), phase_s=0.003 * (finger == "b"))
-        self.rng = np.random.default_rng([8, state.seed, ord(finger)])
+        self.rng = np.random.default_rng([8, shared.seed, ord(finger)])
 
     def begin_trouble(self):
         """Start faults at random; called once per attempt for its three pictures."""
         for _ in range(3):
-            if kind := self.state.fault(f"gel {self.finger}", "unplugged", "frozen", "damaged"):
+            if kind := self.shared.fault(f"gel {self.finger}", "unplugged", "frozen", "damaged"):
                 self._trouble = (kind, time.monotonic() + self.LASTS_S)
 
     def _has(self, kind):
@@ -231,8 +231,8 @@ class EmulatedGel(FakeVideoDevice):
         if self.frozen and self._last is not None:
             return self._last
         image = np.full((24, 32, 3), 90.0) + self.rng.normal(0, 2, (24, 32, 3))
-        if self.state.holding:
-            size = 2 + int(self.state.emulator.force_limit_n / 8)
+        if self.shared.holding:
+            size = 2 + int(self.shared.emulator.force_limit_n / 8)
             image[max(0, 12 - size) : 12 + size, max(0, 16 - size) : 16 + size] += [20, -40, 60]
         self._last = np.clip(image, 0, 255).astype(np.uint8)
         return self._last
@@ -243,29 +243,29 @@ class EmulatedGel(FakeVideoDevice):
 class EmulatedRig(Rig):
     """The rig. Objects are cylinders by name with a random position for each attempt; some slip."""
 
-    def __init__(self, url, state, gels, arm, **gripper):
-        self.state, self.gels = state, gels
+    def __init__(self, url, shared, gels, arm, **gripper):
+        self.shared, self.gels = shared, gels
         quick = {"timeout_s": 0.25, "reconnect_s": 0.02, "acknowledge_faults": True, "max_speed_mm_s": 400.0}
         super().__init__(
             arm,
-            WatchedWSG50(state, port=url, **quick | gripper),
+            WatchedWSG50(shared, port=url, **quick | gripper),
             {
                 finger: OpencvTactile(finger=finger, device=gel_path(finger), warmup_s=0.0, timeout_s=1.0, frozen_s=0.2)
                 for finger in gels
             },
-            EmulatedCamera(state),
+            EmulatedCamera(shared),
             info={"source": "emulated rig", "sensor": "emulated gel"},
             attempt=QUICK,
         )
 
     def prepare(self, object_id, number):
-        state, name = self.state, zlib.crc32(object_id.encode())
-        rng = np.random.default_rng([2, state.seed, name, number])
+        shared, name = self.shared, zlib.crc32(object_id.encode())
+        rng = np.random.default_rng([2, shared.seed, name, number])
         radius, height = np.random.default_rng([1, name]).uniform((18, 60), (40, 140))
         x, y = rng.uniform(-20, 20, 2)
-        state.solid = views.UprightCylinder(float(radius), float(height), float(x), float(y))
-        state.slips, state.noise = bool(rng.uniform() < 0.1), int(rng.integers(2**31))
-        state.hand_at(state.pose)
+        shared.solid = views.UprightCylinder(float(radius), float(height), float(x), float(y))
+        shared.slips, shared.noise = bool(rng.uniform() < 0.1), int(rng.integers(2**31))
+        shared.hand_at(shared.pose)
         for gel in self.gels.values():
             gel.begin_trouble()
 
@@ -278,15 +278,15 @@ def gel_path(finger):
 @contextlib.contextmanager
 def emulated_rig(seed=0, *, port="tcp", arm="at once", rate=0.0, **gripper):
     """Yield an EmulatedRig, not connected; its devices exist while the context is open."""
-    state = EmulatedRigState(seed, rate)
-    gels = {finger: EmulatedGel(state, finger) for finger in "ab"}
+    shared = EmulatedRigState(seed, rate)
+    gels = {finger: EmulatedGel(shared, finger) for finger in "ab"}
     by_path = {gel_path(finger): gel for finger, gel in gels.items()}
     with (
-        SERVERS[port](state.emulator, state.line) as url,
-        ARMS[arm](state) as hand,
+        SERVERS[port](shared.emulator, shared.line) as url,
+        ARMS[arm](shared) as hand,
         patch.object(opencv_stream, "open_capture", lambda device: by_path[device].open(device)),
     ):
-        yield EmulatedRig(url, state, gels, hand, **gripper)
+        yield EmulatedRig(url, shared, gels, hand, **gripper)
 
 
 @dataclass
@@ -321,9 +321,9 @@ def collect_among_faults(out, grasps, *, rate=0.02, seed=0, port="tcp", arm="at 
                 outcome.attempts = sum(tally.attempts for tally in tallies)
             except DeviceError as error:
                 outcome.stops.append(str(error))
-            outcome.left_moving += rig.state.left_moving
-            outcome.left_holding += rig.state.emulator.grasping == HOLDING
-            outcome.faults += Counter(rig.state.all_counts)
+            outcome.left_moving += rig.shared.left_moving
+            outcome.left_holding += rig.shared.emulator.grasping == HOLDING
+            outcome.faults += Counter(rig.shared.all_counts)
     return outcome
 
 

@@ -62,128 +62,128 @@ class FakeRig(Rig):
     can_run_jobs = True
 
     def __init__(self, seed=0, *, fingers=("a", "b"), faults=None):
-        self.state = FakeRigState(seed)
-        self.state.faults = {} if faults is None else faults
+        self.shared = FakeRigState(seed)
+        self.shared.faults = {} if faults is None else faults
         super().__init__(
-            FakeArm(self.state),
-            FakeGripper(self.state),
-            {finger: FakeSensor(self.state, finger) for finger in fingers},
-            FakeCamera(self.state),
+            FakeArm(self.shared),
+            FakeGripper(self.shared),
+            {finger: FakeSensor(self.shared, finger) for finger in fingers},
+            FakeCamera(self.shared),
             info={"source": "fake rig", "sensor": "fake gel", "rig": "fake"},
-            clock=self.state.clock,
-            sleep=self.state.sleep,
+            clock=self.shared.clock,
+            sleep=self.shared.sleep,
         )
 
     def object_ids(self, count):
         return [f"round-{number}" for number in range(count)]
 
     def prepare(self, object_id, number):
-        state, kind = self.state, object_id.split("-")[0]
+        shared, kind = self.shared, object_id.split("-")[0]
         shape = np.random.default_rng([1, zlib.crc32(object_id.encode())])
         radius = {"round": shape.uniform(18, 40), "wide": 70.0, "thin": 9.0, "none": 1e-3}[kind]
-        rng = np.random.default_rng([2, state.seed, zlib.crc32(object_id.encode()), number])
+        rng = np.random.default_rng([2, shared.seed, zlib.crc32(object_id.encode()), number])
         x, y = rng.uniform(-20, 20, 2)
-        state.solid = views.UprightCylinder(radius, shape.uniform(60, 140), float(x), float(y))
-        state.slips, state.noise = bool(rng.uniform() < 0.2), int(rng.integers(2**31))
-        state.force, state.now_s = None, 100.0 * number
+        shared.solid = views.UprightCylinder(radius, shape.uniform(60, 140), float(x), float(y))
+        shared.slips, shared.noise = bool(rng.uniform() < 0.2), int(rng.integers(2**31))
+        shared.force, shared.now_s = None, 100.0 * number
 
 
 class FakeArm(Arm):
-    def __init__(self, state):
-        super().__init__("fake arm", WORKSPACE, clock=state.clock)
-        self.state = state
+    def __init__(self, shared):
+        super().__init__("fake arm", WORKSPACE, clock=shared.clock)
+        self.shared = shared
 
     def _connect(self):
-        self.state.record_call("arm.connect")
+        self.shared.record_call("arm.connect")
 
     def _close(self):
-        self.state.record_call("arm.close")
+        self.shared.record_call("arm.close")
 
     def _stop(self):
-        self.state.record_call("arm.stop")
+        self.shared.record_call("arm.stop")
 
     def _move_to(self, pose, speed_mm_s):
-        self.state.record_call("arm")
-        self.state.sleep(math.dist(self.state.pose.as_tuple()[:3], pose.as_tuple()[:3]) / speed_mm_s)
-        self.state.pose = pose
+        self.shared.record_call("arm")
+        self.shared.sleep(math.dist(self.shared.pose.as_tuple()[:3], pose.as_tuple()[:3]) / speed_mm_s)
+        self.shared.pose = pose
         return pose
 
     def _pose(self):
-        return self.state.pose
+        return self.shared.pose
 
 
 class FakeGripper(Gripper):
-    def __init__(self, state):
+    def __init__(self, shared):
         low, high = FORCE_N
-        super().__init__("fake gripper", stroke_mm=STROKE_MM, min_force_n=low, max_force_n=high, clock=state.clock)
-        self.state = state
+        super().__init__("fake gripper", stroke_mm=STROKE_MM, min_force_n=low, max_force_n=high, clock=shared.clock)
+        self.shared = shared
 
     def _connect(self):
-        self.state.record_call("gripper.connect")
+        self.shared.record_call("gripper.connect")
 
     def _close(self):
-        self.state.record_call("gripper.close")
+        self.shared.record_call("gripper.close")
 
     def _stop(self):
-        self.state.record_call("gripper.stop")
+        self.shared.record_call("gripper.stop")
 
     def _settings(self):
         return {"stroke_mm": self.stroke_mm}
 
     def _state(self):
-        state = self.state
-        status = state.status()
-        opening = state.opening if status == "idle" else state.chord()
-        return GripperState(opening, state.force or 0.0, status)
+        shared = self.shared
+        status = shared.status()
+        opening = shared.opening if status == "idle" else shared.chord()
+        return GripperState(opening, shared.force or 0.0, status)
 
     def _open(self, opening_mm):
-        self.state.record_call("open")
-        self.state.opening, self.state.force = opening_mm, None
+        self.shared.record_call("open")
+        self.shared.opening, self.shared.force = opening_mm, None
         return self._state()
 
     def _grasp(self, force_n, speed_mm_s):
-        self.state.record_call("grasp")
-        self.state.grip_at, self.state.force = self.state.pose, force_n
-        self.state.sleep(self.state.opening / speed_mm_s)
+        self.shared.record_call("grasp")
+        self.shared.grip_at, self.shared.force = self.shared.pose, force_n
+        self.shared.sleep(self.shared.opening / speed_mm_s)
         return self._state()
 
 
 class FakeSensor(TactileSensor):
-    def __init__(self, state, finger):
-        super().__init__(f"fake gel {finger}", finger, clock=state.clock)
-        self.state = state
+    def __init__(self, shared, finger):
+        super().__init__(f"fake gel {finger}", finger, clock=shared.clock)
+        self.shared = shared
 
     def _connect(self):
-        self.state.record_call(f"gel {self.finger}.connect")
+        self.shared.record_call(f"gel {self.finger}.connect")
 
     def _close(self):
-        self.state.record_call(f"gel {self.finger}.close")
+        self.shared.record_call(f"gel {self.finger}.close")
 
     def _read(self):
-        state = self.state
-        state.record_call(f"gel {self.finger}")
-        touching = state.status() == "holding"
-        rng = np.random.default_rng([3, state.noise, ord(self.finger), touching])
+        shared = self.shared
+        shared.record_call(f"gel {self.finger}")
+        touching = shared.status() == "holding"
+        rng = np.random.default_rng([3, shared.noise, ord(self.finger), touching])
         image = np.full((24, 32, 3), 90.0) + rng.normal(0, 2, (24, 32, 3))
         if touching:
-            size = 2 + int(state.force / 8)
+            size = 2 + int(shared.force / 8)
             image[12 - size : 12 + size, 16 - size : 16 + size] += [60, -40, 20]
-        return Frame(np.clip(image, 0, 255).astype(np.uint8), state.now_s)
+        return Frame(np.clip(image, 0, 255).astype(np.uint8), shared.now_s)
 
 
 class FakeCamera(Camera):
-    def __init__(self, state):
-        super().__init__("fake camera", views.camera_pose(), clock=state.clock)
-        self.state = state
+    def __init__(self, shared):
+        super().__init__("fake camera", views.camera_pose(), clock=shared.clock)
+        self.shared = shared
 
     def _connect(self):
-        self.state.record_call("camera.connect")
+        self.shared.record_call("camera.connect")
 
     def _close(self):
-        self.state.record_call("camera.close")
+        self.shared.record_call("camera.close")
 
     def _read(self, depth):
-        state = self.state
-        state.record_call("depth" if depth else "camera")
-        image = views.view(state.solid, seed=state.noise, lens=LENS, px=PX)
-        return type(image)(image.colour, image.depth_m if depth else None, LENS, state.now_s)
+        shared = self.shared
+        shared.record_call("depth" if depth else "camera")
+        image = views.view(shared.solid, seed=shared.noise, lens=LENS, px=PX)
+        return type(image)(image.colour, image.depth_m if depth else None, LENS, shared.now_s)

@@ -29,7 +29,7 @@ OF_PACKAGE = {
         "InfoNCE",
         "listwise loss",
         "sigmoid loss",
-        "candidate_encoder loss",
+        "candidate encoder loss",
         "tower statistics",
         "cosine",
         "pooling of grasps",

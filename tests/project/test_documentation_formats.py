@@ -115,6 +115,6 @@ def test_the_history_of_a_service(tmp_path):
             name: {row[1] for row in database.execute(f"PRAGMA table_info({name})")}
             for (name,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
         }
-    section = text_of(PAGE).partition("## What a service keeps")[2]
+    section = text_of(PAGE).partition("## History of a service")[2]
     rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", section, re.M)
     assert {name: set(re.findall(r"`(\w+)`", text)) for name, text in rows} == columns

@@ -91,9 +91,9 @@ def test_fields_set_in_python_are_checked_and_converted_like_those_of_a_document
 def test_a_table_and_its_inner_tables_can_be_required_to_be_complete():
     gel = {"pitch_mm": 2, "markers": 0}
     assert typed({"watts": 1, "gel": gel}, Lamp, "lamp", complete=True) == Lamp(1.0, Gel(2.0))
-    with pytest.raises(ValueError, match=r"^lamp must hold watts, gel; gel is missing$"):
+    with pytest.raises(ValueError, match=r"^lamp must have watts, gel; gel is missing$"):
         typed({"watts": 1}, Lamp, "lamp", complete=True)
-    with pytest.raises(ValueError, match=r"^lamp\.gel must hold pitch_mm, markers; markers is missing$"):
+    with pytest.raises(ValueError, match=r"^lamp\.gel must have pitch_mm, markers; markers is missing$"):
         typed({"watts": 1, "gel": {"pitch_mm": 2}}, Lamp, "lamp", complete=True)
     with pytest.raises(ValueError, match=r"^lamp\.gel has no setting 'x'"):
         typed({"watts": 1, "gel": gel | {"x": 1}}, Lamp, "lamp")

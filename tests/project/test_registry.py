@@ -62,7 +62,7 @@ def test_an_installed_package_adds_a_name_and_cannot_replace_ours(tmp_path, monk
 def test_a_user_can_name_any_module_and_a_file_only_an_imported_one(tmp_path, monkeypatch):
     (tmp_path / "shapes_of_mine.py").write_text(f"from {HERE} import Shape\nclass Mine(Shape): ...\n")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(LookupError, match="of a module that is not imported, and a file may not choose what is"):
+    with pytest.raises(LookupError, match="its module is not imported, and a name in a file cannot import it"):
         make().load("shapes_of_mine:Mine")
     assert "shapes_of_mine" not in sys.modules
     assert make().name_of("shapes_of_mine:Mine") == "shapes_of_mine:Mine"
@@ -82,7 +82,7 @@ def test_a_class_in_a_function_has_no_name():
     class Hidden(Shape):
         pass
 
-    with pytest.raises(LookupError, match="must stand at the top level of its module"):
+    with pytest.raises(LookupError, match="must be defined at the top level of its module"):
         make().name_of(Hidden)
 
 

@@ -36,15 +36,15 @@ def test_if_a_device_stays_disconnected_the_collection_stops_with_the_reason_and
         real = rig.arm._move_to
 
         def lost(pose, speed_mm_s):
-            if rig.state.emulator.grasping == 4:
+            if rig.shared.emulator.grasping == 4:
                 raise OSError(104, "Connection reset by peer")
             return real(pose, speed_mm_s)
 
         rig.arm._move_to = lost
         with pytest.raises(DeviceError, match=r"failed 5 time\(s\), last: emulated arm cannot move: Connection reset"):
             collect(lambda: rig, tmp_path / "r", objects=["can-0"], seed=1, settings=CollectSettings(2))
-        assert not rig.state.emulator.moves
-        assert rig.state.emulator.opening_mm == pytest.approx(110.0, abs=0.5)
+        assert not rig.shared.emulator.moves
+        assert rig.shared.emulator.opening_mm == pytest.approx(110.0, abs=0.5)
         assert read_recording(tmp_path / "r").grasps == ()
 
 
@@ -55,14 +55,14 @@ def test_jaws_that_a_failed_call_leaves_moving_are_counted(stops, monkeypatch):
         monkeypatch.setattr(WSG50, "_stop", lambda self: None)
         monkeypatch.setattr(Motions, "stop", lambda self: None)
     with emulated_rig(1) as rig, rig:
-        emulator = rig.state.emulator
+        emulator = rig.shared.emulator
         emulator.speed_up = 1.0  # closing takes seconds
         begun = threading.Thread(target=interrupt_when, args=(lambda: emulator.is_closing,))
         begun.start()
         with pytest.raises(KeyboardInterrupt):
             rig.gripper.grasp(10.0, 10.0)
         begun.join()
-        assert rig.state.left_moving == (0 if stops else 1)
+        assert rig.shared.left_moving == (0 if stops else 1)
         emulator.speed_up = SPEED_UP
 
 

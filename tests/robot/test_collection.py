@@ -173,7 +173,7 @@ def test_a_finished_collection_makes_no_attempt(tmp_path):
         return rigs[-1]
 
     collect(make, tmp_path / "r", objects=NAMES, seed=3, settings=CollectSettings(2))
-    assert not any(call in ("arm", "grasp", "depth") for call in rigs[0].state.calls)
+    assert not any(call in ("arm", "grasp", "depth") for call in rigs[0].shared.calls)
     assert files(tmp_path / "r") == before
 
 
@@ -245,7 +245,7 @@ def calls_of(attempt, name="round-0", faults=None, seed=3):
     rig = FakeRig(seed, faults=faults)
     with rig:
         result = AttemptRunner(rig, seed, attempt).run(name, 0)
-    return result, [call for call in rig.state.calls if "." not in call]
+    return result, [call for call in rig.shared.calls if "." not in call]
 
 
 def test_the_order_of_the_calls_of_an_attempt():
@@ -261,7 +261,7 @@ def test_a_motion_that_begins_low_is_vertical(faults, monkeypatch):
     moves, real = [], FakeArm._move_to
 
     def recorded(self, pose, speed_mm_s):
-        moves.append((self.state.pose, pose))
+        moves.append((self.shared.pose, pose))
         return real(self, pose, speed_mm_s)
 
     monkeypatch.setattr(FakeArm, "_move_to", recorded)
@@ -270,7 +270,7 @@ def test_a_motion_that_begins_low_is_vertical(faults, monkeypatch):
         attempter = AttemptRunner(rig, 3, AttemptSettings())
         for number in range(3):
             attempter.run("round-0", number)
-        low = [(here, there) for here, there in moves if here.z_mm < rig.state.solid.height + 10]
+        low = [(here, there) for here, there in moves if here.z_mm < rig.shared.solid.height + 10]
     assert len(low) >= 3
     assert all((here.x_mm, here.y_mm, here.yaw_rad) == (there.x_mm, there.y_mm, there.yaw_rad) for here, there in low)
 
@@ -279,15 +279,15 @@ def test_with_a_given_place_no_depth_is_read_and_the_object_is_put_back_there():
     rig = FakeRig(3)
     with rig:
         rig.prepare("round-0", 0)
-        solid = rig.state.solid
+        solid = rig.shared.solid
         rig.object_fit = CylinderFit(
             solid.x, solid.y, solid.height, solid.radius, 1.0, "given", (solid.radius, solid.radius)
         )
         attempt = AttemptRunner(rig, 3, AttemptSettings(outputs=("before",))).run("round-0", 0)
     assert attempt.fit["method"] == "given"
-    assert "camera" in rig.state.calls
-    assert "depth" not in rig.state.calls
-    put = rig.state.pose
+    assert "camera" in rig.shared.calls
+    assert "depth" not in rig.shared.calls
+    put = rig.shared.pose
     assert (put.x_mm, put.y_mm, put.yaw_rad) == (
         attempt.fields["pose"][0],
         *(attempt.fields["pose"][i] for i in (1, 3)),
@@ -298,7 +298,7 @@ class Picky(CylinderPlanner):
     """Rejects thin objects as ungraspable."""
 
     def plan(self, rig, image, settings, rng):
-        if rig.state.solid.radius < 10:
+        if rig.shared.solid.radius < 10:
             raise UngraspableError("too thin")
         return super().plan(rig, image, settings, rng)
 
@@ -331,7 +331,7 @@ def test_no_depth_is_read_for_a_planner_that_needs_none():
 
         def plan(self, rig, image, settings, rng):
             assert image.depth_m is None
-            solid = rig.state.solid
+            solid = rig.shared.solid
             pose = Pose(solid.x, solid.y, 40.0, 0.5)
             return GraspPlan(
                 pose, dataclasses.replace(pose, z_mm=250.0), rig.gripper.stroke_mm, 12.0, fit={"method": "none"}
@@ -341,7 +341,7 @@ def test_no_depth_is_read_for_a_planner_that_needs_none():
     rig.planner = Blind()
     with rig:
         attempt = AttemptRunner(rig, 3, AttemptSettings(outputs=("before",))).run("round-0", 0)
-    assert "depth" not in rig.state.calls
+    assert "depth" not in rig.shared.calls
     assert (attempt.fields["force_n"], attempt.fit) == (12.0, {"method": "none"})
 
 
@@ -452,8 +452,8 @@ def test_a_device_that_fails_too_often_ends_the_collection_with_the_jaws_open(tm
 
     with pytest.raises(DeviceError, match=rf"at round-0 failed 3 time\(s\), last: the fake {device} fails on purpose"):
         collect(make, tmp_path / "r", objects=["round-0"], seed=3, settings=CollectSettings(5))
-    state = rigs[0].state
-    assert state.force is None
+    shared = rigs[0].shared
+    assert shared.force is None
     assert not any(each.is_connected for each in rigs[0].devices)
     assert len(read_recording(tmp_path / "r").grasps) == len(rows(tmp_path / "r"))
 
@@ -500,7 +500,7 @@ def test_ctrl_c_during_an_attempt_leaves_open_jaws_a_closed_rig_and_a_complete_r
 
     def interrupted(self, force_n, speed_mm_s):
         state = real(self, force_n, speed_mm_s)
-        if self.state.calls.count("grasp") == 3:
+        if self.shared.calls.count("grasp") == 3:
             raise KeyboardInterrupt
         return state
 
@@ -511,7 +511,7 @@ def test_ctrl_c_during_an_attempt_leaves_open_jaws_a_closed_rig_and_a_complete_r
     monkeypatch.setattr(FakeGripper, "_grasp", interrupted)
     with pytest.raises(KeyboardInterrupt):
         collect(make, tmp_path / "r", objects=NAMES, seed=3, settings=CollectSettings(2))
-    assert rigs[0].state.force is None
+    assert rigs[0].shared.force is None
     assert not any(device.is_connected for device in rigs[0].devices)
     assert len(rows(tmp_path / "r")) == 2
     monkeypatch.undo()

@@ -140,7 +140,7 @@ def test_a_pose_out_of_the_workspace_never_reaches_the_arm(pose):
     with FakeArm(FakeRigState(0)) as arm:
         with pytest.raises(DeviceError, match="must be in the workspace"):
             arm.move_to(pose, 100)
-        assert "arm" not in arm.state.calls
+        assert "arm" not in arm.shared.calls
         arm.move_to(Pose(150, -150, 8, 0), 100)  # the faces belong to the workspace
         assert arm.pose() == Pose(150, -150, 8, 0)
 
@@ -174,7 +174,7 @@ def test_a_force_out_of_range_never_reaches_the_gripper(force):
     with FakeGripper(FakeRigState(0)) as gripper:
         with pytest.raises(DeviceError, match="fake gripper: force must be from 5 to 80 N, got"):
             gripper.grasp(force)
-        assert "grasp" not in gripper.state.calls
+        assert "grasp" not in gripper.shared.calls
 
 
 @pytest.mark.parametrize("opening", [-0.1, STROKE_MM + 0.1, math.nan])
@@ -182,7 +182,7 @@ def test_an_opening_beyond_the_stroke_never_reaches_the_gripper(opening):
     with FakeGripper(FakeRigState(0)) as gripper:
         with pytest.raises(DeviceError, match="opening must be from 0 to 110 mm"):
             gripper.open(opening)
-        assert "open" not in gripper.state.calls
+        assert "open" not in gripper.shared.calls
         assert gripper.open(STROKE_MM) == GripperState(STROKE_MM, 0.0, "idle")
 
 

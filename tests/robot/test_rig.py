@@ -10,7 +10,7 @@ ORDER = ["arm", "gripper", "gel a", "gel b", "camera"]
 
 
 def events(rig, what):
-    return [call.removesuffix(f".{what}") for call in rig.state.calls if call.endswith(f".{what}")]
+    return [call.removesuffix(f".{what}") for call in rig.shared.calls if call.endswith(f".{what}")]
 
 
 def test_all_devices_are_connected_in_order_and_closed_in_reverse():
@@ -23,7 +23,7 @@ def test_all_devices_are_connected_in_order_and_closed_in_reverse():
 @pytest.mark.parametrize("number", range(len(ORDER)))
 def test_if_one_device_fails_none_stays_connected(number):
     rig = FakeRig(faults={f"{ORDER[number]}.connect": {1}})
-    with pytest.raises(DeviceError, match="told to fail"):
+    with pytest.raises(DeviceError, match="fails on purpose"):
         rig.connect()
     assert not any(device.is_connected for device in rig.devices)
     assert events(rig, "close") == ORDER[: number + 1][::-1]  # the one that failed cleans up after itself
@@ -101,7 +101,7 @@ FAKE = "tests.fake_rig:FakeRig"
 def test_a_rig_is_built_by_its_name_and_its_info_rebuilds_it():
     rig = load_rig(FAKE, seed=7, fingers=["a"])
     assert isinstance(rig, FakeRig)
-    assert rig.state.seed == 7
+    assert rig.shared.seed == 7
     assert list(rig.sensors) == ["a"]
     assert rig.info["rig_settings"] == {"fingers": ["a"]}
     assert load_rig(rig.info["rig"], seed=7, **rig.info["rig_settings"]).info == rig.info

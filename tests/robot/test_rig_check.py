@@ -35,16 +35,16 @@ def test_every_device_is_checked_moved_back_and_closed(rig):
     assert rows[4].measured["depth known"].endswith(" m")
     assert rows[5].measured["apart"] == "0.0 ms (max 0.0)"
     assert not any(device.is_connected for device in rig.devices)
-    assert rig.state.pose == Pose(0, 0, 300, 0)
-    assert rig.state.opening == 110.0
-    assert "grasp" not in rig.state.calls
+    assert rig.shared.pose == Pose(0, 0, 300, 0)
+    assert rig.shared.opening == 110.0
+    assert "grasp" not in rig.shared.calls
 
 
 def test_without_motion_arm_and_jaws_do_not_move(rig):
     rows = list(check_rig(rig, motion=False))
     assert rows[0].measured["moved"] == "not"
     assert rows[0].measured["state in"].startswith("0.00 ms")
-    assert {"arm", "open", "grasp"}.isdisjoint(rig.state.calls)
+    assert {"arm", "open", "grasp"}.isdisjoint(rig.shared.calls)
 
 
 def test_without_motion_devices_connect_with_may_move_false(rig):
@@ -64,7 +64,7 @@ def test_a_configuration_error_on_connecting_is_a_row_too(rig, monkeypatch):
 
 
 def test_a_device_that_fails_is_a_row_and_the_others_are_still_checked(rig):
-    rig.state.faults = {"gripper.connect": {1}, "gel b": {1}}
+    rig.shared.faults = {"gripper.connect": {1}, "gel b": {1}}
     rows = {row.device: row for row in check_rig(rig)}
     assert rows["fake gripper"].failure == "the fake gripper.connect fails on purpose"
     assert rows["fake gel b"].failure == "the fake gel b fails on purpose"
@@ -90,7 +90,7 @@ def test_a_manual_arm_is_not_moved(rig, monkeypatch):
     monkeypatch.setattr(type(rig.arm), "is_manual", True)
     row = next(check_rig(rig))
     assert row.measured == {"moved": "by a person"}
-    assert "arm" not in rig.state.calls
+    assert "arm" not in rig.shared.calls
 
 
 def test_a_frozen_stream_counts_as_one_frame(rig, monkeypatch):

@@ -179,7 +179,7 @@ WRONG_USE = {
     "no grasps": (["collect", "--grasps", "0", "--out", "rec"], "grasps"),
     "too many objects": (["collect", "--objects", "100001", "--out", "rec"], "at most 100000 objects"),
     "no such gate": (["collect", "--gate", "none.safetensors", "--out", "rec"], "none.safetensors"),
-    "not an empty folder": (["collect", "--out", "catalog"], "catalog holds other files"),
+    "not an empty folder": (["collect", "--out", "catalog"], "catalog contains other files"),
     "nothing to check": (["check", "nowhere"], "nowhere"),
     "bad split": (["check", "catalog", "--split", "text.png"], "not a JSON file"),
     "no split file": (["check", "catalog", "--split", "none.json"], "none.json"),
@@ -291,7 +291,7 @@ def test_an_error_with_a_long_list_is_one_line(words, tmp_path, monkeypatch, cap
 )
 def test_no_folder_is_created_for_an_output_file(words, built, capsys):
     assert main(words) == 2
-    assert f"there is no folder {Path(words[-1]).parent}; make it" in capsys.readouterr().err
+    assert f"the folder {Path(words[-1]).parent} does not exist" in capsys.readouterr().err
     assert not Path("none").exists()
 
 

@@ -122,7 +122,7 @@ def test_a_collection_ended_by_sigterm_opens_its_jaws_closes_its_rig_and_leaves_
 
     def interrupted_grasp(self, force_n, speed_mm_s):
         state = real_grasp(self, force_n, speed_mm_s)
-        if self.state.calls.count("grasp") == 3:
+        if self.shared.calls.count("grasp") == 3:
             signal.raise_signal(signal.SIGTERM)
         return state
 
@@ -132,7 +132,7 @@ def test_a_collection_ended_by_sigterm_opens_its_jaws_closes_its_rig_and_leaves_
     assert main(collect) == 1
     assert capsys.readouterr().err.endswith("retrieve collect: stopped by SIGTERM\n")
     assert signal.getsignal(signal.SIGTERM) is before
-    assert rigs[0].state.force is None
+    assert rigs[0].shared.force is None
     assert not any(device.is_connected for device in rigs[0].devices)
     monkeypatch.setattr(FakeGripper, "_grasp", real_grasp)
     assert main(collect) == 0

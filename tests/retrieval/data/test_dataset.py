@@ -113,7 +113,7 @@ def test_a_line_cut_off_by_a_crash_is_dropped_with_a_warning(small_recording, tm
         file.write('{"grasp_id": "0')
     with caplog.at_level(logging.WARNING):
         assert len(load_grasps(tmp_path / "r")) == 4
-    assert "half-written" in caplog.text
+    assert "incomplete last line" in caplog.text
 
 
 def test_touches_with_different_numbers_of_fingers_are_refused_by_name():
@@ -265,7 +265,7 @@ def test_a_split_can_be_stored_as_json_and_selects_its_grasps():
     ids=repr,
 )
 def test_data_that_is_not_a_split_is_refused_with_the_required_keys(data):
-    with pytest.raises(DatasetError, match=r"split(\.\S+)? must (be a|hold seed, train, validation, test;)"):
+    with pytest.raises(DatasetError, match=r"split(\.\S+)? must (be a|have seed, train, validation, test;)"):
         Split.from_dict(data)
 
 

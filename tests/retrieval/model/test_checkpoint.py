@@ -352,11 +352,11 @@ def test_the_state_of_a_training_is_not_a_checkpoint(saved, name):
         ({"config": {"matcher": {"colour": 1}}}, "matcher has no setting 'colour'; known settings:"),
         ({"config": {"matcher": {"tower": "vgg"}}}, "tower must be one of"),
         ({"config": [1]}, "it must be a table"),
-        ({"split": {"train": ["a"]}}, "split must hold seed, train, validation, test; validation is missing"),
+        ({"split": {"train": ["a"]}}, "split must have seed, train, validation, test; validation is missing"),
         ({"split": []}, "split must be a table"),
         (
             {"posterior": {"slope": 1.0}},
-            "posterior must hold formula, slope, offset, dependence, tests; formula is missing",
+            "posterior must have formula, slope, offset, dependence, tests; formula is missing",
         ),
         (
             {"posterior": POSTERIOR.to_dict() | {"formula": "another"}},
@@ -367,7 +367,7 @@ def test_the_state_of_a_training_is_not_a_checkpoint(saved, name):
             {"posterior": POSTERIOR.to_dict() | {"dependence": 1.5}},
             "posterior.dependence must be a number <= 1.0, got 1.5",
         ),
-        ({"gel_check": {"rates": {}}}, "gel_check must hold foreign_above, contact_above, level_above"),
+        ({"gel_check": {"rates": {}}}, "gel_check must have foreign_above, contact_above, level_above"),
         (
             {"gel_check": GEL_CHECK.to_dict() | {"level_above": "1"}},
             "gel_check.level_above must be a number or nothing, got '1'",

@@ -141,7 +141,7 @@ def test_an_unknown_table_is_refused_with_the_known_ones():
 @pytest.mark.parametrize("table", TABLES)
 def test_an_unknown_key_is_refused_with_the_known_ones(table):
     known = ", ".join(sorted({*TABLES[table], *(LOADER_SETTINGS if table == "training" else ())}))
-    with pytest.raises(ConfigError, match=rf"{table} has no setting 'colour'; [a-z ]+ {known}"):
+    with pytest.raises(ConfigError, match=rf"{table} has no setting 'colour'; known settings: {known}"):
         Config.from_dict({table: {"colour": 1}})
 
 

@@ -273,7 +273,7 @@ def test_a_store_that_always_refuses_raises_and_the_codes_are_stored(build, stor
             raise OSError("503 Slow Down")
 
     requests.rule = refuse
-    with pytest.raises(RemoteStorageError, match=r"memory://bucket/cluster/shard-0.*: the storage refused 6 times"):
+    with pytest.raises(RemoteStorageError, match=r"memory://bucket/cluster/shard-0.*: the storage failed 6 times"):
         build()
     requests.rule = None
     assert sum(embedded) > 0

@@ -162,5 +162,5 @@ def test_an_answer_is_restored_from_its_document(searcher, touch):
     answer = searcher.query(touch)
     assert QueryResult.from_dict(answer.to_dict()) == answer
     for broken in ({}, {**answer.to_dict(), "results": [{}]}):
-        with pytest.raises(BadInput, match="not the document of `retrieve query --json`"):
+        with pytest.raises(BadInput, match="not a document of `retrieve query --json`"):
             QueryResult.from_dict(broken)

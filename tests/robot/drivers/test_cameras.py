@@ -206,7 +206,7 @@ def test_every_set_of_frames_is_released_also_after_a_failure(install):
         eye.read()
         eye.read(depth=False)
         freenect.fails = True
-        with pytest.raises(DeviceError, match="kinect2 returned no picture: a mistake of the package"):
+        with pytest.raises(DeviceError, match="kinect2 returned no picture: an error of the package"):
             eye.read()
         freenect.fails = False
         eye.read()

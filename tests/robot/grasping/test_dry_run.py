@@ -14,13 +14,13 @@ from tests.fake_rig import FakeRig
 def test_the_motions_of_an_attempt_are_reported_in_order_and_nothing_is_moved():
     reports = []
     rig = FakeRig(5)
-    state = rig.state
+    shared = rig.shared
     with make_dry_run(rig, reports.append) as dry:
         attempt = AttemptRunner(dry, 5, AttemptSettings()).run("round-0", 0)
     assert attempt.outcome == "held"
-    assert {"arm", "grasp", "open", "arm.connect", "gripper.connect"}.isdisjoint(state.calls)
-    assert "depth" in state.calls  # camera and gels are read
-    assert "gel a" in state.calls
+    assert {"arm", "grasp", "open", "arm.connect", "gripper.connect"}.isdisjoint(shared.calls)
+    assert "depth" in shared.calls  # camera and gels are read
+    assert "gel a" in shared.calls
     starts = [" ".join(line.split()[:2]) for line in reports]
     assert starts == [
         "jaws: open",  # wide
