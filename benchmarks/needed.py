@@ -3,9 +3,9 @@
 This benchmark measures how many candidates contain the exhaustive top-1 as the catalogue grows. Catalogues are drawn as
 in `benchmarks.scale`, block by block; each is the beginning of the next. No block is stored, so only time grows. For
 each touch, the exhaustive top-1 is found first (the photo with the greatest match logit), then its rank by the
-candidate encoder. As in `benchmarks.scale`, half of the touches stored in the checkpoint choose k: `MARGIN` times the
-number of candidates that contain the exhaustive top-1 for 99 % of them. The other half and the recording's touches, up
-to `--held-out`, evaluate the choice.
+candidate encoder. As in `benchmarks.scale`, one half of the checkpoint's touches chooses k: `MARGIN` times the number
+of candidates that contain the exhaustive top-1 for 99 % of them. The other half and the recording's touches, up to
+`--held-out`, evaluate the choice.
 
 All photos are scored in bfloat16. Photos with a logit close to the best so far are also scored in float32: within
 `SAFE` times the largest difference between both precisions in the first block. So the top-1 is practically always that

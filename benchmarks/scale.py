@@ -3,8 +3,8 @@
 Catalogues of N photos are drawn from the trained model's own distribution: partial activations of recorded photos, each
 a blend of two (w A + (1 - w) B, w uniform in 1/2..1), with their embeddings by the checkpoint's candidate encoder
 (`--by contrastive`: with the embeddings whose cosine is in the partial activations). The exhaustive top-1 of a touch is
-the photo with the greatest match logit. Half of the touches that the checkpoint stores (of its validation objects)
-choose the settings, and the number of candidates that contain the exhaustive top-1 for 99 % of them. `MARGIN` times
+the photo with the greatest match logit. One half of the stored touches of the checkpoint (of its validation objects)
+chooses the settings and the number of candidates that contain the exhaustive top-1 for 99 % of them. `MARGIN` times
 this number is used, because a hundred touches hardly determine the last percent. The reported recall is that of other
 touches: the other half, and those of the recording.
 

@@ -120,7 +120,7 @@ class Rig:
             try:
                 self.ask(f"Put {object_id} {position}, alone, and press Enter.")
             except EOFError as error:
-                raise RobotConfigError("a person must change the objects: run this rig in a terminal") from error
+                raise RobotConfigError("a person must change the objects of this rig: run it in a terminal") from error
             self._object_on_table = object_id
 
     def settings(self) -> dict[str, dict[str, Any]]:

@@ -146,7 +146,7 @@ class GripperSetup:
         lowest = self.settings.to_finger_force(self.limits.min_force_n)
         if force < lowest or speed < self.limits.min_speed_mm_s:
             raise RobotConfigError(
-                f"{self.name}: max_force_n must be at least {lowest:g} N on a finger and max_speed_mm_s at least "
+                f"{self.name}: the limits must allow at least {lowest:g} N on each finger and "
                 f"{self.limits.min_speed_mm_s:g} mm/s, the smallest values of the gripper; got {force:g} N and "
                 f"{speed:g} mm/s"
             )
