@@ -44,7 +44,7 @@ def ways(made: Generation, k: int) -> dict[str, Way]:
     }
 
 
-def places(queries: np.ndarray, photos: np.ndarray, scorer: Callable[[Rows], np.ndarray]) -> dict[str, int]:
+def ranks_by_way(queries: np.ndarray, photos: np.ndarray, scorer: Callable[[Rows], np.ndarray]) -> dict[str, int]:
     """Return the rank, from 1, of the exhaustive top-1 of grasps (G, d) among photos (N, d), for each way."""
     cosines = queries @ photos.T
     scores = {"together": cosines.sum(0, keepdims=True), "each": cosines}
@@ -63,16 +63,16 @@ def measure(
 ) -> Iterator[dict[str, Any]]:
     """Yield a line of figures for each way; sets (S, G) contain rows of touch partial activations (T, width)."""
     queries, photos = crowd.embeddings(partials, "touch"), made.embeddings[made.slots]
-    stored, found = made.arrays["partials"], []
+    stored, ranks = made.arrays["partials"], []
     for chosen in sets:
-        found.append(
-            places(
+        ranks.append(
+            ranks_by_way(
                 queries[chosen], photos, lambda rows, chosen=chosen: crowd.scorer.logits(partials[chosen], stored, rows)
             )
         )
     counts, seconds = _timed(crowd, made, partials, queries, sets, k)
     for way in counts:
-        order = np.sort([place[way] for place in found])
+        order = np.sort([rank[way] for rank in ranks])
         contained = int((order <= k).sum())
         low, high = binomial_interval(contained, len(order))
         yield {

@@ -30,7 +30,7 @@ class TableRow:
     """A line of the table.
 
     Attributes:
-        what: what is measured.
+        what: the measured quantity.
         unit: unit of the figures.
         ours: our figures of single repetitions.
         against: name of the comparison, if any.

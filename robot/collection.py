@@ -209,17 +209,17 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool)
     """
     if not (folder / INFO_FILE).is_file():
         return
-    found = read_info(folder)
-    if "collection" not in found:
+    stored = read_info(folder)
+    if "collection" not in stored:
         raise RecordingError(f"{folder} contains a recording that was not collected by a rig; give another folder")
     if strict:
         expected = {**expected, "software_version": software_version()}
     else:
         expected = {name: value for name, value in expected.items() if name != "devices"}
-    if "gels" not in found:  # recordings of older versions
+    if "gels" not in stored:  # recordings of older versions
         expected = {name: value for name, value in expected.items() if name != "gels"}
     for name, value in _flatten(expected).items():
-        old = _flatten(found).get(name)
+        old = _flatten(stored).get(name)
         if old != value:
             what = name.replace("collection.", "").replace("_", " ")
             raise RecordingError(

@@ -42,10 +42,10 @@ def parse_gel_settings(tables: Mapping[str, Any], fingers: Iterable[str]) -> dic
     Raises:
         RobotConfigError: A table names another finger, or has an invalid setting.
     """
-    found = {finger: GelSettings() for finger in sorted(fingers)}
+    gels = {finger: GelSettings() for finger in sorted(fingers)}
     for finger, table in tables.items():
-        if finger not in found or not isinstance(table, Mapping):
-            known = ", ".join(f"[gel.{each}]" for each in found)
+        if finger not in gels or not isinstance(table, Mapping):
+            known = ", ".join(f"[gel.{each}]" for each in gels)
             raise RobotConfigError(f"gel tables must name a finger with a sensor: {known}; got {finger!r}")
-        found[finger] = build(GelSettings, table, where=f"[gel.{finger}]")
-    return found
+        gels[finger] = build(GelSettings, table, where=f"[gel.{finger}]")
+    return gels

@@ -118,7 +118,7 @@ class Rig:
                 else f"at x {self.object_fit.x_mm:g}, y {self.object_fit.y_mm:g} mm"
             )
             try:
-                self.ask(f"Put {object_id} {position}, alone, and press Enter.")
+                self.ask(f"Put {object_id} {position}, remove all other objects, then press Enter.")
             except EOFError as error:
                 raise RobotConfigError("a person must change the objects of this rig: run it in a terminal") from error
             self._object_on_table = object_id

@@ -253,10 +253,10 @@ class Sawyer(Arm):
 
     def _solve(self, poses: Sequence[Pose], start: Joints) -> Joints:
         """Return the joint angles (N, 7) of way-points; the first is the arm's pose."""
-        found = [start]
+        solved = [start]
         for pose in poses[1:]:
-            found.append(self._solve_one(pose, found[-1], start))
-        return np.array(found)
+            solved.append(self._solve_one(pose, solved[-1], start))
+        return np.array(solved)
 
     def _solve_one(self, pose: Pose, before: Joints, start: Joints) -> Joints:
         """Solve one way-point; after a failure, try other seeds up to `ik_retries` times."""
@@ -264,14 +264,14 @@ class Sawyer(Arm):
         for number in range(self._options.ik_retries + 1):
             request = messages.ik_request(tip, self._options.tip, seeds[number % len(seeds)])
             try:
-                found = messages.ik_answer(self._link.call(messages.IK_SERVICE, request))
+                joints = messages.ik_answer(self._link.call(messages.IK_SERVICE, request))
             except DeviceError as error:
                 self._link.check()
                 problem = str(error)
                 continue
-            turn = float(np.abs(found - before).max())
+            turn = float(np.abs(joints - before).max())
             if turn <= _MAX_TURN_RAD:
-                return found
+                return joints
             problem = f"its solution turns a joint by {turn:.2f} rad at once"
         tries = self._options.ik_retries + 1
         raise DeviceError(

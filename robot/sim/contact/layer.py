@@ -65,7 +65,7 @@ class Contact:
 
     Attributes:
         pressure_mpa: (rows, cols) >= 0.
-        displacement_mm: (rows, cols) inward displacement of the gel alone, without the object's own deformation.
+        displacement_mm: (rows, cols) inward displacement of the gel, without the object's own deformation.
         approach_mm: approach of the undeformed object, from gap = 0.
         force_n: total force.
         area_mm2: contact area.

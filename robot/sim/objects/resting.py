@@ -32,7 +32,7 @@ def stable_up_directions(vertices: Array, centre_of_mass: Array) -> list[Array]:
         centre_of_mass: (3,) its centre of mass.
 
     Returns:
-        At most 6 directions; its own z alone if no pose is stable.
+        At most 6 directions; only its own z if no pose is stable.
     """
     try:
         hull = ConvexHull(vertices)
