@@ -40,10 +40,7 @@ def collect(
         ),
     ] = False,
 ) -> None:
-    """Collect a recording with a rig. Resumes a stopped run.
-
-    A real rig asks a person to change the objects: stay next to it.
-    """
+    """Collect a recording with a rig; stay next to a real rig. Resumes a stopped run."""
     if dry_run:
         ignored = {"gate": gate, "preview": preview, "photos_only": photos_only, "touches_only": touches_only}
         refuse_options("has no effect with --dry-run, which moves and records nothing; leave it out", **ignored)
