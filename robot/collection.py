@@ -158,7 +158,7 @@ def collect(
     if not names:
         raise RobotConfigError("objects must name at least one object, got none")
     if len(set(names)) != len(names):
-        raise RobotConfigError("the names of objects must be different, but one occurs twice")
+        raise RobotConfigError("objects must have different names, but one name occurs twice")
     for name in names:
         check_name("an object's name", name)
     with rig:
