@@ -8,7 +8,7 @@ time.
 
 Every build is a separate process with three times: start-up until the model is loaded, which every command needs;
 decoding and encoding of the new photo, which also runs once before the build, because the first run takes longer; and
-the rest, printed first. For comparison, `os.walk` and `os.stat` over the folders are timed alone.
+the rest, printed first. For comparison, `os.walk` and `os.stat` over the folders are timed separately.
 """
 
 import argparse
@@ -48,7 +48,7 @@ OLD_S = 3600
 def measure(photos: int = PHOTOS, rounds: int = ROUNDS) -> Iterator[ResultLine]:
     """Yield one line: the first build over an index without a stat cache, then builds in turn.
 
-    In each round the arms are a build without new photos, one with one new photo, and one that reads all photos.
+    The arms of each round are a build without new photos, one with a new photo, and one that reads all photos.
     """
     checkpoint = load_checkpoint(shipped_model())
     with tempfile.TemporaryDirectory() as name:

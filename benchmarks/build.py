@@ -65,7 +65,7 @@ def measure(
 def measure_shipped(photos: int = 768, photo_px: int = 512, repetitions: int = 3) -> Iterator[ResultLine]:
     """Yield one line for the shipped model, with enough photos for the build to choose a faster encoder.
 
-    The time of this choice is listed separately. The bare arm is that encoder alone, on as many threads, with prepared
+    The time of this choice is listed separately. The bare arm is only that encoder, on as many threads, with prepared
     images. The work arm decodes, crops and encodes, without an index.
     """
     checkpoint = load_checkpoint(shipped_model())

@@ -76,7 +76,7 @@ def measure(photos: int = PHOTOS, repetitions: int = REPETITIONS, model: Path | 
 
 
 def _models(folder: Path, source: Path) -> dict[str, Path]:
-    """Return backend -> the same checkpoint, alone or with an export next to it."""
+    """Return backend -> the same checkpoint, without or with an export next to it."""
     backends = ["torch"] + (["onnxruntime"] if find_spec("onnx") and find_spec("onnxruntime") else [])
     models = {}
     for backend in backends:

@@ -24,7 +24,7 @@ class ResultLine:
         tower: name of the tower or of the case.
         text: the result as a sentence.
         figures: the numbers by name.
-        each: the times of single repetitions of each arm, for their spread.
+        each: the time of each repetition of each arm, for the range.
     """
 
     benchmark: str
@@ -58,7 +58,7 @@ def in_turns(
 ) -> Times:
     """Run every arm once unmeasured, then all of them in turn, `repetitions` times.
 
-    A short arm is called repeatedly for about `MIN_SECONDS` in its turn, and the mean of the calls counts. `clock`
+    A short arm is called repeatedly for about `MIN_SECONDS` in its turn, and the mean of the calls is used. `clock`
     returns seconds; those of `time.process_time` are CPU time.
     """
     calls = {name: max(1, int(MIN_SECONDS / _seconds(arm, 1, clock))) for name, arm in arms.items()}

@@ -1,4 +1,4 @@
-"""Cost of a simulated grasp: all outputs, each output alone, the saving by leaving one out; then whole collections."""
+"""Cost of a simulated grasp: all outputs, each single output, the saving without one output; then whole collections."""
 
 import dataclasses
 import tempfile

@@ -1,8 +1,8 @@
 """`python -m benchmarks.growth [--grasps 1 2 4 8] [--objects 5 10 20 40] [--touches 1 2 5 10 20] [--json]`.
 
 Growth of CPU time with accepted grasps per object and with objects that the simulated rig collects, in this process
-with planning, gate and files, and with grasps per query of the shipped model. One thread works. Every round measures
-all sizes in turn, and the median of the rounds counts. Slopes are those of log time over log number.
+with planning, gate and files, and with grasps per query of the shipped model. Everything runs on one thread. Every
+round measures all sizes in turn; the median of the rounds is reported. Slopes are those of log time over log number.
 """
 
 import argparse

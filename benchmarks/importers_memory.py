@@ -5,7 +5,7 @@
 
 Rows are written in the layout of each data set, in folders of the same size, with links to a few small pictures. An
 import runs in a separate process. Its peak is read before the recording is returned and after, because the returned
-recording contains one line per grasp. Only names may grow with rows: MAX_KB.
+recording contains one line per grasp. Only the memory for names may grow with the rows, by at most MAX_KB per row.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from typing import Any
 from tests.miniatures import encoded, picture
 
 MAX_KB = {"importing": 1.0, "in all": 3.0}
-"""Maximum memory of a row: during the import, and after the recording was read back."""
+"""Maximum kB per row: during the import, and after the recording was read back."""
 Options = dict[str, Any]
 
 
@@ -334,7 +334,7 @@ WIDE: Mapping[str, Callable[[Path, int], Options]] = {
     "x-capture": x_capture,
     "ycb-slide": ycb_slide,
 }
-"""Importer -> function that writes rows in a folder and returns import options. Rows come in whole folders: 1,000s."""
+"""Importer -> function that writes rows in a folder and returns import options. Folders have 1,000 rows each."""
 
 
 if __name__ == "__main__":

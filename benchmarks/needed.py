@@ -1,14 +1,15 @@
-"""`python -m benchmarks.needed [--sizes 1e3 1e4 1e5 1e6 1e7] [--recording R --features F] [--json]`: candidates.
+"""`python -m benchmarks.needed [--sizes 1e3 1e4 1e5 1e6 1e7] [--recording R --features F] [--json]`.
 
-Number of candidates that contain the exhaustive top-1, against the number of photos. Catalogues are drawn as in
-`benchmarks.scale`, block by block, each the beginning of the next. No block is stored, so only time grows. First the
-exhaustive top-1 of each touch is found, the photo with the greatest match logit of all; then its rank by the candidate
-encoder. As in `benchmarks.scale`, one part of the checkpoint's touches chooses k: `MARGIN` times the number of
-candidates that contain the exhaustive top-1 for 99 % of them. The other touches evaluate the choice.
+This benchmark measures how many candidates contain the exhaustive top-1 as the catalogue grows. Catalogues are drawn as
+in `benchmarks.scale`, block by block; each is the beginning of the next. No block is stored, so only time grows. For
+each touch, the exhaustive top-1 is found first (the photo with the greatest match logit), then its rank by the
+candidate encoder. As in `benchmarks.scale`, one half of the checkpoint's touches chooses k: `MARGIN` times the number
+of candidates that contain the exhaustive top-1 for 99 % of them. The other half and the recording's touches, up to
+`--held-out`, evaluate the choice.
 
-All photos are scored in bfloat16, and also in float32 if their logit is close to the best so far: within `SAFE` times
-the largest difference between both precisions in the first block. So the top-1 is that of float32. A thousand touches
-of ten million photos take an hour and a half on one thread.
+All photos are scored in bfloat16. Photos with a logit close to the best so far are also scored in float32: within
+`SAFE` times the largest difference between both precisions in the first block. So the top-1 is practically always that
+of float32. A thousand touches of ten million photos take an hour and a half on one thread.
 """
 
 import argparse
@@ -30,10 +31,11 @@ from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.search.defaults import shipped_model
 
 SAFE = 2.0
+"""Factor of the largest difference between the precisions in the first block."""
 
 
 class CoarseScorer:
-    """The classifier's layers in bfloat16."""
+    """The fusion head's layers in bfloat16."""
 
     def __init__(self, scorer: FusionScorer) -> None:
         self._width = len(scorer.out)
@@ -83,7 +85,7 @@ def exhaustive_top1(
     return np.array(found), rescored / (sizes[-1] * len(touches))
 
 
-def places(
+def ranks_of(
     crowd: BlendedPhotos, touches: NDArray[np.float32], sizes: Sequence[int], cosines: NDArray[Any]
 ) -> NDArray[Any]:
     """Return the rank, from 1, of each exhaustive top-1 by the candidate encoder: (sizes, touches)."""
@@ -108,25 +110,27 @@ def _blocks(crowd: BlendedPhotos, sizes: Sequence[int], name: str) -> Iterator[t
                 bar.advance(len(block.rows))
 
 
-def lines(sizes: Sequence[int], found: NDArray[Any], choosing: int) -> Iterator[dict[str, float]]:
+def lines(sizes: Sequence[int], ranks: NDArray[Any], choosing: int) -> Iterator[dict[str, float]]:
     """Yield the results of each size. The first `choosing` touches choose k, the others evaluate it."""
-    for size, order in zip(sizes, found, strict=True):
-        needed = [_needed(some) for some in (order[:choosing], order)]
-        taken = min(MARGIN * needed[0], size)
+    for size, order in zip(sizes, ranks, strict=True):
+        needed_by_choosing, needed_by_all = _needed(order[:choosing]), _needed(order)
+        reranked = min(MARGIN * needed_by_choosing, size)
         evaluated = order[choosing:]
-        contained = int((evaluated <= taken).sum())
+        contained = int((evaluated <= reranked).sum())
         low, high = binomial_interval(contained, len(evaluated))
         recall = {
-            "taken": taken,
+            "taken": reranked,
             "touches": len(evaluated),
             "found": contained / len(evaluated),
             "low": low,
             "high": high,
         }
-        yield {"photos": size, "needed": needed[1], "needed_by_chosen": needed[0], "worst": int(order.max()), **recall}
+        needed = {"needed": needed_by_all, "needed_by_chosen": needed_by_choosing}
+        yield {"photos": size, **needed, "worst": int(order.max()), **recall}
 
 
 def _needed(order: NDArray[Any]) -> int:
+    """Return the number of candidates that contains the target fraction of these ranks."""
     return int(np.sort(order)[int(np.ceil(TARGET * len(order))) - 1])
 
 
@@ -140,7 +144,7 @@ def main() -> None:
         "--recording", type=Path, help="recording whose photos are blended (default: a small one is collected)"
     )
     parser.add_argument("--features", type=Path, help="file to store encoded features")
-    parser.add_argument("--json", action="store_true", help="one JSON document a line")
+    parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
     sizes = sorted(int(size) for size in arguments.sizes)
     with tempfile.TemporaryDirectory() as made:
@@ -148,7 +152,7 @@ def main() -> None:
     touches = np.concatenate([crowd.touches, crowd.held_out[: arguments.held_out]])
     start = time.perf_counter()
     cosines, rescored = exhaustive_top1(crowd, touches, sizes)
-    table = list(lines(sizes, places(crowd, touches, sizes, cosines), len(crowd.touches)))
+    table = list(lines(sizes, ranks_of(crowd, touches, sizes, cosines), len(crowd.touches)))
     for line in table:
         shown = {name: value if isinstance(value, int) else round(value, 4) for name, value in line.items()}
         print(json.dumps(line) if arguments.json else "  ".join(f"{name} {value}" for name, value in shown.items()))

@@ -2,7 +2,7 @@
 
     OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 python -m benchmarks.peers --photos 100000
 
-One thread. Each engine's search width is the smallest of its ladder that finds `RECALL` of the best k with half of the
+One thread. Each engine's search width is the smallest of its values that finds `RECALL` of the best k with half of the
 queries. The other half is timed one by one, all engines in turn. Engines that are not installed are left out:
 `pip install hnswlib usearch`. Our kinds rescore their results and order them by the exact inner product; the plain
 engines do not. A query first needs only the unordered set of candidates (`VectorIndex.candidates`); it is compared with

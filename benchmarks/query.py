@@ -91,7 +91,7 @@ def searcher_of(index: Path, checkpoint: Checkpoint, encoder: TouchEncoder) -> S
 
 
 def _bare(matcher: Matcher, encoder: TouchEncoder, images: list[np.ndarray]):
-    """Return the forward pass alone, on prepared images; in PyTorch with folded weights, as in a query."""
+    """Return only the forward pass, on prepared images; in PyTorch with folded weights, as in a query."""
     if isinstance(encoder, OnnxEncoder):
         return lambda: encoder.encode([images])
     tower, batch = TorchEncoder(matcher)._fast.touch_tower, touch_batch([images]).flatten(0, 1)

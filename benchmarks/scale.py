@@ -2,11 +2,11 @@
 
 Catalogues of N photos are drawn from the trained model's own distribution: partial activations of recorded photos, each
 a blend of two (w A + (1 - w) B, w uniform in 1/2..1), with their embeddings by the checkpoint's candidate encoder
-(`--by contrastive`: with the embeddings whose cosine is in the partial activations). The touches are those of
-validation objects, stored in the checkpoint. The exhaustive top-1 is the photo with the greatest match logit of all.
-Every other touch chooses the settings and the number of candidates that contain the exhaustive top-1 for 99 % of
-touches. `MARGIN` times as many are used, because a hundred touches hardly determine the last percent. The reported
-recall is that of the other touches.
+(`--by contrastive`: with the embeddings whose cosine is in the partial activations). The exhaustive top-1 of a touch is
+the photo with the greatest match logit. One half of the stored touches of the checkpoint (of its validation objects)
+chooses the settings and the number of candidates that contain the exhaustive top-1 for 99 % of them. `MARGIN` times
+this number is used, because a hundred touches hardly determine the last percent. The reported recall is that of other
+touches: the other half, and those of the recording.
 
 The cost model, for h = hidden, d = embedding_dim, k candidates, L = 4 sqrt(N) lists and p visited lists:
 
@@ -20,7 +20,7 @@ The cost model, for h = hidden, d = embedding_dim, k candidates, L = 4 sqrt(N) l
     build        rows: constant each; lists: 2 d L 64 L training for each of 10 rounds + 2 d L N     N, N^3/2
     add F        2 d N hashing of existing photos, and N + F rows     N
 
-So with k = c N candidates, and search by lists, the gain over exhaustive search is at most 1 / c.
+So with k = c N candidates, and search by lists, exhaustive search takes at most 1 / c times as long.
 
 Run it on one thread (OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1), like a single query: threads that wait for each other
 make small products many times slower. A million photos take 1.2 GB on disk, and 20 minutes.
@@ -66,7 +66,7 @@ TIMED = 40
 QUERIES, HELD_OUT = 200, 1000
 """Touches that choose the number of candidates, and others that evaluate it."""
 RERANKED = 3e13
-"""Maximum flops for exhaustive scoring: larger catalogues use fewer touches, but at least 60."""
+"""Maximum flops for exhaustive scoring. Larger catalogues use fewer touches, but at least 60."""
 
 PROBE = """
 import sys, time
@@ -200,7 +200,7 @@ def _row(number: int) -> dict[str, Any]:
 
 
 def _build(crowd: BlendedPhotos, store: IndexStore, size: Size) -> Generation:
-    """Stream the catalogue to disk; the time for drawing it is not counted."""
+    """Stream the catalogue to disk; the time for drawing it is not measured."""
     drawing_s, peak_mb, before = 0.0, 0.0, anonymous_mb()
 
     def blocks() -> Iterator[Block]:

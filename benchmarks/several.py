@@ -1,11 +1,11 @@
 """`python -m benchmarks.several [--sizes 1e4 1e5] [--grasps 2 4 8] [--recording R --features F] [--json]`.
 
-Candidates of several grasps of one object: the k photos nearest to all grasps together, as search uses them, compared
-with the union of the k nearest of each grasp. Catalogues are drawn as in `benchmarks.scale`. Every touch of the
-recording begins a set with the next touches of its object. The exhaustive top-1 of a set is the photo with the greatest
-sum of match logits. It is searched among the `SEARCHED` nearest photos of either way, whose limits it never comes near
-(the worst rank is printed). Ranks are those of exact cosines. Candidate search in the index of `--kind` and reranking
-are timed on one thread, both ways in turn.
+This benchmark compares two ways to find candidates for several grasps of one object: one joint search for the k photos
+nearest to the sum of the grasps' embeddings (as queries do), and the union of one search per grasp. Catalogues are
+drawn as in `benchmarks.scale`. Each set consists of a touch of the recording and the next touches of its object. The
+exhaustive top-1 of a set is the photo with the greatest sum of match logits. It is searched among the `SEARCHED`
+nearest photos of both ways; its rank stays far below this limit (the worst rank is printed). Ranks are those of exact
+cosines. Candidate search in the index of `--kind` and reranking are timed on one thread, both ways in turn.
 """
 
 import argparse
@@ -44,7 +44,7 @@ def ways(made: Generation, k: int) -> dict[str, Way]:
     }
 
 
-def places(queries: np.ndarray, photos: np.ndarray, scorer: Callable[[Rows], np.ndarray]) -> dict[str, int]:
+def ranks_by_way(queries: np.ndarray, photos: np.ndarray, scorer: Callable[[Rows], np.ndarray]) -> dict[str, int]:
     """Return the rank, from 1, of the exhaustive top-1 of grasps (G, d) among photos (N, d), for each way."""
     cosines = queries @ photos.T
     scores = {"together": cosines.sum(0, keepdims=True), "each": cosines}
@@ -63,16 +63,16 @@ def measure(
 ) -> Iterator[dict[str, Any]]:
     """Yield a line of figures for each way; sets (S, G) contain rows of touch partial activations (T, width)."""
     queries, photos = crowd.embeddings(partials, "touch"), made.embeddings[made.slots]
-    stored, found = made.arrays["partials"], []
+    stored, ranks = made.arrays["partials"], []
     for chosen in sets:
-        found.append(
-            places(
+        ranks.append(
+            ranks_by_way(
                 queries[chosen], photos, lambda rows, chosen=chosen: crowd.scorer.logits(partials[chosen], stored, rows)
             )
         )
     counts, seconds = _timed(crowd, made, partials, queries, sets, k)
     for way in counts:
-        order = np.sort([place[way] for place in found])
+        order = np.sort([rank[way] for rank in ranks])
         contained = int((order <= k).sum())
         low, high = binomial_interval(contained, len(order))
         yield {

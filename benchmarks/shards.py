@@ -146,9 +146,9 @@ def compare(crowd: BlendedPhotos, folder: Shard, cluster: Shard, touches: int, r
     for number in range(len(partials)):
         query, k = ShardQuery(embeddings[number : number + 1], partials[number : number + 1]), candidates_of(photos)
         start = time.thread_time()
-        one = folder.search(query, 10, k, posterior)
+        from_folder = folder.search(query, 10, k, posterior)
         middle = time.thread_time()
-        many = cluster.search(query, 10, k, posterior)
+        from_shards = cluster.search(query, 10, k, posterior)
         times["folder"].append(middle - start)
         times["shards"].append(time.thread_time() - middle)
         single = cluster.shards[number % len(cluster.shards)]  # type: ignore[attr-defined]
@@ -157,30 +157,31 @@ def compare(crowd: BlendedPhotos, folder: Shard, cluster: Shard, touches: int, r
         times["slowest"].append(time.thread_time() - start)
         times["search"].append(result.timing_ms["candidates"] / 1e3)
         times["rerank"].append(result.timing_ms["rerank"] / 1e3)
-        same += one.best[0].photo == many.best[0].photo
-        better += many.best[0].logit >= one.best[0].logit - 1e-5
+        same += from_folder.best[0].photo == from_shards.best[0].photo
+        better += from_shards.best[0].logit >= from_folder.best[0].logit - 1e-5
     exact, exhaustive_top1, error, exhaustive_s = 0, 0, 0.0, list[list[float]]()
     for number in range(reranked):
         query = ShardQuery(embeddings[number : number + 1], partials[number : number + 1])
         start = time.thread_time()
-        one = folder.search(query, 10, photos, posterior)
+        from_folder = folder.search(query, 10, photos, posterior)
         middle = time.thread_time()
-        many = cluster.search(query, 10, photos, posterior)
+        from_shards = cluster.search(query, 10, photos, posterior)
         exhaustive_s.append([middle - start, time.thread_time() - middle])
-        exhaustive_top1 += one.best[0].photo == many.best[0].photo
-        exact += [each.photo for each in one.best] == [each.photo for each in many.best]
-        error = max(error, *(abs(a.logit - b.logit) for a, b in zip(one.best, many.best, strict=True)))
-        if posterior is not None and one.mass is not None and many.mass is not None:
+        exhaustive_top1 += from_folder.best[0].photo == from_shards.best[0].photo
+        exact += [each.photo for each in from_folder.best] == [each.photo for each in from_shards.best]
+        error = max(error, *(abs(a.logit - b.logit) for a, b in zip(from_folder.best, from_shards.best, strict=True)))
+        if posterior is not None and from_folder.mass is not None and from_shards.mass is not None:
             ours, theirs = (
-                posterior.probabilities_given([each.logit for each in some.best], some.mass) for some in (one, many)
+                posterior.probabilities_given([each.logit for each in some.best], some.mass)
+                for some in (from_folder, from_shards)
             )
             error = max(error, float(np.abs(ours.objects - theirs.objects).max()), abs(ours.none - theirs.none))
-    found = {f"{name}_p50_s": float(np.median(one)) for name, one in times.items()}
-    found["shard_p99_s"] = float(np.percentile(times["slowest"], 99))
+    figures = {f"{name}_p50_s": float(np.median(one)) for name, one in times.items()}
+    figures["shard_p99_s"] = float(np.percentile(times["slowest"], 99))
     agreement = {"same_top1": same / len(partials), "top1_no_worse": better / len(partials)}
     folder_s, shards_s = np.median(exhaustive_s, axis=0)
     return (
-        found
+        figures
         | agreement
         | {"all_scored": reranked, "all_scored_top1": exhaustive_top1 / reranked, "all_scored_same": exact / reranked}
         | {"all_scored_error": error, "all_scored_folder_s": float(folder_s), "all_scored_shards_s": float(shards_s)}

@@ -1,10 +1,9 @@
-"""One table of our results, peers and limits, all in one run; medians, with the range of repetitions.
+"""One table of our results, other libraries and lower limits, all in one run: medians and ranges of repetitions.
 
     python -m benchmarks.table [--only candidates query ...]
 
 Every section is a separate process, because single-threaded ones must set the number of threads before numpy is
-imported. The arms of a line run in turn. It takes about a quarter of an hour of two cores; lines appear as they are
-measured.
+imported. The arms of a line run in turn. It takes about 15 minutes on two cores; lines appear as they are measured.
 """
 
 import argparse
@@ -31,7 +30,7 @@ class TableRow:
     """A line of the table.
 
     Attributes:
-        what: what is measured.
+        what: the measured quantity.
         unit: unit of the figures.
         ours: our figures of single repetitions.
         against: name of the comparison, if any.

@@ -4,7 +4,7 @@
 
     bare      forward pass, loss and backward pass of one batch
     cached    training steps, other images each time, from files that were decoded once (`--cache`), with the optimiser
-    decoded   the same, each image decoded for its step, as in the first round of a training without such files
+    decoded   the same, each image decoded for its step, as in the first pass of a training run without such files
 
 All arms run in turn. With one thread everything runs on one core, so that decoding takes time from the step, and the
 figure is CPU time, which does not depend on other programs. With two threads it is wall-clock time. `--ranks`: two
@@ -54,7 +54,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class Work:
-    """A training.
+    """One training run.
 
     Attributes:
         optimizer: the optimiser.
@@ -229,8 +229,9 @@ def running_on(threads: int) -> Iterator[None]:
 def ranks(towers: Sequence[str], recording: Path, precision: str, rounds: int = ROUNDS) -> Iterator[ResultLine]:
     """Compare two processes of one thread with one process of two threads and one of one, started in turn.
 
-    Each prints the medians of its steps. Wall-clock time counts if nothing else runs. While other programs run, threads
-    wait for one another; then CPU time gives the upper bound for two processes, which also wait for each other.
+    Each prints the medians of its steps. Use the wall-clock time if nothing else runs. While other programs run,
+    threads wait for one another; then the CPU time gives an upper bound for two processes, which also wait for each
+    other.
     """
     two = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     start = {"two": (two, 1), "one": ([sys.executable], 2), "alone": ([sys.executable], 1)}

@@ -1,11 +1,11 @@
-"""`python -m benchmarks.vectors [--photos 1e7] [--kinds flat ivf_sq8] [--recording R]`: a large index alone.
+"""`python -m benchmarks.vectors [--photos 1e7] [--kinds flat ivf_sq8] [--recording R]`: a large index, not reranked.
 
 Build, memory, opening and candidates of an index that contains only rows and embeddings, no partial activations: the
-cost of `indexes` alone, while `benchmarks.scale` also measures the reranking of its candidates. Photos are drawn as in
-`benchmarks.scale`, and the 64 numbers are those of the checkpoint's candidate encoder. Each touch requests
-`--candidates`; for each setting of a kind's ladder the recall of the exact best is printed. CPU time is printed next to
-wall-clock time, because other programs may run. Memory is that of the process without mapped files. Ten million photos
-take 11 GB on disk and 25 minutes.
+cost of `indexes` without the matcher, while `benchmarks.scale` also measures the reranking of its candidates. Photos
+are drawn as in `benchmarks.scale`, and the 64 numbers are those of the checkpoint's candidate encoder. Each touch
+requests `--candidates`; for each setting of a kind's ladder the recall of the exact best is printed. CPU time is
+printed next to wall-clock time, because other programs may run. Memory is that of the process without mapped files. Ten
+million photos take 11 GB on disk and 25 minutes.
 """
 
 import argparse

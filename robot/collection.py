@@ -1,9 +1,10 @@
-"""Autonomous collection of a recording with a rig, as in the paper; with a real rig, a person changes the objects.
+"""Collection of a recording with a rig, as in the paper. With a real rig, a person changes the objects.
 
-Each attempt takes a photo, fits a cylinder, draws a random grasp, reads gel images before, during and after, lifts,
-and reads the gripper's outcome. The gate then decides whether training uses the grasp. Rejected grasps are recorded
-too, and attempts without a grasp are logged (robot.recording.attempt_log). Each object needs `grasps` accepted grasps
-within a limited number of attempts. An ungraspable object is skipped, with the reason in recording.json.
+The steps of an attempt: take a photo, plan (by default: fit a cylinder and draw a random grasp), approach, read the
+gels without contact, close, read the gels, lift, read the gripper's outcome, read the gels again, put the object down.
+The gate then decides whether training uses the grasp. Rejected grasps are recorded too, and attempts without a grasp
+are logged (robot.recording.attempt_log). An object is complete when `grasps` of its grasps are accepted; the number of
+attempts is limited. An ungraspable object is skipped, with the reason in recording.json.
 
 One writer writes all grasps in a fixed order, so the recording does not depend on the number of jobs. A collection
 that was stopped or killed continues at the same point when it is started again.
@@ -50,8 +51,8 @@ class CollectSettings:
 
     Attributes:
         grasps: Accepted grasps of each object.
-        most_attempts: Upper limit of attempts at each object; None: 4 for each grasp, plus 10.
-        attempt: How attempts are made; None: the rig's own settings.
+        most_attempts: Upper limit of attempts at each object; None for 4 attempts per grasp, plus 10.
+        attempt: Settings of the attempts; None for the rig's own.
 
     >>> robot.CollectSettings(grasps=2).limit
     18
@@ -83,8 +84,8 @@ class Progress:
         grasps_target: Number of accepted grasps to collect, over all objects.
         grasps_done: Accepted grasps, plus the missing grasps of objects that need no further attempt.
         accepted: Accepted grasps.
-        attempts: Attempts made.
-        seconds_left: Estimated time left; None: unknown.
+        attempts: Attempts so far.
+        seconds_left: Estimated time left; None if unknown.
     """
 
     objects: int
@@ -120,10 +121,10 @@ def collect(
     """Collect grasps into a recording, or continue an existing one.
 
     Args:
-        make_rig: Builds the rig. It is called once, and with jobs > 1 in every process too.
+        make_rig: Builds the rig. It is called once here and, with jobs > 1, once in every process.
         out: Folder of the recording.
         objects: Names, or the number of the rig's objects.
-        seed: Seed of the planner's and the rig's random choices.
+        seed: Seed of the planner's random choices, stored in recording.json; build the rig with the same seed.
         settings: Grasps and attempts for each object.
         gate: Decides which grasps are accepted (`robot.grasping.gates`).
         gate_name: Name of the gate; it must be the same when a collection continues.
@@ -157,7 +158,7 @@ def collect(
     if not names:
         raise RobotConfigError("objects must name at least one object, got none")
     if len(set(names)) != len(names):
-        raise RobotConfigError("objects must have different names, got a name twice")
+        raise RobotConfigError("objects must have different names, but one name occurs twice")
     for name in names:
         check_name("an object's name", name)
     with rig:
@@ -208,17 +209,17 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool)
     """
     if not (folder / INFO_FILE).is_file():
         return
-    found = read_info(folder)
-    if "collection" not in found:
+    stored = read_info(folder)
+    if "collection" not in stored:
         raise RecordingError(f"{folder} contains a recording that was not collected by a rig; give another folder")
     if strict:
         expected = {**expected, "software_version": software_version()}
     else:
         expected = {name: value for name, value in expected.items() if name != "devices"}
-    if "gels" not in found:  # recordings of older versions
+    if "gels" not in stored:  # recordings of older versions
         expected = {name: value for name, value in expected.items() if name != "gels"}
     for name, value in _flatten(expected).items():
-        old = _flatten(found).get(name)
+        old = _flatten(stored).get(name)
         if old != value:
             what = name.replace("collection.", "").replace("_", " ")
             raise RecordingError(
@@ -258,8 +259,8 @@ class _Collection:
         self._start, self._done_at_start = time.monotonic(), self._count_done()
 
     def run(self, workers: WorkerPool[GraspAttempt]) -> None:
-        """Make and record all attempts, object by object; workers may run ahead, but only with needed attempts."""
-        self._record_skipped_objects()  # a crash may have happened between the log's line and this entry
+        """Make and record all attempts, object by object; workers may work on later attempts that will be needed."""
+        self._record_skipped_objects()  # after a crash, the log may have an object that recording.json lacks
         self._report()
         for name in self.names:
             while self._needs_attempt(name):
@@ -271,15 +272,15 @@ class _Collection:
     def _submit_ahead(self, workers: WorkerPool[GraspAttempt], name: str) -> None:
         """Submit the attempts that are needed next, this object's first."""
         later = self.names[self.names.index(name) :]
-        for each in later:
-            while self._needs_attempt(each, ahead=True):
+        for object_id in later:
+            while self._needs_attempt(object_id, ahead=True):
                 if sum(map(len, self._pending.values())) >= workers.window and self._pending[name]:
                     return
-                number = self.tallies[each].attempts + len(self._pending[each])
-                self._pending[each].append(workers.submit(each, number))
+                number = self.tallies[object_id].attempts + len(self._pending[object_id])
+                self._pending[object_id].append(workers.submit(object_id, number))
 
     def _needs_attempt(self, name: str, ahead: bool = False) -> bool:
-        """Return whether another attempt is needed; with `ahead`, if all pending attempts will be accepted."""
+        """Return whether another attempt is needed; with `ahead`, assume that all pending attempts are accepted."""
         pending, counts = len(self._pending[name]) if ahead else 0, self.tallies[name]
         if counts.skipped is not None:
             return False
@@ -296,7 +297,7 @@ class _Collection:
                 attempt.object_id,
                 attempt.images,
                 **attempt.fields,
-                grasped=logged.accepted,
+                grasped=logged.accepted,  # the gate's decision; `outcome` is the gripper's
                 outcome=attempt.outcome,
                 sequence_id=logged.grasp_id,
                 time_s=round(began + attempt.touch_time_s, 3),

@@ -1,13 +1,13 @@
 """Base classes of arm, gripper, tactile sensor and camera: the contract between the collector and every driver.
 
 Lengths in mm, forces in N, angles in rad, times in s. The rig's frame has its origin on the table at the centre of the
-workspace, z up; the camera stands on the -y side. A gripper force is the clamping force, equal to the force on each
-finger. Images are uint8 RGB, row 0 on top.
+workspace, z up; the camera stands on the -y side. Every gripper force is the force on each finger; manufacturers often
+state the sum over both fingers, which is twice as large. Images are uint8 RGB, row 0 on top.
 
 The base classes check arguments and results and raise DeviceError: no value out of range reaches a driver, and no
 stale frame reaches a recording. A driver implements `_connect`, `_close` and the abstract methods of its base class;
 they may raise DeviceError or OSError. A device connects completely or not at all; `close` works at any time, twice,
-and after a failure. An actuator is stopped when a call ends with an exception.
+and after a failure. If a motion (move_to, open, grasp, ...) ends with an exception, the actuator is stopped.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ class Device(ABC):
     Attributes:
         clock: Time in s, the same for all devices of a rig.
         refused: Settings that the device refused, each with the requested and the actual value.
-        Settings: Dataclass of a driver's settings; its fields are keywords of the driver.
+        Settings: Dataclass of a driver's settings; its fields are the keyword arguments of the constructor.
     """
 
     Settings: ClassVar[type[TypedSettings] | None] = None
@@ -58,7 +58,7 @@ class Device(ABC):
         if self._connected:
             return
         try:
-            with self._named_errors("cannot be connected"):
+            with self._convert_os_errors("cannot be connected"):
                 self._connect()
         except BaseException as error:
             try:
@@ -69,11 +69,11 @@ class Device(ABC):
         self._connected = True
 
     def close(self) -> None:
-        """Close the device if it is connected; after a DeviceError it counts as closed."""
+        """Close the device if it is connected; even after a DeviceError, it is not connected any more."""
         if not self._connected:
             return
         self._connected = False
-        with self._named_errors("cannot be closed"):
+        with self._convert_os_errors("cannot be closed"):
             self._close()
 
     def settings(self) -> dict[str, Any]:
@@ -111,11 +111,11 @@ class Device(ABC):
     def _use(self, failure: str) -> Iterator[None]:
         if not self._connected:
             raise DeviceError(f"{self.name} must be connected before it is used; call connect() first")
-        with self._named_errors(failure):
+        with self._convert_os_errors(failure):
             yield
 
     @contextlib.contextmanager
-    def _named_errors(self, failure: str) -> Iterator[None]:
+    def _convert_os_errors(self, failure: str) -> Iterator[None]:
         """Convert each OSError into a DeviceError."""
         try:
             yield
@@ -146,9 +146,11 @@ class VirtualDevice(Device):
 
 
 class Actuator(Device):
-    """A device that moves, at most at `max_speed_mm_s`; any exception, Ctrl-C included, stops it.
+    """A device that moves, at most at `max_speed_mm_s`; an exception during a motion, Ctrl-C included, stops it.
 
-    `may_move`: whether connecting may move it (a reference run) or enable its motors.
+    Attributes:
+        max_speed_mm_s: Upper limit of the commanded speed.
+        may_move: Whether connecting may move it (homing) or enable its motors.
     """
 
     may_move: bool = True
@@ -158,17 +160,17 @@ class Actuator(Device):
         self.max_speed_mm_s = max_speed_mm_s
 
     def stop(self) -> None:
-        """Stop now and stay usable; raise DeviceError if this fails."""
+        """Stop now and stay usable; a held object may be released. Raise DeviceError if this fails."""
         with self._use("cannot be stopped"):
             self._stop()
 
     @abstractmethod
     def _stop(self) -> None:
-        """Stop; also called when the device is still already, and after a command that failed midway."""
+        """Stop; also called if the device does not move, and after a command that failed midway."""
 
     @contextlib.contextmanager
     def _moving(self, failure: str) -> Iterator[None]:
-        """Do as `_use`, and stop on any exception; an exception of the stop itself is added as a note."""
+        """Like `_use`, and stop on any exception; an exception of the stop itself is added as a note."""
         with self._use(failure):
             try:
                 yield
@@ -181,7 +183,7 @@ class Actuator(Device):
 
 
 class Arm(Actuator):
-    """An arm that moves the gripper inside `workspace`, the limits of the point between the fingertips.
+    """An arm that moves the gripper inside `workspace`, the limits of the point between the fingertips (TCP).
 
     Attributes:
         is_manual: Whether a person moves it on request; speeds are not enforced then.
@@ -202,12 +204,12 @@ class Arm(Actuator):
         self.workspace = workspace
 
     def move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
-        """Move to `pose` and return the pose reached; raise DeviceError, also for a pose outside the workspace."""
+        """Move to `pose` and return the pose reached; raise DeviceError on failure or outside the workspace."""
         if not self.workspace.contains(pose) or not math.isfinite(pose.yaw_rad):
             lower, upper = self.workspace.lower, self.workspace.upper
             raise DeviceError(f"{self.name}: a pose must be in the workspace {lower} to {upper}, got {pose}")
         if pose.tilt_rad and not self.can_tilt:
-            raise DeviceError(f"{self.name}: tilt must be 0, because its fingers always point down, got {pose}")
+            raise DeviceError(f"{self.name}: tilt must be 0, because the fingers always point down; got {pose}")
         self._check("speed", speed_mm_s, 1e-3, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot move"):
             return self._check_reported(self._move_to(pose, speed_mm_s))
@@ -231,9 +233,10 @@ class Arm(Actuator):
 
 
 class Gripper(Actuator):
-    """A gripper with two parallel jaws, at most `stroke_mm` apart, that clamps with `min_force_n` to `max_force_n`.
+    """A gripper with two parallel jaws, at most `stroke_mm` apart, and `min_force_n` to `max_force_n` on each finger.
 
-    A driver may read these limits from the device when it connects; they never rise above the given ones.
+    Before connecting, stroke and smallest force may be typical values; a driver then reads those of the device. The
+    largest force and speed never exceed the configured limits.
 
     >>> with robot.load_rig("sim", seed=0) as rig:
     ...     rig.gripper.grasp(force_n=1e6)
@@ -262,13 +265,19 @@ class Gripper(Actuator):
             return self._state()
 
     def open(self, opening_mm: float) -> GripperState:
-        """Open the jaws to `opening_mm`, release a held object and return the state; raise DeviceError on failure."""
+        """Move the jaws to `opening_mm`, wider or narrower, without gripping; a held object is released.
+
+        Return the state; raise DeviceError on failure.
+        """
         self._check("opening", opening_mm, self.min_opening_mm, self.stroke_mm, "mm")
         with self._moving("cannot open"):
             return self._open(float(opening_mm))
 
     def grasp(self, force_n: float, speed_mm_s: float = 80.0) -> GripperState:
-        """Close the jaws until `force_n` or full closure, wait, and return the state; raise DeviceError on failure."""
+        """Close the jaws until each finger has `force_n` or they are closed, wait, and return the state.
+
+        Raise DeviceError on failure.
+        """
         self._check("force", force_n, self.min_force_n, self.max_force_n, "N")
         self._check("speed", speed_mm_s, self.min_speed_mm_s, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot grasp"):
@@ -321,7 +330,8 @@ class TactileSensor(Device):
 def read_together(sensors: Mapping[str, TactileSensor], max_age_s: float = MAX_AGE_S) -> tuple[dict[str, Frame], float]:
     """Read one frame of each sensor, as close in time as possible; return the frames by finger and their skew in s.
 
-    Each frame is the one nearest to the oldest of the newest frames. A failing sensor raises DeviceError.
+    The common time is that of the sensor whose newest frame is the oldest. Of each sensor, the buffered frame nearest
+    to this time is taken. A failing sensor raises DeviceError.
     """
     newest = {finger: sensor.read(max_age_s) for finger, sensor in sensors.items()}
     common = min(frame.time_s for frame in newest.values())
@@ -383,17 +393,19 @@ def _check_depth(name: str, image: RGBD) -> None:
     depth = image.depth_m
     if depth is None or depth.dtype != np.float32 or depth.shape != image.colour.shape[:2]:
         got = "none" if depth is None else f"{depth.shape} {depth.dtype}"
-        raise DeviceError(f"{name}: depth must be float32 of the colour's {image.colour.shape[:2]}, got {got}")
+        raise DeviceError(
+            f"{name}: depth must be float32 with the colour picture's shape {image.colour.shape[:2]}, got {got}"
+        )
     if image.intrinsics is None:
-        raise DeviceError(f"{name}: a picture with depth must come with its intrinsics")
+        raise DeviceError(f"{name}: a picture with depth must have intrinsics")
 
 
 def _check_rigid(matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Check a rigid transform, with the tolerance 1e-6 of a rotation typed with seven digits."""
-    found = np.asarray(matrix, dtype=np.float64)
-    if found.shape != (4, 4) or not np.isfinite(found).all() or not np.array_equal(found[3], [0, 0, 0, 1]):
-        raise RobotConfigError(f"extrinsics must be a 4 x 4 rigid transform with last row 0 0 0 1, got {found}")
-    rotation = found[:3, :3]
+    rigid = np.asarray(matrix, dtype=np.float64)
+    if rigid.shape != (4, 4) or not np.isfinite(rigid).all() or not np.array_equal(rigid[3], [0, 0, 0, 1]):
+        raise RobotConfigError(f"extrinsics must be a 4 x 4 rigid transform with last row 0 0 0 1, got {rigid}")
+    rotation = rigid[:3, :3]
     if not np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=1e-6) or np.linalg.det(rotation) < 0:
         raise RobotConfigError(f"extrinsics must contain a rotation, got {rotation}")
-    return found
+    return rigid

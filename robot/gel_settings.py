@@ -17,7 +17,7 @@ UNKNOWN = "unknown"
 
 @dataclass(frozen=True)
 class GelSettings(TypedSettings):
-    """Thickness, Young's modulus and Poisson's ratio of one gel; None: unknown, drawn at random in simulation."""
+    """Thickness, Young's modulus and Poisson's ratio of one gel; None if unknown (then random in simulation)."""
 
     thickness_mm: float | None = bounded(0.01, 100.0, None)
     modulus_mpa: float | None = bounded(1e-4, 1e3, None)
@@ -42,10 +42,10 @@ def parse_gel_settings(tables: Mapping[str, Any], fingers: Iterable[str]) -> dic
     Raises:
         RobotConfigError: A table names another finger, or has an invalid setting.
     """
-    found = {finger: GelSettings() for finger in sorted(fingers)}
+    gels = {finger: GelSettings() for finger in sorted(fingers)}
     for finger, table in tables.items():
-        if finger not in found or not isinstance(table, Mapping):
-            known = ", ".join(f"[gel.{each}]" for each in found)
+        if finger not in gels or not isinstance(table, Mapping):
+            known = ", ".join(f"[gel.{each}]" for each in gels)
             raise RobotConfigError(f"gel tables must name a finger with a sensor: {known}; got {finger!r}")
-        found[finger] = build(GelSettings, table, where=f"[gel.{finger}]")
-    return found
+        gels[finger] = build(GelSettings, table, where=f"[gel.{finger}]")
+    return gels

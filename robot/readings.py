@@ -102,8 +102,8 @@ class RGBD:
 
     Attributes:
         colour: (H, W, 3) uint8 RGB.
-        depth_m: (H, W) float32 depth along the optical axis in METRES, NaN where unknown; None: no depth.
-        intrinsics: Required with depth; None if unknown.
+        depth_m: (H, W) float32 depth along the optical axis in METRES, NaN where unknown; None without depth.
+        intrinsics: Required for a picture with depth; None if unknown.
         time_s: Time of exposure.
     """
 
@@ -119,7 +119,7 @@ class GripperState:
 
     Attributes:
         opening_mm: Distance between the fingers.
-        force_n: Clamping force.
+        force_n: Force on each finger.
         status: "holding": an object is clamped. "no_part": the jaws closed without contact. "part_lost": the clamped
             object has slipped out. Else "idle" or "moving".
     """

@@ -4,13 +4,13 @@
     source = "bench 3"                        # written into recording.json
     sensor = "gelsight mini"
 
-    [limits]                                  # upper limits that no call exceeds
-    workspace_lower_mm = [-150, -150, 10]     # of the point between the fingertips; z = 0 is the table
+    [limits]                                  # upper limits of every commanded motion
+    workspace_lower_mm = [-150, -150, 10]     # of the point between the fingertips (TCP); z = 0 is the table
     workspace_upper_mm = [150, 150, 400]
     arm_speed_mm_s = 200
     force_n = 20                              # on each finger
     jaw_speed_mm_s = 60
-    state_age_s = 0.5                         # an actuator is stopped when its state is older
+    state_age_s = 0.5                         # a moving actuator is stopped if it reports no state for this long
 
     [arm]
     driver = "manual"                         # a person moves the hand
@@ -24,23 +24,25 @@
     ...
     [camera]
     driver = "realsense"
-    hand_eye = "hand_eye.json"                # made by `retrieve rig calibrate`
+    hand_eye = "hand_eye.json"                # camera pose in the rig's frame, from `retrieve rig calibrate`
+    hand_eye_days = 30                        # oldest accepted calibration
 
     [gel.a]                                   # known material constants (robot.gel_settings)
     thickness_mm = 3.0
     modulus_mpa = 0.35
-    [grasp]                                   # how grasps are drawn (robot.grasping.settings.GraspSettings)
+    [grasp]                                   # random grasps (robot.grasping.settings.GraspSettings)
     force_n = [5, 15]
-    [attempt]                                 # how attempts are made (robot.grasping.settings.AttemptSettings)
+    [attempt]                                 # speeds, waits, retries (robot.grasping.settings.AttemptSettings)
     settle_s = 1.0
-    [object]                                  # instead of depth: place and size of every object
+    [object]                                  # instead of depth: position and size of every object
     x_mm = 0
     ...
-    [planner]                                 # where the jaws close (robot.grasping.planner)
+    [planner]                                 # the grasp planner (robot.grasping.planner)
     name = "cylinder"                         # its other keys are the planner's settings
 
-Homing jaws move at their own speed, and Sawyer's slow /robot/state may be 2 s old whatever `state_age_s` is.
-Paths are relative to the working directory of the process that reads the file. Unknown keys are errors.
+The limits do not apply to homing, which has the gripper's own speed, nor to an arm that a person moves. Sawyer's slow
+/robot/state may be up to 2 s old, or `state_age_s` if that is longer. Paths are relative to the working directory of
+the process that reads the file. Unknown keys are errors.
 """
 
 import time
@@ -95,8 +97,8 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
 }
 """Drivers by role and name, imported on first use.
 
-A driver is a subclass of its role's base class (robot.devices); its keywords are the keys of its table. An installed
-package registers drivers of all roles in one group of entry points.
+A driver is a subclass of its role's base class (robot.devices). The keys of its table are the keyword arguments of its
+constructor. An installed package registers drivers of all roles in one group of entry points.
 """
 
 MAX_HAND_EYE_AGE_DAYS = 30.0
@@ -120,7 +122,7 @@ class Limits(TypedSettings):
 
 @dataclass(frozen=True)
 class ObjectSettings(TypedSettings):
-    """Place and size of every object (mm), for a rig without depth; error_mm: standard error of the place."""
+    """Position and size of every object (mm), for a rig without depth; error_mm: standard error of the position."""
 
     x_mm: float
     y_mm: float
@@ -156,14 +158,14 @@ class RealRig(Rig):
         sensor: str = "gelsight",
     ) -> None:
         """Build the devices without connecting them; raise RobotConfigError, or UnknownName for a driver."""
-        ceilings = build(Limits, limits, where="[limits]")
-        state_age = {"max_state_age_s": ceilings.state_age_s}
+        maxima = build(Limits, limits, where="[limits]")
+        state_age = {"max_state_age_s": maxima.state_age_s}
         moving: dict[str, Any] = {
-            "workspace": Region(ceilings.workspace_lower_mm, ceilings.workspace_upper_mm),
-            "max_speed_mm_s": ceilings.arm_speed_mm_s,
+            "workspace": Region(maxima.workspace_lower_mm, maxima.workspace_upper_mm),
+            "max_speed_mm_s": maxima.arm_speed_mm_s,
             "ask": ask_on_terminal,
         }
-        closing = {"max_force_n": ceilings.force_n, "max_speed_mm_s": ceilings.jaw_speed_mm_s}
+        closing = {"max_force_n": maxima.force_n, "max_speed_mm_s": maxima.jaw_speed_mm_s}
         gels = parse_gel_settings(gel, sensors)
         super().__init__(
             load_driver("arm", arm, "[arm]", **moving, **state_age),
@@ -175,13 +177,13 @@ class RealRig(Rig):
                 "sensor": sensor,
                 "gels": [{finger: gels[finger].to_dict() for finger in gels}],
             },
-            attempt=_attempt(attempt, grasp, ceilings),
+            attempt=_attempt(attempt, grasp, maxima),
             object_fit=build(ObjectSettings, object, where="[object]").fit() if object else None,
             planner=load_planner(planner),
         )
 
     def connect(self) -> None:
-        """Connect all devices, then check the planner's requirements, because only now is the camera's depth known.
+        """Connect all devices, then check the planner's requirements; before, it is unknown if the camera has depth.
 
         Raises:
             DeviceError: A device cannot be connected.
@@ -202,7 +204,7 @@ def load_driver(role: str, table: Mapping[str, Any], where: str, **arguments: An
         role: Key of DRIVERS.
         table: The table.
         where: Name of the table in messages.
-        arguments: Further keywords of the driver.
+        arguments: Further keyword arguments of the constructor.
 
     Raises:
         UnknownName: No driver has the table's `driver` name.
@@ -257,5 +259,7 @@ def _attempt(attempt: Mapping[str, Any], grasp: Mapping[str, Any], limits: Limit
             raise RobotConfigError(f"{name} must be at most {limit} = {ceiling:g} of [limits], got {value:g}")
     for name in ("settle_s", "hold_s"):
         if getattr(settings, name) < MIN_WAIT_S:
-            raise RobotConfigError(f"[attempt]: {name} must be at least {MIN_WAIT_S:g} s, for a fresh gel frame")
+            raise RobotConfigError(
+                f"[attempt]: {name} must be at least {MIN_WAIT_S:g} s, so that the gel frame is newer than the motion"
+            )
     return settings

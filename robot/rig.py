@@ -42,11 +42,11 @@ class Rig:
         sensors: Tactile sensors by finger, "a" or "b".
         camera: Photographs the table.
         info: Entries of recording.json; at least source and sensor.
-        clock: Time in s, on the scale of the frames' time stamps; a simulated rig has its own.
-        sleep: Waits on the same scale.
+        clock: Returns the time in s, on the same clock as the frames' time stamps; a simulated rig has its own.
+        sleep: Waits for a time in s of this clock.
         ask: Shows a request to a person and returns when it is done.
         attempt: Default attempt settings of this rig.
-        object_fit: Place and size of every object, for a rig whose camera cannot measure them.
+        object_fit: Position and size of every object, for a rig whose camera cannot measure them.
         planner: Chooses the grasps; a CylinderPlanner by default.
 
     >>> with robot.load_rig("sim", seed=0) as rig:
@@ -99,10 +99,10 @@ class Rig:
         return [f"object-{number:04}" for number in range(1, count + 1)]
 
     def prepare(self, object_id: str, number: int) -> None:
-        """Put this object on the table for attempt `number`, by a request to a person.
+        """Ask a person to put this object on the table for attempt `number`.
 
         The request appears when the object changes. With `object_fit` it appears for every attempt, because a slipped
-        grasp has moved the object from its given place.
+        grasp has moved the object from its given position.
 
         Args:
             object_id: The object.
@@ -112,15 +112,15 @@ class Rig:
             RobotConfigError: There is no terminal for the request.
         """
         if object_id != self._object_on_table or self.object_fit is not None:
-            place = (
+            position = (
                 "on the table"
                 if self.object_fit is None
                 else f"at x {self.object_fit.x_mm:g}, y {self.object_fit.y_mm:g} mm"
             )
             try:
-                self.ask(f"Put {object_id} {place}, alone, and press Enter.")
+                self.ask(f"Put {object_id} {position}, remove all other objects, then press Enter.")
             except EOFError as error:
-                raise RobotConfigError("this rig needs a person to change objects: run it in a terminal") from error
+                raise RobotConfigError("a person must change the objects of this rig: run it in a terminal") from error
             self._object_on_table = object_id
 
     def settings(self) -> dict[str, dict[str, Any]]:
@@ -133,7 +133,7 @@ class Rig:
             device.recover()
 
     def connect(self) -> None:
-        """Connect all devices or none: when one fails, close those before it and raise its error."""
+        """Connect all devices or none: if one fails, close the connected ones and raise its error."""
         connected: list[Device] = []
         try:
             for device in self.devices:

@@ -1,7 +1,8 @@
-"""`retrieve rig check`: connect each device of a rig on its own, move it a little, and report measurements.
+"""`retrieve rig check`: connect one device of a rig after another, move it a little, and report measurements.
 
-All devices are checked, also after one has failed. Nothing is grasped: the jaws move by `JAW_MM`, the arm
-rises by `ARM_MM`, and both return.
+All devices are checked, also after one has failed. Nothing is grasped. The jaws move by `JAW_MM`, the arm moves up by
+`ARM_MM` (down, at the top of the workspace), and both return. Connecting may enable the motors of an arm, and may home
+a gripper without reference over its whole stroke. With motion=False, nothing moves.
 """
 
 import contextlib
@@ -60,7 +61,7 @@ def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[DeviceReport]:
 
     Args:
         rig: The rig, not connected.
-        motion: Whether arm and jaws may move a little.
+        motion: Whether arm and jaws may move; if true, connecting may home the gripper.
     """
     rig.arm.may_move = rig.gripper.may_move = motion
     if rig.can_run_jobs:  # a simulated rig needs an object for its gel images
@@ -82,13 +83,13 @@ def _check_device(devices: Sequence[Device], role: str, check: Callable[[], dict
                 connected.enter_context(device)
             refused = dict(devices[0].refused) if len(devices) == 1 else {}
             row = replace(row, measured=check(), refused=refused)
-    except RobotError as error:  # includes a request to a person without a terminal
+    except RobotError as error:  # also if a person must act and there is no terminal
         return replace(row, failure=str(error))
     return row
 
 
 def _check_arm(rig: Rig, motion: bool) -> dict[str, str]:
-    """Raise the arm a little and return."""
+    """Move the arm up a little (down, at the top of the workspace), and back."""
     arm = rig.arm
     if arm.is_manual:
         return {"moved": "by a person"}
@@ -96,12 +97,12 @@ def _check_arm(rig: Rig, motion: bool) -> dict[str, str]:
         return {"moved": "not"} | _round_trip(rig, arm.pose)
     start = arm.pose()
     top = arm.workspace.upper[2]
-    up = replace(start, z_mm=start.z_mm + ARM_MM if start.z_mm + ARM_MM <= top else start.z_mm - ARM_MM)
+    target = replace(start, z_mm=start.z_mm + ARM_MM if start.z_mm + ARM_MM <= top else start.z_mm - ARM_MM)
     speed, began = min(ARM_MM_S, arm.max_speed_mm_s), rig.clock()
-    reached = arm.move_to(up, speed)
+    reached = arm.move_to(target, speed)
     seconds = rig.clock() - began
     arm.move_to(start, speed)
-    away = np.linalg.norm(np.subtract(reached.as_tuple()[:3], up.as_tuple()[:3]))
+    away = np.linalg.norm(np.subtract(reached.as_tuple()[:3], target.as_tuple()[:3]))
     return {"moved": f"{ARM_MM:g} mm in {seconds:.2f} s", "off by": f"{away:.2f} mm"} | _round_trip(rig, arm.pose)
 
 
@@ -111,10 +112,10 @@ def _check_gripper(rig: Rig, motion: bool) -> dict[str, str]:
     measured = {"status": state.status, "opening": f"{state.opening_mm:.2f} mm"} | _round_trip(rig, gripper.state)
     measured["force"] = f"{gripper.min_force_n:g} to {gripper.max_force_n:g} N on each finger"
     if motion and state.status == "idle":
-        there = state.opening_mm - JAW_MM if state.opening_mm >= JAW_MM else state.opening_mm + JAW_MM
-        reached = gripper.open(there)
+        target_mm = state.opening_mm - JAW_MM if state.opening_mm >= JAW_MM else state.opening_mm + JAW_MM
+        reached = gripper.open(target_mm)
         gripper.open(min(state.opening_mm, gripper.stroke_mm))
-        measured["moved"] = f"{JAW_MM:g} mm, off by {abs(reached.opening_mm - there):.2f} mm"
+        measured["moved"] = f"{JAW_MM:g} mm, off by {abs(reached.opening_mm - target_mm):.2f} mm"
     elif motion:
         measured["moved"] = f"not: it is {state.status}"
     return measured
@@ -163,7 +164,7 @@ def _measure_frames(rig: Rig, read: Callable[[], _Picture]) -> tuple[_Picture, d
             break
         rig.sleep(_POLL_S)
     rate = f"{len(times)} frame(s) in {MEASURE_S:g} s"
-    if len(times) > 1:  # from the first frame to the last, so the phase of the measurement does not count
+    if len(times) > 1:  # from the first frame to the last, so the phase of the measurement has no effect
         rate = f"{(len(times) - 1) / (max(times) - min(times)):.1f} frames/s"
     return frame, {"rate": rate, "age": f"{1000 * median(ages):.0f} ms"}
 

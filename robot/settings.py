@@ -39,7 +39,7 @@ def build(cls: type[_T], settings: Mapping[str, Any], *, where: str = "", **argu
     """Return an object of `cls` from plain `settings` and the program's own arguments.
 
     Args:
-        cls: The class. If it has an attribute `Settings`, the fields of that dataclass are keywords too.
+        cls: The class. If it has an attribute `Settings`, the fields of that dataclass are arguments too.
         settings: Plain values by keyword.
         where: Prefix of messages, such as the table of a file.
         arguments: Values from the program; those that the class does not accept are dropped.
@@ -80,7 +80,7 @@ def build_named(
         table: A table of a rig's file.
         key: The key whose value is the name of the class.
         where: Name of the table in messages.
-        default: The name if the table has none; None: the key is required.
+        default: Name to use if the table has no name; None if the key is required.
         arguments: Passed to `build`.
 
     Raises:
@@ -96,7 +96,7 @@ def build_named(
 
 @functools.cache
 def _keywords(cls: type) -> dict[str, tuple[Any, bool]]:
-    """Return the keywords of a class, each with its annotated type and whether it is required."""
+    """Return the keyword arguments of a class, each with its annotated type and whether it is required."""
     found: dict[str, tuple[Any, bool]] = {}
     settings: type | None = getattr(cls, "Settings", None)
     for each in (settings, cls):

@@ -1,7 +1,7 @@
 """`python -m benchmarks.models.in_double COMMAND ...`: run retrieve with float64 in place of float32.
 
-This removes rounding from a comparison of two ways to train. In float32, the order of a sum alone moves the weights of
-trained towers apart, within some steps as far as another seed would.
+This removes rounding from a comparison of two ways to train. In float32, another order of a sum is
+enough to change the weights of trained towers, after some steps as much as another seed would.
 """
 
 import sys

@@ -188,7 +188,7 @@ def first_grasps(features: Features, maximum: int) -> Features:
 def score_methods(
     trained: Sequence[Method], validation: Features, unseen: Features, known: str | None
 ) -> dict[str, Any]:
-    """Return summaries of the measures on unseen objects: means over trainings, and those of the mean scores.
+    """Return summaries of the measures on unseen objects: means over training runs, and those of the mean scores.
 
     The latter are under "together".
     """
@@ -203,7 +203,7 @@ def _measures(validation: ScoreTable, unseen: ScoreTable) -> dict[str, Measure]:
 
 
 def mean_scores(tables: Sequence[ScoreTable]) -> ScoreTable:
-    """Return the mean scores of several trainings."""
+    """Return the mean scores of several training runs."""
     return dataclasses.replace(tables[0], scores=np.mean([table.scores for table in tables], axis=0))
 
 

@@ -295,7 +295,7 @@ def first_finger(recording: Path) -> Path:
 
 
 def draw_split(grasps: list[Grasp], train: int | None, validation: int) -> Split:
-    """Split objects into this many for training and validation, the others for test; train None: all others train."""
+    """Split objects: `validation` for validation, `train` for training (None for all others), the rest for test."""
     names = sorted({grasp.object_id for grasp in grasps})
     names = [str(name) for name in np.random.default_rng(0).permutation(names)]
     validated, others = names[:validation], names[validation:]

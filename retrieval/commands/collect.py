@@ -25,7 +25,7 @@ def collect(
     ] = None,
     preview: Annotated[bool, typer.Option("--preview", help="also write a contact sheet, OUT-preview.png")] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="print the motions of one attempt per object; nothing moves")
+        bool, typer.Option("--dry-run", help="print the motions of one attempt per object; arm and gripper do not move")
     ] = False,
     photos_only: Annotated[
         bool,
@@ -40,7 +40,7 @@ def collect(
         ),
     ] = False,
 ) -> None:
-    """Collect a recording with a rig, or resume it. A real rig asks you to change the objects; stay next to it."""
+    """Collect a recording with a rig; stay next to a real rig. Resumes a stopped run."""
     if dry_run:
         ignored = {"gate": gate, "preview": preview, "photos_only": photos_only, "touches_only": touches_only}
         refuse_options("has no effect with --dry-run, which moves and records nothing; leave it out", **ignored)
@@ -60,8 +60,8 @@ def collect(
     from robot.recording.attempt_log import acceptance_table
     from robot.rig import load_rig
 
-    # The contact sheet is written next to the recording folder, because every image inside it belongs to a grasp. The
-    # paths "." and ".." have no name to extend.
+    # The contact sheet is written next to the recording, because every image inside belongs to a grasp.
+    # "." and ".." have no name to extend, so they are resolved.
     folder = out if out.name not in ("", "..") else out.resolve()
     sheet = folder.with_name(f"{folder.name}-preview.png")
     if preview:
@@ -97,7 +97,7 @@ def collect(
 
 
 def _print_motions(name: str, objects: int, seed: int) -> None:
-    """Run `--dry-run`: print the motions of one attempt per object; nothing moves, nothing is recorded."""
+    """Run `--dry-run`: print the motions of one attempt per object. Nothing moves, nothing is recorded."""
     from robot.grasping.attempt import AttemptRunner
     from robot.grasping.dry_run import make_dry_run
     from robot.rig import load_rig

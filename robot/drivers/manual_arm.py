@@ -54,7 +54,7 @@ class ManualArm(Arm):
         try:
             self._ask(describe_pose(pose))
         except EOFError as error:
-            raise RobotConfigError("this rig needs a person to move the hand: run it in a terminal") from error
+            raise RobotConfigError("a person must move the hand of this rig: run it in a terminal") from error
         self._at = pose
         return pose
 

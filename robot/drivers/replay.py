@@ -41,7 +41,7 @@ class VideoSettings(CropSettings):
 
     Attributes:
         path: The video or folder.
-        fps: Pictures/s; 0: the file's own rate.
+        fps: Pictures/s; 0 for the file's own rate.
         loop: Whether to start again at the end.
     """
 
@@ -136,7 +136,7 @@ class _ReplaySensor(TactileSensor):
 
 
 class VideoSensor(_ReplaySensor):
-    """A video file as a sensor; its keywords are those of VideoSettings."""
+    """A video file as a sensor; the fields of VideoSettings are keyword arguments of the constructor."""
 
     _video: Any = None
     _next = 0
@@ -174,7 +174,7 @@ class VideoSensor(_ReplaySensor):
 
 
 class ImageFolderSensor(_ReplaySensor):
-    """The pictures of a folder as a sensor, ordered by name; its keywords are those of ImageFolderSettings."""
+    """The pictures of a folder as a sensor, ordered by name; keyword arguments as in ImageFolderSettings."""
 
     Settings = ImageFolderSettings
     _files: Sequence[Path] = ()

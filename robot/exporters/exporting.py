@@ -178,7 +178,7 @@ class EpisodeSteps:
                 )
         self.moments = [moment for moment in MOMENT_SUFFIXES if all(map(self._has(moment), grasps))]
         self.notes = [
-            f"frames {moment} the touch are left out because some grasps do not have them"
+            f"the frames {moment} the touch are left out because some grasps do not have them"
             for moment in MOMENT_SUFFIXES
             if moment not in self.moments and any(map(self._has(moment), grasps))
         ]

@@ -65,8 +65,8 @@ def export_lerobot(
         StorageError: The folder cannot be written.
     """
     import_extra("pyarrow", _WHAT), import_extra("av", _WHAT)
-    found, notes = grasps_by_part(recording, parts)
-    grasps = [grasp for part in found.values() for grasp in part]
+    by_part, notes = grasps_by_part(recording, parts)
+    grasps = [grasp for part in by_part.values() for grasp in part]
     steps = EpisodeSteps(recording, grasps)
     tasks = {name: number for number, name in enumerate(dict.fromkeys(grasp.object_id for grasp in grasps))}
     with atomic_folder(out) as folder:
@@ -79,7 +79,7 @@ def export_lerobot(
                         progress(episode + 1, len(grasps))
         _write_tasks(folder / "meta" / "tasks.parquet", tasks)
         _write_json(folder / "meta" / "stats.json", {name: values.to_dict() for name, values in stats.items()})
-        _write_json(folder / "meta" / "info.json", _info(recording, steps, len(tasks), found))
+        _write_json(folder / "meta" / "info.json", _info(recording, steps, len(tasks), by_part))
     return RecordingExport(out, len(grasps), (*notes, *steps.remarks()))
 
 
@@ -188,9 +188,9 @@ class _Stats:
         """Return the statistics in the layout of LeRobot: (3, 1, 1) in 0..1 for pictures."""
         mean = self._sum / self._count
         deviation = np.sqrt(np.maximum(self._squares / self._count - mean**2, 0.0))
-        found = {"min": self._low, "max": self._high, "mean": mean, "std": deviation}
+        statistics = {"min": self._low, "max": self._high, "mean": mean, "std": deviation}
         shape = (-1, 1, 1) if len(mean) == 3 else (-1,)
-        return {name: value.reshape(shape).tolist() for name, value in found.items()} | {"count": [self._count]}
+        return {name: value.reshape(shape).tolist() for name, value in statistics.items()} | {"count": [self._count]}
 
 
 # Files of meta/ --------------------------------------------------------------------------------------------
@@ -241,9 +241,9 @@ def _write_json(path: Path, value: Any) -> None:
 
 
 def _info(
-    recording: Recording, steps: EpisodeSteps, tasks: int, found: Mapping[str, Sequence[RecordedGrasp]]
+    recording: Recording, steps: EpisodeSteps, tasks: int, by_part: Mapping[str, Sequence[RecordedGrasp]]
 ) -> dict[str, Any]:
-    ends = list(itertools.accumulate(map(len, found.values())))
+    ends = list(itertools.accumulate(map(len, by_part.values())))
     episodes = ends[-1]
     keys = ("source", "sensor", "rig", "licence", "citation", "background")
     return {
@@ -256,7 +256,7 @@ def _info(
         "data_files_size_in_mb": 100,
         "video_files_size_in_mb": 200,
         "fps": FPS,
-        "splits": {part: f"{end - len(found[part])}:{end}" for part, end in zip(found, ends, strict=True)},
+        "splits": {part: f"{end - len(by_part[part])}:{end}" for part, end in zip(by_part, ends, strict=True)},
         "data_path": _DATA,
         "video_path": _VIDEO,
         "features": {_key(camera): _video_feature(size) for camera, size in steps.sizes.items()}

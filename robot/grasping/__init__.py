@@ -1,1 +1,1 @@
-"""One attempt at a grasp, over the contract of devices alone."""
+"""One attempt at a grasp. It uses devices only through their base classes."""

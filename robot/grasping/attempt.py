@@ -1,7 +1,7 @@
 """One grasp attempt with any rig: photograph, plan, close, lift, put down.
 
-All random numbers of an attempt derive from (seed, object, number). If the rig prepares its objects from the same
-three, an attempt is a pure function of them: it can be repeated in another process or after a crash.
+All random numbers of an attempt derive from (seed, object, number). On the simulated rig, the whole attempt depends
+only on these three values: it can be repeated in another process or after a crash.
 """
 
 import contextlib
@@ -33,8 +33,8 @@ class GraspAttempt:
     Attributes:
         object_id: The object.
         number: Number of the attempt at this object.
-        outcome: "held", "missed" or "slipped" as the gripper reports after the lift; "no_plan" or "ungraspable" (no
-            further attempt can succeed) without images, for the `reason` given.
+        outcome: "held", "missed" or "slipped", as the gripper reports after the lift. Without images: "no_plan", or
+            "ungraspable" if no further attempt can succeed; `reason` gives the cause.
         images: Content of JPEG and PNG files by column.
         fields: Further fields of the recorded grasp.
         fit: The plan's description of the object, for the log.
@@ -60,7 +60,7 @@ class AttemptRunner:
     Args:
         rig: The rig.
         seed: Seed of the planner's random choices.
-        settings: How attempts are made.
+        settings: Settings of the attempts.
 
     Raises:
         RobotConfigError: A setting is outside the limits of the rig.
@@ -72,7 +72,7 @@ class AttemptRunner:
         self.rig, self.seed, self.settings = rig, seed, settings
 
     def run(self, object_id: str, number: int) -> GraspAttempt:
-        """Make one attempt; after a DeviceError, recover the rig and try again.
+        """Make one attempt; after a DeviceError, recover the rig and repeat the attempt.
 
         After any exception, Ctrl-C included, the jaws are opened. If this fails, the exception's message states it.
 
@@ -83,20 +83,20 @@ class AttemptRunner:
         Raises:
             DeviceError: All retries failed.
         """
-        for trial in range(self.settings.retries + 1):
+        for retry in range(self.settings.retries + 1):
             try:
-                if trial:
+                if retry:
                     self.rig.recover()
                 return self._attempt_once(object_id, number)
             except DeviceError as error:
-                left = self._open_jaws()
-                if trial == self.settings.retries:
+                note = self._open_jaws()
+                if retry == self.settings.retries:
                     raise DeviceError(
-                        f"attempt {number} at {object_id} failed {trial + 1} time(s), last: {error}{left}"
+                        f"attempt {number} at {object_id} failed {retry + 1} time(s), last: {error}{note}"
                     ) from error
             except BaseException as error:
-                if left := self._open_jaws():
-                    error.add_note(left)
+                if note := self._open_jaws():
+                    error.add_note(note)
                 raise
         raise AssertionError("the loop returns or raises")
 
@@ -147,7 +147,7 @@ class AttemptRunner:
         )
 
     def _rise(self) -> None:
-        """Move straight up from the current pose; on a slant, the open jaws would hit an object between them."""
+        """Move straight up from the current pose; on another path, the open jaws would hit an object between them."""
         arm = self.rig.arm
         if arm.is_manual:
             return
@@ -180,7 +180,7 @@ class AttemptRunner:
     def _read_touches(self, moment: str, since_s: float) -> tuple[dict[str, bytes], float]:
         """Read gel images by column, at most `since_s` old, and their skew in s.
 
-        `since_s` is the wait just before; an older frame may show the previous state.
+        `since_s` is the time since the last motion ended. An older frame may show the state before it.
         """
         frames, skew_s = read_together(self.rig.sensors, max_age_s=min(MAX_AGE_S, since_s))
         return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}, skew_s
@@ -194,10 +194,10 @@ class AttemptRunner:
         return _OUTCOME_FROM[status]
 
     def _put_down(self, plan: GraspPlan, held: bool, rng: np.random.Generator) -> None:
-        """Release a held object on the table at a random place and yaw, and open the jaws.
+        """Release a held object on the table at a random position and yaw, and open the jaws.
 
-        With a given `object_fit`, or after a tilted grasp, the object is put back where it was grasped; a tilted
-        hand has room to withdraw there.
+        With a given `object_fit`, or after a tilted grasp, the object is released at the position of the grasp,
+        because a tilted hand has room to withdraw there.
         """
         rig, settings = self.rig, self.settings
         low, high = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)

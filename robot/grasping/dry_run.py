@@ -12,7 +12,8 @@ Report = Callable[[str], object]
 def make_dry_run(rig: Rig, report: Report) -> Rig:
     """Replace the arm and the gripper of an unconnected rig, so that neither is connected or moved; return the rig.
 
-    The limits are those of the rig, so a dry run raises for every motion that the rig would refuse.
+    The limits of the rig's file are checked. The limits that a gripper reports when it connects are unknown here;
+    typical values replace them, so the rig may still refuse a motion of a dry run.
 
     Args:
         rig: The rig.
@@ -24,7 +25,7 @@ def make_dry_run(rig: Rig, report: Report) -> Rig:
 
 
 class DryRunArm(VirtualDevice, Arm):
-    """An arm that reports each motion and is at its goal at once."""
+    """An arm that reports each motion and reaches its goal immediately."""
 
     def __init__(self, arm: Arm, report: Report) -> None:
         super().__init__(f"{arm.name} (dry run)", arm.workspace, max_speed_mm_s=arm.max_speed_mm_s, clock=arm.clock)

@@ -54,8 +54,8 @@ def difference(frame: Picture, before: Picture) -> npt.NDArray[np.float32]:
 class ContactAreaGate:
     """A gate that accepts a grasp when the gel of any finger (or of all) changed its colour over a large enough area.
 
-    It compares the frame after the lift, if recorded, with the no-contact frame, because the gel has no contact after
-    the object has slipped. Else it compares the frame with closed jaws.
+    It compares the frame after the lift, if recorded, with the no-contact frame, because after a slip the gel has
+    no contact. If there is no frame after the lift, it uses the frame with closed jaws.
 
     Attributes:
         noise_levels: A pixel has changed if some channel, averaged over `blur_px` x `blur_px`, differs by more than
@@ -91,8 +91,8 @@ class ContactAreaGate:
     def _changed_fraction(self, finger: str, frames: GraspFrames) -> float:
         if frames.before is None:
             raise RobotConfigError(
-                f"the contact-area gate requires no-contact frames: record frames before the grasp; finger "
-                f"{finger} has none"
+                f"the contact-area gate requires no-contact frames, but finger {finger} has none; record the output "
+                "`before`"
             )
         change = difference(frames.during if frames.after is None else frames.after, frames.before)
         smooth = cv2.blur(change, (self.blur_px, self.blur_px), borderType=cv2.BORDER_REPLICATE)

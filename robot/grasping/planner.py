@@ -1,7 +1,7 @@
 """Grasp planners: choose the grasp of the object in the camera's picture.
 
 A planner is a subclass of GraspPlanner. A rig's file names it, or gives `module:Class`; the other keys of the table
-are the planner's keywords:
+are the keyword arguments of the planner:
 
     [planner]
     name = "cylinder"
@@ -35,7 +35,8 @@ PLANNERS: "Registry[type[GraspPlanner]]" = Registry(
     error=UnknownName,
     base="robot.grasping.planner:GraspPlanner",
 )
-"""Grasp planners by name, imported on first use. A planner's keywords are the keys of its table."""
+"""Grasp planners by name, imported on first use. The keys of a planner's table are the keyword arguments of its
+constructor."""
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,11 @@ class GraspPlan:
     """One planned grasp.
 
     Attributes:
-        pose: Where the jaws close.
+        pose: Pose in which the jaws close.
         above: Pose after the lift.
         opening_mm: Opening before the grasp.
-        force_n: Clamping force.
-        approach: Poses on the way to `pose`, the last one clear of the object; if empty, `above`.
+        force_n: Force on each finger.
+        approach: Poses on the way to `pose`; at the last one, the hand is clear of the object. If empty: `above`.
         fit: Description of the object, for the attempt log.
 
     >>> pose, above = robot.Pose(0.0, 0.0, 60.0, yaw_rad=1.0), robot.Pose(0.0, 0.0, 240.0, yaw_rad=1.0)
@@ -84,7 +85,7 @@ class GraspPlanner(ABC):
         """Raise RobotConfigError if this planner cannot plan for `rig`."""
         if self.needs_depth and rig.object_fit is None and not rig.camera.has_depth:
             raise RobotConfigError(
-                f"{rig.camera.name} has no depth: give the place and size of every object in [object]"
+                f"{rig.camera.name} has no depth: give the position and size of every object in [object]"
             )
 
     @abstractmethod
@@ -94,7 +95,7 @@ class GraspPlanner(ABC):
         Args:
             rig: The rig, connected.
             image: The picture; with depth if `needs_depth`.
-            settings: How grasps are drawn.
+            settings: Settings of the random grasps.
             rng: Source of all random choices.
 
         Raises:
@@ -109,7 +110,7 @@ class CylinderPlanner(GraspPlanner):
     A given `object_fit` of the rig replaces the fit.
 
     Args:
-        search_margin_mm: Width of the border around the workspace in which objects are still found.
+        search_margin_mm: Width of the border around the workspace that is searched for objects too.
     """
 
     def __init__(self, *, search_margin_mm: float = 150.0) -> None:
@@ -132,7 +133,7 @@ def load_planner(table: Mapping[str, Any], default: str = "cylinder") -> GraspPl
 
     Args:
         table: `name`, and the planner's settings.
-        default: The name if the table has none.
+        default: Planner to use if the table has no name.
 
     Raises:
         UnknownName: No planner has this name; the message lists the known ones.
@@ -152,7 +153,7 @@ def plan_grasp(
 
     Args:
         fit: The cylinder.
-        settings: How grasps are drawn.
+        settings: Settings of the random grasps.
         workspace: Limits of the point between the fingertips.
         stroke_mm: Largest opening of the jaws.
         rng: Source of the random choices.

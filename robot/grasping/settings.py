@@ -1,4 +1,4 @@
-"""Settings of grasps and of attempts: forces, places, speeds, waits and recorded outputs."""
+"""Settings of grasps and of attempts: forces, positions, speeds, waits and recorded outputs."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,15 +9,15 @@ from robot.errors import RobotConfigError
 from robot.settings import TypedSettings, bounded, build
 
 OUTPUTS = ("depth", "before", "after")
-"""Optional outputs of an attempt: the depth picture, and gel images before and after the grasp."""
+"""Optional outputs: the depth picture, the no-contact gel images, and the gel images after the lift (object held)."""
 
 
 @dataclass(frozen=True)
 class GraspSettings(TypedSettings):
-    """How grasps are drawn. Lengths in mm, forces in N.
+    """Settings of random grasps. Lengths in mm, forces in N.
 
     Attributes:
-        force_n: Range of the clamping force.
+        force_n: Range of the force on each finger.
         jitter_mm: Largest offset of the pose from the axis, in x and in y.
         floor_mm: Smallest height of the fingertips above the table.
         top_margin_mm: Smallest distance of the fingertips below the object's top.
@@ -56,19 +56,19 @@ class GraspSettings(TypedSettings):
 
 @dataclass(frozen=True)
 class AttemptSettings(TypedSettings):
-    """How attempts are made.
+    """Settings of attempts.
 
     Attributes:
-        grasp: How grasps are drawn.
-        outputs: Members of OUTPUTS to record; devices are not read for the others.
+        grasp: Settings of the random grasps.
+        outputs: Members of OUTPUTS to record; the others are not read from the devices.
         travel_mm_s: Speed of the arm between objects.
         approach_mm_s: Speed of the arm near the object.
         closing_mm_s: Speed of the closing jaws.
         settle_s: Wait between closing and the gel images.
-        hold_s: Wait between the lift and the gripper's outcome.
+        hold_s: Wait between the lift and the query of the gripper's outcome.
         release_mm: Height of the release above the height of the grasp.
         table_share: Inner fraction of the workspace in which objects are put down.
-        retries: Number of repetitions after device failures.
+        retries: Maximum number of repetitions of an attempt after device failures.
         jpeg_quality: Quality of colour pictures, 0 to 100; depth is stored exactly.
     """
 

@@ -3,17 +3,19 @@
     <object>/touch_*.png     by the pattern `touch`
     <object>/photo_*.jpg     by the pattern `photo`
 
-A pattern is a path with words in braces. `{object}` is the name of the object, `{finger}` the name of a finger if a
-touch has several pictures, `{sequence}` a session of grasps. Any other word in braces distinguishes grasps, and `*`
-matches any text. None of them matches a "/". The suffix of the file name is optional. Words that occur in two patterns
-must have the same value: with `touch={object}/{n}_{finger}` and `photo={object}/{n}_photo` each touch gets the photo
-with its number. If several photos match, the touches of the object are assigned to them in turn. `background` is a
-pattern for the no-contact frames: `rest_{finger}.png` for one per finger, `{object}/rest.png` for one per object.
-Links to folders elsewhere are followed.
+A pattern is a path with words in braces. `{object}` is the name of the object, `{sequence}` the name of a session.
+`{finger}` is the name of a finger; use it if a touch has one picture per finger. All other words, and the text that
+each `*` matches, distinguish the grasps of an object. So by default `touch_0_a.png` and `touch_0_b.png` are two grasps;
+with `touch={object}/touch_{n}_{finger}` they are the two fingers of one grasp. A word or `*` never matches a "/". The
+suffix of the file name is optional. Words that occur in two patterns must have the same value: with
+`touch={object}/{n}_{finger}` and `photo={object}/{n}_photo` each touch gets the photo with its number. If several
+photos match, the first touch gets the first photo, the second touch the second photo, and so on, cyclically.
+`background` is a pattern for the no-contact frames: `rest_{finger}.png` for one per finger, `{object}/rest.png` for one
+per object. Links to other folders are followed.
 
-`pairs` names a file below the folder instead: CSV with a header, or JSONL. Each line is a grasp with `object`, `photo`
-and `touch` (or `touch_a`, `touch_b`), and optionally `background` (or `touch_a_before`, ...), `sequence`, `force_n`,
-`opening_mm` and `time_s`. Paths are relative to the folder. The file is read line by line.
+Instead of patterns, `pairs` names a file below the folder: CSV with a header, or JSONL. Each line is a grasp with
+`object`, `photo` and `touch` (or `touch_a`, `touch_b`), and optionally `background` (or `touch_a_before`, ...),
+`sequence`, `force_n`, `opening_mm` and `time_s`. Paths are relative to the folder. The file is read line by line.
 """
 
 import csv
@@ -48,7 +50,7 @@ _COLUMNS = {"object": "object_id", "touch": "touch_a", "background": "touch_a_be
 _NUMBERS = ("force_n", "opening_mm", "time_s")
 _TOUCH = re.compile("touch_[a-z]")
 _LINE = 1 << 20
-"""Maximum characters of a line in a file of pairs; a longer one is cut."""
+"""Maximum characters of a line in a file of pairs; a longer line is split, and each part is read as a line."""
 
 Words = Mapping[str, str]
 
@@ -73,7 +75,7 @@ def import_folder(
         progress: Called with (done, total) after each grasp.
         touch: Pattern of the gel images.
         photo: Pattern of the photos.
-        background: Pattern of the no-contact frames; empty without any.
+        background: Pattern of the no-contact frames; empty if there are none.
         pairs: File of pairs, relative to `src`, instead of the patterns.
         sensor: Name of the sensor.
         licence: Licence of the pictures.
@@ -84,17 +86,17 @@ def import_folder(
     src = Path(src)
     if not src.is_dir():
         raise ImporterError(f"{src} must be a folder of pictures")
-    found: _PairsFile | _PatternMatches = (
+    matches: _PairsFile | _PatternMatches = (
         _PairsFile(src, pairs) if pairs else _PatternMatches(src, touch, photo, background)
     )
-    facts = replace(
+    data_set = replace(
         DATA_SET,
         sensor=sensor,
         licence=licence,
-        fingers=len(found.fingers),
-        background="as in the pictures" if found.has_background else "none",
+        fingers=len(matches.fingers),
+        background="as in the pictures" if matches.has_background else "none",
     )
-    return import_items(facts, found.items(), out, total=found.total, progress=progress)
+    return import_items(data_set, matches.items(), out, total=matches.total, progress=progress)
 
 
 # By patterns -----------------------------------------------------------------------------------------------
@@ -125,7 +127,7 @@ class _Pattern:
         self._expression = re.compile("".join(parts))
 
     def match(self, path: str) -> Words | None:
-        """Return the words of a path that matches, with or without its suffix; each `*` is a word _1, _3, ..."""
+        """Return the words of a path that matches, with or without its suffix; the words of `*` are _1, _3, ..."""
         found = self._expression.fullmatch(os.path.splitext(path)[0]) or self._expression.fullmatch(path)
         return found.groupdict() if found else None
 
@@ -157,7 +159,8 @@ class _PatternMatches:
             if not is_found:
                 content = f"only others, such as {example}" if example else "no picture at all"
                 raise ImporterError(
-                    f"{src} must contain a {option} that matches {text!r}, but contains {content}; see --option"
+                    f"{src} must contain a {option} that matches {text!r}, but contains {content}; "
+                    "change the pattern with --option"
                 )
         if len(names) > len(ascii_lowercase):
             first = sorted(names, key=natural_sort_key)[:3]
@@ -168,7 +171,7 @@ class _PatternMatches:
         self._grasps = self._group_by_words()
 
     def _group_by_words(self) -> dict[tuple[str, ...], list[str]]:
-        """Return grasps by their words except the finger: the path of each finger's picture, empty if it is missing."""
+        """Return a dictionary: words without the finger -> path of each finger's picture ("" if it is missing)."""
         grasps: dict[tuple[str, ...], list[str]] = {}
         position = {finger: number for number, finger in enumerate(self.fingers)}
         for path in _pictures(self.src):
@@ -189,7 +192,7 @@ class _PatternMatches:
     def items(self) -> Iterator[Item | Skip]:
         """Yield the grasps, and a `Skip` for each unusable touch."""
         assigned: Counter[tuple[str, ...]] = Counter()
-        yield from (Skip("another touch has the same words in its path", path) for path in self._repeated)
+        yield from (Skip("another picture of the same grasp and finger was found", path) for path in self._repeated)
         for key, paths in self._grasps.items():
             name, words = safe_name(*key), self._touch.match(next(filter(None, paths))) or {}
             photos, group = self._photos.of(words)
@@ -211,7 +214,7 @@ class _PatternMatches:
 
 
 class _MatchingFiles:
-    """Files by the words that their pattern has in common with that of the touches."""
+    """The files that match a pattern, grouped by the words that it has in common with the pattern of the touches."""
 
     def __init__(self, pattern: _Pattern | None, others: _Pattern) -> None:
         self._pattern = pattern
@@ -238,7 +241,7 @@ class _MatchingFiles:
 def _pictures(src: Path) -> Iterator[str]:
     """Yield the pictures below a folder as relative paths, without hidden ones, in natural order.
 
-    A link to a folder is followed if it leads out of `src`, and each target only once.
+    A link to a folder outside `src` is followed; each target is followed only once.
     """
     root, followed = Path(os.path.realpath(src)), set[Path]()
 
@@ -260,7 +263,7 @@ def _pictures(src: Path) -> Iterator[str]:
 
 
 def _raise_unlistable(error: OSError) -> NoReturn:
-    """Raise an error for a folder that cannot be listed; otherwise an object would be missing silently."""
+    """Raise an error for a folder that cannot be listed, so that no object is missing without a message."""
     raise ImporterError(f"{error.filename} cannot be listed: {error.strerror}") from error
 
 
@@ -297,7 +300,7 @@ class _PairsFile:
             columns = ("photo", *self.fingers, *(f"{finger}_before" for finger in self.fingers))
             paths = {column: row[column] for column in columns if row.get(column)}
             if self._fingers(row) != self.fingers or not paths.get("photo") or not row.get("object_id"):
-                yield Skip("its line has no object, no photo or not all touches", name)
+                yield Skip("its line lacks the object, the photo or a touch", name)
             elif any(not _is_inside(path) for path in paths.values()):
                 yield Skip("a path must be relative to the folder and lead to a file below it", name)
             elif (numbers := _numbers(row)) is None:
@@ -334,7 +337,7 @@ def _documents(lines: Iterator[str]) -> Iterator[dict[str, Any] | str]:
 
 
 def _rename_columns(row: Mapping[Any, Any]) -> dict[str, Any]:
-    """Rename columns as in a recording. Values other than text and numbers count as missing."""
+    """Rename columns as in a recording. Values other than text and numbers are treated as missing."""
     plain = {str(key).removesuffix("_file_name"): value for key, value in row.items() if key is not None}
     return {
         _COLUMNS.get(key, key): value

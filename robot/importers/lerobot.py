@@ -9,8 +9,8 @@ They are read with pyarrow and PyAV, without lerobot. This was checked on a data
 The option `touch` names the gel cameras, separated by commas, and `photo` the camera that shows the object. By default
 cameras with touch, tactile, gel or digit in their name are gel cameras, and the first other camera takes the photo. An
 episode becomes one grasp: its first step provides the no-contact frame and the photo, and the step whose gel images
-differ most from the first is the touch. Its task counts as its object, and an episode is a sequence, unless the
-episodes have fields for these, like the exports of `retrieve export-recording`. Those fields are imported.
+differ most from the first is the touch. If the episodes have fields for object and sequence, like the exports of
+`retrieve export-recording`, these fields are imported. Otherwise the task is the object and the episode the sequence.
 """
 
 import json

@@ -8,8 +8,8 @@
 
 The id of an object is its number, because names occur twice in the public list. If `objectfolder_real_metadata.csv`
 (Index, Name, Material) is next to the folders, recording.json lists names and materials under `objects`. A touch gets
-the photo with its own number; without one, touches are assigned to the photos of their object in turn. The split of a
-pack is stored if its parts have different objects. Audio is ignored.
+the photo with its own number; without such a photo, touch number i gets photo number i modulo the number of photos. The
+split of a pack is stored if its parts have different objects. Audio is ignored.
 """
 
 import csv

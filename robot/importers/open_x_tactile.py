@@ -1,14 +1,14 @@
 """Open-X-Tactile: robot tasks with touch as zarr stores in the layout of FTP-1; and our own exports to that format.
 
     <task>.zarr.zip, or <task>.zarr/ unpacked, zarr version 2
-        meta/episode_ends                       (E,) where each episode ends
+        meta/episode_ends                       (E,) end of each episode
         data/camera_main_rgb                    (T, H, W, 3) uint8; the option `camera` names another
         data/<side>_tactile_data_<group>        (T, areas, H, W, 3) uint8; an area is a finger
         data/<side>_tactile_{sensor,type}_<group>    name of the sensor; image, state or binary
 
 An episode becomes one grasp and one sequence: its first step provides the no-contact frame and the photo, and the step
-whose gel images differ most from the first is the touch. Published stores do not name objects, so a task counts as one
-object. The exports of `retrieve export-recording` have `meta/object_id` and further fields, which are imported.
+whose gel images differ most from the first is the touch. Published stores do not name objects, so a task is treated as
+one object. The exports of `retrieve export-recording` have `meta/object_id` and further fields, which are imported.
 """
 
 import re

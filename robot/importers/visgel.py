@@ -5,10 +5,10 @@
     data_unseen/...                                 objects that the authors held out for testing
 
 The folders between data_seen and touch vary between copies, and are searched. The data set does not name the touched
-objects, so each recording of a touch counts as an object. This is a surrogate: two recordings may show one object, and
-pairs of them then count wrongly as different objects. The touch is the frame that differs most from frame 0, among 16
-evenly spread ones; the photo is the camera frame of the same moment. The folder `<n>` is the sequence. The split
-`unseen` trains on data_seen and tests on data_unseen.
+objects, so each recording of a touch is treated as an object. This is a surrogate: two recordings may show one object,
+and pairs of them are then wrongly treated as different objects. The touch is the frame that differs most from frame 0,
+among 16 evenly spread ones; the photo is the camera frame of the same moment. The folder `<n>` is the sequence. The
+split `unseen` trains on data_seen and tests on data_unseen.
 """
 
 import re

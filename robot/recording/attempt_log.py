@@ -62,7 +62,7 @@ def read_attempts(folder: Path, grasp_ids: Set[str]) -> list[LoggedAttempt]:
 
 
 def _read(path: Path, grasp_ids: Set[str]) -> list[tuple[LoggedAttempt, int]]:
-    """Attempts that count, each with where its line ends in the file."""
+    """Return the valid attempts, each with the position of its line's end in the file."""
     if not path.exists():
         return []
     lines = read_content(path, RecordingError).splitlines(keepends=True)
@@ -129,11 +129,11 @@ class Tally:
 
     Attributes:
         object_id: The object.
-        attempts: Attempts made.
+        attempts: Attempts so far.
         accepted: Accepted grasps.
         outcomes: Number of attempts by outcome.
         reasons: Number of attempts by the reason why there was no grasp.
-        skipped: Reason why the object is ungraspable; None: it is not.
+        skipped: Reason why the object is ungraspable; None if it is graspable.
     """
 
     object_id: str
@@ -168,8 +168,8 @@ def acceptance_table(tallies: Sequence[Tally], grasps_target: int | None = None)
 
     Args:
         tallies: Counts by object.
-        grasps_target: Objects with fewer accepted grasps are marked "gave up"; None: no marks. Ungraspable objects show
-            their reason.
+        grasps_target: Objects with fewer accepted grasps are marked "gave up"; None for no marks. Ungraspable objects
+            show their reason.
     """
     width = max([len(each.object_id) for each in tallies] + [6])
     lines = [f"{'object':{width}}  accepted  of  {'  '.join(OUTCOMES)}"]

@@ -157,7 +157,7 @@ def _grasps(path: Path, data: bytes, ignored: set[str]) -> Iterator[RecordedGras
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """Read and check recording.json alone; raise RecordingError if it is missing or invalid."""
+    """Read and check recording.json only; raise RecordingError if it is missing or invalid."""
     path = root / INFO_FILE
     if not os.path.exists(path):  # also False for a name that the file system cannot store
         raise RecordingError(f"{root} must be a recording, but has no {INFO_FILE}; `retrieve import` writes recordings")

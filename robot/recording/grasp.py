@@ -16,7 +16,7 @@ from robot.errors import RecordingError
 
 _NUMBERS = ("force_n", "opening_mm", "touch_skew_s", "time_s")
 OUTCOMES = ("held", "missed", "slipped", "no_plan")
-"""Outcomes of an attempt: held after the lift, nothing between the jaws, lost during the lift, or no grasp tried."""
+"""Outcomes of an attempt: held after the lift, nothing between the jaws, lost during the lift, or no grasp planned."""
 
 _PLAIN_KEYS = ("grasp_id", "object_id", *_NUMBERS, "pose", "grasped", "outcome", "sequence_id")
 _IMAGE_KEY = re.compile(r"(photo|depth|touch_([a-z])(_before|_after)?)_file_name")
@@ -26,21 +26,21 @@ _REPEATED_KEYS = re.compile(r"object_id|sequence_id|outcome|photo_file_name|touc
 
 @dataclass(frozen=True, slots=True)
 class RecordedGrasp:
-    """One grasp. Images are POSIX paths relative to the recording, touches by finger; None: not recorded.
+    """One grasp. Images are POSIX paths relative to the recording, touches by finger; None if not recorded.
 
     Attributes:
         grasp_id: Unique id.
         object_id: The object.
         photo: Colour picture of the object before the grasp.
         touches: Gel images of the closed jaws.
-        touches_before: Gel images without contact.
-        touches_after: Gel images after the lift.
+        touches_before: No-contact frames, just before the jaws close.
+        touches_after: Gel images after the lift, before the release.
         depth: Depth picture, uint16 in mm.
-        force_n: Clamping force.
+        force_n: Commanded force on each finger.
         opening_mm: Distance between the fingers.
         pose: Pose of the gripper, as in `robot.readings.Pose.as_tuple`.
         touch_skew_s: Time between the fingers' images.
-        grasped: Decision of the gate; training leaves out false.
+        grasped: Whether the gate accepted the grasp, not whether the object was held; training ignores false.
         outcome: One of OUTCOMES, as the gripper reports.
         sequence_id: Id of the recorded sequence of the grasp.
         time_s: Time since the recording began.
@@ -103,7 +103,7 @@ class RecordedGrasp:
 
     @classmethod
     def from_row(cls, row: Mapping[str, Any]) -> Self:
-        """Parse a row of `to_row`; null means not recorded, unknown keys are ignored. Invalid: RecordingError."""
+        """Parse a row of `to_row`; null means not recorded, unknown keys are ignored; raise RecordingError on error."""
         present: dict[str, Any] = {
             key: sys.intern(value) if type(value) is str and _REPEATED_KEYS.fullmatch(key) else value
             for key, value in row.items()

@@ -158,7 +158,7 @@ def find_object_points(depth_mm: Depth, rays: Rays, table: TablePlane, region: R
         depth_mm: (H, W) depth, NaN where unknown.
         rays: Rays of the pixels.
         table: The table.
-        region: Box in the rig's frame; its x and y limit the search. None: no limit.
+        region: Box in the rig's frame; its x and y limit the search. None for no limit.
 
     Raises:
         PlanError: There is no object.

@@ -1,4 +1,4 @@
-"""Cylinder fit of the object on the table: place, height, radius and standard error of the centre.
+"""Cylinder fit of the object on the table: position, height, radius and standard error of the centre.
 
 A depth picture shows only one side of the object. An upright cylinder, a box and a lying cylinder (robot.sight.solids)
 are fitted to the points above the table (robot.sight.cloud); the one with the smallest BIC is returned. If none is
@@ -114,7 +114,7 @@ def fit_cylinder(image: RGBD, extrinsics: npt.ArrayLike, region: Region | None =
     Args:
         image: Picture with depth.
         extrinsics: (4, 4) camera frame to rig frame, mm.
-        region: Box in the rig's frame that limits the search in x and y; None: no limit.
+        region: Box in the rig's frame that limits the search in x and y; None for no limit.
 
     Raises:
         PlanError: No object is visible, or too little of it.
@@ -261,7 +261,7 @@ def _circle_error(circle: Circle, side: Array, arc_deg: float) -> float:
     """Return the standard error of the centre by the least-squares covariance.
 
     Residuals of neighbouring points are correlated (relief, a body that is not quite round), so each sector of the arc
-    counts as one measurement.
+    is treated as one measurement.
     """
     off = np.hypot(*(side[circle.inliers] - [circle.x, circle.y]).T) - circle.radius
     per_sector = circle.inliers.sum() / (arc_deg / _SECTOR_DEG)

@@ -31,7 +31,7 @@ Fit = Callable[[Points, Points], Points]
 VERSION = 1
 COLUMNS = tuple(f"{frame}_{axis}_mm" for frame in ("camera", "rig") for axis in "xyz")
 MIN_SPREAD = 0.02
-"""Points count as collinear (coplanar) below this spread relative to their extent.
+"""Points are treated as collinear (coplanar) below this spread relative to their extent.
 
 At 300 mm this is 6 mm; below it, errors of 5 mm in the points make the camera's rotation arbitrary.
 """
@@ -214,7 +214,7 @@ def load_hand_eye(path: Path, max_age_days: float | None = None, now: datetime |
 
     Args:
         path: The file.
-        max_age_days: Largest accepted age; None: any.
+        max_age_days: Largest accepted age; None for any age.
         now: Current time, for tests.
 
     Raises:
@@ -274,11 +274,11 @@ def _describe_errors(errors: FitErrors) -> str:
 
 def _unit_causes(camera: Points, rig: Points) -> list[str]:
     if max(_extent(rig), _extent(camera)) < _MIN_EXTENT_MM:
-        return ["all points seem to be in metres, they must be in mm"]
+        return ["all points seem to be in metres, but they must be in mm"]
     ratio = _extent(rig) / _extent(camera)
     low, high = _METRES_RATIO
     named = (("camera", low <= ratio <= high), ("rig", low <= 1 / ratio <= high))
-    return [f"the {name} points seem to be in metres, they must be in mm" for name, is_so in named if is_so]
+    return [f"the {name} points seem to be in metres, but they must be in mm" for name, is_so in named if is_so]
 
 
 def _mirror_causes(found: HandEye) -> list[str]:

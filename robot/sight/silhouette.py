@@ -31,7 +31,7 @@ def fit_silhouette(
         depth_mm: (H, W) depth, NaN where unknown.
         rays: Rays of the pixels.
         table: The table.
-        region: Box in the rig's frame that must contain the centre in x and y; None: no limit.
+        region: Box in the rig's frame that must contain the centre in x and y; None for no limit.
 
     Raises:
         PlanError: There is no such patch, or no cylinder on the table explains it.

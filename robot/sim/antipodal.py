@@ -37,7 +37,7 @@ _HAND_MM, _TABLE_CLEARANCE_MM = 50.0, 5.0
 """Width of the hand behind the fingers, across the closing direction; its minimum distance from the table."""
 
 _CALIBRATION_ERROR_MM = 9.0
-"""A grasp is preferred if it still holds when the hand is off by this much, the error of the camera's calibration."""
+"""A grasp is preferred if it also holds with an error of the hand of this size, that of the camera's calibration."""
 
 _WORKSPACE_RADIUS_MM = 180.0
 """Contacts farther than this from the object's middle are outside the workspace."""
@@ -179,7 +179,7 @@ class _JawProfile:
     def approach(
         self, tilt_rad: float, pads: _PadContacts, settings: GraspSettings, stroke_mm: float
     ) -> tuple[Mask, Array]:
-        """Return which places open jaws reach, and how far they withdraw from each to be clear of the object.
+        """Return the places that open jaws can reach, and the distance to withdraw from each, clear of the object.
 
         Returns:
             Two arrays (H, Z): whether the place is reachable, and the retreat in mm.
@@ -240,9 +240,9 @@ def _along_approach(array: NDArray[Any], tilt_rad: float, back: bool = False) ->
 def _clear_places(
     reach_mm: Array, middle_mm: Array, retreat_mm: Array, settings: GraspSettings, stroke_mm: float
 ) -> Mask:
-    """Return whether open fingers and the hand behind them arrive at each place without meeting the object.
+    """Return whether open fingers and the hand behind them can reach each place without touching the object.
 
-    They come along the last axis, from its end.
+    The approach is along the last axis, from its end.
 
     Args:
         reach_mm: (2, across, along) as in `_JawProfile`.

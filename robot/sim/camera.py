@@ -146,7 +146,7 @@ class PinholeCamera:
 
 @dataclass(frozen=True)
 class Lighting:
-    """One lamp and a sky, drawn independently of the object, so that the light gives no hint of it.
+    """One lamp and a sky, drawn independently of the object, so the light contains no information about it.
 
     Attributes:
         direction: unit vector towards the lamp.

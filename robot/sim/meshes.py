@@ -13,7 +13,7 @@ from robot.sim.objects.mesh import FORMATS, MeshBody, mesh_object, object_prefix
 from robot.sim.objects.resting import stable_up_directions
 
 _ENOUGH_GRASPS = 100
-"""Take the first resting pose with this many grasps. Fewer may be an artefact of the grid, out of the arm's reach."""
+"""Take the first resting pose with this many grasps; fewer may be artefacts of the grid, or out of the arm's reach."""
 
 
 class MeshFolder:

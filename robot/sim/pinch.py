@@ -1,9 +1,8 @@
-"""Two fingers close on the object: contact of each finger, press depth, jaw opening, and whether the grip holds.
+"""A grip of two fingers on an object: contact of each finger, press depth, jaw opening, and success of the lift.
 
 Gripper frame: x along the closing direction, z from the fingertips to the hand (up, unless the hand is tilted), origin
-between the fingertips. Finger a comes from -x and faces +x, finger b faces -x. A gel's grid has its rows towards the
-fingertip (-z) and its columns to the finger's right.
-Each quantity is computed once, on first use.
+between the fingertips. Finger a is at -x and faces +x, finger b is at +x and faces -x. In a gel's grid, rows count
+towards the fingertip (-z) and columns to the finger's right. Each quantity is computed once, on first use.
 """
 
 import math
@@ -36,7 +35,7 @@ _MAX_TURN_ERROR_RAD = math.radians(0.2)
 """Maximum error of the object's final turn between the jaws."""
 
 _MIN_WIDTH_RATIO = 0.2
-"""Lower bound on the squeezed width of a soft object, relative to its width; foam has no more room to give."""
+"""Lower bound on the squeezed width of a soft object, relative to its width; foam cannot be squeezed further."""
 
 PAD_MM = (15.2, 20.3)
 """Height and width of a bare finger's pad."""
@@ -51,11 +50,12 @@ class Hand:
 
     Attributes:
         stroke_mm: greatest opening.
-        safety: for the lift, friction must carry this many times the weight.
-        grid: rows and columns of the contact solver; `frontier` measures their effect on the error.
+        safety: for the lift, the friction of both fingers must be at least this many times the weight.
+        grid: rows and columns of the contact solver; `frontier` measures their effect on accuracy.
         tolerance: tolerance of the contact solver.
-        turns_about_grip: closing jaws turn the object about the point between them, for objects grasped far from their
-            middle; otherwise about the object's own axis, near which procedural objects are grasped.
+        turns_about_grip: if true, closing jaws turn the object about the point between them, as for objects that are
+            grasped far from their middle; if false, about the object's own axis, near which procedural objects are
+            grasped.
     """
 
     stroke_mm: float = STROKE_MM
@@ -67,7 +67,7 @@ class Hand:
 
 @dataclass(frozen=True)
 class Grip:
-    """Grip of the jaws: they close at `pose`, from `opening_mm` apart, with `force_n` on each finger.
+    """A grip: the jaws close at `pose`, from the opening `opening_mm`, with `force_n` on each finger.
 
     >>> robot.Grip(robot.Pose(x_mm=0, y_mm=0, z_mm=40, yaw_rad=0), force_n=12).force_n
     12
@@ -86,13 +86,13 @@ class Pinch:
         obj: the object.
         placement: its pose before the jaws close.
         grip: pose, force and opening of the jaws.
-        sensors: the gel of each finger; a finger without one is bare and rigid.
+        sensors: the gel of each finger; a finger without a gel is rigid.
         hand: the gripper.
         seed: seed of the error of the object's final turn.
         passes: counts of the computations done, by name.
 
     Raises:
-        SceneError: No gripper has this force or opening.
+        SceneError: Force or opening is out of range.
     """
 
     obj: SimObject
@@ -116,14 +116,15 @@ class Pinch:
 
     @cached_property
     def final_placement(self) -> Placement:
-        """Pose of the object after the jaws turn it to the nearest position in which they close furthest.
+        """Pose of the object after the closing jaws have turned it.
 
-        The jaws push the object while they close, so flat sides end square to the fingers up to a small error.
+        The object turns to the nearest local minimum of its width between the jaws. So flat sides end square to the
+        fingers, up to a small error.
         """
-        coarse = _nearest_widest_turn(_COARSE_RAD, self._coarse_reach)
+        coarse = _nearest_narrowest_turn(_COARSE_RAD, self._coarse_reach)
         fine = [coarse + angle for angle in _FINE_RAD]
         error_rad = np.random.default_rng([81, self.seed]).uniform(-1.0, 1.0) * _MAX_TURN_ERROR_RAD
-        return self._rotated_placement(_nearest_widest_turn(fine, self._finger_reach(fine)) + error_rad)
+        return self._rotated_placement(_nearest_narrowest_turn(fine, self._finger_reach(fine)) + error_rad)
 
     def _rotated_placement(self, angle: float) -> Placement:
         x, y, pose = self.placement.x_mm, self.placement.y_mm, self.grip.pose
@@ -168,33 +169,33 @@ class Pinch:
 
     @cached_property
     def miss_reason(self) -> str | None:
-        """Why the fingers miss, or None: one comes down on the object, or the object is not between them."""
+        """Why the fingers miss: one comes down on the object, or it is not between them. None if they meet it."""
         reach = self._coarse_reach[len(_COARSE_RAD) // 2]
         if (reach < _START_MM - self.grip.opening_mm / 2).any():
             return "a finger comes down on the object"
-        if not np.isfinite(self._walls["a"]).any() or not np.isfinite(self._walls["b"]).any():
+        if not np.isfinite(self._ray_distances["a"]).any() or not np.isfinite(self._ray_distances["b"]).any():
             return "the object is not between the fingers"
         return None
 
     @cached_property
-    def _walls(self) -> dict[str, Array]:
+    def _ray_distances(self) -> dict[str, Array]:
         """Distance along each finger's rays to the turned object; a bare finger uses the coarse grid."""
-        walls = {}
+        distances = {}
         for finger, side in SIDES.items():
             grid = self.hand.grid if finger in self.sensors else _COARSE_GRID
             self.passes["wall" if finger in self.sensors else "bare_finger"] += 1
             (starts,), (directions,) = self._rays(side, grid, [self.final_placement])
-            walls[finger] = self.obj.body.cast(starts, directions).reshape(grid)
-        return walls
+            distances[finger] = self.obj.body.cast(starts, directions).reshape(grid)
+        return distances
 
     # Contact ------------------------------------------------------------------------------------------------
 
     def gap(self, finger: str) -> Array:
-        """Return the distance (rows, columns), mm, from the gel at first touch to the object; inf beyond the object."""
-        return np.asarray(self._walls[finger] - self._walls[finger].min())
+        """Return the distance (rows, columns) in mm from the gel at first contact to the object; inf without object."""
+        return np.asarray(self._ray_distances[finger] - self._ray_distances[finger].min())
 
     def contact(self, finger: str) -> Contact:
-        """Return the contact of one finger's gel with the object's side. Call it only if `miss_reason` is None."""
+        """Return the contact of one finger's gel with the object; valid only if `miss_reason` is None."""
         if finger not in self._contacts:
             self.passes["contact"] += 1
             self._contacts[finger] = press(
@@ -209,7 +210,7 @@ class Pinch:
         return self._contacts[finger]
 
     def touch(self, finger: str, noise_seed: int) -> Picture:
-        """Return the gel image during the hold."""
+        """Return the gel image with closed jaws; the no-contact frame after a miss."""
         if self.miss_reason:
             return self.sensors[finger].background(noise_seed)
         if finger not in self._clean_images:
@@ -221,22 +222,23 @@ class Pinch:
 
     @cached_property
     def final_opening_mm(self) -> float:
-        """Opening of the jaws at rest: 0 for a miss, otherwise the width less the compression of gels and object.
+        """Opening of the jaws at rest: the object's width minus the compression of gels and object.
 
-        A soft object is never squeezed below a fifth of its width, where linear elasticity does not hold.
+        After a miss it is 0, also if a finger has come down on the object. A soft object keeps at least a fifth of its
+        width, because linear elasticity does not hold below.
         """
         if self.miss_reason:
             return 0.0
-        width = 2 * _START_MM - sum(float(wall.min()) for wall in self._walls.values())
+        width = 2 * _START_MM - sum(float(wall.min()) for wall in self._ray_distances.values())
         compression = sum(self.contact(finger).approach_mm for finger in self.sensors)
         return max(width - compression, _MIN_WIDTH_RATIO * width)
 
     @cached_property
     def slip_reason(self) -> str | None:
-        """Why the lift loses the object, or None. Coulomb friction, a hard-finger model.
+        """Why the lift loses the object; None if it holds. Coulomb friction, a hard-finger model.
 
-        The weight must stay below the friction of both fingers. The line between the contacts and the mean slope under
-        each finger must lie within the friction cone (Nguyen 1988).
+        The friction of both fingers must be at least `safety` times the weight. The line between the contacts, and the
+        mean surface normal under each gel, must lie within the friction cone (Nguyen 1988).
         """
         if self.miss_reason:
             return self.miss_reason
@@ -256,7 +258,7 @@ class Pinch:
 
     def _centre(self, finger: str) -> Array:
         """Return (x, y, z) of a contact in the gripper frame: centre of pressure, or a bare finger's nearest point."""
-        wall, (height, width) = self._walls[finger], self._field_mm
+        wall, (height, width) = self._ray_distances[finger], self._field_mm
         has_gel = finger in self.sensors
         weight = self.contact(finger).pressure_mpa if has_gel else (wall <= wall.min() + 0.1).astype(np.float64)
         rows, columns = np.indices(wall.shape)
@@ -266,10 +268,13 @@ class Pinch:
         return np.array([SIDES[finger] * (float(wall.min()) - _START_MM), y, z])
 
 
-def _nearest_widest_turn(turns: Sequence[float], reached: Array) -> float:
-    """Walk from the middle turn to larger reach and return the nearest turn where neither neighbour reaches further."""
+def _nearest_narrowest_turn(turns: Sequence[float], reached: Array) -> float:
+    """Return the turn of the nearest local minimum of the object's width between the jaws, from the middle turn.
+
+    Further reach of the fingers means a narrower object.
+    """
     reach = reached.sum(axis=1)
-    reach[np.isinf(reach)] = -np.inf  # a finger that misses the object does not count as narrow
+    reach[np.isinf(reach)] = -np.inf  # an object that a finger misses is not narrow
     step = len(turns) // 2
     while 0 < step < len(turns) - 1:
         further = max(step - 1, step + 1, key=lambda other: float(reach[other]))

@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 
 Array = npt.NDArray[np.float64]
 FORCE_N = (5.0, 80.0)
-"""Range of the clamping force of the simulated Weiss WSG-50."""
+"""Range of the force on each finger of the simulated Weiss WSG-50."""
 
 _MESH_UNITS = UNITS | {"pose": f"{UNITS['pose']}; then its tilt in radian, where it does not point straight down"}
 _ATTEMPT_S = 40.0
 _MAX_OBJECTS = 100_000
 _WORKSPACE = Region((-150.0, -150.0, 0.5 * PAD_MM[0]), (150.0, 150.0, 500.0))
 _TABLE_MM = 15.0
-"""Objects stand at most this far from the centre of the workspace in x and y."""
+"""Largest distance of objects from the centre of the workspace, in x and in y."""
 
 
 class SimClock:
@@ -75,7 +75,7 @@ class SimState:
 
     @property
     def is_lifted(self) -> bool:
-        """Whether the hand has left the place where it closed."""
+        """Whether the hand has moved away from the pose in which it closed."""
         grip = self.current_scene().grip
         return grip is not None and self.pose.z_mm > grip.pose.z_mm + 1.0
 
@@ -97,9 +97,9 @@ class SimSettings(TypedSettings):
         focal_px: focal length of the camera. Its pictures have 256 px a side; at 860 they show about 190 mm, and part
             of larger objects.
         localisation_mm: range from which the error of the camera's calibration is drawn.
-        grasp: the table [grasp] of a real rig's file: how grasps are drawn (robot.grasping.settings).
-        attempt: the table [attempt]: how attempts are made (robot.grasping.settings).
-        planner: the table [planner]: where the jaws close (robot.grasping.planner; "mesh" by default for meshes).
+        grasp: the table [grasp], as for a real rig: random grasps (robot.grasping.settings.GraspSettings).
+        attempt: the table [attempt]: speeds, waits, retries (robot.grasping.settings.AttemptSettings).
+        planner: the table [planner]: the grasp planner (robot.grasping.planner; "mesh" by default for meshes).
         gel: the tables [gel.a] and [gel.b]: materials of the gels (robot.gel_settings); unknown properties are drawn.
 
     Raises:
@@ -257,7 +257,7 @@ class SimRig(Rig):
         return {name: scene.image(name) for name in names}
 
     def walls(self, grasp: RecordedGrasp) -> dict[str, Array]:
-        """Return the distance (mm) of the object from each gel at first touch, simulated again from the record.
+        """Return the distance (mm) of the object from each gel at first contact, simulated again from the record.
 
         Each array is (rows, columns) of the contact grid, inf where the finger meets nothing. A miss gives an empty
         dictionary.
@@ -325,7 +325,7 @@ class SimArm(VirtualDevice, Arm):
 
 
 class SimGripper(VirtualDevice, Gripper):
-    """Gripper that closes on the object between its fingers; the mechanics of the pinch give its readings."""
+    """Gripper that closes on the object between its fingers; its readings are those of the simulated grip (`Pinch`)."""
 
     def __init__(self, sim_state: SimState) -> None:
         super().__init__(

@@ -1,9 +1,9 @@
-"""The scene of the simulated rig for one grasp: an object on a table, fingers, a camera, and THE REQUESTED OUTPUTS.
+"""The scene of the simulated rig for one grasp: an object on a table, fingers, a camera, and the requested outputs.
 
     scene = Scene(draw_object(0, 3), outputs={"photo", "touch_a"}, grip=Grip(Pose(0, 0, 60, 0.4), force_n=12))
     images = scene.run()        # {"photo": (256, 256, 3) uint8, "touch_a": (240, 320, 3) uint8}
 
-Outputs have the names of a recording's image columns. Only what an output needs is computed: `scene.passes` counts the
+Outputs have the names of a recording's image columns. Nothing else is computed: `scene.passes` counts the
 computations (view, photo, shadow, depth, turn, wall, bare_finger, contact, gel, background).
 """
 
@@ -36,7 +36,7 @@ class Scene:
         obj: the object.
         placement: its pose on the table.
         camera: the camera over the table.
-        sensors: the gel of each finger, by letter; a finger without one is bare.
+        sensors: the gel of each finger, by letter; a finger without a gel is rigid.
         hand: the gripper.
         grip: pose and force of the jaws; None before a grasp.
         seed: seed of light, noise and the error of the object's turn.
@@ -45,7 +45,7 @@ class Scene:
         passes: counts of the computations done, by name.
 
     Raises:
-        SceneError: An output is unknown, a touch has no sensor or no grip, or no gripper has this finger.
+        SceneError: An output is unknown, a touch has no sensor or no grip, or a finger is not a or b.
 
     >>> scene = robot.Scene(robot.draw_object(seed=0, index=0), outputs={"photo"})
     >>> scene.run()["photo"].dtype

@@ -101,7 +101,7 @@ def test_exhaustive_top1_by_blocks_equals_that_of_the_whole_catalogue(crowd, mon
     monkeypatch.setattr(scale, "BLOCK", 64)
     sizes, touches = [100, 300], np.concatenate([crowd.touches, crowd.held_out])
     cosines, _ = needed.exhaustive_top1(crowd, touches, sizes)
-    found = needed.places(crowd, touches, sizes, cosines)
+    found = needed.ranks_of(crowd, touches, sizes, cosines)
     blocks = [*crowd.blocks(0, 100, 0), *crowd.blocks(100, 300, 0)]
     partials, photos = (
         np.concatenate(part) for part in zip(*((b.arrays["partials"], b.embeddings) for b in blocks), strict=True)
@@ -137,5 +137,5 @@ def test_the_exhaustive_top1_of_several_grasps_has_the_greatest_sum_of_logits():
     """Of four photos the third is between both grasps and has the greatest logit."""
     grasps = np.eye(2, dtype=np.float32)
     photos = np.array([[1, 0], [0, 1], [0.7, 0.7], [0.8, 0]], dtype=np.float32)
-    found = several.places(grasps, photos, lambda rows: np.array([0, 1, 5, 2])[rows])
+    found = several.ranks_by_way(grasps, photos, lambda rows: np.array([0, 1, 5, 2])[rows])
     assert found == {"together": 1, "each": 2}  # for the second grasp only one photo is nearer

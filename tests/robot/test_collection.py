@@ -351,7 +351,7 @@ def test_a_person_puts_the_object_back_before_each_attempt_at_a_given_place():
     rig.ask, rig.object_fit = requests.append, CylinderFit(5.0, -2.5, 100.0, 30.0, 1.0, "given", (30.0, 30.0))
     for number in range(2):
         Rig.prepare(rig, "mug", number)
-    assert requests == ["Put mug at x 5, y -2.5 mm, alone, and press Enter."] * 2
+    assert requests == ["Put mug at x 5, y -2.5 mm, remove all other objects, then press Enter."] * 2
 
 
 def test_a_person_is_not_asked_to_rise_first(monkeypatch):

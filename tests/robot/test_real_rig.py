@@ -90,7 +90,7 @@ def test_a_given_object_replaces_the_fit_for_a_camera_without_depth(tmp_path):
         "given",
     )
     assert object_fit.width_mm(1.0, 25.0) == 60
-    with pytest.raises(RobotConfigError, match="has no depth: give the place and size of every object"):
+    with pytest.raises(RobotConfigError, match="has no depth: give the position and size of every object"):
         load_rig(written(tmp_path, object=None), seed=0)
 
 

@@ -40,7 +40,7 @@ class Kinect2Settings(VendorSettings):
     """Settings of a Kinect 2.
 
     Attributes:
-        pipeline: One of PIPELINES, or "auto", the first that this build has.
+        pipeline: One of PIPELINES, or "auto" for the first that this build has.
         upside_down: Whether the camera hangs upside down; picture and intrinsics are then rotated by 180 degrees.
     """
 
@@ -55,7 +55,7 @@ class Kinect2Settings(VendorSettings):
 
 
 class Kinect2(VendorCamera):
-    """A Kinect 2; its keywords are those of Kinect2Settings."""
+    """A Kinect 2; the fields of Kinect2Settings are keyword arguments of the constructor."""
 
     Settings = Kinect2Settings
 

@@ -31,7 +31,7 @@ class RealSenseSettings(VendorSettings):
 
 
 class RealSense(VendorCamera):
-    """A RealSense depth camera; its keywords are those of RealSenseSettings.
+    """A RealSense depth camera; the fields of RealSenseSettings are keyword arguments of the constructor.
 
     A picture with lens distortion is undistorted by the vendor's model, and `settings` reports it. Depth takes the
     nearest pixel, because interpolation would invent depth at edges.

@@ -25,7 +25,7 @@ class UvcSettings(UsbCameraSettings):
 
 
 class UvcCamera(Camera):
-    """A USB camera by its stable name; its keywords are those of UvcSettings."""
+    """A USB camera by its stable name; the fields of UvcSettings are keyword arguments."""
 
     Settings = UvcSettings
     has_depth = False

@@ -1,7 +1,7 @@
 """Gel sensors with a USB camera: GelSight, GelSight Mini, DIGIT, and any other.
 
-A new sensor is a class of a few lines here. A rig's file may override each PRESET. Automatic exposure and white
-balance are off by default, because they make equal presses look different.
+To support another sensor, add a class of a few lines here. A rig's file may override each value of PRESET. Automatic
+exposure and white balance are off by default, because they change the images of equal presses.
 """
 
 import time
@@ -18,16 +18,19 @@ from robot.readings import Frame
 
 @dataclass(frozen=True, kw_only=True)
 class GelCameraSettings(UsbCameraSettings, CropSettings):
-    """Settings of the camera behind a gel and of the crop; `keep` frames are buffered to match the other finger's."""
+    """Settings of the camera behind a gel and of the crop.
+
+    `keep` frames are buffered, so that a frame close in time to that of the other finger is found.
+    """
 
 
 class OpencvTactile(TactileSensor):
-    """The gel behind a USB camera; its keywords are those of GelCameraSettings.
+    """The gel behind a USB camera; the fields of GelCameraSettings are keyword arguments of the constructor.
 
     Attributes:
         PRESET: Default camera settings of a kind of sensor.
-        CROP: Default crop: fractions at left, top, right and bottom.
-        QUARTER_TURNS: Rotation of the picture, in quarter turns to the left.
+        CROP: Default crop: fractions of width and height to remove at left, top, right and bottom.
+        QUARTER_TURNS: Rotation of the picture, in quarter turns counterclockwise.
     """
 
     Settings = GelCameraSettings
@@ -85,7 +88,7 @@ class OpencvTactile(TactileSensor):
         return self._picture(self._reader.near(time_s))
 
     def _picture(self, frame: Frame) -> Frame:
-        """Rotate, crop, then convert to RGB; conversion last, because it costs less for fewer pixels."""
+        """Rotate, crop, then convert to RGB. The conversion is last, because it is faster with fewer pixels."""
         turns = self.QUARTER_TURNS
         turned = np.ascontiguousarray(np.rot90(frame.pixels, turns)) if turns else frame.pixels
         return Frame(to_rgb(self._rectifier.apply(turned)), frame.time_s)
@@ -100,7 +103,7 @@ class GelSight(OpencvTactile):
 class GelSightMini(OpencvTactile):
     """GelSight Mini with the size and the crop of the vendor's software.
 
-    The camera's full 3280 x 2464 pixels at 25 frames/s would keep a core busy.
+    The camera's full 3280 x 2464 pixels at 25 frames/s would occupy one CPU core.
     """
 
     PRESET = CaptureSettings(width=320, height=240, fps=25.0)
@@ -110,7 +113,7 @@ class GelSightMini(OpencvTactile):
 class Digit(OpencvTactile):
     """DIGIT, with LEDs at full brightness by default.
 
-    The vendor's software transposes and flips its picture, which is a quarter turn to the left.
+    The vendor's software transposes and flips its picture, which is a quarter turn counterclockwise.
     """
 
     PRESET = CaptureSettings(width=320, height=240, fps=60.0, led=(15, 15, 15))

@@ -95,7 +95,7 @@ class SawyerSettings(TypedSettings):
 
 
 class Sawyer(Arm):
-    """Sawyer's right arm; its keywords are those of SawyerSettings."""
+    """Sawyer's right arm; the fields of SawyerSettings are keyword arguments of the constructor."""
 
     Settings = SawyerSettings
 
@@ -204,15 +204,15 @@ class Sawyer(Arm):
         self._make_ready()
 
     def _reconnect(self) -> None:
-        for trial in range(self._options.reconnect_tries):
+        for number in range(self._options.reconnect_tries):
             self._link.close()
             try:
                 return self._open_link()
             except DeviceError as error:
-                _LOG.warning("%s: try %d of %d: %s", self.name, trial + 1, self._options.reconnect_tries, error)
-                if trial + 1 == self._options.reconnect_tries:
+                _LOG.warning("%s: try %d of %d: %s", self.name, number + 1, self._options.reconnect_tries, error)
+                if number + 1 == self._options.reconnect_tries:
                     raise
-            time.sleep(min(_BACK_OFF_S * 2**trial, _LONGEST_BACK_OFF_S))
+            time.sleep(min(_BACK_OFF_S * 2**number, _LONGEST_BACK_OFF_S))
         raise AssertionError("the loop returns or raises")
 
     def _pose(self) -> Pose:
@@ -253,25 +253,25 @@ class Sawyer(Arm):
 
     def _solve(self, poses: Sequence[Pose], start: Joints) -> Joints:
         """Return the joint angles (N, 7) of way-points; the first is the arm's pose."""
-        found = [start]
+        solved = [start]
         for pose in poses[1:]:
-            found.append(self._solve_one(pose, found[-1], start))
-        return np.array(found)
+            solved.append(self._solve_one(pose, solved[-1], start))
+        return np.array(solved)
 
     def _solve_one(self, pose: Pose, before: Joints, start: Joints) -> Joints:
         """Solve one way-point; after a failure, try other seeds up to `ik_retries` times."""
         tip, seeds = self._mount.tip_of(pose), (before, start, None)
-        for trial in range(self._options.ik_retries + 1):
-            request = messages.ik_request(tip, self._options.tip, seeds[trial % len(seeds)])
+        for number in range(self._options.ik_retries + 1):
+            request = messages.ik_request(tip, self._options.tip, seeds[number % len(seeds)])
             try:
-                found = messages.ik_answer(self._link.call(messages.IK_SERVICE, request))
+                joints = messages.ik_answer(self._link.call(messages.IK_SERVICE, request))
             except DeviceError as error:
                 self._link.check()
                 problem = str(error)
                 continue
-            turn = float(np.abs(found - before).max())
+            turn = float(np.abs(joints - before).max())
             if turn <= _MAX_TURN_RAD:
-                return found
+                return joints
             problem = f"its solution turns a joint by {turn:.2f} rad at once"
         tries = self._options.ik_retries + 1
         raise DeviceError(

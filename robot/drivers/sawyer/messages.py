@@ -103,7 +103,7 @@ class RobotState:
 
     @property
     def blocking_reason(self) -> str | None:
-        """Reason why the arm may not move, with the action for a person; None: it may move."""
+        """Reason why the arm may not move, with the action for a person; None if it may move."""
         if self.stopped:
             source = _SOURCE.get(self.estop_source, "an unknown source")
             button = _BUTTON.get(self.estop_button, "in an unknown state")
@@ -136,10 +136,10 @@ def joints_of(message: Mapping[str, Any]) -> Joints | None:
     names, positions = message.get("name"), message.get("position")
     if not isinstance(names, list) or not isinstance(positions, list) or len(names) != len(positions):
         raise DeviceError(f"a joint state must have a position for each name, got {_short(message)}")
-    places = {name: place for name, place in zip(names, positions, strict=True) if isinstance(name, str)}
-    if not set(places) >= set(JOINTS):
+    angles = {name: angle for name, angle in zip(names, positions, strict=True) if isinstance(name, str)}
+    if not set(angles) >= set(JOINTS):
         return None
-    return np.array([_finite(places[name], name) for name in JOINTS])
+    return np.array([_finite(angles[name], name) for name in JOINTS])
 
 
 def stamp_of(message: Mapping[str, Any]) -> Any:

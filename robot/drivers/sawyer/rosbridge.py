@@ -1,7 +1,7 @@
 """Client of rosbridge: ROS topics and services as JSON over a websocket (port 9090), without a ROS install.
 
-It uses `websockets` instead of roslibpy, because a motion command must reach the robot now or never, and a failure
-must raise. Observed with roslibpy 2.1: a message published during a connection loss raises nothing and is sent seconds
+It uses `websockets` instead of roslibpy, because a motion command must not arrive late, and a failure must raise
+an error. Observed with roslibpy 2.1: a message published during a connection loss raises nothing and is sent seconds
 later, after automatic reconnection; rosbridge's "status" errors are dropped; after `terminate`, the same process
 cannot connect again.
 
@@ -160,7 +160,7 @@ class RosbridgeLink:
             raise DeviceError(f"the connection to rosbridge at {self.url} is closed: {self._closed_reason}")
 
     def subscribe(self, topic: str, kind: str) -> None:
-        """Subscribe to a topic of ROS type `kind`; a slow link gets only the newest message."""
+        """Subscribe to a topic of ROS type `kind`; if the link is slow, older messages are dropped."""
         self._topics[topic] = _MessageBuffer()
         self._send({"op": "subscribe", "topic": topic, "type": kind, "throttle_rate": 0, "queue_length": 1})
 
@@ -271,7 +271,7 @@ class RosbridgeLink:
         return True
 
     def _handle_status(self, operation: Message, _: int) -> bool:
-        """Fail the call that an error names; log other messages."""
+        """Pass an error to the waiting call with its id; log all other messages."""
         identity, text = operation.get("id"), operation.get("msg")
         self.counts["status"] += 1
         if isinstance(identity, str) and identity in self._awaited and operation.get("level") == "error":

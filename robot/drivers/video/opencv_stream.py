@@ -27,7 +27,7 @@ from robot.settings import TypedSettings, bounded
 
 _GRAB_LIMIT_S = 1
 _DAMAGED_IN_A_ROW = 10
-"""Number of consecutive undecodable pictures that are skipped before the stream counts as lost."""
+"""Number of consecutive undecodable pictures that are skipped before the stream is considered lost."""
 
 _STAMP_S = (-0.05, 1.0)
 """Accepted ages of a picture's own time stamp in s; a stamp outside this range is on another clock."""
@@ -38,7 +38,7 @@ _ZERO_ALLOWED = ("exposure_ms", "white_balance_k", "gain")
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureSettings(TypedSettings):
-    """Requested settings of a camera; 0, "", () and None leave a setting as the camera has it.
+    """Requested settings of a camera; a setting with 0, "", () or None is not changed.
 
     Attributes:
         width: Width in pixels.
@@ -163,7 +163,7 @@ class CaptureStream:
             self._capture = open_capture(device)
         try:
             if not self._capture.isOpened():
-                raise DeviceError(f"{device} cannot be opened; is it used by another program, or permission missing?")
+                raise DeviceError(f"{device} cannot be opened; is it used by another program? Do you have permission?")
             with self._errors():
                 self.settings = self._write(settings)
         except BaseException:

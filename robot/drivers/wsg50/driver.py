@@ -3,9 +3,12 @@
 Modules of the package: packets (codec), commands and replies (commands), the link, serial or TCP (link), supervised
 motions (motion), settings and forces (setup). Tested with an emulator, not yet with a gripper.
 
-Before use, set in the gripper's web page: the binary command interface; "part width tolerance" and "clamping travel" at
-their maximum, since the width of the object is unknown (a note in the Robotics Library's driver); "error state on TCP
-disconnect" on, so the jaws stop when this program dies. Over a serial line they do not stop.
+Before use, set on the gripper's web page:
+
+* The binary command interface: on.
+* "Part width tolerance" and "clamping travel": their maximum. The width of the object is unknown, so GRASP is sent with
+  `grasp_width_mm`, by default 0. (The driver of the Robotics Library gives the same advice.)
+* "Error state on TCP disconnect": on. Then the jaws stop if this program is killed. Over a serial line they do not.
 """
 
 import logging
@@ -17,7 +20,7 @@ from robot.drivers.wsg50 import commands
 from robot.drivers.wsg50.codec import Packet
 from robot.drivers.wsg50.commands import CommandId, GraspingState, Status, SystemState
 from robot.drivers.wsg50.link import LinkLost, NoReply
-from robot.drivers.wsg50.motion import GripperReading, IsDone, check_ready, fault_names, read
+from robot.drivers.wsg50.motion import ACTION, GripperReading, IsDone, check_ready, fault_names, read
 from robot.drivers.wsg50.setup import TYPICAL_LIMITS, GripperSetup, WSG50Settings
 from robot.errors import DeviceError
 from robot.readings import GripperState, GripperStatus
@@ -33,7 +36,7 @@ _STATUS_OF: dict[GraspingState, GripperStatus] = {
     GraspingState.POSITIONING: "moving",
 }
 _CLOSED_STATES = {GraspingState.HOLDING, GraspingState.NO_PART, GraspingState.PART_LOST}
-"""States that only RELEASE leaves; the gripper refuses GRASP in them."""
+"""States that end only by RELEASE; in them, the gripper refuses GRASP."""
 
 _REACHED_MM, _SAME_MM = 1.0, 0.1
 """Tolerance of a reached target, and distance below which no motion is needed."""
@@ -46,10 +49,10 @@ _SLACK_S = 2.0
 
 
 class WSG50(Gripper):
-    """A WSG-50; its keywords are those of WSG50Settings.
+    """A WSG-50; the fields of WSG50Settings are keyword arguments of the constructor.
 
-    `stop` releases a held object, because STOP ends the gripper's force control. Use it from one thread only; to stop
-    it from outside, interrupt that thread (Ctrl-C).
+    `stop` releases a held object, because STOP ends the gripper's force control. Use the driver from one thread only;
+    to stop the gripper from another thread, interrupt this one (Ctrl-C).
     """
 
     Settings = WSG50Settings
@@ -70,7 +73,7 @@ class WSG50(Gripper):
 
     @property
     def line_counts(self) -> dict[str, int]:
-        """Numbers of errors on the link so far, by kind."""
+        """Number of errors on the serial or TCP link so far, by kind."""
         return dict(self._link.counts)
 
     # Methods of the contract.
@@ -81,14 +84,17 @@ class WSG50(Gripper):
         self._set_up()
 
     def _close(self) -> None:
-        """Stop moving jaws, then announce the disconnect; without announcement the gripper makes a FAST STOP (TCP)."""
-        if not (self._link.has_echoed or self._motions.may_be_moving):  # no motion was begun
+        """If the jaws move, stop them. Then send DISCONNECT.
+
+        Over TCP, the gripper would otherwise enter FAST STOP.
+        """
+        if not (self._link.has_echoed or self._motions.may_be_moving):  # no motion was started
             self._link.close()
             return
         try:
             if self._link.is_open:
                 self._setup.stop_if_moving(self._stop)
-            else:  # the link was lost after the start of a motion; over a serial line the jaws go on
+            else:  # the link was lost after the start of a motion; over a serial line the jaws still move
                 self._stop()
             try:
                 self._motions.stop_updates()
@@ -118,12 +124,12 @@ class WSG50(Gripper):
     def _stop(self) -> None:
         if not self._link.is_open:
             self._setup.reopen()
-        for left in reversed(range(self._options.reconnect_tries)):
+        for tries_left in reversed(range(self._options.reconnect_tries)):
             try:
                 self._motions.stop()
                 return
             except LinkLost:
-                if not left:
+                if not tries_left:
                     raise
             _log.warning("%s: lost the link during a possible motion: opening it again to stop the jaws", self.name)
             self._setup.reopen()
@@ -151,14 +157,14 @@ class WSG50(Gripper):
     # Methods beyond the contract.
 
     def home(self) -> GripperState:
-        """Home the jaws, which moves them over the whole stroke; raise DeviceError if this fails."""
+        """Home the jaws over the whole stroke, at the gripper's own speed; raise DeviceError if this fails."""
         with self._moving("cannot be homed"):
             return self._as_state(self._setup.home())
 
     # Implementation.
 
     def _set_up(self) -> None:
-        """Apply the settings and read the gripper's limits, capped by the upper limits of the settings."""
+        """Apply the settings and read the gripper's limits; max_force_n and max_speed_mm_s may lower them."""
         self._setup.run(may_home=self.may_move)
         limits, options = self._setup.limits, self._options
         self.min_opening_mm, self.stroke_mm = self._setup.opening_range
@@ -179,7 +185,7 @@ class WSG50(Gripper):
         return reading
 
     def _wider_opening(self, reading: GripperReading) -> float:
-        """Return an opening a little wider than the current one, to release the object."""
+        """Return an opening slightly wider than the current one, to release the object."""
         return min(reading.opening_mm + _REGRIP_MM, self._setup.opening_range[1])
 
     def _release(self, width_mm: float) -> GripperReading:
@@ -203,7 +209,7 @@ class WSG50(Gripper):
     def _as_state(self, reading: GripperReading) -> GripperState:
         if reading.system & SystemState.FAST_STOP or reading.grasping not in _STATUS_OF:
             raise DeviceError(
-                f"{self.name} is in FAST STOP: {fault_names(reading.system)}; find the reason, then call recover()"
+                f"{self.name} is in FAST STOP or in an error state: {fault_names(reading.system)}; {ACTION}"
             )
         status = _STATUS_OF[reading.grasping]
         if status == "holding" and reading.opening_mm < self._options.min_part_mm:

@@ -96,7 +96,8 @@ class Port:
                 write_timeout=write_timeout_s,
                 exclusive=True,
             )
-            self._serial.reset_input_buffer = lambda: None  # pyserial's never returns while a socket's peer sends
+            # pyserial's own method never returns while a socket's peer sends.
+            self._serial.reset_input_buffer = lambda: None
             self._serial.open()
         except Exception as error:  # pyserial raises termios.error, ValueError and others too
             raise LinkLost(f"the gripper's port {name} cannot be opened: {_first_line(error)}") from error

@@ -1,9 +1,9 @@
 """Supervised motions of a WSG-50: the gripper's state decides, its replies only trigger a read of the state.
 
-A reply can be lost, late or doubled, and a motion command that is sent twice may be executed twice. Therefore a motion
-has ended when the gripper reports that it is still, in a possible end state of the motion. The command is sent again,
-once, only if the gripper is still and has not executed it. During a motion the state arrives as automatic updates every
-few milliseconds; without them the motion is stopped.
+A reply can be lost, late or duplicated, and a motion command that is sent twice may be executed twice. Therefore a
+motion has ended when the gripper reports that it is still, in a possible end state of the motion. The command is sent
+again, once, only if the gripper is still and has not executed it. During a motion the state arrives as automatic
+updates every few milliseconds; without them the motion is stopped.
 """
 
 import logging
@@ -35,6 +35,12 @@ _FAULTS = (
 )
 _RESENDABLE = (None, Status.SUCCESS, Status.CHECKSUM_ERROR)
 """Answers after which a command that was not executed may be sent again, because it was not received."""
+
+ACTION = (
+    "remove the cause, acknowledge it on the gripper's web page or set acknowledge_faults = true, then start again "
+    "or call recover()"
+)
+"""Action for a person after a fault."""
 
 _POLL_S = 0.01
 
@@ -77,13 +83,11 @@ def fault_names(system: SystemState) -> str:
 def check_ready(reading: GripperReading) -> None:
     """Raise DeviceError unless the gripper can execute a motion."""
     if reading.system & SystemState.FAST_STOP or reading.grasping is GraspingState.ERROR:
-        raise DeviceError(
-            f"the gripper is in FAST STOP ({fault_names(reading.system)}); find the reason, then call recover()"
-        )
+        raise DeviceError(f"the gripper is in FAST STOP or in an error state ({fault_names(reading.system)}); {ACTION}")
     if not reading.system & SystemState.REFERENCED:
         raise DeviceError("the gripper has lost its reference; call recover(), which homes it")
     if reading.is_moving:
-        raise DeviceError("the gripper is moving and must be still before a motion; call stop()")
+        raise DeviceError("the gripper is still moving; call stop() before the next motion")
 
 
 class Motions:
@@ -95,7 +99,7 @@ class Motions:
         period_ms: Period of the updates.
 
     Attributes:
-        may_be_moving: Whether the jaws may still move: a motion was begun and they were not still since.
+        may_be_moving: Whether the jaws may move: a motion was started, and they have not been still since.
         common_state: System state bits that all updates of the last motion had in common.
     """
 
@@ -200,7 +204,7 @@ class Motions:
             return
         error = DeviceError(
             f"the state of the moving gripper must be at most {self.max_age_s:g} s old, got {age:.2g} s: sent FAST "
-            "STOP; is the line overloaded?"
+            "STOP; is the link overloaded?"
         )
         try:
             self.link.send_urgent(_FAST_STOP)

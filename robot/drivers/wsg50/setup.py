@@ -36,24 +36,24 @@ class WSG50Settings(TypedSettings):
         port: A path, or socket://192.168.1.20:1000.
         baud: Baud rate of a serial line, as set in the gripper (the default is not verified).
         stop_bits: Stop bits of a serial line, as set in the gripper (the default is not verified).
-        timeout_s: Time-out of an answer.
+        timeout_s: Longest wait for an answer.
         home_direction: "default" as the gripper is configured, "out" or "in"; it is homed on connecting if it has lost
             its reference.
-        acceleration_mm_s2: 0 leaves the gripper's own.
-        soft_limits_mm: Smallest and largest opening; empty leaves the gripper's own.
+        acceleration_mm_s2: Acceleration of the jaws; 0 for the gripper's own setting.
+        soft_limits_mm: Smallest and largest opening; empty for the gripper's own setting.
         tare: Whether to tare force-measuring fingers on connecting.
-        acknowledge_faults: Whether to acknowledge a FAST STOP after logging it; else a person must.
-        grasp_width_mm: Nominal width of each grasp.
-        min_part_mm: Openings below this mean that the fingers hold each other, not a part.
+        acknowledge_faults: Whether to log and acknowledge a FAST STOP; if false, a person must acknowledge it.
+        grasp_width_mm: Nominal width of the object, sent with each GRASP; 0 if unknown.
+        min_part_mm: A smaller opening means that the fingers touch each other and hold no part.
         opening_speed_mm_s: Speed of opening and pre-positioning.
         finger_share: Fraction of the gripper's force on each finger; see `to_finger_force`.
         update_ms: Period of the state updates during a motion.
         homing_timeout_s: Longest duration of homing.
-        reconnect_tries: Number of tries of `recover` to open the port.
+        reconnect_tries: How often `recover` tries to open the port.
         reconnect_s: First wait between them, which doubles up to 5 s.
         max_force_n: Upper limit of forces.
         max_speed_mm_s: Upper limit of speeds.
-        max_state_age_s: Largest age of the state during a motion.
+        max_state_age_s: The jaws are stopped if no state arrives for this long during a motion.
     """
 
     port: str
@@ -81,7 +81,7 @@ class WSG50Settings(TypedSettings):
         """Raise RobotConfigError for a setting of another type or out of range."""
         super().__post_init__()
         if self.max_state_age_s < 2e-3 * self.update_ms:
-            raise RobotConfigError(f"max_state_age_s must span two updates of {self.update_ms} ms")
+            raise RobotConfigError(f"max_state_age_s must be at least two periods of update_ms = {self.update_ms} ms")
         if self.home_direction not in _DIRECTIONS:
             raise RobotConfigError(
                 f"home_direction must be one of {', '.join(_DIRECTIONS)}, got {self.home_direction!r}"
@@ -106,7 +106,7 @@ class WSG50Settings(TypedSettings):
         jaws. So with a limit of 40 N each finger pushes with 20 N, the fraction 0.5. A user of the simulator Drake
         found this factor in their own controller (its pull request 9950).
 
-        Two points are uncertain. The reported force (45h) is assumed to count as the limit does. Without
+        Two points are uncertain. We assume that the reported force (45h) is defined as the limit is. Without
         force-measuring fingers, the gripper derives the force from its motor current only. With a force gauge, set
         `finger_share` to the measured force on one finger divided by the limit.
         """
@@ -146,20 +146,21 @@ class GripperSetup:
         lowest = self.settings.to_finger_force(self.limits.min_force_n)
         if force < lowest or speed < self.limits.min_speed_mm_s:
             raise RobotConfigError(
-                f"{self.name}: the limits must allow its smallest force on a finger, {lowest:g} N, and speed, "
-                f"{self.limits.min_speed_mm_s:g} mm/s; got {force:g} N and {speed:g} mm/s"
+                f"{self.name}: the limits must allow at least {lowest:g} N on each finger and "
+                f"{self.limits.min_speed_mm_s:g} mm/s, the smallest values of the gripper; got {force:g} N and "
+                f"{speed:g} mm/s"
             )
         self.stop_if_moving(self.motions.stop)
         self._end_fast_stop()
         if not self._system_state() & SystemState.REFERENCED:
             if not may_home:
-                raise DeviceError(f"{self.name} has lost its reference, and homing is not allowed now")
+                raise DeviceError(f"{self.name} has lost its reference and must be homed, but motion is not allowed")
             _log.warning("%s has lost its reference: homing, the jaws move", self.name)
             self.home()
         self._apply()
 
     def reconnect(self) -> None:
-        """Open the port, if necessary, and synchronise; try again with increasing waits."""
+        """Open the port, if necessary, and synchronise; repeat after a failure, with increasing waits."""
         wait_s = self.settings.reconnect_s
         for number in range(1, self.settings.reconnect_tries + 1):
             try:
@@ -182,7 +183,7 @@ class GripperSetup:
             time.sleep(self.settings.reconnect_s)
 
     def home(self) -> GripperReading:
-        """Home the jaws; a reference that was missing before or during the motion proves success without an answer."""
+        """Home the jaws. If the answer is lost, a reference that was missing and is now present proves success."""
         packet = commands.home(_DIRECTIONS[self.settings.home_direction])
         before = self._system_state()
 
@@ -217,7 +218,7 @@ class GripperSetup:
         if has > min(force_limit_n * (1 + _ROUNDING), ceiling):
             raise DeviceError(
                 f"{self.name}: the force limit must be {force_limit_n:g} N, but the gripper has {has:g} N; "
-                "no grasp is made"
+                "the grasp is not made"
             )
 
     def read_back(self) -> dict[str, Any]:
@@ -260,7 +261,7 @@ class GripperSetup:
     def _apply(self) -> None:
         settings, link = self.settings, self.link
         is_holding = self.motions.read().grasping is GraspingState.HOLDING
-        if not is_holding:  # a smaller force would drop the held object
+        if not is_holding:  # with a smaller force, the held object would fall
             self.set_force(settings.to_finger_force(self.limits.min_force_n))
         if requested := settings.acceleration_mm_s2:
             lowest, highest = self.limits.min_acceleration_mm_s2, self.limits.max_acceleration_mm_s2

@@ -2,9 +2,11 @@
 
 Find p >= 0 and the approach d with   s = u(p) + gap - d >= 0,   p s = 0,   and either sum p dA = force or d = depth.
 
-u is the inward displacement of the gel (robot.sim.contact.kernels); an elastic object adds the displacement of a
-half-space (composite modulus 1/E* = (1-v1^2)/E1 + (1-v2^2)/E2, where only the gel's term is a layer's). Lengths are
-scaled by the pixel, pressures by E*, and both by the load, so any consistent units work: mm, N and MPa.
+p is the pressure, and s the gap that remains between object and deformed gel. u is the inward displacement of the gel,
+a layer with plane-strain modulus E* = E / (1 - nu^2) (robot.sim.contact.kernels). An elastic object adds the
+displacement of a half-space with its own modulus E* = E / (1 - nu^2). The problem is solved for unit load (force or
+depth), with the pixel as unit of length and the gel's E* as unit of pressure, and the result is scaled back. So any
+consistent units work, such as mm, N and MPa.
 """
 
 import math
@@ -20,7 +22,7 @@ from robot.sim.contact.scaled_problem import ElasticSurface, ScaledProblem
 
 STRAIN_LIMIT = 0.5  # linear elasticity holds below this: displacement over thickness, and slope
 SINGLE_PRECISION_TOLERANCE = 5e-3  # the error of float32 products is thousands of times smaller
-_SCALED_RANGE = (1e-100, 1e100)  # of force / (E* pixel^2) and depth / pixel
+_SCALED_RANGE = (1e-100, 1e100)  # of force / (E* pixel^2) and depth / pixel, with the gel's E*
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class Layer:
         _check_elastic("a layer's", self.modulus_mpa, self.poisson)
         if math.isinf(self.modulus_mpa):
             raise RobotConfigError(
-                "a layer's modulus must be finite, got inf: a rigid gel shows nothing. Give its value in MPa"
+                "a layer's modulus must be finite, got inf. A rigid gel does not deform; give its modulus in MPa"
             )
         if not self.thickness_mm > 0.0:
             raise RobotConfigError(
@@ -53,7 +55,7 @@ class Layer:
 
     @property
     def plane_modulus_mpa(self) -> float:
-        """E* = E / (1 - nu^2)."""
+        """Plane-strain modulus of the gel, E* = E / (1 - nu^2)."""
         return self.modulus_mpa / (1.0 - self.poisson**2)
 
 
@@ -63,7 +65,7 @@ class Contact:
 
     Attributes:
         pressure_mpa: (rows, cols) >= 0.
-        displacement_mm: (rows, cols) inward displacement of the gel alone, without the object's own deformation.
+        displacement_mm: (rows, cols) inward displacement of the gel, without the object's own deformation.
         approach_mm: approach of the undeformed object, from gap = 0.
         force_n: total force.
         area_mm2: contact area.
@@ -74,13 +76,15 @@ class Contact:
 
     Flags:
 
-        no_contact        nothing touches; not converged if there was a force to carry
-        unresolved        the contact is under three pixels wide: trust force and place, not pressure and depth
-        at_border         the contact reaches the border of the map, and nothing presses beyond
-        large_strain      a displacement over half the thickness: linear elasticity does not hold
-        steep             a slope over one half: linear elasticity does not hold
-        iteration_cap     stopped short of the tolerance; not converged
-        rigid_volume      a periodic surface cannot lose the volume that the depth requires; not converged, not solved
+        no_contact        there is no contact; `converged` is False if force_n > 0
+        unresolved        the contact is less than three pixels wide: pressure and depth are inaccurate, force and
+                          position are not
+        at_border         the contact reaches the border of the map; the part beyond it is missing
+        large_strain      a displacement exceeds half the thickness: linear elasticity does not hold
+        steep             a slope exceeds one half: linear elasticity does not hold
+        iteration_cap     the solver stopped before it reached the tolerance; `converged` is False
+        rigid_volume      an incompressible periodic layer cannot be pressed to this depth; the problem is not solved,
+                          and `converged` is False
     """
 
     pressure_mpa: Floats
@@ -119,7 +123,7 @@ def press(
         object_poisson: Poisson's ratio of the object.
         tolerance: upper bound on the solver's residual.
         max_iterations: maximum number of solver steps.
-        padded: False makes the surface periodic (a half-space's mean displacement is then 0).
+        padded: If false, the surface is periodic (the mean displacement of a half-space is then 0).
 
     Raises:
         SceneError: The gap, force or depth is impossible.
@@ -133,13 +137,13 @@ def press(
     if math.isinf(lowest) or force_n == 0.0 or (depth_mm is not None and depth_mm <= lowest):
         return _no_contact(gap, force_n or 0.0, depth_mm, ())
     softness = layer.plane_modulus_mpa * (1.0 - object_poisson**2) / object_modulus_mpa
-    # A plane on a periodic surface leaves only float32 rounding errors, so periodic problems use float64.
+    # On a periodic surface, a plane displaces nothing but float32 rounding errors, so periodic problems use float64.
     single_precision = padded and tolerance >= SINGLE_PRECISION_TOLERANCE
     surface = ElasticSurface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded, single_precision)
     if depth_mm is not None and not surface.can_change_volume() and depth_mm > gap.mean():
         return _no_contact(gap, math.inf, depth_mm, ("rigid_volume",))
     scale = _scale(pixel_mm, layer.plane_modulus_mpa, force_n, 0.0 if depth_mm is None else depth_mm - lowest)
-    with np.errstate(over="ignore"):  # surfaces that far away never touch
+    with np.errstate(over="ignore"):  # surfaces at such a distance never touch
         scaled = (gap - lowest) / pixel_mm / scale
         scaled[scaled > _SCALED_RANGE[1]] = math.inf
     load = None if force_n is None else 1.0
@@ -148,18 +152,19 @@ def press(
 
 
 def _scale(pixel_mm: float, modulus_mpa: float, force_n: float | None, depth_mm: float) -> float:
-    """Return load or depth in units of pixels and E*. Raise SceneError if it is outside the computable range."""
+    """Return load or depth in units of pixels and the gel's E*; raise SceneError if it is not computable."""
     scale = depth_mm / pixel_mm if force_n is None else force_n / modulus_mpa / pixel_mm / pixel_mm
     if not _SCALED_RANGE[0] < scale < _SCALED_RANGE[1]:
         raise SceneError(
-            f"force / (E* pixel^2) or depth / pixel must be between {_SCALED_RANGE[0]} and {_SCALED_RANGE[1]}, "
-            f"got {scale}; give force, modulus and lengths in consistent units"
+            f"force / (E* pixel^2), with E* = E / (1 - nu^2) of the gel, or depth / pixel must be between "
+            f"{_SCALED_RANGE[0]} and {_SCALED_RANGE[1]}, got {scale}; give force, modulus and lengths in "
+            "consistent units"
         )
     return scale
 
 
 def _no_contact(gap: Floats, force_n: float, depth_mm: float | None, flags: tuple[str, ...]) -> Contact:
-    """Return a contact without pressure; not converged if there was a force to carry."""
+    """Return a contact without pressure; `converged` is False if force_n > 0."""
     lowest = float(gap.min())
     approach = depth_mm if depth_mm is not None else lowest if math.isfinite(lowest) else 0.0
     nothing = np.zeros(gap.shape)
@@ -198,7 +203,7 @@ def _contact(
 
 
 def _is_narrow(touching: npt.NDArray[np.bool_]) -> bool:
-    """Return whether every contact pixel has a neighbour without contact; beyond the border counts as contact."""
+    """Return whether every contact pixel has a neighbour without contact; outside pixels are treated as contact."""
     padded = np.pad(touching, 1, mode="edge")
     around = padded[:-2, 1:-1] & padded[2:, 1:-1] & padded[1:-1, :-2] & padded[1:-1, 2:]
     return bool(touching.any()) and not bool((touching & around).any())
@@ -247,6 +252,6 @@ def _check_load(force_n: float | None, depth_mm: float | None) -> None:
     if (force_n is None) == (depth_mm is None):
         raise SceneError(f"a press must have a force or a depth, got {force_n} N and {depth_mm} mm; give one of them")
     if force_n is not None and not 0.0 <= force_n < math.inf:
-        raise SceneError(f"a force must be finite and not negative, got {force_n} N; a gel does not pull")
+        raise SceneError(f"a force must be finite and not negative, got {force_n} N; a gel cannot pull")
     if depth_mm is not None and not math.isfinite(depth_mm):
         raise SceneError(f"a depth must be finite, got {depth_mm} mm; give the approach from gap = 0")

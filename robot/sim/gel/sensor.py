@@ -51,7 +51,7 @@ class GelSensor:
 
     Attributes:
         layer: the elastic gel.
-        optics: how the surface becomes colours.
+        optics: model that turns the surface into colours.
         rows: rows of the image.
         cols: columns of the image.
         pixel_mm: side of a pixel on the gel.

@@ -89,7 +89,7 @@ class Body(ABC):
 
     @abstractmethod
     def volumes_mm3(self, shell_mm: float) -> tuple[float, float]:
-        """Return the volume of the solid, and of its outermost `shell_mm` alone."""
+        """Return the volume of the solid, and the volume of its outermost `shell_mm`."""
 
     @abstractmethod
     def _cast(self, rays: ClippedRays) -> Vectors:

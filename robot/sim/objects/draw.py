@@ -39,7 +39,7 @@ class SimObject:
 
     @cached_property
     def mass_kg(self) -> float:
-        """Mass as a solid up to 0.6 kg; above, as hollow with a wall of 3 mm, like bottles and castings."""
+        """Mass: solid if at most 0.6 kg, otherwise hollow with a wall of 3 mm, as for bottles and castings."""
         solid, shell = (volume * 1e-9 * self.material.density_kg_m3 for volume in self.body.volumes_mm3(SHELL_MM))
         return solid if solid <= MAX_SOLID_KG else min(solid, shell)
 
@@ -64,7 +64,7 @@ class SimObject:
 def draw_object(seed: int, index: int, *, family: str | None = None, relief: str | None = None) -> SimObject:
     """Draw object `index` of the object set `seed`.
 
-    A pure function of its arguments; expensive work starts when the body is used.
+    The result depends on the arguments only. Expensive work starts when the body is used.
 
     Args:
         seed: number of the object set.

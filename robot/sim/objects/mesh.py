@@ -180,7 +180,7 @@ class MeshBody(Body):
         return distances
 
     def first_faces(self, origins: Vectors, directions: Vectors) -> tuple[Faces, Vectors]:
-        """Return the first mesh face along each ray (-1: none), and for each hit the distance to its plane."""
+        """Return the first mesh face along each ray (-1 for a miss), and for each hit the distance to its plane."""
         face = np.asarray(self._caster.intersects_first(origins, directions), np.int64)
         hit = face >= 0
         normal, corner = self.mesh.face_normals[face[hit]], self.mesh.corners[face[hit], 0]

@@ -161,7 +161,7 @@ def interpolate_heights(height_mm: Floats, u: Floats, v: Floats) -> Floats:
 
 
 def gradients(solid: DisplacedSolid, points: Vectors, step_mm: float) -> Vectors:
-    """Return differences of f, (n, 3), over the corners of a tetrahedron of that size: four evaluations, not six."""
+    """Return differences of f, (n, 3), over the corners of a tetrahedron of that size, by four evaluations."""
     out = np.zeros(points.shape)
     _gradients(solid, _rows_of(solid), points, np.float32(step_mm / 2), out)
     return out
@@ -172,7 +172,7 @@ Rays = tuple[Vectors, Vectors, Vectors, Vectors]
 
 
 def first_hits(solid: DisplacedSolid, rays: Rays, step_mm: float, max_steps: int = MAX_STEPS) -> Vectors:
-    """Return the distance (n,) along each ray to the first zero of f; inf: none.
+    """Return the distance (n,) along each ray to the first zero of f; inf if there is none.
 
     Args:
         solid: the solid.

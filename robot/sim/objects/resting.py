@@ -1,8 +1,8 @@
 """Stable resting poses of a solid on the table.
 
 A solid rests on a side of its convex hull if its centre of mass lies above the polygon of the points that touch the
-table there (Goldberg 1999). Scans are not flat to a micrometre, so points within a millimetre of the table count as
-touching.
+table there (Goldberg 1999). Scans are not flat to a micrometre, so points within a millimetre of the table are
+treated as touching.
 """
 
 import math
@@ -19,7 +19,7 @@ _MIN_TIPPING_RAD = math.radians(4.0)
 """A pose is not stable if a smaller tilt tips the solid over."""
 
 _SAME_COSINE = math.cos(math.radians(20.0))
-"""Sides with normals closer than this count as one side; its most stable pose is used."""
+"""Sides with normals closer than this are treated as one side; its most stable pose is used."""
 
 _MAX_POSES = 6
 
@@ -32,7 +32,7 @@ def stable_up_directions(vertices: Array, centre_of_mass: Array) -> list[Array]:
         centre_of_mass: (3,) its centre of mass.
 
     Returns:
-        At most 6 directions; its own z alone if no pose is stable.
+        At most 6 directions; only its own z if no pose is stable.
     """
     try:
         hull = ConvexHull(vertices)

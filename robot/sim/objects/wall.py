@@ -69,7 +69,7 @@ def bake(shape: Shape, relief: Relief) -> ReliefLevels | None:
 
 
 def bake_plain(chart: Chart, relief: Relief) -> ReliefLevels | None:
-    """Draw relief alone, everywhere; return None for a smooth one."""
+    """Draw only the relief, everywhere; return None for a smooth one."""
     sheet = _sheet(chart)
     height = relief.height(sheet)
     return None if height is None else ReliefLevels(tuple(_levels(height, sheet, np.ones(2, np.float32), 0.0)))

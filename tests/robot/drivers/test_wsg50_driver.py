@@ -172,7 +172,7 @@ def test_it_does_not_home_if_connecting_must_not_move_the_jaws():
     emulator = EmulatedWSG50(referenced=False, speed_up=20.0)
     with gripper_with_emulator(emulator=emulator, connect=False) as (gripper, _):
         gripper.may_move = False
-        with pytest.raises(DeviceError, match="has lost its reference, and homing is not allowed now"):
+        with pytest.raises(DeviceError, match="has lost its reference and must be homed, but motion is not allowed"):
             gripper.connect()
     assert HOME not in emulator.received
     assert emulator.opening_mm == 50.0

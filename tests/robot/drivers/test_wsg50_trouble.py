@@ -71,7 +71,7 @@ def test_after_a_fast_stop_every_call_raises_until_recovery(port):
 def test_the_cause_of_a_fast_stop_is_named(fault, text):
     with gripper_with_emulator() as (gripper, emulator):
         emulator.fail(fault)
-        with pytest.raises(DeviceError, match=f"FAST STOP: {text};"):
+        with pytest.raises(DeviceError, match=f"FAST STOP or in an error state: {text};"):
             gripper.state()
 
 

@@ -229,7 +229,7 @@ def test_zarr_opens_an_open_x_tactile_export(source, tmp_path):
     assert np.isnan(store["meta/force_n"][0])
     assert store["meta/pose"][1].tolist() == [1.0, 2.0, 3.0, 0.5]
     assert result.notes == (
-        "frames after the touch are left out because some grasps do not have them",
+        "the frames after the touch are left out because some grasps do not have them",
         "photo: 1 grasp(s) had another size and were resized to 40 x 30 with black borders",
     )
 

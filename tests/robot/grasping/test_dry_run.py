@@ -45,7 +45,7 @@ def test_a_tilt_is_reported_and_is_refused_for_an_arm_that_cannot_tilt():
     assert reports == ["arm: to x 0.0, y 0.0, z 100.0 mm, yaw 0.000 rad, tilt 1.571 rad, at 100 mm/s"]
     with (
         make_dry_run(FakeRig(5), print) as dry,
-        pytest.raises(DeviceError, match="tilt must be 0, because its fingers always point down"),
+        pytest.raises(DeviceError, match="tilt must be 0, because the fingers always point down"),
     ):
         dry.arm.move_to(pose, 100.0)
 

@@ -41,7 +41,7 @@ def test_the_folder_names_the_object_and_touches_are_in_the_order_of_their_numbe
     assert {grasp.object_id for grasp in recording.grasps} == {"mug", "tin can"}
 
 
-def test_touches_are_assigned_to_the_photos_of_their_object_in_turn(source, tmp_path):
+def test_photos_are_assigned_to_the_touches_of_their_object_cyclically(source, tmp_path):
     recording = import_folder(source, tmp_path / "out")
     photos = [photo_of(recording, source, number) for number in range(3)]
     assert photos == ["mug/photo_1.jpg", "mug/photo_2.jpg", "mug/photo_1.jpg"]
@@ -81,11 +81,11 @@ def test_fingers_are_combined_and_a_grasp_with_a_missing_finger_is_skipped(tmp_p
     assert recording.info["background"] != "none"
 
 
-def test_the_second_touch_with_the_same_words_is_skipped(source, tmp_path):
+def test_the_second_picture_of_a_grasp_and_finger_is_skipped(source, tmp_path):
     picture(source / "mug/touch_1.jpg", 77)
     recording = import_folder(source, tmp_path / "out")
     assert ids_of(recording)[0] == ("mug-1", "mug")
-    assert recording.info["skipped"] == {"another touch has the same words in its path": 1}
+    assert recording.info["skipped"] == {"another picture of the same grasp and finger was found": 1}
 
 
 def test_links_to_other_folders_are_followed_without_cycles(source, tmp_path):
@@ -186,7 +186,7 @@ def test_invalid_lines_are_skipped_by_reason(source, tmp_path, kind):
     recording = import_folder(source, tmp_path / "out", pairs=name)
     assert ids_of(recording) == [("mug-1", "mug")]
     assert recording.info["skipped"] == {
-        "its line has no object, no photo or not all touches": 1,
+        "its line lacks the object, the photo or a touch": 1,
         "a path must be relative to the folder and lead to a file below it": 1,
         "force_n, opening_mm, time_s must be numbers": 1,
         "its touch a is missing": 1,

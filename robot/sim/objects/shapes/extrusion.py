@@ -239,7 +239,7 @@ class Extrusion(Shape):
         return 1 - np.float32(self.taper / self.height_mm) * np.clip(z, 0, np.float32(self.height_mm))
 
     def straighten(self, x: Floats, y: Floats, z: Floats) -> tuple[Floats, Floats, Floats | None]:
-        """Undo twist and taper; return coordinates in the outline's plane, and its relative size (None: 1)."""
+        """Undo twist and taper; return coordinates in the outline's plane, and its relative size (None for 1)."""
         if self.twist_per_mm:
             turn = np.float32(self.twist_per_mm) * np.clip(z, 0, np.float32(self.height_mm))
             sine, cosine = np.sin(turn), np.cos(turn)
