@@ -154,7 +154,9 @@ def require_folder(path: Path) -> None:
         BadInput: The folder does not exist.
     """
     if not path.parent.is_dir():
-        raise BadInput(f"{path} cannot be written: the folder {path.parent} does not exist. Create it, or name another file.")
+        raise BadInput(
+            f"{path} cannot be written: the folder {path.parent} does not exist. Create it, or name another file."
+        )
 
 
 def write_output(path: Path, data: bytes, kind: Kind) -> None:
