@@ -86,7 +86,8 @@ class SimSettings(TypedSettings):
 
     Attributes:
         fingers: fingers with a gel.
-        optics: led, grey (white lamps, a grey camera), or a sensor fitted to real presses (gelsight, gelsight_mini).
+        optics: led, grey (white lamps, a grey camera), varied (sensors of any make), or a sensor fitted to real
+            presses (gelsight, gelsight_mini).
         gels: number of gel pairs; the objects are divided between them.
         markers: whether the gels have black dots.
         families: shape families to draw from; all if empty.
@@ -166,15 +167,15 @@ class SimRig(Rig):
             grid=options.contact_grid, tolerance=options.contact_tolerance, turns_about_grip=self.meshes is not None
         )
         drawn = np.random.default_rng([103, seed]).integers(2**31, size=options.gels)
-        dots = Markers() if options.markers else None
         fingers, known = options.fingers, parse_gel_settings(options.gel, options.fingers)
         self._gels = [
-            {
-                finger: replace(draw_sensor(int(pair), finger, optics=options.optics, gel=known[finger]), markers=dots)
-                for finger in fingers
-            }
+            {finger: draw_sensor(int(pair), finger, optics=options.optics, gel=known[finger]) for finger in fingers}
             for pair in drawn
         ]
+        if options.markers:
+            self._gels = [
+                {finger: replace(sensor, markers=Markers()) for finger, sensor in pair.items()} for pair in self._gels
+            ]
         self._camera = PinholeCamera(focal_px=options.focal_px)
         clock, self.error_mm = SimClock(), _calibration_error(seed, options.localisation_mm)
         self.sim_state = SimState(clock)

@@ -6,7 +6,7 @@ effects of a sensor (tint, dust, blur, noise) are in `robot.sim.gel.sensor`.
 LEDs (SIMULATION: near-field LED): a point source at s with axis o and emission order m lights the point p of a matt
 surface with normal n by w = max(0, n . d) max(0, -o . d)^m / |s - p|^2, d = (s - p) / |s - p|. One colour is a bar of
 such points. The unpressed gel has w_flat, and the picture is
-    I_c = backdrop_c * (ambient + (1 - ambient) * sum_b mix_cb * shade_b * w_b / w_flat_b),
+    I_c = backdrop_c * (ambient + (1 - ambient) * sum_b mix_cb * shade_b * w_b / w_flat_b)^gamma,
 so the effects that the backdrop contains (the lamp's falloff, the vignette of the lens) are not counted twice.
 """
 
@@ -111,30 +111,36 @@ MINI_MIX = ((0.76, 0.19, 0.05), (0.23, 0.69, 0.08), (0.07, 0.07, 0.86))
 
 @dataclass(frozen=True)
 class LedOptics(Optics):
-    """Three bars of near-field LEDs.
+    """Bars of near-field LEDs.
 
     Attributes:
-        bars: the three bars.
+        bars: the bars, at least one.
         backdrops: the unpressed gel, one for each channel.
-        mix: contribution of each bar to each channel; each row adds up to 1.
+        mix: contribution of each bar (columns) to each channel (rows); each row adds up to 1.
         ambient: fraction of the light that comes from all directions (reflected inside the gel).
         shadow: fraction of a bar's light that the surface can block; 0 skips cast shadows.
+        gamma: exponent of the camera's response; the flat gel does not depend on it.
 
     Raises:
-        RobotConfigError: A fraction is outside 0 to 1, or a row of `mix` does not add up to 1.
+        RobotConfigError: A fraction is outside 0 to 1, `gamma` is not above 0, or `mix` does not fit the bars.
     """
 
-    bars: tuple[LedBar, LedBar, LedBar] = MINI_BARS
+    bars: tuple[LedBar, ...] = MINI_BARS
     backdrops: tuple[GaussianBackdrop, GaussianBackdrop, GaussianBackdrop] = MINI_BACKDROPS
-    mix: tuple[Triple, Triple, Triple] = MINI_MIX
+    mix: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]] = MINI_MIX
     ambient: float = 0.38
     shadow: float = 0.25
+    gamma: float = 1.0
 
     def __post_init__(self) -> None:
         if not (0 <= self.ambient <= 1 and 0 <= self.shadow <= 1):
             raise RobotConfigError(f"ambient and shadow must be 0 to 1, got {self.ambient} and {self.shadow}")
+        if not self.bars or any(len(row) != len(self.bars) for row in self.mix):
+            raise RobotConfigError(f"mix must have a column for each of the {len(self.bars)} bars, got {self.mix}")
         if any(abs(sum(row) - 1) > 1e-6 or min(row) < 0 for row in self.mix):
             raise RobotConfigError(f"each row of mix must be fractions that add up to 1, got {self.mix}")
+        if not 0 < self.gamma < math.inf:
+            raise RobotConfigError(f"gamma must be above 0, got {self.gamma}")
 
     def backdrop(self, field: Field) -> Array:
         """Return the three backdrops (rows, cols, 3)."""
@@ -149,9 +155,9 @@ class LedOptics(Optics):
             for shade, cast in zip(shades, cast_shadows(surface, self.bars), strict=True):
                 shade -= np.float32(self.shadow) * cast
         axes, mix, ambient = (x.ravel(), y.ravel()), np.array(self.mix, np.float32), np.float32(self.ambient)
-        out = np.empty((field.rows, field.cols, 3), np.float32)
-        shade_by_bars(np.stack(slopes), leds, strengths, axes, shades, mix, ambient, self.backdrop(field), out)
-        return out
+        out, backdrop = np.empty((field.rows, field.cols, 3), np.float32), self.backdrop(field)
+        shade_by_bars(np.stack(slopes), leds, strengths, axes, shades, mix, ambient, backdrop, out)
+        return out if self.gamma == 1 else backdrop * (out / backdrop) ** np.float32(self.gamma)
 
 
 @lru_cache(maxsize=16)

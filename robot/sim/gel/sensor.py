@@ -61,6 +61,8 @@ class GelSensor:
         noise: camera noise.
         flaws: dust, hairs, grains and roughness, or None.
         markers: printed dots, or None.
+        detail: resolution of the camera as a fraction of the picture's; the picture is scaled down and up again.
+        jpeg_quality: quality (1 to 100) at which the camera compresses the picture; None: no compression.
 
     Raises:
         RobotConfigError: A setting is out of range.
@@ -77,6 +79,8 @@ class GelSensor:
     noise: Noise = _PLAIN_NOISE
     flaws: Flaws | None = None
     markers: Markers | None = None
+    detail: float = 1.0
+    jpeg_quality: int | None = None
 
     def __post_init__(self) -> None:
         Field(self.rows, self.cols, self.pixel_mm)
@@ -85,6 +89,11 @@ class GelSensor:
             raise RobotConfigError(f"tint and exposure must be above 0 and blur_px 0 or more, got {self}")
         if not (0 <= self.noise.read < math.inf and 0 <= self.noise.shot < math.inf):
             raise RobotConfigError(f"noise must be 0 or more grey levels, got {self.noise}")
+        if not 0 < self.detail <= 1 or not (self.jpeg_quality is None or 1 <= self.jpeg_quality <= 100):
+            raise RobotConfigError(
+                f"detail must be above 0 and at most 1 and jpeg_quality 1 to 100 or None, got {self.detail} and "
+                f"{self.jpeg_quality}"
+            )
 
     @property
     def gel(self) -> GelSettings:
@@ -133,7 +142,18 @@ class GelSensor:
         return cv2.GaussianBlur(image, (0, 0), self.blur_px) if self.blur_px > 0 else image
 
     def capture(self, clean: Array, seed: int) -> Picture:
-        """Return the camera's picture of `clean`: with noise, rounded and clipped to 0..255."""
+        """Return the camera's picture of `clean`: noisy, rounded, clipped to 0..255, reduced and compressed."""
+        picture = self._add_noise(clean, seed)
+        if self.detail < 1:
+            rows, cols = (max(1, round(self.detail * size)) for size in picture.shape[:2])
+            small = cv2.resize(picture, (cols, rows), interpolation=cv2.INTER_AREA)
+            picture = np.asarray(cv2.resize(small, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
+        if self.jpeg_quality is not None:
+            data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])[1]
+            picture = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), np.uint8)[..., ::-1]
+        return picture
+
+    def _add_noise(self, clean: Array, seed: int) -> Picture:
         if self.noise.read == 0 and self.noise.shot == 0:
             return np.clip(np.rint(clean), 0, 255).astype(np.uint8)
         out = np.empty(clean.shape, np.uint8)
@@ -186,7 +206,7 @@ def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings
     Args:
         seed: seed of the sensor.
         finger: name of its finger.
-        optics: led, grey, or the name of a fitted sensor.
+        optics: led, grey, varied (a sensor of any make), or the name of a fitted sensor.
         gel: known properties of the gel; all others are drawn as without it.
 
     Raises:
@@ -214,7 +234,8 @@ def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings
         noise=Noise(float(rng.uniform(0.6, 1.1)), float(rng.uniform(0.003, 0.012))),
         flaws=_draw_flaws(rng),
     )
-    return replace(sensor, optics=OPTICS[optics](rng))
+    sensor = replace(sensor, optics=OPTICS[optics](rng))
+    return _draw_camera(sensor, rng) if optics == "varied" else sensor
 
 
 def _triple(values: Any) -> Triple:
@@ -240,7 +261,7 @@ def _draw_led(rng: np.random.Generator) -> LedOptics:
         _draw_backdrop(backdrop, float(gain), rng) for backdrop, gain in zip(MINI_BACKDROPS, power, strict=True)
     )
     return LedOptics(
-        bars,  # type: ignore[arg-type]
+        bars,
         backdrops,  # type: ignore[arg-type]
         ambient=float(rng.uniform(0.33, 0.43)),
         shadow=float(rng.uniform(0.15, 0.35)),
@@ -252,7 +273,68 @@ def _draw_grey(rng: np.random.Generator) -> LedOptics:
     bars = tuple(_draw_bar(replace(bar, angle_rad=bar.angle_rad + math.radians(40)), rng) for bar in MINI_BARS)
     backdrop = _draw_backdrop(MINI_BACKDROPS[1], float(np.exp(0.04 * rng.standard_normal())), rng)
     row = 0.55, 0.3, 0.15
-    return LedOptics(bars, (backdrop,) * 3, (row,) * 3, ambient=0.45, shadow=0.2)  # type: ignore[arg-type]
+    return LedOptics(bars, (backdrop,) * 3, (row,) * 3, ambient=0.45, shadow=0.2)
+
+
+def _draw_varied(rng: np.random.Generator) -> LedOptics:
+    """Draw the lamps of any make: 1 to 6 bars of any colour and place, white or coloured, a camera of any gamma.
+
+    The ranges contain GelSight Mini, Wedge and DIGIT and go beyond them, so that a tower trained on such sensors does
+    not depend on one make (domain randomisation, Tobin et al., IROS 2017).
+    """
+    count, is_grey = int(rng.integers(1, 7)), bool(rng.uniform() < 0.25)
+    angles = rng.uniform(0, 2 * math.pi) + np.arange(count) * 2 * math.pi / count + 0.35 * rng.standard_normal(count)
+    bars = tuple(
+        LedBar(
+            float(angle),
+            distance_mm=float(rng.uniform(11, 22)),
+            height_mm=float(rng.uniform(3, 16)),
+            length_mm=float(rng.uniform(1, 14)),
+            points=int(rng.integers(1, 5)),
+            order=float(rng.uniform(0.5, 2.0)),
+        )
+        for angle in angles
+    )
+    rows = rng.dirichlet(np.full(count, rng.uniform(0.3, 2.0)), size=3)
+    backdrops = tuple(_draw_any_backdrop(rng) for _ in range(3))
+    if is_grey:
+        rows, backdrops = rows[[0, 0, 0]], backdrops[:1] * 3
+    return LedOptics(
+        bars,
+        backdrops,  # type: ignore[arg-type]
+        tuple(tuple(float(value) for value in row / row.sum()) for row in rows),  # type: ignore[arg-type]
+        ambient=float(rng.uniform(0.15, 0.6)),
+        shadow=float(rng.uniform(0, 0.4)),
+        gamma=float(np.exp(rng.uniform(-0.5, 0.5))),
+    )
+
+
+def _draw_any_backdrop(rng: np.random.Generator) -> GaussianBackdrop:
+    """Draw a channel of the flat gel: dark to bright, its maximum anywhere, with a weak or strong vignette."""
+    x0, y0 = (float(value) for value in rng.uniform(-0.6, 0.6, 2))
+    width_x, width_y = (float(value) for value in np.exp(rng.uniform(-0.5, 1.2, 2)))
+    slant_x, slant_y = (float(value) for value in rng.uniform(-18, 18, 2))
+    return GaussianBackdrop(
+        float(rng.uniform(15, 90)), float(rng.uniform(15, 130)), x0, y0, width_x, width_y, slant_x, slant_y
+    )
+
+
+def _draw_camera(sensor: GelSensor, rng: np.random.Generator) -> GelSensor:
+    """Return the sensor with the camera of any make: scale, colour, noise, resolution, compression, markers."""
+    pitch_mm = float(rng.uniform(0.8, 2.5))
+    markers = Markers(pitch_mm, pitch_mm * float(rng.uniform(0.08, 0.22)), float(rng.uniform(0.3, 0.9)))
+    has_markers, is_reduced, is_compressed = (bool(value) for value in rng.uniform(size=3) < (0.25, 0.5, 0.5))
+    return replace(
+        sensor,
+        pixel_mm=float(rng.uniform(0.045, 0.08)),
+        tint=_triple(np.exp(0.08 * rng.standard_normal(3))),
+        exposure=float(np.exp(rng.uniform(-0.3, 0.3))),
+        blur_px=float(rng.uniform(0.4, 2.0)),
+        noise=Noise(float(rng.uniform(0.3, 3.0)), float(rng.uniform(0.002, 0.03))),
+        markers=markers if has_markers else None,
+        detail=float(rng.uniform(0.3, 1.0)) if is_reduced else 1.0,
+        jpeg_quality=int(rng.integers(40, 96)) if is_compressed else None,
+    )
 
 
 def _draw_bar(bar: LedBar, rng: np.random.Generator) -> LedBar:
@@ -285,6 +367,7 @@ def _draw_backdrop(backdrop: GaussianBackdrop, gain: float, rng: np.random.Gener
 OPTICS: dict[str, Callable[[np.random.Generator], Optics]] = {
     "led": _draw_led,
     "grey": _draw_grey,
+    "varied": _draw_varied,
     "gelsight": lambda _: load_fitted("gelsight"),
     "gelsight_mini": lambda _: load_fitted("gelsight_mini"),
 }

@@ -97,7 +97,7 @@ HARD = {
 
 
 @pytest.mark.parametrize("name", HARD)
-@pytest.mark.parametrize("kind", ["led", "grey", *fitted_names()])
+@pytest.mark.parametrize("kind", ["led", "grey", "varied", *fitted_names()])
 def test_hard_surfaces_give_pictures(name, kind):
     sensor = replace(draw_sensor(0, "a", optics=kind), rows=24, cols=32, pixel_mm=0.5, markers=Markers())
     clean = sensor._render_surface(Surface(HARD[name], sensor.field))
@@ -209,6 +209,7 @@ def test_shadows_are_computed_only_on_demand(monkeypatch):
 @pytest.mark.parametrize("kind", OPTICS)
 def test_a_flat_gel_shows_the_backdrop_and_render_of_nothing_is_the_background(kind):
     sensor = replace(draw_sensor(1, "a", optics=kind), flaws=None, blur_px=0.0, tint=(1.0, 1.0, 1.0), exposure=1.0)
+    sensor = replace(sensor, markers=None, detail=1.0, jpeg_quality=None)
     quiet = replace(sensor, noise=SILENT)
     backdrop = np.clip(np.rint(quiet.optics.backdrop(quiet.field)), 0, 255)
     assert np.abs(quiet.background(0) - backdrop).max() <= 1  # a tie may round either way
@@ -310,8 +311,55 @@ def test_other_wrong_settings_are_refused():
         draw_sensor(0, "")
 
 
+def test_mix_must_fit_the_bars_and_gamma_must_be_positive():
+    with pytest.raises(RobotConfigError, match="a column for each of the 1 bars"):
+        LedOptics(bars=(LedBar(0.0),))
+    with pytest.raises(RobotConfigError, match="gamma must be above 0, got 0"):
+        LedOptics(gamma=0.0)
+    for wrong in ({"detail": 0.0}, {"detail": 1.5}, {"jpeg_quality": 0}, {"jpeg_quality": 101}):
+        with pytest.raises(RobotConfigError, match="detail must be above 0 and at most 1 and jpeg_quality 1 to 100"):
+            small_sensor(**wrong)
+
+
+def test_gamma_is_the_exponent_of_the_light_relative_to_the_flat_gel():
+    plain, steep = (small_sensor(optics=LedOptics(gamma=gamma, shadow=0.0)) for gamma in (1.0, 2.0))
+    surface = Surface(dome(), SMALL)
+    backdrop = plain.optics.backdrop(SMALL)
+    light = plain.optics.colours(surface, surface.slopes) / backdrop
+    np.testing.assert_allclose(steep.optics.colours(surface, surface.slopes), backdrop * light**2, rtol=1e-4)
+    flat = Surface(np.zeros((1, 1)), SMALL)
+    np.testing.assert_allclose(steep.optics.colours(flat, flat.slopes), backdrop, rtol=1e-4)
+
+
+def test_a_camera_of_less_detail_blurs_noise_and_compression_changes_the_picture_slightly():
+    sensor = draw_sensor(2, "a")
+    sharp, reduced, compressed = (
+        replace(sensor, **change).background(3).astype(float) for change in ({}, {"detail": 0.25}, {"jpeg_quality": 60})
+    )
+    roughness = [np.abs(np.diff(picture, axis=1)).mean() for picture in (sharp, reduced)]
+    assert roughness[1] < 0.5 * roughness[0]
+    assert abs(reduced.mean() - sharp.mean()) < 1
+    assert 0 < np.abs(compressed - sharp).mean() < 4
+
+
+def test_varied_sensors_have_any_number_of_lamps_colours_markers_and_cameras():
+    sensors = [draw_sensor(seed, "a", optics="varied") for seed in range(60)]
+    assert sensors[7] == draw_sensor(7, "a", optics="varied")
+    assert len(set(sensors)) == 60
+    assert {len(sensor.optics.bars) for sensor in sensors} == set(range(1, 7))
+    greys = sum(len(set(sensor.optics.backdrops)) == 1 for sensor in sensors)
+    dotted = sum(sensor.markers is not None for sensor in sensors)
+    reduced = sum(sensor.detail < 1 for sensor in sensors)
+    compressed = sum(sensor.jpeg_quality is not None for sensor in sensors)
+    for count, probability in ((greys, 0.25), (dotted, 0.25), (reduced, 0.5), (compressed, 0.5)):
+        assert abs(count / 60 - probability) < 0.2  # three standard deviations
+    for sensor in sensors[:20]:
+        small = replace(sensor, rows=48, cols=64, pixel_mm=5 * sensor.pixel_mm)
+        assert 10 < small.background(0).mean() < 245
+
+
 def test_an_unknown_optics_lists_the_known_ones():
-    with pytest.raises(UnknownName, match="'lamp'; known are gelsight, gelsight_mini, grey, led"):
+    with pytest.raises(UnknownName, match="'lamp'; known are gelsight, gelsight_mini, grey, led, varied"):
         draw_sensor(0, "a", optics="lamp")
     with pytest.raises(UnknownName, match="known are gelsight, gelsight_mini"):
         load_fitted("../gelsight")
