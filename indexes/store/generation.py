@@ -32,7 +32,7 @@ DOCUMENT_BYTES, DOCUMENT_BYTES_PER_ROW = 2**18, 2**12
 SHOWN_IDS = 5
 MAX_CHECKED_RESULTS = 1000
 OLD_SAMPLE_DIVISOR = 16
-"""Factor by which fewer rows are checked if the parent (the generation whose rows are reused) already had them."""
+"""A self-check samples this many times fewer rows of old slots (those of the parent, whose rows are reused)."""
 
 
 class Generation:

@@ -2,8 +2,8 @@
 
 The gallery of a row excludes the photos of its own grasps, which have object, light and pose in common with it. The
 protocols `with_own` and `paired` of other benchmarks include them. A row without any other photo of its object is no
-query; the description of the gallery states their number. Other objects have equal weight, however many photos they
-have.
+query; the description of the gallery states their number. In pair and K-way tests other objects have equal weight,
+however many photos they have; in rankings of the whole gallery each photo counts.
 """
 
 import numpy as np

@@ -132,7 +132,7 @@ class Posterior:
         return self.slope / (1 + self.dependence * (grasps - 1))
 
     def log_ratio(self, logits: ArrayLike, grasps: int) -> Floats:
-        """Return log-ratios of the likelihoods of the grasps: objects with these logits to one that is absent."""
+        """Return log likelihood ratios of objects with these logits to an object that the catalogue lacks."""
         return self.weight(grasps) * _finite(logits, "every logit") + self.offset
 
     def logit_of(self, log_ratio: Floats, grasps: int) -> Floats:
@@ -256,7 +256,7 @@ def _finite(values: ArrayLike, name: str) -> Floats:
 CATALOGUE_SIZES = (20, 1000)
 """Objects of the catalogues of a fit; at most all but one of the validation objects."""
 MIN_OBJECTS = 3
-"""Smallest number of objects of a fit: without the true object, a catalogue of two has one object."""
+"""Smallest number of objects of a fit; with two objects, every catalogue would have only one."""
 _SETS = 4
 _SEARCH = {"xatol": 1e-4, "fatol": 1e-9, "maxiter": 2000}
 
@@ -292,7 +292,7 @@ def identification_trials(scored: ScoredTouches, seed: int) -> Iterator["Identif
     """Yield the trials of single touches, then of sets of two grasps, three and so on, while objects have enough."""
     for grasps in range(1, MAX_GRASPS + 1):
         rng = np.random.default_rng([seed, grasps])
-        sets = []  # each of touches of one object that has an unmasked photo; for one grasp every touch
+        sets = []  # each: touches of one object that leave it an unmasked photo; all touches singly for one grasp
         for name in np.unique(scored.touch_owner):
             touches = np.flatnonzero(scored.touch_owner == name)
             draws = touches[:, None] if grasps == 1 else [rng.permutation(touches)[:grasps] for _ in range(_SETS)]

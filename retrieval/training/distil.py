@@ -5,8 +5,8 @@ softmax of these scores over the photos. This loss gives the top of the ranking,
 large weight.
 
 Training examples are mixup blends of two recorded partial activations, so a few thousand recorded photos represent a
-large catalogue. The head's term is affine in the normalised features: its blend is that of the blended features. The
-embedding part (`cosine`) is blended too, and is then shorter than the embedding of a real image.
+large catalogue. The head's term is affine in the normalised features, so a blend of two terms is the term of the
+blended features. The embedding part (`cosine`) is blended too, and is then shorter than that of a real image.
 
 In a large catalogue many photos score nearly as high as the exhaustive top-1; a few thousand photos contain few such
 hard negatives. Therefore most photos of a batch are the nearest ones, by the current student, in a large pool of

@@ -165,7 +165,7 @@ def choose_by_agreement(bench: SearchBench, requirements: SearchRequirements) ->
 def choose_by_neighbours(vectors: Floats, slots: Slots, requirements: SearchRequirements) -> OperatingPoint:
     """Choose only the kind, by recall of nearest neighbours, for a checkpoint that stores no touches.
 
-    Without a time bound, nothing is measured.
+    Without a time bound, or with a required kind, nothing is measured.
 
     Args:
         vectors: Unit embeddings (S, d) float32.

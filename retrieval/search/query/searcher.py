@@ -39,8 +39,8 @@ Floats = NDArray[np.float32]
 class Searcher:
     """An opened index with its model.
 
-    Any number of threads may query it at once, and forked processes too: no thread or lock outlives a query. Close it
-    with `close` or a `with` block; running queries then finish.
+    Any number of threads may query it at once, and forked processes too: each opens its own ONNX session. Close it with
+    `close` or a `with` block; running queries then finish.
 
     >>> searcher = retrieval.open("index")
     >>> one = searcher.query(["a.png", "b.png"], top=2)
@@ -168,9 +168,9 @@ class Searcher:
                 with `image[..., ::-1]`. A file and its decoded array give the same answer.
             background: The fingers' no-contact frames, for a model that uses them.
             top: Number of objects to return.
-            candidates: Number of photos to rerank in each shard, at least `top`: those nearest to the sum of the
-                grasps' embeddings, and the rest of the best objects. Default: as measured by `build-index`. All are
-                scored if the catalogue has no more photos, or if the model has no trained embeddings.
+            candidates: Number of photos to rerank in each shard, raised to `top` if smaller: those nearest to the sum
+                of the grasps' embeddings. The best objects' other photos are scored too. Default: as measured by
+                `build-index`. All are scored if there are no more photos, or if the model has no trained embeddings.
             none_prior: Prior probability that the catalogue lacks the object.
 
         Raises:

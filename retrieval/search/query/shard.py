@@ -127,7 +127,7 @@ class Shard(Protocol):
         """
 
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
-        """Return the rows of photos, and of gel images of reference touches, which have `touch`; None if missing."""
+        """Return the row of each photo or gel image of a reference touch (with the key `touch`); None if missing."""
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """Return a page of the photos that contain all words in object, path or metadata.
