@@ -1,7 +1,7 @@
 """A catalogue: a folder of photos to search, with the user's own metadata.
 
-    catalog/<object_id>/<photo>     the first folder names the object, at any depth of the photo below it
-    catalog/<object_id>.<ext>       or one photo per object, named by its file; other rules: retrieval.data.naming
+    catalog/<object_id>/<photo>     the first folder names the object; the photo may be at any depth below it
+    catalog/<object_id>.<ext>       or one photo per object, named like the object; other rules: retrieval.data.naming
     catalog/<object_id>/touch_*     a gel image: a touch of the object (retrieval.data.catalogue_touches)
     catalog/metadata.jsonl          optional: one JSON object per line, with `file_name` (a photo's path in the
                                     catalogue) or `object_id` (all its photos) and any other keys; a photo's
@@ -133,7 +133,7 @@ class Catalogue:
 def require_separate_folders(catalogue: str | Path, index: str | Path) -> None:
     """Check that an index folder contains no photos of the catalogue.
 
-    A folder of the catalogue without photos may be an index, such as `./index` in the catalogue `.`.
+    An index may be a folder below the catalogue that contains no photos, such as `./index` in the catalogue `.`.
 
     Raises:
         BadInput: The index folder is the catalogue folder, or a folder below it that contains photos.
@@ -164,8 +164,8 @@ def list_catalogue(
         folder_cache: Names that earlier builds listed in unchanged folders; this call updates it.
 
     Raises:
-        DatasetError: The folder does not exist, contains neither photo nor touch, or none that fits the naming; or
-            the metadata are invalid.
+        DatasetError: The folder does not exist, contains no photo or touch, or only ones that do not fit the
+            naming; or the metadata are invalid.
     """
     root, naming = Path(folder), naming or Naming()
     if not root.is_dir():

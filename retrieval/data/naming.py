@@ -1,6 +1,6 @@
 """Derive the object of a photo from its path in the catalogue: the rule of `build-index --objects-from`.
 
-    folder     the first folder, at any depth of the photo below it; a photo in no folder is named by its file
+    folder     the first folder, also for photos in its subfolders; without a folder, the name of the file
     stem       the file's name without extension and without a number at the end, in any folder:
                mug_0.jpg, mug-12.jpg and "mug (3).jpg" show mug
     PATTERN    a path in which {object} stands for the name, and any other word in braces for an ignored part:

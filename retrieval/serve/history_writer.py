@@ -171,7 +171,10 @@ class HistoryWriter:
             return HttpProblem("not-ready", f"Query {query_id} is still being stored. Try again.", {"retry-after": "1"})
         if query_id in self._failures:
             return HttpProblem("unknown", f"Query {query_id} could not be stored: {self._failures[query_id]}")
-        return HttpProblem("unknown", f"The history has no query {query_id[:64]!r}. Only the newest are kept.")
+        return HttpProblem(
+            "unknown",
+            f"The history has no query {query_id[:64]!r}. Of queries without feedback, only the newest are kept.",
+        )
 
     def close(self) -> None:
         """Stop the writer and close the database. Pending queries are not written; call `drain` first."""

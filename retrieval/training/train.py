@@ -90,7 +90,7 @@ def train(
     >>> import dataclasses
     >>> from pathlib import Path
     >>> config = retrieval.load_config("tiny").using(losses={"contrastive": 1.0, "sigmoid": 0.1})
-    >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))  # a real one takes thousands
+    >>> config = dataclasses.replace(config, training=config.training.with_iterations(2))  # preset small: 500 steps
     >>> made = retrieval.train("lab", Path("lab.safetensors"), config, quiet=True)
     >>> made.provenance["step"], len(made.split.train)
     (2, 7)
@@ -343,7 +343,7 @@ class Trainer:
     def _load_own_checkpoint(self) -> Checkpoint:
         """Return the best checkpoint so far, which is part of the state.
 
-        After a crash between the two writes it is newer than the state; repeating the steps gives the same result.
+        After a crash between writing it and the state, it is newer; repeating the steps gives the same result.
         """
         stored = load_checkpoint(self.out)
         mine = (stored.split, stored.provenance.get("data_digest")) == (self.split, self.data_digest)

@@ -39,8 +39,8 @@ Floats = NDArray[np.float32]
 class Searcher:
     """An opened index with its model.
 
-    Any number of threads may query it at once, and forked processes too: each opens its own ONNX session. Close it with
-    `close` or a `with` block; running queries then finish.
+    Any number of threads may query it at once, and so may forked processes. Close it with `close` or a `with` block;
+    running queries then finish.
 
     >>> searcher = retrieval.open("index")
     >>> one = searcher.query(["a.png", "b.png"], top=2)

@@ -169,7 +169,7 @@ def test_feedback_on_a_deleted_query_is_refused(client, touches, monkeypatch):
     read = iter([store.query(name)])  # the first read, just before the query is deleted
     store._database.execute("DELETE FROM queries")
     monkeypatch.setattr(store, "query", lambda name: next(read, None))
-    assert "Only the newest are kept" in problem(add_feedback(client, name, "none"), 404, "unknown")
+    assert "only the newest are kept" in problem(add_feedback(client, name, "none"), 404, "unknown")
 
 
 def test_a_file_of_another_program_is_no_history(tmp_path):
