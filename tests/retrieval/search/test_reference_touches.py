@@ -159,7 +159,7 @@ def test_pages_and_tables_show_the_nearest_touch(catalogue_with_touches, calibra
     page = query_html(result, catalogue_with_touches)
     assert page.count('alt="reference touch"') == 8  # two fingers of each of four objects
     assert "no photo: scored by its touches only" in page
-    assert "fitted on 40 touches of 20 objects" in page
+    assert "calibrated on 40 touches of 20 objects" in page
     print_table(result)
     table = capsys.readouterr().out
     assert "nearest touch" in table
