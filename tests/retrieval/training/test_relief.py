@@ -201,14 +201,14 @@ def test_the_command_line_collects_pictures_and_trains_on_them(quick, tmp_path, 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["collect", "--photos-only", "--touches-only", "--out", "x"], "go alone"),
-        (["collect", "--photos-only", "--preview", "--out", "x"], "go alone"),
-        (["train", "x", "--task", "relief", "--out", "y.safetensors", "--init-photo", "z"], "needs no split"),
+        (["collect", "--photos-only", "--touches-only", "--out", "x"], "cannot be combined"),
+        (["collect", "--photos-only", "--preview", "--out", "x"], "cannot be combined"),
+        (["train", "x", "--task", "relief", "--out", "y.safetensors", "--init-photo", "z"], "does not take --split"),
         (
             ["train", "x", "--task", "grasp-success", "--out", "y.safetensors", "--init-photo", "z"],
-            "--init-photo is of",
+            "--init-photo does not apply",
         ),
-        (["train", "x", "--task", "relief", "--out", "y.safetensors", "--iterations", "0"], "0 is not from 1"),
+        (["train", "x", "--task", "relief", "--out", "y.safetensors", "--iterations", "0"], "must be from 1 to"),
         (["train", "x", "--task", "relief", "--out", "y.safetensors"], "--photos-only"),
     ],
 )
