@@ -179,7 +179,7 @@ WRONG_USE = {
     "no grasps": (["collect", "--grasps", "0", "--out", "rec"], "grasps"),
     "too many objects": (["collect", "--objects", "100001", "--out", "rec"], "at most 100000 objects"),
     "no such gate": (["collect", "--gate", "none.safetensors", "--out", "rec"], "none.safetensors"),
-    "not an empty folder": (["collect", "--out", "catalog"], "catalog holds other files"),
+    "not an empty folder": (["collect", "--out", "catalog"], "catalog contains other files"),
     "nothing to check": (["check", "nowhere"], "nowhere"),
     "bad split": (["check", "catalog", "--split", "text.png"], "not a JSON file"),
     "no split file": (["check", "catalog", "--split", "none.json"], "none.json"),
