@@ -3,8 +3,8 @@
 The steps of an attempt: take a photo, plan (by default: fit a cylinder and draw a random grasp), approach, read the
 gels without contact, close, read the gels, lift, read the gripper's outcome, read the gels again, put the object down.
 The gate then decides whether training uses the grasp. Rejected grasps are recorded too, and attempts without a grasp
-are logged (robot.recording.attempt_log). An object is complete when `grasps` of its grasps are accepted; the number of
-attempts is limited. An ungraspable object is skipped, with the reason in recording.json.
+are logged (robot.recording.attempt_log). An object is complete when it has the required number of accepted grasps; the
+number of attempts is limited. An ungraspable object is skipped, with the reason in recording.json.
 
 One writer writes all grasps in a fixed order, so the recording does not depend on the number of jobs. A collection
 that was stopped or killed continues at the same point when it is started again.
@@ -140,8 +140,8 @@ def collect(
         DeviceError: A device failed too often.
         StorageError: The disk refused a write.
 
-    After any exception, Ctrl-C included, recorded grasps are complete and the rig is closed with open jaws. The
-    message of an exception states when the jaws could not be opened.
+    After any exception, Ctrl-C included, recorded grasps are complete and the rig is closed. If the exception ends an
+    attempt, the jaws are open, or its message or a note on it states that they could not be opened.
 
     >>> import functools
     >>> rig, settings = functools.partial(robot.load_rig, "sim", seed=3), robot.CollectSettings(grasps=1)

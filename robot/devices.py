@@ -69,7 +69,7 @@ class Device(ABC):
         self._connected = True
 
     def close(self) -> None:
-        """Close the device if it is connected; even after a DeviceError, it is not connected any more."""
+        """Close the device if it is connected; even if this raises DeviceError, it is disconnected afterwards."""
         if not self._connected:
             return
         self._connected = False
@@ -265,19 +265,13 @@ class Gripper(Actuator):
             return self._state()
 
     def open(self, opening_mm: float) -> GripperState:
-        """Move the jaws to `opening_mm`, wider or narrower, without gripping; a held object is released.
-
-        Return the state; raise DeviceError on failure.
-        """
+        """Open or narrow the jaws to `opening_mm`; a held object is released. Return the state or raise DeviceError."""
         self._check("opening", opening_mm, self.min_opening_mm, self.stroke_mm, "mm")
         with self._moving("cannot open"):
             return self._open(float(opening_mm))
 
     def grasp(self, force_n: float, speed_mm_s: float = 80.0) -> GripperState:
-        """Close the jaws until each finger has `force_n` or they are closed, wait, and return the state.
-
-        Raise DeviceError on failure.
-        """
+        """Close until each finger has `force_n` or the jaws are fully closed; return the state or raise DeviceError."""
         self._check("force", force_n, self.min_force_n, self.max_force_n, "N")
         self._check("speed", speed_mm_s, self.min_speed_mm_s, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot grasp"):
@@ -330,8 +324,7 @@ class TactileSensor(Device):
 def read_together(sensors: Mapping[str, TactileSensor], max_age_s: float = MAX_AGE_S) -> tuple[dict[str, Frame], float]:
     """Read one frame of each sensor, as close in time as possible; return the frames by finger and their skew in s.
 
-    The common time is that of the sensor whose newest frame is the oldest. Of each sensor, the buffered frame nearest
-    to this time is taken. A failing sensor raises DeviceError.
+    Each sensor gives its buffered frame nearest in time to the oldest of the newest frames, or raises DeviceError.
     """
     newest = {finger: sensor.read(max_age_s) for finger, sensor in sensors.items()}
     common = min(frame.time_s for frame in newest.values())
@@ -364,11 +357,7 @@ class Camera(Device):
         self.extrinsics = _check_rigid(extrinsics)
 
     def read(self, depth: bool = True, max_age_s: float = MAX_AGE_S) -> RGBD:
-        """Return the newest picture; compute depth only if `depth` is true.
-
-        Raises:
-            DeviceError: Reading failed, the picture is older than `max_age_s`, or the camera has no depth.
-        """
+        """Return the newest picture, with depth if `depth` is true; raise DeviceError if it is too old or has none."""
         with self._use("cannot be read"):
             if depth and not self.has_depth:
                 raise DeviceError(f"{self.name} has no depth: read it with depth=False")
@@ -401,7 +390,7 @@ def _check_depth(name: str, image: RGBD) -> None:
 
 
 def _check_rigid(matrix: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Check a rigid transform, with the tolerance 1e-6 of a rotation typed with seven digits."""
+    """Check a rigid transform; the tolerance 1e-6 accepts a rotation that was typed with seven digits."""
     rigid = np.asarray(matrix, dtype=np.float64)
     if rigid.shape != (4, 4) or not np.isfinite(rigid).all() or not np.array_equal(rigid[3], [0, 0, 0, 1]):
         raise RobotConfigError(f"extrinsics must be a 4 x 4 rigid transform with last row 0 0 0 1, got {rigid}")

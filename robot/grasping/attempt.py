@@ -74,7 +74,8 @@ class AttemptRunner:
     def run(self, object_id: str, number: int) -> GraspAttempt:
         """Make one attempt; after a DeviceError, recover the rig and repeat the attempt.
 
-        After any exception, Ctrl-C included, the jaws are opened. If this fails, the exception's message states it.
+        After any exception, Ctrl-C included, the jaws are opened. If this fails, the exception's message, or a note on
+        the exception, states it.
 
         Args:
             object_id: The object.
@@ -196,8 +197,8 @@ class AttemptRunner:
     def _put_down(self, plan: GraspPlan, held: bool, rng: np.random.Generator) -> None:
         """Release a held object on the table at a random position and yaw, and open the jaws.
 
-        With a given `object_fit`, or after a tilted grasp, the object is released at the position of the grasp,
-        because a tilted hand has room to withdraw there.
+        In two cases it is released at the position of the grasp: with a given `object_fit`, which fixes the position of
+        the object, and after a tilted grasp, because a tilted hand has room to withdraw there.
         """
         rig, settings = self.rig, self.settings
         low, high = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)

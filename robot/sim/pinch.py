@@ -28,7 +28,7 @@ SIDES = {"a": 1.0, "b": -1.0}
 """The direction that each finger faces along the gripper's x."""
 
 _START_MM = 400.0
-"""Rays towards the object start this far from the closing plane, outside any object that a gripper grasps."""
+"""Rays towards the object start this far from the plane x = 0, outside any object that a gripper grasps."""
 _COARSE_RAD = [math.radians(angle) for angle in range(-40, 41, 4)]
 _FINE_RAD = [math.radians(0.4 * step) for step in range(-10, 11)]
 _MAX_TURN_ERROR_RAD = math.radians(0.2)
@@ -51,7 +51,7 @@ class Hand:
     Attributes:
         stroke_mm: greatest opening.
         safety: for the lift, the friction of both fingers must be at least this many times the weight.
-        grid: rows and columns of the contact solver; `frontier` measures their effect on accuracy.
+        grid: rows and columns of the contact solver; `benchmarks.frontier` measures their effect on accuracy.
         tolerance: tolerance of the contact solver.
         turns_about_grip: if true, closing jaws turn the object about the point between them, as for objects that are
             grasped far from their middle; if false, about the object's own axis, near which procedural objects are

@@ -1,8 +1,9 @@
 """Checks of a recording by the appearance of its pictures; each yields findings on its grasps.
 
-Each check compares a minority with the majority of the recording. A note reports the cases that cannot be decided.
-Three cases cannot be decided from the pictures: two fingers with similar gels, a no-contact frame and a touch without
-contact, and two objects whose photos were all exchanged.
+The checks for exchanged pictures compare a minority with the majority of the recording. Exchanges of two fingers with
+similar gels, of a no-contact frame with a touch of little contact, and of similar photos cannot be found; notes report
+these cases (the second one only if it concerns most touches). If all photos of two objects were exchanged, this cannot
+be found either, and no note reports it.
 """
 
 from collections import Counter
@@ -39,8 +40,8 @@ def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> 
     """Find photos and touches that look exchanged.
 
     Gel images look alike (the gel's tint and lamps); photos of different objects do not. So small pictures of touches
-    lie close to their median, and photos lie far from it. A grasp is suspect if its photo lies closer than its touch.
-    The whole recording is suspect if its photos are more alike than its touches.
+    lie close to their median, and photos lie far from it. A grasp is suspect if its photo lies at less than half
+    the distance of its touch. The whole recording is suspect if its photos are twice as alike as its touches.
     """
     if len(grasps) < 3:
         return
@@ -67,7 +68,7 @@ def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> 
 
 
 def check_fingers(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Find frames of two fingers, of touches and without contact, that look exchanged."""
+    """Find grasps whose two fingers look exchanged, in the touches or in the no-contact frames."""
     with_frames = [grasp for grasp in grasps if len(grasp.backgrounds) == len(grasp.touches)]
     for moment, selected in (("touch", grasps), ("no-contact frame", with_frames)):
         if len(selected) < _MIN_GRASPS:
@@ -78,7 +79,7 @@ def check_fingers(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
             which = f"{ascii_lowercase[a]} and {ascii_lowercase[b]}"
             found = swapped_fingers(frames[a], frames[b])
             if found is None:
-                text = f"fingers {which} look too similar to find swapped ones ({moment})"
+                text = f"fingers {which} look too similar to find swaps ({moment})"
                 yield Finding("note", "unchecked-fingers", text)
                 continue
             names = [selected[row].grasp_id for row in found]
@@ -138,8 +139,8 @@ def check_light(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Find
             yield Finding(
                 "note",
                 "unchecked-light",
-                "without a separate no-contact frame for every grasp, only a strong effect of light on the object's "
-                "identity is found",
+                "without a separate no-contact frame for every grasp, light that identifies the object is found only "
+                "if its effect is strong",
             )
             continue
         frames = [_small(records, [_of(grasp, moment)[finger] for grasp in grasps]) for finger in fingers]
@@ -229,11 +230,13 @@ def check_near_copies(grasps: Sequence[Grasp], records: ImageRecords, accepted: 
         )
     if left_out:
         reasons.append(f"{left_out} belong to grasps that are named above")
-    yield Finding("note", COMPARED_COPIES, f"near copies were searched in {'; '.join([', '.join(counts), *reasons])}")
+    yield Finding(
+        "note", COMPARED_COPIES, f"near copies were searched for in {'; '.join([', '.join(counts), *reasons])}"
+    )
 
 
 def _by_kind(grasps: Sequence[Grasp]) -> dict[str, dict[Path, Grasp]]:
-    """Return one grasp for each file of the photos, and of the touches of each finger."""
+    """Return, for photos and for the touches of each finger, one grasp for each picture file."""
     kinds = {"photo": {grasp.photo: grasp for grasp in grasps}}
     for finger in range(min((len(grasp.touches) for grasp in grasps), default=0)):
         kinds[f"touch {ascii_lowercase[finger]}"] = {grasp.touches[finger]: grasp for grasp in grasps}

@@ -1,7 +1,8 @@
 """Gel sensors with a USB camera: GelSight, GelSight Mini, DIGIT, and any other.
 
-To support another sensor, add a class of a few lines here. A rig's file may override each value of PRESET. Automatic
-exposure and white balance are off by default, because they change the images of equal presses.
+To support another sensor, add a class of a few lines here, and its name to DRIVERS of robot.real_rig. A rig's file may
+override each value of PRESET. Automatic exposure and white balance are off by default, because they change the images
+of equal presses.
 """
 
 import time
@@ -28,7 +29,7 @@ class OpencvTactile(TactileSensor):
     """The gel behind a USB camera; the fields of GelCameraSettings are keyword arguments of the constructor.
 
     Attributes:
-        PRESET: Default camera settings of a kind of sensor.
+        PRESET: Default width, height, fps, fourcc and led of a kind of sensor; its other fields have no effect.
         CROP: Default crop: fractions of width and height to remove at left, top, right and bottom.
         QUARTER_TURNS: Rotation of the picture, in quarter turns counterclockwise.
     """
@@ -95,7 +96,7 @@ class OpencvTactile(TactileSensor):
 
 
 class GelSight(OpencvTactile):
-    """The paper's GelSight with the authors' usb_cam settings, automatic exposure and white balance off."""
+    """The paper's GelSight, with the picture size, rate and format of the authors' usb_cam settings."""
 
     PRESET = CaptureSettings(width=1280, height=960, fps=30.0, fourcc="MJPG")
 

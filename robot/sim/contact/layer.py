@@ -83,8 +83,8 @@ class Contact:
         large_strain      a displacement exceeds half the thickness: linear elasticity does not hold
         steep             a slope exceeds one half: linear elasticity does not hold
         iteration_cap     the solver stopped before it reached the tolerance; `converged` is False
-        rigid_volume      an incompressible periodic layer cannot be pressed to this depth; the problem is not solved,
-                          and `converged` is False
+        rigid_volume      a periodic gel that is incompressible or a half-space cannot be pressed to this depth; the
+                          problem is not solved, and `converged` is False
     """
 
     pressure_mpa: Floats

@@ -271,6 +271,6 @@ def test_the_last_note_counts_the_pictures_compared_for_copies_and_explains_the_
     main(["check", str(broken.folder)])
     last = capsys.readouterr().err.splitlines()[-2]
     assert last.startswith(f"{broken.folder}: ")
-    assert re.search(rf"searched in \d+ of {total} images \(photo\), 0 of {total} images \(touch a\)", last)
+    assert re.search(rf"searched for in \d+ of {total} images \(photo\), 0 of {total} images \(touch a\)", last)
     assert "show too little to recognise a copy (little contact, or too many similar pictures)" in last
     assert "6 belong to grasps that are named above" in last
