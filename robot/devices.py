@@ -148,9 +148,7 @@ class VirtualDevice(Device):
 class Actuator(Device):
     """A device that moves, at most at `max_speed_mm_s`; an exception during a motion, Ctrl-C included, stops it.
 
-    Attributes:
-        max_speed_mm_s: Upper limit of the commanded speed.
-        may_move: Whether connecting may move it (homing) or enable its motors.
+    `may_move`: whether connecting may move it (homing) or enable its motors.
     """
 
     may_move: bool = True
@@ -265,19 +263,13 @@ class Gripper(Actuator):
             return self._state()
 
     def open(self, opening_mm: float) -> GripperState:
-        """Move the jaws to `opening_mm`, wider or narrower, without gripping; a held object is released.
-
-        Return the state; raise DeviceError on failure.
-        """
+        """Widen or narrow the jaws to `opening_mm`, release a held object, return the state, or raise DeviceError."""
         self._check("opening", opening_mm, self.min_opening_mm, self.stroke_mm, "mm")
         with self._moving("cannot open"):
             return self._open(float(opening_mm))
 
     def grasp(self, force_n: float, speed_mm_s: float = 80.0) -> GripperState:
-        """Close the jaws until each finger has `force_n` or they are closed, wait, and return the state.
-
-        Raise DeviceError on failure.
-        """
+        """Close the jaws until `force_n` on each finger or full closure; return the state, or raise DeviceError."""
         self._check("force", force_n, self.min_force_n, self.max_force_n, "N")
         self._check("speed", speed_mm_s, self.min_speed_mm_s, self.max_speed_mm_s, "mm/s")
         with self._moving("cannot grasp"):
@@ -330,8 +322,7 @@ class TactileSensor(Device):
 def read_together(sensors: Mapping[str, TactileSensor], max_age_s: float = MAX_AGE_S) -> tuple[dict[str, Frame], float]:
     """Read one frame of each sensor, as close in time as possible; return the frames by finger and their skew in s.
 
-    The common time is that of the sensor whose newest frame is the oldest. Of each sensor, the buffered frame nearest
-    to this time is taken. A failing sensor raises DeviceError.
+    Each frame is the buffered one nearest to t, the lowest time of all newest frames. DeviceError if a sensor fails.
     """
     newest = {finger: sensor.read(max_age_s) for finger, sensor in sensors.items()}
     common = min(frame.time_s for frame in newest.values())
@@ -393,9 +384,7 @@ def _check_depth(name: str, image: RGBD) -> None:
     depth = image.depth_m
     if depth is None or depth.dtype != np.float32 or depth.shape != image.colour.shape[:2]:
         got = "none" if depth is None else f"{depth.shape} {depth.dtype}"
-        raise DeviceError(
-            f"{name}: depth must be float32 with the colour picture's shape {image.colour.shape[:2]}, got {got}"
-        )
+        raise DeviceError(f"{name}: depth must be float32 and {image.colour.shape[:2]} like the colour, got {got}")
     if image.intrinsics is None:
         raise DeviceError(f"{name}: a picture with depth must have intrinsics")
 
