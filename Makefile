@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Two processes; whoever is done first takes tests from the other, so that a file's tests and what they share stay together.
+# Two processes. A file's tests run in one process and share its fixtures; a process without tests takes some of the other's.
 PYTEST := python -m pytest -n 2 --dist worksteal
 
 .PHONY: demo test test-slow test-all test-lowest benchmark docs clean
@@ -16,7 +16,7 @@ test: $(VENV)/installed
 	$(BIN)/mypy
 	$(BIN)/$(PYTEST) -m "not slow"
 
-# What is dear to run and seldom the first to break: whole trainings, notebooks, kill after kill, the README's commands.
+# Long tests: trainings, notebooks, killed processes, the commands of the documentation.
 test-slow: $(VENV)/installed
 	$(BIN)/$(PYTEST) -m slow
 
@@ -30,7 +30,7 @@ test-lowest:
 benchmark: $(VENV)/installed
 	$(BIN)/python -m benchmarks
 
-# Opens from the disk; its search wants a server: `python3 -m http.server -d site`.
+# Open site/index.html. The site's search needs a server: `python3 -m http.server -d site`.
 docs: $(VENV)/installed
 	$(BIN)/python -m benchmarks.reference
 	$(BIN)/zensical build --clean --strict
@@ -46,7 +46,7 @@ $(VENV)/installed: pyproject.toml $(CONSTRAINTS)
 	@$(PYTHON) -c 'import venv, ensurepip' 2>/dev/null || \
 		{ echo "Python's venv module is needed. On Debian or Ubuntu: apt-get install python3-venv"; exit 1; }
 	$(PYTHON) -m venv --clear $(VENV)
-# PyTorch first and pinned: an unpinned one may bring gigabytes of CUDA libraries that the tests do not use.
+# PyTorch first, pinned: other versions may install gigabytes of CUDA libraries, which the tests do not use.
 	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) torch
 	$(BIN)/python -m pip install --quiet -c $(CONSTRAINTS) -e '.[test,docs,sim,mesh,heif,calibration,evaluation,onnx,gripper,sawyer,realsense,importers,serve,cluster,transformers]'
 	@touch $@

@@ -123,7 +123,7 @@ def collect(
     Args:
         make_rig: Builds the rig. It is called once here and, with jobs > 1, once in every process.
         out: Folder of the recording.
-        objects: Names, or the number of the rig's objects.
+        objects: Names of the objects, or how many to collect; the rig then gives the names.
         seed: Seed of the planner's random choices, stored in recording.json; build the rig with the same seed.
         settings: Grasps and attempts for each object.
         gate: Decides which grasps are accepted (`robot.grasping.gates`).

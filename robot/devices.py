@@ -357,7 +357,7 @@ class Camera(Device):
         self.extrinsics = _check_rigid(extrinsics)
 
     def read(self, depth: bool = True, max_age_s: float = MAX_AGE_S) -> RGBD:
-        """Return the newest picture, with depth if `depth` is true; raise DeviceError if it is too old or has none."""
+        """Return the newest picture, with depth if `depth` is true; raise DeviceError if it is old or lacks depth."""
         with self._use("cannot be read"):
             if depth and not self.has_depth:
                 raise DeviceError(f"{self.name} has no depth: read it with depth=False")

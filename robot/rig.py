@@ -90,7 +90,7 @@ class Rig:
 
     @property
     def home(self) -> Pose:
-        """Pose behind the table, outside the camera's picture."""
+        """Pose at the top of the workspace's far side (+y); a camera at -y should not see the hand there."""
         lower, upper = self.arm.workspace.lower, self.arm.workspace.upper
         return Pose((lower[0] + upper[0]) / 2, upper[1], upper[2], 0.0)
 
@@ -101,8 +101,8 @@ class Rig:
     def prepare(self, object_id: str, number: int) -> None:
         """Ask a person to put this object on the table for attempt `number`.
 
-        The request appears when the object changes. With `object_fit` it appears for every attempt, because a slipped
-        grasp has moved the object from its given position.
+        The request appears when the object changes. With `object_fit` it appears for every attempt, because the
+        attempt before may have moved the object from its given position.
 
         Args:
             object_id: The object.

@@ -24,15 +24,15 @@ SPARE_CODES = 64
 """Candidates beyond k that are scored exactly, because codes of a byte per component swap the order of near-copies."""
 
 MIN_REFINED = 64
-"""Smallest k for the number of refined candidates: compressed scores are too coarse to trust the first few."""
+"""A smaller k counts as this for the number of refined candidates: codes are too coarse to trust the first few."""
 
 
 @dataclass(frozen=True)
 class IVFParameters(vector_index.Parameters):
     """Number of lists, and number of lists that a search visits.
 
-    Training and adding cost N x lists: 4 times as many lists made a build 10 times slower and, at equal recall, a
-    query 10 to 50 % faster.
+    Adding costs N x lists, training up to `MAX_POINTS_PER_CENTRE` x lists x lists: 4 times as many lists made a build
+    10 times slower and, at equal recall, a query 10 to 50 % faster.
 
     Attributes:
         lists: Number of lists; None for sqrt(N). It is lowered to N / 39, the maximum that N points can train.
@@ -52,8 +52,8 @@ class IVFPQParameters(IVFParameters):
 
     Attributes:
         code_bytes: Bytes of each code, a divisor of the vector size; None for the largest divisor up to an eighth of it
-            (or up to 8).
-        refine: `refine` times k candidates are scored exactly.
+            (up to 8 if the size is below 64).
+        refine: `refine` times k candidates are scored exactly (k is raised to `MIN_REFINED`).
     """
 
     code_bytes: int | None = None
@@ -114,7 +114,7 @@ class IVFFlatIndex(FaissIndex):
 
 
 class IVFSQ8Index(IVFFlatIndex):
-    """Inverted lists of vectors with one byte for each component: a quarter of the memory, scores within 1 %."""
+    """Inverted lists of vectors with one byte for each component: a quarter of the memory; codes score within 1 %."""
 
     kind: ClassVar[str] = "ivf_sq8"
     structure_type: ClassVar[str] = "IndexIVFScalarQuantizer"

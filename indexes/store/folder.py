@@ -153,7 +153,7 @@ class IndexStore:
     ) -> Generation:
         """Write a new generation from blocks of rows, with one block in memory at a time, and make it current.
 
-        If the write fails, the index does not change; after `WriteFailed` it is the old or the new one, complete.
+        After `WriteFailed` the index is the old or the new one, complete; after any other error it is unchanged.
 
         Args:
             blocks: Blocks of rows; a range selects rows of the parent, which are copied without parsing.

@@ -33,7 +33,7 @@ SIZE_WEIGHTS = (2.0, 1.0, 1.0, 0.5)
 """Weights of the squared differences in `LabelledPicture.size_targets`, each in standard deviations. The pitch is most
 visible in photos and gel images."""
 SHAPE_MISMATCH_DISTANCE = 3.0
-"""Distance between two objects of different shapes, in the same unit."""
+"""Distance that different shapes add, as the root of the sum of squares, in the same unit."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,9 @@ def load_labelled(folder: Path) -> tuple[str, list[LabelledPicture]]:
         info = read_json(folder / "pictures.json")
         lines = read_regular(folder / "metadata.jsonl").decode().splitlines()
     except (OSError, ValueError) as error:
-        raise DatasetError(f"{folder} must be a folder that `retrieve collect --photos-only` wrote: {error}") from error
+        raise DatasetError(
+            f"{folder} must be a folder that `retrieve collect --photos-only` or `--touches-only` wrote: {error}"
+        ) from error
     kind = info.get("kind") if isinstance(info, dict) else None
     if kind not in KINDS:
         raise DatasetError(f"{folder}/pictures.json: kind must be photo or touch, got {kind!r}")

@@ -31,7 +31,7 @@ _SHADE_TINT = 0.22
 _DARKEST_SHADE = -1.6
 """Logarithm of the darkest shadow's lightness relative to the ground."""
 _DIFFERENCE_THRESHOLDS = (4.0, 3.5)
-"""Deviations of the ground's colour, and lightness, from which a pixel is assigned to the object."""
+"""Deviations from the ground's colour, and from its lightness, above which a pixel belongs to the object."""
 
 Grey = NDArray[np.float32]
 
@@ -118,7 +118,11 @@ def _medians(values: NDArray[np.float32], selected: NDArray[np.bool_]) -> NDArra
 
 
 def _largest_region(differs: NDArray[np.bool_]) -> tuple[int, int, int, int] | None:
-    """Return the box around the largest region near the middle and all regions a tenth as large; None if too small."""
+    """Return the box around the object's regions; None if they are too small.
+
+    The weight of a region is its area times a factor that falls with its distance from about the middle of the photo.
+    The object's regions have at least a tenth of the largest weight.
+    """
     mask = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8))
     count, _, about, middles = cv2.connectedComponentsWithStats(mask)

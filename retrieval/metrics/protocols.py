@@ -149,7 +149,7 @@ def per_object(measure: Measure, column: int = 0) -> dict[int, float]:
 
 
 def confusions(table: ScoreTable, *, photos: int = 1, draws: int = 16, seed: int = 0) -> list[tuple[int, int, float]]:
-    """Return the objects that rank first: (object, confused with, fraction of its queries), largest fraction first.
+    """Return wrong objects that rank first: (object, confused with, fraction of its queries), largest fraction first.
 
     All objects of the gallery are candidates, each represented by `photos` photos that are drawn `draws` times. Tied
     objects divide the rank. Correct results are not listed, so an object's fractions add up to 1 minus its accuracy.

@@ -30,8 +30,8 @@ MAX_HEADER_BYTES = 16_384
 MAX_HEADERS = 100
 """Maximum number of headers of one request; one header costs as much work as a hundred bytes."""
 FREE_CHUNKS, MIN_CHUNK_BYTES = 1_000, 256
-"""Number of chunks of a body without a limit, and minimum mean bytes of a chunk if there are more; a chunk costs as
-much work as 1 kB."""
+"""A body may have FREE_CHUNKS chunks of any size, and one more for each MIN_CHUNK_BYTES bytes; a chunk costs as much
+work as 1 kB."""
 _HEADER_PIECE, _BODY_PIECE = 4_096, 65_536
 
 

@@ -2,7 +2,7 @@
 
 The number of requests in flight is limited; further requests are answered with 429 immediately. A request is dropped
 before its work begins if its client disconnects or its deadline passes. Waiting queries with equal options are answered
-as one batch: the encoder takes the same time for each, but the interpreter's work is done once.
+as one batch: the encoder is no faster in a batch, but the interpreter's work is done once.
 """
 
 import asyncio

@@ -9,8 +9,8 @@ large catalogue. The head's term is affine in the normalised features, so a blen
 blended features. The embedding part (`cosine`) is blended too, and is then shorter than that of a real image.
 
 In a large catalogue many photos score nearly as high as the exhaustive top-1; a few thousand photos contain few such
-hard negatives. Therefore most photos of a batch are the nearest ones, by the current student, in a large pool of
-blends.
+hard negatives. Therefore, after a warm-up, up to three quarters of a batch's photos are the nearest to its touches, by
+the current student, in a large pool of blends.
 """
 
 import dataclasses
@@ -74,7 +74,7 @@ def distil(
     Args:
         matcher: The matcher.
         touch_partials: Partial activations (N, P) of touches of training objects.
-        photo_partials: Partial activations (N, P) of photos of training objects.
+        photo_partials: Partial activations (M, P) of photos of training objects.
         width: Hidden units of the candidate encoder.
         steps: Number of steps.
         seed: The same seed gives the same candidate encoder.
@@ -226,9 +226,9 @@ def recorded_partials(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> tuple[Tensor, Tensor]:
-    """Return partial activations (N, P) of the touches of grasps, and of their photos.
+    """Return partial activations (N, P) of the touches of N grasps, and (M, P) of their M photo files.
 
-    At most `MAX_GRASPS` random grasps are used.
+    At most `MAX_GRASPS` random grasps are used. Grasps may share a photo, so M <= N.
 
     Args:
         matcher: The matcher.
@@ -276,14 +276,14 @@ def with_candidate_encoder(
     quiet: bool = False,
     should_stop: Callable[[], bool] = lambda: False,
 ) -> Checkpoint:
-    """Return `checkpoint` with a distilled candidate encoder, queries, and the encoder's metric.
+    """Return `checkpoint` with a distilled candidate encoder, its metric, and validation touches (`queries`).
 
     The matcher of `checkpoint` is reused and modified.
 
     Args:
         checkpoint: The checkpoint.
         config: The configuration, which sets the size of the candidate encoder.
-        train: Partial activations (N, P) of touches and of photos of training objects.
+        train: Partial activations of touches (N, P) and of photos (M, P) of training objects.
         validation: The same of validation objects, if any. The metric uses their touches among the photos of all.
         quiet: No progress on stderr.
         should_stop: As for `distil`.

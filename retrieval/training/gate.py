@@ -51,8 +51,8 @@ class GraspNet(nn.Module):
 
     Single images are not normalised, since the strength of the change distinguishes contact from noise. The logits
     depend on the logarithm of the strength; otherwise a firm touch would have a thousand times the logit of a light
-    one. A change of the whole picture comes from a lamp, not from contact. So edges are repeated: zero padding would
-    draw a frame around the picture.
+    one. A lamp changes the whole picture, contact only a part of it. So the pictures are padded with their edge pixels:
+    with zeros, a lamp's change would end at the edge and look like contact.
     """
 
     scale: Tensor

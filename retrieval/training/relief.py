@@ -189,7 +189,7 @@ class ReliefTraining:
         self._variants.cache_decoded([(picture.file, picture.before) for picture in everything], quiet=quiet)
 
     def _images(self, pictures: Sequence[LabelledPicture], rng: np.random.Generator | None = None) -> Tensor:
-        """Return pictures as a batch (B, 3, H, W); `rng` draws the variant of each, the first one without it."""
+        """Return pictures as a batch (B, 3, H, W). `rng` draws the variant of each; default: the first."""
         images = [
             to_float(variants[rng.integers(len(variants)) if rng else 0])
             for variants in self._workers.map(lambda picture: self._variants(picture.file, picture.before), pictures)

@@ -296,8 +296,8 @@ def fit_gel_check(head: GelHead, test: GelCheckFeatures, levels: tuple[Sequence[
 def contact_threshold(no_contact: ArrayLike, touch: ArrayLike) -> float:
     """Return the threshold between values of no-contact frames and of touches.
 
-    At most `FALSE_ALARM_RATE` of the no-contact values lie above it. It is higher if at most `LOW_CONTACT_RATE` of the
-    touches lie below it.
+    It is the higher of two values: at most `FALSE_ALARM_RATE` of the no-contact values lie above the first, and at most
+    `LOW_CONTACT_RATE` of the touches lie below the second.
     """
     low, high = np.asarray(no_contact, dtype=np.float64), np.asarray(touch, dtype=np.float64)
     return float(max(np.quantile(low, 1 - FALSE_ALARM_RATE), np.quantile(high, LOW_CONTACT_RATE)))

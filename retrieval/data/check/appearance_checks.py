@@ -188,7 +188,7 @@ def check_exchanged_photos(grasps: Sequence[Grasp], records: ImageRecords) -> It
 
 
 def check_own_photo(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Find touches that are their own photo, with another encoding or size."""
+    """Find touches whose picture is the photo of the same grasp, in any encoding or size."""
     names = [
         grasp.grasp_id
         for grasp in grasps

@@ -43,10 +43,10 @@ from retrieval.search.build.measuring import (
 )
 
 TARGET = 0.99
-"""Default agreement with exhaustive search at rank 1."""
+"""Default of the agreement@k that the chosen k candidates must reach."""
 
 APPROXIMATE_FACTOR = 4
-"""Largest factor of candidates of an approximate kind, compared with exact search."""
+"""Largest number of candidates of an approximate kind that is tried under a bound, as a multiple of exact search's."""
 
 MAX_CHANGED_FRACTION = 0.10
 """Fraction of a catalogue that may change before its operating point is measured again."""
@@ -58,7 +58,7 @@ class SearchRequirements:
 
     Attributes:
         kind: Name of a kind of index.
-        min_recall: Smallest agreement with exhaustive search at rank 1.
+        min_recall: Smallest agreement@k of the chosen k candidates.
         max_ms: Longest candidate search and reranking of one touch, in milliseconds, with the index open.
 
     Raises:
@@ -97,7 +97,7 @@ class SearchRequirements:
 
     @property
     def target(self) -> float:
-        """Agreement with exhaustive search that the point must reach."""
+        """Agreement@k that the point must reach."""
         return TARGET if self.min_recall is None else self.min_recall
 
     @property
@@ -196,7 +196,8 @@ def _choose_point(bench: SearchBench, requirements: SearchRequirements) -> Searc
 def _points(bench: SearchBench, requirements: SearchRequirements) -> Iterator[SearchPoint]:
     """Yield points of exact search with more and more candidates until one has the recall, then of approximate kinds.
 
-    Approximate kinds start with the number of candidates of the last exact point.
+    Approximate kinds start with the number of candidates of the last exact point. If an approximate kind is required,
+    points of exact search are measured only for this number and not yielded; the last point has all photos.
     """
     approximate = None if requirements.kind is None or load_kind(requirements.kind).exact else requirements.kind
     exact = bench.index_of_kind("flat" if requirements.kind is None or approximate else requirements.kind)

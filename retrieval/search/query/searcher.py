@@ -1,5 +1,7 @@
 """Query an opened index: encode the touch, find candidates, rerank them by match logit, and give a verdict."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -39,8 +41,7 @@ Floats = NDArray[np.float32]
 class Searcher:
     """An opened index with its model.
 
-    Any number of threads may query it at once, and so may forked processes. Close it with `close` or a `with` block;
-    running queries then finish.
+    Threads and forked processes may query it at the same time. Close it with `close` or a `with` block.
 
     >>> searcher = retrieval.open("index")
     >>> one = searcher.query(["a.png", "b.png"], top=2)
@@ -80,7 +81,7 @@ class Searcher:
         verify: bool = True,
         threads: int | None = None,
         shards: OpenShards | None = None,
-    ) -> "Searcher":
+    ) -> Searcher:
         """Open the current generation of an index or a sharded index, with the checkpoint that built it.
 
         If an export of the checkpoint (`retrieval.model.export`) is in its folder or in the user's cache, the export
@@ -90,8 +91,7 @@ class Searcher:
             index: Its folder; or the URL of a sharded index, whose shards are fetched once into the user's cache.
             model: Path of the checkpoint, if it was moved.
             verify: Compare the checksums of the index's files.
-            threads: Number of threads that encode a touch. Default: the library's choice. With PyTorch it applies to
-                the whole process.
+            threads: Number of threads of the encoder (with PyTorch: of the process). Default: the library's choice.
             shards: Function that opens the shards of a sharded index. Default: open them in this process.
 
         Raises:
@@ -129,7 +129,7 @@ class Searcher:
 
     @property
     def objects(self) -> Objects:
-        """The objects of that generation."""
+        """The objects of the opened generation of an index folder. Raises BadInput for a sharded index."""
         return self._folder.objects
 
     @property
@@ -139,7 +139,7 @@ class Searcher:
             raise BadInput(f"{self.index} is a sharded index, but one index folder is required; open one of its shards")
         return shard
 
-    def __enter__(self) -> "Searcher":
+    def __enter__(self) -> Searcher:
         return self._snapshot()
 
     def __exit__(
@@ -169,8 +169,9 @@ class Searcher:
             background: The fingers' no-contact frames, for a model that uses them.
             top: Number of objects to return.
             candidates: Number of photos to rerank in each shard, raised to `top` if smaller: those nearest to the sum
-                of the grasps' embeddings. The best objects' other photos are scored too. Default: as measured by
-                `build-index`. All are scored if there are no more photos, or if the model has no trained embeddings.
+                of the grasps' embeddings. Default: as measured by `build-index`. The best objects' other photos, and
+                those of the objects with the nearest reference touches, are scored too. All photos of a shard are
+                scored if it has no more than this number, or if the model has no trained embeddings.
             none_prior: Prior probability that the catalogue lacks the object.
 
         Raises:
@@ -240,7 +241,7 @@ class Searcher:
         codes = opened.reader.encode(grasps, opened.reader.no_contact_frames(background), Stopwatch())
         return EncodedTouches(codes.embeddings, codes.partials)
 
-    def _snapshot(self) -> "Searcher":
+    def _snapshot(self) -> Searcher:
         """Return a copy with references to all resources, so that `close` in another thread cannot break a query."""
         opened = object.__new__(type(self))
         vars(opened).update(vars(self))
@@ -280,7 +281,7 @@ class Searcher:
 
     def _score(
         self, query: ShardQuery, top: int, candidates: int | None, none_prior: float, clock: Stopwatch
-    ) -> "_ScoredQuery | None":
+    ) -> _ScoredQuery | None:
         """Return the best objects and their probabilities; None without a grasp with contact."""
         grasps = len(query.partials)
         if not grasps:
@@ -300,7 +301,7 @@ class Searcher:
         classes: list[str],
         embeddings: Floats,
         timing_ms: dict[str, float],
-        scored: "_ScoredQuery | None",
+        scored: _ScoredQuery | None,
         none_prior: float,
     ) -> QueryResult:
         info, probabilities = self.info, scored.probabilities if scored else None
@@ -332,7 +333,7 @@ class Searcher:
             embeddings=embeddings,
         )
 
-    def _more_grasps(self, scored: "_ScoredQuery", none_prior: float) -> int | None:
+    def _more_grasps(self, scored: _ScoredQuery, none_prior: float) -> int | None:
         """Return the number of further grasps until a match is expected; None if unclear or too many."""
         mass, probabilities = scored.found.mass, scored.probabilities
         if self.posterior is None or probabilities is None or mass is None:
@@ -341,7 +342,7 @@ class Searcher:
             return None
         return self.posterior.more_grasps(scored.found.best[0].logit, mass.objects, scored.grasps, none_prior)
 
-    def _ranking(self, scored: "_ScoredQuery") -> list[Match]:
+    def _ranking(self, scored: _ScoredQuery) -> list[Match]:
         ranking, base, probabilities = [], self.catalogue.absolute(), scored.probabilities
         for rank, (logit, photo, reference) in enumerate(scored.found.best, start=1):
             probability = None if probabilities is None else float(probabilities.objects[rank - 1])
@@ -350,7 +351,7 @@ class Searcher:
             ranking.append(Match(*fields, base / photo.path, reference, if_present))
         return ranking
 
-    def _formula(self, scored: "_ScoredQuery", none_prior: float) -> dict[str, Any] | None:
+    def _formula(self, scored: _ScoredQuery, none_prior: float) -> dict[str, Any] | None:
         """Return the formula of the probabilities, with the numbers of this query."""
         if self.posterior is None or scored.probabilities is None:
             return None

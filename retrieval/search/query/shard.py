@@ -5,7 +5,7 @@ A shard receives encoded touches. It returns its best objects, and the sums of t
 candidates and logits of other objects stay in the shard.
 
 All photos of an object are in one shard, which therefore computes the object's logit. The best objects of all shards
-include the best of the catalogue, and their likelihoods add up to those of the catalogue.
+include the best of the catalogue, and the sums of the shards add up to the sums of the catalogue.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -144,7 +144,7 @@ class FolderShard:
     """The photos of one generation of an index folder, opened in this process.
 
     Its index finds candidates, and the model's head reranks them. Reference touches contribute to the logits of their
-    objects. Threads may search at once; they wait for each other only for the text search over all rows.
+    objects. Threads may search at once. Only a `page` with words may wait: until the first one has read all rows' text.
 
     Args:
         generation: The opened generation.
@@ -260,7 +260,7 @@ class FolderShard:
         objects = self.objects.aggregate(rows, logits, posterior, grasps)
         if self.references is None or similarities is None:
             return objects
-        with_photos = self.references.calibration.with_photos  # the posterior of photos next to references
+        with_photos = self.references.calibration.with_photos  # posterior of photos, for objects with both
         both = None if with_photos is None else self.objects.aggregate(rows, logits, with_photos, grasps)
         return self.references.combine(objects, both, similarities, posterior, grasps)
 

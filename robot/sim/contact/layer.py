@@ -137,7 +137,8 @@ def press(
     if math.isinf(lowest) or force_n == 0.0 or (depth_mm is not None and depth_mm <= lowest):
         return _no_contact(gap, force_n or 0.0, depth_mm, ())
     softness = layer.plane_modulus_mpa * (1.0 - object_poisson**2) / object_modulus_mpa
-    # On a periodic surface, a plane displaces nothing but float32 rounding errors, so periodic problems use float64.
+    # On a periodic half-space, uniform pressure causes no displacement; float32 would give rounding errors instead, so
+    # periodic problems use float64.
     single_precision = padded and tolerance >= SINGLE_PRECISION_TOLERANCE
     surface = ElasticSurface(layer.thickness_mm / pixel_mm, layer.poisson, softness, not padded, single_precision)
     if depth_mm is not None and not surface.can_change_volume() and depth_mm > gap.mean():

@@ -3,11 +3,12 @@
 Both return grey levels (0 to 255, before clipping) for red, green and blue; a flat gel gives the backdrop. The other
 effects of a sensor (tint, dust, blur, noise) are in `robot.sim.gel.sensor`.
 
-LEDs (SIMULATION: near-field LED): a point source at s with axis o and emission order m lights the point p of a matt
-surface with normal n by w = max(0, n . d) max(0, -o . d)^m / |s - p|^2, d = (s - p) / |s - p|. One colour is a bar of
-such points. The unpressed gel has w_flat, and the picture is
+LEDs: a point source at s with axis o and emission order m lights the point p of a matt surface with normal n by
+w = max(0, n . d) max(0, -o . d)^m / |s - p|^2, d = (s - p) / |s - p|. A bar b is a row of such points; w_b is the sum
+of their w, and w_flat_b is this sum for the unpressed gel. Channel c of the picture is
     I_c = backdrop_c * (ambient + (1 - ambient) * sum_b mix_cb * shade_b * w_b / w_flat_b)^gamma,
-so the effects that the backdrop contains (the lamp's falloff, the vignette of the lens) are not counted twice.
+so the effects that the backdrop contains (the lamp's falloff, the vignette of the lens) are not counted twice. shade_b
+is 1 minus the blocked part of the bar's light; LedOptics describes backdrop, mix, ambient and gamma.
 """
 
 import math

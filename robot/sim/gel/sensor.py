@@ -269,7 +269,7 @@ def _draw_led(rng: np.random.Generator) -> LedOptics:
 
 
 def _draw_grey(rng: np.random.Generator) -> LedOptics:
-    """Draw the sensor of another maker: white lamps in other places and a grey camera, so three equal channels."""
+    """Draw the optics of another maker: white lamps in other places, equal channels (before the sensor's tint)."""
     bars = tuple(_draw_bar(replace(bar, angle_rad=bar.angle_rad + math.radians(40)), rng) for bar in MINI_BARS)
     backdrop = _draw_backdrop(MINI_BACKDROPS[1], float(np.exp(0.04 * rng.standard_normal())), rng)
     row = 0.55, 0.3, 0.15

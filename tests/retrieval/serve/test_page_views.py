@@ -128,7 +128,7 @@ def test_the_history_is_searched_and_exported(opened, files):
     open_view(opened, "History")
     opened.locator(".query").first.wait_for()
     opened.get_by_role("searchbox", name="Search").fill("words that never occur")
-    opened.get_by_text("No matching questions.").wait_for()
+    opened.get_by_text("No matching queries.").wait_for()
     opened.get_by_role("searchbox", name="Search").fill("")
     opened.locator(".query").first.wait_for()
     with opened.expect_download() as download:

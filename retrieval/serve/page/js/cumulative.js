@@ -113,7 +113,7 @@ function plot(answers, lines) {
   );
 }
 
-/** The legend; all other objects share one entry, as the table of numbers distinguishes them. */
+/** The legend; all other objects share one entry; only the table of numbers distinguishes them. */
 function legend(lines) {
   const following = lines.filter(({ kind }) => kind === "other").length;
   const keys = lines.filter(({ kind }) => kind !== "other").map(({ name, kind }) => h("li", { class: kind }, name));

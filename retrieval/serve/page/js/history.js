@@ -62,7 +62,7 @@ export function historyView() {
       if (offset) list.append(...items);
       else list.replaceChildren(...items);
       more.hidden = page.next === null;
-      total.textContent = page.total ? count(page.total, "question") : empty(filters);
+      total.textContent = page.total ? count(page.total, "query") : empty(filters);
     } catch (error) {
       list.replaceChildren(
         h(
@@ -111,7 +111,7 @@ export function historyView() {
 }
 
 function empty({ search, feedback }) {
-  return search || feedback ? "No matching questions." : "No questions yet. The questions of the first page appear here.";
+  return search || feedback ? "No matching queries." : "No queries yet. Queries of the view Ask appear here.";
 }
 
 function entry(item, showSimilarTouches) {

@@ -35,7 +35,7 @@ export function groupByGrasp(files, fingers) {
   return grasps;
 }
 
-/** A problem of a file that shows without reading it, or null. */
+/** A problem that is visible without reading the file, or null. */
 function fileProblem(file) {
   if (file.type && !file.type.startsWith("image/")) return `${file.name} is not a picture.`;
   if (file.size > MAX_BYTES) return `${file.name} has ${(file.size / 1e6).toFixed(1)} MB; the limit is 20 MB.`;

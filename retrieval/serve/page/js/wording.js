@@ -9,8 +9,8 @@ export function percent(p) {
 
 /** "1 photo", "2,000 photos". */
 export function count(number, word) {
-  const more = word.endsWith("ch") ? "es" : "s";
-  return `${number.toLocaleString("en")} ${word}${number === 1 ? "" : more}`;
+  const plural = word.endsWith("y") ? `${word.slice(0, -1)}ies` : word.endsWith("ch") ? `${word}es` : `${word}s`;
+  return `${number.toLocaleString("en")} ${number === 1 ? word : plural}`;
 }
 
 /** The local date and time of a timestamp. */
@@ -57,7 +57,7 @@ export function verdict(answer) {
   }
 }
 
-/** A sentence on the first object given that the catalogue contains it; stored answers of earlier versions lack it. */
+/** A sentence on the first object given that the catalogue contains it; older stored answers lack this probability. */
 function ifPresent(best) {
   if (best.probability_if_present == null) return "The nearest objects are shown.";
   return `If it contains the object, this is ${best.object_id} with probability ${percent(best.probability_if_present)}.`;
