@@ -141,7 +141,7 @@ def collect(
         StorageError: The disk refused a write.
 
     After any exception, Ctrl-C included, recorded grasps are complete and the rig is closed. If the exception ends an
-    attempt, the jaws are open, or its message or a note on it states that they could not be opened.
+    attempt, the jaws are opened; if that failed, the exception's message or a note on it says so.
 
     >>> import functools
     >>> rig, settings = functools.partial(robot.load_rig, "sim", seed=3), robot.CollectSettings(grasps=1)

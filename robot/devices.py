@@ -235,8 +235,8 @@ class Arm(Actuator):
 class Gripper(Actuator):
     """A gripper with two parallel jaws, at most `stroke_mm` apart, and `min_force_n` to `max_force_n` on each finger.
 
-    Before connecting, stroke and smallest force may be typical values; a driver then reads those of the device. The
-    largest force and speed never exceed the configured limits.
+    Before connecting, stroke and smallest force may be typical values; once connected, the driver reads the device's.
+    The largest force and speed never exceed the configured limits.
 
     >>> with robot.load_rig("sim", seed=0) as rig:
     ...     rig.gripper.grasp(force_n=1e6)

@@ -18,13 +18,13 @@ MAX_POINTS_PER_CENTRE = 64
 """Largest number of training points of each centre: more points improve the centres little and take longer."""
 
 MIN_CODED_VECTORS = 16 * POINTS_PER_CENTRE
-"""Vectors that train compressed codes: enough for the smallest codebook and for the range of each component."""
+"""Least number of vectors to train compressed codes: enough for the smallest codebook and the components' ranges."""
 
 SPARE_CODES = 64
 """Candidates beyond k that are scored exactly, because codes of a byte per component swap the order of near-copies."""
 
 MIN_REFINED = 64
-"""A smaller k counts as this for the number of refined candidates: codes are too coarse to trust the first few."""
+"""Least k from which the number of refined candidates is computed: codes are too coarse to trust the first few."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class IVFFlatIndex(FaissIndex):
 
 
 class IVFSQ8Index(IVFFlatIndex):
-    """Inverted lists of vectors with one byte for each component: a quarter of the memory; codes score within 1 %."""
+    """Inverted lists with one byte for each component: a quarter of the memory; scores from codes within 1 %."""
 
     kind: ClassVar[str] = "ivf_sq8"
     structure_type: ClassVar[str] = "IndexIVFScalarQuantizer"

@@ -75,7 +75,7 @@ class VectorIndex(ABC):
     """Whether `retrieve build-index` may choose this kind if a bound for recall or time is set and exact search is too
     slow."""
     retrain_growth: ClassVar[float | None] = None
-    """The structure is rebuilt beyond this multiple of the number of slots that it was built on; None for never."""
+    """The structure is rebuilt when it has this many times the slots of its last build; None: never."""
     structure_file: ClassVar[bool] = True
     """Whether `save` writes a file; without one, the vectors are the whole index."""
     search_settings: ClassVar[frozenset[str]] = frozenset()

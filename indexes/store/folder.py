@@ -10,9 +10,9 @@
       vectors.faiss       structure of the index, for kinds that have one
       NAME.json           documents
     LOCK                  locked by the writer
-    files.stat            stat cache of the files behind the rows; of no generation (`indexes.store.stat_cache`)
-    folders.stat          stat cache of their folders; of no generation
-    unfinished.sqlite     codes of an interrupted build; of no generation (`indexes.store.unfinished`)
+    files.stat            stat cache of the files of the rows, for all generations (`indexes.store.stat_cache`)
+    folders.stat          stat cache of their folders, for all generations
+    unfinished.sqlite     codes of an interrupted build, for all generations (`indexes.store.unfinished`)
 
 A generation is self-contained: its folder together with a CURRENT is an index, also as a copy. A generation with a
 parent copies the rows that it reuses: a million photos (1 GB) in 2 to 7 seconds.
@@ -121,8 +121,8 @@ class IndexStore:
     ) -> Generation:
         """Write a new generation with exactly these rows, make it current, and return it opened.
 
-        Rows that `parent.reusable` finds by their ids and digests reuse the parent's vectors and arrays. F counts the
-        other rows, in their order; without a parent it is the number of rows.
+        Rows that `parent.reusable` finds by their ids and digests reuse the parent's vectors and arrays. The
+        arguments have the other rows, F in number and in the same order; without a parent, all rows.
 
         Args:
             rows: JSON objects with a distinct text "id", and a "digest" of the content for later reuse.

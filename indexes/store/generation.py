@@ -32,7 +32,7 @@ DOCUMENT_BYTES, DOCUMENT_BYTES_PER_ROW = 2**18, 2**12
 SHOWN_IDS = 5
 MAX_CHECKED_RESULTS = 1000
 OLD_SAMPLE_DIVISOR = 16
-"""A self-check samples this many times fewer rows of old slots (those of the parent, whose rows are reused)."""
+"""A self-check samples this many times fewer rows of old slots than of new ones (old: reused from the parent)."""
 
 
 class Generation:
@@ -164,8 +164,8 @@ class Generation:
         """Search for the vectors of sampled rows, and check that each row is found.
 
         A row passes if a search for its vector ranks the row's slot, or a near-copy with the same score, first. Rows
-        that fail with k = 1 are searched again with k = 1 % of the rows (at most `MAX_CHECKED_RESULTS`), similar to
-        the numbers of candidates of queries: compressed kinds then score more slots exactly.
+        that fail with k = 1 are searched again with k = 1 % of the rows (at most `MAX_CHECKED_RESULTS`), about
+        as many as a query has candidates, because compressed kinds then score more slots exactly.
 
         Args:
             sample: Number of rows in new slots. Of rows in older slots, `sample` / `OLD_SAMPLE_DIVISOR` are checked.

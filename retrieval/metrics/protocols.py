@@ -1,9 +1,9 @@
 """Evaluation metrics: each turns a score table into one value per query, with its gallery and the value of chance.
 
 The gallery of a row excludes the photos of its own grasps, which have object, light and pose in common with it. The
-protocols `with_own` and `paired` of other benchmarks include them. A row without any other photo of its object is no
-query; the description of the gallery states their number. In pair and K-way tests other objects have equal weight,
-however many photos they have; in rankings of the whole gallery each photo counts.
+protocols `with_own` and `paired` of other benchmarks include them. Rows without another photo of their object
+are not queries; the description of the gallery states how many there are. In pair and K-way tests other objects have
+equal weight, however many photos they have; in rankings of the whole gallery each photo counts.
 """
 
 import numpy as np
@@ -63,7 +63,7 @@ def _rival_weights(table: ScoreTable) -> NDArray[np.float64]:
     weights = np.where(table.relevant, 0, columns)
     total = weights.sum(1, keepdims=True)
     if not total.all():
-        raise BadInput(f"a test needs {table.column_words} of at least two objects; a row has those of one")
+        raise BadInput(f"a test needs {table.column_words} of at least two objects; a row has only those of one object")
     return np.asarray(weights / total)
 
 
@@ -151,8 +151,9 @@ def per_object(measure: Measure, column: int = 0) -> dict[int, float]:
 def confusions(table: ScoreTable, *, photos: int = 1, draws: int = 16, seed: int = 0) -> list[tuple[int, int, float]]:
     """Return wrong objects that rank first: (object, confused with, fraction of its queries), largest fraction first.
 
-    All objects of the gallery are candidates, each represented by `photos` photos that are drawn `draws` times. Tied
-    objects divide the rank. Correct results are not listed, so an object's fractions add up to 1 minus its accuracy.
+    All objects of the gallery are candidates, each represented by `photos` photos that are drawn `draws` times. Objects
+    that tie for the first rank share it equally. Correct results are not listed, so an object's fractions add up to 1
+    minus its accuracy.
     """
     queries = table.with_targets
     scores = object_scores(queries, photos, draws, seed)
@@ -165,7 +166,7 @@ def confusions(table: ScoreTable, *, photos: int = 1, draws: int = 16, seed: int
 
 
 def true_ranks(table: ScoreTable) -> NDArray[np.float64]:
-    """Return the expected rank (T,), from 1, of the first photo of a row's object without own photos; NaN if none."""
+    """Return for each row the rank (T,) of the first photo of its object, from 1, without own photos; NaN if none."""
     ranks = np.full(len(table.has_target), np.nan)
     ranks[table.has_target] = ranking.first_rank(table.with_targets.first)
     return ranks

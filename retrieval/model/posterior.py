@@ -6,12 +6,12 @@
     P(none) proportional to  p
 
 O is the number of objects in the catalogue. p is the prior probability that the object in the hand is none of them; the
-objects have equal priors. `w * l(o) + offset` is the log of a likelihood ratio: of these touches on object o to these
-touches on an object that the catalogue lacks. The photos of an object are equally likely views of it, so their
+objects have equal priors. `w * l(o) + offset` is the log of the ratio of two likelihoods of these touches: on object o,
+and on an object that the catalogue lacks. The photos of an object are equally likely views of it, so their
 likelihoods are averaged. An object with one photo has just its match logit.
 
-slope, offset and dependence maximise the likelihood of "which object was it, or none" over catalogues of validation
-objects, drawn with the true object and without. Grasps of one object are correlated by `dependence` (0: independent,
+slope, offset and dependence maximise the likelihood of the right answer over random catalogues of validation
+objects, with the true object and without it. Grasps of one object are correlated by `dependence` (0: independent,
 their logits add; 1: more grasps add no information): n of them count as n / (1 + dependence (n - 1)) independent ones
 (the design effect of cluster sampling; Kish 1965, section 5.4).
 
@@ -84,7 +84,7 @@ class EvidenceMass:
         scored: Log of the sum of exp(w * logit - top) over the scored objects.
         unscored: The same over the other objects, estimated from a sample of them.
         objects: Number of scored and unscored objects.
-        top: Largest w * logit. It is stored separately, because a sum with it would lose the digits of the others.
+        top: Largest w * logit. It is stored separately: adding it to the others would lose their last digits.
     """
 
     scored: float
@@ -211,7 +211,7 @@ class Posterior:
 
             slope * n / (1 + dependence * (n - 1)) * l / g + offset  >  log objects + log (p / (1 - p))
 
-        The term with l grows at most by the factor 1 / dependence from n = 1 (trials: docs/measurements/answers.md).
+        From n = 1 on, the term with l grows by at most 1 / dependence (trials: docs/measurements/answers.md).
 
         Args:
             logit: Logit l of the best object, which is not more likely than none yet.
@@ -292,7 +292,7 @@ def identification_trials(scored: ScoredTouches, seed: int) -> Iterator["Identif
     """Yield the trials of single touches, then of sets of two grasps, three and so on, while objects have enough."""
     for grasps in range(1, MAX_GRASPS + 1):
         rng = np.random.default_rng([seed, grasps])
-        sets = []  # each: touches of one object that leave it an unmasked photo; all touches singly for one grasp
+        sets = []  # touches of one object that do not mask all its photos; for one grasp: each touch alone
         for name in np.unique(scored.touch_owner):
             touches = np.flatnonzero(scored.touch_owner == name)
             draws = touches[:, None] if grasps == 1 else [rng.permutation(touches)[:grasps] for _ in range(_SETS)]

@@ -132,7 +132,7 @@ class Queue:
         pictures: RequestPictures | None = None,
         parsed_query: ParsedQuery | None = None,
     ) -> Result:
-        """Decode `pictures`, then run `work` with the generation that is served at its turn.
+        """Decode `pictures`, then run `work` with the generation that is served when it starts.
 
         Args:
             work: Function of the generation; it runs in a worker thread.

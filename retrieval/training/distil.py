@@ -9,8 +9,8 @@ large catalogue. The head's term is affine in the normalised features, so a blen
 blended features. The embedding part (`cosine`) is blended too, and is then shorter than that of a real image.
 
 In a large catalogue many photos score nearly as high as the exhaustive top-1; a few thousand photos contain few such
-hard negatives. Therefore, after a warm-up, up to three quarters of a batch's photos are the nearest to its touches, by
-the current student, in a large pool of blends.
+hard negatives. Therefore, after a warm-up, up to three quarters of a batch's photos come from a large
+pool of blends: those nearest to its touches by the embeddings of the current student.
 """
 
 import dataclasses
@@ -284,7 +284,7 @@ def with_candidate_encoder(
         checkpoint: The checkpoint.
         config: The configuration, which sets the size of the candidate encoder.
         train: Partial activations of touches (N, P) and of photos (M, P) of training objects.
-        validation: The same of validation objects, if any. The metric uses their touches among the photos of all.
+        validation: The same of validation objects, if any. The metric ranks all photos by these touches.
         quiet: No progress on stderr.
         should_stop: As for `distil`.
 

@@ -343,7 +343,8 @@ class Trainer:
     def _load_own_checkpoint(self) -> Checkpoint:
         """Return the best checkpoint so far, which is part of the state.
 
-        After a crash between writing it and the state, it is newer; repeating the steps gives the same result.
+        After a crash between the writing of the two, the checkpoint is newer than the state; repeating the steps
+        gives the same checkpoint.
         """
         stored = load_checkpoint(self.out)
         mine = (stored.split, stored.provenance.get("data_digest")) == (self.split, self.data_digest)

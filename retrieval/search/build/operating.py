@@ -6,8 +6,9 @@ is exact nearest-neighbour search by embedding). The agreement@k with exhaustive
 of touches whose exhaustive top-1 is among the k candidates.
 
     no bound       exact search, and the smallest k of `candidate_steps` with a recall of 0.99
-    min_recall     the first point that has this recall and whose search takes no longer than its reranking: exact
-                   search, then approximate kinds. If there is none, the fastest point with this recall
+    min_recall     exact search is tried first, then approximate kinds. The first point is chosen that has this
+                   recall and whose search takes no longer than its reranking. If there is none, the fastest point with
+                   this recall
     max_ms         the first point with a recall of 0.99 within the time: exact search, then approximate kinds. If
                    there is none, the point with the highest recall within the time. If no point is within the time,
                    the fastest point with a recall of 0.99
@@ -46,7 +47,7 @@ TARGET = 0.99
 """Default of the agreement@k that the chosen k candidates must reach."""
 
 APPROXIMATE_FACTOR = 4
-"""Largest number of candidates of an approximate kind that is tried under a bound, as a multiple of exact search's."""
+"""Under a bound, approximate kinds are tried with at most this many times the candidates of exact search."""
 
 MAX_CHANGED_FRACTION = 0.10
 """Fraction of a catalogue that may change before its operating point is measured again."""
@@ -151,7 +152,7 @@ def choose_operating_point(
 
 
 def needs_measurement(photos: int, requirements: SearchRequirements) -> bool:
-    """Whether the choice needs a measurement. Few photos are all scored, unless a time bound may forbid it."""
+    """Whether the choice needs a measurement. Few photos are all scored, unless there is a time bound."""
     return len(candidate_steps(photos)) > 1 or requirements.max_ms is not None
 
 
@@ -197,7 +198,7 @@ def _points(bench: SearchBench, requirements: SearchRequirements) -> Iterator[Se
     """Yield points of exact search with more and more candidates until one has the recall, then of approximate kinds.
 
     Approximate kinds start with the number of candidates of the last exact point. If an approximate kind is required,
-    points of exact search are measured only for this number and not yielded; the last point has all photos.
+    exact search is measured only to find this number and not yielded; the last point has all photos.
     """
     approximate = None if requirements.kind is None or load_kind(requirements.kind).exact else requirements.kind
     exact = bench.index_of_kind("flat" if requirements.kind is None or approximate else requirements.kind)

@@ -144,7 +144,7 @@ class FolderShard:
     """The photos of one generation of an index folder, opened in this process.
 
     Its index finds candidates, and the model's head reranks them. Reference touches contribute to the logits of their
-    objects. Threads may search at once. Only a `page` with words may wait: until the first one has read all rows' text.
+    objects. Threads may search at once. Only `page` with words may wait, until all rows' text is read.
 
     Args:
         generation: The opened generation.

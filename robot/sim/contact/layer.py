@@ -1,4 +1,4 @@
-"""Frictionless normal contact of an elastic layer on a rigid base with a height map, for small strains.
+"""Frictionless normal contact between a height map and an elastic layer on a rigid base, for small strains.
 
 Find p >= 0 and the approach d with   s = u(p) + gap - d >= 0,   p s = 0,   and either sum p dA = force or d = depth.
 
@@ -211,7 +211,7 @@ def _is_narrow(touching: npt.NDArray[np.bool_]) -> bool:
 
 
 def _max_slope(height: Floats) -> float:
-    """Return the largest slope by central differences, both in pixels."""
+    """Return the largest slope by central differences; heights and distances are in pixels."""
     slopes = [np.gradient(height, axis=axis) for axis in (0, 1) if height.shape[axis] > 1]
     return float(np.sqrt(sum((slope**2 for slope in slopes), np.zeros(1))).max())
 
