@@ -14,7 +14,7 @@ They are not installed with the package. Each runs in a checkout of the reposito
     python -m benchmarks.simulation     parts of a simulated grasp, compared with another checkout
     python -m benchmarks.growth         growth of collection with grasps and objects, and of a query with its grasps
     python -m benchmarks.training       images per second in training
-    python -m benchmarks.gpu            speed-up by a graphics card
+    python -m benchmarks.gpu            speed-up by a GPU
     python -m benchmarks.shards         a sharded index, compared with one folder
     python -m benchmarks.queueing       cost of many shards, extrapolated
     python -m benchmarks.frontier       error against run time of the kernels (of a search: `retrieve frontier`)

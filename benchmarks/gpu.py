@@ -1,9 +1,9 @@
-"""Speed-up by a graphics card: building, querying, training and simulating, on a device and on the processor in turn.
+"""Speed-up by a GPU: building, querying, training and simulating, on a device and on the processor in turn.
 
     python -m benchmarks.gpu [--device cuda] [--tower mobilenet_v2] [--json]
 
 The towers are those of the commands, moved to the device: images come from the processor and codes go back, as in a
-build. Scoring and simulation run in numpy on the processor: they are timed once, to show what a card cannot shorten.
+build. Scoring and simulation run in numpy on the processor: they are timed once, to show what a GPU does not speed up.
 """
 
 import argparse

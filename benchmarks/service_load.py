@@ -27,11 +27,11 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
-import cv2
 import httpx
 import numpy as np
 
 from retrieval.data.dataset import load_grasps
+from retrieval.data.images import encode_image
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
@@ -62,7 +62,7 @@ class LoadFixture:
             self.photograph(rig, name, 2)
         self.spare = rig.object_ids(objects + 1)[-1]
         touched = next(touched for number in range(99) if (touched := rig.press(self.names[0], 500 + number)))
-        self.touch = [encoded(".jpg", touched[f"touch_{finger}"]) for finger in "ab"]  # the format of rigs
+        self.touch = [encode_image(touched[f"touch_{finger}"], ".jpg") for finger in "ab"]  # the format of rigs
         self.body = {"touches": [[base64.b64encode(image).decode() for image in self.touch]]}
         self.rig, self.model = rig, load_checkpoint(shipped_model())
         build_index(self.catalogue, self.model, self.index, quiet=True)
@@ -73,7 +73,7 @@ class LoadFixture:
         for number in range(photos):
             rig.prepare(name, number)
             (self.catalogue / name / f"{number}.jpg").write_bytes(
-                encoded(".jpg", rig.sim_state.current_scene().image("photo"))
+                encode_image(rig.sim_state.current_scene().image("photo"), ".jpg")
             )
 
     def next_generation(self, index):
@@ -101,10 +101,6 @@ class DrawnQuery:
         build_index(catalogue, load_checkpoint(folder / "tiny.safetensors"), self.index, quiet=True)
         touch = synthetic.write_queries(folder / "touch", objects[:1])[self.names[0]][0]
         self.body = {"touches": [[base64.b64encode(path.read_bytes()).decode() for path in touch]]}
-
-
-def encoded(ending, pixels):
-    return bytes(cv2.imencode(ending, np.ascontiguousarray(pixels[..., ::-1]))[1].tobytes())
 
 
 def resident_mb(pid):
