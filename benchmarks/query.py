@@ -85,7 +85,7 @@ def _line(
 
 def searcher_of(index: Path, checkpoint: Checkpoint, encoder: TouchEncoder) -> Searcher:
     """Return a searcher that encodes touches with this encoder."""
-    scorer = read_scorer(checkpoint.path)
+    scorer = read_scorer(checkpoint)
     shard = FolderShard(IndexStore(index).open(threads=1), scorer, checkpoint.config.has_embeddings)
     return Searcher(index, shard, checkpoint, encoder, scorer)
 

@@ -67,7 +67,7 @@ class UnadaptedBaseline:
         for fold in map(self.features.of_objects, folds):
             features = fold.select(first_rows(fold, max_touches))
             own = np.eye(len(features), dtype=np.bool_)
-            projections = touch_embeddings(self._partials(features).numpy(), self.start.config.matcher.hidden)
+            projections = touch_embeddings(self._partials(features).numpy(), self.start.config.matcher.cosine_columns)
             scored = ScoredTouches(self.logits(features), features.owner, features.owner, own)
             parts.append(ReferenceTouches(scored, projections))
         return parts

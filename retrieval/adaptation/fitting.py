@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch import nn
 
 from retrieval.adaptation.data import AdaptationData
 from retrieval.adaptation.estimate import Estimate
@@ -82,6 +83,7 @@ def install_codes(matcher: Matcher, projections: CcaProjections, scale: float, o
         offset: Offset of the logit.
     """
     for layer, found in ((matcher.touch_projection, projections.touch), (matcher.photo_projection, projections.photo)):
+        assert isinstance(layer, nn.Linear)  # the configuration of `adapt` has no hidden layer
         used = found.weight.shape[1]  # shorter codes leave zeros, which do not change the cosine
         layer.weight.zero_()
         layer.bias.zero_()

@@ -110,4 +110,4 @@ def frozen_matcher(config: Config) -> Matcher:
 
 def _feature_counts(matcher: Matcher) -> tuple[int, int, int]:
     """Return the fingers, the features of one finger, and the features of a photo."""
-    return matcher.config.fingers, matcher.touch_tower.feature_count, matcher.head.photo_partial.in_features
+    return matcher.config.fingers, matcher.touch_tower.output_count, matcher.photo_feature_count

@@ -187,7 +187,7 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
         references = header.get("references")
         references = None if references is None else ReferenceCalibration.from_dict(references)
         queries = state.pop(_QUERIES, None)
-        partial = info.config.matcher.partial_width
+        partial = info.config.matcher.touch_partial_width
         if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (partial,)):
             raise CheckpointError(
                 f"{_QUERIES} must be float16 (touches, {partial}); got {queries.dtype} {tuple(queries.shape)}"

@@ -94,8 +94,9 @@ def checkpoint_info(path: Path, header: dict[str, Any]) -> CheckpointInfo:
     return CheckpointInfo(path, file_digest(path), config, header["provenance"], check)
 
 
-def read_scorer(path: Path) -> FusionScorer:
+def read_scorer(info: CheckpointInfo) -> FusionScorer:
     """Read the layers of a checkpoint's head that score pairs of partial activations. Raises CheckpointError."""
+    path, matcher = info.path, info.config.matcher
     try:
         with safe_open(path, framework="np") as file:
             parts = [file.get_tensor(name) for name in _SCORER_TENSORS]
@@ -107,7 +108,8 @@ def read_scorer(path: Path) -> FusionScorer:
         if part.shape != shape or part.dtype.kind != "f":
             raise unusable(path, f"{name} is {part.dtype} {part.shape}, must be floats of shape {shape}")
     second, second_bias, out, out_bias = (part.astype(np.float32) for part in parts)
-    return FusionScorer(second, second_bias, out[0], out_bias)
+    cosine_dim = matcher.pooled_width - hidden
+    return FusionScorer(second, second_bias, out[0], out_bias, cosine_dim=cosine_dim, cell_dim=matcher.cell_dim)
 
 
 def read_header(path: Path) -> dict[str, Any]:

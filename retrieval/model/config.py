@@ -48,6 +48,11 @@ class MatcherConfig:
             activations to embeddings after training. 0: search uses the contrastive embeddings.
         candidate_linear: Number of the embedding_dim components that are linear in the contrastive embedding. Requires
             `cosine`.
+        projection_hidden: Hidden units of the projections to the contrastive embeddings. 0: the projections are linear.
+        cell_dim: Length of a cell's vector in the late interaction that is added to the match logit
+            (`retrieval.model.late_interaction`); needs tower_output "stages". 0: no late interaction, as in the paper.
+        touch_cells: Cells along each side of a gel image.
+        photo_cells: Cells along each side of the last view of a photo.
         cosine: Add the scaled cosine of the contrastive embeddings to the match logit. The paper does not do this.
         architectures: Architecture by name of each backbone that another library builds, so that a checkpoint needs
             neither its files nor a network. `Config.using` fills it in.
@@ -62,13 +67,32 @@ class MatcherConfig:
     embedding_dim: Count = 128
     candidate_width: Annotated[int, Meta(ge=0)] = 0
     candidate_linear: int = 0
+    projection_hidden: Annotated[int, Meta(ge=0)] = 0
+    cell_dim: Annotated[int, Meta(ge=0)] = 0
+    touch_cells: Count = 4
+    photo_cells: Count = 10
     cosine: bool = False
     architectures: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def partial_width(self) -> int:
-        """Width of a partial activation: the head's term, then the scaled embedding if the logit adds its cosine."""
+    def pooled_width(self) -> int:
+        """Width of a partial activation without cells: the head's term, then the scaled embedding with `cosine`."""
         return self.hidden + (self.embedding_dim if self.cosine else 0)
+
+    @property
+    def cosine_columns(self) -> slice:
+        """The columns of a partial activation that are the scaled embedding."""
+        return slice(self.hidden, self.pooled_width)
+
+    @property
+    def touch_partial_width(self) -> int:
+        """Width of a touch's partial activation."""
+        return self.pooled_width + self.fingers * self.touch_cells**2 * self.cell_dim
+
+    @property
+    def partial_width(self) -> int:
+        """Width of a photo's partial activation."""
+        return self.pooled_width + self.photo_cells**2 * self.cell_dim
 
     def __post_init__(self) -> None:
         check_fields(self, "matcher", ConfigError)
@@ -77,6 +101,10 @@ class MatcherConfig:
             0 <= self.candidate_linear <= limit,
             f"matcher.candidate_linear must be from 0 to {limit} (below embedding_dim, and 0 without cosine), got "
             f"{self.candidate_linear}",
+        )
+        _require(
+            not self.cell_dim or self.tower_output == "stages",
+            f'matcher.cell_dim above 0 needs tower_output = "stages", got {self.tower_output!r}',
         )
 
 

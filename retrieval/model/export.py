@@ -1,5 +1,6 @@
 """`retrieve export`: the touch encoder as ONNX, if ONNX Runtime is faster on this machine."""
 
+import copy
 import logging
 import stat
 import statistics
@@ -22,6 +23,7 @@ from retrieval.errors import BadInput, CheckpointError, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import TorchEncoder, for_inference
 from retrieval.model.fusion import Matcher, Standardise
+from retrieval.model.late_interaction import CellEncoder
 from retrieval.model.onnx_encoder import (
     CHECKPOINT_KEY,
     EXPORT_SUFFIX,
@@ -177,8 +179,8 @@ class _TouchEncoder(nn.Module):
     def forward(self, images: Tensor) -> tuple[Tensor, ...]:
         tower = self.matcher.touch_tower
         pictures = images.permute(0, 1, 4, 2, 3).flatten(0, 1)
-        features = tower._encode((pictures - tower.mean) / tower.std)
-        features = features.reshape(-1, self.matcher.config.fingers * tower.feature_count)
+        features = tower.encode_unchecked(pictures)
+        features = features.reshape(-1, self.matcher.config.fingers * tower.output_count)
         encoding, readings = self.matcher.touch_search_encoding(features), self.matcher.gel_readings(features)
         outputs = encoding.partial, encoding.embedding
         return outputs if readings is None else (*outputs, readings)
@@ -195,8 +197,8 @@ class _PhotoEncoder(nn.Module):
         tower, views = self.matcher.photo_tower, self.matcher.views
         side = images.shape[1]
         pictures = images.reshape(-1, side, views, side, 3).permute(0, 2, 4, 1, 3).flatten(0, 1)
-        features = tower._encode((pictures - tower.mean) / tower.std)
-        encoding = self.matcher.photo_search_encoding(features.reshape(-1, views * tower.feature_count))
+        features = self.matcher.joined_views(tower.encode_unchecked(pictures))
+        encoding = self.matcher.photo_search_encoding(features)
         return encoding.partial, encoding.embedding
 
 
@@ -206,6 +208,11 @@ def _exportable_matcher(matcher: Matcher, side: str) -> Matcher:
     norm = matcher.get_submodule(f"{side}_norm")
     if isinstance(norm, Standardise):
         fast.add_module(f"{side}_norm", _FrozenNorm(norm))
+    cells = fast.get_submodule(f"{side}_cells") if matcher.config.cell_dim else None
+    if isinstance(cells, CellEncoder) and isinstance(cells.norm, Standardise):
+        frozen = copy.copy(cells)
+        frozen._modules = {**cells._modules, "norm": _FrozenNorm(cells.norm)}
+        fast.add_module(f"{side}_cells", frozen)
     return fast
 
 

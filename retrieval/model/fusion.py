@@ -3,11 +3,12 @@
 The first layer of the head is linear in the concatenation of the modalities, so it is stored as two layers: `W [t; v] +
 b = (W_t t + b) + W_v v`. Each term is a partial activation. The partial activation of a photo is computed once, stored,
 and added to that of any touch. If the logit adds the cosine of the embeddings (`MatcherConfig.cosine`), a partial
-activation ends with its embedding times the root of the scale. The index then still stores nothing else of a photo.
+activation continues with its embedding times the root of the scale. With late interaction (`MatcherConfig.cell_dim`) it
+ends with the vectors of the image's cells. So an index stores nothing else of a photo.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +20,9 @@ from retrieval.errors import BadInput
 from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion_scorer import FusionScorer
+from retrieval.model.late_interaction import CellEncoder, cell_scores, paired_cell_scores
 from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX
+from retrieval.model.stored_partials import Partials
 from retrieval.model.towers import build_tower
 
 COSINE_SCALE_INIT = 4.0
@@ -71,10 +74,33 @@ class Standardise(nn.BatchNorm1d):
 
 
 class FusionHead(nn.Module):
-    """Late fusion (Lin et al., ICRA 2019): two layers of `hidden` units with ReLU, dropout between, one logit."""
+    """Match logits of partial activations, with cells or without.
 
-    def __init__(self, touch_features: int, photo_features: int, hidden: int, dropout: float) -> None:
+    The first term is late fusion (Lin et al., ICRA 2019): two layers of `hidden` units with ReLU, dropout between, one
+    logit. The cosine of the embeddings and the late interaction of the cells add to it, if the matcher has them.
+    """
+
+    def __init__(
+        self,
+        touch_features: int,
+        photo_features: int,
+        hidden: int,
+        dropout: float,
+        cosine_dim: int = 0,
+        cell_dim: int = 0,
+    ) -> None:
+        """Make the layers, with random weights.
+
+        Args:
+            touch_features: Features of a touch.
+            photo_features: Features of a photo.
+            hidden: Width of the two layers.
+            dropout: Dropout probability.
+            cosine_dim: Numbers of a partial activation that are a scaled embedding; 0 without the cosine.
+            cell_dim: Length of a cell's vector; 0 without late interaction.
+        """
         super().__init__()
+        self.cosine_end, self.cell_dim = hidden + cosine_dim, cell_dim
         self.touch_partial = nn.Linear(touch_features, hidden)
         self.photo_partial = nn.Linear(photo_features, hidden, bias=False)
         self.dropout = nn.Dropout(dropout)
@@ -87,11 +113,35 @@ class FusionHead(nn.Module):
 
     def forward(self, touch_partial: Tensor, photo_partial: Tensor) -> Tensor:
         """Return match logits (P,) of pairs of partial activations (P, partial); (1, partial) broadcasts."""
+        pooled = slice(self.second.in_features, self.cosine_end)
+        logits = self._fusion(touch_partial, photo_partial)
+        logits = logits + (touch_partial[..., pooled] * photo_partial[..., pooled]).sum(-1)
+        if self._have_cells(photo_partial):
+            logits = logits + paired_cell_scores(self._cells(touch_partial), self._cells(photo_partial))
+        return logits
+
+    def all_logits(self, touch_partials: Tensor, photo_partials: Tensor) -> Tensor:
+        """Return match logits (T, N) of every touch (T, partial) with every photo (N, partial)."""
+        pooled = slice(self.second.in_features, self.cosine_end)
+        logits = self._fusion(touch_partials[:, None], photo_partials[None])
+        logits = logits + touch_partials[:, pooled] @ photo_partials[:, pooled].T
+        if self._have_cells(photo_partials):
+            logits = logits + cell_scores(self._cells(touch_partials), self._cells(photo_partials))
+        return logits
+
+    def _fusion(self, touch_partial: Tensor, photo_partial: Tensor) -> Tensor:
         hidden = self.second.in_features
         x = self.dropout(functional.relu(touch_partial[..., :hidden] + photo_partial[..., :hidden]))
         x = functional.relu(self.second(x))
-        cosine = (touch_partial[..., hidden:] * photo_partial[..., hidden:]).sum(-1)
-        return self.out(x).squeeze(-1) + cosine  # type: ignore[no-any-return]
+        return self.out(x).squeeze(-1)  # type: ignore[no-any-return]
+
+    def _have_cells(self, partial: Tensor) -> bool:
+        return partial.shape[-1] > self.cosine_end
+
+    def _cells(self, partial: Tensor) -> Tensor:
+        """Return the vectors (..., cells, cell_dim) of the cells of partial activations (..., partial)."""
+        cells = partial[..., self.cosine_end :]
+        return cells.reshape(*cells.shape[:-1], -1, self.cell_dim)
 
 
 class Matcher(nn.Module):
@@ -110,22 +160,34 @@ class Matcher(nn.Module):
         # All fingers use one set of weights.
         self.touch_tower = build_tower(config.tower, config.tower_output, config.architectures)
         self.photo_tower = build_tower(config.tower, config.tower_output, config.architectures)
+        if config.cell_dim:
+            self.touch_tower.divide(config.touch_cells)
+            self.photo_tower.divide(config.photo_cells)
         touch_features = config.fingers * self.touch_tower.feature_count
         photo_features = views * self.photo_tower.feature_count
-        self.head = FusionHead(touch_features, photo_features, config.hidden, config.dropout)
+        cosine_dim = config.embedding_dim if config.cosine else 0
+        self.head = FusionHead(
+            touch_features, photo_features, config.hidden, config.dropout, cosine_dim, config.cell_dim
+        )
         # Created after the head, so that the head's random initial weights equal the paper's model.
-        self.touch_projection = nn.Linear(touch_features, config.embedding_dim)
-        self.photo_projection = nn.Linear(photo_features, config.embedding_dim)
+        self.touch_projection = _projection(touch_features, config)
+        self.photo_projection = _projection(photo_features, config)
         # In evaluation mode a fixed affine map, so the head's first layer remains a sum of two terms.
         norm = Standardise if config.standardise else nn.Identity
         self.touch_norm, self.photo_norm = norm(touch_features), norm(photo_features)
+        self.touch_cells, self.photo_cells = (
+            CellEncoder(tower.cell_channels, config.cell_dim, norm(tower.cell_channels), weighted=weighted)
+            if config.cell_dim
+            else None
+            for tower, weighted in ((self.touch_tower, True), (self.photo_tower, False))
+        )
         self.log_scale = nn.Parameter(torch.tensor(LOG_SCALE_INIT))
         self.cosine_scale = nn.Parameter(torch.tensor(COSINE_SCALE_INIT)) if config.cosine else None
         self.candidate_encoder = candidate_encoder_of(config) if config.candidate_width else None
         self.gel_head: GelHead | None = None  # fitted after training (`retrieval.training.verdicts`)
 
     def touch_features(self, touches: Tensor) -> Tensor:
-        """Return features (B, fingers * features) of touches (B, fingers, 3, H, W) in 0..1, fingers in order a, b.
+        """Return features (B, fingers * output_count) of touches (B, fingers, 3, H, W) in 0..1, fingers in order a, b.
 
         Raises:
             BadInput: A touch has another number of images than this matcher has fingers.
@@ -138,29 +200,66 @@ class Matcher(nn.Module):
         return features.float().view(len(touches), -1)
 
     def photo_features(self, photos: Tensor) -> Tensor:
-        """Return features (B, views * features) of photos (B, 3, H, views * W) in 0..1."""
+        """Return features (B, photo_feature_count) of photos (B, 3, H, views * W) in 0..1."""
         if self.views > 1:
             # One copy with channels last: without it, convolutions in training take 1.4 times as long.
             count, _, height, _ = photos.shape
             side_by_side = photos.permute(0, 2, 3, 1).reshape(count, height, self.views, -1, 3)
             photos = side_by_side.transpose(1, 2).flatten(0, 1).permute(0, 3, 1, 2)
         features: Tensor = self.photo_tower(photos)
-        return features.float().view(len(photos) // self.views, -1)
+        return self.joined_views(features.float())
+
+    def joined_views(self, outputs: Tensor) -> Tensor:
+        """Return features (B, photo_feature_count) of the tower's outputs (B * views, output_count).
+
+        These are the features of every view, then the cells of the last view: a zoom into the object, if the
+        preprocessing has one.
+        """
+        outputs = outputs.view(-1, self.views, self.photo_tower.output_count)
+        pooled = self.photo_tower.feature_count
+        return torch.cat([outputs[..., :pooled].flatten(1), outputs[:, -1, pooled:]], dim=1)
+
+    @property
+    def photo_feature_count(self) -> int:
+        """Length of the features of a photo."""
+        tower = self.photo_tower
+        return (self.views - 1) * tower.feature_count + tower.output_count
 
     def touch_encoding(self, features: Tensor) -> ImageEncoding:
         """Return partial activations of touch features, and their embeddings by the contrastive projection."""
-        features = self.touch_norm(features)
-        return self._encoding(self.head.touch_partial(features), _unit(self.touch_projection(features)))
+        tower, fingers = self.touch_tower, self.config.fingers
+        each = features.reshape(-1, fingers, tower.output_count)
+        pooled = self.touch_norm(each[..., : tower.feature_count].flatten(1))
+        parts, embedding = [self.head.touch_partial(pooled)], _unit(self.touch_projection(pooled))
+        if self.touch_cells is not None:
+            cells = each[..., tower.feature_count :].reshape(-1, fingers * tower.cells**2, tower.cell_channels)
+            return self._encoding(parts, embedding, self.touch_cells(cells))
+        return self._encoding(parts, embedding)
 
     def photo_encoding(self, features: Tensor) -> ImageEncoding:
         """Return partial activations of photo features, and their embeddings by the contrastive projection."""
-        features = self.photo_norm(features)
-        return self._encoding(self.head.photo_partial(features), _unit(self.photo_projection(features)))
+        tower = self.photo_tower
+        count = self.views * tower.feature_count
+        pooled = self.photo_norm(features[:, :count])
+        parts, embedding = [self.head.photo_partial(pooled)], _unit(self.photo_projection(pooled))
+        if self.photo_cells is not None:
+            cells = features[:, count:].reshape(-1, tower.cells**2, tower.cell_channels)
+            return self._encoding(parts, embedding, self.photo_cells(cells))
+        return self._encoding(parts, embedding)
 
-    def _encoding(self, term: Tensor, embedding: Tensor) -> ImageEncoding:
-        if self.cosine_scale is None:
-            return ImageEncoding(term, embedding)
-        return ImageEncoding(torch.cat([term, embedding * self.cosine_scale.clamp(min=0.0).sqrt()], dim=-1), embedding)
+    def _encoding(self, parts: list[Tensor], embedding: Tensor, cells: Tensor | None = None) -> ImageEncoding:
+        """Return the encoding of images.
+
+        Args:
+            parts: The first parts of the partial activations.
+            embedding: (B, embedding_dim) unit embeddings.
+            cells: (B, N, cell_dim) vectors of cells.
+        """
+        if self.cosine_scale is not None:
+            parts.append(embedding * self.cosine_scale.clamp(min=0.0).sqrt())
+        if cells is not None:
+            parts.append(cells.flatten(1))
+        return ImageEncoding(torch.cat(parts, dim=-1), embedding)
 
     def touch_search_encoding(self, features: Tensor) -> ImageEncoding:
         """Return partial activations and search embeddings of touch features."""
@@ -168,15 +267,20 @@ class Matcher(nn.Module):
         return (
             encoding
             if self.candidate_encoder is None
-            else ImageEncoding(encoding.partial, self.candidate_encoder.touch(encoding.partial))
+            else ImageEncoding(encoding.partial, self.candidate_encoder.touch(self._pooled(encoding.partial)))
         )
 
     def gel_readings(self, features: Tensor) -> Tensor | None:
         """Return the readings (B, fingers, 2) of each finger's features (`GelHead`); None without a gel head."""
         if self.gel_head is None:
             return None
-        readings: Tensor = self.gel_head(features.view(-1, self.config.fingers, self.touch_tower.feature_count))
+        each = features.view(-1, self.config.fingers, self.touch_tower.output_count)
+        readings: Tensor = self.gel_head(each[..., : self.touch_tower.feature_count])
         return readings
+
+    def _pooled(self, partial: Tensor) -> Tensor:
+        """Return partial activations without their cells."""
+        return partial[..., : self.config.pooled_width]
 
     def photo_search_encoding(self, features: Tensor) -> ImageEncoding:
         """Return partial activations and search embeddings of photo features, as an index stores them."""
@@ -184,7 +288,7 @@ class Matcher(nn.Module):
         return (
             encoding
             if self.candidate_encoder is None
-            else ImageEncoding(encoding.partial, self.candidate_encoder.photo(encoding.partial))
+            else ImageEncoding(encoding.partial, self.candidate_encoder.photo(self._pooled(encoding.partial)))
         )
 
     def forward(self, touches: Tensor, photos: Tensor) -> Tensor:
@@ -201,7 +305,19 @@ class Matcher(nn.Module):
 
 def candidate_encoder_of(config: MatcherConfig) -> CandidateEncoder:
     """Return an untrained candidate encoder with the sizes of a matcher."""
-    return CandidateEncoder(config.partial_width, config.candidate_width, config.embedding_dim, config.candidate_linear)
+    return CandidateEncoder(config.pooled_width, config.candidate_width, config.embedding_dim, config.candidate_linear)
+
+
+def _projection(features: int, config: MatcherConfig) -> nn.Module:
+    """Return a projection to an embedding: linear, or with one hidden layer."""
+    if not config.projection_hidden:
+        return nn.Linear(features, config.embedding_dim)
+    return nn.Sequential(
+        nn.Linear(features, config.projection_hidden),
+        nn.ReLU(),
+        nn.Dropout(config.dropout),
+        nn.Linear(config.projection_hidden, config.embedding_dim),
+    )
 
 
 def _unit(x: Tensor) -> Tensor:
@@ -213,14 +329,18 @@ def scorer_of(head: FusionHead) -> FusionScorer:
 
     It shares the head's weights if these are on the CPU.
     """
-    parts = (head.second.weight, head.second.bias, head.out.weight[0], head.out.bias)
-    return FusionScorer(*(part.detach().cpu().numpy() for part in parts))
+    second, bias, out, out_bias = (
+        part.detach().cpu().numpy()
+        for part in (head.second.weight, head.second.bias, head.out.weight[0], head.out.bias)
+    )
+    cosine_dim = head.cosine_end - len(out)
+    return FusionScorer(second, bias, out, out_bias, cosine_dim=cosine_dim, cell_dim=head.cell_dim)
 
 
 def score_partials(
     head: FusionHead,
     touch_partials: Tensor,
-    photo_partials: NDArray[np.floating[Any]],
+    photo_partials: Partials,
     rows: NDArray[np.int64] | None = None,
 ) -> NDArray[np.float32]:
     """Return `FusionScorer.logits` for a head in PyTorch.

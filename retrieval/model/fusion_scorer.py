@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from _touch_retrieval.documents import typed
 from retrieval.data.resize import RgbImage, resize
 from retrieval.errors import BadInput, NumericalError
+from retrieval.model.stored_partials import Partials, as_float32
 
 CONTACT, NO_CONTACT, NOT_A_GEL = "contact", "no contact", "not a gel image"
 BLOCKS = 16
@@ -88,30 +89,47 @@ def contact_level(touch: RgbImage, no_contact: RgbImage) -> float:
 
 
 Floats = NDArray[np.float32]
-Partials = NDArray[np.floating[Any]]
 BLOCK = 2048
 """Number of photos that are scored together."""
+CELL_BLOCK = 64
+"""The same for scores of cells, whose vectors then fit into the processor's cache."""
 
 
 @dataclass(frozen=True)
 class FusionScorer:
     """The layers of a fusion head after its partial activations.
 
-    A partial activation is a concatenation [hidden (H), scaled contrastive embedding (E)]. The match logit is
-    `out . relu(second relu(touch_hidden + photo_hidden) + second_bias) + out_bias + touch_embedding . photo_embedding`;
-    the last term is a scaled cosine similarity, and E is 0 for a head without it (`cosine`).
+    A partial activation is a concatenation [hidden (H), scaled contrastive embedding (E), vectors of cells]. The match
+    logit is `out . relu(second relu(touch_hidden + photo_hidden) + second_bias) + out_bias + touch_embedding .
+    photo_embedding + sum over cells i of the touch of max over cells j of the photo of touch_cell_i . photo_cell_j`.
+    The second term is a scaled cosine similarity, and E is 0 for a head without it (`cosine`). The last term is left
+    out if the photos have no cells.
 
     Attributes:
         second: (H, H) weights of the second layer. All arrays are float32.
         second_bias: (H,) its bias.
         out: (H,) weights of the output.
         out_bias: (1,) its bias.
+        cosine_dim: E.
+        cell_dim: Length of a cell's vector; 0 without cells.
     """
 
     second: Floats
     second_bias: Floats
     out: Floats
     out_bias: Floats
+    cosine_dim: int = 0
+    cell_dim: int = 0
+
+    @property
+    def pooled_width(self) -> int:
+        """Width of a partial activation without cells."""
+        return len(self.out) + self.cosine_dim
+
+    @property
+    def cosine_columns(self) -> slice:
+        """The columns of a partial activation that are the scaled embedding."""
+        return slice(len(self.out), self.pooled_width)
 
     def logits(self, touch_partials: Floats, photo_partials: Partials, rows: NDArray[np.int64] | None = None) -> Floats:
         """Return the match logits of photos, summed over grasps: (len(rows),).
@@ -120,20 +138,24 @@ class FusionScorer:
         float32.
 
         Args:
-            touch_partials: (G, partial) partial activations of G grasps of ONE object.
-            photo_partials: (N, partial) in any float type, possibly memory-mapped.
+            touch_partials: (G, touch partial) partial activations of G grasps of ONE object.
+            photo_partials: (N, partial) of the photos, in any float type or as stored.
             rows: Photos to score; None for all.
 
         Raises:
             NumericalError: A logit is NaN or infinite: sorting would rank it first.
         """
         count = len(photo_partials) if rows is None else len(rows)
+        has_cells = self.cell_dim > 0 and photo_partials.shape[1] > self.pooled_width
+        block = CELL_BLOCK if has_cells else BLOCK
         scores = np.empty(count, dtype=np.float32)
         with np.errstate(over="ignore", invalid="ignore"):  # the check below names the row
-            for start in range(0, count, BLOCK):
-                part = slice(start, min(start + BLOCK, count))
-                photos = photo_partials[part] if rows is None else photo_partials[rows[part]]
-                scores[part] = self._sum_of_logits(touch_partials, as_float32(photos))
+            for start in range(0, count, block):
+                part = slice(start, min(start + block, count))
+                photos = as_float32(photo_partials[part] if rows is None else photo_partials[rows[part]])
+                scores[part] = self._sum_of_logits(touch_partials, photos)
+                if has_cells:
+                    scores[part] += self._sum_of_cell_scores(touch_partials, photos)
         if not np.isfinite(scores).all():
             bad = int(np.flatnonzero(~np.isfinite(scores))[0])
             name = bad if rows is None else int(rows[bad])
@@ -143,7 +165,7 @@ class FusionScorer:
     def _sum_of_logits(self, touch_partials: Floats, photos: Floats) -> Floats:
         width = len(self.out)
         hidden, second = (np.empty((len(photos), width), dtype=np.float32) for _ in range(2))
-        total: Floats = photos[:, width:] @ touch_partials[:, width:].sum(0)
+        total: Floats = photos[:, self.cosine_columns] @ touch_partials[:, self.cosine_columns].sum(0)
         total += len(touch_partials) * self.out_bias[0]
         for touch_partial in touch_partials:
             np.add(photos[:, :width], touch_partial[:width], out=hidden)
@@ -154,27 +176,10 @@ class FusionScorer:
             total += second @ self.out
         return total
 
-
-def as_float32(values: Partials) -> Floats:
-    """Return `values` in float32, exactly.
-
-    Partial activations are finite float16. numpy converts these one by one, which takes longer than the arithmetic on
-    them. Shifting the five bits of the exponent and the ten of the fraction gives the number over 2^112, subnormals
-    included.
-    """
-    if values.dtype != np.float16:
-        return np.ascontiguousarray(values, dtype=np.float32)
-    bits = np.ascontiguousarray(values).view(np.int16)
-    if ((bits & _EXPONENT) == _EXPONENT).any():  # NaN or infinite
-        return values.astype(np.float32)
-    wide = bits.astype(np.int32)  # copies the sign to all upper bits
-    wide <<= 13
-    wide &= _SIGN_AND_VALUE
-    floats: Floats = wide.view(np.float32)
-    floats *= _UNSHIFT
-    return floats
-
-
-_EXPONENT = np.int16(0x7C00)
-_SIGN_AND_VALUE = np.int32(0x8FFFE000 - 2**32)
-_UNSHIFT = np.float32(2.0**112)
+    def _sum_of_cell_scores(self, touch_partials: Floats, photos: Floats) -> Floats:
+        """Return, for each photo, the sum over all touch cells of the largest inner product with one of its cells."""
+        touch_cells = np.ascontiguousarray(touch_partials[:, self.pooled_width :]).reshape(-1, self.cell_dim)
+        photo_cells = photos[:, self.pooled_width :].reshape(-1, self.cell_dim)
+        products = photo_cells @ touch_cells.T
+        best: Floats = products.reshape(len(photos), -1, len(touch_cells)).max(1)
+        return np.asarray(best.sum(1))

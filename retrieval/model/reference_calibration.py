@@ -84,15 +84,15 @@ class ReferenceCalibration:
         return typed(data, cls, "references", complete=True, error=BadInput)
 
 
-def touch_embeddings(partials: NDArray[np.floating[Any]], hidden: int) -> Floats:
+def touch_embeddings(partials: NDArray[np.floating[Any]], columns: slice) -> Floats:
     """Return the unit contrastive embeddings (G, d) of touches.
 
     Args:
-        partials: (G, hidden + d) partial activations, which end with the scaled embeddings. d is 0 for a model whose
+        partials: (G, partial) partial activations.
+        columns: Their d columns with the scaled embeddings (`MatcherConfig.cosine_columns`). d is 0 for a model whose
             logit has no cosine.
-        hidden: Width of the fusion head.
     """
-    embeddings = np.asarray(partials[:, hidden:], dtype=np.float32)
+    embeddings = np.asarray(partials[:, columns], dtype=np.float32)
     return np.asarray(embeddings / np.maximum(np.linalg.norm(embeddings, axis=1, keepdims=True), np.float32(1e-6)))
 
 

@@ -29,7 +29,7 @@ from retrieval.errors import JobInterrupted
 from retrieval.model.candidate_encoder import CandidateEncoder, PartialStatistics
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
-from retrieval.model.fusion import FusionHead, Matcher, candidate_encoder_of
+from retrieval.model.fusion import Matcher, candidate_encoder_of
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.features import Features
 from retrieval.training.fit import Plan, fit
@@ -73,7 +73,7 @@ def distil(
 
     Args:
         matcher: The matcher.
-        touch_partials: Partial activations (N, P) of touches of training objects.
+        touch_partials: Partial activations (N, P) of touches of training objects. Their cells are not used.
         photo_partials: Partial activations (M, P) of photos of training objects.
         width: Hidden units of the candidate encoder.
         steps: Number of steps.
@@ -88,11 +88,12 @@ def distil(
         NumericalError: The loss is not finite.
     """
     config = dataclasses.replace(matcher.config, candidate_width=width, candidate_linear=linear)
+    touch_partials, photo_partials = (part[:, : config.pooled_width] for part in (touch_partials, photo_partials))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         candidate_encoder = candidate_encoder_of(config).to(touch_partials.device)
     touch_statistics, photo_statistics = (
-        PartialStatistics.of(part, config.partial_width - config.hidden) for part in (touch_partials, photo_partials)
+        PartialStatistics.of(part, config.pooled_width - config.hidden) for part in (touch_partials, photo_partials)
     )
     candidate_encoder.initialise_linear(photo_partials, touch_statistics, photo_statistics)
     generator, head = torch.Generator().manual_seed(seed), matcher.head.eval()
@@ -103,7 +104,9 @@ def distil(
         standardised = touch_statistics(touches)
         photos = sampler.photos(step - steps // WARMUP_DIVISOR, standardised)
         scores = candidate_encoder.scores(standardised, photo_statistics(photos))
-        return distillation_loss(scores, all_logits(head, touches, photos))
+        with torch.no_grad():
+            logits = head.all_logits(touches, photos)
+        return distillation_loss(scores, logits)
 
     optimizer, plan = torch.optim.Adam(candidate_encoder.parameters()), Plan(steps, LEARNING_RATE)
     with Bar("distil candidate encoder", steps, "steps", quiet=quiet) as bar:
@@ -194,12 +197,6 @@ def blend(partials: Tensor, count: int, generator: torch.Generator) -> Tensor:
     return Blends.sample(partials, count, generator).of(partials, torch.arange(count, device=partials.device))
 
 
-@torch.no_grad()
-def all_logits(head: FusionHead, touch_partials: Tensor, photo_partials: Tensor) -> Tensor:
-    """Return match logits (T, N) of every touch with every photo, one touch at a time to save memory."""
-    return torch.stack([head(touch[None], photo_partials) for touch in touch_partials])
-
-
 def agreement_metrics(matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor) -> dict[str, float]:
     """Return the fraction of touches whose exhaustive top-1 is among the candidate encoder's nearest 1 % of photos."""
     candidates = max(1, round(CANDIDATE_FRACTION * len(photo_partials)))
@@ -210,10 +207,12 @@ def agreement_metrics(matcher: Matcher, touch_partials: Tensor, photo_partials: 
 def exhaustive_top1_ranks(matcher: Matcher, touch_partials: Tensor, photo_partials: Tensor) -> NDArray[np.int64]:
     """Return the rank (T,), from 0, of each touch's exhaustive top-1 photo in the candidate encoder's order."""
     assert matcher.candidate_encoder is not None
+    encoder, pooled = matcher.candidate_encoder, matcher.config.pooled_width
     with torch.inference_mode():
-        top1 = all_logits(matcher.head, touch_partials, photo_partials).argmax(1)
-        similarity = matcher.candidate_encoder.touch(touch_partials) @ matcher.candidate_encoder.photo(photo_partials).T
-        nearer = similarity > similarity.gather(1, top1[:, None])
+        # One touch at a time saves memory.
+        logits = torch.cat([matcher.head.all_logits(touch, photo_partials) for touch in torch.split(touch_partials, 1)])
+        similarity = encoder.touch(touch_partials[:, :pooled]) @ encoder.photo(photo_partials[:, :pooled]).T
+        nearer = similarity > similarity.gather(1, logits.argmax(1)[:, None])
     return nearer.sum(1).cpu().numpy()
 
 

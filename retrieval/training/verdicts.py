@@ -135,7 +135,7 @@ def posterior_touches(
         photo_partials = matcher.photo_encoding(torch.stack(list(photos.values()))).partial.cpu().numpy()
     scorer = scorer_of(matcher.head)
     logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
-    embeddings = touch_embeddings(touch_partials, matcher.config.hidden)
+    embeddings = touch_embeddings(touch_partials, matcher.config.cosine_columns)
     return ReferenceTouches(ScoredTouches(logits, touch_owner, photo_owner, own), embeddings)
 
 

@@ -12,7 +12,7 @@ class ListwiseLoss(Loss):
 
     def forward(self, batch: EncodedBatch) -> Tensor:
         """Return the loss (scalar) of a batch."""
-        logits = batch.matcher.head(batch.touch.partial[:, None], batch.photo.partial[None])
+        logits = batch.matcher.head.all_logits(batch.touch.partial, batch.photo.partial)
         return listwise_loss(logits, batch.touch_objects, batch.photo_objects)
 
 

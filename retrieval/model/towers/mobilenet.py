@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 
+import torch
 from torch import Tensor, nn
 
 from retrieval.model.towers.tower import Tower, stage_statistics, without_autocast
@@ -58,6 +59,7 @@ class MobileNetV2(Tower):
     1280 pooled features, 1536 of stages; 3,504,872 parameters with the 1000-way layer.
     """
 
+    cell_channels = 64 + 96
     optional_prefixes = ("classifier.", "features.18.")
     url = "https://download.pytorch.org/models/mobilenet_v2-b0353104.pth"
 
@@ -91,6 +93,12 @@ class MobileNetV2(Tower):
             return stage_statistics(self._stages(x))
         x = nn.functional.adaptive_avg_pool2d(self.features[_FLOAT32_LAYERS:](x), 1).flatten(1)
         return x if self.classifier is None else self.classifier(x)
+
+    def _encode_with_map(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        with without_autocast(images):
+            x = self.features[:_FLOAT32_LAYERS](images)
+        maps = list(self._stages(x))
+        return stage_statistics(maps), torch.cat(maps[1:3], dim=1)  # both at stride 16
 
     def _stages(self, x: Tensor) -> Iterator[Tensor]:
         for number, layer in enumerate(list(self.features)[_FLOAT32_LAYERS:], start=_FLOAT32_LAYERS):

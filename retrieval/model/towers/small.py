@@ -33,6 +33,7 @@ class SmallTower(Tower):
     256 features, or 888 for the output "stages".
     """
 
+    cell_channels = _WIDTHS[-1]
     optional_prefixes = ("fc.",)
 
     def __init__(self, output: str) -> None:
@@ -59,6 +60,12 @@ class SmallTower(Tower):
         x = self.stages[_FLOAT32_LAYERS:](first).flatten(2)
         x = torch.cat([x.mean(2), x.amax(2)], dim=1)
         return x if self.fc is None else self.fc(x)
+
+    def _encode_with_map(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        with without_autocast(images):
+            first = self.stages[:_FLOAT32_LAYERS](images)
+        maps = [first, *self._maps(first)]
+        return stage_statistics(maps), maps[-1]
 
     def _maps(self, x: Tensor) -> Iterator[Tensor]:
         for layer in list(self.stages)[_FLOAT32_LAYERS:]:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from retrieval.errors import BadInput, CheckpointError, NumericalError
+from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
 from retrieval.model.towers.weights import State, download
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
@@ -34,6 +34,8 @@ class Tower(nn.Module):
     """
 
     feature_count: int
+    cell_channels: int = 0
+    """Channels of a cell; 0 for a tower that has no cells, because it does not implement `_encode_with_map`."""
     optional_prefixes: ClassVar[tuple[str, ...]] = ()
     """Prefixes of weights that published checkpoints contain and some outputs of the tower do not need; the 1000-way
     layer first."""
@@ -53,12 +55,15 @@ class Tower(nn.Module):
         """
         super().__init__()
         self.output = output
+        self.cells = 0
         # Not persistent: the state dict has exactly the keys of ImageNet checkpoints.
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1), persistent=False)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Encode images (B, 3, H, W), float32 RGB within -1..1 (0..1 unless differences), to (B, feature_count).
+        """Encode images (B, 3, H, W), float32 RGB within -1..1 (0..1 unless differences), to (B, output_count).
+
+        The features come first, then the cells row by row.
 
         Raises:
             BadInput: Another shape, type or range.
@@ -75,7 +80,36 @@ class Tower(nn.Module):
             raise NumericalError("a tower takes finite pixels; got a NaN or infinite one")
         if max(-low, high) > 1.0 + 1e-4:  # averages of pixels may round past 1
             raise BadInput(f"a tower takes pixels within -1..1; got {low:.3g}..{high:.3g}; divide 8-bit images by 255")
-        return self._encode((images - self.mean) / self.std)
+        return self.encode_unchecked(images)
+
+    @property
+    def output_count(self) -> int:
+        """Length of an output: the features, then the channels of all cells."""
+        return self.feature_count + self.cells**2 * self.cell_channels
+
+    def divide(self, cells: int) -> "Tower":
+        """Append a grid of `cells` x `cells` cells to each output, and return this tower.
+
+        Raises:
+            ConfigError: This kind of tower has no cells.
+        """
+        if cells and not self.cell_channels:
+            raise ConfigError(f"{type(self).__name__} has no cells, so it cannot be used with cell_dim above 0")
+        self.cells = cells
+        return self
+
+    def encode_unchecked(self, images: Tensor) -> Tensor:
+        """Return `forward` without its checks of the images, which ONNX cannot express."""
+        images = (images - self.mean) / self.std
+        if not self.cells:
+            return self._encode(images)
+        features, maps = self._encode_with_map(images)
+        cells = nn.functional.adaptive_avg_pool2d(maps.float(), self.cells)  # (B, C, cells, cells)
+        return torch.cat([features, cells.flatten(2).transpose(1, 2).flatten(1)], dim=1)
+
+    def _encode_with_map(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Return features (B, feature_count) and a map (B, cell_channels, H', W') that is averaged over each cell."""
+        raise NotImplementedError
 
     def _encode(self, images: Tensor) -> Tensor:
         """Encode normalised images (B, 3, H, W) to (B, feature_count)."""

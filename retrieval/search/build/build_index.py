@@ -24,6 +24,7 @@ from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import can_reuse_partials, fingerprint
 from retrieval.model.reference_calibration import REFERENCE_CALIBRATION, REFERENCE_ROWS
+from retrieval.model.stored_partials import stored_layout
 from retrieval.search.build.build_report import BuildReport
 from retrieval.search.build.embed import EMBEDDED, RE_EMBEDDED, RENAMED, RESUMED, BuildPart, Embedder
 from retrieval.search.build.embed_touches import ReferenceBuild, embed_references
@@ -230,8 +231,11 @@ def _reusable(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | N
     before, now = current.manifest.fingerprint, fingerprint(checkpoint)
     if {name: before.get(name) for name in now} == now:
         return current, None, ""
-    width = (checkpoint.config.matcher.partial_width,)
-    if can_reuse_partials(checkpoint, before) and current.arrays["partials"].shape[1:] == width:
+    matcher = checkpoint.config.matcher
+    layout = stored_layout(matcher.pooled_width, matcher.partial_width)
+    if can_reuse_partials(checkpoint, before) and layout == {
+        name: (array.dtype, array.shape[1:]) for name, array in current.arrays.items()
+    }:
         return None, current, CANDIDATE_ENCODER_CHANGED
     changed = [reason for name, reason in CHANGE_REASONS.items() if before.get(name) != now[name]]
     written = f"; the index was written by version {current.manifest.software}" if current.manifest.software else ""

@@ -30,6 +30,7 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.encode import Image, batches, one_thread
 from retrieval.model.photo_encoder import fastest_photo_encoder, torch_photo_encoder
+from retrieval.model.stored_partials import PARTIALS, StoredPartials, stored_layout, to_stored
 from retrieval.search.build.stat_cache import photo_row
 
 T = TypeVar("T")
@@ -48,10 +49,10 @@ from an interrupted build."""
 
 
 class _PhotoEncoding(NamedTuple):
-    """Embedding (d,) and partial activation (partial_width,) of a photo, its rounding error if new, and its origin."""
+    """Embedding (d,) and stored partial activation of a photo, its rounding error if new, and its origin."""
 
     embedding: NDArray[np.float32]
-    partial_activation: NDArray[np.float16]
+    stored: dict[str, NDArray[Any]]
     partial_error: float
     origin: str
 
@@ -88,8 +89,8 @@ class BuildPart:
         """The block of rows, or the range of the parent's rows, for the index writer."""
         if self.unchanged or not self.codes:
             return self.unchanged or Block(self.rows)
-        partials = np.stack([code.partial_activation for code in self.codes])
-        return Block(self.rows, np.stack([code.embedding for code in self.codes]), {"partials": partials})
+        arrays = {name: np.stack([code.stored[name] for code in self.codes]) for name in self.codes[0].stored}
+        return Block(self.rows, np.stack([code.embedding for code in self.codes]), arrays)
 
 
 _ReadItem: TypeAlias = _Photo | SkippedPhoto
@@ -126,10 +127,11 @@ class Embedder:
     ) -> None:
         self.checkpoint, self.parent, self._partials = checkpoint, parent, partials
         config = checkpoint.config.matcher
+        self._stored = stored_layout(config.pooled_width, config.partial_width)
         layouts: Layouts = {
             "embedding": (np.dtype(np.float32), (config.embedding_dim,)),
-            "partials": (np.dtype(np.float16), (config.partial_width,)),
             "partial_error": (np.dtype(np.float32), ()),
+            **self._stored,
         }
         self._unfinished = UnfinishedBuild(index, fingerprint(checkpoint), layouts)
         self._sources = [source for source in (parent, *donors, partials) if source is not None]
@@ -221,24 +223,28 @@ class Embedder:
             numbers = source.rows.by_digest.find(keys_of(missing))
             present = [digest for digest, number in zip(missing, numbers, strict=True) if number >= 0]
             rows = numbers[numbers >= 0]
-            partials, is_partial_only = source.arrays["partials"][rows], source is self._partials
-            embeddings = self._embeddings(partials) if is_partial_only else source.embeddings[source.slots[rows]]
-            for digest, embedding, partial_activation in zip(present, embeddings, partials, strict=True):
-                found[digest] = _PhotoEncoding(
-                    embedding, partial_activation, 0.0, RE_EMBEDDED if is_partial_only else RENAMED
-                )
+            stored = {name: source.arrays[name][rows] for name in self._stored}
+            is_partial_only = source is self._partials
+            embeddings = self._embeddings(stored) if is_partial_only else source.embeddings[source.slots[rows]]
+            for place, (digest, embedding) in enumerate(zip(present, embeddings, strict=True)):
+                one = {name: array[place] for name, array in stored.items()}
+                found[digest] = _PhotoEncoding(embedding, one, 0.0, RE_EMBEDDED if is_partial_only else RENAMED)
         for digest, record in self._unfinished.find(digest for digest in digests if digest not in found).items():
             found[digest] = _PhotoEncoding(
-                record["embedding"], record["partials"], float(record["partial_error"]), RESUMED
+                record["embedding"],
+                {name: record[name] for name in self._stored},
+                float(record["partial_error"]),
+                RESUMED,
             )
         return found
 
     @torch.inference_mode()
-    def _embeddings(self, partials: NDArray[np.float16]) -> NDArray[np.float32]:
-        """Return the candidate encoder's embeddings (n, d) of stored partial activations (n, partial_width)."""
+    def _embeddings(self, arrays: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """Return the candidate encoder's embeddings (n, d) of stored partial activations."""
         candidate_encoder = self.checkpoint.matcher.candidate_encoder
         assert candidate_encoder is not None
-        stored = torch.from_numpy(partials.astype(np.float32)).to(next(candidate_encoder.parameters()).device)
+        pooled = arrays[PARTIALS].astype(np.float32)
+        stored = torch.from_numpy(pooled).to(next(candidate_encoder.parameters()).device)
         embeddings: NDArray[np.float32] = candidate_encoder.photo(stored).cpu().numpy()
         return embeddings
 
@@ -271,18 +277,20 @@ class Embedder:
         """Encode the images of these rows, and store their codes in case the build is interrupted."""
         partials, embeddings = self._encode_photos(images)
         largest = np.abs(partials).max(axis=1)
+        arrays = to_stored(partials, self.checkpoint.config.matcher.pooled_width)
         if len(bad := np.flatnonzero(~(largest <= np.finfo(np.float16).max))):
             raise NumericalError(
                 f"partial activations are stored as float16 and must be within 65504; {rows[bad[0]]['id']} gives "
                 f"{largest[bad[0]]}: the model has diverged, train again with a lower learning rate"
             )
-        stored = partials.astype(np.float16)
-        errors = np.abs(stored - partials).max(axis=1)
+        errors = np.abs(StoredPartials(arrays)[:] - partials).max(axis=1)
         self._unfinished.add(
-            [row["digest"] for row in rows], {"embedding": embeddings, "partials": stored, "partial_error": errors}
+            [row["digest"] for row in rows], {"embedding": embeddings, "partial_error": errors, **arrays}
         )
-        made = zip(embeddings, stored, errors.tolist(), strict=True)
-        return [_PhotoEncoding(*code, EMBEDDED) for code in made]
+        return [
+            _PhotoEncoding(embedding, {name: array[place] for name, array in arrays.items()}, error, EMBEDDED)
+            for place, (embedding, error) in enumerate(zip(embeddings, errors.tolist(), strict=True))
+        ]
 
     def _count(self, part: BuildPart) -> None:
         self.skipped += part.skipped

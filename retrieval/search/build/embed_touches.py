@@ -32,6 +32,7 @@ from retrieval.model.reference_calibration import (
     fit_reference_calibration,
     touch_embeddings,
 )
+from retrieval.model.stored_partials import StoredPartials
 
 Partials = NDArray[np.float16]
 MIN_OBJECTS = 10
@@ -111,7 +112,7 @@ class ReferenceBuild:
             return {"by": "objects that the model was not fitted to", "calibration": checkpoint.references.to_dict()}
         names = np.array([row["object_id"] for row in self.rows])
         sample = _sample_objects(names)
-        codes = touch_embeddings(self.partials[sample], checkpoint.config.matcher.hidden)
+        codes = touch_embeddings(self.partials[sample], checkpoint.config.matcher.cosine_columns)
         photographed = ~np.isin(tables.objects, keys_of(self.touch_only))
         touched, owner = np.unique(names[sample], return_inverse=True)
         keys = keys_of(touched.tolist())
@@ -119,7 +120,7 @@ class ReferenceBuild:
         order = np.argsort(keys)
         photo_owner = order[np.searchsorted(keys[order], tables.objects[photos])]
         scorer = scorer_of(checkpoint.matcher.head)
-        touch_partials, photo_partials = self.partials[sample].astype(np.float32), tables.arrays["partials"][photos]
+        touch_partials, photo_partials = self.partials[sample].astype(np.float32), StoredPartials(tables.arrays)[photos]
         logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
         none = np.zeros(logits.shape, np.bool_)
         fitted = fit_reference_calibration(ReferenceTouches(ScoredTouches(logits, owner, photo_owner, none), codes))

@@ -7,11 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import takewhile
 from statistics import median
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from indexes import KINDS, load_kind
 from indexes.kinds.measure import Clock, query_ms, recall_against_exact, sample_queries
@@ -21,6 +19,7 @@ from retrieval.console.progress import Bar
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.fusion import score_partials
+from retrieval.model.stored_partials import Partials
 
 EXHAUSTIVE_LIMIT = 500
 """Up to this number of photos, all are scored and nothing is measured."""
@@ -129,7 +128,7 @@ class ExhaustiveBench(SearchBench):
         checkpoint: Checkpoint,
         vectors: Floats,
         slots: Slots,
-        partials: NDArray[np.floating[Any]],
+        partials: Partials,
         *,
         quiet: bool = True,
         clock: Clock = time.perf_counter,

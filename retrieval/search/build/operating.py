@@ -33,6 +33,7 @@ from indexes.store.tables import Tables
 from retrieval.errors import BadInput
 from retrieval.metrics.k_way import binomial_interval
 from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.stored_partials import StoredPartials
 from retrieval.search.build.measuring import (
     SHORT_LADDER,
     ExhaustiveBench,
@@ -146,9 +147,9 @@ def choose_operating_point(
         return OperatingPoint(kind, load_kind(kind).parameters_type(), operating_point_sentence(candidates), candidates)
     if not can_measure(checkpoint):
         return choose_by_neighbours(tables.vectors, tables.slots, requirements)
-    return choose_by_agreement(
-        ExhaustiveBench(checkpoint, tables.vectors, tables.slots, tables.arrays["partials"], quiet=quiet), requirements
-    )
+    partials = StoredPartials(tables.arrays)
+    bench = ExhaustiveBench(checkpoint, tables.vectors, tables.slots, partials, quiet=quiet)
+    return choose_by_agreement(bench, requirements)
 
 
 def needs_measurement(photos: int, requirements: SearchRequirements) -> bool:

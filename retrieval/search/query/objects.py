@@ -17,6 +17,7 @@ from indexes.store.rows import keys_of
 from retrieval.data.storage import is_inside
 from retrieval.data.text import replace_surrogates
 from retrieval.model.posterior import Posterior
+from retrieval.model.stored_partials import Layout
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -56,28 +57,28 @@ def listed_photo(row: dict[str, Any]) -> ListedPhoto:
     return ListedPhoto(replace_surrogates(object_id), replace_surrogates(path), replace_surrogates(metadata))
 
 
-def check_usable(generation: Generation, partial_width: int) -> None:
+def check_usable(generation: Generation, layout: Layout) -> None:
     """Check the manifest entries of catalogue, checkpoint and candidates, and the partial activations.
 
     Args:
         generation: The opened generation.
-        partial_width: Required width of the partial activations.
+        layout: Required type and shape of the stored partial activations.
 
     Raises:
         CorruptIndex: A check fails.
     """
-    about, partials = generation.manifest.about, generation.arrays.get("partials")
+    about = generation.manifest.about
     candidates = about.get("candidates")
     k = candidates.get("k") if isinstance(candidates, dict) else None
     if candidates is not None and not (type(k) is int and 1 <= k < 2**31):
         raise CorruptIndex(f"{generation.folder}: its number of candidates must be 1 or more; {AGAIN}")
     if not all(isinstance(about.get(name), str) and "\0" not in about[name] for name in ("catalogue", "checkpoint")):
         raise CorruptIndex(f"{generation.folder}: the manifest must name its catalogue and its checkpoint; {AGAIN}")
-    if partials is None or partials.ndim != 2 or partials.shape[1] != partial_width or partials.dtype.kind != "f":
-        got = "none" if partials is None else f"{partials.dtype} {partials.shape}"
-        raise CorruptIndex(
-            f"{generation.folder}: partial activations must have {partial_width} numbers, got {got}; {AGAIN}"
-        )
+    for name, (dtype, shape) in layout.items():
+        array = generation.arrays.get(name)
+        if array is None or array.shape[1:] != shape or array.dtype != dtype:
+            got = "none" if array is None else f"{array.dtype} {array.shape}"
+            raise CorruptIndex(f"{generation.folder}: {name} must be {dtype} (photos, {shape[0]}), got {got}; {AGAIN}")
 
 
 class ScoredObjects(NamedTuple):

@@ -8,6 +8,7 @@ from indexes.store.generation import Generation, check_fingerprint
 from indexes.store.manifest import Manifest
 from indexes.store.sharded import ShardedManifest, open_shard
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info, read_scorer
+from retrieval.model.stored_partials import stored_layout
 from retrieval.search import defaults
 from retrieval.search.query.objects import check_usable
 from retrieval.search.query.shard import FolderShard, IndexInfo, Shard, Shards
@@ -67,8 +68,9 @@ def read_checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path |
 def folder_shard(generation: Generation, stored: CheckpointInfo) -> FolderShard:
     """Return a shard of an opened generation and the scoring layers. Raises MismatchedIndex or CorruptIndex."""
     generation.require(fingerprint(stored))
-    check_usable(generation, stored.config.matcher.partial_width)
-    return FolderShard(generation, read_scorer(stored.path), stored.config.has_embeddings)
+    matcher = stored.config.matcher
+    check_usable(generation, stored_layout(matcher.pooled_width, matcher.partial_width))
+    return FolderShard(generation, read_scorer(stored), stored.config.has_embeddings)
 
 
 def open_sharded_index(

@@ -54,13 +54,13 @@ class References:
     (`retrieval.model.reference_calibration`).
     """
 
-    def __init__(self, generation: Generation, objects: Objects, hidden: int) -> None:
+    def __init__(self, generation: Generation, objects: Objects, columns: slice) -> None:
         """Read and check the references.
 
         Args:
             generation: An opened generation with reference touches.
             objects: Its objects.
-            hidden: Number of entries of a partial activation before the embedding.
+            columns: Columns of a partial activation with the scaled embedding.
 
         Raises:
             CorruptIndex: The documents are damaged.
@@ -74,14 +74,16 @@ class References:
             raise CorruptIndex(f"{where}: the list of reference touches is invalid ({error}); {AGAIN}") from error
         touches, touch_only = listed.touches, listed.touch_only
         partials = documents.get(REFERENCE_PARTIALS)
-        width = generation.arrays["partials"].shape[1]
         if (
             not isinstance(partials, np.ndarray)
-            or partials.shape != (len(touches), width)
+            or partials.ndim != 2
+            or len(partials) != len(touches)
+            or partials.shape[1] < columns.stop
             or partials.dtype.kind != "f"
         ):
             raise CorruptIndex(
-                f"{where}: each reference touch must have a partial activation of {width} numbers; {AGAIN}"
+                f"{where}: each reference touch must have a partial activation of at least {columns.stop} numbers; "
+                f"{AGAIN}"
             )
         try:
             self.calibration = ReferenceCalibration.from_dict(
@@ -94,9 +96,9 @@ class References:
         order = np.flatnonzero(numbers >= 0)  # an object without a readable photo has no number
         order = order[np.argsort(numbers[order], kind="stable")]
         self._touches, self._all = [touches[row].touch for row in order], touches
-        self._codes: Floats = touch_embeddings(partials[order], hidden)
+        self._codes: Floats = touch_embeddings(partials[order], columns)
         self._objects, self._starts = np.unique(numbers[order], return_index=True)
-        self._hidden, self._touch_only = hidden, np.zeros(objects.count, np.bool_)
+        self._columns, self._touch_only = columns, np.zeros(objects.count, np.bool_)
         self._touch_only[without_photos[without_photos >= 0]] = True
 
     def image(self, path: str) -> dict[str, Any] | None:
@@ -124,7 +126,7 @@ class References:
         found = np.full(len(self._touch_only), np.nan)
         if len(self._objects):
             found[self._objects] = reference_similarity(
-                touch_embeddings(partials, self._hidden) @ self._codes.T, self._starts
+                touch_embeddings(partials, self._columns) @ self._codes.T, self._starts
             ).sum(0)
         return found
 
@@ -178,7 +180,7 @@ class References:
             return None
         start = int(self._starts[place])
         stop = int(self._starts[place + 1]) if place + 1 < len(self._starts) else len(self._codes)
-        cosines = (touch_embeddings(partials, self._hidden) @ self._codes[start:stop].T).max(0)
+        cosines = (touch_embeddings(partials, self._columns) @ self._codes[start:stop].T).max(0)
         best = int(cosines.argmax())
         adds = None if np.isnan(photo_logits) else logit - photo_logits
         return NearestReference(self._touches[start + best], float(cosines[best]), adds)

@@ -108,7 +108,7 @@ class Searcher:
         """
         shard, stored = open_index(index, model, verify, shards)
         encoder = find_export(stored, threads) or torch_encoder(stored, threads)
-        return cls(url_or_path(index), shard, stored, encoder, read_scorer(stored.path))
+        return cls(url_or_path(index), shard, stored, encoder, read_scorer(stored))
 
     def close(self) -> None:
         """Release the index and the model; running queries finish first. A second call does nothing."""

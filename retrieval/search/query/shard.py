@@ -23,6 +23,7 @@ from retrieval.errors import BadInput
 from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.posterior import EvidenceMass, Posterior
 from retrieval.model.reference_calibration import REFERENCE_ROWS
+from retrieval.model.stored_partials import StoredPartials
 from retrieval.model.touches import Stopwatch
 from retrieval.search.query.answer import NearestReference
 from retrieval.search.query.objects import ListedPhoto, Objects, ScoredObjects, listed_photo
@@ -159,7 +160,7 @@ class FolderShard:
         self.generation, self.scorer, self.has_embeddings = generation, scorer, has_embeddings
         self.objects = Objects(generation)
         has_references = REFERENCE_ROWS in generation.documents
-        self.references = References(generation, self.objects, len(scorer.out)) if has_references else None
+        self.references = References(generation, self.objects, scorer.cosine_columns) if has_references else None
         self._lock = Lock()
 
     @property
@@ -294,7 +295,7 @@ class FolderShard:
     def _logits(self, partials: Floats, rows: Rows) -> Floats:
         """Return the match logits of the rows, summed over grasps."""
         every = len(rows) == self.generation.count
-        logits = self.scorer.logits(partials, self.generation.arrays["partials"], None if every else rows)
+        logits = self.scorer.logits(partials, StoredPartials(self.generation.arrays), None if every else rows)
         return self.objects.align_duplicates(rows, logits)
 
 

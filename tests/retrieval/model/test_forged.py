@@ -138,9 +138,10 @@ def test_forged_tensors_are_refused(saved, tensors):
 def test_a_forged_scorer_is_refused(saved, tensors):
     state, header = read_tensors(saved)
     state = {name: tensor for name, tensor in {**state, **tensors}.items() if tensor is not None}
+    info = read_checkpoint_info(saved)
     write_tensors(saved, state, header)
     with pytest.raises(CheckpointError):
-        read_scorer(saved)
+        read_scorer(info)
 
 
 def test_a_checkpoint_that_is_not_a_regular_file_is_refused_without_being_read(tmp_path):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from retrieval.errors import NumericalError
-from retrieval.model.fusion_scorer import FusionScorer, as_float32
+from retrieval.model.fusion_scorer import CELL_BLOCK, FusionScorer
+from retrieval.model.stored_partials import StoredPartials, as_float32, stored_layout, to_stored
 
 
 def random_scorer(hidden, seed=0):
@@ -72,3 +73,71 @@ def test_a_partial_activation_that_is_not_finite_is_named_by_its_row(bad, dtype)
     ones = FusionScorer(*(np.ones(shape, np.float32) for shape in ((4, 4), 4, 4, 1)))
     with pytest.raises(NumericalError, match="photo row 7 has"):
         ones.logits(np.zeros((1, 4), np.float32), photos, np.array([1, 7, 8]))
+
+
+def cell_score(touch_cells, photo_cells):
+    """The sum of the largest products, in plain loops."""
+    return sum(
+        max(sum(float(t) * float(p) for t, p in zip(mine, other, strict=True)) for other in photo_cells)
+        for mine in touch_cells
+    )
+
+
+def test_cells_add_for_each_touch_cell_its_largest_product_with_a_photo_cell():
+    scorer, rng = random_scorer(4), np.random.default_rng(3)
+    scorer = FusionScorer(scorer.second, scorer.second_bias, scorer.out, scorer.out_bias, cosine_dim=2, cell_dim=3)
+    touches = rng.normal(size=(2, 4 + 2 + 5 * 3)).astype(np.float32)
+    photos = rng.normal(size=(CELL_BLOCK + 2, 4 + 2 + 7 * 3)).astype(np.float32)
+    expected = [
+        sum(
+            by_hand(scorer, touch[:4], photo[:4])
+            + float(touch[4:6] @ photo[4:6])
+            + cell_score(touch[6:].reshape(5, 3), photo[6:].reshape(7, 3))
+            for touch in touches
+        )
+        for photo in photos
+    ]
+    np.testing.assert_allclose(scorer.logits(touches, photos), expected, rtol=1e-5, atol=1e-4)
+
+
+def test_photos_without_cells_are_scored_without_them():
+    scorer, rng = random_scorer(4), np.random.default_rng(4)
+    with_cells = FusionScorer(scorer.second, scorer.second_bias, scorer.out, scorer.out_bias, cell_dim=3)
+    touches, photos = (rng.normal(size=(2, 4)).astype(np.float32) for _ in range(2))
+    longer = np.concatenate([touches, np.ones((2, 6), np.float32)], axis=1)
+    assert np.array_equal(with_cells.logits(longer, photos), scorer.logits(touches, photos))
+
+
+def unit_partials(rows, pooled, cells, dim):
+    rng = np.random.default_rng(5)
+    vectors = rng.normal(size=(rows, cells, dim))
+    vectors /= np.linalg.norm(vectors, axis=2, keepdims=True)
+    return np.concatenate([rng.normal(size=(rows, pooled)), vectors.reshape(rows, -1)], axis=1).astype(np.float32)
+
+
+def test_stored_cells_are_wrong_by_at_most_half_a_step_of_1_127():
+    partials = unit_partials(9, 6, 4, 8)
+    stored = StoredPartials(to_stored(partials, 6))
+    assert stored.shape == partials.shape
+    assert len(stored) == 9
+    assert np.abs(stored[:][:, 6:] - partials[:, 6:]).max() <= 0.5 / 127 + 1e-6  # float32 rounding of the product
+    np.testing.assert_array_equal(stored[:][:, :6], partials[:, :6].astype(np.float16).astype(np.float32))
+    np.testing.assert_array_equal(stored[np.array([7, 2])], stored[:][[7, 2]])
+
+
+def test_a_logit_from_stored_cells_is_wrong_by_at_most_the_rounding_of_its_cells():
+    scorer, partials = random_scorer(6), unit_partials(40, 6, 4, 8)
+    scorer = FusionScorer(scorer.second, scorer.second_bias, scorer.out, scorer.out_bias, cell_dim=8)
+    exact = partials.copy()
+    exact[:, :6] = partials[:, :6].astype(np.float16)
+    touches = unit_partials(2, 6, 3, 8)
+    # A product of a unit vector with an error of at most 1/254 in each of 8 components.
+    bound = 2 * 3 * np.sqrt(8) * 0.5 / 127 + 1e-4
+    stored = StoredPartials(to_stored(partials, 6))
+    assert np.abs(scorer.logits(touches, stored) - scorer.logits(touches, exact)).max() <= bound
+
+
+def test_the_layout_of_an_index_lists_cells_only_if_there_are_some():
+    assert stored_layout(6, 6) == {"partials": (np.dtype(np.float16), (6,))}
+    assert stored_layout(6, 14)["cells"] == (np.dtype(np.int8), (8,))
+    assert list(to_stored(np.zeros((2, 6), np.float32), 6)) == ["partials"]

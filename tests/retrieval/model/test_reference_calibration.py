@@ -38,10 +38,10 @@ def test_several_references_are_averaged_as_likelihoods():
             assert got == pytest.approx(math.log(mean) / SHARPNESS, abs=1e-6)
 
 
-def test_embeddings_are_the_end_of_partial_activations_at_norm_one():
-    partials = np.float16([[9, 9, 3, 4], [9, 9, 0, -2]])
-    np.testing.assert_allclose(touch_embeddings(partials, 2), [[0.6, 0.8], [0, -1]], atol=1e-6)
-    assert touch_embeddings(partials, 4).shape == (2, 0)
+def test_embeddings_are_columns_of_partial_activations_at_norm_one():
+    partials = np.float16([[9, 9, 3, 4, 7], [9, 9, 0, -2, 7]])
+    np.testing.assert_allclose(touch_embeddings(partials, slice(2, 4)), [[0.6, 0.8], [0, -1]], atol=1e-6)
+    assert touch_embeddings(partials, slice(4, 4)).shape == (2, 0)
 
 
 def test_a_calibration_is_stored_and_read_again():

@@ -22,6 +22,9 @@ from tests import synthetic
 from tests.documents import ROOT, text_of
 from tests.reference_model import NAMES, POSTERIOR, REFERENCE_CALIBRATION, write_reference_model
 
+EMBEDDING = slice(32, 48)
+"""Columns of a partial activation with the scaled embedding."""
+
 
 @pytest.fixture
 def calibrated_model(tmp_path):
@@ -58,7 +61,7 @@ def other_cosine(model, grasps):
 
     load = model.config.preprocessing.load_touch
     codes = touch_embeddings(
-        encode_touches(model.matcher, [[load(path) for path in one] for one in grasps]).partial.numpy(), 32
+        encode_touches(model.matcher, [[load(path) for path in one] for one in grasps]).partial.numpy(), EMBEDDING
     )
     return float(codes[0] @ codes[1])
 
@@ -75,8 +78,8 @@ def test_photos_and_references_of_an_object_combine_as_computed_by_hand(
         rows = [at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == NAMES[0]]
         photos = searcher.scorer.logits(partials, searcher.generation.arrays["partials"][rows])
         mine = [at for at, row in enumerate(searcher.generation.documents["references"]["touches"]) if at < 2]
-        stored = touch_embeddings(searcher.generation.documents["touches"][mine], 32)
-    cosines = touch_embeddings(partials, 32) @ stored.T
+        stored = touch_embeddings(searcher.generation.documents["touches"][mine], EMBEDDING)
+    cosines = touch_embeddings(partials, EMBEDDING) @ stored.T
     near = math.log(np.exp(SHARPNESS * cosines.astype(float)).mean()) / SHARPNESS
     slope = REFERENCE_CALIBRATION.with_photos.slope
     photo_logits = math.log(np.exp(slope * (photos.astype(float) + REFERENCE_CALIBRATION.weight * near)).mean()) / slope

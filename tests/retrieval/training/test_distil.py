@@ -128,7 +128,7 @@ def test_a_blend_lies_between_two_rows_and_nearer_to_one():
 
 def test_every_touch_is_scored_with_every_photo(matcher, partials):
     touches, photos = partials[0][:4], partials[1][:6]
-    table = distil.all_logits(matcher.head, touches, photos)
+    table = matcher.head.all_logits(touches, photos)
     for row, column in itertools.product(range(4), range(6)):
         one = matcher.head(touches[row][None], photos[column][None])
         torch.testing.assert_close(table[row, column], one[0], rtol=1e-5, atol=1e-6)

@@ -1,0 +1,62 @@
+"""Late interaction: cells of the gel images against cells of a photo (Khattab and Zaharia, SIGIR 2020, eq. 3).
+
+A tower divides an image into a grid of cells (`Tower.divide`), and a small network maps each cell to a vector. The
+score of a touch with a photo is a sum over the cells of the touch: of each, the largest inner product with a cell of
+the photo. Vectors of photo cells have unit length. The length of a touch cell's vector is its weight. The weight is
+learned, so that cells without contact count little. Scores of several grasps add up.
+"""
+
+from torch import Tensor, nn
+from torch.nn import functional
+
+CELL_HIDDEN = 128
+"""Hidden units of the network of a cell."""
+WEIGHT_INIT = 0.25
+"""Initial weight of a touch cell; 32 cells then add at most 8 to the logit."""
+
+
+class CellEncoder(nn.Module):
+    """Maps cells of one modality to vectors."""
+
+    def __init__(self, channels: int, dim: int, norm: nn.Module, *, weighted: bool) -> None:
+        """Make the network, with random weights.
+
+        Args:
+            channels: Channels of a cell.
+            dim: Length of a vector.
+            norm: Standardises (B, channels).
+            weighted: The length of a vector is a learned weight; otherwise it is 1.
+        """
+        super().__init__()
+        self.norm, self.weighted = norm, weighted
+        self.network = nn.Sequential(
+            nn.Linear(channels, CELL_HIDDEN), nn.ReLU(), nn.Linear(CELL_HIDDEN, dim + int(weighted))
+        )
+
+    def forward(self, cells: Tensor) -> Tensor:
+        """Return vectors (B, N, dim) of cells (B, N, channels)."""
+        output: Tensor = self.network(self.norm(cells.flatten(0, 1)))
+        output = output.reshape(-1, cells.shape[1], output.shape[-1])
+        if not self.weighted:
+            return functional.normalize(output.float(), dim=-1, eps=1e-6)
+        weight = functional.softplus(output[..., -1:].float()) * (WEIGHT_INIT / 0.693)  # softplus(0) = 0.693
+        return weight * functional.normalize(output[..., :-1].float(), dim=-1, eps=1e-6)
+
+
+def cell_scores(touch_cells: Tensor, photo_cells: Tensor) -> Tensor:
+    """Return scores (T, N) of every touch with every photo.
+
+    Args:
+        touch_cells: (T, Q, d) vectors of the touches' cells.
+        photo_cells: (N, P, d) vectors of the photos' cells.
+    """
+    touches, each, _ = touch_cells.shape
+    photos, places, _ = photo_cells.shape
+    products = photo_cells.flatten(0, 1) @ touch_cells.flatten(0, 1).T
+    best = products.view(photos, places, touches * each).max(dim=1).values  # `amax` has a slower gradient
+    return best.view(photos, touches, each).float().sum(dim=2).T
+
+
+def paired_cell_scores(touch_cells: Tensor, photo_cells: Tensor) -> Tensor:
+    """Return scores (...) of pairs of vectors (..., Q, d) and (..., P, d), whose leading axes broadcast."""
+    return (touch_cells @ photo_cells.transpose(-1, -2)).max(dim=-1).values.float().sum(dim=-1)

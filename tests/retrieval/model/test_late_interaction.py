@@ -1,0 +1,124 @@
+"""Late interaction: cells of a tower's map, their vectors, and scores of every touch with every photo."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from retrieval.errors import ConfigError
+from retrieval.model.config import MatcherConfig
+from retrieval.model.fusion import Matcher, scorer_of
+from retrieval.model.late_interaction import CellEncoder, cell_scores, paired_cell_scores
+from retrieval.model.towers import build_tower
+
+CELLS = MatcherConfig(
+    "small",
+    "stages",
+    hidden=16,
+    standardise=True,
+    embedding_dim=8,
+    projection_hidden=12,
+    cosine=True,
+    cell_dim=4,
+    touch_cells=2,
+    photo_cells=3,
+)
+
+
+@pytest.fixture
+def matcher():
+    torch.manual_seed(0)
+    return Matcher(CELLS, views=2).eval()
+
+
+@pytest.fixture
+def images():
+    torch.manual_seed(1)
+    return torch.rand(3, 2, 3, 64, 64), torch.rand(5, 3, 96, 192)
+
+
+def test_a_score_is_the_sum_of_the_largest_products_of_two_plain_loops():
+    touches = torch.tensor([[[1.0, 0.0], [0.0, 2.0]]])
+    photos = torch.tensor([[[3.0, 1.0], [1.0, 4.0]], [[0.0, -1.0], [-2.0, -3.0]]])
+    # First photo: max(3, 1) + max(2, 8). Second photo: max(0, -2) + max(-2, -6).
+    assert cell_scores(touches, photos).tolist() == [[11.0, -2.0]]
+    assert paired_cell_scores(touches, photos).tolist() == [11.0, -2.0]
+
+
+def test_the_gradient_of_a_score_reaches_only_the_photo_cell_with_the_largest_product():
+    photos = torch.tensor([[[3.0, 1.0], [1.0, 0.5]]], requires_grad=True)
+    cell_scores(torch.tensor([[[1.0, 1.0]]]), photos).sum().backward()
+    assert photos.grad.tolist() == [[[1.0, 1.0], [0.0, 0.0]]]
+
+
+def test_photo_cells_have_unit_length_and_touch_cells_their_weight():
+    torch.manual_seed(0)
+    cells = torch.randn(2, 5, 6)
+    photo = CellEncoder(6, 4, torch.nn.Identity(), weighted=False)(cells)
+    touch = CellEncoder(6, 4, torch.nn.Identity(), weighted=True)(cells)
+    torch.testing.assert_close(photo.norm(dim=-1), torch.ones(2, 5))
+    assert (touch.norm(dim=-1) > 0).all()
+    assert touch.norm(dim=-1).std() > 0
+
+
+def test_cells_are_the_means_of_the_map_row_by_row():
+    tower = build_tower("small", "stages").divide(2).eval()
+    images = torch.rand(1, 3, 64, 64)
+    _, maps = tower._encode_with_map((images - tower.mean) / tower.std)  # (1, 128, 4, 4)
+    cells = tower(images)[0, tower.feature_count :].view(4, tower.cell_channels)
+    torch.testing.assert_close(cells[1], maps[0, :, :2, 2:].mean((1, 2)))
+    torch.testing.assert_close(cells[2], maps[0, :, 2:, :2].mean((1, 2)))
+
+
+@pytest.mark.parametrize("name", ["small", "mobilenet_v2"])
+def test_cells_do_not_change_the_features_before_them(name):
+    torch.manual_seed(0)
+    tower, images = build_tower(name, "stages").eval(), torch.rand(2, 3, 64, 64)
+    with torch.inference_mode():
+        plain = tower(images)
+        divided = tower.divide(4)(images)
+    assert divided.shape == (2, tower.output_count)
+    assert torch.equal(divided[:, : tower.feature_count], plain)
+
+
+def test_a_tower_without_cells_is_refused_by_name():
+    with pytest.raises(ConfigError, match="has no cells"):
+        build_tower("resnet18", "stages").divide(4)
+    with pytest.raises(ConfigError, match="stages"):
+        MatcherConfig("mobilenet_v2", "pooled", cell_dim=8)
+
+
+def test_logits_of_every_pair_equal_those_of_single_pairs_and_those_in_numpy(matcher, images):
+    with torch.inference_mode():
+        touch = matcher.touch_encoding(matcher.touch_features(images[0])).partial
+        photo = matcher.photo_encoding(matcher.photo_features(images[1])).partial
+        table = matcher.head.all_logits(touch, photo)
+    assert touch.shape[1] == CELLS.touch_partial_width
+    assert photo.shape[1] == CELLS.partial_width
+    for row in range(3):
+        torch.testing.assert_close(table[row], matcher.head(touch[row][None], photo), rtol=1e-5, atol=1e-5)
+        numpy = scorer_of(matcher.head).logits(touch[row][None].numpy(), photo.numpy())
+        np.testing.assert_allclose(numpy, table[row], rtol=1e-5, atol=1e-5)
+
+
+def test_partial_activations_without_cells_give_the_logit_without_late_interaction(matcher, images):
+    plain = Matcher(dataclasses.replace(CELLS, cell_dim=0), views=2).eval()
+    plain.load_state_dict({k: v for k, v in matcher.state_dict().items() if k in plain.state_dict()})
+    width = CELLS.pooled_width
+    with torch.inference_mode():
+        touch, photo = matcher.touch_features(images[0]), matcher.photo_features(images[1])
+        partials = matcher.touch_encoding(touch).partial, matcher.photo_encoding(photo).partial
+        found = matcher.head.all_logits(*(part[:, :width] for part in partials))
+        expected = plain.head.all_logits(
+            plain.touch_encoding(plain.touch_features(images[0])).partial,
+            plain.photo_encoding(plain.photo_features(images[1])).partial,
+        )
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_late_interaction_is_trained_by_the_logit(matcher, images):
+    logits = matcher(images[0], images[1][:3])
+    logits.sum().backward()
+    assert all(parameter.grad.abs().sum() > 0 for parameter in matcher.touch_cells.parameters())
+    assert matcher.photo_cells.network[0].weight.grad.abs().sum() > 0
