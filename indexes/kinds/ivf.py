@@ -24,7 +24,7 @@ SPARE_CODES = 64
 """Candidates beyond k that are scored exactly, because codes of a byte per component swap the order of near-copies."""
 
 MIN_REFINED = 64
-"""Least k from which the number of refined candidates is computed: codes are too coarse to trust the first few."""
+"""For a smaller k, as many candidates are refined as for this k: codes are too coarse to trust the first few."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class IVFFlatIndex(FaissIndex):
 
 
 class IVFSQ8Index(IVFFlatIndex):
-    """Inverted lists with one byte for each component: a quarter of the memory; scores from codes within 1 %."""
+    """Inverted lists with one byte for each component: a quarter of the memory. Code scores are within 1 % of exact."""
 
     kind: ClassVar[str] = "ivf_sq8"
     structure_type: ClassVar[str] = "IndexIVFScalarQuantizer"

@@ -24,7 +24,7 @@ from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 if P(none
 
 A query passes through four files: `fusion_scorer.py` sums the match logits z of a photo over the grasps;
 `search/query/objects.py` computes l(o) of each object, which reference touches change (`reference_calibration.py`);
-`search/query/shard.py` chooses the photos to score and samples the others; `EvidenceMass.merged` adds the shards here.
+`search/query/shard.py` chooses the photos to score and samples the others; `EvidenceMass.merged` below sums the shards.
 """
 
 import math
@@ -94,7 +94,7 @@ class EvidenceMass:
 
     @classmethod
     def merged(cls, masses: Sequence["EvidenceMass"]) -> "EvidenceMass":
-        """Return the evidence of several parts of a catalogue together; at least one part, no object in two."""
+        """Return the evidence of several parts of a catalogue together: at least one part, no object in two parts."""
         top = max(mass.top for mass in masses)
         return cls(
             float(np.logaddexp.reduce([mass.scored + (mass.top - top) for mass in masses])),
@@ -104,7 +104,7 @@ class EvidenceMass:
         )
 
     def extrapolated(self, objects: int) -> "EvidenceMass":
-        """Return the evidence with `objects` more objects, each with the mean likelihood of these."""
+        """Return the evidence with `objects` more objects, each with the mean likelihood of those in this one."""
         if not objects:
             return self
         mean = float(np.logaddexp(self.scored, self.unscored)) - math.log(self.objects)
@@ -174,7 +174,7 @@ class Posterior:
         )
 
     def mass(self, logits: ArrayLike, grasps: int = 1, *, unscored: int = 0, sample: ArrayLike = ()) -> EvidenceMass:
-        """Return the evidence for objects, given as in `probabilities`."""
+        """Return the evidence mass of objects; the arguments are those of `probabilities`."""
         known, drawn = _finite(logits, "every logit"), _finite(sample, "every logit of the sample")
         if not len(known) or unscored < 0 or (unscored and not len(drawn)):
             raise BadInput(
@@ -211,7 +211,7 @@ class Posterior:
 
             slope * n / (1 + dependence * (n - 1)) * l / g + offset  >  log objects + log (p / (1 - p))
 
-        From n = 1 on, the term with l grows by at most 1 / dependence (trials: docs/measurements/answers.md).
+        From n = 1 on, the term with l grows at most by a factor 1 / dependence (trials: docs/measurements/answers.md).
 
         Args:
             logit: Logit l of the best object, which is not more likely than none yet.
@@ -254,7 +254,7 @@ def _finite(values: ArrayLike, name: str) -> Floats:
 # Fitting ---------------------------------------------------------------------------------------------------
 
 CATALOGUE_SIZES = (20, 1000)
-"""Objects of the catalogues of a fit; at most all but one of the validation objects."""
+"""Numbers of objects in the catalogues of a fit, at most all validation objects but one."""
 MIN_OBJECTS = 3
 """Smallest number of objects of a fit; with two objects, every catalogue would have only one."""
 _SETS = 4

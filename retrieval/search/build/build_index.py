@@ -62,8 +62,8 @@ def build_index(
 ) -> BuildReport:
     """Write the next generation of an index of a catalogue, or the first one.
 
-    Nothing is written if neither the photos, nor their objects, nor the requirements changed. Photos that cannot be
-    read are skipped and reported. An interrupted build stores its codes for the next build.
+    Nothing is written if model, photos, objects, reference touches and requirements are unchanged. Photos that cannot
+    be read are skipped and reported. An interrupted build stores its embeddings and partial activations for the next.
 
     Args:
         folder: The catalogue: a local folder or a URL (`retrieval.data.sources`).
@@ -115,7 +115,7 @@ class BuildOptions:
         verify: Read every file.
         note: First sentence of the report's reason.
         about: Further entries of the manifest.
-        donors: Generations whose codes may be reused.
+        donors: Generations whose embeddings and partial activations may be reused.
         keep: Number of earlier generations that stay on the disk.
     """
 

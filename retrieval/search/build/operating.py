@@ -6,9 +6,8 @@ is exact nearest-neighbour search by embedding). The agreement@k with exhaustive
 of touches whose exhaustive top-1 is among the k candidates.
 
     no bound       exact search, and the smallest k of `candidate_steps` with a recall of 0.99
-    min_recall     exact search is tried first, then approximate kinds. The first point is chosen that has this
-                   recall and whose search takes no longer than its reranking. If there is none, the fastest point with
-                   this recall
+    min_recall     the first point with this recall whose search takes no longer than its reranking: exact search,
+                   then approximate kinds. If there is none, the fastest point with this recall
     max_ms         the first point with a recall of 0.99 within the time: exact search, then approximate kinds. If
                    there is none, the point with the highest recall within the time. If no point is within the time,
                    the fastest point with a recall of 0.99
@@ -78,7 +77,7 @@ class SearchRequirements:
         if self.min_recall is not None and not 0 < self.min_recall <= 1:
             raise BadInput(f"the minimum recall must be above 0 and at most 1; got {self.min_recall}")
         if self.max_ms is not None and not self.max_ms > 0:
-            raise BadInput(f"the longest search must take more than 0 ms; got {self.max_ms}")
+            raise BadInput(f"the time limit of a search must be more than 0 ms; got {self.max_ms}")
 
     @classmethod
     def of(
@@ -153,7 +152,7 @@ def choose_operating_point(
 
 
 def needs_measurement(photos: int, requirements: SearchRequirements) -> bool:
-    """Whether the choice needs a measurement. Few photos are all scored, unless there is a time bound."""
+    """Whether the choice needs a measurement. A small catalogue needs none, unless there is a time bound."""
     return len(candidate_steps(photos)) > 1 or requirements.max_ms is not None
 
 
@@ -333,9 +332,9 @@ def operating_point_sentence(candidates: Mapping[str, Any]) -> str:
     found = round(candidates["top1_agreement"] * candidates["queries"])
     scored = "scores every photo" if k >= photos else f"reranks the best {k} of {photos} photos"
     text = (
-        f"The fusion head {scored}: these contain the exhaustive top-1 for {found} of {candidates['queries']} "
-        f"validation touches (95 % interval {low:.3f} to {high:.3f}), in {candidates['ms']:.3g} ms, compared with "
-        f"{candidates['exhaustive_ms']:.3g} ms for all."
+        f"The fusion head {scored}. The candidates contain the exhaustive top-1 for {found} of {candidates['queries']} "
+        f"validation touches (95 % interval {low:.3f} to {high:.3f}). Search and reranking take "
+        f"{candidates['ms']:.3g} ms, scoring all photos {candidates['exhaustive_ms']:.3g} ms."
     )
     return text + _unmet_requirements(candidates["top1_agreement"], candidates["ms"], candidates["requirements"])
 

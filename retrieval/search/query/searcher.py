@@ -100,7 +100,7 @@ class Searcher:
 
         >>> import numpy as np
         >>> from PIL import Image
-        >>> pictures = [np.asarray(Image.open(name)) for name in ("a.png", "b.png")]  # as cameras give them
+        >>> pictures = [np.asarray(Image.open(name)) for name in ("a.png", "b.png")]  # red first
         >>> with retrieval.open("index") as searcher:
         ...     from_arrays, from_files = searcher.query(pictures), searcher.query(["a.png", "b.png"])
         >>> from_arrays.results == from_files.results
@@ -213,7 +213,7 @@ class Searcher:
         candidates: int | None = None,
         none_prior: float = NONE_PRIOR,
     ) -> list[QueryResult]:
-        """Return the result for each of several objects in the hand, each in the form that `query` accepts.
+        """Return one result for each of several objects in the hand; give each object's touches as for `query`.
 
         Touches are encoded in batches, so logits differ by at most 1e-4 from single queries. If the touches of one
         object are invalid, the error names the object and no query runs.

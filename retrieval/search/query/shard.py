@@ -128,7 +128,7 @@ class Shard(Protocol):
         """
 
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
-        """Return the row of each photo or gel image of a reference touch (with the key `touch`); None if missing."""
+        """Return the row of each id: a photo, or a reference touch's gel image (with key `touch`); None if missing."""
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
         """Return a page of the photos that contain all words in object, path or metadata.

@@ -283,7 +283,7 @@ def test_invalid_requirements_raise_before_embedding(catalogue_copy, checkpoint,
         with pytest.raises(BadInput, match="minimum recall must be above 0"):
             build_index(catalogue_copy, checkpoint, index, min_recall=recall, quiet=True)
     for budget in (0, -1, float("nan")):
-        with pytest.raises(BadInput, match="must take more than 0 ms"):
+        with pytest.raises(BadInput, match="must be more than 0 ms"):
             build_index(catalogue_copy, checkpoint, index, max_ms=budget, quiet=True)
     assert embedded == []
 
