@@ -25,7 +25,7 @@ from retrieval.training.verdicts import with_verdicts
 
 @one_thread()
 def fit_matcher(data: AdaptationData, estimate: Estimate | None, out: Path) -> Checkpoint:
-    """Fit codes to all recorded objects and return them as a checkpoint.
+    """Fit projections to all recorded objects and return them in a checkpoint.
 
     Args:
         data: The recorded grasps and their features.
@@ -40,7 +40,7 @@ def fit_matcher(data: AdaptationData, estimate: Estimate | None, out: Path) -> C
         touch, largest = features.touch.reshape(len(features), -1), max(GRID)
         projections = dict(fit_projections(touch, features.photo, features.owner, data.blocks, [largest]))[largest]
         scale, offset = 1.0, 0.0
-    install_codes(matcher, projections, scale, offset)
+    install_projections(matcher, projections, scale, offset)
     objects = tuple(sorted(set(features.object_ids)))
     return Checkpoint(
         path=out,
@@ -73,18 +73,18 @@ def _log_odds(parts: Iterable[ScoredTouches]) -> tuple[float, float]:
 
 
 @torch.no_grad()
-def install_codes(matcher: Matcher, projections: CcaProjections, scale: float, offset: float) -> None:
-    """Make the match logit `scale * cosine + offset` of the codes; the layers of the head contribute 0.
+def install_projections(matcher: Matcher, projections: CcaProjections, scale: float, offset: float) -> None:
+    """Make the match logit `scale * cosine + offset` of the projected features; the layers of the head contribute 0.
 
     Args:
         matcher: The matcher to change.
-        projections: Maps from features to codes.
+        projections: Maps from features to encodings.
         scale: Scale of the cosine.
         offset: Offset of the logit.
     """
     for layer, found in ((matcher.touch_projection, projections.touch), (matcher.photo_projection, projections.photo)):
         assert isinstance(layer, nn.Linear)  # the configuration of `adapt` has no hidden layer
-        used = found.weight.shape[1]  # shorter codes leave zeros, which do not change the cosine
+        used = found.weight.shape[1]  # shorter encodings leave zeros, which do not change the cosine
         layer.weight.zero_()
         layer.bias.zero_()
         layer.weight[:used] = torch.from_numpy(found.weight.T.astype(np.float32))
@@ -101,7 +101,7 @@ def calibrate_fit(
 ) -> Checkpoint:
     """Add the gel check and the posterior to a fitted checkpoint.
 
-    The posterior is fitted on held-out objects, because the codes are overfitted to their own objects.
+    The posterior is fitted on held-out objects, because the projections are overfitted to the fitted objects.
 
     Args:
         checkpoint: The fitted checkpoint.

@@ -28,7 +28,7 @@ class Fold:
 
     Attributes:
         left_out: Features of the grasps of the held-out objects.
-        projections: Codes fitted to the other objects.
+        projections: Projections fitted to the other objects.
         settings: Settings selected among the other objects.
     """
 
@@ -64,7 +64,7 @@ def draw_folds(grasps: Sequence[Grasp], seed: int) -> list[tuple[str, ...]]:
 def fit_folds(
     features: Features, folds: Sequence[Sequence[str]], data: AdaptationData, *, seed: int, label: str, quiet: bool
 ) -> Iterator[Fold]:
-    """Yield each fold with the fit to the objects outside it, which also select the settings.
+    """Yield each fold with the fit to the objects outside it. The settings are selected on the same objects.
 
     Args:
         features: Features of all grasps.
@@ -83,7 +83,7 @@ def fit_folds(
 
 
 def choose_settings(features: Features, data: AdaptationData, seed: int) -> CcaSelection:
-    """Return settings, selected by holding out half of each kind of objects, and codes fitted to all objects."""
+    """Return settings, selected by holding out half of each kind of objects, and projections fitted to all objects."""
     parts = held_out_folds(features, data.kind_of, linked_objects(data.grasps), seed)
     return select_settings(features, data.blocks, parts)
 
@@ -105,7 +105,7 @@ class FoldAccuracy:
     objects: int
 
     def measure(self, column: str) -> Measure:
-        """Return the measure "top1" or "pair_accuracy"; its owners are places of the sorted objects."""
+        """Return the measure "top1" or "pair_accuracy"; its owners are indices of the sorted objects."""
         owner = np.unique(self.object_ids, return_inverse=True)[1].astype(np.int64)
         chance = 1 / self.objects if column == "top1" else 0.5
         return Measure(getattr(self, column)[:, None], owner, np.array([chance]), f"{self.objects} held-out objects")
@@ -142,7 +142,7 @@ def score_accuracy(scores: NDArray[np.float32], features: Features, seed: int = 
 
 
 def pair_accuracy(parts: Sequence[FoldAccuracy]) -> float:
-    """Return how often a touch's own photo outscores that of another object; objects have equal weight."""
+    """Return how often the photo of the touched object outscores that of another object; objects have equal weight."""
     return float(measure(parts, "pair_accuracy").by_object()[1].mean())
 
 

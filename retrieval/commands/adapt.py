@@ -21,7 +21,7 @@ def adapt(
     init: Annotated[
         str,
         typer.Option(
-            help="weights of a published tower that is added to those of the model: imagenet, a file, or none"
+            help="weights of a published tower that is combined with the model's towers: imagenet, a file, or none"
         ),
     ] = "imagenet",
     split: Annotated[Path | None, typer.Option(help=f"{SPLIT}; test objects are not used")] = None,

@@ -39,4 +39,4 @@ def check(
     compared = [finding.message for finding in findings if finding.kind == COMPARED_COPIES]
     say("; ".join([f"{recording}: {errors} error(s), {warnings} warning(s)", *compared]))
     if errors:
-        raise RetrievalError(f"{recording} is not fit for training; see the errors above")
+        raise RetrievalError(f"{recording} is not suitable for training; see the errors above")

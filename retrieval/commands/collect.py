@@ -23,7 +23,9 @@ def collect(
     gate: Annotated[
         Path | None, typer.Option(help="grasp-success checkpoint (default: a rule on the contact area)")
     ] = None,
-    preview: Annotated[bool, typer.Option("--preview", help="also write a contact sheet, OUT-preview.png")] = False,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="write an overview image, OUT-preview.png (simulated rig only)")
+    ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="print the motions of one attempt per object; arm and gripper do not move")
     ] = False,
@@ -60,7 +62,7 @@ def collect(
     from robot.recording.attempt_log import acceptance_table
     from robot.rig import load_rig
 
-    # The contact sheet is written next to the recording, because every image inside belongs to a grasp.
+    # The overview is written next to the recording, because every image inside belongs to a grasp.
     # "." and ".." have no name to extend, so they are resolved.
     folder = out if out.name not in ("", "..") else out.resolve()
     sheet = folder.with_name(f"{folder.name}-preview.png")

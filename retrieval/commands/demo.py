@@ -93,7 +93,7 @@ def _run(command: Callable[..., object], *arguments: Path, **options: object) ->
 
 
 def _split(grasps: Sequence["Grasp"], catalogue: Path) -> "dict[str, list[Grasp]]":
-    """Copy the photos of each object's first grasps into the catalogue; return its last grasps by object."""
+    """Copy the photos of each object's first grasps into the catalogue; return the query grasps by object."""
     by_object: dict[str, list[Grasp]] = defaultdict(list)
     for grasp in grasps:
         by_object[grasp.object_id].append(grasp)

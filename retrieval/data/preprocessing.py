@@ -141,7 +141,7 @@ class Preprocessing:
         """Return a gel image (H, W, 3) in 0..1 as (touch_px, touch_px, 3), with the background subtracted.
 
         The subtraction follows the resizing: the two files may have different sizes, and the work is less. For "abs",
-        sensor noise averages out while it has both signs, instead of adding a grey veil.
+        sensor noise averages out before the absolute value, which would make it a grey offset.
 
         Args:
             image: The gel image.

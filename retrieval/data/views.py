@@ -27,7 +27,7 @@ _SIDE = 128
 _RING = 6
 _GAMMA = 2.2
 _SHADE_TINT = 0.22
-"""Largest shift of the ground's colour between red and blue if only the sky lights it."""
+"""Largest shift of the ground's colour between red and blue if only diffuse light reaches it."""
 _DARKEST_SHADE = -1.6
 """Logarithm of the darkest shadow's lightness relative to the ground."""
 _DIFFERENCE_THRESHOLDS = (4.0, 3.5)
@@ -46,11 +46,12 @@ class PixelBox(NamedTuple):
 
 
 def find_object(image: Samples) -> PixelBox:
-    """Return the box of the one object before a plain ground in a photo (H, W, 3), or the whole photo without one.
+    """Return the box of the object on a plain background in a photo (H, W, 3), or of the whole photo if none is found.
 
-    The border of the photo shows the ground: planes of colour and lightness, fitted robustly. An object differs from
-    it in colour, or is lighter, or darker than a shadow. A shadow is the ground with less light and a tint between the
-    lamp's and the sky's. Depth would be more reliable, but a catalogue has none.
+    The border of the photo shows this background (the ground): planes of colour and lightness, fitted robustly. An
+    object differs from it in colour, or is lighter, or darker than a shadow. A shadow is the ground with less light,
+    and with a tint between those of the lamp and of diffuse light (the sky). Depth would be more reliable, but a
+    catalogue has none.
     """
     height, width = image.shape[:2]
     linear = np.clip(resize_unchecked(image, (_SIDE, _SIDE)), 0, 1) ** np.float32(_GAMMA) + np.float32(1e-3)
@@ -189,8 +190,8 @@ def min_photo_side_for_crop(box: PixelBox, short: int, px: int) -> int:
     """Return the smallest shorter side that is sufficient for the view `crop`.
 
     Args:
-        box: The object's box in a photo of the same picture.
-        short: Shorter side of that photo in pixels.
+        box: The object's box in a reduced decoding of the photo.
+        short: Shorter side of that decoding in pixels.
         px: Side of the view in pixels.
     """
     fraction = _CROP_MARGIN * max(box.right - box.left, box.bottom - box.top, 1) / short

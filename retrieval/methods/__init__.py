@@ -1,7 +1,7 @@
 """Methods to compare: each scores touches with photos, fitted on the same grasps.
 
-A new method is one file and one row of `METHODS`, or a class in a user's own package. The behaviour suite runs over the
-table.
+A new method is one file and one row of `METHODS`, or a class in a user's own package. The behaviour tests run on
+every row.
 """
 
 from typing import TYPE_CHECKING

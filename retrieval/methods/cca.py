@@ -1,9 +1,9 @@
 """Canonical correlation analysis (Hotelling, Biometrika 1936) for retrieval.
 
-Three measures make it a strong baseline: a ridge (with fewer grasps than features the plain method fits any noise with
+Three additions make it a strong baseline: a ridge (with fewer grasps than features the plain method fits any noise with
 correlation 1), dimensions weighted by rho^p (Gong et al., IJCV 2014: a plain cosine would give noise dimensions full
-weight), and settings chosen by ranking on validation objects. All computations are in float64 from the singular value
-decomposition of the centred data; X'X would square the condition number.
+weight), and settings chosen by ranking on validation objects. All computations are in float64, from the singular value
+decomposition of the centred data. Only `leading_svd` uses X'X, which squares the condition number.
 """
 
 from collections.abc import Iterator
@@ -124,8 +124,8 @@ def canonical_correlations(
     """Return the canonical correlations of touches with photos, each touch paired with every photo of its object.
 
     A pair of an object with m grasps has weight 1/m, so every grasp has the same total weight. Pairing is the block
-    average B = E'E, E (objects, n) with rows 1/sqrt(m): the cross-covariance X'BY needs only object means, and its rank
-    is below the number of objects. Its whitened form is factored by QR of both sides.
+    average B = E'E, E (objects, n) with 1/sqrt(m) at an object's grasps: the cross-covariance X'BY needs only object
+    means, and its rank is below the number of objects. Its whitened form is factored by QR of both sides.
 
     Args:
         touch: Decomposed touches.
@@ -171,7 +171,7 @@ def leading_svd(x: Matrix, max_directions: int = MAX_DIRECTIONS) -> tuple[Matrix
     """Return the thin decomposition in the widest directions of many items.
 
     It uses the eigenvectors of X'X or, if that is smaller, of XX'. The squared condition number affects only the
-    narrowest directions, which are not returned.
+    narrowest directions, which `LEADING_CUT` removes later.
     """
     width = x.shape[1]
     if len(x) < width:
@@ -218,7 +218,7 @@ class CcaGridPoint:
 
 
 class Cca(Method):
-    """Cosine of canonical variates weighted by rho^p; ridge, components and p by ranking on validation objects."""
+    """Cosine of canonical variates weighted by rho^p; ranking on validation objects chooses ridge, components and p."""
 
     is_seeded = False
 
@@ -279,7 +279,7 @@ class CcaPca(Cca):
 
     A few dozen objects do not determine which of a thousand features correlate across touch and photo. The ridge of
     `Cca` damps the narrow directions; this method drops them. On 36 everyday objects of VT60 it is no better than `Cca`
-    (docs/real.md) but faster, so the controls of the benchmark on real data use it.
+    but faster, so the controls of the benchmark on real data use it.
     """
 
     max_directions = 96

@@ -2,8 +2,8 @@
 
 The features of each tower are reduced to their widest directions, with equal weight for every tower. Canonical
 correlations with a ridge follow (`retrieval.methods.cca`). On a few dozen objects no method with more freedom was
-better (docs/adapting.md). The composed maps are one matrix, so the result is stored as the projections of an ordinary
-matcher.
+better (docs/measurements/adaptation.md). The maps of each modality compose to one affine map, so the result is stored
+as the projections of an ordinary matcher.
 
 Settings are chosen from `GRID` on held-out training objects (`select_settings`), never on test objects.
 """
@@ -213,7 +213,7 @@ def select_settings(
     Args:
         features: Features of grasps.
         blocks: Feature widths of the concatenated towers, of touches and of photos.
-        folds: Objects of `features` that are held out together; the others are fitted on.
+        folds: Objects of `features` that are held out together; the fit uses the others.
         settings: The settings to choose from.
     """
     touch_view, photo_view = (
@@ -268,7 +268,7 @@ class CcaTowers(Method):
     Settings are chosen by ranking on validation objects. With `fit_on_validation` they are chosen by cross-validation
     within all objects, and the held-out objects also calibrate the cosines ("posterior" in `best_params`).
 
-    If the features of a reference touch follow those of each photo, an entry of the catalogue is both. The touch's
+    If the features of a reference touch follow those of each photo, an entry of the catalogue has both. The touch's
     cosines with the photo and with the reference, which is encoded as a touch, are then weighted by logistic regression
     on validation objects.
     """
@@ -324,8 +324,8 @@ def _rows(features: "Features") -> Rows:
 def _weights(projections: CcaProjections, validation: "Features", width: int) -> list[float]:
     """Return the weights of the cosine with a photo and with a reference touch in the log-odds of one object.
 
-    Logistic regression over all pairs of a touch and an entry; pairs of one object have the same total weight as the
-    others. No weight is negative.
+    Logistic regression over all pairs of a touch and an entry; matching pairs have the same total weight as
+    non-matching ones. No weight is negative.
     """
     from sklearn.linear_model import LogisticRegression  # slow to import
 
@@ -359,6 +359,6 @@ def tower_widths(config: Config, features: "Features") -> TowerWidths:
     if expected[0] != got[0] or got[1] not in accepted:
         raise BadInput(
             f"features must be those of the towers {config.matcher.tower} ({config.matcher.tower_output}), "
-            f"{expected[0]} of a touch and {expected[1]} of a photo; got {got[0]} and {got[1]}; encode with these"
+            f"{expected[0]} of a touch and {expected[1]} of a photo; got {got[0]} and {got[1]}; use these towers"
         )
     return touch_view, accepted[got[1]]

@@ -45,12 +45,12 @@ class Projections(nn.Module):
         return functional.normalize(embedding, dim=-1, eps=1e-6)
 
     def loss(self, touch: Tensor, photo: Tensor, touch_objects: Tensor, photo_objects: Tensor) -> Tensor:
-        """Return the loss (scalar) of a batch of embeddings. InfoNCE compares photos of one touch: its bias stays 0."""
+        """Return the loss (scalar) of a batch of embeddings. InfoNCE does not depend on a bias, which stays 0."""
         return contrastive_loss(touch, photo, touch_objects, photo_objects, self.log_scale)
 
     @torch.no_grad()
     def clamp_scale(self) -> None:
-        """Clamp the parameter of the scale to at most 100, so that its gradient can reduce it again."""
+        """Clamp the scale to 1..100. The parameter is clamped, so that its gradient can reduce it again."""
         self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
 
     @torch.no_grad()

@@ -61,8 +61,8 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
     """Train on features and store the checkpoint in `settings.folder`.
 
     A checkpoint of the same fit in that folder is reused, an unfinished one is continued. The model has no candidate
-    encoder, because every photo is scored. The towers of the checkpoint are those of `frozen_matcher`; it works like
-    any other if the features come from them.
+    encoder, because every photo is scored. The checkpoint has the towers of `frozen_matcher`. It works like any
+    other one if the features come from these towers.
 
     Raises:
         BadInput: The features are not from such towers.
@@ -90,7 +90,7 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
         if expected != got:
             raise BadInput(
                 f"late fusion takes features of its own towers, {expected[1]} of a finger and {expected[2]} of a photo "
-                f"({config.matcher.tower}, {config.matcher.tower_output}); got {got[1]} and {got[2]}; encode with these"
+                f"({config.matcher.tower}, {config.matcher.tower_output}); got {got[1]} and {got[2]}; use these towers"
             )
         towers = frozen_matcher(settings.config)
         trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())

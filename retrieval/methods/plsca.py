@@ -74,7 +74,7 @@ def _rotations(touch: Matrix, photo: Matrix) -> tuple[Matrix, Matrix]:
     """Return maps (r, k) of either view to its k components.
 
     They come from power iteration. scikit-learn's other algorithm decomposes the deflated cross matrix in full, and
-    LAPACK's gesdd did not converge on one of ImageNet features after 20 components.
+    LAPACK's gesdd did not converge on such a matrix of ImageNet features after 20 components.
     """
     from sklearn.cross_decomposition import PLSCanonical  # slow to import
     from sklearn.exceptions import ConvergenceWarning
@@ -82,7 +82,7 @@ def _rotations(touch: Matrix, photo: Matrix) -> tuple[Matrix, Matrix]:
     # Centring removes one dimension of the rows; the smaller view's directions also limit the components.
     limit = min(COMPONENTS[-1], touch.shape[1], photo.shape[1], len(touch) - 1)
     with warnings.catch_warnings():
-        # Two directions of nearly equal covariance: either is valid, and validation chooses the number of components.
+        # Directions of nearly equal covariance cause it: either is valid; validation chooses the number of components.
         warnings.simplefilter("ignore", ConvergenceWarning)
         model = PLSCanonical(limit, scale=False).fit(touch, photo)
     return model.x_rotations_, model.y_rotations_

@@ -65,7 +65,7 @@ class RetrieveRerank(LateFusion):
         return np.array(scores)
 
     def _score_sets(self, touch_encodings: Array, photo_encodings: Array, sets: NDArray[np.int64]) -> Array:
-        """Score sets as single touches. Sets have touches in common, so all photos are scored once per touch."""
+        """Rerank for a set as for one touch. Sets have touches in common, so all photos are scored once per touch."""
         used, place = np.unique(sets, return_inverse=True)
         touch_partials, partials, nearness = self._parts(touch_encodings[used], photo_encodings)
         logits = super()._score(touch_partials, partials)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MAX_GRASPS, VALIDATION_GRASPS = 8, 5
 MAX_STEPS, VALIDATE_EVERY = 1000, 50
 OBJECTS_PER_BATCH, PHOTOS = 24, 4
-"""Sets in a batch; photos of its own object and photos of other objects that each set is paired with."""
+"""Sets in a batch; for each set, the number of photos of its own object, and of photos of other objects."""
 PAIRS_PER_BLOCK = 16_384
 
 

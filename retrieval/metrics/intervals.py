@@ -107,7 +107,8 @@ def compare(
     """Compare two methods on the same queries, with objects as the units.
 
     The p-value is that of a two-sided sign-flip permutation test on the objects' differences. Up to 18 objects it uses
-    all flips, else `draws` random ones (Phipson and Smyth 2010: p is never 0). It is 1 for one object or no difference.
+    all flips, else `draws` random ones (Phipson and Smyth 2010: p is never 0). The p-value is 1 for one
+    object or no difference.
 
     Args:
         a: Measures of the first method, one per training seed.
@@ -136,7 +137,7 @@ def compare(
 
 
 def sign_flip_p(differences: NDArray[np.float64], *, draws: int = 10_000, seed: int = 0) -> float:
-    """Return the fraction of sign flips of the differences (R,) whose mean is as far from 0 as the observed one."""
+    """Return the fraction of sign flips of the differences (R,) whose mean is at least as far from 0 as observed."""
     observed = abs(differences.sum())
     # Sums of the same numbers in another order differ by rounding; they are treated as equal.
     threshold = observed - 1e-12 * np.abs(differences).sum()

@@ -106,7 +106,7 @@ def average_precision(table: ScoreTable) -> Measure:
     """Average precision over the whole gallery, without own photos.
 
     With `table.with_own()` this is the cross-sensory retrieval of the ObjectFolder benchmark, whose gallery contains
-    every instance of the other modality, that of the query's own grasp included.
+    every instance of the other modality, including that of the query's own grasp.
     """
     queries = table.with_targets
     values = ranking.average_precision(queries.scores, queries.relevant, ~queries.own)
@@ -114,7 +114,7 @@ def average_precision(table: ScoreTable) -> Measure:
 
 
 def paired(table: ScoreTable, k: int) -> Measure:
-    """Top-k accuracy of the whole set as one batch, averaged over both directions, as TVL measures.
+    """Top-k accuracy of the whole set as one batch, averaged over both directions, as in TVL.
 
     Only the photo (or touch) of the same grasp is correct; other photos of the object are wrong. Raises BadInput unless
     rows and columns are the same grasps.

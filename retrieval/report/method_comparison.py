@@ -138,7 +138,7 @@ def ceilings(builder: Builder) -> Iterator[Block | None]:
     if builder.results.data.get("ceilings"):
         yield Text(
             "CCA trained and tested within one modality. Matching between touch and photo can hardly be better than "
-            "the worse of the two. The difference between that ceiling and the result is lost between the modalities."
+            "the worse of the two. The difference between that ceiling and the result is due to the change of modality."
         )
         yield tables.ceilings(builder.results)
 
@@ -169,8 +169,8 @@ def audit(builder: Builder) -> Iterator[Block | None]:
         yield builder.picture(
             "nearest.jpg",
             f"Test frames next to the nearest training or validation frames; distances: {', '.join(gaps)}.",
-            "The nearest frames on both sides of the split. Copies would look the same; two light touches look similar "
-            "without being copies.",
+            "The nearest frames on both sides of the split. Copies would look the same; two low-contact touches look "
+            "similar without being copies.",
             galleries.nearest_frames,
             found["frames"],
             builder.grasps,

@@ -449,7 +449,7 @@ def test_check_exits_with_1_if_it_finds_errors(recording, tmp_path, capsys):
     assert main(["check", str(broken), "--json"]) == 1
     output = capsys.readouterr()
     assert json.loads(output.out)["findings"][0]["kind"] == "broken"
-    assert "is not fit for training" in output.err
+    assert "is not suitable for training" in output.err
 
 
 def test_the_whole_job_from_recording_to_ranking(recording, workplace, capsys):

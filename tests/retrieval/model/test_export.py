@@ -83,6 +83,7 @@ LARGE = ("resnet34", "resnet50")
 MAKES = [{"tower": tower, "tower_output": "stages"} for tower in sorted(TOWERS) if tower not in LARGE]
 MAKES += [{"tower_output": name} for name in OUTPUTS]
 MAKES += [{"fingers": 1}, {"standardise": False}, {"candidate_width": 0}]
+MAKES += [{"tower_output": "stages", "cell_dim": 4, "touch_cells": 2, "cosine": True, "projection_hidden": 12}]
 
 
 @pytest.mark.parametrize("make", MAKES, ids=str)
