@@ -68,15 +68,16 @@ retrieve check recording/                                   # before training
 An importer reads a public data set in its published layout, or your own pictures, and writes a
 [recording](formats.md#recording) for training, evaluation and search. It processes one grasp at a time, so memory grows
 only with names, not with pictures: 100,000 rows instead of 10,000 take 15 to 67 MB more, depending on the importer
-(`python -m benchmarks.importers_memory`), and one line per grasp when the recording is read back. An interrupted import
-continues when you run it again. Unreadable items are skipped, counted by reason and reported. `recording.json` stores
-the counts under `skipped`, the licence and the citation, and under `objects` the data set's own information on them.
-Pictures that many grasps share, such as one no-contact frame, are stored once. A published split by objects is in
-`splits/<name>.json`, for `--split`. Some importers need packages of the extra:
+(`python -m benchmarks.importers_memory`). At the end, memory also holds the recording's lines, one per grasp. An
+interrupted import continues when you run it again. Unreadable items are skipped, counted by reason and reported.
+`recording.json` stores the counts under `skipped`, the licence and the citation, and under `objects` the data set's own
+information on them. Pictures that many grasps share, such as one no-contact frame, are stored once. A published split
+by objects is in `splits/<name>.json`, for `--split`. Some importers need packages of the extra:
 `pip install 'touch-retrieval[importers]'`.
 
 The data sets are not ours. Their own pages state the licence, which binds you and not us. If parts of a layout are not
 verified, the importer follows the authors' descriptions and other people's readers, and lists these parts when it ends.
+The [glossary](glossary.md#training-and-evaluation) defines the controls that the notes name.
 
 """
 
@@ -183,7 +184,7 @@ def _help(title: str, command: Any) -> Iterator[str]:
 
 def data_sets() -> str:
     """Return docs/datasets.md."""
-    columns = ("name", "required content", "sensor", "fingers", "no-contact frame", "licence", "layout")
+    columns = ("name", "the folder must contain", "sensor", "fingers", "no-contact frame", "licence", "layout")
     rows = [columns, ("---",) * len(columns)]
     for name in sorted(IMPORTERS):
         facts = data_set_of(name)
@@ -198,7 +199,7 @@ def data_sets() -> str:
 def _data_set(name: str) -> str:
     facts, options = data_set_of(name), options_of(load_importer(name))
     below = inspect.cleandoc(sys.modules[load_importer(name).__module__].__doc__ or "").partition("\n")[2]
-    parts = [f"\n## {name}\n", f"{title_of(name)}. {facts.citation}.\n", below.strip("\n") + "\n"]
+    parts = [f"\n## {name}\n", f"{title_of(name)}. Citation: {facts.citation}.\n", below.strip("\n") + "\n"]
     if options:
         parts.append(f"Options: {', '.join(f'`{option}={default}`' for option, (_, default) in options.items())}.\n")
     parts += [f"* {note[0].upper()}{note[1:].rstrip('.')}." for note in facts.notes()]

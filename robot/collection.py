@@ -153,7 +153,7 @@ def collect(
     if jobs < 1:
         raise RobotConfigError(f"jobs must be at least 1, got {jobs}")
     if jobs > 1 and not rig.can_run_jobs:
-        raise RobotConfigError(f"{type(rig).__name__} can run only once, so jobs must be 1, got {jobs}")
+        raise RobotConfigError(f"{type(rig).__name__} can run in one process only, so jobs must be 1, got {jobs}")
     names = rig.object_ids(objects) if isinstance(objects, int) else list(objects)
     if not names:
         raise RobotConfigError("objects must name at least one object, got none")

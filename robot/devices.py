@@ -130,9 +130,8 @@ class Device(ABC):
     def _check_age(self, time_s: float, max_age_s: float) -> None:
         age = self.clock() - time_s
         if not -_CLOCK_SLACK_S <= age <= max_age_s:
-            raise DeviceError(
-                f"{self.name}: the frame must be at most {max_age_s:g} s old, got {age:.3g} s; is the stream frozen?"
-            )
+            allowed = f"from {-_CLOCK_SLACK_S:g} to {max_age_s:g} s"
+            raise DeviceError(f"{self.name}: the frame's age must be {allowed}, got {age:.3g} s; is the stream frozen?")
 
 
 class VirtualDevice(Device):

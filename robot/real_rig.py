@@ -40,9 +40,9 @@
     [planner]                                 # the grasp planner (robot.grasping.planner)
     name = "cylinder"                         # its other keys are the planner's settings
 
-The limits do not apply to homing, which has the gripper's own speed, nor to an arm that a person moves. Sawyer's slow
-/robot/state may be up to 2 s old, or `state_age_s` if that is longer. Paths are relative to the working directory of
-the process that reads the file. Unknown keys are errors.
+The limits do not apply to homing, which has the gripper's own speed. If a person moves the arm, they limit only the
+requested poses and speeds. Sawyer's slow /robot/state may be up to 2 s old, or `state_age_s` if that is longer. Paths
+are relative to the working directory of the process that reads the file. Unknown keys are errors.
 """
 
 import time

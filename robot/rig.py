@@ -172,7 +172,7 @@ def _close_all(devices: tuple[Device, ...] | list[Device]) -> BaseException | No
 
 
 def load_rig(spec: str, *, seed: int, **settings: Any) -> Rig:
-    """Build, without connecting it, the rig that `spec` names: a name of RIGS, or a TOML file.
+    """Build the rig that `spec` names, but do not connect it; `spec` is a name of RIGS or a TOML file.
 
         rig = "sim"
         fingers = ["a", "b"]   # the other keys are settings of that rig

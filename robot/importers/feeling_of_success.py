@@ -53,7 +53,7 @@ DATA_SET = DataSet(
     unverified=(
         "the compression of the published files: blosc needs pip install hdf5plugin",
         "that the first colour is red",
-        "that a name identifies one object: earlier files cut names off, so an object might have two",
+        "that each object has one name: earlier files cut names off, so an object might have two",
     ),
 )
 _FILE = re.compile(r".*\.(h5|hdf5)")

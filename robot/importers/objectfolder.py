@@ -44,12 +44,12 @@ DATA_SET = DataSet(
     rig="robot arm; photos of the object alone",
     expects="`<index>/visual/0.png` and `<index>/tactile/0.png`, or `vision/<object>/` and `touch/<object>/`",
     caveats=(
-        "In the benchmark a query is correct if any picture of its object is found (mAP), and some published numbers "
-        "on real objects are on training objects.",
+        "The benchmark counts any picture of the right object as correct (mAP, mean average precision). Some published "
+        "numbers for real objects are those of training objects.",
     ),
     unverified=(
         "that pictures of the simulated packs are 160 pixels wide, which distinguishes them from the real ones",
-        "whether the split of each pack divides objects or their pictures",
+        "whether the split of each pack is by object or by picture",
     ),
 )
 _SIMULATED = "GelSight, simulated (Taxim)"

@@ -8,7 +8,7 @@
 The authors' extract_frame.py extracts the frames from the videos.
 The data set names materials, not objects. An unbroken run of frames in contact with one material counts as one object,
 `<sequence>-<first frame>`, and `frames` evenly spread frames of it are its grasps (0: all). A video is a sequence: a
-split must not divide its runs. The no-contact frame of a video is the first frame that label.txt does not list.
+split must not separate its runs. The no-contact frame of a video is the first frame that label.txt does not list.
 """
 
 import re

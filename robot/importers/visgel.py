@@ -45,8 +45,8 @@ DATA_SET = DataSet(
     caveats=(
         "The data set does not name the touched objects: object_id is one recording of one touch, and two of them may "
         "show one object. This makes pair accuracy and recall too low.",
-        "Photos show arm and scene, and the place can identify the touch. Print the control with the photo's "
-        "background.",
+        "Photos show arm and scene, and the place can identify the touch. Print the control that sees only the "
+        "margin of the photo.",
     ),
     unverified=(
         "the folders between data_seen and touch",

@@ -25,8 +25,8 @@ DATA_SET = DataSet(
     rig="by hand, the object in a vise; webcam",
     expects="`real/<object>/dataset_<k>/frames/` and `webcam_frames/`",
     caveats=(
-        "There are only ten objects, and the webcam shows the vise, the hand and one place: print the control with the "
-        "photo's background next to every result.",
+        "There are only ten objects, and the webcam shows the vise, the hand and one place: print the control that "
+        "sees only the margin of the photo next to every result.",
     ),
     unverified=(
         "that frames of the same number were taken at the same time: the pickled tables of times are not opened",

@@ -1,4 +1,4 @@
-"""attempts.jsonl: the result of every attempt, with or without a grasp, and the acceptance of each object.
+"""The log attempts.jsonl (the result of every attempt, with or without a grasp), and the acceptance by object.
 
 The file lies in the recording's folder. A line contains object_id, number, outcome, accepted and ended_s (seconds of
 rig time since the recording began). If there was a grasp, it adds grasp_id, the gate's score and fit (method and error

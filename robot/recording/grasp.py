@@ -42,7 +42,7 @@ class RecordedGrasp:
         touch_skew_s: Time between the fingers' images.
         grasped: Whether the gate accepted the grasp, not whether the object was held; training ignores false.
         outcome: One of OUTCOMES, as the gripper reports.
-        sequence_id: Id of the recorded sequence of the grasp.
+        sequence_id: Id shared by grasps that no split separates.
         time_s: Time since the recording began.
 
     >>> grasp = robot.read_recording("recording").grasps[0]

@@ -606,7 +606,7 @@ def test_an_attempt_setting_out_of_range_is_refused(setting):
 
 def test_a_real_rig_cannot_run_in_several_jobs(tmp_path, monkeypatch):
     monkeypatch.setattr(FakeRig, "can_run_jobs", False)
-    with pytest.raises(RobotConfigError, match=r"FakeRig can run only once, so jobs must be 1, got 2"):
+    with pytest.raises(RobotConfigError, match=r"FakeRig can run in one process only, so jobs must be 1, got 2"):
         run(tmp_path / "r", jobs=2)
 
 

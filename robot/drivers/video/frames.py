@@ -120,7 +120,7 @@ class FrameReader:
         return self._wait(self.settings.timeout_s + self.settings.warmup_s, time_s)[-1]
 
     def near(self, time_s: float) -> Frame:
-        """Return the buffered frame nearest to `time_s`, the newer one of two; raise DeviceError without frames."""
+        """Return the buffered frame nearest to `time_s`, on a tie the newer one; raise DeviceError without frames."""
         return min(self._wait(self.settings.timeout_s), key=lambda frame: (abs(frame.time_s - time_s), -frame.time_s))
 
     def reopen_now(self) -> None:
@@ -137,7 +137,7 @@ class FrameReader:
         if self._thread.is_alive():
             raise DeviceError(
                 f"{self.name} did not close within {_CLOSING_S:g} s, because its driver still waits for a picture; "
-                "it closes when the driver returns. Unplug it if this does not help"
+                "it closes when the driver returns. If the driver does not return, unplug the camera"
             )
 
     def _open(self) -> Stream:

@@ -53,7 +53,7 @@ _TABLE = tuple(map(_table_row, range(256)))
 
 
 def checksum(data: bytes | bytearray, start: int = 0xFFFF) -> int:
-    """Return the checksum of `data`, 0 for a packet with its checksum; not CCITT, the register shifts right."""
+    """Return the checksum of `data`: 0 if it includes the packet's own. Unlike CCITT, the register shifts right."""
     value = start
     for byte in data:
         value = _TABLE[(value ^ byte) & 0xFF] ^ (value >> 8)
@@ -64,7 +64,7 @@ class _PrefixChecksums:
     """Checksums of many ranges of one buffer in a single pass over its bytes.
 
     In a stream of truncated packets, up to 44 packets claim the same byte. The checksum is linear: that of a range
-    follows from the checksums, started at 0, up to its two ends.
+    follows from the checksums (initial value 0) of all bytes before its start and before its end.
     """
 
     def __init__(self, buffer: bytes | bytearray, first: int) -> None:
@@ -87,7 +87,7 @@ def _after_zeros(value: int, count: int) -> int:
 
 
 def _zeros(max_count: int) -> tuple[tuple[int, ...], ...]:
-    """Return, for each number of zero bytes up to `max_count`, the checksum of each single bit after them."""
+    """Return rows for 0 to `max_count` zero bytes: what these bytes make of each checksum with a single bit set."""
     columns = [tuple(1 << bit for bit in range(16))]
     for _ in range(max_count):
         columns.append(tuple(_TABLE[value & 0xFF] ^ (value >> 8) for value in columns[-1]))

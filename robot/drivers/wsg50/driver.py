@@ -52,7 +52,7 @@ class WSG50(Gripper):
     """A WSG-50; the fields of WSG50Settings are keyword arguments of the constructor.
 
     `stop` releases a held object, because STOP ends the gripper's force control. Use the driver from one thread only;
-    to stop the gripper from another thread, interrupt this one (Ctrl-C).
+    to stop the gripper from another thread, interrupt the driver's thread (Ctrl-C).
     """
 
     Settings = WSG50Settings

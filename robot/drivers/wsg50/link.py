@@ -34,8 +34,8 @@ _PADDING = bytes(MAX_PAYLOAD + 8)
 _MAX_READS = 6
 """Number of reads of 4096 bytes after the end of a wait.
 
-It is more than arrives in ten seconds, in case this program was suspended. The limit protects against a peer that
-sends without end.
+It exceeds ten seconds of updates at the default period, in case this program was suspended. The limit protects against
+a peer that sends without end.
 """
 
 _MAX_TIMEOUTS = 3.0
@@ -296,7 +296,7 @@ class Link:
         raise NoReply(f"the gripper did not answer {command_name(command_id)} within {self.timeout_s:g} s")
 
     def _note(self, packet: Packet, command_id: int | None) -> bool:
-        """Store an update and return whether the packet is of this command; another one requires synchronisation."""
+        """Store an update; return whether the packet is of this command. Any other packet requires synchronisation."""
         if packet.id in commands.UPDATING:
             if packet.payload[:2] == bytes(2):
                 self.updates[packet.id] = (packet.payload[2:], time.monotonic())

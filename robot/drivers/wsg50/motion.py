@@ -34,7 +34,7 @@ _FAULTS = (
     | SystemState.SCRIPT_FAILURE
 )
 _RESENDABLE = (None, Status.SUCCESS, Status.CHECKSUM_ERROR)
-"""Answers after which a command that was not executed may be sent again, because it was not received."""
+"""Answers after which a command that was not executed may be sent again: perhaps it was not received."""
 
 ACTION = (
     "remove the cause, acknowledge it on the gripper's web page or set acknowledge_faults = true, then start again "
@@ -137,8 +137,8 @@ class Motions:
         answer = "nothing" if status is None else status.name
         stop = f", FAST STOP: {fault_names(reading.system)}" if reading.system & SystemState.FAST_STOP else ""
         raise DeviceError(
-            f"the gripper answered {answer} to {command_name(packet.id)} and is still at {reading.opening_mm:.1f} mm, "
-            f"{reading.grasping.name.lower()}{stop}; check it, then call recover()"
+            f"the gripper answered {answer} to {command_name(packet.id)} and rests at "
+            f"{reading.opening_mm:.1f} mm, {reading.grasping.name.lower()}{stop}; check it, then call recover()"
         )
 
     def stop(self) -> None:
@@ -159,7 +159,7 @@ class Motions:
         """Send packets one after the other until one is answered."""
         for number, packet in enumerate(packets, start=1):
             if packet.id == CommandId.FAST_STOP:
-                _log.warning("the gripper does not stop: sending FAST STOP")
+                _log.warning("STOP has failed: sending FAST STOP")
             try:
                 self.link.send_urgent(packet)
                 return
@@ -213,7 +213,7 @@ class Motions:
         raise error
 
     def _is_moving(self) -> bool:
-        """Return whether the last updates report a motion, and add them to `common_state`."""
+        """Return whether the last updates report a motion; keep in `common_state` only bits that they have."""
         try:
             system = commands.system_state(self.link.updates[CommandId.SYSTEM_STATE][0])
             grasping = commands.grasping_state(self.link.updates[CommandId.GRASPING_STATE][0])
@@ -227,7 +227,7 @@ class Motions:
         reading = self._last_reading(deadline)
         if reading.is_moving:
             raise DeviceError(
-                f"the gripper must be still, but still moves at {reading.opening_mm:.1f} mm: switch off its power"
+                f"the gripper must have stopped, but moves at {reading.opening_mm:.1f} mm: switch off its power"
             )
         return reading
 

@@ -49,8 +49,8 @@ class WSG50Settings(TypedSettings):
         finger_share: Fraction of the gripper's force on each finger; see `to_finger_force`.
         update_ms: Period of the state updates during a motion.
         homing_timeout_s: Longest duration of homing.
-        reconnect_tries: How often `recover` tries to open the port.
-        reconnect_s: First wait between them, which doubles up to 5 s.
+        reconnect_tries: Number of tries to open a lost port again.
+        reconnect_s: First wait between two tries, which doubles up to 5 s.
         max_force_n: Upper limit of forces.
         max_speed_mm_s: Upper limit of speeds.
         max_state_age_s: The jaws are stopped if no state arrives for this long during a motion.
@@ -217,8 +217,8 @@ class GripperSetup:
         self._note("force_n", force_n, settings.to_finger_force(has))
         if has > min(force_limit_n * (1 + _ROUNDING), ceiling):
             raise DeviceError(
-                f"{self.name}: the force limit must be {force_limit_n:g} N, but the gripper has {has:g} N; "
-                "the grasp is not made"
+                f"{self.name}: the force limit (both fingers) must be {force_limit_n:g} N, but the gripper has "
+                f"{has:g} N; the jaws do not close"
             )
 
     def read_back(self) -> dict[str, Any]:

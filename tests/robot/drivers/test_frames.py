@@ -205,7 +205,7 @@ def test_a_frozen_stream_is_stale_long_before_it_is_opened_again(script, make):
     gel = Gel("a", make(), clock=lambda: now[0])
     gel.connect()
     wait_for_frames(gel.reader, 3)
-    with pytest.raises(DeviceError, match=r"at most 0\.5 s old, got 0\.7 s; is the stream frozen"):
+    with pytest.raises(DeviceError, match=r"to 0\.5 s, got 0\.7 s; is the stream frozen"):
         gel.read()
     assert gel.reader.lost_count == 0
 

@@ -63,7 +63,7 @@ def test_opening_to_less_than_the_held_object_releases_it_first():
     with gripper_with_emulator() as (gripper, emulator):
         emulator.object_mm = 40.0
         gripper.grasp(10.0)
-        with pytest.raises(DeviceError, match=r"AXIS_BLOCKED to MOVE .* is still at 40.0 mm"):
+        with pytest.raises(DeviceError, match=r"AXIS_BLOCKED to MOVE .* rests at 40.0 mm"):
             gripper.open(20.0)
         assert emulator.force_limit_n == 5.0  # the smallest force, because it is not a grasp
         emulator.object_mm = None
@@ -114,7 +114,7 @@ def test_values_out_of_range_never_reach_the_gripper():
 def test_a_gripper_that_would_clamp_harder_than_requested_does_not_grasp():
     with gripper_with_emulator() as (gripper, emulator):
         emulator.keeps_force_n = 60.0
-        with pytest.raises(DeviceError, match="force limit must be 20 N, but the gripper has 60 N"):
+        with pytest.raises(DeviceError, match=r"force limit \(both fingers\) must be 20 N, but the gripper has 60 N"):
             gripper.grasp(10.0)
         assert GRASP not in emulator.received
         assert gripper.refused["force_n"] == "requested 10, has 30"
@@ -130,7 +130,7 @@ def test_a_force_limit_may_have_a_rounding_error_but_never_exceed_the_upper_limi
     with gripper_with_emulator(max_force_n=10.0) as (gripper, emulator):
         for actual, requested in ((20.002, 10.0), (20.00001, 10.0), (10.01, 5.0)):
             emulator.keeps_force_n = actual
-            with pytest.raises(DeviceError, match="force limit must be"):
+            with pytest.raises(DeviceError, match=r"force limit \(both fingers\) must be"):
                 gripper.grasp(requested)
         emulator.keeps_force_n = 10.000005
         assert gripper.grasp(5.0).status == "no_part"
