@@ -64,9 +64,11 @@ def add_camera_noise(clean, tile, place, read, shot, out):  # type: ignore[no-un
     square = read * read
     first_row, step, first, sign = place
     for row in range(out.shape[0]):
-        noise_row = first_row + step * row
-        for i in range(out.shape[1]):
-            level = clean[row, i]
+        levels, greys = clean[row], out[row]  # slices of one row are faster than two indices
+        noise = tile[first_row + step * row, first : first + len(greys)]
+        for i in range(len(greys)):
+            level = levels[i]
             spread = np.float32(sign) * np.sqrt((level if level > 0 else np.float32(0)) * shot + square)
-            grey = np.rint(level + spread * tile[noise_row, first + i])
-            out[row, i] = np.uint8(min(max(grey, np.float32(0)), np.float32(255)))
+            grey = np.rint(level + spread * noise[i])
+            grey = grey if grey > 0 else np.float32(0)
+            greys[i] = np.int32(grey if grey < 255 else np.float32(255))
