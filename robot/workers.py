@@ -41,7 +41,7 @@ class WorkerPool(Generic[T]):
 
     def __init__(self, jobs: int, local_work: Work[T], make: Callable[[], Work[T]]) -> None:
         self._local_work, self._pool = local_work, None
-        self.window = 1 if jobs == 1 else 2 * jobs
+        self.window = 1 if jobs == 1 else 4 * jobs
         self._environment: dict[str, str | None] = {}
         self._threads = cv2.getNumThreads()
         self._before = set(multiprocessing.active_children())

@@ -117,6 +117,11 @@ class PinholeCamera:
         return np.asarray(local @ self.to_rig[:3, :3].T)
 
     @cached_property
+    def depth_per_distance(self) -> Array:
+        """Depth (px * px,) along the camera's axis per distance along each ray."""
+        return np.asarray(self.rays @ self.to_rig[:3, 2])
+
+    @cached_property
     def table_distance_mm(self) -> Array:
         """Distance (px * px,) to the table along each ray.
 
@@ -351,8 +356,7 @@ def depth(view: CameraView, noise_seed: int) -> npt.NDArray[np.float32]:
     """
     px = view.camera.px
     rng = np.random.default_rng([73, noise_seed])
-    forward = view.camera.to_rig[:3, 2]
-    exact = (view.distance_mm * (view.camera.rays @ forward)).reshape(px, px)
+    exact = (view.distance_mm * view.camera.depth_per_distance).reshape(px, px)
     noisy = _add_flying_pixels(exact, rng) + 1.5 * rng.standard_normal(exact.shape) * (exact / 700.0) ** 2
     noisy[_hole_mask(view, exact, rng)] = np.nan
     return (np.round(noisy) / 1000.0).astype(np.float32)

@@ -123,7 +123,7 @@ def layer_correction(poisson: float) -> LayerCorrection:
     return LayerCorrection(rho, j0(angle) @ weight, -j1(angle) @ (weight * x))
 
 
-@functools.lru_cache(maxsize=16)
+@functools.lru_cache(maxsize=128)
 def influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
     """Return the quadrant (rows, cols) of the influence of a layer `thickness` pixels thick; inf is the half-space."""
     if math.isinf(thickness):

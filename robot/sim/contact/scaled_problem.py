@@ -52,7 +52,8 @@ class ElasticSurface:
         gel_operator = self.gel_operator(grid, window)
         if self.softness == 0.0:
             return gel_operator
-        half_space = _operator(grid, window, math.inf, self.poisson, self.periodic, self.single_precision)
+        # A half-space in scaled units does not depend on Poisson's ratio, so all gels share the operator.
+        half_space = _operator(grid, window, math.inf, 0.0, self.periodic, self.single_precision)
         return gel_operator.plus(half_space, self.softness)
 
     def can_change_volume(self) -> bool:

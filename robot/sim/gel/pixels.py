@@ -50,21 +50,25 @@ def shade_by_bars(slopes, leds, strengths, axes, shades, mix, ambient, backdrop,
 
 
 @jit
-def add_camera_noise(clean, noise, read, shot, out):  # type: ignore[no-untyped-def]
+def add_camera_noise(clean, tile, place, read, shot, out):  # type: ignore[no-untyped-def]
     """Write rounded grey levels with noise of variance read^2 + shot * level into `out`.
 
     Args:
-        clean: (rows, cols, 3) grey levels.
-        noise: (rows, cols, 3) noise of variance 1.
+        clean: (rows, n) grey levels; n is the number of columns times 3.
+        tile: (tile rows, tile n) noise of variance 1.
+        place: first row, step from row to row (1 or -1), and first value of a row in the tile; then the noise's sign.
         read: standard deviation of the read noise.
         shot: variance of the shot noise per grey level.
-        out: (rows, cols, 3) uint8 result.
+        out: (rows, n) uint8 result.
     """
     square = read * read
+    first_row, step, first, sign = place
     for row in range(out.shape[0]):
-        for column in range(out.shape[1]):
-            for channel in range(3):
-                level = clean[row, column, channel]
-                spread = np.sqrt((level if level > 0 else np.float32(0)) * shot + square)
-                grey = np.rint(level + spread * noise[row, column, channel])
-                out[row, column, channel] = np.uint8(min(max(grey, np.float32(0)), np.float32(255)))
+        levels, greys = clean[row], out[row]  # slices of one row are faster than two indices
+        noise = tile[first_row + step * row, first : first + len(greys)]
+        for i in range(len(greys)):
+            level = levels[i]
+            spread = np.float32(sign) * np.sqrt((level if level > 0 else np.float32(0)) * shot + square)
+            grey = np.rint(level + spread * noise[i])
+            grey = grey if grey > 0 else np.float32(0)
+            greys[i] = np.int32(grey if grey < 255 else np.float32(255))

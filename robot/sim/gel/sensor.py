@@ -156,15 +156,11 @@ class GelSensor:
     def _add_noise(self, clean: Array, seed: int) -> Picture:
         if self.noise.read == 0 and self.noise.shot == 0:
             return np.clip(np.rint(clean), 0, 255).astype(np.uint8)
-        out = np.empty(clean.shape, np.uint8)
-        add_camera_noise(
-            clean,
-            _noise_tile(self.rows, self.cols, seed),
-            np.float32(self.noise.read),
-            np.float32(self.noise.shot),
-            out,
-        )
-        return out
+        rows, values = clean.shape[0], clean.shape[1] * 3  # a row's colours one after the other
+        tile, place = _draw_noise(self.rows, self.cols, seed)
+        out, flat = np.empty((rows, values), np.uint8), np.ascontiguousarray(clean).reshape(rows, values)
+        add_camera_noise(flat, tile, place, np.float32(self.noise.read), np.float32(self.noise.shot), out)
+        return out.reshape(clean.shape)
 
 
 @lru_cache(maxsize=8)
@@ -176,23 +172,25 @@ _TILE_MARGIN = 64
 
 
 @lru_cache(maxsize=4)
-def _tile(sign: int, rows: int, cols: int) -> Array:
+def _tile(rows: int, cols: int, is_mirrored: bool) -> Array:
+    """Return noise (rows + margin, (cols + margin) * 3), with the columns in reverse order if mirrored."""
     shape = (rows + _TILE_MARGIN, cols + _TILE_MARGIN, 3)
     drawn = np.random.default_rng([0x6E15, rows, cols]).standard_normal(shape, dtype=np.float32)
-    return sign * drawn
+    return np.ascontiguousarray(drawn[:, ::-1] if is_mirrored else drawn).reshape(shape[0], -1)
 
 
-def _noise_tile(rows: int, cols: int, seed: int) -> Array:
-    """Return standard normal noise (rows, cols, 3): a window of one large tile, placed and flipped by the seed.
+def _draw_noise(rows: int, cols: int, seed: int) -> tuple[Array, tuple[int, int, int, int]]:
+    """Return a large tile of standard normal noise and the place of a window in it, as `add_camera_noise` takes them.
 
     Fresh random values would cost more than the optics. 64 x 64 places, mirrored and of either sign, do not repeat
     visibly for a person or a tower.
     """
     rng = np.random.default_rng([seed, 0x7015E])
     down, right = (int(value) for value in rng.integers(0, _TILE_MARGIN, 2))
-    flip_rows, flip_cols, sign = (1 if value else -1 for value in rng.integers(0, 2, 3))
-    window = _tile(sign, rows, cols)[down : down + rows, right : right + cols]
-    return window[::flip_rows, ::flip_cols]
+    keeps_rows, keeps_cols, is_positive = (bool(value) for value in rng.integers(0, 2, 3))
+    first_row, step = (down, 1) if keeps_rows else (down + rows - 1, -1)
+    first_col = right if keeps_cols else _TILE_MARGIN - right
+    return _tile(rows, cols, not keeps_cols), (first_row, step, 3 * first_col, 1 if is_positive else -1)
 
 
 # Drawing sensors -------------------------------------------------------------------------------------------

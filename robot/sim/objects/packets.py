@@ -82,71 +82,71 @@ def _evaluate_all(code, rows, places, values, results):  # type: ignore[no-untyp
         for row in range(values.shape[0]):
             for i in range(count):
                 rows[row, i] = values[row, first + i]
-        _evaluate(code, rows)
+        _evaluate(code, rows, count)
         for number in range(len(places)):
             for i in range(count):
                 results[number, first + i] = rows[places[number], i]
 
 
 @jit
-def _evaluate(code, r):  # type: ignore[no-untyped-def]
-    """Execute the code on all lanes of the rows."""
+def _evaluate(code, r, count):  # type: ignore[no-untyped-def]
+    """Execute the code on the first `count` lanes of the rows."""
     for line in range(len(code)):
         name, d, a, b, c = code[line, 0], code[line, 1], code[line, 2], code[line, 3], code[line, 4]
         if name == _ADD:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = r[a, i] + r[b, i]
         elif name == _SUBTRACT:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = r[a, i] - r[b, i]
         elif name == _MULTIPLY:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = r[a, i] * r[b, i]
         elif name == _MAXIMUM:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = r[a, i] if r[a, i] > r[b, i] else r[b, i]
         elif name == _MINIMUM:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = r[a, i] if r[a, i] < r[b, i] else r[b, i]
         elif name == _ABSOLUTE:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = abs(r[a, i])
         elif name == _SQRT:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = np.sqrt(r[a, i])
         elif name == _DIVIDE:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = r[a, i] / r[b, i]
         elif name == _WHERE:
-            for i in range(LANES):
+            for i in range(count):
                 yes, no = r[b, i], r[c, i]
                 r[d, i] = yes if r[a, i] != 0 else no
         elif name == _GREATER:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = np.float32(1) if r[a, i] > r[b, i] else np.float32(0)
         elif name == _RINT:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = np.rint(r[a, i])
         elif name == _FLOOR:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = np.floor(r[a, i])
         elif name == _COPYSIGN:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = np.copysign(r[a, i], r[b, i])
         elif name == _SIN:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = np.sin(r[a, i])
         elif name == _COS:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = np.cos(r[a, i])
         elif name == _EXP:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = np.exp(r[a, i])
         elif name == _LOG:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = np.log(r[a, i])
         else:
-            for i in range(LANES):
+            for i in range(count):
                 r[d, i] = np.log1p(r[a, i])
 
 
@@ -227,7 +227,7 @@ def _interpolate_heights(height, u, v, out):  # type: ignore[no-untyped-def]
 @jit
 def _relief_heights(solid, rows, count):  # type: ignore[no-untyped-def]
     """Write relief at the points in the rows into the first row."""
-    _evaluate(solid.place.code, rows)
+    _evaluate(solid.place.code, rows, count)
     s, t, mask = solid.place.results[0], solid.place.results[1], solid.place.results[2]
     per_s, per_t = np.float32(solid.per_s), np.float32(solid.per_t)
     for i in range(count):
@@ -242,7 +242,7 @@ def _evaluate_field(solid, rows, count):  # type: ignore[no-untyped-def]
         for row in range(3):
             for i in range(count):
                 relief_rows[row, i] = base[row, i]
-    _evaluate(solid.distance.code, base)
+    _evaluate(solid.distance.code, base, count)
     if solid.height_mm.size:
         _relief_heights(solid, relief_rows, count)
         for i in range(count):
@@ -302,15 +302,15 @@ def _march(solid, rows, origins, directions, near, far, finest, max_steps, found
         if count == 0:
             break
         for axis in range(3):
-            for i in range(LANES):
+            for i in range(count):
                 base[axis, i] = lanes[_ORIGIN + axis, i] + lanes[_T, i] * lanes[_DIRECTION + axis, i]
         touched = 0
         if has_relief:
             for axis in range(3):
-                for i in range(LANES):
+                for i in range(count):
                     relief_rows[axis, i] = base[axis, i]
-        _evaluate(solid.distance.code, base)
-        for i in range(LANES):
+        _evaluate(solid.distance.code, base, count)
+        for i in range(count):
             gaps[i] = base[result, i] - highest
         if has_relief:
             for i in range(count):
@@ -321,7 +321,7 @@ def _march(solid, rows, origins, directions, near, far, finest, max_steps, found
                     touched += 1
             if touched:
                 _relief_heights(solid, relief_rows, touched)
-        for i in range(LANES):
+        for i in range(count):
             base[0, i] = gaps[i]
         for k in range(touched):
             base[0, low[k]] = gaps[low[k]] + highest - relief_rows[0, k]
@@ -329,7 +329,7 @@ def _march(solid, rows, origins, directions, near, far, finest, max_steps, found
             if base[0, i] <= 0:
                 found[0, ray[i]], found[1, ray[i]] = lanes[_T, i], base[0, i]
                 found[2, ray[i]], found[3, ray[i]] = lanes[_BEFORE, i], lanes[_F_BEFORE, i]
-        for i in range(LANES):
+        for i in range(count):
             f, gap, t, outside = base[0, i], gaps[i], lanes[_T, i], gaps[i] > 0
             stride = finest * min(max(lanes[_STEPS, i] / np.float32(40), np.float32(1)), np.float32(4))
             forward = f / bound if f / bound > gap else gap

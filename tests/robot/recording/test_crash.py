@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -151,3 +152,17 @@ def test_a_killed_process_leaves_complete_grasps(tmp_path):
     with RecordingWriter(tmp_path / "r", INFO) as writer:  # the lock ended with the process
         writer.append("2", "mug", pictures())
     assert ids(tmp_path / "r") == ["1", "2"]
+
+
+def test_the_images_of_a_grasp_are_synced_at_the_same_time(tmp_path, monkeypatch):
+    started, real = threading.Barrier(3, timeout=10), os.fsync
+
+    def sync(descriptor):
+        if threading.current_thread() is not threading.main_thread():
+            started.wait()  # breaks if the images are synced one after the other
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", sync)
+    with RecordingWriter(tmp_path, INFO) as writer:
+        writer.append("1", "mug", pictures())
+    assert ids(tmp_path) == ["1"]

@@ -181,6 +181,14 @@ def test_a_rigid_object_needs_no_separate_operator(monkeypatch):
     assert set(made) == {2.0 / PIXEL}
 
 
+def test_all_gels_share_the_operators_of_the_half_space():
+    surfaces = [pressing.ElasticSurface(20.0, poisson, 0.1, False) for poisson in (0.45, 0.49)]
+    made = pressing._operator.cache_info().misses
+    for surface in surfaces:
+        surface.combined_operator((12, 16), (12, 16))
+    assert pressing._operator.cache_info().misses == made + 3  # two gels and one half-space
+
+
 # Flags -----------------------------------------------------------------------------------------------------
 
 
