@@ -3,7 +3,7 @@
 import contextlib
 import os
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor, wait
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ PART_SUFFIX = ".part"
 ImageSource = npt.NDArray[Any] | bytes | str | Path
 """Pixels, or the content or path of a PNG or JPEG file. Pixels: (H, W, 3) uint8 RGB; depth: (H, W) uint16."""
 
-_SYNC_THREADS = 8  # a grasp has about as many files
 _SUFFIXES = {b"\x89PNG\r\n\x1a\n": ".png", b"\xff\xd8\xff": ".jpg"}
 
 
@@ -36,11 +35,20 @@ def storage_errors(folder: Path) -> Iterator[None]:
         raise StorageError(f"{where} could not be written: {reason}; earlier grasps are complete") from error
 
 
-def write_files(contents: Mapping[Path, bytes]) -> None:
+def sync_threads() -> Executor:
+    """Return the threads that `write_files` uses, about as many as a grasp has files; the caller shuts them down."""
+    return ThreadPoolExecutor(8)
+
+
+def write_files(contents: Mapping[Path, bytes], threads: Executor) -> None:
     """Write each file completely or leave it untouched: write a temporary file, sync it, then rename it.
 
     All files are written before the first is synced, and they are synced at the same time: the file system then writes
     its journal once, not file by file. The caller syncs the folder.
+
+    Args:
+        contents: Content of each file.
+        threads: Threads that sync, `sync_threads()`.
 
     Raises:
         OSError: A file could not be written; the error names it.
@@ -54,10 +62,10 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
                 opened[path] = files.enter_context(open(parts[path], "wb"))
                 opened[path].write(data)
                 opened[path].flush()
-            with ThreadPoolExecutor(_SYNC_THREADS) as threads:
-                syncs = {path: threads.submit(os.fsync, file.fileno()) for path, file in opened.items()}
-                for path in syncs:
-                    syncs[path].result()
+            syncs = {path: threads.submit(os.fsync, file.fileno()) for path, file in opened.items()}
+            wait(syncs.values())
+            for path in syncs:
+                syncs[path].result()
         for path, part in parts.items():
             os.replace(part, path)
     except BaseException as error:

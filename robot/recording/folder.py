@@ -40,6 +40,7 @@ from robot.storage import (
     read_content,
     read_json_object,
     storage_errors,
+    sync_threads,
     write_files,
 )
 
@@ -220,7 +221,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
     """
 
     def __init__(self, folder: str | Path, info: Mapping[str, Any]) -> None:
-        self.folder = Path(folder)
+        self.folder, self._threads = Path(folder), sync_threads()
         expected = _full_info(info)
         _check_no_other_files(self.folder)
         with storage_errors(self.folder):
@@ -293,7 +294,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
             raise RecordingError(f"unknown key {unknown[0]!r}; robot.recording.folder lists the known keys")
         grasp = RecordedGrasp.from_row(row)
         with storage_errors(self.folder):
-            write_files({self.folder / path: data for path, data in contents.items()})
+            write_files({self.folder / path: data for path, data in contents.items()}, self._threads)
             sync(self.folder / IMAGES_FOLDER)
             self._write_line(json.dumps(grasp.to_row(), ensure_ascii=False).encode())
         self._grasp_ids[grasp_id] = None
@@ -332,6 +333,7 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
     def close(self) -> None:
         """Close the file and release the folder's lock; a second call does nothing."""
         self._file.close()
+        self._threads.shutdown()
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -25,7 +25,15 @@ from robot.errors import RecordingError, RobotConfigError
 from robot.recording.folder import IMAGES_FOLDER, METADATA_FILE, software_version
 from robot.rig import load_rig
 from robot.sim.rig import SimRig
-from robot.storage import append_line, file_content, read_content, read_json_object, storage_errors, write_files
+from robot.storage import (
+    append_line,
+    file_content,
+    read_content,
+    read_json_object,
+    storage_errors,
+    sync_threads,
+    write_files,
+)
 from robot.workers import Work, WorkerPool
 
 INFO_FILE = "pictures.json"
@@ -166,7 +174,8 @@ def _write(folder: Path, kind: str, object_id: str, pictures: Pictures, labels: 
         data, suffix = file_content(name, pixels)
         files[name] = f"{IMAGES_FOLDER}/{object_id}-{name}{suffix}"
         contents[folder / files[name]] = data
-    write_files(contents)
+    with sync_threads() as threads:
+        write_files(contents, threads)
     rows = []
     for name in files:
         if name.endswith("_before"):

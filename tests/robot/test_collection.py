@@ -615,12 +615,12 @@ def test_a_full_disk_raises_and_recorded_grasps_are_complete(tmp_path, monkeypat
 
     real, count = module.write_files, []
 
-    def full(contents):
+    def full(contents, threads):
         count.append(contents)
         if len(count) > 1:
-            real(dict(list(contents.items())[:3]))
+            real(dict(list(contents.items())[:3]), threads)
             raise OSError(28, "No space left on device")
-        real(contents)
+        real(contents, threads)
 
     monkeypatch.setattr(module, "write_files", full)
     with pytest.raises(StorageError, match="No space left on device; earlier grasps are complete"):
