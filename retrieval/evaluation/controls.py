@@ -95,14 +95,20 @@ def ceiling_experiments(experiment: Experiment) -> dict[str, Experiment]:
     "photo_to_photo" is left out if no object has two different photos. A grasp is never compared with itself, as no
     touch is compared with its own photo.
     """
-    features, folder = experiment.features, experiment.folder / "ceilings"
+    features, folder = experiment.features_for(CEILING_METHOD), experiment.folder / "ceilings"
     experiments = {"touch_to_touch": dataclasses.replace(features, photo=features.touch.reshape(len(features), -1))}
     photos = {(owner, row.tobytes()) for owner, row in zip(features.owner.tolist(), features.photo, strict=True)}
     if len(photos) > len(set(features.object_ids)):
         experiments["photo_to_photo"] = dataclasses.replace(features, touch=features.photo[:, None])
     return {
         name: dataclasses.replace(
-            experiment, folder=folder / name, features=each, pairs=None, checkpoint=None, role=f"ceiling: {name}"
+            experiment,
+            folder=folder / name,
+            features=each,
+            pairs=None,
+            checkpoint=None,
+            matcher=None,  # the features have no cells
+            role=f"ceiling: {name}",
         )
         for name, each in experiments.items()
     }

@@ -153,6 +153,7 @@ def _experiments(
         checkpoint=data.checkpoint,
         shuffled=False,
         quiet=quiet,
+        matcher=data.matcher,
     )
     return experiment, control_experiments(experiment, data, cache, seed)
 

@@ -18,6 +18,7 @@ from retrieval.methods.method import Method, MethodSettings
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.encode import one_thread
+from retrieval.model.fusion import Matcher
 from retrieval.model.losses import LOSSES
 from retrieval.training.features import Features
 from retrieval.training.state import code_digest
@@ -40,6 +41,8 @@ class Experiment:
         quiet: No progress on stderr.
         fit_on_validation: As in `MethodSettings`.
         kind_of: As in `MethodSettings`.
+        matcher: Matcher whose towers computed the features; methods without cells then get no cells. None if the
+            features have none.
         role: Label for progress lines, such as "control: low_pass"; empty for the evaluation itself.
     """
 
@@ -54,6 +57,7 @@ class Experiment:
     quiet: bool
     fit_on_validation: bool = False
     kind_of: Mapping[str, str] | None = None
+    matcher: Matcher | None = None
     role: str = ""
 
     def seeds_of(self, name: str, seeds: list[int]) -> list[int]:
@@ -70,7 +74,7 @@ class Experiment:
         if not self.quiet:
             say(f"evaluate: {name}, seed {seed}" + (f" ({self.role})" if self.role else ""))
         method, fit_s = self._fit(name, seed)
-        predictions = predict(method, self.features, self.queries, fit_s)
+        predictions = predict(method, self.features_for(name), self.queries, fit_s)
         write_predictions(path, predictions, cache_key)
         return predictions
 
@@ -98,15 +102,21 @@ class Experiment:
         method = METHODS.load(name)(settings)
         if self.checkpoint is not None and isinstance(method, LateFusion):
             return type(method).of_checkpoint(self.checkpoint, method.settings), 0.0
-        train, validation = (self.features.of_objects(part) for part in (self.split.train, self.split.validation))
+        features = self.features_for(name)
+        train, validation = (features.of_objects(part) for part in (self.split.train, self.split.validation))
         if self.pairs:
-            train = train.concatenate(self.pairs)
+            train = train.concatenate(self.features_for(name, self.pairs))
         if self.shuffled:
             train, validation = _permute_touches(train, seed), _permute_touches(validation, seed)
         start = time.perf_counter()
         with one_thread():  # heads are small; times refer to one core
             method.fit(train, validation)
         return method, time.perf_counter() - start
+
+    def features_for(self, name: str, features: Features | None = None) -> Features:
+        """Return the features, or others of the same towers, as a method takes them: without cells, or with them."""
+        features = features or self.features
+        return features if self.matcher is None or METHODS.load(name).uses_cells else features.pooled(self.matcher)
 
 
 def _permute_touches(features: Features, seed: int) -> Features:

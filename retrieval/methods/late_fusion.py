@@ -26,6 +26,8 @@ SOURCE = "features of a recording"
 class LateFusion(Method):
     """Match logits of a fusion head over frozen towers. The encodings are partial activations of its first layer."""
 
+    uses_cells = True
+
     @classmethod
     def of_checkpoint(cls, checkpoint: Checkpoint, settings: MethodSettings) -> Self:
         """Return the method with the model of a checkpoint, already fitted."""

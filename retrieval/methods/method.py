@@ -68,6 +68,8 @@ class Method(ABC):
 
     is_seeded: ClassVar[bool] = True
     """Whether fits differ by seed; otherwise one fit is enough."""
+    uses_cells: ClassVar[bool] = False
+    """Whether features end with the cells of the towers, if these have cells (`retrieval.model.late_interaction`)."""
 
     def __init__(self, settings: MethodSettings) -> None:
         self.settings = settings

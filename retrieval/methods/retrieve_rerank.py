@@ -78,9 +78,9 @@ class RetrieveRerank(LateFusion):
 
     def _parts(self, touch_encodings: Array, photo_encodings: Array) -> tuple[Array, Array, Array]:
         """Return partial activations of touches and of photos, and cosines (T, N) of their embeddings."""
-        width = self._matcher.config.partial_width
-        nearness = touch_encodings[:, width:] @ photo_encodings[:, width:].T
-        return touch_encodings[:, :width], np.ascontiguousarray(photo_encodings[:, :width]), nearness
+        touch, photo = self._matcher.config.touch_partial_width, self._matcher.config.partial_width
+        nearness = touch_encodings[:, touch:] @ photo_encodings[:, photo:].T
+        return touch_encodings[:, :touch], np.ascontiguousarray(photo_encodings[:, :photo]), nearness
 
     def _count(self, photos: int) -> int:
         return max(1, round(self.reranked_fraction * photos))

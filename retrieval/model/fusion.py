@@ -220,6 +220,11 @@ class Matcher(nn.Module):
         return torch.cat([outputs[..., :pooled].flatten(1), outputs[:, -1, pooled:]], dim=1)
 
     @property
+    def pooled_counts(self) -> tuple[int, int]:
+        """Lengths of the features of a finger and of a photo, without cells."""
+        return self.touch_tower.feature_count, self.views * self.photo_tower.feature_count
+
+    @property
     def photo_feature_count(self) -> int:
         """Length of the features of a photo."""
         tower = self.photo_tower

@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp
@@ -28,6 +28,7 @@ from retrieval.model.checkpoint import read_tensors, tensors_digest, write_tenso
 from retrieval.model.config import Config
 from retrieval.model.encode import batches, default_device, photo_features, touch_features
 from retrieval.model.fusion import Matcher
+from retrieval.model.towers.tower import Tower
 from retrieval.training.batches import BatchImages
 from retrieval.training.disk_image_cache import ImageFiles, part_path
 
@@ -105,6 +106,11 @@ class Features:
             np.concatenate([self.touch, others.touch]),
             np.concatenate([self.photo, others.photo]),
         )
+
+    def pooled(self, matcher: Matcher) -> "Features":
+        """Return these features, of the towers of `matcher`, without the cells at their end."""
+        touch, photo = matcher.pooled_counts
+        return dataclasses.replace(self, touch=self.touch[..., :touch], photo=self.photo[:, :photo])
 
     @cached_property
     def digest(self) -> str:
@@ -261,8 +267,8 @@ def _grasp_for_variant(grasp: Grasp, touch_variant: str) -> Grasp:
     return dataclasses.replace(grasp, touches=grasp.backgrounds)
 
 
-def _tower_digest(tower: nn.Module) -> str:
-    return tensors_digest(tower.state_dict(), type(tower).__name__)
+def _tower_digest(tower: Tower) -> str:
+    return tensors_digest(tower.state_dict(), f"{type(tower).__name__} {tower.output} {tower.cells}")
 
 
 @dataclass(frozen=True)

@@ -160,6 +160,19 @@ def test_four_validation_objects_give_no_threshold_and_a_reason_instead_of_pair_
     assert f"{reason}." in (folder / "report.md").read_text()
 
 
+def test_late_interaction_changes_late_fusion_and_no_method_without_cells(run, tmp_path):
+    matcher = dataclasses.replace(CONFIG.matcher, tower_output="stages")
+    cells = dataclasses.replace(matcher, cell_dim=4, touch_cells=2, photo_cells=2)
+    plain, with_cells = (
+        run(tmp_path / name, config=dataclasses.replace(CONFIG, matcher=one))
+        for name, one in (("plain", matcher), ("cells", cells))
+    )
+    for name in ("cca", "constant"):
+        assert with_cells["methods"][name]["measures"] == plain["methods"][name]["measures"]
+    assert with_cells["ceilings"] == plain["ceilings"]
+    assert with_cells["methods"]["late_fusion"]["measures"] != plain["methods"]["late_fusion"]["measures"]
+
+
 def test_a_constant_scorer_is_exactly_at_chance_in_every_measure(made):
     for name, summary in made[0]["methods"]["constant"]["measures"].items():
         assert summary["value"] == pytest.approx(summary["chance"], abs=1e-12), name
