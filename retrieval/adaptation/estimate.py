@@ -69,7 +69,8 @@ class Estimate:
         lines.append(f"unadapted model: top-1 accuracy {baseline[0]}, pair accuracy {baseline[1]}")
         if self.is_baseline_better:
             lines.append(
-                "  The unadapted model is used: it is more accurate than the fit. Only its probabilities are fitted."
+                "  The unadapted model is used: its pair accuracy is at least that of the fit. "
+                "Only its probabilities and its check of gel images are fitted."
             )
         return lines
 

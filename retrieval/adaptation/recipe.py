@@ -28,7 +28,7 @@ class Adaptation:
     Attributes:
         checkpoint: The written checkpoint.
         data: The fitted grasps and their features.
-        estimate: The accuracy estimate; None for fewer than six objects, whose checkpoint has no probabilities.
+        estimate: The accuracy estimate; None for fewer than six objects; the checkpoint then has no probabilities.
         report: Page of the learning curve, if it was requested and there is an estimate.
 
     >>> from pathlib import Path
@@ -69,8 +69,8 @@ def adapt(
 ) -> Adaptation:
     """Fit a model to a recording from another sensor with your objects, and write the checkpoint `out`.
 
-    If the start model is more accurate on held-out objects than the fitted model, `out` is a copy of the start model
-    with a new calibration of its probabilities.
+    If the pair accuracy of the start model on held-out objects is at least that of the fit, `out` is a copy of the
+    start model with newly fitted probabilities and gel check.
 
     Args:
         recording: A folder, or the object that `robot.read_recording` returns.

@@ -60,7 +60,8 @@ def train(
     cluster: Annotated[
         bool,
         typer.Option(
-            "--cluster", help="start the ranks with Ray Train, on the Ray cluster at RAY_ADDRESS, else on this machine"
+            "--cluster",
+            help="start the ranks (processes) with Ray Train, on the Ray cluster at RAY_ADDRESS, else on this machine",
         ),
     ] = False,
     workers: Annotated[

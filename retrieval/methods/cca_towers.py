@@ -87,7 +87,7 @@ class AffineMap(NamedTuple):
 
 
 class CcaProjections(NamedTuple):
-    """Maps from touches and photos to encodings whose cosine is high for one object."""
+    """Maps from touches and photos to encodings; the cosine is high if both show the same object."""
 
     touch: AffineMap
     photo: AffineMap
@@ -194,7 +194,7 @@ class CcaSelection:
         auc: Their mean AUC over the folds.
         projections: The maps, fitted to all objects.
         held_out_touches: For each fold, the cosines of its touches with its photos by maps that were fitted without its
-            objects, and the encodings of these touches: the input of the fit of a posterior and of reference touches.
+            objects, and the encodings of these touches: the input of the fits of posterior and reference calibration.
     """
 
     settings: CcaSettings
@@ -208,7 +208,7 @@ def select_settings(
 ) -> CcaSelection:
     """Choose the settings that rank photos of held-out objects best; among ties, the largest.
 
-    Only the reduction to the widest directions, which ignores objects, is computed from all of them.
+    Only the reduction to the widest directions also uses the held-out grasps; it does not use their objects.
 
     Args:
         features: Features of grasps.
@@ -343,7 +343,7 @@ def _weights(projections: CcaProjections, validation: "Features", width: int) ->
 def tower_widths(config: Config, features: "Features") -> TowerWidths:
     """Return the feature widths of each tower of `config`, of a touch and of a photo.
 
-    The features of a reference touch behind a photo are not counted. Touches may also take the place of photos.
+    Features of a reference touch after those of a photo are not counted. Touches may also take the place of photos.
 
     Raises:
         BadInput: The features are not from these towers.

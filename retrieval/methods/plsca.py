@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from retrieval.training.features import Features
 
 MAX_PRINCIPAL_COMPONENTS = 256
-"""Principal components of each modality. Every step of the power iteration passes over all features of all rows: with
-2,560 + 1,280 of them 100 components would take minutes, and the omitted directions vary least."""
+"""Principal components of each modality. Every step of the power iteration passes over all features of all rows.
+For 2,560 + 1,280 features, 100 components would take minutes. The omitted directions vary least."""
 COMPONENTS = (4, 8, 16, 32, 64, 100)
 """The last number is ObjectFolder's."""
 

@@ -124,10 +124,10 @@ def comparisons(builder: Builder) -> Iterator[Block | None]:
 
 
 def controls(builder: Builder) -> Iterator[Block | None]:
-    """Yield the controls: the same method on inputs that lack information about the answer."""
+    """Yield the controls: the same method on inputs without the information of interest."""
     if builder.results.data.get("controls"):
         yield Text(
-            "The same method on inputs that lack information about the answer. Permuted touches and no-contact frames "
+            "The same method on inputs without the information of interest. Permuted touches and no-contact frames "
             "should be at chance. Low-pass touches contain light and coarse shape, so they may be above chance."
         )
         yield tables.controls(builder.results)
