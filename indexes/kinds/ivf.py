@@ -24,7 +24,7 @@ SPARE_CODES = 64
 """Candidates beyond k that are scored exactly, because codes of a byte per component swap the order of near-copies."""
 
 MIN_REFINED = 64
-"""For a smaller k, as many candidates are refined as for this k: codes are too coarse to trust the first few."""
+"""A smaller k refines as many candidates as this k: codes are too coarse to trust the first few."""
 
 
 @dataclass(frozen=True)

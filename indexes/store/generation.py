@@ -28,7 +28,7 @@ from indexes.store.rows import RECORD, Rows, are_distinct, keys_of
 
 ROWS, TABLE, EMBEDDINGS, STRUCTURE = "rows.jsonl", "table.npy", "embeddings.npy", "vectors.faiss"
 DOCUMENT_BYTES, DOCUMENT_BYTES_PER_ROW = 2**18, 2**12
-"""Largest JSON of a document: a constant, plus bytes for each row or touch."""
+"""Largest JSON of a document: a constant, plus bytes for each row of the index and of its array documents."""
 SHOWN_IDS = 5
 MAX_CHECKED_RESULTS = 1000
 OLD_SAMPLE_DIVISOR = 16

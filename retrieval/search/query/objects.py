@@ -82,7 +82,7 @@ def check_usable(generation: Generation, layout: Layout) -> None:
 
 
 class ScoredObjects(NamedTuple):
-    """Objects with a scored photo.
+    """Objects with a scored photo, or with a gel image in its place.
 
     Attributes:
         numbers: Their numbers (J,).
@@ -155,7 +155,7 @@ class Objects:
         if top < len(selected):  # including ties with the last one
             selected = np.flatnonzero(scored.logits >= np.partition(scored.logits, -top)[-top])
         logits = scored.logits[selected]
-        if len(set(logits.tolist())) == len(selected):  # names are needed only for ties, because rows must be parsed
+        if len(set(logits.tolist())) == len(selected):  # parse rows for their names only if there are ties
             order = np.argsort(-logits)
         else:
             names = np.array([listed_photo(self._rows[row]).object_id for row in scored.rows[selected]])

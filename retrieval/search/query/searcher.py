@@ -393,7 +393,7 @@ def require_counts(top: int, candidates: int | None) -> None:
 
 
 def torch_encoder(stored: CheckpointInfo, threads: int | None = None) -> TouchEncoder:
-    """Return an encoder of the towers in PyTorch, whose slow import happens here."""
+    """Return a touch encoder that runs in PyTorch; the slow import of PyTorch happens here."""
     from retrieval.model.checkpoint import load_checkpoint
     from retrieval.model.encode import TorchEncoder
 

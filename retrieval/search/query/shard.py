@@ -33,7 +33,7 @@ DEFAULT_CANDIDATES = 1000
 MIN_COMPLETED_OBJECTS = 20
 """Smallest number of best objects whose photos are all scored."""
 MIN_SUM_NORM = 1e-5
-"""Norm of a sum of unit embeddings below which it is only rounding error."""
+"""A sum of unit embeddings with a smaller norm is only rounding error."""
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
 
@@ -228,7 +228,7 @@ class FolderShard:
         """Return the number of photos to rerank: `candidates`, else the measured number, else `DEFAULT_CANDIDATES`.
 
         Args:
-            top: Number of objects to return; a smaller result is raised to it.
+            top: Number of objects to return, the minimum number of photos to rerank.
             candidates: The user's number; None for the number that was measured for the index.
         """
         measured = self.generation.manifest.about.get("candidates") or {"k": DEFAULT_CANDIDATES}
