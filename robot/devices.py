@@ -182,7 +182,7 @@ class Actuator(Device):
 
 
 class Arm(Actuator):
-    """An arm that moves the gripper inside `workspace`, the limits of the point between the fingertips (TCP).
+    """An arm that moves the gripper inside `workspace`, the limits of the point between the fingertips.
 
     Attributes:
         is_manual: Whether a person moves it on request; speeds are not enforced then.

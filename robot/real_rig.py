@@ -5,7 +5,7 @@
     sensor = "gelsight mini"
 
     [limits]                                  # upper limits of every commanded motion
-    workspace_lower_mm = [-150, -150, 10]     # of the point between the fingertips (TCP); z = 0 is the table
+    workspace_lower_mm = [-150, -150, 10]     # of the point between the fingertips; z = 0 is the table
     workspace_upper_mm = [150, 150, 400]
     arm_speed_mm_s = 200
     force_n = 20                              # on each finger
@@ -40,7 +40,7 @@
     [planner]                                 # the grasp planner (robot.grasping.planner)
     name = "cylinder"                         # its other keys are the planner's settings
 
-The limits do not apply to homing, which has the gripper's own speed. If a person moves the arm, they limit only the
+The limits do not apply to homing, which has the gripper's own speed. With a manual arm, the limits apply only to the
 requested poses and speeds. Sawyer's slow /robot/state may be up to 2 s old, or `state_age_s` if that is longer. Paths
 are relative to the working directory of the process that reads the file. Unknown keys are errors.
 """

@@ -26,10 +26,10 @@ DATA_SET = DataSet(
     rig="by hand, phone camera",
     expects="pairs `<billet>/<place>_touch.png`, `<billet>/<place>_photo.jpg`",
     caveats=(
-        "Light and gel drift from billet to billet: a low-passed touch (8 x 6) of a ground billet identifies the "
-        "billet far above chance. This is leakage from the capture, not touch. Print this low-pass control next to "
-        "every result, split by sequence_id, and prefer the welded billets. There are only 9 billets: state exact "
-        "(Clopper-Pearson) intervals.",
+        "Light and gel drift from billet to billet: a low-passed touch (8 x 6) of a ground (not welded) billet "
+        "identifies the billet far above chance. This is leakage from the capture, not touch. Print this low-pass "
+        "control next to every result, split by sequence_id, and prefer the welded billets. There are only 9 billets: "
+        "state exact (Clopper-Pearson) intervals.",
     ),
 )
 _FILE = re.compile(r"(?P<place>.+)_(?P<kind>touch|photo)\.(png|jpg|jpeg)", re.IGNORECASE)

@@ -28,7 +28,7 @@ DATA_SET = DataSet(
     rig="robot arm, presses along z",
     expects="`metadata/force_metadata.csv` and the pictures that the options touch and photo name",
     caveats=(
-        "Frames of one press are nearly the same. Its authors lost 17.7 points of recall when they kept each press in "
+        "Frames of one press are nearly the same. The authors lost 17.7 points of recall when they kept each press in "
         "one part of the split. Split by material, which is the object here, or by sequence_id, never by frame.",
         "Three DIGITs took turns; the sequence_id of a press names its sensor. For one sensor: --option sensor=NAME",
         "A photo shows its material, not the place of the touch.",

@@ -7,11 +7,11 @@
     attempts.jsonl    only if a rig collected it: all attempts, those without a grasp included
                       (robot.recording.attempt_log)
 
-A line contains grasp_id, object_id and, where recorded, force_n, opening_mm, pose, grasped (decision of the gate;
-training leaves out false), outcome (reported by the gripper: held, missed, slipped), sequence_id and time_s. Images
-are paths relative to the folder: photo_file_name, depth_file_name and for each finger (a, b, ...) touch_a_file_name,
-touch_a_before_file_name (no contact) and touch_a_after_file_name. Values that were not recorded are left out. Hugging
-Face datasets ("imagefolder") opens the folder as it is.
+A line contains grasp_id, object_id and, where recorded, force_n, opening_mm, pose, touch_skew_s, grasped (decision
+of the gate; training leaves out grasps with false), outcome (reported by the gripper: held, missed, slipped),
+sequence_id and time_s. Images are paths relative to the folder: photo_file_name, depth_file_name and for each finger
+(a, b, ...) touch_a_file_name, touch_a_before_file_name (no contact) and touch_a_after_file_name. Values that were not
+recorded are left out. Hugging Face datasets ("imagefolder") opens the folder as it is.
 
 A line is written after its images are on disk, so a crash leaves complete grasps; an incomplete last line is dropped.
 """

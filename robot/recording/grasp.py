@@ -40,7 +40,7 @@ class RecordedGrasp:
         opening_mm: Distance between the fingers.
         pose: Pose of the gripper, as in `robot.readings.Pose.as_tuple`.
         touch_skew_s: Time between the fingers' images.
-        grasped: Whether the gate accepted the grasp, not whether the object was held; training ignores false.
+        grasped: Whether the gate accepted the grasp, not if the object was held; training omits grasps with false.
         outcome: One of OUTCOMES, as the gripper reports.
         sequence_id: Id shared by grasps that no split separates.
         time_s: Time since the recording began.

@@ -87,7 +87,7 @@ def _after_zeros(value: int, count: int) -> int:
 
 
 def _zeros(max_count: int) -> tuple[tuple[int, ...], ...]:
-    """Return rows for 0 to `max_count` zero bytes: what these bytes make of each checksum with a single bit set."""
+    """Return a row for each count of zero bytes: the checksums after them, from each checksum with one bit set."""
     columns = [tuple(1 << bit for bit in range(16))]
     for _ in range(max_count):
         columns.append(tuple(_TABLE[value & 0xFF] ^ (value >> 8) for value in columns[-1]))

@@ -1,4 +1,4 @@
-"""Supervised motions of a WSG-50: the gripper's state decides, its replies only trigger a read of the state.
+"""Supervised motions of a WSG-50: its state tells if a motion has ended; its replies only trigger a read.
 
 A reply can be lost, late or duplicated, and a motion command that is sent twice may be executed twice. Therefore a
 motion has ended when the gripper reports that it is still, in a possible end state of the motion. The command is sent
@@ -227,7 +227,7 @@ class Motions:
         reading = self._last_reading(deadline)
         if reading.is_moving:
             raise DeviceError(
-                f"the gripper must have stopped, but moves at {reading.opening_mm:.1f} mm: switch off its power"
+                f"the gripper should be still, but moves at {reading.opening_mm:.1f} mm: switch off its power"
             )
         return reading
 
