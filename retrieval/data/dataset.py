@@ -6,6 +6,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -304,6 +305,8 @@ class PairSampler:
         self.photos = [sorted({grasp.photo for grasp in part}) for part in self.grasps]
         if len({photo for part in self.photos for photo in part}) != sum(map(len, self.photos)):
             raise DatasetError("two objects share a photo file; run `retrieve check`")
+        # Permuting 10,000 objects for each touch would take as long as a training step.
+        self._order_of_round = lru_cache(maxsize=2)(lambda number: self._rng(3, number).permutation(len(self.objects)))
 
     def batch(self, step: int, touches: int) -> PairBatch:
         """Return the pairs of training step `step` (from 0) with `touches` touches."""
@@ -318,7 +321,7 @@ class PairSampler:
 
     def _touch(self, turn: int) -> tuple[int, Grasp]:
         round_number, place = divmod(turn, len(self.objects))
-        index = int(self._rng(3, round_number).permutation(len(self.objects))[place])
+        index = int(self._order_of_round(round_number)[place])
         cycle, position = divmod(round_number, len(self.grasps[index]))
         order = self._rng(4, index, cycle).permutation(len(self.grasps[index]))
         return index, self.grasps[index][int(order[position])]

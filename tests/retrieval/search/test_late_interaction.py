@@ -14,9 +14,7 @@ from retrieval.search.build.build_index import build_index
 from retrieval.search.query.searcher import Searcher
 from tests.conftest import TINY
 
-CELLS = dataclasses.replace(
-    TINY.matcher, tower_output="stages", cosine=True, cell_dim=4, touch_cells=2, photo_cells=3
-)
+CELLS = dataclasses.replace(TINY.matcher, tower_output="stages", cosine=True, cell_dim=4, touch_cells=2, photo_cells=3)
 
 
 @pytest.fixture
