@@ -46,6 +46,9 @@ def train(
     init_touch: InitTower = None,
     photos: LabelledPhotos = None,
     touches: LabelledTouches = None,
+    start: Annotated[
+        str | None, typer.Option(help="checkpoint whose towers and head the training continues from")
+    ] = None,
     iterations: Iterations = None,
     seed: Annotated[
         int | None,
@@ -70,6 +73,7 @@ def train(
 ) -> None:
     """Train a matcher, pretrain a tower on relief, or train a grasp-success gate for `collect`."""
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch, "photos": photos, "touches": touches}
+    inits["start"] = start
     if (cluster and task != "match") or (workers is not None and not cluster):
         raise BadInput("--cluster needs --task match, and --workers needs --cluster")
     if task == "grasp-success":
@@ -83,8 +87,10 @@ def train(
             say(line)
         return
     if task == "relief":
-        if split or init_photo or init_touch or photos or touches:
-            raise BadInput("--task relief does not take --split, --photos, --touches, --init-photo or --init-touch")
+        if split or init_photo or init_touch or start or photos or touches:
+            raise BadInput(
+                "--task relief does not take --split, --photos, --touches, --start, --init-photo or --init-touch"
+            )
         from retrieval.training.relief import ITERATIONS, train_relief
 
         settings = training_config(config, None, init=init, seed=seed)

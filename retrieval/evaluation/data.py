@@ -100,6 +100,7 @@ def _of_model(checkpoint: Checkpoint, config: Config) -> Config:
         checkpoint.config.training,
         init="random",
         init_photo="",
+        start="",
         init_touch="",
         photos=config.training.photos,
         touches=config.training.touches,

@@ -120,6 +120,8 @@ class TrainingConfig:
         init_touch: Initial weights of the touch tower, if not empty (`retrieval.training.relief` makes such weights).
             For concatenated towers the part "init" stands for the value of `init`.
         init_photo: The same for the photo tower.
+        start: Checkpoint of `retrieve train` whose towers and head the training continues from, if not empty, such as
+            one with frozen towers. It replaces the initial weights.
         photos: Folder of labelled photos that are paired with `touches` by label and trained on in addition to the
             recording (`retrieval.data.labelled_pictures`). Set both or neither.
         touches: Folder of labelled touches.
@@ -128,6 +130,7 @@ class TrainingConfig:
         positives_per_touch: Photos of the touch's object in a batch.
         negatives_per_touch: Photos of other objects in a batch.
         learning_rate: Learning rate of the optimiser.
+        tower_rate: Ratio of the towers' learning rate to that of the other layers.
         schedule: Name of a learning rate schedule in `SCHEDULES`.
         weights: Weights of the losses that are added to the match loss (`retrieval.model.losses.LOSSES`). Configuration
             files name them `contrastive_weight` and so on.
@@ -151,6 +154,7 @@ class TrainingConfig:
     init: str = "imagenet"
     init_touch: str = ""
     init_photo: str = ""
+    start: str = ""
     photos: str = ""
     touches: str = ""
     iterations: Count = 26_000
@@ -158,6 +162,7 @@ class TrainingConfig:
     positives_per_touch: Count = 4
     negatives_per_touch: Count = 4
     learning_rate: Annotated[float, Meta(gt=0)] = 1e-4
+    tower_rate: Annotated[float, Meta(gt=0)] = 1.0
     schedule: str = "constant"
     weights: Mapping[str, float] = field(default_factory=dict)
     shuffle_fingers: bool = False
@@ -316,7 +321,7 @@ class Config:
     def without_paths(self) -> dict[str, Any]:
         """Return `to_dict` with the names of files and folders in place of their paths on this machine."""
         tables = self.to_dict()
-        for name in ("init", "init_photo", "init_touch", "photos", "touches"):
+        for name in ("init", "init_photo", "init_touch", "start", "photos", "touches"):
             parts = tables["training"][name].split(TOWER_SEPARATOR)
             tables["training"][name] = TOWER_SEPARATOR.join(Path(part).name for part in parts)
         matcher = tables["matcher"]

@@ -14,6 +14,8 @@ from retrieval.errors import NumericalError
 from retrieval.model.config import SCHEDULES
 
 Batch = TypeVar("Batch")
+RATE = "rate"
+"""Key of a parameter group: the ratio of its learning rate to that of the plan; 1 without this key."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def fit(
     """
     for batch in batches:
         for group in optimizer.param_groups:
-            group["lr"] = plan.learning_rate * SCHEDULES[plan.schedule](done, plan.steps)
+            group["lr"] = plan.learning_rate * group.get(RATE, 1.0) * SCHEDULES[plan.schedule](done, plan.steps)
         with step_context():
             optimizer.zero_grad(set_to_none=True)
             current = loss(batch)

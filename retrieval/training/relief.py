@@ -32,7 +32,7 @@ from retrieval.model.encode import autocast, default_device, to_batch
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.disk_image_cache import DiskImageCache
-from retrieval.training.fit import Plan, fit
+from retrieval.training.fit import RATE, Plan, fit
 from retrieval.training.state import load_state, require_no_unfinished_state, save_state, state_path
 
 BATCH, ITERATIONS, LEARNING_RATE = 32, 1500, 4e-4
@@ -163,9 +163,11 @@ class ReliefTraining:
         nn.init.zeros_(last.bias)
         self.head = nn.Sequential(nn.BatchNorm1d(features, affine=False), nn.Dropout(DROPOUT), last)
         self.modules = nn.ModuleDict({"tower": self.tower, "head": self.head}).to(self.device)
-        self.optimizer = torch.optim.AdamW(
-            [{"params": self.tower.parameters()}, {"params": self.head.parameters()}], weight_decay=WEIGHT_DECAY
-        )
+        groups: list[dict[str, Any]] = [
+            {"params": self.tower.parameters()},
+            {"params": self.head.parameters(), RATE: HEAD_RATE_FACTOR},
+        ]
+        self.optimizer = torch.optim.AdamW(groups, weight_decay=WEIGHT_DECAY)
         self._variants: ImageCache | DiskImageCache = ImageCache(self._load)
         self._workers = worker_pool(config.training.workers)
 
@@ -209,14 +211,10 @@ class ReliefTraining:
                 self._loss,
                 bar=bar,
                 done=self.step,
-                before_step=self._scale_head_rate,
                 after_step=self._after_step,
                 validate=lambda _: self._save(out),
                 should_stop=should_stop,
             )
-
-    def _scale_head_rate(self) -> None:
-        self.optimizer.param_groups[1]["lr"] *= HEAD_RATE_FACTOR
 
     def _after_step(self, done: int) -> None:
         self.step = done

@@ -54,7 +54,7 @@ from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
 from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import Features, features_by_image
-from retrieval.training.fit import Plan, fit
+from retrieval.training.fit import RATE, Plan, fit
 from retrieval.training.state import code_digest, load_state, require_no_unfinished_state, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
 from retrieval.training.verdicts import with_verdicts
@@ -149,9 +149,12 @@ class Trainer:
         self.modules = nn.ModuleDict({"matcher": self.matcher, "losses": self.losses})
         towers = (module for module in self.matcher.modules() if isinstance(module, Tower))
         self.code = code_digest(*map(type, (*self.losses.terms, *towers)))
-        trained = [parameter for parameter in self.modules.parameters() if parameter.requires_grad]
+        groups: list[dict[str, Any]] = [{"params": []}, {"params": [], RATE: settings.tower_rate}]
+        for name, parameter in self.modules.named_parameters():
+            if parameter.requires_grad:
+                groups[name.startswith(TOWERS)]["params"].append(parameter)
         # On a CPU, PyTorch's default optimizer reads every tensor eight times, the fused one once. CUDA's is fast.
-        self.optimizer = torch.optim.Adam(trained, lr=settings.learning_rate, fused=self.device.type == "cpu")
+        self.optimizer = torch.optim.Adam(groups, lr=settings.learning_rate, fused=self.device.type == "cpu")
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
         self.features: FeatureSource = TrainedFeatures(config, self.device)
@@ -325,7 +328,7 @@ class Trainer:
         }
 
     def _save_state(self) -> None:
-        excluded = FROZEN if self.config.training.freeze_towers else ()  # these are in the checkpoint
+        excluded = TOWERS if self.config.training.freeze_towers else ()  # these are in the checkpoint
         header = {"step": self.step, "best": None if self.validation is None else self.best, **self._identity()}
         save_state(self.out, self.modules, self.optimizer, header, excluded=excluded)
 
@@ -338,7 +341,7 @@ class Trainer:
         weights = self._load_own_checkpoint().matcher.state_dict().items()
         named = {f"matcher.{name}": tensor for name, tensor in weights}
         frozen = self.config.training.freeze_towers
-        return {name: tensor for name, tensor in named.items() if frozen and name.startswith(FROZEN)}
+        return {name: tensor for name, tensor in named.items() if frozen and name.startswith(TOWERS)}
 
     def _load_own_checkpoint(self) -> Checkpoint:
         """Return the best checkpoint so far, which is part of the state.
@@ -356,8 +359,8 @@ class Trainer:
         return stored
 
 
-FROZEN = ("matcher.touch_tower.", "matcher.photo_tower.")
-"""Prefixes of the names of the frozen towers' weights."""
+TOWERS = ("matcher.touch_tower.", "matcher.photo_tower.")
+"""Prefixes of the names of the towers' weights."""
 
 
 def labelled_pairs(config: Config) -> list[Grasp]:
@@ -375,9 +378,33 @@ def build_matcher(config: Config) -> Matcher:
     ):
         shipped = partial(_shipped_tower, config.matcher.fingers, side)
         initialise_tower(tower, settings.tower_init(init), shipped)
+    if settings.start:
+        _start_from(matcher, Path(settings.start))
+    for tower in (matcher.touch_tower, matcher.photo_tower):
         tower.requires_grad_(not settings.freeze_towers)
         distributed.synchronize_batch_norm(tower)
     return matcher
+
+
+def _start_from(matcher: Matcher, path: Path) -> None:
+    """Copy the weights of a checkpoint into a matcher.
+
+    Layers that only one of the two has keep their initial weights: the candidate encoder, the gel head, the layers of
+    cells.
+
+    Raises:
+        CheckpointError: The checkpoint cannot be read, or one of its layers has another size.
+    """
+    ours, theirs = matcher.state_dict(), load_checkpoint(path).matcher.state_dict()
+    shared = {name: tensor for name, tensor in theirs.items() if name in ours}
+    for name, tensor in shared.items():
+        if tensor.shape != ours[name].shape:
+            raise CheckpointError(
+                f"{path} cannot start this training: {name} is {tuple(tensor.shape)}, must be "
+                f"{tuple(ours[name].shape)}; "
+                "use the configuration of that checkpoint, or another checkpoint"
+            )
+    matcher.load_state_dict(shared, strict=False)
 
 
 def _shipped_tower(fingers: int, side: str) -> dict[str, Tensor]:

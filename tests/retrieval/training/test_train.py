@@ -662,3 +662,28 @@ def test_fingers_are_shuffled_within_a_touch_by_the_seed():
     repeated = torch.cat([shuffle_fingers(features, fingers=2) for _ in range(50)])
     assert 60 < int((repeated == swapped.repeat(50, 1)).all(1).sum()) < 140
     assert torch.equal(shuffle_fingers(features, fingers=1), features)
+
+
+def test_training_continues_from_the_towers_and_the_head_of_a_checkpoint(model):
+    started = build_matcher(with_training(TINY, start=str(model))).state_dict()
+    assert same_weights(started, load_checkpoint(model).matcher.state_dict())
+
+
+def test_a_checkpoint_with_layers_of_another_size_cannot_start_a_training(model):
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, hidden=64))
+    with pytest.raises(CheckpointError, match=r"head\.\S+ is .*, must be"):
+        build_matcher(with_training(config, start=str(model)))
+
+
+def test_the_towers_learn_at_their_own_rate(recording, tmp_path):
+    """Adam's first step moves each weight by its learning rate, whatever the gradient."""
+    config = with_training(TINY, iterations=1, tower_rate=0.25)
+    trainer = trainer_for(recording, tmp_path / "m.safetensors", config)
+    before = {name: tensor.clone() for name, tensor in trainer.matcher.named_parameters()}
+    trainer.run(quiet=True)
+    moved = {
+        name: float((tensor - before[name]).abs().max().detach()) / config.training.learning_rate
+        for name, tensor in trainer.matcher.named_parameters()
+    }
+    assert moved["touch_tower.stages.0.weight"] == pytest.approx(0.25, rel=0.01)
+    assert moved["head.second.weight"] == pytest.approx(1.0, rel=0.01)
