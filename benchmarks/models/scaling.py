@@ -39,11 +39,17 @@ from retrieval.training.train import labelled_pairs
 from robot.recording.folder import read_recording
 
 LINES = ("-", "--", "-.")
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 KNOWN = {"shape": slice(0, 1), "relief": slice(1, 2), "both": slice(0, 2)}
 """Words of a simulated object's name ("mug-ribs-0-00001") that describe it."""
 PHOTO_ONLY = 8
 """Added to numbers of touched objects in plots, because 0 has no place on a logarithmic axis."""
-SHOWN = {"pair_accuracy": "pair accuracy", "topn_k5": "top-1 accuracy, K = 5", "topn_k10": "top-1 accuracy, K = 10"}
+SHOWN = {
+    "pair_accuracy": "pair accuracy",
+    "topn_k5": "top-1 accuracy, K = 5",
+    "topn_k10": "top-1 accuracy, K = 10",
+    "topn_k100": "top-1 accuracy, K = 100",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -216,14 +222,20 @@ def scores_of(method: Method, features: Features, known: str | None = None) -> S
     return ScoreTable(scores, features.owner, features.owner, np.eye(len(features), dtype=bool))
 
 
+def shown(points: Sequence[dict[str, Any]]) -> dict[str, str]:
+    """Return name and label of the measures of the points; too few unseen objects allow fewer measures."""
+    return {name: label for name, label in SHOWN.items() if name in points[0]}
+
+
 def table(points: Sequence[dict[str, Any]]) -> str:
     """Return a Markdown table of the points."""
+    measures = shown(points)
     lines = [
-        "| method | training objects | grasps of each | photo-only objects | " + " | ".join(SHOWN.values()) + " |",
-        "|---|---|---|---|" + "---|" * len(SHOWN),
+        "| method | training objects | grasps of each | photo-only objects | " + " | ".join(measures.values()) + " |",
+        "|---|---|---|---|" + "---|" * len(measures),
     ]
     for point in points:
-        cells = [_cell(point[name]) for name in SHOWN]
+        cells = [_cell(point[name]) for name in measures]
         sizes = (f"{point['objects']:,}", str(point["grasps"]), f"{point['photographed']:,}")
         lines.append("| " + " | ".join((point["method"], *sizes, *cells)) + " |")
     return "\n".join(lines)
@@ -251,7 +263,8 @@ def plot_photographed(points: Sequence[dict[str, Any]]) -> Figure:
     figure = Figure(figsize=(12, 4.2), layout="constrained")
     points = [point for point in points if point["method"] == points[0]["method"]]
     counts = sorted({point["photographed"] for point in points})
-    for axes, (name, label) in zip(figure.subplots(1, 3), SHOWN.items(), strict=True):
+    measures = shown(points)
+    for axes, (name, label) in zip(figure.subplots(1, len(measures)), measures.items(), strict=True):
         for number, count in enumerate(counts):
             own = [point for point in points if point["photographed"] == count]
             own.sort(key=lambda point: int(point["objects"]))
@@ -272,7 +285,7 @@ def plot_photographed(points: Sequence[dict[str, Any]]) -> Figure:
 
 def _panel(axes: Axes, points: Sequence[dict[str, Any]], key: str) -> None:
     methods = list(dict.fromkeys(point["method"] for point in points))
-    for (name, label), colour in zip(SHOWN.items(), ("#0072b2", "#d55e00", "#009e73"), strict=True):
+    for (name, label), colour in zip(shown(points).items(), COLOURS, strict=False):
         for method, style in zip(methods, LINES, strict=False):
             own = sorted((point for point in points if point["method"] == method), key=lambda point: int(point[key]))
             value, low, high = (np.array([point[name][part][0] for point in own]) for part in ("value", "low", "high"))

@@ -138,6 +138,12 @@ METRICS: dict[str, Metric] = {
         "main",
         lambda tables: k_way_measure(tables.test, 10, tables.seed),
     ),
+    "topn_k100": Metric(
+        "100-way top-1 accuracy",
+        "100-way top-1 accuracy",
+        "main",
+        lambda tables: k_way_measure(tables.test, 100, tables.seed),
+    ),
     "topn_k5_all_objects": Metric(
         "5-way top-1 accuracy, all objects",
         "5-way top-1 accuracy, all objects",
