@@ -147,9 +147,9 @@ def test_adding_cells_embeds_every_photo_again(index, pooled_index, catalogue, c
 
 
 def test_the_report_states_the_bytes_of_a_photo(index, catalogue, checkpoint):
-    kept = build_index(catalogue, checkpoint, index, quiet=True)
-    assert kept.photo_bytes == {"partials": POOLED_BYTES, "cells": CELL_BYTES}
-    assert "cells are stored as int8; a photo takes 132 bytes: 96 pooled and 36 of cells" in list(kept.lines())
+    stored = build_index(catalogue, checkpoint, index, quiet=True)
+    assert stored.photo_bytes == {"partials": POOLED_BYTES, "cells": CELL_BYTES}
+    assert "cells are stored as int8; a photo takes 132 bytes: 96 pooled and 36 of cells" in list(stored.lines())
     dropped = build_index(catalogue, checkpoint, index, cells=False, quiet=True)
     line = "no cells are stored (--cells stores them); a photo takes 96 bytes: 96 pooled and 0 of cells"
     assert line in list(dropped.lines())
@@ -234,3 +234,15 @@ def test_the_pooled_posterior_is_fitted_on_the_logits_of_the_matcher_without_cel
     made = verdicts.with_verdicts(checkpoint, None, grasps, grasps)
     assert made.pooled_posterior.slope == pytest.approx(verdicts.fit_posterior(expected.scored).slope, rel=1e-3)
     assert made.posterior != made.pooled_posterior
+
+
+@pytest.mark.parametrize("cells", [True, False])
+def test_a_model_with_a_candidate_encoder_embeds_its_stored_touches(catalogue, checkpoint, tmp_path, cells):
+    """Only their pooled part: the candidate encoder does not see cells."""
+    sizes = dataclasses.replace(CELLS, candidate_width=8)
+    config = Config(sizes, TINY.training, TINY.preprocessing)
+    queries = np.ones((3, sizes.touch_partial_width), dtype=np.float16)
+    path, provenance = tmp_path / "encoder.safetensors", checkpoint.provenance
+    save_checkpoint(path, Matcher(sizes).eval(), config, split=None, provenance=provenance, queries=queries)
+    report = build_index(catalogue, load_checkpoint(path), tmp_path / "index", cells=cells, max_ms=1e6, quiet=True)
+    assert report.candidates["queries"] == 3
