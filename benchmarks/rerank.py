@@ -1,22 +1,28 @@
-"""Rerank candidates with stored partial activations, compared with the whole network on every pair."""
+"""Rerank candidates with stored partial activations: compared with the whole network, and without late interaction."""
 
+import dataclasses
+import time
 from collections.abc import Iterator
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
 from benchmarks.common import REPETITIONS, ResultLine, as_text, duration, in_turns, matcher_of, random_images
 from retrieval.model.config import Config
 from retrieval.model.encode import encode_photos, encode_touches, to_batch, touch_batch
-from retrieval.model.fusion import scorer_of
+from retrieval.model.fusion import FusionHead, scorer_of
+from retrieval.model.stored_partials import StoredPartials, to_stored
 
 BATCH = 16
+CELL_DIM = 32
+"""Length of a cell's vector where the configuration has none."""
 
 
 def measure(
     config: Config, candidates: tuple[int, ...] = (100, 1000), sample: int = BATCH, repetitions: int = REPETITIONS
 ) -> Iterator[ResultLine]:
-    """Yield one line for each number of candidates.
+    """Yield one line for each number of candidates, and one for late interaction with the last number.
 
     The whole network runs on `sample` pairs, and its time is scaled. The matrix product is that of the head's second
     layer for all candidates, in numpy's BLAS library.
@@ -62,3 +68,45 @@ def measure(
             },
             {"partials": times.seconds[str(count)], "product": times.seconds[f"product {count}"]},
         )
+    yield measure_cells(config, candidates[-1], repetitions)
+
+
+def measure_cells(config: Config, candidates: int = 1000, repetitions: int = REPETITIONS) -> ResultLine:
+    """Return the line that compares reranking with and without cells, in CPU time of one thread.
+
+    Both arms score the same random partial activations of one touch, as an index stores those of photos.
+    """
+    sizes = dataclasses.replace(
+        config.matcher, tower_output="stages", cosine=True, cell_dim=config.matcher.cell_dim or CELL_DIM
+    )
+    generator, width = np.random.default_rng(0), sizes.pooled_width
+    touch = generator.normal(size=(1, sizes.touch_partial_width)).astype(np.float32)
+    photos = generator.normal(size=(candidates, sizes.partial_width)).astype(np.float32)
+    cells = photos[:, width:].reshape(candidates, -1, sizes.cell_dim)
+    cells /= np.linalg.norm(cells, axis=2, keepdims=True)
+    scorer = scorer_of(FusionHead(1, 1, sizes.hidden, 0.0, sizes.embedding_dim, sizes.cell_dim))
+    arrays = {"with": to_stored(photos, width), "without": to_stored(photos[:, :width], width)}
+    stored = {name: StoredPartials(each) for name, each in arrays.items()}
+    with threadpool_limits(1, "blas"):
+        arms = {name: (lambda each=each: scorer.logits(touch, each)) for name, each in stored.items()}
+        times = in_turns(arms, repetitions, time.process_time)
+    ratio, bytes_each = (
+        times.ratio("with", "without"),
+        {name: sum(array.nbytes for array in each.values()) // candidates for name, each in arrays.items()},
+    )
+    return ResultLine(
+        "rerank",
+        config.matcher.tower,
+        f"{candidates} candidates with {sizes.photo_cells**2} cells of {sizes.cell_dim} numbers take "
+        f"{duration(times.median('with'))} of one thread, without cells {duration(times.median('without'))}: "
+        f"{as_text(ratio)}; a photo takes {bytes_each['with']} and {bytes_each['without']} bytes",
+        {
+            "candidates": candidates,
+            "cells_s": times.median("with"),
+            "pooled_s": times.median("without"),
+            "cells_ratio": ratio[0],
+            "cells_bytes": bytes_each["with"],
+            "pooled_bytes": bytes_each["without"],
+        },
+        times.seconds,
+    )

@@ -41,11 +41,18 @@ class UnadaptedBaseline:
         return cls(start, replace(found, touch=np.ascontiguousarray(found.touch[:, fingers])))
 
     @one_thread()
-    def logits(self, features: Features) -> NDArray[np.float32]:
-        """Return match logits (n, n) of the touch of every grasp with the photo of every grasp."""
+    def logits(self, features: Features, *, pooled: bool = False) -> NDArray[np.float32]:
+        """Return match logits (n, n) of the touch of every grasp with the photo of every grasp.
+
+        Args:
+            features: Features of the n grasps.
+            pooled: Score without late interaction.
+        """
         matcher, touches = self.start.matcher, self._partials(features)
         with torch.inference_mode():
             photos = matcher.photo_encoding(torch.from_numpy(features.photo)).partial.numpy()
+        if pooled:
+            photos = photos[:, : matcher.config.pooled_width]
         return np.stack([score_partials(matcher.head, touch[None], photos) for touch in touches])
 
     @torch.inference_mode()
@@ -56,19 +63,22 @@ class UnadaptedBaseline:
         """Return the accuracy of the model among the objects of each fold."""
         return [score_accuracy(self.logits(features), features) for features in map(self.features.of_objects, folds)]
 
-    def reference_touches(self, folds: Sequence[Sequence[str]], max_touches: int) -> list[ReferenceTouches]:
+    def reference_touches(
+        self, folds: Sequence[Sequence[str]], max_touches: int, *, pooled: bool = False
+    ) -> list[ReferenceTouches]:
         """Return the touches of each fold that calibrate the posterior and the reference touches.
 
         Args:
             folds: Objects of each fold.
             max_touches: Maximum number of touches of one object.
+            pooled: Score without late interaction.
         """
         parts = []
         for fold in map(self.features.of_objects, folds):
             features = fold.select(first_rows(fold, max_touches))
             own = np.eye(len(features), dtype=np.bool_)
             projections = touch_embeddings(self._partials(features).numpy(), self.start.config.matcher.cosine_columns)
-            scored = ScoredTouches(self.logits(features), features.owner, features.owner, own)
+            scored = ScoredTouches(self.logits(features, pooled=pooled), features.owner, features.owner, own)
             parts.append(ReferenceTouches(scored, projections))
         return parts
 

@@ -135,10 +135,14 @@ def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estima
     folds = [sorted(set(fold.left_out.object_ids)) for fold in estimate.folds]
     about = {"source": data.source, "data_digest": data_digest(data.grasps)}
     provenance = start.provenance | {"adapted_to": about, "metrics": estimate.to_dict()}
-    return _with_posterior(
+    made = _with_posterior(
         dataclasses.replace(checkpoint, provenance=provenance),
         estimate.baseline.reference_touches(folds, MAX_CALIBRATION_TOUCHES),
     )
+    if not start.config.matcher.cell_dim:
+        return made
+    pooled = _with_posterior(made, estimate.baseline.reference_touches(folds, MAX_CALIBRATION_TOUCHES, pooled=True))
+    return dataclasses.replace(made, pooled_posterior=pooled.posterior, pooled_references=pooled.references)
 
 
 def _with_posterior(checkpoint: Checkpoint, left_out: list[ReferenceTouches]) -> Checkpoint:

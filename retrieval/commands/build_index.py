@@ -61,6 +61,14 @@ def build_index(
             help="maximum time of one search in milliseconds: candidate search and reranking",
         ),
     ] = None,
+    cells: Annotated[
+        bool | None,
+        typer.Option(
+            "--cells/--no-cells",
+            help="store the cells of photos, for late interaction; without them the index is smaller and reranking "
+            "faster (default: as in OUT, else store them if the model has them)",
+        ),
+    ] = None,
     preview: Annotated[
         bool, typer.Option("--preview", help="write OUT-views.png: some photos as the model receives them")
     ] = False,
@@ -116,6 +124,7 @@ def build_index(
         "kind": kind,
         "min_recall": min_recall,
         "max_ms": max_ms,
+        "cells": cells,
         "verify": verify,
     }
     run = None

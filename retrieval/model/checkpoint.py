@@ -6,7 +6,7 @@ Nothing is unpickled. A file is written under a temporary name, flushed to disk,
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
@@ -67,6 +67,8 @@ class Checkpoint(CheckpointInfo):
         queries: (Q, partial) partial activations of touches of validation objects, with which an index measures its
             own search.
         references: Calibration of reference touches; None if there were too few data.
+        pooled_posterior: As `posterior`, of the logits without late interaction; None for a model without cells.
+        pooled_references: As `references`, of the same logits.
 
     >>> checkpoint = retrieval.load_checkpoint("model.safetensors")
     >>> checkpoint.config.preprocessing.background, len(checkpoint.digest)
@@ -78,6 +80,27 @@ class Checkpoint(CheckpointInfo):
     posterior: Posterior | None = None
     queries: NDArray[np.float16] | None = None
     references: ReferenceCalibration | None = None
+    pooled_posterior: Posterior | None = None
+    pooled_references: ReferenceCalibration | None = None
+
+    def without_cells(self) -> "Checkpoint":
+        """Return the model without late interaction, with the calibration of its logits, for an index without cells.
+
+        It has the same digest. A model without cells is returned as it is.
+        """
+        if not self.config.matcher.cell_dim:
+            return self
+        matcher = self.matcher.without_cells()
+        return replace(
+            self,
+            config=replace(self.config, matcher=matcher.config),
+            matcher=matcher,
+            posterior=self.pooled_posterior,
+            queries=None if self.queries is None else self.queries[:, : matcher.config.pooled_width],
+            references=self.pooled_references,
+            pooled_posterior=None,
+            pooled_references=None,
+        )
 
 
 def save_checkpoint(
@@ -91,6 +114,8 @@ def save_checkpoint(
     gel_check: GelCheck | None = None,
     queries: NDArray[np.float16] | None = None,
     references: ReferenceCalibration | None = None,
+    pooled_posterior: Posterior | None = None,
+    pooled_references: ReferenceCalibration | None = None,
     float16: bool = False,
 ) -> None:
     """Write `path` and its model card (the same name with .md) atomically.
@@ -105,6 +130,8 @@ def save_checkpoint(
         gel_check: Thresholds of its gel head.
         queries: (Q, partial) partial activations of validation touches.
         references: Calibration of reference touches.
+        pooled_posterior: Calibration of the logits without late interaction; stored only if the model has cells.
+        pooled_references: As `references`, of the same logits.
         float16: Store weights as float16, which halves the file. Loading converts them to float32.
 
     Raises:
@@ -119,6 +146,9 @@ def save_checkpoint(
         "references": references.to_dict() if references else None,
         "provenance": dict(provenance),
     }
+    if config.matcher.cell_dim:
+        header["pooled_posterior"] = pooled_posterior.to_dict() if pooled_posterior else None
+        header["pooled_references"] = pooled_references.to_dict() if pooled_references else None
     state = matcher.state_dict()
     if float16:
         state = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in state.items()}
@@ -130,7 +160,10 @@ def save_checkpoint(
     write_atomically(sibling_file(path, ".md"), _model_card(path.name, header).encode())
 
 
-CHECKPOINT_FIELDS = ("split", "provenance", "posterior", "gel_check", "queries", "references")
+CHECKPOINT_FIELDS = (
+    *("split", "provenance", "posterior", "gel_check", "queries", "references"),
+    *("pooled_posterior", "pooled_references"),
+)
 """Fields of a checkpoint that are stored in addition to matcher and configuration."""
 
 
@@ -183,9 +216,8 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
     info = info or checkpoint_info(path, header)
     try:
         split = None if header["split"] is None else Split.from_dict(header["split"])
-        posterior = None if header.get("posterior") is None else Posterior.from_dict(header["posterior"])
-        references = header.get("references")
-        references = None if references is None else ReferenceCalibration.from_dict(references)
+        posterior, references = _calibration(header, "posterior", "references")
+        pooled_posterior, pooled_references = _calibration(header, "pooled_posterior", "pooled_references")
         queries = state.pop(_QUERIES, None)
         partial = info.config.matcher.touch_partial_width
         if queries is not None and (queries.dtype != torch.float16 or queries.shape[1:] != (partial,)):
@@ -212,6 +244,19 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
         posterior,
         None if queries is None else np.asarray(queries.numpy()),
         references,
+        pooled_posterior,
+        pooled_references,
+    )
+
+
+def _calibration(
+    header: Mapping[str, Any], posterior: str, references: str
+) -> tuple[Posterior | None, ReferenceCalibration | None]:
+    """Return the calibration under these keys of a header. Raises BadInput if it is damaged."""
+    found, touches = header.get(posterior), header.get(references)
+    return (
+        None if found is None else Posterior.from_dict(found),
+        None if touches is None else ReferenceCalibration.from_dict(touches),
     )
 
 

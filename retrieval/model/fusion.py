@@ -7,6 +7,8 @@ activation continues with its embedding times the root of the scale. With late i
 ends with the vectors of the image's cells. So an index stores nothing else of a photo.
 """
 
+import copy
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -301,6 +303,15 @@ class Matcher(nn.Module):
         touch = self.touch_encoding(self.touch_features(touches))
         photo = self.photo_encoding(self.photo_features(photos))
         return self.head(touch.partial, photo.partial)  # type: ignore[no-any-return]
+
+    def without_cells(self) -> "Matcher":
+        """Return a copy without late interaction; its partial activations and logits are the pooled ones."""
+        pooled = copy.deepcopy(self)
+        pooled.config = dataclasses.replace(self.config, cell_dim=0)
+        pooled.touch_cells, pooled.photo_cells, pooled.head.cell_dim = None, None, 0
+        pooled.touch_tower.divide(0)
+        pooled.photo_tower.divide(0)
+        return pooled
 
     @torch.no_grad()
     def clamp_scale(self) -> None:

@@ -1,6 +1,7 @@
 """Fit the parts of a checkpoint that verdicts need, after training: a posterior, and the gel check.
 
-The posterior (`retrieval.model.posterior`) is fitted on touches and photos of validation objects. The gel check
+The posterior (`retrieval.model.posterior`) is fitted on touches and photos of validation objects; a model with late
+interaction has a second one, for an index without cells. The gel check
 (`retrieval.model.fusion_scorer`) uses the touch tower's features. Its linear layer is fitted on touches and no-contact
 frames of training objects and on foreign pictures. Its thresholds are chosen on those of validation objects.
 """
@@ -23,8 +24,13 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, touch_features
 from retrieval.model.fusion import GEL_CLASSES, MIN_RELATIVE_DEVIATION, GelHead, Matcher, scorer_of
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
-from retrieval.model.posterior import ScoredTouches, fit_posterior
-from retrieval.model.reference_calibration import ReferenceTouches, fit_reference_calibration, touch_embeddings
+from retrieval.model.posterior import Posterior, ScoredTouches, fit_posterior
+from retrieval.model.reference_calibration import (
+    ReferenceCalibration,
+    ReferenceTouches,
+    fit_reference_calibration,
+    touch_embeddings,
+)
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.foreign_images import draw_foreign
 
@@ -82,12 +88,12 @@ def with_verdicts(
     touches, photos = recorded_features(
         matcher, source, validation, what="posterior", quiet=quiet, should_stop=should_stop
     )
-    queries = posterior_touches(matcher, validation, touches, photos)
-    made = dataclasses.replace(
-        made,
-        posterior=None if queries is None else fit_posterior(queries.scored, seed=seed),
-        references=None if queries is None else fit_reference_calibration(queries, seed=seed),
-    )
+    posterior, references = _fit_calibration(posterior_touches(matcher, validation, touches, photos), seed)
+    made = dataclasses.replace(made, posterior=posterior, references=references)
+    if matcher.config.cell_dim:
+        queries = posterior_touches(matcher, validation, touches, photos, pooled=True)
+        posterior, references = _fit_calibration(queries, seed)
+        made = dataclasses.replace(made, pooled_posterior=posterior, pooled_references=references)
     if len(validation) < MIN_GRASPS:
         return made
     train_touches, _ = recorded_features(matcher, source, train, what="gel check", quiet=quiet, should_stop=should_stop)
@@ -112,8 +118,21 @@ def _sample_grasps(grasps: Sequence[Grasp], seed: int) -> list[Grasp]:
 # The posterior ---------------------------------------------------------------------------------------------
 
 
+def _fit_calibration(
+    queries: ReferenceTouches | None, seed: int
+) -> tuple[Posterior | None, ReferenceCalibration | None]:
+    if queries is None:
+        return None, None
+    return fit_posterior(queries.scored, seed=seed), fit_reference_calibration(queries, seed=seed)
+
+
 def posterior_touches(
-    matcher: Matcher, grasps: Sequence[Grasp], touches: Tensor, photos: dict[Path, Tensor]
+    matcher: Matcher,
+    grasps: Sequence[Grasp],
+    touches: Tensor,
+    photos: dict[Path, Tensor],
+    *,
+    pooled: bool = False,
 ) -> ReferenceTouches | None:
     """Return the data that a posterior is fitted on; None if there are too few objects or photos.
 
@@ -122,6 +141,7 @@ def posterior_touches(
         grasps: G grasps.
         touches: Touch features (G, fingers * F).
         photos: Features of each photo by file.
+        pooled: Score without late interaction, as an index without cells does.
     """
     objects = sorted({grasp.object_id for grasp in grasps})
     object_of = {grasp.photo: grasp.object_id for grasp in grasps}
@@ -133,6 +153,8 @@ def posterior_touches(
     with torch.inference_mode():
         touch_partials = matcher.touch_encoding(touches).partial.cpu().numpy()
         photo_partials = matcher.photo_encoding(torch.stack(list(photos.values()))).partial.cpu().numpy()
+    if pooled:
+        photo_partials = photo_partials[:, : matcher.config.pooled_width]
     scorer = scorer_of(matcher.head)
     logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
     embeddings = touch_embeddings(touch_partials, matcher.config.cosine_columns)

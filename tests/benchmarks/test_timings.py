@@ -33,7 +33,7 @@ from retrieval.model.encode import has_fast_bfloat16
 from tests.conftest import TINY
 
 SMALLEST = {
-    "rerank": (rerank.measure, {"candidates": (3, 40), "sample": 5, "repetitions": 1}, 2),
+    "rerank": (rerank.measure, {"candidates": (3, 40), "sample": 5, "repetitions": 1}, 3),
     "query": (query.measure, {"photos": 40, "repetitions": 1}, 2 if find_spec("onnxruntime") else 1),
     "build": (build.measure, {"photos": 3, "photo_px": 64, "repetitions": 1}, 1),
     "step": (step.measure, {"touches": 2, "photos_each": 2, "repetitions": 1}, 1),

@@ -24,7 +24,7 @@ from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import can_reuse_partials, fingerprint
 from retrieval.model.reference_calibration import REFERENCE_CALIBRATION, REFERENCE_ROWS
-from retrieval.model.stored_partials import stored_layout
+from retrieval.model.stored_partials import CELLS, stored_layout
 from retrieval.search.build.build_report import BuildReport
 from retrieval.search.build.embed import EMBEDDED, RE_EMBEDDED, RENAMED, RESUMED, BuildPart, Embedder
 from retrieval.search.build.embed_touches import ReferenceBuild, embed_references
@@ -41,6 +41,8 @@ CANDIDATE_ENCODER_CHANGED = (
     "Only the candidate encoder changed: partial activations of unchanged photos were reused and their embeddings "
     "recomputed, without decoding or encoding a photo."
 )
+CELLS_DROPPED = "The index no longer stores cells; all else that it stored of unchanged photos was reused."
+CELLS_ADDED = "Every photo was embedded again: the index stores cells now."
 CHANGE_REASONS = {
     "checkpoint": "the model changed",
     "preprocessing": "the preprocessing of photos changed",
@@ -57,6 +59,7 @@ def build_index(
     kind: str | type[VectorIndex] | None = None,
     min_recall: float | None = None,
     max_ms: float | None = None,
+    cells: bool | None = None,
     verify: bool = False,
     quiet: bool = False,
 ) -> BuildReport:
@@ -74,6 +77,8 @@ def build_index(
         kind: Kind of index, a name or a class; None for exact search, unless a bound requires another kind.
         min_recall: Smallest agreement with exhaustive search at rank 1 (`retrieval.search.build.operating`).
         max_ms: Longest time of candidate search and reranking for one touch, in milliseconds.
+        cells: Store the cells of photos, for late interaction; None for the setting of the existing index, else True.
+            Requires a model with cells.
         verify: List every folder and read every file, even if size, times and inode did not change
             (`retrieval.search.build.stat_cache`).
         quiet: Show no progress.
@@ -82,7 +87,7 @@ def build_index(
         A report of the build.
 
     Raises:
-        BadInput: The rule or a requirement is invalid.
+        BadInput: The rule or a requirement is invalid, or `cells` is given for a model without cells.
         DatasetError: No photo can be read.
         IndexesError: The index could not be written (`indexes.store.folder.IndexStore.write`) and did not change.
 
@@ -97,9 +102,10 @@ def build_index(
     except IndexesError:
         before = {}
     naming, note = naming_by(objects_from, before)
+    options = BuildOptions(naming, requirements, quiet, verify, note, cells=stores_cells(cells, before, checkpoint))
     folders = FolderCache(out, known=not verify)
     catalogue = list_photos(folder, naming, folders)
-    report = build_listed(catalogue, checkpoint, out, BuildOptions(naming, requirements, quiet, verify, note))
+    report = build_listed(catalogue, checkpoint, out, options)
     folders.write()
     return report
 
@@ -117,6 +123,7 @@ class BuildOptions:
         about: Further entries of the manifest.
         donors: Generations whose embeddings and partial activations may be reused.
         keep: Number of earlier generations that stay on the disk.
+        cells: Store the cells of photos; None for a model without cells.
     """
 
     naming: Naming
@@ -127,6 +134,7 @@ class BuildOptions:
     about: Mapping[str, Any] = field(default_factory=dict)
     donors: Sequence[Generation] = ()
     keep: int = 2
+    cells: bool | None = None
 
 
 def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, options: BuildOptions) -> BuildReport:
@@ -139,6 +147,8 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         options: The options of the build.
     """
     requirements, store = options.requirements, IndexStore(out)
+    if options.cells is False:
+        checkpoint = checkpoint.without_cells()
     if requirements.kind is not None:
         chosen = load_kind(requirements.kind)
         chosen.resolve_parameters(
@@ -194,6 +204,8 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         recall=manifest.recall,
         candidates=manifest.about["candidates"],
         partial_error=embedder.partial_error,
+        cells=options.cells,
+        photo_bytes={name: array.dtype.itemsize * array.shape[1] for name, array in generation.arrays.items()},
         seconds=seconds,
         references=references.summary(manifest.about[REFERENCE_CALIBRATION]["by"]) if references.rows else None,
     )
@@ -220,6 +232,27 @@ def naming_by(rule: str | None, about: Mapping[str, Any]) -> tuple[Naming, str]:
     return naming, f"The rule for object names changed from {known.text} to {naming.text}."
 
 
+def stores_cells(requested: bool | None, about: Mapping[str, Any], checkpoint: Checkpoint) -> bool | None:
+    """Return whether to store the cells of photos; None for a model without cells.
+
+    Args:
+        requested: The user's setting; None for that of the existing index, else True.
+        about: Entries of that index's manifest.
+        checkpoint: The model.
+
+    Raises:
+        BadInput: The user gave a setting, and the model has no cells.
+    """
+    if checkpoint.config.matcher.cell_dim:
+        return about.get(CELLS) is not False if requested is None else requested
+    if requested is None:
+        return None
+    raise BadInput(
+        f"--cells and --no-cells need a model with late interaction, and {checkpoint.path} has none (cell_dim = 0); "
+        "leave the option out"
+    )
+
+
 def _reusable(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | None, Generation | None, str]:
     """Return the generation with reusable photos, the one with reusable partial activations only, and a reason."""
     try:
@@ -229,13 +262,15 @@ def _reusable(store: IndexStore, checkpoint: Checkpoint) -> tuple[Generation | N
     except (CorruptIndex, UnsupportedFormat) as error:
         return None, None, f"The existing index is not usable, so every photo was embedded again ({error})."
     before, now = current.manifest.fingerprint, fingerprint(checkpoint)
-    if {name: before.get(name) for name in now} == now:
-        return current, None, ""
     matcher = checkpoint.config.matcher
     layout = stored_layout(matcher.pooled_width, matcher.partial_width)
-    if can_reuse_partials(checkpoint, before) and layout == {
-        name: (array.dtype, array.shape[1:]) for name, array in current.arrays.items()
-    }:
+    stored = {name: (array.dtype, array.shape[1:]) for name, array in current.arrays.items()}
+    if {name: before.get(name) for name in now} == now:
+        if not layout.keys() <= stored.keys():
+            return None, None, CELLS_ADDED
+        current.arrays = {name: current.arrays[name] for name in layout}  # a generation has the arrays of its parent
+        return current, None, "" if layout.keys() == stored.keys() else CELLS_DROPPED
+    if can_reuse_partials(checkpoint, before) and layout.items() <= stored.items():
         return None, current, CANDIDATE_ENCODER_CHANGED
     changed = [reason for name, reason in CHANGE_REASONS.items() if before.get(name) != now[name]]
     written = f"; the index was written by version {current.manifest.software}" if current.manifest.software else ""
@@ -261,6 +296,7 @@ class _BuildJob:
             "catalogue": self.where,
             "objects_from": options.naming.text,
             "requirements": asdict(options.requirements),
+            **({} if options.cells is None else {CELLS: options.cells}),
             **self.references.about,
             **options.about,
         }
@@ -289,6 +325,8 @@ class _BuildJob:
         start, embedder = time.perf_counter(), self.embedder
         changed = embedder.made[EMBEDDED] + embedder.made[RESUMED] + embedder.removed
         previous = None if embedder.parent is None else embedder.parent.manifest
+        if previous is not None and previous.about.get(CELLS) != self.options.cells:
+            previous = None  # it was measured with other logits
         point = choose_operating_point(
             embedder.checkpoint, tables, self.options.requirements, previous, changed, quiet=self.options.quiet
         )

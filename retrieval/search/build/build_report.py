@@ -7,6 +7,7 @@ from pathlib import PurePosixPath
 from typing import Any
 
 from retrieval.data.folder_walk import SkippedPhoto
+from retrieval.model.stored_partials import CELLS, PARTIALS
 
 SHOWN, FEW = 20, 5
 """Number of printed lines for entries with a reason each, and for entries without."""
@@ -44,6 +45,8 @@ class BuildReport:
         recall: Measured recall of the vector index.
         candidates: Measured number of candidates; None if the checkpoint stores no touches to measure with.
         partial_error: Largest rounding error of a stored partial activation.
+        cells: Whether the index stores the cells of photos, for late interaction; None for a model without cells.
+        photo_bytes: Bytes of a photo in each array: of its pooled partial activation (`partials`), and of its cells.
         seconds: Time of decoding and encoding.
         shards: Shards of a sharded index, as in its manifest (`indexes.store.sharded`); None for an index folder.
         references: Numbers of reference touches (`touches`), their objects (`objects`), objects without photos
@@ -82,6 +85,8 @@ class BuildReport:
     recall: Any
     candidates: dict[str, Any] | None
     partial_error: float
+    cells: bool | None
+    photo_bytes: dict[str, int]
     seconds: float
     shards: list[dict[str, Any]] | None = None
     references: dict[str, Any] | None = None
@@ -137,6 +142,10 @@ class BuildReport:
             yield f"  {shard['folder']} ({shard['generation']}): {shard['photos']} photos of {shard['objects']} objects"
         yield f"candidate search: {self.kind}. {self.reason}{measured}"
         yield f"partial activations are stored as float16, with an error of at most {self.partial_error:.2g}"
+        if self.cells is not None:
+            pooled, cells = (self.photo_bytes.get(name, 0) for name in (PARTIALS, CELLS))
+            what = "cells are stored as int8" if self.cells else "no cells are stored (--cells stores them)"
+            yield f"{what}; a photo takes {pooled + cells:,} bytes: {pooled:,} pooled and {cells:,} of cells"
         yield from _list_lines("remark(s)", self.notes)
         if self.left_out:
             reasons = ", ".join(f"{count} {reason}" for reason, count in self.left_out.items())

@@ -134,7 +134,11 @@ class Embedder:
             **self._stored,
         }
         self._unfinished = UnfinishedBuild(index, fingerprint(checkpoint), layouts)
-        self._sources = [source for source in (parent, *donors, partials) if source is not None]
+        self._sources = [
+            source
+            for source in (parent, *donors, partials)
+            if source is not None and self._stored.keys() <= source.arrays.keys()
+        ]
         self.objects, self.made = Counter[str](), Counter[str]()
         self.skipped: list[SkippedPhoto] = []
         self.known, self.partial_error = 0, 0.0

@@ -158,7 +158,9 @@ def embed_references(
     _require_fit(checkpoint)
     known: Mapping[tuple[str, ...], Partials] = {}
     if parent is not None and REFERENCE_ROWS in parent.documents:
-        stored = zip(parent.documents[REFERENCE_ROWS]["touches"], parent.documents[REFERENCE_PARTIALS], strict=True)
+        # An index that drops its cells has longer ones.
+        before = parent.documents[REFERENCE_PARTIALS][:, : checkpoint.config.matcher.touch_partial_width]
+        stored = zip(parent.documents[REFERENCE_ROWS]["touches"], before, strict=True)
         known = {tuple(row["digests"]): partial for row, partial in stored}
     skipped: list[SkippedPhoto] = []
     rows: list[dict[str, Any]] = []

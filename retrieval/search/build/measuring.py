@@ -231,7 +231,8 @@ def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch
         torch.from_numpy(checkpoint.queries[:count].astype(np.float32)),
         checkpoint.matcher.candidate_encoder,
     )
-    return partials, candidate_encoder.touch(partials.to(next(candidate_encoder.parameters()).device)).cpu().numpy()
+    pooled = partials[:, : checkpoint.config.matcher.pooled_width]
+    return partials, candidate_encoder.touch(pooled.to(next(candidate_encoder.parameters()).device)).cpu().numpy()
 
 
 def _queries(checkpoint: Checkpoint, photos: int) -> tuple[torch.Tensor, Floats]:

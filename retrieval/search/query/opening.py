@@ -1,14 +1,17 @@
 """Open an index folder or a sharded index, with the checkpoint that built it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation, check_fingerprint
 from indexes.store.manifest import Manifest
 from indexes.store.sharded import ShardedManifest, open_shard
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info, read_scorer
-from retrieval.model.stored_partials import stored_layout
+from retrieval.model.fusion_scorer import FusionScorer
+from retrieval.model.stored_partials import CELLS, stored_layout
 from retrieval.search import defaults
 from retrieval.search.query.objects import check_usable
 from retrieval.search.query.shard import FolderShard, IndexInfo, Shard, Shards
@@ -68,9 +71,21 @@ def read_checkpoint_of(manifest: Manifest | ShardedManifest, model: str | Path |
 def folder_shard(generation: Generation, stored: CheckpointInfo) -> FolderShard:
     """Return a shard of an opened generation and the scoring layers. Raises MismatchedIndex or CorruptIndex."""
     generation.require(fingerprint(stored))
-    matcher = stored.config.matcher
-    check_usable(generation, stored_layout(matcher.pooled_width, matcher.partial_width))
-    return FolderShard(generation, read_scorer(stored), stored.config.has_embeddings)
+    matcher, scorer = stored.config.matcher, scorer_for(stored, generation.manifest.about)
+    width = matcher.partial_width if scorer.cell_dim else matcher.pooled_width
+    check_usable(generation, stored_layout(matcher.pooled_width, width))
+    return FolderShard(generation, scorer, stored.config.has_embeddings)
+
+
+def scorer_for(stored: CheckpointInfo, about: Mapping[str, Any]) -> FusionScorer:
+    """Return the scoring layers of a checkpoint, without late interaction if the index was built without cells.
+
+    Args:
+        stored: Header of the checkpoint.
+        about: Entries of the index's manifest.
+    """
+    scorer = read_scorer(stored)
+    return replace(scorer, cell_dim=0) if about.get(CELLS) is False else scorer
 
 
 def open_sharded_index(

@@ -14,7 +14,7 @@ from indexes.errors import UnsupportedFormat
 from indexes.store.generation import Generation
 from retrieval.data.storage import url_or_path
 from retrieval.errors import BadInput
-from retrieval.model.checkpoint_info import CheckpointInfo, read_scorer
+from retrieval.model.checkpoint_info import CheckpointInfo
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, FusionScorer
 from retrieval.model.onnx_encoder import find_export
 from retrieval.model.posterior import NONE_PRIOR, Posterior, PosteriorProbabilities, require_prior
@@ -31,7 +31,7 @@ from retrieval.model.touches import (
 )
 from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult, is_clear
 from retrieval.search.query.objects import Objects
-from retrieval.search.query.opening import OpenShards, open_index
+from retrieval.search.query.opening import OpenShards, open_index, scorer_for
 from retrieval.search.query.reference_touches import reference_summary
 from retrieval.search.query.shard import FolderShard, Shard, ShardQuery, ShardResult
 
@@ -108,7 +108,7 @@ class Searcher:
         """
         shard, stored = open_index(index, model, verify, shards)
         encoder = find_export(stored, threads) or torch_encoder(stored, threads)
-        return cls(url_or_path(index), shard, stored, encoder, read_scorer(stored))
+        return cls(url_or_path(index), shard, stored, encoder, scorer_for(stored, shard.info.about))
 
     def close(self) -> None:
         """Release the index and the model; running queries finish first. A second call does nothing."""

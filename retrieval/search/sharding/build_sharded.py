@@ -47,7 +47,8 @@ from retrieval.errors import BadInput, NoReadablePhoto, TooManyUnreadable
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.reference_calibration import REFERENCE_CALIBRATION, REFERENCE_ROWS
-from retrieval.search.build.build_index import BuildOptions, build_listed, naming_by
+from retrieval.model.stored_partials import CELLS
+from retrieval.search.build.build_index import BuildOptions, build_listed, naming_by, stores_cells
 from retrieval.search.build.build_report import BuildReport
 from retrieval.search.build.embed import no_photo
 from retrieval.search.build.operating import SearchRequirements
@@ -115,6 +116,7 @@ def build_sharded(
     kind: str | type[VectorIndex] | None = None,
     min_recall: float | None = None,
     max_ms: float | None = None,
+    cells: bool | None = None,
     max_unreadable: float = MAX_UNREADABLE,
     verify: bool = False,
     quiet: bool = False,
@@ -131,6 +133,7 @@ def build_sharded(
         kind: As for `build_index`.
         min_recall: As for `build_index`.
         max_ms: As for `build_index`.
+        cells: As for `build_index`.
         max_unreadable: Largest fraction of photos that may be unreadable.
         verify: As for `build_index`.
         quiet: Show no progress.
@@ -163,7 +166,11 @@ def build_sharded(
             pass
         except (CorruptIndex, UnsupportedFormat) as error:
             note = f"The existing sharded index is not usable ({error})."
-        naming, renamed = naming_by(objects_from, {} if before is None else before.about)
+        about = {} if before is None else before.about
+        naming, renamed = naming_by(objects_from, about)
+        cells = stores_cells(cells, about, checkpoint)
+        if cells is False:
+            checkpoint = checkpoint.without_cells()
         catalogue = list_photos(folder, naming)
         if catalogue.touches and checkpoint.references is None:
             raise BadInput(
@@ -173,7 +180,7 @@ def build_sharded(
         _delete_old_shards(own, before, shards)
         old_generations = {} if stored is None else stored.generations()
         donors = [] if before is None or before.of == shards else before.shards
-        options = BuildOptions(naming, requirements, quiet, verify, keep=_KEEP_ALL)
+        options = BuildOptions(naming, requirements, quiet, verify, keep=_KEEP_ALL, cells=cells)
         jobs = [
             ShardJob(out, folder, part, checkpoint.path, replace(options, about={"shard": folder}), donors)
             for folder, part in _split_catalogue(catalogue, shards)
@@ -322,6 +329,7 @@ def _manifest(
         "objects_from": report.objects_from,
         "requirements": asdict(requirements),
         "partial_error": report.partial_error,
+        **({} if report.cells is None else {CELLS: report.cells}),
     }
     if report.references is not None and checkpoint.references is not None:
         about[REFERENCE_ROWS] = {key: report.references[key] for key in ("touches", "objects")}

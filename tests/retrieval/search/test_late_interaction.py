@@ -1,20 +1,34 @@
 """An index of a model with late interaction: what it stores, and that its answers are those of the whole network."""
 
 import dataclasses
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from retrieval.model.checkpoint import load_checkpoint, save_checkpoint
+from indexes.store.folder import IndexStore
+from indexes.store.sharded import read_sharded_manifest
+from retrieval.commands.main import main
+from retrieval.errors import BadInput
+from retrieval.model.checkpoint import load_checkpoint, read_tensors, save_checkpoint, store_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import Posterior
+from retrieval.model.reference_calibration import ReferenceCalibration
 from retrieval.search.build.build_index import build_index
 from retrieval.search.query.searcher import Searcher
+from retrieval.search.sharding.build_sharded import build_sharded
+from retrieval.training import verdicts
 from tests.conftest import TINY
+from tests.reference_model import REFERENCE_CALIBRATION, write_reference_model
 
 CELLS = dataclasses.replace(TINY.matcher, tower_output="stages", cosine=True, cell_dim=4, touch_cells=2, photo_cells=3)
+POSTERIOR, POOLED_POSTERIOR = Posterior(0.9, -0.5, 0.7, 40), Posterior(1.1, -0.4, 0.6, 40)
+POOLED_REFERENCES = ReferenceCalibration(Posterior(7.0, -2.0, 0.5, 40), 4.0, Posterior(1.2, -1.0, 0.8, 40), 20, 40)
+POOLED_BYTES, CELL_BYTES = 2 * (32 + 16), 3 * 3 * 4
+"""Bytes of a photo: 32 hidden units and an embedding of 16 in float16; 3 x 3 cells of 4 numbers in int8."""
 
 
 @pytest.fixture
@@ -23,8 +37,13 @@ def checkpoint(tmp_path):
     config = Config(CELLS, TINY.training, TINY.preprocessing)
     provenance = {"source": "a test", "step": 1, "data_digest": "0" * 64, "metrics": {}}
     path = tmp_path / "cells.safetensors"
-    posterior = Posterior(0.9, -0.5, 0.7, 40)
-    save_checkpoint(path, Matcher(CELLS).eval(), config, split=None, provenance=provenance, posterior=posterior)
+    calibration = {
+        "posterior": POSTERIOR,
+        "references": REFERENCE_CALIBRATION,
+        "pooled_posterior": POOLED_POSTERIOR,
+        "pooled_references": POOLED_REFERENCES,
+    }
+    save_checkpoint(path, Matcher(CELLS).eval(), config, split=None, provenance=provenance, **calibration)
     return load_checkpoint(path)
 
 
@@ -64,12 +83,166 @@ def test_a_second_build_embeds_no_photo_again(index, catalogue, checkpoint):
     assert report.embedded == 0
 
 
-def test_an_index_without_cells_is_refused_by_a_model_that_has_them(index, checkpoint):
+def test_an_index_that_lost_its_cells_is_refused(index, checkpoint):
     from indexes.errors import CorruptIndex
-    from indexes.store.folder import IndexStore
     from retrieval.search.query.opening import folder_shard
 
     generation = IndexStore(index).open()
     del generation.arrays["cells"]
     with pytest.raises(CorruptIndex, match="cells must be int8"):
         folder_shard(generation, checkpoint)
+
+
+# Cells left out -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def pooled_index(catalogue, checkpoint, tmp_path):
+    build_index(catalogue, checkpoint, tmp_path / "pooled", cells=False, quiet=True)
+    return tmp_path / "pooled"
+
+
+def arrays_of(index):
+    return IndexStore(index).open().arrays
+
+
+def test_an_index_without_cells_gives_the_pooled_logits_and_their_posterior(
+    pooled_index, checkpoint, catalogue, touches
+):
+    assert list(arrays_of(pooled_index)) == ["partials"]
+    files, load, matcher = next(iter(touches.values()))[0], checkpoint.config.preprocessing, checkpoint.matcher
+    with Searcher.open(pooled_index) as searcher, torch.inference_mode():
+        assert searcher.posterior == POOLED_POSTERIOR
+        assert searcher.scorer.cell_dim == 0
+        partials = searcher.encode(files).partials
+        for match in searcher.query(files, top=8).results:
+            photo = torch.from_numpy(load.load_photo(catalogue / match.photo)).permute(2, 0, 1)[None]
+            pooled = matcher.photo_encoding(matcher.photo_features(photo)).partial[:, : CELLS.pooled_width]
+            row = [at for at, row in enumerate(searcher.generation.rows) if row["path"] == match.photo]
+            found = searcher.shard._logits(partials, np.array(row))
+            assert float(found[0]) == pytest.approx(float(matcher.head(torch.from_numpy(partials), pooled)), abs=0.01)
+
+
+def test_a_later_build_keeps_the_setting(pooled_index, index, catalogue, checkpoint):
+    assert not build_index(catalogue, checkpoint, pooled_index, quiet=True).written
+    report = build_index(catalogue, checkpoint, index, quiet=True)
+    assert (report.written, report.cells) == (False, True)
+
+
+def test_dropping_cells_reuses_all_else_and_reads_no_photo(index, pooled_index, catalogue, checkpoint, monkeypatch):
+    report = build_index(catalogue, checkpoint, index, cells=False, quiet=True)
+    assert (report.written, report.embedded, report.renamed) == (True, 0, 0)
+    assert report.reason.startswith("The index no longer stores cells")
+    assert list(arrays_of(index)) == ["partials"]
+    np.testing.assert_array_equal(arrays_of(index)["partials"], arrays_of(pooled_index)["partials"])
+    assert IndexStore(index).open().documents["calibration"] == POOLED_POSTERIOR.to_dict()
+
+
+def test_adding_cells_embeds_every_photo_again(index, pooled_index, catalogue, checkpoint):
+    report = build_index(catalogue, checkpoint, pooled_index, cells=True, quiet=True)
+    assert report.embedded == report.photos
+    assert report.reason.startswith("Every photo was embedded again: the index stores cells now.")
+    np.testing.assert_array_equal(arrays_of(pooled_index)["cells"], arrays_of(index)["cells"])
+    assert IndexStore(pooled_index).open().documents["calibration"] == POSTERIOR.to_dict()
+
+
+def test_the_report_states_the_bytes_of_a_photo(index, catalogue, checkpoint):
+    stored = build_index(catalogue, checkpoint, index, quiet=True)
+    assert stored.photo_bytes == {"partials": POOLED_BYTES, "cells": CELL_BYTES}
+    assert "cells are stored as int8; a photo takes 132 bytes: 96 pooled and 36 of cells" in list(stored.lines())
+    dropped = build_index(catalogue, checkpoint, index, cells=False, quiet=True)
+    line = "no cells are stored (--cells stores them); a photo takes 96 bytes: 96 pooled and 0 of cells"
+    assert line in list(dropped.lines())
+
+
+def test_the_command_takes_the_option(catalogue, checkpoint, tmp_path, capsys):
+    command = ["build-index", str(catalogue), "--model", str(checkpoint.path), "--out", str(tmp_path / "made")]
+    assert main([*command, "--no-cells"]) == 0
+    assert "no cells are stored" in capsys.readouterr().err
+    assert list(arrays_of(tmp_path / "made")) == ["partials"]
+
+
+@pytest.mark.parametrize("cells", [True, False])
+def test_a_model_without_cells_refuses_the_option(catalogue, tmp_path, cells):
+    model = write_reference_model(tmp_path / "pooled.safetensors")
+    with pytest.raises(BadInput, match="need a model with late interaction"):
+        build_index(catalogue, model, tmp_path / "none", cells=cells, quiet=True)
+    with pytest.raises(BadInput, match="need a model with late interaction"):
+        build_sharded(catalogue, model, tmp_path / "none", 2, cells=cells, quiet=True)
+
+
+def test_a_sharded_index_without_cells_gives_the_results_of_one_folder(
+    pooled_index, catalogue, checkpoint, tmp_path, touches
+):
+    report = build_sharded(catalogue, checkpoint, tmp_path / "sharded", 2, cells=False, quiet=True)
+    assert (report.cells, report.photo_bytes) == (False, {"partials": POOLED_BYTES})
+    assert read_sharded_manifest(tmp_path / "sharded").calibration == POOLED_POSTERIOR.to_dict()
+    assert not build_sharded(catalogue, checkpoint, tmp_path / "sharded", 2, quiet=True).written
+    files = next(iter(touches.values()))[0]
+    with Searcher.open(tmp_path / "sharded") as sharded, Searcher.open(pooled_index) as whole:
+        for mine, other in zip(sharded.query(files).results, whole.query(files).results, strict=True):
+            assert (mine.object_id, mine.logit) == (other.object_id, pytest.approx(other.logit, abs=1e-5))
+
+
+def test_cells_cannot_come_from_shards_of_another_division_that_lack_them(catalogue, checkpoint, tmp_path):
+    build_sharded(catalogue, checkpoint, tmp_path / "sharded", 2, cells=False, quiet=True)
+    report = build_sharded(catalogue, checkpoint, tmp_path / "sharded", 3, cells=True, quiet=True)
+    assert report.embedded == report.photos
+
+
+def test_reference_touches_are_reused_with_the_calibration_of_pooled_logits(
+    catalogue_with_touches, checkpoint, tmp_path, touches
+):
+    build_index(catalogue_with_touches, checkpoint, tmp_path / "index", quiet=True)
+    report = build_index(catalogue_with_touches, checkpoint, tmp_path / "index", cells=False, quiet=True)
+    assert (report.references["touches"], report.references["encoded"]) == (8, 0)
+    generation = IndexStore(tmp_path / "index").open()
+    assert generation.documents["touches"].shape[1] == CELLS.pooled_width
+    assert generation.manifest.about["reference_calibration"]["calibration"] == POOLED_REFERENCES.to_dict()
+    with Searcher.open(tmp_path / "index") as searcher:
+        assert searcher.query(next(iter(touches.values()))[0]).results
+
+
+def test_only_a_checkpoint_with_cells_stores_the_calibration_of_pooled_logits(checkpoint, tmp_path):
+    assert (checkpoint.pooled_posterior, checkpoint.pooled_references) == (POOLED_POSTERIOR, POOLED_REFERENCES)
+    pooled = checkpoint.without_cells()
+    assert (pooled.posterior, pooled.references, pooled.digest) == (
+        POOLED_POSTERIOR,
+        POOLED_REFERENCES,
+        checkpoint.digest,
+    )
+    assert pooled.without_cells() is pooled
+    store_checkpoint(pooled, tmp_path / "stored.safetensors")
+    assert not [key for key in read_tensors(tmp_path / "stored.safetensors")[1] if key.startswith("pooled")]
+
+
+def test_the_pooled_posterior_is_fitted_on_the_logits_of_the_matcher_without_cells(checkpoint, monkeypatch):
+    """Twelve touches of six objects, each of two photos: without cells, photo features end before those of cells."""
+    matcher, pooled = checkpoint.matcher, checkpoint.matcher.without_cells()
+    rng = torch.Generator().manual_seed(0)
+    photos = {Path(f"{at}.png"): torch.rand(matcher.photo_feature_count, generator=rng) for at in range(12)}
+    touches = torch.rand(12, 2 * matcher.touch_tower.output_count, generator=rng)
+    grasps = [SimpleNamespace(object_id=f"object {at // 2}", photo=photo) for at, photo in enumerate(photos)]
+    each, count = pooled.touch_tower.feature_count, pooled.photo_feature_count
+    short = {photo: features[:count] for photo, features in photos.items()}
+    short_touches = touches.reshape(12, 2, -1)[..., :each].reshape(12, -1)
+    expected = verdicts.posterior_touches(pooled, grasps, short_touches, short)
+    found = verdicts.posterior_touches(matcher, grasps, touches, photos, pooled=True)
+    np.testing.assert_allclose(found.scored.logits, expected.scored.logits, atol=1e-5)
+    monkeypatch.setattr(verdicts, "recorded_features", lambda *_, **__: (touches, photos))
+    monkeypatch.setattr(verdicts, "_sample_grasps", lambda some, _: some)  # keeps their order
+    made = verdicts.with_verdicts(checkpoint, None, grasps, grasps)
+    assert made.pooled_posterior.slope == pytest.approx(verdicts.fit_posterior(expected.scored).slope, rel=1e-3)
+    assert made.posterior != made.pooled_posterior
+
+
+@pytest.mark.parametrize("cells", [True, False])
+def test_a_model_with_a_candidate_encoder_embeds_its_stored_touches(catalogue, checkpoint, tmp_path, cells):
+    """Only their pooled part: the candidate encoder does not see cells."""
+    sizes = dataclasses.replace(CELLS, candidate_width=8)
+    config = Config(sizes, TINY.training, TINY.preprocessing)
+    queries = np.ones((3, sizes.touch_partial_width), dtype=np.float16)
+    path, provenance = tmp_path / "encoder.safetensors", checkpoint.provenance
+    save_checkpoint(path, Matcher(sizes).eval(), config, split=None, provenance=provenance, queries=queries)
+    report = build_index(catalogue, load_checkpoint(path), tmp_path / "index", cells=cells, max_ms=1e6, quiet=True)
+    assert report.candidates["queries"] == 3
