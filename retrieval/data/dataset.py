@@ -77,12 +77,14 @@ class Attempt:
             nothing is recorded.
         accepted: Whether a matcher is trained on it.
         after: Frames after the lift, one file per finger in order, or empty.
+        time_s: Time since the recording began, if recorded.
     """
 
     grasp: Grasp
     outcome: str
     accepted: bool
     after: tuple[Path, ...]
+    time_s: float | None
 
     @property
     def held(self) -> bool:
@@ -115,6 +117,7 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
             outcome=line.outcome or {None: "unknown", True: "held", False: "failed"}[line.grasped],
             accepted=line.grasped is not False,
             after=in_finger_order(line.touches_after),
+            time_s=line.time_s,
         )
         for line in recording.grasps
     ]
