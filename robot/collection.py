@@ -12,6 +12,7 @@ that was stopped or killed continues at the same point when it is started again.
 
 import atexit
 import functools
+import itertools
 import json
 import re
 import time
@@ -22,19 +23,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import cv2
-import numpy as np
-import numpy.typing as npt
-
 from robot.errors import RecordingError, RobotConfigError
 from robot.grasping.attempt import AttemptRunner, GraspAttempt
-from robot.grasping.gates import ContactAreaGate, Gate, GraspFrames, apply_gate
+from robot.grasping.gates import ContactAreaGate, Gate, RecordedTouches, apply_gate
 from robot.grasping.settings import AttemptSettings
 from robot.recording.attempt_log import UNGRASPABLE, AttemptLog, LoggedAttempt, Tally, tally
 from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, software_version
 from robot.recording.grasp import check_name
 from robot.rig import Rig
-from robot.storage import decode_picture
 from robot.workers import Work, WorkerPool
 
 RigMaker = Callable[[], Rig]
@@ -42,7 +38,6 @@ RigMaker = Callable[[], Rig]
 
 _ATTEMPTS_PER_GRASP, _SPARE_ATTEMPTS = 4, 10
 _UNSAFE_CHARACTERS = re.compile(r"[^A-Za-z0-9._-]")
-_TOUCH = re.compile(r"touch_([a-z])")
 
 
 @dataclass(frozen=True)
@@ -53,6 +48,8 @@ class CollectSettings:
         grasps: Accepted grasps of each object.
         most_attempts: Upper limit of attempts at each object; None for 4 attempts per grasp, plus 10.
         attempt: Settings of the attempts; None for the rig's own.
+        rounds: Collect in rounds: one accepted grasp of each object, then the next round. Otherwise collect object by
+            object.
 
     >>> robot.CollectSettings(grasps=2).limit
     18
@@ -61,6 +58,7 @@ class CollectSettings:
     grasps: int = 44
     most_attempts: int | None = None
     attempt: AttemptSettings | None = None
+    rounds: bool = False
 
     def __post_init__(self) -> None:
         """Raise RobotConfigError for a number below 1."""
@@ -185,12 +183,15 @@ def _make_work(make_rig: RigMaker, seed: int, settings: AttemptSettings) -> Work
 
 def _recording_info(rig: Rig, seed: int, settings: CollectSettings, gate_name: str) -> dict[str, Any]:
     """Return the content of recording.json: the rig's info and all settings of the collection."""
+    collection = {"gate": gate_name, **asdict(settings), "most_attempts": settings.limit}
+    if not settings.rounds:
+        del collection["rounds"]
     info = {
         **rig.info,
         "seed": seed,
         "background": "before each grasp" if settings.attempt and "before" in settings.attempt.outputs else "none",
         "devices": rig.settings(),
-        "collection": {"gate": gate_name, **asdict(settings), "most_attempts": settings.limit},
+        "collection": collection,
     }
     try:
         return dict(json.loads(json.dumps(info, allow_nan=False)))
@@ -216,6 +217,7 @@ def _check_can_continue(folder: Path, expected: Mapping[str, Any], strict: bool)
         expected = {**expected, "software_version": software_version()}
     else:
         expected = {name: value for name, value in expected.items() if name != "devices"}
+    stored, expected = ({**info, "collection": {"rounds": False, **info["collection"]}} for info in (stored, expected))
     if "gels" not in stored:  # recordings of older versions
         expected = {name: value for name, value in expected.items() if name != "gels"}
     for name, value in _flatten(expected).items():
@@ -251,7 +253,7 @@ class _Collection:
         progress: Callable[[Progress], None] | None,
     ) -> None:
         self.writer, self.log, self.names, self.settings, self.gate = writer, log, names, settings, gate
-        _check_log(log, writer, names)
+        _check_log(log, writer, names, settings.rounds)
         self.tallies = {name: Tally(name) for name in names} | tally(log.attempts)
         self._seconds = log.attempts[-1].ended_s if log.attempts else 0.0
         self._pending: dict[str, deque[Callable[[], GraspAttempt]]] = defaultdict(deque)
@@ -259,32 +261,41 @@ class _Collection:
         self._start, self._done_at_start = time.monotonic(), self._count_done()
 
     def run(self, workers: WorkerPool[GraspAttempt]) -> None:
-        """Make and record all attempts, object by object; workers may work on later attempts that will be needed."""
+        """Make and record all attempts in order; workers may work on later attempts that will be needed."""
         self._record_skipped_objects()  # after a crash, the log may have an object that recording.json lacks
         self._report()
-        for name in self.names:
-            while self._needs_attempt(name):
-                self._submit_ahead(workers, name)
+        for target, name in self._turns():
+            while self._needs_attempt(name, target):
+                self._submit_ahead(workers, target, name)
                 self._record(self._pending[name].popleft()())
                 self._report()
-            self._pending.pop(name, None)  # attempts left over when an object is ungraspable
 
-    def _submit_ahead(self, workers: WorkerPool[GraspAttempt], name: str) -> None:
-        """Submit the attempts that are needed next, this object's first."""
-        later = self.names[self.names.index(name) :]
-        for object_id in later:
-            while self._needs_attempt(object_id, ahead=True):
+    def _turns(self) -> Iterator[tuple[int, str]]:
+        """Yield the accepted grasps that an object needs for the next turn, and the object."""
+        grasps = self.settings.grasps
+        for target in range(1, grasps + 1) if self.settings.rounds else (grasps,):
+            for name in self.names:
+                yield target, name
+
+    def _submit_ahead(self, workers: WorkerPool[GraspAttempt], target: int, name: str) -> None:
+        """Submit the attempts that are needed next, those of this turn first."""
+        later = itertools.dropwhile(lambda turn: turn != (target, name), self._turns())
+        for turn_target, object_id in later:
+            while self._needs_attempt(object_id, turn_target, ahead=True):
                 if sum(map(len, self._pending.values())) >= workers.window and self._pending[name]:
                     return
                 number = self.tallies[object_id].attempts + len(self._pending[object_id])
                 self._pending[object_id].append(workers.submit(object_id, number))
 
-    def _needs_attempt(self, name: str, ahead: bool = False) -> bool:
-        """Return whether another attempt is needed; with `ahead`, assume that all pending attempts are accepted."""
+    def _needs_attempt(self, name: str, target: int, ahead: bool = False) -> bool:
+        """Return whether the object needs another attempt until it has `target` accepted grasps.
+
+        With `ahead`, assume that all pending attempts are accepted.
+        """
         pending, counts = len(self._pending[name]) if ahead else 0, self.tallies[name]
         if counts.skipped is not None:
             return False
-        return counts.accepted + pending < self.settings.grasps and counts.attempts + pending < self.settings.limit
+        return counts.accepted + pending < target and counts.attempts + pending < self.settings.limit
 
     def _record(self, attempt: GraspAttempt) -> None:
         """Apply the gate, then write the attempt's log line and its grasp."""
@@ -305,6 +316,7 @@ class _Collection:
         self.tallies[attempt.object_id].add(logged)
         if attempt.outcome == UNGRASPABLE:
             self._record_skipped_objects()
+            del self._pending[attempt.object_id]
 
     def _record_skipped_objects(self) -> None:
         """Write the ungraspable objects, if any, to recording.json."""
@@ -322,8 +334,8 @@ class _Collection:
         return logged(accepted=accepted, grasp_id=grasp_id, score=score, fit=attempt.fit)
 
     def _count_done(self) -> int:
-        grasps_target = self.settings.grasps
-        return sum(self.tallies[name].accepted if self._needs_attempt(name) else grasps_target for name in self.names)
+        target = self.settings.grasps
+        return sum(self.tallies[name].accepted if self._needs_attempt(name, target) else target for name in self.names)
 
     def _report(self) -> None:
         if self._progress is None:
@@ -335,7 +347,7 @@ class _Collection:
         self._progress(
             Progress(
                 objects=len(tallies),
-                objects_done=sum(not self._needs_attempt(name) for name in self.names),
+                objects_done=sum(not self._needs_attempt(name, self.settings.grasps) for name in self.names),
                 grasps_target=grasps_target,
                 grasps_done=grasps_done,
                 accepted=sum(each.accepted for each in tallies),
@@ -345,15 +357,20 @@ class _Collection:
         )
 
 
-def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str]) -> None:
+def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str], rounds: bool) -> None:
     """Raise RecordingError unless the log contains every grasp, in the order of this collection."""
     logged = {attempt.grasp_id for attempt in log.attempts} - {None}
     if lost := writer.grasp_ids - logged:
         raise RecordingError(f"{log.folder}: attempts.jsonl lacks grasp {min(lost)}; restore it or give a new folder")
-    order = list(tally(log.attempts))
+    tallies = tally(log.attempts)
+    order = list(tallies)
     if order != list(names[: len(order)]):
         raise RecordingError(
             f"{log.folder} was collected with other objects ({', '.join(order[:3])}, ...); give the same or more"
+        )
+    if rounds and len(order) < len(names) and any(counts.accepted > 1 for counts in tallies.values()):
+        raise RecordingError(
+            f"{log.folder} was collected in rounds through {len(order)} objects, not {len(names)}; give the same ones"
         )
 
 
@@ -363,30 +380,3 @@ def grasp_id_of(object_id: str, number: int) -> str:
     if plain != object_id or not plain[0].isalnum():
         plain = f"x{zlib.crc32(object_id.encode()):08x}_{plain}"
     return f"{plain}-{number:04}"
-
-
-class RecordedTouches(Mapping[str, GraspFrames]):
-    """Each finger's frames as recorded, so the gate gets the same pixels as training; decoded on access."""
-
-    def __init__(self, images: Mapping[str, bytes]) -> None:
-        self._images = images
-        self._fingers = [match[1] for column in images if (match := _TOUCH.fullmatch(column))]
-
-    def __getitem__(self, finger: str) -> GraspFrames:
-        before, during, after = (self._decode(f"touch_{finger}{moment}") for moment in ("_before", "", "_after"))
-        if during is None:
-            raise KeyError(finger)
-        return GraspFrames(before, during, after)
-
-    def _decode(self, column: str) -> npt.NDArray[np.uint8] | None:
-        if column not in self._images:
-            return None
-        pixels = decode_picture(self._images[column])
-        assert pixels is not None, "it was encoded by robot.grasping.attempt"
-        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._fingers)
-
-    def __len__(self) -> int:
-        return len(self._fingers)

@@ -23,6 +23,13 @@ def collect(
     gate: Annotated[
         Path | None, typer.Option(help="grasp-success checkpoint (default: a rule on the contact area)")
     ] = None,
+    rounds: Annotated[
+        bool,
+        typer.Option(
+            "--rounds",
+            help="one accepted grasp of each object, then the next round, so that drift does not identify the object",
+        ),
+    ] = False,
     preview: Annotated[
         bool, typer.Option("--preview", help="write an overview image, OUT-preview.png (simulated rig only)")
     ] = False,
@@ -44,14 +51,15 @@ def collect(
 ) -> None:
     """Collect a recording with a rig; stay next to a real rig. Resumes a stopped run."""
     if dry_run:
-        ignored = {"gate": gate, "preview": preview, "photos_only": photos_only, "touches_only": touches_only}
+        ignored = {"gate": gate, "preview": preview, "rounds": rounds}
+        ignored |= {"photos_only": photos_only, "touches_only": touches_only}
         refuse_options("has no effect with --dry-run, which moves and records nothing; leave it out", **ignored)
         _print_motions(rig, objects, seed)
         return
     if photos_only or touches_only:
-        if (photos_only and touches_only) or gate or preview:
+        if (photos_only and touches_only) or gate or preview or rounds:
             raise BadInput(
-                "--photos-only and --touches-only cannot be combined with each other, with --gate or with --preview"
+                "--photos-only and --touches-only cannot be combined with each other, --gate, --preview or --rounds"
             )
         _collect_pictures("photo" if photos_only else "touch", rig, objects, out, seed, jobs)
         return
@@ -69,7 +77,12 @@ def collect(
     if preview:
         require_ours(sheet, PREVIEW)
     decide, gate_name = _load_gate(gate)
-    settings = CollectSettings(grasps=grasps)
+    settings = CollectSettings(grasps=grasps, rounds=rounds)
+    if rounds:
+        say(
+            f"{grasps} rounds through {objects} objects, one accepted grasp of each in a round; where a person changes "
+            "the objects, the rig requests another object after each accepted grasp"
+        )
     with announce_resume(f"the grasps so far are stored in {out}"), CountedBar("collect", "grasps") as bar:
         tallies = collect_grasps(
             partial(load_rig, rig, seed=seed),

@@ -74,16 +74,16 @@ class Attempt:
     """One closing of the gripper, successful or not.
 
     Attributes:
-        outcome: "held"; or the failure: "missed", "slipped", "no_plan", or "failed" for another one; "unknown" if
-            nothing is recorded.
+        outcome: "held", "missed", "slipped", "no_plan"; "failed" for another failure; "unknown" if not recorded.
         accepted: Whether a matcher is trained on it.
-        after: Frames after the lift, one file per finger in order, or empty.
+        after: Frames after the lift, one file per finger in order, or empty. `time_s`: since the recording began.
     """
 
     grasp: Grasp
     outcome: str
     accepted: bool
     after: tuple[Path, ...]
+    time_s: float | None
 
     @property
     def held(self) -> bool:
@@ -116,6 +116,7 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
             outcome=line.outcome or {None: "unknown", True: "held", False: "failed"}[line.grasped],
             accepted=line.grasped is not False,
             after=in_finger_order(line.touches_after),
+            time_s=line.time_s,
         )
         for line in recording.grasps
     ]
@@ -124,8 +125,7 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
 def load_attempts(folder: Path) -> list[Attempt]:
     """Read the successful AND the failed grasps of a recording, in the order of collection.
 
-    The result is `outcome`, or `grasped` without an outcome. Grasps with neither are left out, and so are plans
-    without a grasp. Raises DatasetError like `load_grasps`.
+    Grasps without `outcome` and `grasped`, and plans without a grasp, are left out. Raises DatasetError.
     """
     attempts = [attempt for attempt in load_all_attempts(folder) if attempt.outcome not in ("unknown", "no_plan")]
     if not attempts:

@@ -5,7 +5,8 @@ if this is at least 1/2. A learned gate is trained in `retrieval` and passed to 
 contacts, because it uses the images on which a matcher is trained later; therefore rejected grasps are recorded too.
 """
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -13,8 +14,10 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.errors import RobotConfigError, RobotError
+from robot.storage import decode_picture
 
 Picture = npt.NDArray[np.uint8]
+_TOUCH = re.compile(r"touch_([a-z])")
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +27,33 @@ class GraspFrames:
     before: Picture | None
     during: Picture
     after: Picture | None = None
+
+
+class RecordedTouches(Mapping[str, GraspFrames]):
+    """Each finger's frames as recorded, so the gate gets the same pixels as training; decoded on access."""
+
+    def __init__(self, images: Mapping[str, bytes]) -> None:
+        self._images = images
+        self._fingers = [match[1] for column in images if (match := _TOUCH.fullmatch(column))]
+
+    def __getitem__(self, finger: str) -> GraspFrames:
+        before, during, after = (self._decode(f"touch_{finger}{moment}") for moment in ("_before", "", "_after"))
+        if during is None:
+            raise KeyError(finger)
+        return GraspFrames(before, during, after)
+
+    def _decode(self, column: str) -> npt.NDArray[np.uint8] | None:
+        if column not in self._images:
+            return None
+        pixels = decode_picture(self._images[column])
+        assert pixels is not None, "it was encoded by robot.grasping.attempt"
+        return np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fingers)
+
+    def __len__(self) -> int:
+        return len(self._fingers)
 
 
 Gate = Callable[[Mapping[str, GraspFrames]], bool | float]

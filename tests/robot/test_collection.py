@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from robot.collection import CollectSettings, Progress, RecordedTouches, collect, grasp_id_of
+from robot.collection import CollectSettings, Progress, collect, grasp_id_of
 from robot.errors import DeviceError, RecordingError, RobotConfigError, StorageError, UngraspableError
 from robot.grasping.attempt import AttemptRunner, depth_in_mm
-from robot.grasping.gates import ContactAreaGate
+from robot.grasping.gates import ContactAreaGate, RecordedTouches
 from robot.grasping.planner import CylinderPlanner, GraspPlan
 from robot.grasping.settings import AttemptSettings, GraspSettings
 from robot.readings import RGBD, Pose
@@ -32,10 +32,12 @@ def unsynced(monkeypatch):
     monkeypatch.setattr("os.fsync", lambda descriptor: None)
 
 
-def run(out, names=NAMES, *, seed=3, rig_seed=None, faults=None, grasps=2, attempt=None, limit=None, **options):
+def run(
+    out, names=NAMES, *, seed=3, rig_seed=None, faults=None, grasps=2, attempt=None, limit=None, rounds=False, **options
+):
     """Collect with a fake rig and return the tallies by object."""
     make = functools.partial(FakeRig, seed if rig_seed is None else rig_seed, faults=faults)
-    settings = CollectSettings(grasps, limit, attempt or AttemptSettings())
+    settings = CollectSettings(grasps, limit, attempt or AttemptSettings(), rounds)
     tallies = collect(make, out, objects=names, seed=seed, settings=settings, **options)
     return {each.object_id: each for each in tallies}
 
@@ -236,6 +238,72 @@ def test_a_recording_without_gels_of_an_older_version_can_be_continued(tmp_path,
 
     collect(make_with_gels, tmp_path / "r", **(arguments | {"objects": ["round-0", "round-2"]}))
     assert {grasp.object_id for grasp in read_recording(tmp_path / "r").grasps} == {"round-0", "round-2"}
+
+
+# Rounds -----------------------------------------------------------------------------------------------------
+
+
+def objects_of_accepted(folder):
+    return [row["object_id"] for row in rows(folder) if row["grasped"]]
+
+
+def test_the_default_order_is_object_by_object_and_is_not_named_in_the_recording(tmp_path):
+    run(tmp_path / "r", grasps=3)
+    assert objects_of_accepted(tmp_path / "r") == [name for name in NAMES for _ in range(3)]
+    assert "rounds" not in read_recording(tmp_path / "r").info["collection"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_in_rounds_each_object_gets_one_accepted_grasp_and_then_the_next_round_begins(tmp_path, jobs):
+    """The grasps are those of the default order, because an attempt depends on seed, object and number only."""
+    run(tmp_path / "r", grasps=3, rounds=True, jobs=jobs)
+    run(tmp_path / "default", grasps=3)
+    assert objects_of_accepted(tmp_path / "r") == [*NAMES] * 3
+    changing = {"metadata.jsonl", "attempts.jsonl", "recording.json"}
+    pictures = [
+        {name: data for name, data in files(folder).items() if name not in changing}
+        for folder in (tmp_path / "r", tmp_path / "default")
+    ]
+    assert pictures[0] == pictures[1]
+
+
+def test_an_object_that_cannot_be_grasped_is_left_out_of_later_rounds(tmp_path):
+    tallies = run(tmp_path / "r", ["round-0", "wide-1", "round-2"], rounds=True, limit=4)
+    assert tallies["wide-1"].attempts == 4
+    assert objects_of_accepted(tmp_path / "r") == ["round-0", "round-2"] * 2
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_ungraspable_object_is_skipped_in_rounds_too(tmp_path, jobs):
+    settings = CollectSettings(2, None, AttemptSettings(), rounds=True)
+    tallies = collect(picky_rig, tmp_path / "r", objects=NAMES, seed=3, settings=settings, jobs=jobs)
+    assert [(each.accepted, each.skipped) for each in tallies] == [(2, None), (0, "too thin"), (2, None)]
+
+
+@pytest.mark.parametrize("stop", range(1, 9))
+def test_rounds_stopped_after_any_attempt_continue_to_the_same_bytes(tmp_path, stop):
+    def interrupted(now):
+        if now.attempts == stop:
+            raise KeyboardInterrupt
+
+    run(tmp_path / "whole", grasps=3, rounds=True)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path / "r", grasps=3, rounds=True, progress=interrupted)
+    run(tmp_path / "r", grasps=3, rounds=True, jobs=1)
+    assert files(tmp_path / "r") == files(tmp_path / "whole")
+
+
+def test_another_order_or_more_objects_in_later_rounds_are_refused(tmp_path):
+    run(tmp_path / "r", NAMES[:2], rounds=True)
+    run(tmp_path / "default", NAMES[:2])
+    before = files(tmp_path / "r")
+    with pytest.raises(RecordingError, match="was collected with rounds True, not False"):
+        run(tmp_path / "r", NAMES[:2])
+    with pytest.raises(RecordingError, match="was collected with rounds False, not True"):
+        run(tmp_path / "default", NAMES[:2], rounds=True)
+    with pytest.raises(RecordingError, match="in rounds through 2 objects, not 3; give the same ones"):
+        run(tmp_path / "r", rounds=True)
+    assert files(tmp_path / "r") == before
 
 
 # Calls of the devices ---------------------------------------------------------------------------------------

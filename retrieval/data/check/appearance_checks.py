@@ -6,7 +6,6 @@ these cases (the second one only if it concerns most touches). If all photos of 
 be found either, and no note reports it.
 """
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -19,7 +18,6 @@ from retrieval.data.check.appearance_statistics import (
     SmallImages,
     distance,
     exchanged_photos,
-    nearest_grasp_accuracy,
     swapped_fingers,
     swapped_moments,
 )
@@ -30,10 +28,6 @@ from retrieval.data.dataset import Grasp
 COMPARED_COPIES = "compared-copies"
 """Kind of the finding that reports how many pictures were compared for near copies."""
 _MIN_GRASPS = 4
-_MAX_BY_LIGHT, _MAX_BY_TOUCH = 0.35, 0.6
-"""Thresholds of (accuracy - chance) / (1 - chance) of a classifier that sees only the illumination: the first one on
-no-contact frames, the second one on the mean colour of touches. The mean colour depends a little on the touched object
-(0.2 to 0.35 on simulated recordings)."""
 
 
 def check_swapped_modalities(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
@@ -119,43 +113,6 @@ def check_moments(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Fi
             yield Finding("note", "unchecked-moments", text)
     names = [grasp.grasp_id for grasp in both if grasp.grasp_id in suspects]
     yield from findings_for("error", "swapped-moments", "touch and no-contact frame look swapped", names, both)
-
-
-def check_light(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:
-    """Find lamps or gels that changed from object to object, so that the illumination identifies the object."""
-    objects = np.unique([grasp.object_id for grasp in grasps], return_inverse=True)[1] if grasps else np.zeros(0, int)
-    repeated = Counter(objects.tolist())
-    if len(repeated) < 2 or max(repeated.values()) < 2:
-        yield Finding(
-            "note", "unchecked-light", "light that identifies the object cannot be checked: no object has two grasps"
-        )
-        return
-    has_before = all(len(grasp.backgrounds) == len(grasp.touches) for grasp in grasps)
-    # A no-contact frame that serves many grasps shows the light of one moment only.
-    has_before = has_before and len({records[one.backgrounds[0]].digest for one in grasps}) > len(grasps) / 2
-    fingers = range(min(len(grasp.touches) for grasp in grasps))
-    for moment, allowed in (("before", _MAX_BY_LIGHT), ("touch", _MAX_BY_TOUCH)):
-        if moment == "before" and not has_before:
-            yield Finding(
-                "note",
-                "unchecked-light",
-                "without a separate no-contact frame for every grasp, light that identifies the object is found only "
-                "if its effect is strong",
-            )
-            continue
-        frames = [_small(records, [_of(grasp, moment)[finger] for grasp in grasps]) for finger in fingers]
-        values = np.stack(frames, axis=1)
-        found = nearest_grasp_accuracy(values if moment == "before" else values.mean(axis=(2, 3)), objects)
-        if found.exceeds_chance(allowed):
-            what = "the no-contact frame" if moment == "before" else "the mean colour of the touch"
-            yield Finding(
-                "warning",
-                "light",
-                f"{what} is enough to identify the object in {found.accuracy:.0%} of {found.grasps} grasps (chance "
-                f"{found.chance:.0%}): light or gel changed from object to object, and a model can learn that instead "
-                "of touch; mix the objects while recording, and compare with the controls of `retrieve evaluate`",
-            )
-            return
 
 
 def check_exchanged_photos(grasps: Sequence[Grasp], records: ImageRecords) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Statistics of a recording's pictures: fingers, moments, light and photos that do not fit the others.
+"""Statistics of a recording's pictures: fingers, moments and photos that do not fit the others.
 
 The reference is always the recording itself: a minority is suspect. Some cases cannot be distinguished (similar gels,
 touches without contact, objects of one colour); these are only counted. Arrays contain small pictures (n, h, w, 3) of
@@ -76,48 +76,6 @@ def swapped_moments(before: SmallImages, during: SmallImages) -> MomentSwaps:
 def distance(images: SmallImages, centre: SmallImages) -> NDArray[np.float64]:
     """Return the root mean square difference (n,) of each image from `centre` (h, w, 3)."""
     return np.asarray(np.sqrt(np.mean((images - centre) ** 2, axis=(1, 2, 3), dtype=np.float64)))
-
-
-# Light -------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class NearestGraspAccuracy:
-    """Accuracy of identifying a grasp's object by the nearest other grasp.
-
-    Attributes:
-        accuracy: Fraction of grasps whose nearest other grasp has the same object.
-        chance: Expected fraction by chance.
-        grasps: Number of grasps.
-    """
-
-    accuracy: float
-    chance: float
-    grasps: int
-
-    def exceeds_chance(self, part: float) -> bool:
-        """Return whether accuracy is more than `part` of the way from chance to 1, and significantly above chance."""
-        deviation = np.sqrt(self.chance * (1 - self.chance) / max(self.grasps, 1))
-        threshold = max(part * (1 - self.chance), 5 * deviation)
-        return bool(self.grasps > 0 and self.accuracy > self.chance + threshold)
-
-
-def nearest_grasp_accuracy(values: NDArray[np.floating], objects: NDArray[np.int64]) -> NearestGraspAccuracy:
-    """Return how well values (n, k) of grasps identify their objects (n,), by the nearest other grasp."""
-    flat = values.reshape(len(values), -1).astype(np.float64)
-    flat = flat - flat.mean(axis=0)
-    squares = (flat**2).sum(axis=1)
-    correct = []
-    for row in range(len(flat)):
-        distances = squares - 2 * (flat @ flat[row])
-        distances[row] = np.inf
-        correct.append(objects[distances.argmin()] == objects[row])
-    others = np.bincount(objects)[objects] - 1
-    has_others = others > 0
-    if not has_others.any():
-        return NearestGraspAccuracy(0.0, 0.0, 0)
-    chance = others[has_others].mean() / (len(objects) - 1)
-    return NearestGraspAccuracy(float(np.mean(np.array(correct)[has_others])), float(chance), int(has_others.sum()))
 
 
 # Photos ------------------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import numpy as np
 
 from retrieval.console.output import abbreviate_list
 from retrieval.console.progress import Bar
-from retrieval.data.check import appearance_checks, known_problems
+from retrieval.data.check import appearance_checks, drift, known_problems
 from retrieval.data.check.findings import Finding, ImageRecord, ImageRecords, findings_for
 from retrieval.data.check.near_copies import thumbnail
 from retrieval.data.dataset import Attempt, Grasp, Split, load_all_attempts, require_accepted
@@ -79,16 +79,19 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
         known_problems.check_shared_backgrounds,
         known_problems.check_repeated_touches,
         appearance_checks.check_own_photo,
-        appearance_checks.check_light,
         appearance_checks.check_exchanged_photos,
     )
 
-    def unnamed() -> list[Grasp]:
-        named = {name for finding in findings for name in finding.grasps}
+    def unnamed(besides: str = "") -> list[Grasp]:
+        named = {name for finding in findings if finding.kind != besides for name in finding.grasps}
         return [grasp for grasp in readable if grasp.grasp_id not in named]
 
     for check in of_all + of_accepted:
         findings += check([one for one in unnamed() if check in of_all or one.grasp_id in trained_on], records)
+    place_of = {grasp.grasp_id: place for place, grasp in enumerate(_in_order_of_capture(attempts))}
+    # A recording without photos has the touch in place of the photo; its no-contact frames are checked all the same.
+    touched = [one for one in unnamed(besides="same-modality") if one.grasp_id in trained_on]
+    findings += drift.check_light(sorted(touched, key=lambda grasp: place_of[grasp.grasp_id]), records)
     remaining = [one for one in unnamed() if one.grasp_id in trained_on]
     findings += appearance_checks.check_near_copies(remaining, records, accepted)
     if split:
@@ -148,6 +151,13 @@ def require_fit(split: Split, grasps: Sequence[Grasp]) -> None:
 def _pictures(attempt: Attempt) -> tuple[Path, ...]:
     grasp = attempt.grasp
     return (grasp.photo, *grasp.touches, *grasp.backgrounds, *attempt.after)
+
+
+def _in_order_of_capture(attempts: Sequence[Attempt]) -> list[Grasp]:
+    """Return the grasps by their times if all are recorded, else in the order of the lines."""
+    if all(attempt.time_s is not None for attempt in attempts):
+        attempts = sorted(attempts, key=lambda attempt: attempt.time_s or 0.0)
+    return [attempt.grasp for attempt in attempts]
 
 
 def _read_pictures(attempts: Sequence[Attempt]) -> ImageRecords:
