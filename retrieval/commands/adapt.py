@@ -36,10 +36,13 @@ def adapt(
 ) -> None:
     """Fit a model to a new sensor and your own objects. Takes minutes on two cores."""
     from retrieval.adaptation.recipe import adapt as fit
+    from retrieval.data.check.recording import check_gel_layout
     from retrieval.search import defaults
 
     if report:
         require_ours(report / "curve.md", TEXT)
+    for finding in check_gel_layout(recording):
+        say(f"{finding.severity}: {finding.message}")
     result = fit(recording, out, model, init=init, split=read_split(split), report=report, cache=cache, seed=seed)
     defaults.remember("model", out)
     for line in result.lines():

@@ -43,10 +43,14 @@ def import_(
     if source is None or out is None:
         raise BadInput(f"an import needs a source folder and --out; run: retrieve import {name} SRC --out recording/")
     recording = run_importer(name, source, out, **options)
+    from retrieval.data.check.recording import check_gel_layout
+
     for note in recording.notes:
         say(note)
     objects = len({grasp.object_id for grasp in recording.grasps})
     say(f"{out}: {len(recording.grasps)} grasps of {objects} objects")
+    for finding in check_gel_layout(out):
+        say(f"{finding.severity}: {finding.message}")
 
 
 def run_importer(name: str, source: Path, out: Path, **options: Any) -> "Recording":

@@ -6,6 +6,7 @@ concerns appearance, or something missing: inspect the recording. A NOTE reports
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from concurrent.futures import ThreadPoolExecutor
 from hashlib import sha256
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 from retrieval.console.output import abbreviate_list
 from retrieval.console.progress import Bar
 from retrieval.data.check import appearance_checks, drift, known_problems
+from retrieval.data.check.colour_layout import COLOUR_LAYOUT, check_colour_layout
 from retrieval.data.check.findings import Finding, ImageRecord, ImageRecords, findings_for
 from retrieval.data.check.near_copies import thumbnail
 from retrieval.data.dataset import Attempt, Grasp, Split, load_all_attempts, require_accepted
@@ -71,6 +73,7 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
         _same_images,
         known_problems.check_dead_frames,
         appearance_checks.check_swapped_modalities,
+        check_colour_layout,  # before check_fingers, which takes exchanged channels of one finger for another finger
         appearance_checks.check_fingers,
         appearance_checks.check_moments,
     )
@@ -92,13 +95,30 @@ def check_recording(folder: Path, split: Split | None = None) -> list[Finding]:
     # A recording without photos has the touch in place of the photo; its no-contact frames are checked all the same.
     touched = [one for one in unnamed(besides="same-modality") if one.grasp_id in trained_on]
     findings += drift.check_light(sorted(touched, key=lambda grasp: place_of[grasp.grasp_id]), records)
-    remaining = [one for one in unnamed() if one.grasp_id in trained_on]
+    # A mirrored image may be a near copy, too.
+    remaining = [one for one in unnamed(besides=COLOUR_LAYOUT) if one.grasp_id in trained_on]
     findings += appearance_checks.check_near_copies(remaining, records, accepted)
     if split:
         findings += check_split(accepted, split)
         readable_accepted = [grasp for grasp in readable if grasp.grasp_id in trained_on]
         findings += known_problems.check_sequences_in_training(readable_accepted, split, records)
     return sorted(findings, key=lambda finding: finding.severity == "note")
+
+
+def check_gel_layout(folder: Path) -> list[Finding]:
+    """Return the findings of `check_colour_layout`; only the gel images are read.
+
+    Args:
+        folder: Folder of the recording.
+
+    Raises:
+        DatasetError: The recording cannot be read.
+    """
+    attempts = load_all_attempts(folder)
+    gels = {one.grasp.grasp_id: (*one.grasp.touches, *one.grasp.backgrounds) for one in attempts}
+    records = _read(sorted({path for paths in gels.values() for path in paths}), set(), set())
+    grasps = [one.grasp for one in attempts if not any(records[path].error for path in gels[one.grasp.grasp_id])]
+    return list(check_colour_layout(grasps, records))
 
 
 def check_split(grasps: Sequence[Grasp], split: Split) -> Iterable[Finding]:
@@ -164,6 +184,11 @@ def _read_pictures(attempts: Sequence[Attempt]) -> ImageRecords:
     files = sorted({path for attempt in attempts for path in _pictures(attempt)})
     photos = {attempt.grasp.photo for attempt in attempts}
     copied = {path for one in attempts if one.accepted for path in (one.grasp.photo, *one.grasp.touches)}
+    return _read(files, photos, copied)
+
+
+def _read(files: Sequence[Path], photos: AbstractSet[Path], copied: AbstractSet[Path]) -> ImageRecords:
+    """Read pictures; those of `photos` are also stored as photos, those of `copied` also as thumbnails."""
 
     def read(path: Path) -> ImageRecord:
         try:
