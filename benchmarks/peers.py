@@ -22,10 +22,11 @@ import numpy as np
 
 import indexes
 from benchmarks.common import ResultLine, as_text, in_turns
-from indexes.kinds.faiss_index import faiss, faiss_call
+from indexes.kinds.faiss_index import faiss_call, load_faiss
 from indexes.kinds.measure import sample_queries
 from indexes.kinds.scores import Floats, Slots, scan
 
+faiss = load_faiss()
 DIM, QUERIES, BEST, RECALL = 64, 100, 10, 0.99
 LINKS, BREADTH = 32, 80
 """Of every graph: neighbours of a node, and the number of nodes visited during insertion."""

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.common import ResultLine, as_text, duration, in_turns, matcher_of, random_images
-from retrieval.data.dataset import PairBatch
+from retrieval.data.pairs import PairBatch
 from retrieval.model.config import Config
 from retrieval.model.encode import to_batch, touch_batch
 from retrieval.training.step import WeightedLosses, batch_loss

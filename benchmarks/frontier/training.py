@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from retrieval.data.dataset import PairBatch, PairSampler
+from retrieval.data.pairs import PairBatch, PairSampler
 from retrieval.frontier.clock import time_points
 from retrieval.frontier.pixels import load_touch
 from retrieval.frontier.points import ApproximationResult, Panel, Tradeoff, smallest_error

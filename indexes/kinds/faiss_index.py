@@ -6,16 +6,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
 
-import faiss as _faiss
 import numpy as np
 
 from indexes.errors import CorruptIndex, EngineError
 from indexes.kinds.checks import check_slots
 from indexes.kinds.scores import Doubles, Floats, Mask, Slots, error_bound, grid_scores, scan, to_grid, top_k
 from indexes.kinds.vector_index import VectorIndex
-
-faiss: Any = _faiss
-"""The library, untyped: its stubs are incomplete."""
 
 FETCH_FACTOR = 4
 """Growth of the number of candidates from one round to the next."""
@@ -24,9 +20,17 @@ ADDED_ROWS = 1 << 16
 """Vectors passed to FAISS at once."""
 
 
+def load_faiss() -> Any:
+    """Return the library, untyped: its stubs are incomplete. The slow import happens on the first call."""
+    import faiss
+
+    return faiss
+
+
 @contextmanager
 def faiss_call(doing: str, threads: int | None) -> Iterator[None]:
     """Run FAISS with `threads` threads (None: its own setting), and convert its exceptions to `EngineError`."""
+    faiss = load_faiss()
     before = faiss.omp_get_max_threads()
     if threads is not None:
         faiss.omp_set_num_threads(threads)
@@ -147,7 +151,7 @@ class FaissIndex(VectorIndex):
     def _extend_structure(self) -> None:
         if self._structure.ntotal < self.count:
             with faiss_call(f"copying {self.kind}", None):
-                self._structure = faiss.clone_index(self._structure)  # a copy of this index may use it too
+                self._structure = load_faiss().clone_index(self._structure)  # a copy of this index may use it too
             self._add_missing()
 
     def _add_missing(self) -> None:
@@ -158,9 +162,10 @@ class FaissIndex(VectorIndex):
 
     def _write(self, path: Path) -> None:
         with faiss_call(f"writing {path}", None):
-            faiss.write_index(self._structure, str(path))
+            load_faiss().write_index(self._structure, str(path))
 
     def _read(self, path: Path) -> None:
+        faiss = load_faiss()
         try:
             structure = faiss.read_index(str(path))
         except Exception as error:

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from indexes.kinds import vector_index
-from indexes.kinds.faiss_index import FaissIndex, faiss
+from indexes.kinds.faiss_index import FaissIndex, load_faiss
 from indexes.kinds.scores import Floats, Slots
+
+faiss = load_faiss()
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,10 @@ import numpy as np
 
 from indexes.errors import ParameterError
 from indexes.kinds import vector_index
-from indexes.kinds.faiss_index import FaissIndex, faiss
+from indexes.kinds.faiss_index import FaissIndex, load_faiss
 from indexes.kinds.scores import Floats, Slots
+
+faiss = load_faiss()
 
 POINTS_PER_CENTRE = 39
 """Smallest number of training points of each centre that FAISS accepts without a warning."""

@@ -4,7 +4,9 @@ Results go to stdout, everything else to stderr. Exit codes: 0 done, 1 the job r
 The function of a command can also be called from Python; its docstring is the help text.
 """
 
+import atexit
 import errno
+import gc
 import os
 import signal
 import sys
@@ -78,6 +80,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: Words after the program name; None for those of `sys.argv`.
     """
+    if argv is None:  # the process ends with the command: its end need not search all objects for reference cycles
+        atexit.register(gc.freeze)
     # A stream that the shell closed (`2>&-`) is None, and printing to None prints to stdout.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115

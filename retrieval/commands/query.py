@@ -7,9 +7,11 @@ import typer
 
 from retrieval.commands.options import COUNT, FRACTION, Index, IndexModel, Json, NoVerify, OptionValues
 from retrieval.console.files import PAGE, require_folder, require_ours, text_bytes, write_output
+from retrieval.console.memory import paused_collection
 from retrieval.console.output import print_json, say
 
 
+@paused_collection()
 def query(
     *,
     gelsight: Annotated[

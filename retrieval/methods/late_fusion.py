@@ -16,8 +16,9 @@ from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher, score_partials
 from retrieval.training.features import Features
+from retrieval.training.initial_weights import build_matcher
 from retrieval.training.state import finish_training, unfinished_path
-from retrieval.training.train import Trainer, build_matcher
+from retrieval.training.train import Trainer
 
 SOURCE = "features of a recording"
 """Training source in the checkpoint's provenance."""

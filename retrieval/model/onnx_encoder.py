@@ -166,8 +166,13 @@ def with_checksum(model: bytes) -> bytes:
     `metadata_props` is field 14 of ONNX's ModelProto. A map entry has its key in field 1 and its value in field 2. A
     protocol buffer merges fields that are appended to it.
     """
+    return model + _seal(model)
+
+
+def _seal(model: bytes | memoryview) -> bytes:
+    """Return the metadata entry with the SHA-256 of a model."""
     entry = _field(1, SEAL) + _field(2, hashlib.sha256(model).hexdigest().encode())
-    return model + _field(14, entry)
+    return _field(14, entry)
 
 
 def read_checked_export(path: Path, owners: Sequence[int] = ()) -> bytes:
@@ -180,7 +185,7 @@ def read_checked_export(path: Path, owners: Sequence[int] = ()) -> bytes:
         raise CheckpointError(str(error)) from error
     except OSError as error:
         raise CheckpointError(f"{path} cannot be read ({error.strerror})") from error
-    if len(data) <= _SEAL_BYTES or with_checksum(data[:-_SEAL_BYTES]) != data:
+    if len(data) <= _SEAL_BYTES or _seal(memoryview(data)[:-_SEAL_BYTES]) != data[-_SEAL_BYTES:]:
         raise CheckpointError(f"{path} is damaged, or not a file of `retrieve export`")
     return data
 

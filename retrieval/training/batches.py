@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Grasp, ImageCache, PairBatch
+from retrieval.data.dataset import Grasp, ImageCache
 from retrieval.data.loading import TimedFunction, map_in_order, worker_count, worker_pool
+from retrieval.data.pairs import PairBatch
 from retrieval.errors import DatasetError, JobInterrupted
 from retrieval.model.config import Config
 from retrieval.model.encode import Image, autocast, one_thread, photo_features, to_batch, touch_batch, touch_features

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from retrieval.data.dataset import PairBatch
+from retrieval.data.pairs import PairBatch
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses import LOSSES
 from retrieval.model.losses.loss import EncodedBatch, Loss

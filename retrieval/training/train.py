@@ -9,7 +9,6 @@ import math
 import threading
 import time
 from concurrent.futures import Future
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from retrieval.data.check.recording import require_fit
 from retrieval.data.dataset import (
     AnyRecording,
     Grasp,
-    PairSampler,
     Split,
     data_digest,
     finger_count,
@@ -35,6 +33,7 @@ from retrieval.data.dataset import (
 )
 from retrieval.data.labelled_pictures import pair_by_label
 from retrieval.data.loading import prefetch, worker_count
+from retrieval.data.pairs import PairSampler
 from retrieval.errors import CheckpointError, ConfigError, JobInterrupted
 from retrieval.metrics.pairs import fit_calibration, pair_accuracy, pair_auc
 from retrieval.model.checkpoint import (
@@ -48,13 +47,12 @@ from retrieval.model.config import Config, TrainingConfig, named_config
 from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.tower import Tower
-from retrieval.model.towers.weights import initialise_tower
-from retrieval.search.defaults import shipped_model
 from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
 from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import Features, features_by_image
 from retrieval.training.fit import RATE, Plan, fit
+from retrieval.training.initial_weights import build_matcher
 from retrieval.training.state import code_digest, load_state, require_no_unfinished_state, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
 from retrieval.training.verdicts import with_verdicts
@@ -367,50 +365,6 @@ def labelled_pairs(config: Config) -> list[Grasp]:
     """Return the grasps of the configured folders of labelled pictures; empty without such folders."""
     photos, touches = config.training.photos, config.training.touches
     return pair_by_label(Path(photos), Path(touches), config.matcher.fingers) if photos else []
-
-
-def build_matcher(config: Config) -> Matcher:
-    """Return a matcher with the configured initial weights in both towers."""
-    settings, matcher = config.training, Matcher(config.matcher, len(config.preprocessing.views))
-    for tower, init, side in (
-        (matcher.touch_tower, settings.init_touch, "touch_tower"),
-        (matcher.photo_tower, settings.init_photo, "photo_tower"),
-    ):
-        shipped = partial(_shipped_tower, config.matcher.fingers, side)
-        initialise_tower(tower, settings.tower_init(init), shipped)
-    if settings.start:
-        _start_from(matcher, Path(settings.start))
-    for tower in (matcher.touch_tower, matcher.photo_tower):
-        tower.requires_grad_(not settings.freeze_towers)
-        distributed.synchronize_batch_norm(tower)
-    return matcher
-
-
-def _start_from(matcher: Matcher, path: Path) -> None:
-    """Copy the weights of a checkpoint into a matcher.
-
-    Layers that only one of the two has keep their initial weights: the candidate encoder, the gel head, the layers of
-    cells.
-
-    Raises:
-        CheckpointError: The checkpoint cannot be read, or one of its layers has another size.
-    """
-    ours, theirs = matcher.state_dict(), load_checkpoint(path).matcher.state_dict()
-    shared = {name: tensor for name, tensor in theirs.items() if name in ours}
-    for name, tensor in shared.items():
-        if tensor.shape != ours[name].shape:
-            raise CheckpointError(
-                f"{path} cannot start this training: {name} is {tuple(tensor.shape)}, must be "
-                f"{tuple(ours[name].shape)}; "
-                "use the configuration of that checkpoint, or another checkpoint"
-            )
-    matcher.load_state_dict(shared, strict=False)
-
-
-def _shipped_tower(fingers: int, side: str) -> dict[str, Tensor]:
-    checkpoint = load_checkpoint(shipped_model(min(fingers, 2)))
-    tower: nn.Module = getattr(checkpoint.matcher, side)
-    return tower.state_dict()
 
 
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:

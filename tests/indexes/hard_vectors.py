@@ -61,7 +61,7 @@ def _nan_vector() -> HardCase:
 
 
 def _nan_query() -> HardCase:
-    from indexes.kinds.faiss_index import faiss
+    import faiss
 
     query = np.full((1, 3), np.nan, np.float32)
     structure = faiss.IndexFlatIP(3)
@@ -127,7 +127,7 @@ def _ties_at_the_last_rank() -> HardCase:
 
 
 def _more_than_there_are() -> HardCase:
-    from indexes.kinds.faiss_index import faiss
+    import faiss
 
     structure = faiss.IndexFlatIP(3)
     structure.add(_axes())

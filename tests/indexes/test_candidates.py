@@ -5,12 +5,18 @@ import pytest
 
 from indexes import KINDS, load_kind
 from indexes.errors import VectorError
-from indexes.kinds import faiss_index
+from indexes.kinds import faiss_index, flat
 from indexes.store.folder import IndexStore
 from tests.indexes.test_store import unit
 
 N, D = 1500, 16
 EXACT = [kind for kind in KINDS if load_kind(kind).exact]
+
+
+@pytest.fixture(params=["numpy", "FAISS"], autouse=True)
+def library(request, monkeypatch):
+    """The library that scores vectors for `flat`: numpy in small indexes, FAISS in others."""
+    monkeypatch.setattr(flat, "MAX_NUMPY_SCORES", 5 * N if request.param == "numpy" else 0)
 
 
 @pytest.fixture(scope="module")

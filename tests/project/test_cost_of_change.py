@@ -16,7 +16,7 @@ from indexes.kinds.exact import ExactIndex
 from retrieval import frontier
 from retrieval.commands import main as command_line
 from retrieval.data import views
-from retrieval.data.dataset import PairBatch
+from retrieval.data.pairs import PairBatch
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.evaluation.real import PROTOCOLS
 from retrieval.evaluation.real.protocol import Protocol, topn_accuracy

@@ -104,7 +104,7 @@ class Tower(nn.Module):
         if not self.cells:
             return self._encode(images)
         features, maps = self._encode_with_map(images)
-        cells = nn.functional.adaptive_avg_pool2d(maps.float(), self.cells)  # (B, C, cells, cells)
+        cells = _grid_means(maps.float(), self.cells)
         return torch.cat([features, cells.flatten(2).transpose(1, 2).flatten(1)], dim=1)
 
     def _encode_with_map(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -125,6 +125,14 @@ class Tower(nn.Module):
     def rename_state(state: State) -> State:
         """Map the keys of a known older layout to the current one; by default the identity."""
         return state
+
+
+def _grid_means(maps: Tensor, cells: int) -> Tensor:
+    """Return the means (B, C, cells, cells) of maps (B, C, H, W) over the cells of a grid."""
+    height, width = (int(side) for side in maps.shape[2:])
+    if height % cells or width % cells:
+        return nn.functional.adaptive_avg_pool2d(maps, cells)  # the ONNX exporter lacks this one
+    return nn.functional.avg_pool2d(maps, (height // cells, width // cells))
 
 
 class TowerFamily(Tower, ABC):

@@ -36,7 +36,7 @@ from retrieval.model.towers import build_tower
 from retrieval.model.towers.small import SmallTower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.features import Features
-from retrieval.training.train import build_matcher
+from retrieval.training.initial_weights import build_matcher
 
 
 @pytest.fixture

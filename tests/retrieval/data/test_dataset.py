@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from retrieval.data.dataset import (
     Grasp,
     ImageCache,
-    PairSampler,
     Split,
     data_digest,
     finger_count,
@@ -23,6 +22,7 @@ from retrieval.data.dataset import (
     make_split,
     recording_source,
 )
+from retrieval.data.pairs import PairSampler
 from retrieval.errors import DatasetError
 from robot.recording.folder import read_recording
 from tests import synthetic

@@ -7,8 +7,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import pytest
 import torch
 
-from retrieval.data.dataset import PairSampler, load_grasps
+from retrieval.data.dataset import load_grasps
 from retrieval.data.loading import map_in_order, prefetch, worker_count
+from retrieval.data.pairs import PairSampler
 from retrieval.errors import ConfigError
 from retrieval.model.config import Config, load_config
 from retrieval.training.batches import TrainedFeatures

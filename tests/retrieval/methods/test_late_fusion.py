@@ -14,8 +14,9 @@ from retrieval.methods.retrieve_rerank import RetrieveRerank, nearest_photos
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.encode import one_thread
 from retrieval.training.features import Features, encode_recording
+from retrieval.training.initial_weights import build_matcher
 from retrieval.training.state import state_path, unfinished_path
-from retrieval.training.train import Trainer, build_matcher, train
+from retrieval.training.train import Trainer, train
 from tests.conftest import TINY
 
 FROZEN = dataclasses.replace(TINY, training=dataclasses.replace(TINY.training, freeze_towers=True))

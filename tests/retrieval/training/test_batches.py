@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from retrieval.data.dataset import PairSampler, load_grasps
+from retrieval.data.dataset import load_grasps
+from retrieval.data.pairs import PairSampler
 from retrieval.model.fusion import Matcher
 from retrieval.model.losses.match import match_loss
 from retrieval.training.batches import TrainedFeatures

@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from retrieval.commands.main import main
-from retrieval.data.dataset import PairSampler, load_grasps
+from retrieval.data.dataset import load_grasps
+from retrieval.data.pairs import PairSampler
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput, ConfigError, DatasetError
 from retrieval.model.checkpoint import read_tensors

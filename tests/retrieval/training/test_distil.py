@@ -17,7 +17,7 @@ from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import Matcher
 from retrieval.training import distil
 from retrieval.training.features import encode_recording
-from retrieval.training.train import build_matcher
+from retrieval.training.initial_weights import build_matcher
 from tests.conftest import TINY
 
 HIDDEN = 16

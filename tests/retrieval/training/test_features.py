@@ -18,7 +18,7 @@ from retrieval.training.features import (
     low_pass,
     photo_margin,
 )
-from retrieval.training.train import build_matcher
+from retrieval.training.initial_weights import build_matcher
 from tests.conftest import TINY
 
 

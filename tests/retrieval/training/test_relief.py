@@ -15,8 +15,8 @@ from retrieval.errors import CheckpointError, ConfigError, DatasetError
 from retrieval.model.checkpoint import read_tensors
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.training import relief
+from retrieval.training.initial_weights import build_matcher
 from retrieval.training.relief import augment, centre_crop, train_relief
-from retrieval.training.train import build_matcher
 
 CONFIG = Config(
     MatcherConfig(tower="small", tower_output="pooled", hidden=8),

@@ -13,7 +13,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from retrieval.data.dataset import PairSampler, Split, load_grasps, make_split
+from retrieval.data.dataset import Split, load_grasps, make_split
+from retrieval.data.pairs import PairSampler
 from retrieval.errors import CheckpointError, ConfigError, DatasetError, JobInterrupted
 from retrieval.model.checkpoint import load_checkpoint, read_tensors
 from retrieval.model.fusion import Matcher
@@ -22,9 +23,10 @@ from retrieval.model.losses.listwise import listwise_loss
 from retrieval.model.losses.loss import Loss
 from retrieval.model.losses.match import match_loss
 from retrieval.training.batches import FrozenFeatures, TrainedFeatures
+from retrieval.training.initial_weights import build_matcher
 from retrieval.training.state import state_path
 from retrieval.training.step import WeightedLosses, batch_loss, shuffle_fingers
-from retrieval.training.train import Trainer, build_matcher, set_training_mode, train
+from retrieval.training.train import Trainer, set_training_mode, train
 from tests.conftest import TINY
 from tests.labelled_pictures import label_recording
 from tests.waiting import run_process, wait_until
@@ -406,10 +408,12 @@ import sys, torch
 from pathlib import Path
 from retrieval.training import distributed
 from retrieval.training.batches import TrainedFeatures
-from retrieval.data.dataset import PairSampler, load_grasps
+from retrieval.data.dataset import load_grasps
+from retrieval.data.pairs import PairSampler
 from retrieval.model.losses.contrastive import contrastive_loss
 from retrieval.training.step import WeightedLosses, batch_loss
-from retrieval.training.train import build_matcher, set_training_mode
+from retrieval.training.initial_weights import build_matcher
+from retrieval.training.train import set_training_mode
 from tests.conftest import TINY
 from tests.labelled_pictures import label_recording
 from tests.retrieval.training.test_train import with_training
