@@ -77,7 +77,7 @@ by objects is in `splits/<name>.json`, for `--split`. Some importers need packag
 
 The data sets are not ours. Their own pages state the licence, which binds you and not us. If parts of a layout are not
 verified, the importer follows the authors' descriptions and other people's readers, and lists these parts when it ends.
-The [glossary](glossary.md#training-and-evaluation) defines the controls that the notes name.
+[Real data](real.md#what-counts-as-touch) defines the controls that the notes name.
 
 """
 

@@ -40,7 +40,7 @@
     [planner]                                 # the grasp planner (robot.grasping.planner)
     name = "cylinder"                         # its other keys are the planner's settings
 
-The limits do not apply to homing, which has the gripper's own speed. With a manual arm, the limits apply only to the
+The limits do not apply to homing, which has the gripper's own speed. A manual arm's limits apply only to the
 requested poses and speeds. Sawyer's slow /robot/state may be up to 2 s old, or `state_age_s` if that is longer. Paths
 are relative to the working directory of the process that reads the file. Unknown keys are errors.
 """

@@ -2,7 +2,7 @@
 
 Three additions make it a strong baseline: a ridge (with fewer grasps than features the plain method fits any noise with
 correlation 1), dimensions weighted by rho^p (Gong et al., IJCV 2014: a plain cosine would give noise dimensions full
-weight), and settings chosen by ranking on validation objects. All computations are in float64, from the singular value
+weight), and settings chosen by ranking on validation objects. The fit is in float64, from the singular value
 decomposition of the centred data. Only `leading_svd` uses X'X, which squares the condition number.
 """
 

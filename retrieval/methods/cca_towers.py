@@ -208,7 +208,7 @@ def select_settings(
 ) -> CcaSelection:
     """Choose the settings that rank photos of held-out objects best; among ties, the largest.
 
-    Only the reduction to the widest directions also uses the held-out grasps; it does not use their objects.
+    Only the reduction to the widest directions also sees the held-out grasps, but no object ids.
 
     Args:
         features: Features of grasps.

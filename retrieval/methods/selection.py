@@ -39,7 +39,7 @@ def ranking_auc(
         excluded: (T, N) photos of the row's own grasps, which are ignored unless the object has no other.
 
     Raises:
-        NumericalError: A score is not finite. A NaN would count as the lower score.
+        NumericalError: A score is not finite. A NaN would count as the higher one.
     """
     bad = np.flatnonzero(~np.isfinite(scores).all(axis=1))
     if len(bad):

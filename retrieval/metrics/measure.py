@@ -91,7 +91,7 @@ def weight_below(
     """Return the weight (V,) of the `others` below each of `values`; equal ones count half (Mann and Whitney).
 
     With weights that sum to 1, or divided by the number of others, the mean over values is the AUC. Scores must be
-    finite: a NaN exceeds nothing.
+    finite: a NaN is sorted as the highest.
 
     Args:
         values: (V,) scores.

@@ -43,8 +43,8 @@ DATA_SET = DataSet(
     caveats=(
         "There are no photos: the gel image itself replaces each photo. Do not train a matcher on it.",
         "The videos of a part were made one after the other, and light and gel drift: the no-contact frame alone "
-        "identifies the part far above chance. Print this control, and results with the contact difference (touch "
-        "minus no-contact frame) on one common no-contact frame.",
+        "identifies the part far above chance. Print this control, and results with each touch minus its "
+        "no-contact frame, added to one common no-contact frame.",
         "Videos were made in two sessions: those of 50 frames have another light than those of 126 frames.",
         "Frames of one video are nearly the same: hold out whole videos, which are the sequences.",
     ),

@@ -53,7 +53,7 @@ _TABLE = tuple(map(_table_row, range(256)))
 
 
 def checksum(data: bytes | bytearray, start: int = 0xFFFF) -> int:
-    """Return the checksum of `data`: 0 if it includes the packet's own. Unlike CCITT, the register shifts right."""
+    """Return the checksum of `data`: 0 if `data` ends with a valid one. Unlike CCITT, the register shifts right."""
     value = start
     for byte in data:
         value = _TABLE[(value ^ byte) & 0xFF] ^ (value >> 8)
@@ -87,7 +87,7 @@ def _after_zeros(value: int, count: int) -> int:
 
 
 def _zeros(max_count: int) -> tuple[tuple[int, ...], ...]:
-    """Return a row for each count of zero bytes: the checksums after them, from each checksum with one bit set."""
+    """Return rows: row n has the checksum of each single bit of a start value, after n zero bytes."""
     columns = [tuple(1 << bit for bit in range(16))]
     for _ in range(max_count):
         columns.append(tuple(_TABLE[value & 0xFF] ^ (value >> 8) for value in columns[-1]))
