@@ -82,7 +82,7 @@ def _rotations(touch: Matrix, photo: Matrix) -> tuple[Matrix, Matrix]:
     # Centring removes one dimension of the rows; the smaller view's directions also limit the components.
     limit = min(COMPONENTS[-1], touch.shape[1], photo.shape[1], len(touch) - 1)
     with warnings.catch_warnings():
-        # It warns of directions of nearly equal covariance: any is valid; validation chooses how many are used.
+        # Nearly equal covariances converge slowly: any direction is valid; validation chooses how many are used.
         warnings.simplefilter("ignore", ConvergenceWarning)
         model = PLSCanonical(limit, scale=False).fit(touch, photo)
     return model.x_rotations_, model.y_rotations_

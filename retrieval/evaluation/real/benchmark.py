@@ -357,7 +357,6 @@ class _ProtocolRun:
             quiet=True,
             fit_on_validation=True,
             kind_of=self.facts.kind_of,
-            matcher=towers.matcher,
         )
         protocol = self.protocol
         cache_key = experiment.cache_key(condition.method, seed) | {

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from retrieval.data.dataset import Grasp, finger_count
 from retrieval.errors import DatasetError
+from retrieval.methods import METHODS
 from retrieval.methods.late_fusion import frozen_matcher
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.config import Config
@@ -162,9 +163,14 @@ class Condition:
 
     def features(self) -> Features:
         """Return the features to fit and score on."""
-        towers = self.row.towers
         if self.kind == "order":
-            return with_clock_touches(towers.features())
+            return with_clock_touches(self._tower_features())
         if self.kind == "background":
-            return towers.features(photo_variant="margin")
-        return towers.features({"low_pass": "low_pass", "no_contact": "no_contact"}.get(self.kind, "touch"))
+            return self._tower_features(photo_variant="margin")
+        return self._tower_features({"low_pass": "low_pass", "no_contact": "no_contact"}.get(self.kind, "touch"))
+
+    def _tower_features(self, touch_variant: str = "touch", photo_variant: str = "photo") -> Features:
+        """Return the features of the towers as the method takes them: without cells, or with them."""
+        towers = self.row.towers
+        features = towers.features(touch_variant, photo_variant)
+        return features if METHODS.load(self.method).uses_cells else features.pooled(towers.matcher)

@@ -87,7 +87,7 @@ def _after_zeros(value: int, count: int) -> int:
 
 
 def _zeros(max_count: int) -> tuple[tuple[int, ...], ...]:
-    """Return rows: row n has the checksum of each single bit of a start value, after n zero bytes."""
+    """Return rows: entry b of row n is the checksum of n zero bytes from start value 1 << b."""
     columns = [tuple(1 << bit for bit in range(16))]
     for _ in range(max_count):
         columns.append(tuple(_TABLE[value & 0xFF] ^ (value >> 8) for value in columns[-1]))
