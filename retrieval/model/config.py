@@ -140,6 +140,8 @@ class TrainingConfig:
             towers are trained.
         freeze_batch_norm: Keep the batch statistics of the initial weights.
         freeze_towers: Train only the layers after the towers. Every image is then encoded once per training run.
+        freeze_stem: Keep the first layers of the towers (`Tower.stem_layers`) frozen if the towers are trained. Their
+            maps of every image are then computed once per training run, which makes a step several times faster.
         distil_steps: Steps that distil the candidate encoder after training (`retrieval.training.distil`).
         validation_fraction: Fraction of the objects that are validation objects.
         test_fraction: Fraction of the objects that are test objects.
@@ -169,6 +171,7 @@ class TrainingConfig:
     negatives: str = "auto"
     freeze_batch_norm: bool = False
     freeze_towers: bool = False
+    freeze_stem: bool = False
     distil_steps: Count = 600
     validation_fraction: Fraction = 0.1
     test_fraction: Fraction = 0.184
@@ -252,9 +255,11 @@ WEIGHT_SUFFIX = "_weight"
 SCHEDULES: dict[str, Callable[[int, int], float]] = {
     "constant": lambda step, steps: 1.0,
     "cosine": lambda step, steps: 0.5 * (1 + math.cos(math.pi * step / steps)),
+    "warmup": lambda step, steps: min(1.0, 20 * (step + 1) / steps) * 0.5 * (1 + math.cos(math.pi * step / steps)),
     "halving": lambda step, steps: 0.5 ** (4 * step // steps),
 }
-"""Name -> factor of the learning rate at a step (from 0) of all `steps`; "halving" halves after each quarter."""
+"""Name -> factor of the learning rate at a step (from 0) of all `steps`. "warmup" is "cosine" with a linear rise over
+the first twentieth of the steps; "halving" halves after each quarter."""
 NEGATIVES = ("auto", "batch", "dataset")
 PRECISIONS = ("auto", "float32", "bfloat16")
 

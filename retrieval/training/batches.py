@@ -1,9 +1,11 @@
 """Features of the distinct images of pairs, from towers in training or from frozen towers with cached features."""
 
-from collections.abc import Callable, Mapping, Sequence
+import copy
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -17,8 +19,20 @@ from retrieval.data.dataset import Grasp, ImageCache
 from retrieval.data.loading import TimedFunction, map_in_order, worker_count, worker_pool
 from retrieval.data.pairs import PairBatch
 from retrieval.errors import DatasetError, JobInterrupted
+from retrieval.model.checkpoint import tensors_digest
 from retrieval.model.config import Config
-from retrieval.model.encode import Image, autocast, one_thread, photo_features, to_batch, touch_batch, touch_features
+from retrieval.model.encode import (
+    Image,
+    autocast,
+    for_inference,
+    one_thread,
+    photo_features,
+    photo_stems,
+    to_batch,
+    touch_batch,
+    touch_features,
+    touch_stems,
+)
 from retrieval.model.fusion import Matcher
 from retrieval.training import distributed
 from retrieval.training.disk_image_cache import DiskImageCache
@@ -173,13 +187,19 @@ class FrozenFeatures(BatchImages):
         new = {grasp.grasp_id: grasp for grasp in batch.grasps if grasp.grasp_id not in self._features}
         if new:
             images = map_in_order(self._workers, self.touch, new.values())
-            self._features.update(zip(new, touch_features(matcher, images), strict=True))
+            self._features.update(zip(new, self._encode_touches(matcher, images), strict=True))
         photos = [path for path in batch.photos if path not in self._features]
         if photos:
             photo_images = map_in_order(self._workers, self.photo, photos)
-            self._features.update(zip(photos, photo_features(matcher, photo_images), strict=True))
+            self._features.update(zip(photos, self._encode_photos(matcher, photo_images), strict=True))
         touches = torch.stack([self._features[grasp.grasp_id] for grasp in batch.grasps])
         return LoadedBatch(batch, touches, torch.stack([self._features[path] for path in batch.photos]))
+
+    def _encode_touches(self, matcher: Matcher, touches: Iterable[Sequence[Image]]) -> Tensor:
+        return touch_features(matcher, touches)
+
+    def _encode_photos(self, matcher: Matcher, photos: Iterable[Image]) -> Tensor:
+        return photo_features(matcher, photos)
 
     def step_context(self) -> AbstractContextManager[None]:
         """Return the context of a training step: one thread, since more do not speed up the head's small products."""
@@ -195,7 +215,77 @@ class FrozenFeatures(BatchImages):
         return loaded.touches, loaded.photos
 
 
-FeatureSource = TrainedFeatures | FrozenFeatures
+class StemFeatures(FrozenFeatures):
+    """Features of towers whose stem is frozen: the stem's maps of each image are computed once.
+
+    The maps are stored as float16, which rounds them by at most a two-thousandth.
+    """
+
+    def __init__(self, config: Config, device: torch.device, matcher: Matcher) -> None:
+        """Start without maps.
+
+        Args:
+            config: The configuration.
+            device: Device of the maps.
+            matcher: The matcher whose stems are frozen.
+        """
+        super().__init__(config, device, {})
+        self._stems = for_inference(copy.deepcopy(matcher).eval())
+
+    def _encode_touches(self, matcher: Matcher, touches: Iterable[Sequence[Image]]) -> Tensor:
+        return touch_stems(self._stems, touches)
+
+    def _encode_photos(self, matcher: Matcher, photos: Iterable[Image]) -> Tensor:
+        return photo_stems(self._stems, photos)
+
+    def cache_decoded(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
+        """Compute the maps of all images of grasps, and store them in `folder`, from which later runs read them."""
+        from retrieval.training.features import FeatureCache  # it imports this module
+
+        settings, workers = self.config.preprocessing.digest(), self.config.training.workers
+        touch_by, photo_by = (
+            (f"{kind}_stem", tensors_digest(tower.stem_layers().state_dict(), type(tower).__name__), settings)
+            for kind, tower in (("touch", self._stems.touch_tower), ("photo", self._stems.photo_tower))
+        )
+        encode = partial(touch_stems, self._stems)
+        cache = FeatureCache(folder, touch_by, self.touch, encode, self.files, workers, quiet)
+        self._features |= zip((grasp.grasp_id for grasp in grasps), torch.from_numpy(cache.rows(grasps)), strict=True)
+        files = list(dict.fromkeys(grasp.photo for grasp in grasps))
+        encode = partial(photo_stems, self._stems)
+        photos = FeatureCache(folder, photo_by, self.photo, encode, lambda file: (file,), workers, quiet)
+        self._features |= zip(files, torch.from_numpy(photos.rows(files)), strict=True)
+
+    def step_context(self) -> AbstractContextManager[None]:
+        """Return the context of a training step; it changes nothing, since towers use every core."""
+        return nullcontext()
+
+    def train_features(self, matcher: Matcher, loaded: LoadedBatch) -> tuple[Tensor, Tensor]:
+        """Return features of the batch's touches and photos; each rank computes a part."""
+        touches, photos = len(loaded.batch.grasps), len(loaded.batch.photos)
+        own_touches, own_photos = (
+            part[distributed.rank_rows(len(part))].to(self.device).float() for part in (loaded.touches, loaded.photos)
+        )
+        with autocast(self.device, self.config.training.precision):
+            with distributed.counting_rank_rows(touches):
+                touch = matcher.touch_features_of_stem(own_touches)
+            with distributed.counting_rank_rows(photos):
+                photo = matcher.photo_features_of_stem(own_photos)
+        return distributed.gather_rows(touch, touches), distributed.gather_rows(photo, photos)
+
+    @torch.inference_mode()
+    def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
+        """Return features of the pairs' touches and photos."""
+        loaded = self.prepare(matcher, pairs).result()
+        return tuple(  # type: ignore[return-value]
+            torch.cat([encode(part.to(self.device).float()) for part in torch.split(maps, _CHUNK)])
+            for encode, maps in (
+                (matcher.touch_features_of_stem, loaded.touches),
+                (matcher.photo_features_of_stem, loaded.photos),
+            )
+        )
+
+
+FeatureSource = TrainedFeatures | FrozenFeatures | StemFeatures
 """The source of a training run's features."""
 _CHUNK = 64
 

@@ -27,6 +27,8 @@ def build_matcher(config: Config) -> Matcher:
         _start_from(matcher, Path(settings.start))
     for tower in (matcher.touch_tower, matcher.photo_tower):
         tower.requires_grad_(not settings.freeze_towers)
+        if settings.freeze_stem:
+            tower.stem_layers().requires_grad_(False)
         distributed.synchronize_batch_norm(tower)
     return matcher
 

@@ -22,6 +22,8 @@ _STAGES = (
 _STAGE_OUTPUTS = {6: 32, 10: 64, 13: 96, 17: 320}
 _FLOAT32_LAYERS = 3
 """Layers up to stride 4, computed in float32."""
+_STEM_LAYERS = 7
+"""Layers up to the first stage of `_STAGE_OUTPUTS`."""
 
 
 def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
@@ -30,6 +32,11 @@ def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups
         nn.BatchNorm2d(outputs),
         nn.ReLU6(inplace=True),
     )
+
+
+def _statistics_and_map(maps: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """Return features of the stages' maps, and the map of cells: the two stages at stride 16."""
+    return stage_statistics(maps), torch.cat(maps[1:3], dim=1)
 
 
 class InvertedResidual(nn.Module):
@@ -97,11 +104,22 @@ class MobileNetV2(Tower):
     def _encode_with_map(self, images: Tensor) -> tuple[Tensor, Tensor]:
         with without_autocast(images):
             x = self.features[:_FLOAT32_LAYERS](images)
-        maps = list(self._stages(x))
-        return stage_statistics(maps), torch.cat(maps[1:3], dim=1)  # both at stride 16
+        return _statistics_and_map(list(self._stages(x)))
 
-    def _stages(self, x: Tensor) -> Iterator[Tensor]:
-        for number, layer in enumerate(list(self.features)[_FLOAT32_LAYERS:], start=_FLOAT32_LAYERS):
+    def stem_layers(self) -> nn.Module:
+        """Return the layers up to the first stage, at stride 8.
+
+        Raises:
+            ConfigError: The output is not "stages".
+        """
+        return self.features[:_STEM_LAYERS] if self.output == "stages" else super().stem_layers()
+
+    def _encode_maps(self, maps: Tensor) -> tuple[Tensor, Tensor]:
+        return _statistics_and_map([maps, *self._stages(maps, _STEM_LAYERS)])
+
+    def _stages(self, x: Tensor, first: int = _FLOAT32_LAYERS) -> Iterator[Tensor]:
+        """Yield the outputs of the stages, from the input of layer number `first`."""
+        for number, layer in enumerate(list(self.features)[first:], start=first):
             x = layer(x)
             if number in _STAGE_OUTPUTS:
                 yield x

@@ -1,0 +1,168 @@
+"""Recognition of one object among 10, 100 and 1,000, and of objects that the catalogue lacks.
+
+    python -m benchmarks.models.recognition RECORDING --distractors PHOTOS --out FOLDER --model old=A --model new=B
+
+RECORDING holds grasps of objects that no model was trained on, eight of each for the rows with five grasps and three
+photos. PHOTOS is a folder of `retrieve collect --photos-only`: one photo of each further object of the catalogue. Every
+query is one to five grasps of an object. Every candidate has photos that were not taken in these grasps. Values are
+expectations over the other candidates; intervals resample the touched objects. The last column compares each model with
+the first one on the same queries. It writes recognition.json in FOLDER; features are reused.
+"""
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from retrieval.console.progress import Bar
+from retrieval.data.dataset import Grasp, load_grasps
+from retrieval.data.labelled_pictures import load_labelled
+from retrieval.data.loading import map_in_order, worker_pool
+from retrieval.evaluation.reject import reject
+from retrieval.metrics.intervals import compare, summarise
+from retrieval.metrics.measure import Measure
+from retrieval.metrics.protocols import k_way
+from retrieval.metrics.table import ScoreTable
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
+from retrieval.model.encode import batches, photo_features
+from retrieval.model.posterior import Posterior
+from retrieval.search.defaults import SHIPPED_NAMES, shipped_model
+from retrieval.training.distil import feature_partials
+from retrieval.training.features import encode_recording
+
+QUERIES = ((1, 1), (2, 1), (3, 3), (5, 3))
+"""Grasps of a query, and photos of a touched candidate."""
+CANDIDATES = (10, 100, 1000)
+SETS = 4
+"""Sets of several grasps of each object."""
+CATALOGUE = 100
+"""Objects of the catalogues in which "none of these" is measured."""
+DRAWS = 4
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Score every model and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recording", type=Path)
+    parser.add_argument("--distractors", type=Path, help="folder of photo-only objects")
+    parser.add_argument("--model", action="append", required=True, help="NAME=FILE; FILE may be `shipped`")
+    parser.add_argument("--first-finger", action="store_true", help="use only finger a")
+    parser.add_argument("--out", type=Path, required=True)
+    arguments = parser.parse_args(argv)
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    grasps = load_grasps(arguments.recording)
+    if arguments.first_finger:
+        grasps = [replace(each, touches=each.touches[:1], backgrounds=each.backgrounds[:1]) for each in grasps]
+    found: dict[str, dict[str, Measure]] = {}
+    for name, _, file in (choice.partition("=") for choice in arguments.model):
+        checkpoint = load_checkpoint(shipped_model(SHIPPED_NAMES[file]) if file in SHIPPED_NAMES else Path(file))
+        found[name] = measures(checkpoint, grasps, arguments.distractors, arguments.out / "features")
+    first = next(iter(found.values()))
+    rows: dict[str, dict[str, Any]] = {
+        name: {
+            key: {**summarise([value], seed=0), "against_first": compare([value], [first[key]], seed=0)}
+            for key, value in each.items()
+        }
+        for name, each in found.items()
+    }
+    (arguments.out / "recognition.json").write_text(json.dumps(rows, indent=1) + "\n")
+    print(table(rows))
+    return 0
+
+
+def measures(
+    checkpoint: Checkpoint, grasps: Sequence[Grasp], distractors: Path | None, cache: Path
+) -> dict[str, Measure]:
+    """Return the measures of a checkpoint by name."""
+    features = encode_recording(grasps, checkpoint.matcher, checkpoint.config, cache)
+    touches, photos = feature_partials(checkpoint.matcher, features)
+    names = sorted(set(features.object_ids))
+    owner = np.array([names.index(name) for name in features.object_ids])
+    others = distractor_partials(checkpoint, distractors) if distractors else photos[:0]
+    photo_owner = np.concatenate([owner, len(names) + np.arange(len(others))])
+    scores = all_scores(checkpoint, touches, torch.cat([photos, others]))
+    found: dict[str, Measure] = {}
+    for count, shown in QUERIES:
+        queries = grasp_sets(owner, count, shown)
+        if not len(queries):
+            continue
+        own = np.zeros((len(queries), len(photo_owner)), dtype=bool)
+        np.put_along_axis(own, queries, True, axis=1)
+        scored = ScoreTable(scores[queries].sum(1), owner[queries[:, 0]], photo_owner, own)
+        what = f"{count} grasp{'s' * (count > 1)}, {shown} photo{'s' * (shown > 1)}"
+        for k in CANDIDATES:
+            if len(scored.objects) >= k:
+                curve = k_way(scored, k, photos=shown, draws=DRAWS)
+                found[f"K = {k:,}, {what}"] = Measure(curve.values[:, :1], curve.owner, curve.chance[:1], curve.gallery)
+        if checkpoint.posterior is not None and len(names) >= CATALOGUE:
+            small = scored.select(scored.touch_owner < CATALOGUE, photo_owner < CATALOGUE)
+            weighted = Posterior(checkpoint.posterior.weight(count), checkpoint.posterior.offset)
+            found[f"none of these, AUROC, {what}"] = reject(weighted, small).auroc
+    return found
+
+
+def grasp_sets(owner: NDArray[np.int64], count: int, photos: int) -> NDArray[np.int64]:
+    """Return rows (S, count) of grasps of one object, of which `photos` other grasps are left."""
+    if count == 1:
+        return np.array([[row] for row in range(len(owner)) if (owner == owner[row]).sum() > photos])
+    rng = np.random.default_rng([0, count])
+    each = [np.flatnonzero(owner == name) for name in np.unique(owner)]
+    drawn = [
+        rng.choice(rows, count, replace=False) for rows in each if len(rows) >= count + photos for _ in range(SETS)
+    ]
+    return np.array(drawn, dtype=np.int64).reshape(-1, count)
+
+
+@torch.inference_mode()
+def distractor_partials(checkpoint: Checkpoint, folder: Path) -> torch.Tensor:
+    """Return partial activations (N, partial) of photo-only objects."""
+    files = [picture.file for picture in load_labelled(folder)[1]]
+    encoded = []
+    with Bar("encode distractors", len(files), "photos") as bar, worker_pool("auto") as pool:
+        for images in batches(map_in_order(pool, checkpoint.config.preprocessing.load_photo, files), 32):
+            features = photo_features(checkpoint.matcher, images)
+            encoded.append(checkpoint.matcher.photo_encoding(features).partial)
+            bar.advance(len(images))
+    return torch.cat(encoded)
+
+
+@torch.inference_mode()
+def all_scores(checkpoint: Checkpoint, touches: torch.Tensor, photos: torch.Tensor) -> NDArray[np.float32]:
+    """Return match logits (T, N)."""
+    parts = []
+    with Bar("score", len(touches), "touches") as bar:
+        for part in torch.split(touches, 4):
+            score = partial(checkpoint.matcher.head.eval().all_logits, part)
+            parts.append(torch.cat([score(some) for some in torch.split(photos, 512)], dim=1))
+            bar.advance(len(part))
+    return np.asarray(torch.cat(parts).numpy())
+
+
+def table(rows: dict[str, dict[str, Any]]) -> str:
+    """Return a Markdown table of all measures and models."""
+    first = next(iter(rows))
+    lines = ["| measure | chance | " + " | ".join(rows) + " | difference |", "|---|---|" + "---|" * (len(rows) + 1)]
+    for key, summary in rows[first].items():
+        cells = [interval(each[key]["value"][0], each[key]["low"][0], each[key]["high"][0]) for each in rows.values()]
+        last = list(rows.values())[-1][key]["against_first"]
+        lines.append(
+            f"| {key} | {summary['chance'][0]:.3f} | {' | '.join(cells)} | "
+            f"{interval(last['difference'], last['low'], last['high'])} |"
+        )
+    return "\n".join(lines)
+
+
+def interval(value: float, low: float, high: float) -> str:
+    """Return a value with its interval."""
+    return f"{value:.3f} [{low:.3f}, {high:.3f}]"
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
