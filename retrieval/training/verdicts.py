@@ -34,7 +34,7 @@ from retrieval.model.reference_calibration import (
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.foreign_images import draw_foreign
 
-MAX_GRASPS = 400
+MAX_GRASPS = 800
 """Largest number of grasps from each part of the split."""
 MIN_GRASPS = 40
 """Number of validation grasps that the gel check needs; thresholds of fewer grasps would reject too many touches."""
