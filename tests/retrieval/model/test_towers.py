@@ -7,9 +7,11 @@ from urllib.error import URLError
 import pytest
 import torch
 from torch import nn
+from torch.nn import functional
 
 from retrieval.errors import BadInput, CheckpointError, ConfigError, NumericalError
 from retrieval.model.towers import TOWERS, build_tower, tower_name
+from retrieval.model.towers.mobilenet import InvertedResidual
 from retrieval.model.towers.tower import Tower, stage_statistics
 from retrieval.model.towers.weights import initialise_tower, load_tower_state, read_state
 from tests.data import touch_data
@@ -317,3 +319,15 @@ def test_group_norms_of_the_small_tower_stay_in_float32_where_convolutions_do_no
     assert ours.dtype == torch.float32
     torch.testing.assert_close(ours, exact)
     assert (naive.float() - exact).abs().max() > 1e-3
+
+
+def test_strided_depthwise_convolutions_compute_in_float32_under_autocast():
+    torch.manual_seed(0)
+    block = InvertedResidual(8, 8, stride=2, expansion=2)
+    strided = block.conv[1][0]
+    image = torch.rand(2, 16, 8, 8)
+    with torch.autocast("cpu", torch.bfloat16):
+        got = strided(image.bfloat16())
+    assert got.dtype == torch.float32
+    expected = functional.conv2d(image.bfloat16().float(), strided.weight, stride=2, padding=1, groups=16)
+    torch.testing.assert_close(got, expected)
