@@ -103,8 +103,8 @@ def measures(
                 found[f"K = {k:,}, {what}"] = Measure(curve.values[:, :1], curve.owner, curve.chance[:1], curve.gallery)
         if checkpoint.posterior is not None and len(names) >= CATALOGUE:
             small = scored.select(scored.touch_owner < CATALOGUE, photo_owner < CATALOGUE)
-            weighted = Posterior(checkpoint.posterior.weight(count), checkpoint.posterior.offset)
-            found[f"none of these, AUROC, {what}"] = reject(weighted, small).auroc
+            weighted = replace(small, scores=checkpoint.posterior.weight(count) * small.scores)
+            found[f"none of these, AUROC, {what}"] = reject(Posterior(1.0, checkpoint.posterior.offset), weighted).auroc
     return found
 
 

@@ -1,0 +1,38 @@
+"""Recognition among many objects: sets of grasps, and the table of a model compared with itself."""
+
+import json
+
+import numpy as np
+import pytest
+
+from benchmarks.models import recognition
+from retrieval.data.dataset import load_grasps
+
+
+def test_a_set_has_one_object_and_leaves_enough_photos():
+    owner = np.array([0, 0, 0, 1, 1])
+    sets = recognition.grasp_sets(owner, 2, photos=1)
+    assert sets.shape == (recognition.SETS, 2)
+    assert all(set(rows) < {0, 1, 2} and len(set(rows)) == 2 for rows in sets.tolist())
+    assert recognition.grasp_sets(owner, 1, photos=1).tolist() == [[0], [1], [2], [3], [4]]
+    assert recognition.grasp_sets(owner, 1, photos=2).tolist() == [[0], [1], [2]]
+
+
+@pytest.fixture
+def small(monkeypatch):
+    monkeypatch.setattr(recognition, "CANDIDATES", (5,))
+    monkeypatch.setattr(recognition, "CATALOGUE", 5)
+    monkeypatch.setattr(recognition, "QUERIES", ((1, 1), (2, 1)))
+
+
+@pytest.mark.usefixtures("small")
+def test_a_model_does_not_differ_from_itself(recording, model, tmp_path, capsys):
+    models = ("--model", f"one={model}", "--model", f"other={model}")
+    assert recognition.main([str(recording), *models, "--out", str(tmp_path)]) == 0
+    rows = json.loads((tmp_path / "recognition.json").read_text())
+    assert rows["one"].keys() == rows["other"].keys() >= {"K = 5, 1 grasp, 1 photo", "K = 5, 2 grasps, 1 photo"}
+    measured = rows["other"]["K = 5, 1 grasp, 1 photo"]
+    assert measured["chance"] == [0.2]
+    assert measured["against_first"]["difference"] == 0
+    assert measured["queries"] == len(load_grasps(recording))
+    assert "| K = 5, 1 grasp, 1 photo | 0.200 |" in capsys.readouterr().out
