@@ -25,7 +25,7 @@ They are not installed with the package. Each runs in a checkout of the reposito
     python -m benchmarks.models.answers        verdict, ranking, P(object | present) and advice of answers
     python -m benchmarks.models.next_grasp     information of another grasp, compared with the page's estimate
     python -m benchmarks.models.scaling        accuracy against the number of training objects and grasps
-    python -m benchmarks.models.recognition    one object among 10, 100 and 1,000: several checkpoints on the same queries
+    python -m benchmarks.models.recognition    checkpoints compared: one object among 10, 100 and 1,000
     python -m benchmarks.models.in_double      a command in float64
     python -m benchmarks.importers_memory      memory of the importers for many rows
     python -m benchmarks.service_load          the service under load

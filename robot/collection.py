@@ -271,7 +271,7 @@ class _Collection:
                 self._report()
 
     def _turns(self) -> Iterator[tuple[int, str]]:
-        """Yield the accepted grasps that an object needs for the next turn, and the object."""
+        """Yield each turn: the total of accepted grasps that ends it, and its object."""
         grasps = self.settings.grasps
         for target in range(1, grasps + 1) if self.settings.rounds else (grasps,):
             for name in self.names:
@@ -288,7 +288,7 @@ class _Collection:
                 self._pending[object_id].append(workers.submit(object_id, number))
 
     def _needs_attempt(self, name: str, target: int, ahead: bool = False) -> bool:
-        """Return whether the object needs another attempt until it has `target` accepted grasps.
+        """Return whether the object has fewer than `target` accepted grasps and may be attempted again.
 
         With `ahead`, assume that all pending attempts are accepted.
         """

@@ -1,8 +1,8 @@
 """Base classes of arm, gripper, tactile sensor and camera: the contract between the collector and every driver.
 
-Lengths in mm, forces in N, angles in rad, times in s. The rig's frame has its origin on the table at the centre of the
-workspace, z up; the camera stands on the -y side. Every gripper force is the force on each finger; manufacturers often
-state the sum over both fingers, which is twice as large. Images are uint8 RGB, row 0 on top.
+Lengths in mm, forces in N, angles in rad, times in s. The rig's frame has its origin on the table, z up, by convention
+at the centre of the workspace; the camera stands on the -y side. Every gripper force is the force on each finger;
+manufacturers often state the sum over both fingers, which is twice as large. Images are uint8 RGB, row 0 on top.
 
 The base classes check arguments and results and raise DeviceError: no value out of range reaches a driver, and no
 stale frame reaches a recording. A driver implements `_connect`, `_close` and the abstract methods of its base class;
@@ -321,9 +321,10 @@ class TactileSensor(Device):
 
 
 def read_together(sensors: Mapping[str, TactileSensor], max_age_s: float = MAX_AGE_S) -> tuple[dict[str, Frame], float]:
-    """Read one frame of each sensor, as close in time as possible; return the frames by finger and their skew in s.
+    """Read one frame of each sensor, close in time; return the frames by finger and their skew in s.
 
-    Each sensor gives its buffered frame nearest in time to the oldest of the newest frames, or raises DeviceError.
+    The oldest of the sensors' newest frames sets the time. Each other sensor gives its buffered frame nearest to it, or
+    raises DeviceError.
     """
     newest = {finger: sensor.read(max_age_s) for finger, sensor in sensors.items()}
     common = min(frame.time_s for frame in newest.values())

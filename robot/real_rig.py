@@ -41,8 +41,8 @@
     name = "cylinder"                         # its other keys are the planner's settings
 
 The limits do not apply to homing, which has the gripper's own speed. A manual arm's limits apply only to the
-requested poses and speeds. Sawyer's slow /robot/state may be up to 2 s old, or `state_age_s` if that is longer. Paths
-are relative to the working directory of the process that reads the file. Unknown keys are errors.
+requested poses and speeds. Sawyer's robot and collision states may be as old as the larger of 2 s and `state_age_s`.
+Paths are relative to the working directory of the process that reads the file. Unknown keys are errors.
 """
 
 import time
@@ -183,7 +183,7 @@ class RealRig(Rig):
         )
 
     def connect(self) -> None:
-        """Connect all devices, then check the planner's requirements; before, it is unknown if the camera has depth.
+        """Connect all devices, then check the planner again: a replay camera finds only now whether it has depth.
 
         Raises:
             DeviceError: A device cannot be connected.

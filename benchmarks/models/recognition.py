@@ -5,8 +5,8 @@
 RECORDING holds grasps of objects that no model was trained on, eight of each for the rows with five grasps and three
 photos. PHOTOS is a folder of `retrieve collect --photos-only`: one photo of each further object of the catalogue. Every
 query is one to five grasps of an object. Every candidate has photos that were not taken in these grasps. Values are
-expectations over the other candidates; intervals resample the touched objects. The last column compares each model with
-the first one on the same queries. It writes recognition.json in FOLDER; features are reused.
+expectations over the other candidates; intervals resample the touched objects. The last column compares the last model
+with the first one on the same queries. It writes recognition.json in FOLDER; features are reused.
 """
 
 import argparse
@@ -109,7 +109,7 @@ def measures(
 
 
 def grasp_sets(owner: NDArray[np.int64], count: int, photos: int) -> NDArray[np.int64]:
-    """Return rows (S, count) of grasps of one object, of which `photos` other grasps are left."""
+    """Return rows (S, count): `count` grasps of one object that has at least `photos` other grasps."""
     if count == 1:
         return np.array([[row] for row in range(len(owner)) if (owner == owner[row]).sum() > photos])
     rng = np.random.default_rng([0, count])

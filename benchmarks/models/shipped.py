@@ -37,13 +37,13 @@ PRESET = "relief-large"
 PRETRAINING_PRESET = "relief"
 VALIDATION, VALIDATION_GRASPS = 150, 5
 """Objects that choose the checkpoint and calibrate it, and grasps of each."""
-OBJECTS, VARIED, ITERATIONS = 5000, 4000, 1200
+OBJECTS, VARIED, ITERATIONS = 4700, 4000, 1500
 DISTIL_STEPS = 2000
 """Training steps of its candidate encoder, more than the preset's: it is trained once and used by everyone."""
 FOREIGN = 8000
 """Number of non-gel pictures for training its check of touches: more than in an ordinary training."""
 FITTED = 10
-"""Scored objects for calibration, and as many training objects for other fits; the rest are the test set."""
+"""Number of validation objects, and of training objects, among the scored ones; the others are the test set."""
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -153,11 +153,13 @@ def pretrain_towers(arguments: argparse.Namespace) -> int:
         ("touch", "touches", SEED_TOUCHES, TOUCH_RIG),
     ):
         folder, tower = arguments.folder / pictures, arguments.folder / f"{side}-tower.safetensors"
+        if tower.exists():
+            continue
         size = ("--objects", getattr(arguments, pictures), "--seed", seed, "--jobs", arguments.jobs)
-        code = retrieve("collect", f"--{pictures}-only", "--rig", rig, *size, "--out", folder)
-        if not code and not tower.exists():
-            options = ("--config", PRETRAINING_PRESET, "--init", arguments.init, "--iterations", arguments.steps)
-            code = retrieve("train", folder, "--task", "relief", *options, "--out", tower)
+        options = ("--config", PRETRAINING_PRESET, "--init", arguments.init, "--iterations", arguments.steps)
+        code = retrieve("collect", f"--{pictures}-only", "--rig", rig, *size, "--out", folder) or retrieve(
+            "train", folder, "--task", "relief", *options, "--out", tower
+        )
         if code:
             return code
     return 0

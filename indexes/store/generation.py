@@ -164,8 +164,8 @@ class Generation:
         """Search for the vectors of sampled rows, and check that each row is found.
 
         A row passes if a search for its vector ranks the row's slot, or a near-copy with the same score, first. Rows
-        that fail with k = 1 are searched again with k = 1 % of the rows (at most `MAX_CHECKED_RESULTS`), about
-        as many as a query has candidates, because compressed kinds then score more slots exactly.
+        that fail with k = 1 are searched again with k = 1 % of the rows (at most `MAX_CHECKED_RESULTS`):
+        compressed kinds then rescore more slots exactly.
 
         Args:
             sample: Number of rows in new slots. Of rows in older slots, `sample` / `OLD_SAMPLE_DIVISOR` are checked.
@@ -274,7 +274,7 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
         documents |= {name: read_json(folder / f"{name}.json", max_bytes) for name in names if name not in documents}
         counts, slots = manifest.counts, rows.table["slot"]
         if slots.min() < 0 or slots.max() >= counts.slots:
-            raise CorruptIndex(f"{folder}: slots must be below {counts.slots}, but are not; {AGAIN}")
+            raise CorruptIndex(f"{folder}: slots must be from 0 to {counts.slots - 1}; {AGAIN}")
         tombstones = counts.slots - int(np.count_nonzero(np.bincount(slots)))
         got = {"rows": len(slots), "slots": len(embeddings), "tombstones": tombstones, "dim": embeddings.shape[1]}
         expected = {**asdict(counts), "dim": manifest.dim}
@@ -303,11 +303,11 @@ def read_generation(folder: Path, *, verify: bool, threads: int | None = None) -
 
 
 def max_document_bytes(rows: int, arrays: Iterable[NDArray[Any]]) -> int:
-    """Return the largest number of bytes of a JSON document.
+    """Return the size limit of a JSON document, in bytes.
 
     Args:
         rows: Number of rows of the index.
-        arrays: Its documents that are arrays.
+        arrays: The index's documents that are arrays.
     """
     return min(MAX_JSON_BYTES, DOCUMENT_BYTES + DOCUMENT_BYTES_PER_ROW * (rows + sum(map(len, arrays))))
 

@@ -64,7 +64,7 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
         job: The settings.
 
     Returns:
-        Number of leading slots that the parent already had in the same structure.
+        Number of leading slots in the structure reused from the parent; 0 if it was built anew.
     """
     with TableWriter(folder, job.parent, job.fingerprint) as writer:
         for block in blocks:
@@ -124,7 +124,7 @@ def write_generation(folder: Path, name: str, blocks: Iterable[Block | range], j
 
 
 def _build_or_grow(tables: Tables, job: WriteJob) -> tuple[VectorIndex, int, int]:
-    """Return the index, its number of vectors at the last training, and the number that the parent already had."""
+    """Return the index, its number of vectors at the last build, and the number in the reused structure."""
     vectors, parent = tables.vectors, tables.parent
     if parent is None or tables.renumbered or not _can_reuse_structure(parent, len(vectors), job):
         return job.kind.build_checked(vectors, job.requested, seed=job.seed, threads=job.threads), len(vectors), 0

@@ -75,7 +75,7 @@ def adapt(
     Args:
         recording: A folder, or the object that `robot.read_recording` returns.
         out: The checkpoint (.safetensors).
-        start: The start model. Default: the shipped model for the same number of fingers.
+        start: The start model. Default: the shipped model for one finger, or for two or more.
         tower: The published tower to combine with those of the model: a name, "module:Class", or a class.
         init: Weights of that tower: "imagenet", a file, or "none" to use the towers of the start model only.
         split: A split whose test objects are not used at all.

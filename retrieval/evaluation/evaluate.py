@@ -68,8 +68,8 @@ def evaluate(
     Args:
         recording: A folder, or the object that `robot.read_recording` returns.
         out: Folder of the results.
-        config: Towers, heads and split: a `Config` (`Config.using` accepts your own towers and losses), or an argument
-            of `load_config`. Its seed is the seed of every random draw.
+        config: Towers, heads and split, if `model` does not give them: a `Config` (`Config.using` accepts your own
+            towers and losses), or an argument of `load_config`. Its seed is the seed of every random draw.
         preset: Name of the configuration in the report. Default: the configuration's name.
         methods: Names, or your own classes, which the report lists by class name.
         model: A checkpoint to evaluate instead of one that is fitted here.

@@ -119,20 +119,19 @@ def reject(posterior: Posterior, table: ScoreTable, *, seed: int = 0) -> Rejecti
 
 
 def _areas(present: Floats, absent: Floats, weights: Floats) -> Floats:
-    """Return values (T,) whose mean is the area under the curve and whose object means vary as the area does.
+    """Return values (T,): their object-weighted mean is the area under the curve; their object means give its variance.
 
-    DeLong 1988; Obuchowski 1997 for clustered data: v = P(present > others' absent) + P(others' present > absent) -
-    area.
+    DeLong 1988; Obuchowski 1997 for clustered data: v = P(present > any absent) + P(any present > absent) - area.
     """
     hits, alarms = weight_below(present, absent, weights), 1 - weight_below(absent, present, weights)
     return np.asarray(hits + alarms - np.sum(weights * hits))
 
 
 def _false_accepts(present: Floats, absent: Floats, owner: NDArray[np.int64]) -> Floats:
-    """Return values (T,) whose mean is the false accept rate and whose object means vary as the rate does.
+    """Return values (T,): their object-weighted mean is the false accept rate; their object means give its variance.
 
-    The threshold depends on the same queries, so the true accepts of an object change the rate too. Its value is the
-    jackknife pseudo-value, from the rate without that object.
+    The threshold depends on the same queries, so the true accepts of an object change the rate too. Each object's value
+    is a jackknife pseudo-value, from the rate without it.
     """
     weights = object_weights(owner)
     rate = _false_accept_rate(present, absent, weights)

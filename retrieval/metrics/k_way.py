@@ -1,4 +1,4 @@
-"""Top-n accuracy of K-way tests, and exact intervals; tied scores get their expected rank."""
+"""Top-n accuracy of K-way tests, averaged over the orders of ties, and binomial intervals."""
 
 from collections.abc import Sequence
 from math import comb
@@ -61,11 +61,11 @@ def grouped_interval(correct: Sequence[Sequence[bool]]) -> tuple[float, float]:
     """Return the 95 % interval of the fraction of correct answers, given group by group (such as by object).
 
     Answers of one group are correlated, so this is the exact binomial interval for the equivalent number of independent
-    answers (Korn and Graubard 1998): their number over the design effect, which is the variance between groups over
-    that of independent answers. If all answers are correct, or all wrong, groups show no difference, and every answer
-    is treated as independent. A few groups do not show how much groups differ: over 1,500 samples with 20 answers a
-    group and proportions drawn as Beta(2.8, 1.2), coverage was 79 % with 2 groups, 86, 89, 92, 92, 92 and 93 % with 3
-    to 8, and 94 % with 9 and 10. Raises BadInput without answers.
+    answers (Korn and Graubard 1998): their number divided by the design effect (at least 1), the ratio of the variance
+    between groups to that of independent answers. If all answers are correct, or all wrong, groups show no difference,
+    and every answer is treated as independent. A few groups do not show how much groups differ: over 1,500 samples with
+    20 answers a group and proportions drawn as Beta(2.8, 1.2), coverage was 79 % with 2 groups, 86, 89, 92, 92, 92 and
+    93 % with 3 to 8, and 94 % with 9 and 10. Raises BadInput without answers.
     """
     total, successes = sum(map(len, correct)), sum(map(sum, correct))
     if not 0 < successes < total or len(correct) < 2:

@@ -2,9 +2,9 @@
 
 An embedding trained by a contrastive loss orders photos differently from the fusion head: the photo that the head ranks
 first may have a low rank in that order. The two small networks here are distilled from the head
-(`retrieval.training.distil`). They read partial activations, so an index gets new embeddings without reading a photo
-again. If the logit contains the cosine of the contrastive embeddings, some of the output components are linear in these
-embeddings: their principal axes, which carry nearly all of that cosine. The networks then learn only the rest.
+(`retrieval.training.distil`). They read partial activations, so an index gets new embeddings without encoding a
+photo again. With `candidate_linear`, some output components are linear in the contrastive embeddings. They start as
+principal axes, which carry nearly all of the logit's cosine, and are trained too.
 """
 
 from typing import NamedTuple, Self
@@ -15,7 +15,7 @@ from torch.nn import functional
 
 
 class CandidateEncoder(nn.Module):
-    """One network with one hidden layer per modality, with linear components appended to its output.
+    """For each modality, a network with one hidden layer, and optional linear components appended.
 
     The inner product of a touch's and a photo's output orders the photos.
     """
@@ -24,11 +24,11 @@ class CandidateEncoder(nn.Module):
         """Make the networks, with random weights.
 
         Args:
-            partial: Width of a partial activation.
+            partial: Width of a pooled partial activation (without cells).
             width: Hidden units of each network.
             embedding_dim: Components of an embedding.
-            linear: Number of components that are linear in the last `embedding_dim` numbers of a partial activation.
-                These numbers must then be the contrastive embedding.
+            linear: Number of components that are linear in the last `embedding_dim` numbers of a pooled partial
+                activation. These numbers must then be the contrastive embedding.
         """
         super().__init__()
         self.touch_network, self.photo_network = (
@@ -46,7 +46,7 @@ class CandidateEncoder(nn.Module):
         return functional.normalize(_concatenated(self.photo_network, self.photo_linear, partial), dim=-1, eps=1e-6)
 
     def scores(self, touch_partials: Tensor, photo_partials: Tensor) -> Tensor:
-        """Return scores (T, N) in the unit of the match logit, up to a constant per touch: the training target.
+        """Return scores (T, N), trained to equal the match logits up to a constant per touch.
 
         The norm of a touch's output is its sharpness. It does not reorder photos, so embeddings drop it.
         """
@@ -91,7 +91,7 @@ class PartialStatistics(NamedTuple):
 
     Attributes:
         mean: (partial,) mean of each unit.
-        scale: (partial,) standard deviation over all units of the head's term, or of the embedding at the end.
+        scale: (partial,) one standard deviation for the whole head's term, and one for the whole embedding.
     """
 
     mean: Tensor

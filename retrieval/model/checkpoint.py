@@ -31,8 +31,9 @@ from retrieval.model.checkpoint_info import (
     unusable,
 )
 from retrieval.model.config import Config
-from retrieval.model.fusion import GelHead, Matcher
+from retrieval.model.fusion import Matcher
 from retrieval.model.fusion_scorer import GelCheck
+from retrieval.model.gel_head import GelHead
 from retrieval.model.posterior import Posterior
 from retrieval.model.reference_calibration import ReferenceCalibration
 from retrieval.version import __version__

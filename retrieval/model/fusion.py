@@ -4,7 +4,7 @@ The first layer of the head is linear in the concatenation of the modalities, so
 b = (W_t t + b) + W_v v`. Each term is a partial activation. The partial activation of a photo is computed once, stored,
 and added to that of any touch. If the logit adds the cosine of the embeddings (`MatcherConfig.cosine`), a partial
 activation continues with its embedding times the root of the scale. With late interaction (`MatcherConfig.cell_dim`) it
-ends with the vectors of the image's cells. So an index stores nothing else of a photo.
+ends with the vectors of the image's cells. So the head needs nothing else of a photo.
 """
 
 import copy
@@ -22,6 +22,7 @@ from retrieval.errors import BadInput
 from retrieval.model.candidate_encoder import CandidateEncoder
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion_scorer import FusionScorer
+from retrieval.model.gel_head import GelHead
 from retrieval.model.late_interaction import CellEncoder, cell_scores, paired_cell_scores
 from retrieval.model.losses.contrastive import LOG_SCALE_INIT, LOG_SCALE_MAX
 from retrieval.model.stored_partials import Partials
@@ -50,8 +51,8 @@ MIN_RELATIVE_DEVIATION = 0.02
 class Standardise(nn.BatchNorm1d):
     """Centre and scale each feature by its statistics over the training batches; no parameters.
 
-    A channel that hardly varies around a large mean is not scaled up to unit variance. Rounding its weights to float16
-    changes it by a thousandth of the mean, which would then be as large as the signal.
+    A channel that hardly varies around a large mean is not scaled up to unit variance. Rounding the tower's weights to
+    float16 shifts it by a thousandth of its mean; scaling up would make this error as large as the signal.
     """
 
     def __init__(self, features: int) -> None:
@@ -325,7 +326,7 @@ class Matcher(nn.Module):
         )
 
     def forward(self, touches: Tensor, photos: Tensor) -> Tensor:
-        """Return match logits (P,) of pairs: touches (P, fingers, 3, H, W) with photos (P, 3, H, W)."""
+        """Return match logits (P,) of pairs: touches (P, fingers, 3, H, W) with photos (P, 3, H, views * W)."""
         touch = self.touch_encoding(self.touch_features(touches))
         photo = self.photo_encoding(self.photo_features(photos))
         return self.head(touch.partial, photo.partial)  # type: ignore[no-any-return]
@@ -341,7 +342,7 @@ class Matcher(nn.Module):
 
     @torch.no_grad()
     def clamp_scale(self) -> None:
-        """Clamp the parameter of the contrastive scale to at most 100, so that its gradient can reduce it again."""
+        """Clamp the contrastive scale to 1 to 100, so that the gradient of `log_scale` can reduce it again."""
         self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
 
 
@@ -397,25 +398,3 @@ def score_partials(
         Summed match logits (len(rows),).
     """
     return scorer_of(head).logits(touch_partials.detach().cpu().numpy(), photo_partials, rows)
-
-
-GEL_CLASSES = ("contact", "no_contact", "foreign")
-"""Classes of the gel head."""
-
-
-class GelHead(nn.Module):
-    """A linear layer to one logit for each of `GEL_CLASSES`."""
-
-    def __init__(self, features: int) -> None:
-        super().__init__()
-        self.classifier = nn.Linear(features, len(GEL_CLASSES))
-
-    def forward(self, features: Tensor) -> Tensor:
-        """Return readings (B, fingers, 2) of features (B, fingers, F).
-
-        The first is the log-odds of "no gel image" against both other classes, the second that of contact against a
-        no-contact gel.
-        """
-        contact, no_contact, foreign = self.classifier(features).unbind(-1)
-        gel = torch.logsumexp(torch.stack([contact, no_contact], dim=-1), dim=-1)  # ONNX has no logaddexp
-        return torch.stack([foreign - gel, contact - no_contact], dim=-1)

@@ -1,7 +1,7 @@
 """The gel check (`GelCheck`) and the match logits of the fusion head (`FusionScorer`), in numpy.
 
 The gel check comes first: is this a gel image, and is there contact? A linear layer on the touch tower's features
-(`retrieval.model.fusion.GelHead`) classifies each finger's image: gel in contact, gel without contact, or a picture
+(`retrieval.model.gel_head.GelHead`) classifies each finger's image: gel in contact, gel without contact, or a picture
 that is not a gel image. With a no-contact frame, contact is the difference from that frame, which needs no model.
 
 Pairs are scored from stored partial activations, with the photos in blocks. The head's layers after the partial

@@ -64,8 +64,7 @@ def as_float32(values: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
     """Return `values` in float32, exactly.
 
     Partial activations are finite float16. numpy converts these one by one, which takes longer than the arithmetic on
-    them. Shifting the five bits of the exponent and the ten of the fraction gives the number over 2^112, subnormals
-    included.
+    them. Shifting the five exponent bits and ten fraction bits gives the number divided by 2^112, also for subnormals.
     """
     if values.dtype != np.float16:
         return np.ascontiguousarray(values, dtype=np.float32)

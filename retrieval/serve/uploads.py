@@ -347,8 +347,8 @@ def _from_form(data: bytes, content_type: str, fingers: int) -> ParsedQuery:
     fields: dict[str, str] = {}
     for name, is_file, content in form_parts(data, content_type):
         if is_file != (name in files) or (not is_file and len(content) > MAX_FIELD_BYTES):
-            kind = "a file" if name in files else "a short text"
-            raise HttpProblem("bad-input", f"{name[:100]!r} must be {kind}, and one of gelsight, background, top, ...")
+            kind = "a file" if name in files else f"a text of at most {MAX_FIELD_BYTES} bytes"
+            raise HttpProblem("bad-input", f"{name[:100]!r} must be {kind}; only gelsight and background are files.")
         if is_file:
             files[name].append(content)
         else:

@@ -287,6 +287,17 @@ class StemFeatures(FrozenFeatures):
 
 FeatureSource = TrainedFeatures | FrozenFeatures | StemFeatures
 """The source of a training run's features."""
+
+
+def feature_source(
+    config: Config, device: torch.device, matcher: Matcher, known: Mapping[str | Path, Tensor]
+) -> FeatureSource:
+    """Return the source of a training run's features; `known` features of frozen towers are as in `FrozenFeatures`."""
+    if config.training.freeze_towers:
+        return FrozenFeatures(config, device, known)
+    return StemFeatures(config, device, matcher) if config.training.freeze_stem else TrainedFeatures(config, device)
+
+
 _CHUNK = 64
 
 

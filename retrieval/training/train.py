@@ -48,7 +48,7 @@ from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.tower import Tower
 from retrieval.training import distributed
-from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, StemFeatures, TrainedFeatures
+from retrieval.training.batches import LoadedBatch, feature_source
 from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import Features, features_by_image
 from retrieval.training.fit import RATE, Plan, fit
@@ -161,15 +161,8 @@ class Trainer:
         self.optimizer = torch.optim.Adam(groups, lr=settings.learning_rate, fused=self.device.type == "cpu")
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
-        self.features: FeatureSource
-        if settings.freeze_towers:
-            self.features = FrozenFeatures(
-                config, self.device, features_by_image(grasps, known, self.device) if known else {}
-            )
-        elif settings.freeze_stem:
-            self.features = StemFeatures(config, self.device, self.matcher)
-        else:
-            self.features = TrainedFeatures(config, self.device)
+        stored = features_by_image(grasps, known, self.device) if known else {}
+        self.features = feature_source(config, self.device, self.matcher, stored)
         set_training_mode(self.matcher, settings)
         self.step, self.best = 0, -math.inf
         self._image_count, self._compute_s = 0, 0.0

@@ -22,8 +22,9 @@ from retrieval.data.images import read_rgb
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, touch_features
-from retrieval.model.fusion import GEL_CLASSES, MIN_RELATIVE_DEVIATION, GelHead, Matcher, scorer_of
+from retrieval.model.fusion import MIN_RELATIVE_DEVIATION, Matcher, scorer_of
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
+from retrieval.model.gel_head import GEL_CLASSES, GelHead
 from retrieval.model.posterior import Posterior, ScoredTouches, fit_posterior
 from retrieval.model.reference_calibration import (
     ReferenceCalibration,

@@ -181,8 +181,8 @@ class AttemptRunner:
     def _read_touches(self, moment: str, since_s: float) -> tuple[dict[str, bytes], float]:
         """Read gel images by column, at most `since_s` old, and their skew in s.
 
-        With contact, `since_s` is at most the time since the last motion ended: an older frame may show the state
-        before it. Without contact, frames during the approach show the same as frames after it.
+        With contact, `since_s` is the wait after the last motion, so no frame is older than the end of that motion.
+        Without contact, frames from the approach are valid, too.
         """
         frames, skew_s = read_together(self.rig.sensors, max_age_s=min(MAX_AGE_S, since_s))
         return {f"touch_{finger}{moment}": self._jpeg(frame.pixels) for finger, frame in frames.items()}, skew_s

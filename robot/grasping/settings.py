@@ -20,7 +20,7 @@ class GraspSettings(TypedSettings):
         force_n: Range of the force on each finger.
         jitter_mm: Largest offset of the pose from the axis, in x and in y.
         floor_mm: Smallest height of the fingertips above the table.
-        top_margin_mm: Smallest distance of the fingertips below the object's top.
+        top_margin_mm: Smallest distance of the fingertips below the object's top; floor_mm has priority.
         reach_mm: Largest distance of the fingertips below the object's top.
         finger_mm: Width of a finger.
         clearance_mm: Room on either side of the object when the jaws are open.

@@ -1,4 +1,4 @@
-"""Importers: each converts one public data set to a recording, and is loaded on first use."""
+"""Importers: each converts one data set or format to a recording, and is loaded on first use."""
 
 import inspect
 import sys

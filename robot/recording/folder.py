@@ -276,7 +276,9 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         if self._file.closed:
             raise RecordingError(f"the writer of {self.folder} is closed; open another")
         if not isinstance(grasp_id, str) or not GRASP_ID.fullmatch(grasp_id):
-            raise RecordingError(f"grasp_id must be letters, digits and ._- (at most 128), got {grasp_id!r}")
+            raise RecordingError(
+                f"grasp_id must be at most 128 ASCII letters, digits and ._-, not beginning with ._-, got {grasp_id!r}"
+            )
         if grasp_id in self._grasp_ids:
             raise RecordingError(f"the recording already contains grasp {grasp_id}; see grasp_ids")
         contents: dict[str, bytes] = {}
@@ -303,7 +305,10 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
     def has_shared(self, name: str) -> bool:
         """Return whether the recording contains the shared image `name`; raise RecordingError for an invalid name."""
         if not GRASP_ID.fullmatch(name):
-            raise RecordingError(f"the name of a shared image must be letters, digits and ._-, got {name!r}")
+            raise RecordingError(
+                "the name of a shared image must be at most 128 ASCII letters, digits and ._-, not beginning with ._-, "
+                f"got {name!r}"
+            )
         if name not in self._shared:
             for suffix in (".png", ".jpg"):
                 path = f"{IMAGES_FOLDER}/{name}_shared{suffix}"

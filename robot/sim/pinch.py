@@ -118,8 +118,8 @@ class Pinch:
     def final_placement(self) -> Placement:
         """Pose of the object after the closing jaws have turned it.
 
-        The object turns to the nearest local minimum of its width between the jaws. So flat sides end square to the
-        fingers, up to a small error.
+        The object turns to the nearest local minimum of its width between the jaws. So flat sides end parallel
+        to the pads, up to a small error.
         """
         coarse = _nearest_narrowest_turn(_COARSE_RAD, self._coarse_reach)
         fine = [coarse + angle for angle in _FINE_RAD]
@@ -269,7 +269,7 @@ class Pinch:
 
 
 def _nearest_narrowest_turn(turns: Sequence[float], reached: Array) -> float:
-    """Return the turn of the nearest local minimum of the object's width between the jaws, from the middle turn.
+    """Return the turn at which a descent from the middle turn reaches a local minimum of the object's width.
 
     Further reach of the fingers means a narrower object.
     """

@@ -248,7 +248,7 @@ def _is_sufficient(point: SearchPoint, requirements: SearchRequirements) -> bool
 def _points_within_time(
     bench: SearchBench, requirements: SearchRequirements, tried: Sequence[SearchPoint]
 ) -> Iterator[SearchPoint]:
-    """Yield points with fewer candidates than the recall needs, if the user set only a time bound."""
+    """Yield points below the smallest step that fit the time, if the user set only a time bound."""
     if requirements.max_ms is None or requirements.min_recall is not None:
         return
     for kind in dict.fromkeys(point.kind for point in tried):
@@ -290,7 +290,7 @@ def _record(point: SearchPoint, requirements: SearchRequirements, bench: SearchB
 
 
 def exhaustive_record(photos: int, requirements: SearchRequirements) -> dict[str, Any]:
-    """Return the manifest's "candidates" of a small catalogue whose photos are all scored, without a measurement."""
+    """Return the manifest's "candidates" if all photos are scored without a measurement."""
     return {
         "k": photos,
         "top1_agreement": 1.0,
@@ -346,4 +346,4 @@ def _unmet_requirements(recall: float, ms: float, requirements: Mapping[str, Any
         unmet.append(f"a recall of {target:g}")
     if requirements["max_ms"] is not None and ms > requirements["max_ms"]:
         unmet.append(f"{requirements['max_ms']:g} ms")
-    return f" No measured setting reaches {' and '.join(unmet)}; this is the closest." if unmet else ""
+    return f" This setting misses {' and '.join(unmet)}; no measured one meets all requirements." if unmet else ""

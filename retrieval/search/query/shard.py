@@ -237,8 +237,8 @@ class FolderShard:
     def _candidates(self, embeddings: Floats, similarities: Similarities | None, k: int) -> Rows:
         """Return the rows to score.
 
-        These are the k photos nearest to all grasps together, and the photos of the k objects with the nearest
-        reference touches; or all rows, if k covers them.
+        These are the k photos nearest to all grasps together, and photos of the k objects with the nearest reference
+        touches; all rows if k covers them or there are no embeddings.
         """
         if not self.has_embeddings or k >= self.generation.count:
             return np.arange(self.generation.count)

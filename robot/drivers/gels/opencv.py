@@ -63,7 +63,7 @@ class OpencvTactile(TactileSensor):
 
     @property
     def lost_count(self) -> int:
-        """Number of stream losses since the sensor was connected."""
+        """Failures of the stream since the sensor was connected, failed reopenings included."""
         return self._reader.lost_count
 
     def _connect(self) -> None:

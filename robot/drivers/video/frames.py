@@ -1,7 +1,7 @@
 """Reader of a free-running camera: a thread reads all frames with their times and buffers the newest few.
 
 Frames are buffered as the camera delivers them (BGR); rotation, crop and colour order are applied only on reading. A
-frame equal to the previous one keeps the previous time, so a frozen stream becomes stale. The thread owns the stream.
+frame equal to the previous one is dropped, so a frozen stream becomes stale. The thread owns the stream.
 When the stream fails, ends or freezes, the thread closes it and opens it again, with increasing delays. Until a new
 frame arrives, readers wait; after the timeout they raise with the reason.
 """
@@ -73,7 +73,7 @@ class FrameReader:
 
     Attributes:
         frame_count: Frames read, dropped ones included.
-        lost_count: Number of stream losses.
+        lost_count: Failures of the stream, failed reopenings included.
     """
 
     def __init__(
@@ -149,8 +149,8 @@ class FrameReader:
         with self._changed:
             if not self._changed.wait_for(lambda: bool(self._frames) and self._frames[-1].time_s > since_s, timeout_s):
                 raise DeviceError(
-                    f"{self.name} returned no picture within {timeout_s:g} s: {self._last_error}; the stream was lost "
-                    f"{self.lost_count} time(s). Is it plugged in, and used by no other program?"
+                    f"{self.name} returned no picture within {timeout_s:g} s: {self._last_error}; reading or "
+                    f"reopening failed {self.lost_count} time(s). Is it plugged in, and used by no other program?"
                 )
             return list(self._frames)
 
@@ -172,7 +172,7 @@ class FrameReader:
             _close_quietly(stream)
 
     def _store(self, frame: Frame) -> None:
-        """Buffer a new frame; drop a frame equal to the last one, which keeps its older time."""
+        """Buffer a new frame; drop a repeat of the last frame, whose time stays unchanged."""
         with self._changed:
             self.frame_count += 1
             if self._last is not None and _is_same_picture(self._last.pixels, frame.pixels):

@@ -199,13 +199,13 @@ def _draw_noise(rows: int, cols: int, seed: int) -> tuple[Array, tuple[int, int,
 def draw_sensor(seed: int, finger: str, *, optics: str = "led", gel: GelSettings = _UNKNOWN_GEL) -> GelSensor:
     """Draw a used sensor with its own gel, lamps, tint and dust.
 
-    The same seed, finger and optics give the same sensor.
+    The same arguments give the same sensor.
 
     Args:
         seed: seed of the sensor.
         finger: name of its finger.
         optics: led, grey, varied (a sensor of any make), or the name of a fitted sensor.
-        gel: known properties of the gel; all others are drawn as without it.
+        gel: known properties of the gel; they do not change the other random values.
 
     Raises:
         UnknownName: There are no optics of this name.

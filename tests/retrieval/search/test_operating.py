@@ -193,12 +193,30 @@ QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.
         (SearchRequirements(max_ms=5), QUICK, "flat", 500, ""),
         (SearchRequirements(max_ms=4), QUICK, "ivf_sq8", 500, ""),
         (SearchRequirements(max_ms=2.8), QUICK, "hnsw", 500, ""),
-        (SearchRequirements(max_ms=2.6), QUICK, "flat", 100, "reaches a recall of 0.99; this is the closest"),
-        (SearchRequirements(max_ms=0.1), QUICK, "hnsw", 500, "reaches 0.1 ms; this is the closest"),
-        (SearchRequirements(min_recall=0.99, max_ms=1), QUICK, "hnsw", 500, "reaches 1 ms; this is the closest"),
+        (
+            SearchRequirements(max_ms=2.6),
+            QUICK,
+            "flat",
+            100,
+            "misses a recall of 0.99; no measured one meets all requirements",
+        ),
+        (SearchRequirements(max_ms=0.1), QUICK, "hnsw", 500, "misses 0.1 ms; no measured one meets all requirements"),
+        (
+            SearchRequirements(min_recall=0.99, max_ms=1),
+            QUICK,
+            "hnsw",
+            500,
+            "misses 1 ms; no measured one meets all requirements",
+        ),
         (SearchRequirements("ivf_sq8"), QUICK, "ivf_sq8", 500, ""),
         (SearchRequirements("ivf_sq8"), EXACT, "ivf_sq8", 1000, ""),  # all are scored before a top-1 is lost
-        (SearchRequirements("flat", max_ms=1), QUICK, "flat", 500, "reaches 1 ms; this is the closest"),
+        (
+            SearchRequirements("flat", max_ms=1),
+            QUICK,
+            "flat",
+            500,
+            "misses 1 ms; no measured one meets all requirements",
+        ),
     ],
 )
 def test_the_requirements_decide(requirements, points, kind, k, message):
@@ -293,8 +311,8 @@ def timed(monkeypatch):
         ({"flat": 3.0}, "flat", ""),
         ({"flat": 30.0, "ivf_sq8": 0.5}, "ivf_sq8", ""),
         ({"flat": 30.0, "ivf_sq8": 8.0, "hnsw": 2.0}, "hnsw", ""),
-        ({"flat": 30.0, "ivf_sq8": 8.0, "hnsw": 9.0}, "ivf_sq8", "reaches 5 ms; this is the closest"),
-        ({"flat": 30.0, "ivf_sq8": 40.0, "hnsw": 50.0}, "flat", "reaches 5 ms; this is the closest"),
+        ({"flat": 30.0, "ivf_sq8": 8.0, "hnsw": 9.0}, "ivf_sq8", "misses 5 ms; no measured one meets all requirements"),
+        ({"flat": 30.0, "ivf_sq8": 40.0, "hnsw": 50.0}, "flat", "misses 5 ms; no measured one meets all requirements"),
     ],
 )
 def test_the_first_kind_with_time_and_recall_is_chosen(ms, kind, message, timed):

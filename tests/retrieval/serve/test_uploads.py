@@ -137,7 +137,7 @@ PART = b'\r\n--x\r\ncontent-disposition: form-data; name="top"\r\n\r\n3'
         (b"--x\r\n" + b"a: b\r\n" * 3_000_000 + PART + b"\r\n--x--", "with headers of at most 4096 bytes"),
         (b"--x\r\n" + b"\r\n--" * 4_000_000, "The form is incomplete"),
         (b"--x\r\n\r\n\r\n3\r\n--x--", "must name its field"),
-        (PART[:-1] + b"1" * 2000 + b"\r\n--x--", "'top' must be a short text"),
+        (PART[:-1] + b"1" * 2000 + b"\r\n--x--", "'top' must be a text of at most"),
         (b"", "The form is incomplete"),
     ],
     ids=["parts", "headers", "partial boundaries", "no name", "long", "empty"],

@@ -134,7 +134,7 @@ def test_readers_of_a_lost_stream_get_the_reason(script, make):
     reader.start()
     script.items.put(DeviceError("it returned no more pictures"))
     wait_until(lambda: reader.lost_count)
-    with pytest.raises(DeviceError, match=r"it returned no more pictures; the stream was lost 1 time\(s\)"):
+    with pytest.raises(DeviceError, match=r"it returned no more pictures; reading or reopening failed 1 time\(s\)"):
         reader.newest()
     with pytest.raises(DeviceError, match="it returned no more pictures"):
         reader.near(1.0)
