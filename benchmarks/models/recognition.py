@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import gammaln
 
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import Grasp, load_grasps
@@ -28,8 +29,7 @@ from retrieval.data.loading import map_in_order, worker_pool
 from retrieval.evaluation.reject import reject
 from retrieval.metrics.intervals import compare, summarise
 from retrieval.metrics.measure import Measure
-from retrieval.metrics.protocols import k_way
-from retrieval.metrics.table import ScoreTable
+from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import batches, photo_features
 from retrieval.model.posterior import Posterior
@@ -99,13 +99,36 @@ def measures(
         what = f"{count} grasp{'s' * (count > 1)}, {shown} photo{'s' * (shown > 1)}"
         for k in CANDIDATES:
             if len(scored.objects) >= k:
-                curve = k_way(scored, k, photos=shown, draws=DRAWS)
-                found[f"K = {k:,}, {what}"] = Measure(curve.values[:, :1], curve.owner, curve.chance[:1], curve.gallery)
+                found[f"K = {k:,}, {what}"] = top1(scored, k, shown)
         if checkpoint.posterior is not None and len(names) >= CATALOGUE:
             small = scored.select(scored.touch_owner < CATALOGUE, photo_owner < CATALOGUE)
             weighted = replace(small, scores=checkpoint.posterior.weight(count) * small.scores)
             found[f"none of these, AUROC, {what}"] = reject(Posterior(1.0, checkpoint.posterior.offset), weighted).auroc
     return found
+
+
+def top1(table: ScoreTable, k: int, photos: int) -> Measure:
+    """Return the top-1 accuracy of each row among its object and k - 1 random others, in closed form.
+
+    Of n others, b score higher and e equal. The row's object is first with probability
+    [C(n - b + 1, k) - C(n - b - e, k)] / [(e + 1) C(n, k - 1)]: no higher one is drawn, and ties are broken at random.
+    """
+    scores = object_scores(table, photos, DRAWS, seed=0)
+    true = np.take_along_axis(scores, np.searchsorted(table.objects, table.touch_owner)[None, :, None], 2)
+    higher, equal = (scores > true).sum(2), (scores == true).sum(2) - 1
+    n = len(table.objects) - 1
+    first, all_tied_lost, draws = (
+        log_binomial(count, size) for count, size in ((n - higher + 1, k), (n - higher - equal, k), (n, k - 1))
+    )
+    values = ((np.exp(first - draws) - np.exp(all_tied_lost - draws)) / (equal + 1)).mean(0)
+    return Measure(values[:, None], table.touch_owner, np.array([1 / k]), f"{k} of these objects: {table.gallery}")
+
+
+def log_binomial(n: NDArray[np.int64] | int, k: int) -> NDArray[np.float64]:
+    """Return log C(n, k); -inf if n < k."""
+    n = np.asarray(n, dtype=np.float64)
+    logarithm = gammaln(n + 1) - gammaln(np.maximum(n - k, 0) + 1) - gammaln(k + 1)
+    return np.asarray(np.where(n >= k, logarithm, -np.inf))
 
 
 def grasp_sets(owner: NDArray[np.int64], count: int, photos: int) -> NDArray[np.int64]:

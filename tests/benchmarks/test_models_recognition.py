@@ -7,6 +7,8 @@ import pytest
 
 from benchmarks.models import recognition
 from retrieval.data.dataset import load_grasps
+from retrieval.metrics.protocols import k_way
+from retrieval.metrics.table import ScoreTable
 
 
 def test_a_set_has_one_object_and_leaves_enough_photos():
@@ -16,6 +18,16 @@ def test_a_set_has_one_object_and_leaves_enough_photos():
     assert all(set(rows) < {0, 1, 2} and len(set(rows)) == 2 for rows in sets.tolist())
     assert recognition.grasp_sets(owner, 1, photos=1).tolist() == [[0], [1], [2], [3], [4]]
     assert recognition.grasp_sets(owner, 1, photos=2).tolist() == [[0], [1], [2]]
+
+
+def test_top1_equals_the_accuracy_of_k_way_tests_also_with_ties():
+    rng = np.random.default_rng(0)
+    owner = np.arange(12)
+    for levels in (2, 1000):  # many ties, and hardly any
+        scores = rng.integers(levels, size=(12, 12)).astype(np.float32)
+        scored = ScoreTable(scores, owner, owner, np.zeros((12, 12), dtype=bool))
+        expected = k_way(scored, 5, draws=1).values[:, 0]
+        np.testing.assert_allclose(recognition.top1(scored, 5, 1).values[:, 0], expected, rtol=1e-9)
 
 
 @pytest.fixture
