@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from retrieval.search.query.neighbours import Neighbour as Neighbour
     from retrieval.search.query.neighbours import nearest_photos as nearest_photos
     from retrieval.search.query.searcher import Searcher as Searcher
+    from retrieval.search.query.verification import Verification as Verification
     from retrieval.serve.client import Client as Client
     from retrieval.training.train import train as train
 
@@ -75,6 +76,7 @@ _MODULES = {
     "Searcher": "search.query.searcher:Searcher",
     "MethodSettings": "methods.method:MethodSettings",
     "Tower": "model.towers.tower:Tower",
+    "Verification": "search.query.verification:Verification",
     "adapt": "adaptation.recipe:adapt",
     "agreement": "search.query.agreement:agreement",
     "benchmark": "evaluation.real.benchmark:benchmark",

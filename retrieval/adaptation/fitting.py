@@ -53,6 +53,7 @@ def fit_matcher(data: AdaptationData, estimate: Estimate | None, out: Path) -> C
             "metrics": estimate.to_dict() if estimate else {},
         },
         gel_check=None,
+        verification=None,
         matcher=matcher,
         split=Split(config.training.seed, train=objects, validation=(), test=()),
     )

@@ -30,6 +30,7 @@ from retrieval.commands.options import Command
 from retrieval.commands.query import query
 from retrieval.commands.serve import serve
 from retrieval.commands.train import train
+from retrieval.commands.verify import verify
 from retrieval.console.interruption import record_interrupts
 from retrieval.console.output import checked_stdout, discard_stdout, prepare_streams, printable, say, show
 from retrieval.version import __version__
@@ -48,8 +49,8 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-_COMMANDS = (demo, collect, import_, export_recording, check, train, adapt, build_index, query, export, evaluate)
-for _command in (*_COMMANDS, frontier, serve):
+_COMMANDS = (demo, collect, import_, export_recording, check, train, adapt, build_index, query, verify, export)
+for _command in (*_COMMANDS, evaluate, frontier, serve):
     _name = _command.__name__.strip("_").replace("_", "-")
     app.command(_name, cls=Command)(_command)
 app.add_typer(benchmark.app)

@@ -36,10 +36,12 @@ from retrieval.model.fusion_scorer import GelCheck
 from retrieval.model.gel_head import GelHead
 from retrieval.model.posterior import Posterior
 from retrieval.model.reference_calibration import ReferenceCalibration
+from retrieval.model.verification import VerificationCalibration
 from retrieval.version import __version__
 
 _QUERIES = "queries.touch_partials"
 _GEL_HEAD = "gel_head."
+_CARD_FAR = 0.2  # smaller rates need more than the smallest number of validation objects
 _DTYPES = {
     torch.float16,
     torch.bfloat16,
@@ -62,6 +64,7 @@ class Checkpoint(CheckpointInfo):
         config: Settings of towers, head and preprocessing.
         provenance: Step, seed, data digest and metrics of the training.
         gel_check: Thresholds that separate touches, no-contact gels and other images; None without a gel head.
+        verification: Error rates of `Searcher.verify`; None if there were too few validation objects.
         matcher: The towers, the fusion head and the projections.
         split: Training, validation and test objects; None if the training run had no split.
         posterior: Calibration of the logits; None for an uncalibrated model.
@@ -99,6 +102,7 @@ class Checkpoint(CheckpointInfo):
             posterior=self.pooled_posterior,
             queries=None if self.queries is None else self.queries[:, : matcher.config.pooled_width],
             references=self.pooled_references,
+            verification=None,
             pooled_posterior=None,
             pooled_references=None,
         )
@@ -113,6 +117,7 @@ def save_checkpoint(
     provenance: Mapping[str, Any],
     posterior: Posterior | None = None,
     gel_check: GelCheck | None = None,
+    verification: VerificationCalibration | None = None,
     queries: NDArray[np.float16] | None = None,
     references: ReferenceCalibration | None = None,
     pooled_posterior: Posterior | None = None,
@@ -129,6 +134,7 @@ def save_checkpoint(
         provenance: Source, step, seed, data digest and metrics of the training.
         posterior: Calibration of its logits.
         gel_check: Thresholds of its gel head.
+        verification: Error rates of verifications with its logits.
         queries: (Q, partial) partial activations of validation touches.
         references: Calibration of reference touches.
         pooled_posterior: Calibration of the logits without late interaction; stored only if the model has cells.
@@ -144,6 +150,7 @@ def save_checkpoint(
         "split": split.to_dict() if split else None,
         "posterior": posterior.to_dict() if posterior else None,
         "gel_check": gel_check.to_dict() if gel_check else None,
+        "verification": verification.to_dict() if verification else None,
         "references": references.to_dict() if references else None,
         "provenance": dict(provenance),
     }
@@ -162,7 +169,7 @@ def save_checkpoint(
 
 
 CHECKPOINT_FIELDS = (
-    *("split", "provenance", "posterior", "gel_check", "queries", "references"),
+    *("split", "provenance", "posterior", "gel_check", "verification", "queries", "references"),
     *("pooled_posterior", "pooled_references"),
 )
 """Fields of a checkpoint that are stored in addition to matcher and configuration."""
@@ -240,6 +247,7 @@ def load_checkpoint(path: str | Path, *, info: CheckpointInfo | None = None) -> 
         info.config,
         info.provenance,
         info.gel_check,
+        info.verification,
         matcher.eval(),
         split,
         posterior,
@@ -364,6 +372,12 @@ def _model_card(name: str, header: Mapping[str, Any]) -> str:
         lines.append(
             f"* Reference touches: fitted on {references['touches']} touches of {references['objects']} objects that "
             "were left out"
+        )
+    if header["verification"]:
+        bounds = VerificationCalibration.from_dict(header["verification"]).bounds(_CARD_FAR)
+        lines.append(
+            f"* Verification at a false-accept rate of {_CARD_FAR:g}: false-reject rate "
+            f"{bounds.false_rejects.value:.3f} [{bounds.false_rejects.low:.3f}, {bounds.false_rejects.high:.3f}]"
         )
     if gel_check:
         rates = [f"{name.replace('_', ' ')} {value:.3f}" for name, value in gel_check["rates"].items()]

@@ -13,6 +13,7 @@ from retrieval.console.files import HEADER
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.config import Config
 from retrieval.model.fusion_scorer import FusionScorer, GelCheck
+from retrieval.model.verification import VerificationCalibration
 
 FORMAT = 2
 _SCORER_TENSORS = ("head.second.weight", "head.second.bias", "head.out.weight", "head.out.bias")
@@ -28,6 +29,7 @@ class CheckpointInfo:
         config: Settings of towers, head and preprocessing.
         provenance: Step, seed, data digest, metrics and so on.
         gel_check: Thresholds on the readings of the gel head; None without one.
+        verification: Error rates of `Searcher.verify`; None if there were too few validation objects.
     """
 
     path: Path
@@ -35,6 +37,7 @@ class CheckpointInfo:
     config: Config
     provenance: dict[str, Any]
     gel_check: GelCheck | None
+    verification: VerificationCalibration | None
 
 
 def fingerprint(checkpoint: CheckpointInfo) -> dict[str, str]:
@@ -89,9 +92,11 @@ def checkpoint_info(path: Path, header: dict[str, Any]) -> CheckpointInfo:
     try:
         config = Config.from_dict(header["config"])
         check = None if header.get("gel_check") is None else GelCheck.from_dict(header["gel_check"])
+        rates = header.get("verification")
+        verification = None if rates is None else VerificationCalibration.from_dict(rates)
     except BadInput as error:
         raise unusable(path, error) from error
-    return CheckpointInfo(path, file_digest(path), config, header["provenance"], check)
+    return CheckpointInfo(path, file_digest(path), config, header["provenance"], check, verification)
 
 
 def read_scorer(info: CheckpointInfo) -> FusionScorer:

@@ -32,6 +32,7 @@ from retrieval.model.reference_calibration import (
     fit_reference_calibration,
     touch_embeddings,
 )
+from retrieval.model.verification import fit_verification
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.foreign_images import draw_foreign
 
@@ -89,8 +90,13 @@ def with_verdicts(
     touches, photos = recorded_features(
         matcher, source, validation, what="posterior", quiet=quiet, should_stop=should_stop
     )
-    posterior, references = _fit_calibration(posterior_touches(matcher, validation, touches, photos), seed)
+    queries = posterior_touches(matcher, validation, touches, photos)
+    posterior, references = _fit_calibration(queries, seed)
     made = dataclasses.replace(made, posterior=posterior, references=references)
+    if queries is not None and posterior is not None:
+        embeddings = photo_embeddings(matcher, photos)
+        verification = fit_verification(queries.scored, embeddings, posterior, seed)
+        made = dataclasses.replace(made, verification=verification)
     if matcher.config.cell_dim:
         queries = posterior_touches(matcher, validation, touches, photos, pooled=True)
         posterior, references = _fit_calibration(queries, seed)
@@ -160,6 +166,13 @@ def posterior_touches(
     logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
     embeddings = touch_embeddings(touch_partials, matcher.config.cosine_columns)
     return ReferenceTouches(ScoredTouches(logits, touch_owner, photo_owner, own), embeddings)
+
+
+@torch.inference_mode()
+def photo_embeddings(matcher: Matcher, photos: dict[Path, Tensor]) -> NDArray[np.float64]:
+    """Return the contrastive embeddings (N, embedding_dim) of photos, given their features."""
+    embeddings = matcher.photo_encoding(torch.stack(list(photos.values()))).embedding
+    return np.asarray(embeddings.cpu().numpy().astype(np.float64))
 
 
 # The gel check ---------------------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """The result of a query: a verdict and a ranking of objects with probabilities, with the index and the timing."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from retrieval.errors import BadInput
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.information import Information, information, unlisted_probability
-from retrieval.model.posterior import Posterior
+from retrieval.model.posterior import Posterior, PosteriorProbabilities
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
 CLEAR_PROBABILITY = 0.5
@@ -235,3 +236,21 @@ def verdict_sentence(result: QueryResult) -> str:
             f"{best.object_id} with probability {best.probability_if_present:.2f}{remark}. {result.advice}"
         )
     return f"uncalibrated: {best.object_id} ranks first; this model has no probabilities{remark}"
+
+
+def verdict_of(classes: Sequence[str], probabilities: PosteriorProbabilities | None) -> str:
+    """Return the verdict from the gel check of each grasp and the probabilities; None for an uncalibrated model."""
+    if NOT_A_GEL in classes:
+        return NOT_A_GEL
+    if CONTACT not in classes:
+        return NO_CONTACT
+    if probabilities is None:
+        return UNCALIBRATED
+    return MATCH if probabilities.is_match else NONE_OF_THESE
+
+
+def require_counts(top: int, candidates: int | None) -> None:
+    """Check numbers of objects and candidates. Raises BadInput unless they are whole numbers of at least 1."""
+    counts: list[object] = [top] if candidates is None else [top, candidates]
+    if not all(isinstance(count, int | np.integer) and count >= 1 for count in counts):
+        raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")

@@ -12,6 +12,7 @@ from indexes.store.sharded import ShardedManifest, open_shard
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info, read_scorer
 from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.stored_partials import CELLS, stored_layout
+from retrieval.model.touches import TouchEncoder
 from retrieval.search import defaults
 from retrieval.search.query.objects import check_usable
 from retrieval.search.query.shard import FolderShard, IndexInfo, Shard, Shards
@@ -123,3 +124,11 @@ def sharded_index_info(manifest: ShardedManifest) -> IndexInfo:
         manifest.calibration,
         len(manifest.shards),
     )
+
+
+def torch_encoder(stored: CheckpointInfo, threads: int | None = None) -> TouchEncoder:
+    """Return a touch encoder that runs in PyTorch; the slow import of PyTorch happens here."""
+    from retrieval.model.checkpoint import load_checkpoint
+    from retrieval.model.encode import TorchEncoder
+
+    return TorchEncoder(load_checkpoint(stored.path, info=stored).matcher, threads)

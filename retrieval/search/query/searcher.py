@@ -15,7 +15,7 @@ from indexes.store.generation import Generation
 from retrieval.data.storage import url_or_path
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint_info import CheckpointInfo
-from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, FusionScorer
+from retrieval.model.fusion_scorer import CONTACT, NOT_A_GEL, FusionScorer
 from retrieval.model.onnx_encoder import find_export
 from retrieval.model.posterior import NONE_PRIOR, Posterior, PosteriorProbabilities, require_prior
 from retrieval.model.reference_calibration import REFERENCE_ROWS
@@ -29,11 +29,12 @@ from retrieval.model.touches import (
     TouchReader,
     parse_grasps,
 )
-from retrieval.search.query.answer import MATCH, NONE_OF_THESE, UNCALIBRATED, Match, QueryResult, is_clear
+from retrieval.search.query.answer import NONE_OF_THESE, Match, QueryResult, is_clear, require_counts, verdict_of
 from retrieval.search.query.objects import Objects
-from retrieval.search.query.opening import OpenShards, open_index, scorer_for
+from retrieval.search.query.opening import OpenShards, open_index, scorer_for, torch_encoder
 from retrieval.search.query.reference_touches import reference_summary
 from retrieval.search.query.shard import FolderShard, Shard, ShardQuery, ShardResult
+from retrieval.search.query.verification import Verification, verify
 
 Floats = NDArray[np.float32]
 
@@ -125,15 +126,16 @@ class Searcher:
     @property
     def generation(self) -> Generation:
         """The opened generation of an index folder. Raises BadInput for a sharded index."""
-        return self._folder.generation
+        return self.folder_shard.generation
 
     @property
     def objects(self) -> Objects:
         """The objects of the opened generation of an index folder. Raises BadInput for a sharded index."""
-        return self._folder.objects
+        return self.folder_shard.objects
 
     @property
-    def _folder(self) -> FolderShard:
+    def folder_shard(self) -> FolderShard:
+        """The shard of an opened index folder. Raises BadInput for a sharded index."""
         shard = self._snapshot().shard
         if not isinstance(shard, FolderShard):
             raise BadInput(f"{self.index} is a sharded index, but one index folder is required; open one of its shards")
@@ -241,6 +243,23 @@ class Searcher:
         codes = opened.reader.encode(grasps, opened.reader.no_contact_frames(background), Stopwatch())
         return EncodedTouches(codes.embeddings, codes.partials)
 
+    def verify(
+        self, touches: AnyTouches, expect: str, *, far: float = 0.01, background: Sequence[AnyImage] | None = None
+    ) -> Verification:
+        """Decide whether the object in the hand is the expected one, at a stated false-accept rate.
+
+        Args:
+            touches: As for `query`; at most the first four grasps with contact are used.
+            expect: The expected object of the catalogue.
+            far: False-accept rate: the fraction of other objects that is accepted.
+            background: As for `query`.
+
+        Raises:
+            BadInput: The catalogue lacks the object, the rate is too small for the model's validation objects, or the
+                model has no error rates.
+        """
+        return verify(self._snapshot(), touches, expect, far=far, background=background)
+
     def _snapshot(self) -> Searcher:
         """Return a copy with references to all resources, so that `close` in another thread cannot break a query."""
         opened = object.__new__(type(self))
@@ -305,7 +324,7 @@ class Searcher:
         none_prior: float,
     ) -> QueryResult:
         info, probabilities = self.info, scored.probabilities if scored else None
-        verdict = _verdict(classes, probabilities)
+        verdict = verdict_of(classes, probabilities)
         searched = scored.found.searched if scored else info.photos
         sharding = {"shards": info.shards, "searched": searched / info.photos} if info.shards > 1 else {}
         return QueryResult(
@@ -373,28 +392,3 @@ class _ScoredQuery(NamedTuple):
     found: ShardResult
     grasps: int
     probabilities: PosteriorProbabilities | None
-
-
-def _verdict(classes: Sequence[str], probabilities: PosteriorProbabilities | None) -> str:
-    if NOT_A_GEL in classes:
-        return NOT_A_GEL
-    if CONTACT not in classes:
-        return NO_CONTACT
-    if probabilities is None:
-        return UNCALIBRATED
-    return MATCH if probabilities.is_match else NONE_OF_THESE
-
-
-def require_counts(top: int, candidates: int | None) -> None:
-    """Check numbers of objects and candidates. Raises BadInput unless they are whole numbers of at least 1."""
-    counts: list[object] = [top] if candidates is None else [top, candidates]
-    if not all(isinstance(count, int | np.integer) and count >= 1 for count in counts):
-        raise BadInput(f"top and candidates must be whole numbers of 1 or more; got {top} and {candidates}")
-
-
-def torch_encoder(stored: CheckpointInfo, threads: int | None = None) -> TouchEncoder:
-    """Return a touch encoder that runs in PyTorch; the slow import of PyTorch happens here."""
-    from retrieval.model.checkpoint import load_checkpoint
-    from retrieval.model.encode import TorchEncoder
-
-    return TorchEncoder(load_checkpoint(stored.path, info=stored).matcher, threads)

@@ -192,6 +192,19 @@ class FolderShard:
         ]
         return ShardResult(photos, len(objects.numbers), best, mass, self.generation.count, clock.finish(1))
 
+    def object_logit(self, number: int, partials: Floats, posterior: Posterior) -> float:
+        """Return the logit of an object for grasps, by all its photos and reference touches.
+
+        Args:
+            number: Number of the object (`Objects.numbers_of`).
+            partials: (G, partial_width) partial activations of the grasps.
+            posterior: The posterior of the model.
+        """
+        rows = self.objects.remaining_rows(np.array([number]), np.zeros(0, dtype=np.int64))
+        similarities = None if self.references is None else self.references.similarities_to_objects(partials)
+        scored = self._objects_of(rows, self._logits(partials, rows), posterior, len(partials), similarities)
+        return float(scored.logits[0])
+
     def rows(self, ids: Sequence[str]) -> list[dict[str, Any] | None]:
         """As `Shard.rows`."""
         numbers = self.generation.rows.find(ids).tolist()

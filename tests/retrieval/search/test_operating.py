@@ -36,7 +36,17 @@ def checkpoint_of(candidate_width=8, queries=TOUCHES):
     config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, candidate_width=candidate_width))
     partials = np.random.default_rng(1).normal(size=(queries, config.matcher.partial_width)).astype(np.float16)
     matcher = Matcher(config.matcher).eval()
-    return Checkpoint(Path("m"), "0" * 64, config, {}, gel_check=None, matcher=matcher, split=None, queries=partials)
+    return Checkpoint(
+        Path("m"),
+        "0" * 64,
+        config,
+        {},
+        gel_check=None,
+        verification=None,
+        matcher=matcher,
+        split=None,
+        queries=partials,
+    )
 
 
 @pytest.fixture

@@ -244,6 +244,7 @@ def checkpoint(matcher, tmp_path):
         config=Config(WITHOUT_CANDIDATE_ENCODER),
         split=None,
         gel_check=None,
+        verification=None,
         provenance=about,
     )
 

@@ -1,0 +1,55 @@
+"""`retrieve verify`: is the object in the hand the expected one?"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from retrieval.commands.options import FRACTION, Index, IndexModel, Json, NoVerify, OptionValues
+from retrieval.console.output import print_json, say
+
+
+def verify(
+    *,
+    expect: Annotated[str, typer.Option(metavar="OBJECT", help="the expected object of the catalogue")],
+    gelsight: Annotated[
+        list[OptionValues],
+        typer.Option(
+            parser=OptionValues.parse,
+            metavar="IMAGE...",
+            help="gel images of one grasp, one per finger; repeat the option for more grasps of the same object",
+        ),
+    ],
+    background: Annotated[
+        OptionValues | None,
+        typer.Option(parser=OptionValues.parse, metavar="IMAGE...", help="no-contact frames, one per finger"),
+    ] = None,
+    far: Annotated[
+        float,
+        typer.Option(metavar="RATE", parser=FRACTION, help="false-accept rate: accepted fraction of other objects"),
+    ] = 0.01,
+    index: Index = None,
+    model: IndexModel = None,
+    json: Json = False,
+    no_verify: NoVerify = False,
+) -> int:
+    """Accept or reject the object in the hand as the expected one, at a stated false-accept rate."""
+    from retrieval.search import defaults
+
+    path, reason = defaults.find_index(index)
+    if index is None:
+        say(f"index: {path} ({reason})")
+    from retrieval.search.query.searcher import Searcher
+    from retrieval.search.query.verification import VERIFY_EXIT_CODES
+
+    with Searcher.open(path, model=model, verify=not no_verify) as searcher:
+        result = searcher.verify(
+            [[Path(image) for image in grasp] for grasp in gelsight],
+            expect,
+            far=far,
+            background=None if background is None else [Path(image) for image in background],
+        )
+    if json:
+        print_json(result.to_dict())
+    say(result.sentence)
+    return VERIFY_EXIT_CODES[result.decision]

@@ -1,0 +1,214 @@
+"""Verification: does the hand hold the expected object? Thresholds with a stated false-accept rate.
+
+    accept           if the largest log likelihood ratio after 1, 2, ... grasps is at least a
+    reject           if the last one is at most b, or after MAX_GRASPS grasps
+    another grasp    otherwise
+
+The ratio compares "this object" with "an object that the catalogue lacks" (`retrieval.model.posterior`). This is a
+sequential test between two bounds (Wald 1945). Wald's own bounds hold for exact ratios of independent grasps; these are
+quantiles over sequences of grasps of validation objects. The fraction `far` of the impostors has a largest ratio over
+MAX_GRASPS grasps above a, so the rate holds for every number of grasps. The bound b adds a tenth of the false rejects
+that a alone causes, and at least MIN_EARLY_REJECTS.
+
+Two kinds of impostors are measured: another object at random, and the object whose photos are most similar to those of
+the expected one. Terms follow ISO/IEC 19795-1: false-accept rate (FAR), false-reject rate (FRR), genuine, impostor.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from _touch_retrieval.documents import check_fields, typed
+from retrieval.errors import BadInput
+from retrieval.model.posterior import IdentificationTrials, Posterior, ScoredTouches
+
+MAX_GRASPS = 4
+"""Largest number of grasps before a decision."""
+MIN_OBJECTS = 20
+"""Number of validation objects that a calibration needs."""
+SEQUENCES = 8
+"""Sequences of grasps of each validation object."""
+MIN_EARLY_REJECTS = 0.005
+"""Smallest fraction of genuine sequences that the lower bound rejects."""
+ERRORS_NEEDED = 30
+"""A rate is supported by the data if they would contain this many errors (rule of 30, Doddington et al. 2000)."""
+LEVELS = tuple(float(level) for level in np.round(np.geomspace(1e-5, 0.5, 95), 9))
+"""False-accept rates whose thresholds are stored."""
+QUANTILES = tuple(float(level) for level in np.round(np.linspace(0, 1, 201), 3))
+
+Floats = NDArray[np.float64]
+ACCEPT, REJECT, ANOTHER_GRASP = "accept", "reject", "another grasp"
+
+
+@dataclass(frozen=True)
+class ErrorRate:
+    """An error rate on validation objects, with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class DecisionBounds:
+    """The two bounds of a verification, and its error rates.
+
+    Attributes:
+        accept: Smallest log likelihood ratio that accepts.
+        reject: Largest log likelihood ratio that rejects before the last grasp.
+        false_accepts: False-accept rate for random impostors, the requested one.
+        similar_false_accepts: The same for the most similar object of about as many as were used for calibration.
+        false_rejects: False-reject rate after all `MAX_GRASPS` grasps.
+        accepted: Fraction of genuine sequences that are accepted within 1, 2, ... grasps.
+    """
+
+    accept: float
+    reject: float
+    false_accepts: ErrorRate
+    similar_false_accepts: ErrorRate
+    false_rejects: ErrorRate
+    accepted: tuple[float, ...]
+
+    def decide(self, ratios: Floats) -> str:
+        """Return the decision after the log likelihood ratios (G,) of the first grasp, the first two, and so on."""
+        if ratios.max() >= self.accept:
+            return ACCEPT
+        return REJECT if ratios[-1] <= self.reject or len(ratios) >= MAX_GRASPS else ANOTHER_GRASP
+
+
+@dataclass(frozen=True)
+class VerificationCalibration:
+    """Log likelihood ratios of sequences of grasps of validation objects.
+
+    Attributes:
+        objects: Number of validation objects.
+        impostors: Largest ratio of a random impostor that is exceeded at each rate of `LEVELS`.
+        similar: Quantiles (`QUANTILES`) of the largest ratio of the most similar impostor.
+        genuine: For 1 to `MAX_GRASPS` grasps, quantiles of the largest ratio of genuine sequences so far.
+        lowest: Quantiles of the lowest ratio of genuine sequences before the last grasp.
+    """
+
+    objects: Annotated[int, Meta(ge=MIN_OBJECTS)]
+    impostors: tuple[float, ...]
+    similar: tuple[float, ...]
+    genuine: tuple[tuple[float, ...], ...]
+    lowest: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        check_fields(self, "verification", BadInput)
+        sizes = [len(self.impostors), *map(len, (self.similar, self.lowest, *self.genuine)), len(self.genuine)]
+        expected = [len(LEVELS), *[len(QUANTILES)] * (2 + len(self.genuine)), MAX_GRASPS]
+        if sizes != expected:
+            raise BadInput(f"verification must have {expected} numbers, got {sizes}")
+
+    @property
+    def pairs(self) -> int:
+        """Number of pairs of different validation objects."""
+        return self.objects * (self.objects - 1) // 2
+
+    def bounds(self, far: float) -> DecisionBounds:
+        """Return the bounds at a false-accept rate.
+
+        Raises:
+            BadInput: The rate is not between 0 and 0.5, or too small for the number of validation objects.
+        """
+        if not (isinstance(far, int | float) and 0 < far <= LEVELS[-1]):
+            raise BadInput(f"the false-accept rate must be above 0 and at most {LEVELS[-1]:g}, got {far}")
+        if far * self.pairs < ERRORS_NEEDED:
+            needed = math.ceil((1 + math.sqrt(1 + 8 * ERRORS_NEEDED / far)) / 2)
+            raise BadInput(
+                f"a false-accept rate of {far:g} needs {needed:,} validation objects; the model has {self.objects}, "
+                f"enough for {ERRORS_NEEDED / self.pairs:.2g}: give a larger rate, or train with more objects"
+            )
+        accept = float(np.interp(math.log(far), np.log(LEVELS), self.impostors))
+        rejects = _fraction_below(accept, self.genuine[-1])
+        early = max(MIN_EARLY_REJECTS, rejects / 10)
+        reject = min(float(np.interp(early, QUANTILES, self.lowest)), accept)
+        return DecisionBounds(
+            accept,
+            reject,
+            _rate(far, self.pairs),
+            _rate(1 - _fraction_below(accept, self.similar), self.objects),
+            _rate(min(1.0, rejects + early), self.objects),
+            tuple(1 - _fraction_below(accept, quantiles) for quantiles in self.genuine),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return a plain dictionary, as stored in checkpoints."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Any) -> "VerificationCalibration":
+        """Inverse of `to_dict`. Raises BadInput for anything else."""
+        return typed(data, cls, "verification", complete=True, error=BadInput)
+
+
+def _fraction_below(value: float, quantiles: tuple[float, ...]) -> float:
+    """Return the fraction of a distribution that lies below a value."""
+    return float(np.interp(value, quantiles, QUANTILES, left=0.0, right=1.0))
+
+
+def _rate(value: float, trials: int) -> ErrorRate:
+    from retrieval.metrics.k_way import clopper_pearson  # imports scipy, which queries do not need
+
+    return ErrorRate(value, *clopper_pearson(value * trials, trials, 0.95))
+
+
+def fit_verification(
+    scored: ScoredTouches, embeddings: Floats, posterior: Posterior, seed: int = 0
+) -> VerificationCalibration | None:
+    """Return the calibration from touches and photos of validation objects.
+
+    Args:
+        scored: Match logits of the touches with the photos.
+        embeddings: (N, d) unit embeddings of the photos, by which the most similar object is found.
+        posterior: The posterior of the model.
+        seed: Seed of the sequences.
+
+    Returns:
+        The calibration; None if fewer than `MIN_OBJECTS` objects have `MAX_GRASPS` grasps and a photo of another one.
+    """
+    rng = np.random.default_rng([seed, 7])
+    sequences = []
+    for name in np.unique(scored.touch_owner):
+        touches, photos = np.flatnonzero(scored.touch_owner == name), scored.photo_owner == name
+        drawn = [rng.permutation(touches)[:MAX_GRASPS] for _ in range(SEQUENCES)]
+        sequences += [rows for rows in drawn if len(rows) == MAX_GRASPS and (photos & ~scored.own[rows].any(0)).any()]
+    sets = np.array(sequences, dtype=np.int64).reshape(-1, MAX_GRASPS)
+    known = np.unique(scored.touch_owner[sets[:, 0]])
+    if len(known) < MIN_OBJECTS:
+        return None
+    ratios = np.stack(
+        [
+            IdentificationTrials.of(scored, sets[:, :count], seed).log_ratios(posterior)
+            for count in range(1, MAX_GRASPS + 1)
+        ]
+    )
+    objects = np.unique(scored.photo_owner)
+    rows, true = np.arange(len(sets)), np.searchsorted(objects, scored.touch_owner[sets[:, 0]])
+    similar = _most_similar(objects, scored.photo_owner, embeddings)
+    highest = np.maximum.accumulate(ratios, axis=0)
+    impostor = np.ones(ratios.shape[1:], dtype=bool)
+    impostor[rows, true] = False
+    genuine = highest[:, rows, true]
+    return VerificationCalibration(
+        len(known),
+        tuple(np.quantile(highest[-1][impostor], 1 - np.array(LEVELS)).tolist()),
+        tuple(np.quantile(highest[-1][rows, similar[true]], QUANTILES).tolist()),
+        tuple(tuple(np.quantile(values, QUANTILES).tolist()) for values in genuine),
+        tuple(np.quantile(ratios[:-1, rows, true].min(0), QUANTILES).tolist()),
+    )
+
+
+def _most_similar(objects: NDArray[np.int64], owner: NDArray[np.int64], embeddings: Floats) -> NDArray[np.int64]:
+    """Return for each object the place (O,) of the other object with the most similar mean embedding."""
+    means = np.stack([embeddings[owner == name].mean(0) for name in objects])
+    means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)
+    cosines = means @ means.T
+    np.fill_diagonal(cosines, -np.inf)
+    return np.asarray(cosines.argmax(1))

@@ -1,0 +1,120 @@
+"""`Searcher.verify` and `retrieve verify`: accept, reject, another grasp, and invalid requests."""
+
+import dataclasses
+import json
+
+import pytest
+
+import retrieval
+from retrieval.commands.main import main
+from retrieval.errors import BadInput
+from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
+from retrieval.model.posterior import Posterior
+from retrieval.model.verification import LEVELS, MAX_GRASPS, QUANTILES, VerificationCalibration
+from retrieval.search.build.build_index import build_index
+
+POSTERIOR = Posterior(slope=1.0, offset=0.0)
+
+
+def calibration(accept, reject):
+    """Return a calibration whose bounds are these at every rate."""
+    return VerificationCalibration(
+        objects=100,
+        impostors=(accept,) * len(LEVELS),
+        similar=(accept - 1,) * len(QUANTILES),
+        genuine=((accept + 1,) * len(QUANTILES),) * MAX_GRASPS,
+        lowest=(reject,) * len(QUANTILES),
+    )
+
+
+@pytest.fixture(scope="module")
+def open_index(model, catalogue, tmp_path_factory):
+    """Return a function that builds and opens an index of a model with a calibration."""
+
+    def opened(fitted):
+        folder = tmp_path_factory.mktemp("verified")
+        made = dataclasses.replace(load_checkpoint(model), posterior=POSTERIOR, verification=fitted, gel_check=None)
+        store_checkpoint(made, folder / "m.safetensors")
+        build_index(catalogue, load_checkpoint(folder / "m.safetensors"), folder / "index", quiet=True)
+        return retrieval.open(folder / "index")
+
+    return opened
+
+
+@pytest.fixture(scope="module")
+def ratio(open_index, touches):
+    """The log likelihood ratio of the first object for its first touch: the logit of its photos."""
+    name = sorted(touches)[0]
+    with open_index(None) as searcher:
+        result = searcher.query(touches[name][:1], top=99)
+        return next(match.logit for match in result.results if match.object_id == name)
+
+
+@pytest.mark.parametrize(
+    ("accept", "reject", "decision"), [(-1, -2, "accept"), (2, 1, "reject"), (1, -1, "another grasp")]
+)
+def test_the_ratio_of_the_expected_object_is_compared_with_the_bounds(
+    open_index, touches, ratio, accept, reject, decision
+):
+    name = sorted(touches)[0]
+    with open_index(calibration(ratio + accept, ratio + reject)) as searcher:
+        found = searcher.verify(touches[name][:1], name, far=0.05)
+        assert found.decision == decision
+        assert found.log_ratios == [pytest.approx(ratio, abs=1e-4)]
+        assert found.is_accepted == (decision == "accept")
+        assert found.sentence.startswith(decision)
+
+
+def test_a_sequence_that_ends_without_a_decision_is_rejected(open_index, touches, ratio):
+    name = sorted(touches)[0]
+    grasps = [*touches[name], touches[name][0]]
+    assert len(grasps) == MAX_GRASPS
+    with open_index(calibration(1e3, -1e3)) as searcher:
+        assert searcher.verify(grasps[:-1], name).decision == "another grasp"
+        found = searcher.verify(grasps, name)
+        assert found.decision == "reject"
+        assert len(found.log_ratios) == MAX_GRASPS
+
+
+def test_only_the_photos_of_the_expected_object_are_scored(open_index, touches, monkeypatch):
+    name = sorted(touches)[0]
+    with open_index(calibration(0.0, -1.0)) as searcher:
+        counts = []
+        logits = type(searcher.folder_shard.scorer).logits
+        monkeypatch.setattr(
+            type(searcher.folder_shard.scorer),
+            "logits",
+            lambda scorer, partials, photos, rows=None: (
+                counts.append(len(rows)),
+                logits(scorer, partials, photos, rows),
+            )[1],
+        )
+        searcher.verify(touches[name][:1], name)
+        assert counts == [3]  # the catalogue has three photos of each object
+
+
+def test_an_object_that_the_catalogue_lacks_is_refused(open_index, touches):
+    with open_index(calibration(0.0, -1.0)) as searcher, pytest.raises(BadInput, match="has no object 'anvil'"):
+        searcher.verify(next(iter(touches.values()))[:1], "anvil")
+
+
+def test_a_model_without_error_rates_is_refused(open_index, touches):
+    with open_index(None) as searcher, pytest.raises(BadInput, match="no error rates for verification"):
+        searcher.verify(next(iter(touches.values()))[:1], sorted(touches)[0])
+
+
+def test_the_command_prints_the_decision_and_exits_with_its_code(open_index, touches, capsys):
+    name = sorted(touches)[0]
+    with open_index(calibration(-1e3, -2e3)) as searcher:
+        index = str(searcher.index)
+    images = [str(path) for path in touches[name][0]]
+    assert main(["verify", "--expect", name, "--gelsight", *images, "--index", index, "--json"]) == 0
+    output = capsys.readouterr()
+    document = json.loads(output.out)
+    assert document["decision"] == "accept"
+    assert document["bounds"]["false_accepts"]["value"] == 0.01
+    assert f"accept: {name}" in output.err
+    assert main(["verify", "--expect", "anvil", "--gelsight", *images, "--index", index]) == 2
+    assert "has no object 'anvil'" in capsys.readouterr().err
+    assert main(["verify", "--expect", name, "--gelsight", *images, "--index", index, "--far", "0.00001"]) == 2
+    assert "validation objects; the model has 100" in capsys.readouterr().err
