@@ -26,6 +26,7 @@ They are not installed with the package. Each runs in a checkout of the reposito
     python -m benchmarks.models.next_grasp     information of another grasp, compared with the page's estimate
     python -m benchmarks.models.scaling        accuracy against the number of training objects and grasps
     python -m benchmarks.models.recognition    checkpoints compared: one object among 10, 100 and 1,000
+    python -m benchmarks.models.verify         stated and achieved error rates of verification
     python -m benchmarks.models.in_double      a command in float64
     python -m benchmarks.importers_memory      memory of the importers for many rows
     python -m benchmarks.service_load          the service under load

@@ -17,7 +17,7 @@ the expected one. Terms follow ISO/IEC 19795-1: false-accept rate (FAR), false-r
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from msgspec import Meta
@@ -159,19 +159,34 @@ def _rate(value: float, trials: int) -> ErrorRate:
     return ErrorRate(value, *clopper_pearson(value * trials, trials, 0.95))
 
 
-def fit_verification(
+class VerificationSequences(NamedTuple):
+    """Log likelihood ratios of sequences of `MAX_GRASPS` grasps.
+
+    Attributes:
+        owner: (S,) object of each sequence.
+        ratios: (S, MAX_GRASPS) ratios of the right object after 1, 2, ... grasps.
+        genuine: (MAX_GRASPS, S) the largest of them so far.
+        impostor: (S, O - 1) largest ratio of each other object.
+        similar: (S,) that of the most similar other object.
+    """
+
+    owner: NDArray[np.int64]
+    ratios: Floats
+    genuine: Floats
+    impostor: Floats
+    similar: Floats
+
+
+def verification_sequences(
     scored: ScoredTouches, embeddings: Floats, posterior: Posterior, seed: int = 0
-) -> VerificationCalibration | None:
-    """Return the calibration from touches and photos of validation objects.
+) -> VerificationSequences:
+    """Draw `SEQUENCES` sequences of each object with `MAX_GRASPS` grasps and a photo of another one, and score them.
 
     Args:
         scored: Match logits of the touches with the photos.
-        embeddings: (N, d) unit embeddings of the photos, by which the most similar object is found.
+        embeddings: (N, d) embeddings of the photos, by which the most similar object is found.
         posterior: The posterior of the model.
         seed: Seed of the sequences.
-
-    Returns:
-        The calibration; None if fewer than `MIN_OBJECTS` objects have `MAX_GRASPS` grasps and a photo of another one.
     """
     rng = np.random.default_rng([seed, 7])
     sequences = []
@@ -180,28 +195,46 @@ def fit_verification(
         drawn = [rng.permutation(touches)[:MAX_GRASPS] for _ in range(SEQUENCES)]
         sequences += [rows for rows in drawn if len(rows) == MAX_GRASPS and (photos & ~scored.own[rows].any(0)).any()]
     sets = np.array(sequences, dtype=np.int64).reshape(-1, MAX_GRASPS)
-    known = np.unique(scored.touch_owner[sets[:, 0]])
-    if len(known) < MIN_OBJECTS:
-        return None
+    owner, objects = scored.touch_owner[sets[:, 0]], np.unique(scored.photo_owner)
+    if not len(sets):
+        none = np.zeros((0, MAX_GRASPS))
+        return VerificationSequences(owner, none, none.T, np.zeros((0, len(objects) - 1)), none[:, 0])
     ratios = np.stack(
         [
             IdentificationTrials.of(scored, sets[:, :count], seed).log_ratios(posterior)
             for count in range(1, MAX_GRASPS + 1)
         ]
     )
-    objects = np.unique(scored.photo_owner)
-    rows, true = np.arange(len(sets)), np.searchsorted(objects, scored.touch_owner[sets[:, 0]])
-    similar = _most_similar(objects, scored.photo_owner, embeddings)
+    rows, true = np.arange(len(sets)), np.searchsorted(objects, owner)
     highest = np.maximum.accumulate(ratios, axis=0)
-    impostor = np.ones(ratios.shape[1:], dtype=bool)
-    impostor[rows, true] = False
-    genuine = highest[:, rows, true]
+    is_impostor = np.arange(len(objects)) != true[:, None]
+    similar = _most_similar(objects, scored.photo_owner, embeddings)[true]
+    return VerificationSequences(
+        owner,
+        ratios[:, rows, true].T,
+        highest[:, rows, true],
+        highest[-1][is_impostor].reshape(len(sets), -1),
+        highest[-1][rows, similar],
+    )
+
+
+def fit_verification(
+    scored: ScoredTouches, embeddings: Floats, posterior: Posterior, seed: int = 0
+) -> VerificationCalibration | None:
+    """Return the calibration from touches and photos of validation objects; arguments of `verification_sequences`.
+
+    None if fewer than `MIN_OBJECTS` objects have sequences.
+    """
+    found = verification_sequences(scored, embeddings, posterior, seed)
+    objects = len(np.unique(found.owner))
+    if objects < MIN_OBJECTS:
+        return None
     return VerificationCalibration(
-        len(known),
-        tuple(np.quantile(highest[-1][impostor], 1 - np.array(LEVELS)).tolist()),
-        tuple(np.quantile(highest[-1][rows, similar[true]], QUANTILES).tolist()),
-        tuple(tuple(np.quantile(values, QUANTILES).tolist()) for values in genuine),
-        tuple(np.quantile(ratios[:-1, rows, true].min(0), QUANTILES).tolist()),
+        objects,
+        tuple(np.quantile(found.impostor, 1 - np.array(LEVELS)).tolist()),
+        tuple(np.quantile(found.similar, QUANTILES).tolist()),
+        tuple(tuple(np.quantile(values, QUANTILES).tolist()) for values in found.genuine),
+        tuple(np.quantile(found.ratios[:, :-1].min(1), QUANTILES).tolist()),
     )
 
 
