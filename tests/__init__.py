@@ -11,6 +11,7 @@
     fake_rig, replay_rig, views, meshes         rigs, depth pictures and solids from formulas and from files
     fake_video, wsg50_bench, wsg50_packets      fake cameras and a fake gripper
     oracle, documents, pages                    expected search results; parsers of documents and pages
+    verification                                a calibration of verifications with given bounds
     hard_case                                   one stiff or extreme input
     hostile_pictures, decoding                  pictures that are slow to decode; processes that hang
     plugins                                     entry points of a package that is not installed

@@ -24,7 +24,7 @@ from retrieval.serve.history import FeedbackBody
 from retrieval.serve.history_writer import HistoryWriter, Recorder
 from retrieval.serve.human_baseline import ChoiceBody, RunBody
 from retrieval.serve.metrics import Metrics
-from retrieval.serve.queries import AgreementBody
+from retrieval.serve.queries import AgreementBody, VerifyBody
 from retrieval.serve.queue import Queue
 from retrieval.serve.security import Guard
 from retrieval.serve.service import LiveRig, Service
@@ -46,6 +46,7 @@ _CLOSING_S = 1.0
 _BODIES: tuple[type[BaseModel], ...] = (
     QueryBody,
     BatchBody,
+    VerifyBody,
     AgreementBody,
     FeedbackBody,
     RunBody,

@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 
 from retrieval.model.information import Information
+from retrieval.model.verification import DecisionBounds
 from retrieval.search.query.answer import NearestReference
 
 EXAMPLE: dict[str, Any] = {
@@ -143,6 +144,20 @@ class NearPhotosDocument(BaseModel):
     generation: str
     photo: str
     items: list[NearPhoto]
+
+
+class VerificationDocument(BaseModel):
+    """The document of `retrieve verify --json`.
+
+    decision: "accept", "reject", "another grasp", "no contact" or "not a gel image"; bounds is null for the last two.
+    """
+
+    expected: str = Field(examples=["mug"])
+    decision: str = Field(examples=["accept"])
+    touches: list[list[str]]
+    grasps: list[str]
+    log_ratios: list[float]
+    bounds: DecisionBounds | None
 
 
 class AgreementDocument(BaseModel):

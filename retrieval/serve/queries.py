@@ -1,4 +1,4 @@
-"""Routes of queries: one object, several objects, cumulative queries, and occlusion maps."""
+"""Routes of queries: one object, several objects, cumulative queries, verification, and occlusion maps."""
 
 from fastapi import APIRouter, Request
 from pydantic import Field
@@ -6,7 +6,13 @@ from pydantic import Field
 from retrieval.search.query.agreement import agreement
 from retrieval.search.query.answer import QueryResult
 from retrieval.serve.catalogue import photo_of
-from retrieval.serve.documents import AgreementDocument, BatchDocument, CumulativeQueryDocument, QueryDocument
+from retrieval.serve.documents import (
+    AgreementDocument,
+    BatchDocument,
+    CumulativeQueryDocument,
+    QueryDocument,
+    VerificationDocument,
+)
 from retrieval.serve.errors import DocumentResponse, problem_responses
 from retrieval.serve.generations import ServedGeneration
 from retrieval.serve.service import Parts
@@ -86,6 +92,37 @@ async def query_batch(request: Request, parts: Parts) -> DocumentResponse:
     for result in results:
         parts.metrics.count_answer(result)
     return DocumentResponse({"answers": [result.to_dict() for result in results]})
+
+
+class VerifyBody(RequestBody):
+    """The expected object, touches, and the false-accept rate."""
+
+    expect: str = Field(min_length=1, max_length=4096, examples=["mug"])
+    touches: Grasps
+    background: list[Base64Image] | None = None
+    far: float = Field(0.01, gt=0, le=0.5, description="Fraction of other objects that is accepted.")
+
+
+@router.post(
+    "/v1/verify",
+    response_model=VerificationDocument,
+    responses=_PROBLEMS,
+    openapi_extra=json_body("VerifyBody"),
+    summary="Is the expected object in the hand?",
+)
+async def verify(request: Request, parts: Parts) -> DocumentResponse:
+    """Return the document of `retrieve verify --json`."""
+    parts.queue.require_capacity()
+    body = await read_json(request, VerifyBody)
+    pictures = pictures_of([body.touches], body.background)
+    found = await parts.queue.submit(
+        lambda generation: generation.searcher.verify(
+            pictures.images[0], body.expect, far=body.far, background=pictures.frames
+        ),
+        request,
+        pictures=pictures,
+    )
+    return DocumentResponse(found.to_dict())
 
 
 class AgreementBody(RequestBody):

@@ -9,22 +9,9 @@ import retrieval
 from retrieval.commands.main import main
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
-from retrieval.model.posterior import Posterior
-from retrieval.model.verification import LEVELS, MAX_GRASPS, QUANTILES, VerificationCalibration
+from retrieval.model.verification import MAX_GRASPS
 from retrieval.search.build.build_index import build_index
-
-POSTERIOR = Posterior(slope=1.0, offset=0.0)
-
-
-def calibration(accept, reject):
-    """Return a calibration whose bounds are these at every rate."""
-    return VerificationCalibration(
-        objects=100,
-        impostors=(accept,) * len(LEVELS),
-        similar=(accept - 1,) * len(QUANTILES),
-        genuine=((accept + 1,) * len(QUANTILES),) * MAX_GRASPS,
-        lowest=(reject,) * len(QUANTILES),
-    )
+from tests.verification import POSTERIOR, calibration
 
 
 @pytest.fixture(scope="module")

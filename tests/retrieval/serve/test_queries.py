@@ -1,12 +1,18 @@
 """Queries over HTTP: the same answers as in Python, for JSON and forms."""
 
 import base64
+import dataclasses
+import json
 
 import pytest
 
-from retrieval.serve.documents import MatchDocument, QueryDocument
+from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.searcher import Searcher
+from retrieval.serve.documents import MatchDocument, QueryDocument, VerificationDocument
 from tests import synthetic
-from tests.serving import problem
+from tests.serving import problem, service
+from tests.verification import POSTERIOR, calibration
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +80,24 @@ def test_the_occlusion_map_of_a_photo_is_not_flat(client, searcher, grasps):
     found = client.post("/v1/agreement", json={"photo": photo, "touches": encoded(grasps), "squares": 2}).json()
     assert (found["rows"], found["columns"], [len(row) for row in found["falls"]]) == (2, 2, [2, 2])
     assert len({fall for row in found["falls"] for fall in row}) > 1
+
+
+def test_verification_returns_the_document_of_the_searcher(grasps, model, catalogue, tmp_path):
+    made = dataclasses.replace(load_checkpoint(model), verification=calibration(-1e3, -2e3), posterior=POSTERIOR)
+    store_checkpoint(made, tmp_path / "m.safetensors")
+    build_index(catalogue, load_checkpoint(tmp_path / "m.safetensors"), tmp_path / "index", quiet=True)
+    with Searcher.open(tmp_path / "index") as searcher, service(tmp_path / "index") as client:
+        name = searcher.generation.rows[0]["object_id"]
+        found = client.post("/v1/verify", json={"expect": name, "touches": encoded(grasps), "far": 0.1}).json()
+        assert found["decision"] == "accept"
+        assert found == json.loads(json.dumps(searcher.verify(grasps, name, far=0.1).to_dict()))
+        assert set(found) == set(VerificationDocument.model_fields)
+
+
+def test_a_verification_that_the_model_cannot_support_is_refused(client, grasps):
+    body = {"expect": "mug", "touches": encoded(grasps)}
+    assert "no error rates for verification" in problem(client.post("/v1/verify", json=body), 422, "bad-input")
+    assert "far" in problem(client.post("/v1/verify", json={**body, "far": 0}), 422, "bad-input")
 
 
 @pytest.mark.parametrize(
