@@ -5,8 +5,9 @@
 RECORDING holds grasps of objects that no model was trained on, eight of each for the rows with five grasps and three
 photos. PHOTOS is a folder of `retrieve collect --photos-only`: one photo of each further object of the catalogue. Every
 query is one to five grasps of an object. Every candidate has photos that were not taken in these grasps. Values are
-expectations over the other candidates; intervals resample the touched objects. The last column compares the last model
-with the first one on the same queries. It writes recognition.json in FOLDER; features are reused.
+expectations over the other candidates; intervals resample the touched objects. A model with late interaction is also
+scored without its cells, as in an index of `build-index --no-cells`. Differences are to the first model, on
+the same queries. It writes recognition.json in FOLDER; features are reused.
 """
 
 import argparse
@@ -64,6 +65,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name, _, file in (choice.partition("=") for choice in arguments.model):
         checkpoint = load_checkpoint(shipped_model(SHIPPED_NAMES[file]) if file in SHIPPED_NAMES else Path(file))
         found[name] = measures(checkpoint, grasps, arguments.distractors, arguments.out / "features")
+        if checkpoint.config.matcher.cell_dim:
+            pooled = checkpoint.without_cells()
+            found[f"{name}, no cells"] = measures(pooled, grasps, arguments.distractors, arguments.out / "features")
     first = next(iter(found.values()))
     rows: dict[str, dict[str, Any]] = {
         name: {
@@ -171,14 +175,15 @@ def all_scores(checkpoint: Checkpoint, touches: torch.Tensor, photos: torch.Tens
 def table(rows: dict[str, dict[str, Any]]) -> str:
     """Return a Markdown table of all measures and models."""
     first = next(iter(rows))
-    lines = ["| measure | chance | " + " | ".join(rows) + " | difference |", "|---|---|" + "---|" * (len(rows) + 1)]
+    headings = [first, *(part for name in rows if name != first for part in (name, f"{name} - {first}"))]
+    lines = ["| measure | chance | " + " | ".join(headings) + " |", "|---|---|" + "---|" * len(headings)]
     for key, summary in rows[first].items():
-        cells = [interval(each[key]["value"][0], each[key]["low"][0], each[key]["high"][0]) for each in rows.values()]
-        last = list(rows.values())[-1][key]["against_first"]
-        lines.append(
-            f"| {key} | {summary['chance'][0]:.3f} | {' | '.join(cells)} | "
-            f"{interval(last['difference'], last['low'], last['high'])} |"
-        )
+        cells = [f"{summary['chance'][0]:.3f}"]
+        for name, each in rows.items():
+            cells.append(interval(each[key]["value"][0], each[key]["low"][0], each[key]["high"][0]))
+            if name != first:
+                cells.append(interval(*(each[key]["against_first"][part] for part in ("difference", "low", "high"))))
+        lines.append(f"| {key} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
