@@ -93,7 +93,7 @@ def matching(config: Config, recording: Path, folder: Path) -> Iterator[tuple[Tr
         TrainedFeatures(config, trainer.device, keep_bytes=0) as decoded,
         TrainedFeatures(config, trainer.device) as cached,
     ):
-        cached.cache_decoded(folder, grasps, quiet=True)
+        cached.fill_cache(folder, grasps, quiet=True)
         trainer.features = cached
 
         def work(source: TrainedFeatures) -> Work:

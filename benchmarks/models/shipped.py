@@ -116,7 +116,7 @@ def trained(arguments: argparse.Namespace, fingers: int, touch_tower: Path, phot
     trainer = Trainer(config, split, grasps, unfinished_path(out), recording_source(recordings[0]))
     trainer.foreign_pictures = FOREIGN
     if fingers == 2 and not out.exists():
-        trainer.features.cache_decoded(folder / "stems", grasps)
+        trainer.features.fill_cache(folder / "stems", grasps)
     return finish_training(trainer, out, quiet=False)
 
 

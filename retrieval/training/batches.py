@@ -105,7 +105,7 @@ class BatchImages:
         """Return a preprocessed photo."""
         return self._photo(path)
 
-    def cache_decoded(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
+    def fill_cache(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
         """Decode the images of grasps into `folder`, and read them from there afterwards (`DiskImageCache`)."""
         settings = self.config.preprocessing
         by, workers = settings.digest(), self.config.training.workers
@@ -238,7 +238,7 @@ class StemFeatures(FrozenFeatures):
     def _encode_photos(self, matcher: Matcher, photos: Iterable[Image]) -> Tensor:
         return photo_stems(self._stems, photos)
 
-    def cache_decoded(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
+    def fill_cache(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
         """Compute the maps of all images of grasps, and store them in `folder`, from which later runs read them."""
         from retrieval.training.features import FeatureCache  # it imports this module
 

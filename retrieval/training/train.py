@@ -78,7 +78,7 @@ def train(
         config: An object (`Config.using` accepts your own towers and losses), or an argument of `load_config`.
         split: Objects of each part. Default: a random split as the configuration sets it.
         resume: Continue from the state next to `out`.
-        cache: Folder of decoded images (`retrieval.training.disk_image_cache`), for towers that are trained.
+        cache: Folder of decoded images, or of the maps of frozen stems, for towers that are trained.
         quiet: No progress on stderr.
 
     Raises:
@@ -115,7 +115,7 @@ def train(
     else:
         trainer.resume()
     if cache:
-        trainer.features.cache_decoded(cache, [*grasps, *labelled_pairs(config)], quiet=quiet or distributed.rank() > 0)
+        trainer.features.fill_cache(cache, [*grasps, *labelled_pairs(config)], quiet=quiet or distributed.rank() > 0)
     trainer.run(quiet)
     return load_checkpoint(out)
 

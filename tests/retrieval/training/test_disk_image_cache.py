@@ -63,7 +63,7 @@ def batch_of(recording, config, folder=None):
     grasps = load_grasps(recording)
     with TrainedFeatures(config, CPU) as source:
         if folder:
-            source.cache_decoded(folder, grasps, quiet=True)
+            source.fill_cache(folder, grasps, quiet=True)
         return source.prepare(None, PairSampler(grasps, seed=0).batch(0, 6)).result()
 
 

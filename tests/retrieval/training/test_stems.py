@@ -114,10 +114,10 @@ def test_the_stem_encodes_each_image_once(new_trainer, monkeypatch):
 def test_stored_maps_are_read_without_opening_an_image(new_trainer, tmp_path, monkeypatch):
     first, second = new_trainer(), new_trainer()
     grasps = first.sampler.grasps[0]
-    first.features.cache_decoded(tmp_path / "maps", grasps, quiet=True)
+    first.features.fill_cache(tmp_path / "maps", grasps, quiet=True)
     monkeypatch.setattr("retrieval.data.preprocessing.read_rgb", None)  # a call would raise
     monkeypatch.setattr("retrieval.data.preprocessing.read_bytes", None)
-    second.features.cache_decoded(tmp_path / "maps", grasps, quiet=True)
+    second.features.fill_cache(tmp_path / "maps", grasps, quiet=True)
     batch = first.sampler.batch(0, 2)
     batch = dataclasses.replace(batch, grasps=list(grasps[:1]), photos=[grasps[0].photo])
     maps = [trainer.features.prepare(trainer.matcher, batch).result() for trainer in (first, second)]
