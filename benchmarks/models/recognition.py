@@ -178,6 +178,8 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
     headings = [first, *(part for name in rows if name != first for part in (name, f"{name} - {first}"))]
     lines = ["| measure | chance | " + " | ".join(headings) + " |", "|---|---|" + "---|" * len(headings)]
     for key, summary in rows[first].items():
+        if not all(key in each for each in rows.values()):  # a model without a posterior has no "none of these"
+            continue
         cells = [f"{summary['chance'][0]:.3f}"]
         for name, each in rows.items():
             cells.append(interval(each[key]["value"][0], each[key]["low"][0], each[key]["high"][0]))

@@ -2,8 +2,8 @@
 
     python -m benchmarks.models.shipped make FOLDER --init WEIGHTS
         simulate photos and presses of objects and pretrain both towers on relief; simulate grasps of other objects, by
-        gels with the optics of a GelSight and of any make; train the matcher with its towers, and store it as float16
-        in FOLDER/simulated-mobilenet.safetensors; with --fingers 1 then train a head for one gel image on these towers
+        gels with the optics of a GelSight and of any make; train the matcher on these towers, and store it as float16
+        in FOLDER/simulated-mobilenet.safetensors; with --fingers 1 one for touches of one gel image, of the same grasps
     python -m benchmarks.models.shipped score FOLDER
         collect other objects into FOLDER/recording, and evaluate the shipped checkpoint on them: FOLDER/report; with
         --fingers 1 that for one finger, in FOLDER/report-one-finger
@@ -21,7 +21,7 @@ import numpy as np
 
 from retrieval.commands.main import main as run_command
 from retrieval.data.dataset import Grasp, Split, load_grasps, recording_source
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint, write_tensors
+from retrieval.model.checkpoint import Checkpoint, store_checkpoint
 from retrieval.model.config import Config, load_config
 from retrieval.search import defaults
 from retrieval.training.state import finish_training, unfinished_path
@@ -76,32 +76,20 @@ def main(argv: list[str] | None = None) -> int:
 
 def make_shipped(arguments: argparse.Namespace) -> int:
     """Collect, pretrain the towers and train; continue an interrupted run."""
-    folder = arguments.folder
-    two_fingers = folder / defaults.SHIPPED[2]
-    if not two_fingers.exists():
-        if code := pretrain_towers(arguments) or collect_trained(arguments):
-            return code
-        made = trained(arguments, 2, *(folder / f"{side}-tower.safetensors" for side in ("touch", "photo")))
-        store(made, two_fingers)
-    if arguments.fingers == 1:
-        towers = folder / "trained-touch-tower.safetensors", folder / "trained-photo-tower.safetensors"
-        matcher = load_checkpoint(two_fingers).matcher
-        for file, tower in zip(towers, (matcher.touch_tower, matcher.photo_tower), strict=True):
-            write_tensors(file, tower.state_dict(), {})
-        store(trained(arguments, 1, *towers), folder / defaults.SHIPPED[1])
+    if code := pretrain_towers(arguments) or collect_trained(arguments):
+        return code
+    store(trained(arguments), arguments.folder / defaults.SHIPPED[arguments.fingers])
     return 0
 
 
-def trained(arguments: argparse.Namespace, fingers: int, touch_tower: Path, photo_tower: Path) -> Checkpoint:
-    """Train a matcher from the weights of two towers; with one finger, the towers stay frozen."""
-    folder = arguments.folder
-    config = load_config(PRESET)
+def trained(arguments: argparse.Namespace) -> Checkpoint:
+    """Train a matcher on the frozen, pretrained towers."""
+    folder, fingers, config = arguments.folder, arguments.fingers, load_config(PRESET)
     training = dataclasses.replace(
         config.training.with_iterations(arguments.iterations),
         init=str(arguments.init),
-        init_touch=str(touch_tower),
-        init_photo=str(photo_tower),
-        freeze_towers=fingers == 1,
+        init_touch=str(folder / "touch-tower.safetensors"),
+        init_photo=str(folder / "photo-tower.safetensors"),
         distil_steps=DISTIL_STEPS,
     )
     config = Config(dataclasses.replace(config.matcher, fingers=fingers), training, config.preprocessing)
@@ -115,8 +103,6 @@ def trained(arguments: argparse.Namespace, fingers: int, touch_tower: Path, phot
     out = folder / f"trained-{fingers}-fingers.safetensors"
     trainer = Trainer(config, split, grasps, unfinished_path(out), recording_source(recordings[0]))
     trainer.foreign_pictures = FOREIGN
-    if fingers == 2 and not out.exists():
-        trainer.features.fill_cache(folder / "stems", grasps)
     return finish_training(trainer, out, quiet=False)
 
 

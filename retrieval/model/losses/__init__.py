@@ -18,11 +18,12 @@ LOSSES: "Registry[type[Loss]]" = Registry(
     {
         "contrastive": "retrieval.model.losses.contrastive:ContrastiveLoss",
         "listwise": "retrieval.model.losses.listwise:ListwiseLoss",
+        "pooled_listwise": "retrieval.model.losses.pooled_listwise:PooledListwiseLoss",
         "sigmoid": "retrieval.model.losses.sigmoid:SigmoidLoss",
     },
     error=ConfigError,
     base="retrieval.model.losses.loss:Loss",
 )
 
-LOGIT_LOSSES = frozenset({"listwise"})
+LOGIT_LOSSES = frozenset({"listwise", "pooled_listwise"})
 """Losses on match logits only. Every other one trains the embeddings for candidate search."""

@@ -10,6 +10,9 @@ from retrieval.errors import ConfigError
 from retrieval.model.config import MatcherConfig
 from retrieval.model.fusion import Matcher, scorer_of
 from retrieval.model.late_interaction import CellEncoder, cell_scores, paired_cell_scores
+from retrieval.model.losses.listwise import listwise_loss
+from retrieval.model.losses.loss import EncodedBatch
+from retrieval.model.losses.pooled_listwise import PooledListwiseLoss
 from retrieval.model.towers import build_tower
 
 CELLS = MatcherConfig(
@@ -122,3 +125,17 @@ def test_late_interaction_is_trained_by_the_logit(matcher, images):
     logits.sum().backward()
     assert all(parameter.grad.abs().sum() > 0 for parameter in matcher.touch_cells.parameters())
     assert matcher.photo_cells.network[0].weight.grad.abs().sum() > 0
+
+
+def test_the_pooled_listwise_loss_is_that_of_the_matcher_without_cells_and_trains_no_cell(matcher, images):
+    touch = matcher.touch_encoding(matcher.touch_features(images[0]))
+    photo = matcher.photo_encoding(matcher.photo_features(images[1][:3]))
+    objects = torch.arange(3)
+    loss = PooledListwiseLoss(8, 3)(EncodedBatch(matcher, touch, photo, objects, objects))
+    pooled = matcher.without_cells()
+    without_cells = pooled(images[0].repeat_interleave(3, 0), images[1][:3].repeat(3, 1, 1, 1)).view(3, 3)
+    torch.testing.assert_close(loss, listwise_loss(without_cells, objects, objects))
+    loss.backward()
+    cells = [*matcher.touch_cells.parameters(), *matcher.photo_cells.parameters()]
+    assert all(parameter.grad is None or not parameter.grad.any() for parameter in cells)
+    assert matcher.head.second.weight.grad.abs().sum() > 0
