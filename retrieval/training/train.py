@@ -125,9 +125,11 @@ class Trainer:
 
     Attributes:
         foreign_pictures: Number of pictures that are no gel images, on which the check of gel images is fitted.
+        checked_grasps: Grasps of training objects on which it is fitted. None: all of them.
     """
 
     foreign_pictures = FOREIGN_COUNT
+    checked_grasps: list[Grasp] | None = None
 
     def __init__(
         self,
@@ -281,7 +283,7 @@ class Trainer:
             made = with_verdicts(
                 made,
                 self.features,
-                train,
+                train if self.checked_grasps is None else self.checked_grasps,
                 held_out,
                 foreign=self.foreign_pictures,
                 quiet=quiet,

@@ -204,7 +204,7 @@ class GelCheckFeatures:
             matcher: The matcher.
             settings: Preprocessing of the pictures.
             grasps: G grasps.
-            touches: Their touch features (G, fingers * F).
+            touches: Their touch features (G, fingers * F), perhaps with cells.
             count: Number of foreign pictures.
             seed: Seed of the foreign pictures.
         """
@@ -216,12 +216,17 @@ class GelCheckFeatures:
         photos = [settings.load_photo(grasp.photo) for grasp in sample]
         gels = [settings.load_touch(grasp.touches[0], *grasp.backgrounds[:1]) for grasp in sample]
         names, drawn = zip(*draw_foreign(count, settings.touch_px, photos, gels, seed), strict=True)
-        shape = (-1, fingers, touches.shape[1] // fingers)
+        pooled = matcher.touch_tower.feature_count
+
+        def of_fingers(features: Tensor) -> Tensor:
+            """Return the features (N, fingers, F) of each finger, without cells."""
+            return features.cpu().reshape(len(features), fingers, -1)[..., :pooled]
+
         return cls(
-            touches.cpu().reshape(shape),
-            touch_features(matcher, frames).cpu().reshape(shape) if frames else torch.zeros(0, *shape[1:]),
+            of_fingers(touches),
+            of_fingers(touch_features(matcher, frames)) if frames else torch.zeros(0, fingers, pooled),
             # A touch needs one picture per finger, so each foreign picture is repeated.
-            touch_features(matcher, [[picture] * fingers for picture in drawn]).cpu().reshape(shape)[:, 0],
+            of_fingers(touch_features(matcher, [[picture] * fingers for picture in drawn]))[:, 0],
             np.array([name != "false colours" for name in names]),
         )
 

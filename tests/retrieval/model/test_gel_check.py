@@ -8,7 +8,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from retrieval.data.dataset import load_grasps
+from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import BadInput
+from retrieval.model.config import MatcherConfig
+from retrieval.model.encode import touch_features
+from retrieval.model.fusion import Matcher
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck, contact_level
 from retrieval.training.foreign_images import SYNTHETIC_KINDS, draw_foreign
 from retrieval.training.verdicts import GelCheckFeatures, contact_threshold, fit_gel_check, fit_gel_head
@@ -163,3 +168,20 @@ def test_a_feature_that_never_varies_gives_no_infinite_weight():
     for part in (features.touch, features.no_contact, features.foreign):
         part[..., 7] = 3.0
     assert bool(torch.isfinite(fit_gel_head(features).classifier.weight).all())
+
+
+def test_the_gel_head_of_a_matcher_with_cells_reads_the_features_without_them(recording):
+    """A head that was fitted on features and cells did not fit the checkpoint that stored it."""
+    torch.manual_seed(0)
+    config = MatcherConfig(
+        "small", "stages", hidden=8, embedding_dim=4, cosine=True, cell_dim=2, touch_cells=2, photo_cells=2
+    )
+    matcher, settings = Matcher(config).eval(), Preprocessing(touch_px=32, photo_px=32)
+    grasps = load_grasps(recording)[:6]
+    images = [[settings.load_touch(path) for path in grasp.touches] for grasp in grasps]
+    found = GelCheckFeatures.of(matcher, settings, grasps, touch_features(matcher, images), 8, seed=0)
+    pooled = matcher.touch_tower.feature_count
+    assert pooled < matcher.touch_tower.output_count
+    assert [part.shape[-1] for part in (found.touch, found.no_contact, found.foreign)] == [pooled] * 3
+    matcher.touch_tower.divide(0)
+    torch.testing.assert_close(found.touch.flatten(1), touch_features(matcher, images))
