@@ -55,7 +55,7 @@ from retrieval.training.fit import RATE, Plan, fit
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.state import code_digest, load_state, require_no_unfinished_state, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
-from retrieval.training.verdicts import FOREIGN_COUNT, with_verdicts
+from retrieval.training.verdicts import with_verdicts
 
 
 def train(
@@ -121,15 +121,7 @@ def train(
 
 
 class Trainer:
-    """The state of one training run.
-
-    Attributes:
-        foreign_pictures: Number of pictures that are no gel images, on which the check of gel images is fitted.
-        checked_grasps: Grasps of training objects on which it is fitted. None: all of them.
-    """
-
-    foreign_pictures = FOREIGN_COUNT
-    checked_grasps: list[Grasp] | None = None
+    """The state of one training run."""
 
     def __init__(
         self,
@@ -280,15 +272,7 @@ class Trainer:
                 made, self.config, self.features, train, held_out, quiet=quiet, should_stop=stop.is_set
             )
         if self.has_images:
-            made = with_verdicts(
-                made,
-                self.features,
-                train if self.checked_grasps is None else self.checked_grasps,
-                held_out,
-                foreign=self.foreign_pictures,
-                quiet=quiet,
-                should_stop=stop.is_set,
-            )
+            made = with_verdicts(made, self.features, train, held_out, quiet=quiet, should_stop=stop.is_set)
         store_checkpoint(made, self.out)
 
     def _validate_and_save(self) -> None:

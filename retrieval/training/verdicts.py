@@ -36,7 +36,7 @@ from retrieval.model.verification import fit_verification
 from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.foreign_images import draw_foreign
 
-MAX_GRASPS = 800
+MAX_GRASPS = 400
 """Largest number of grasps from each part of the split."""
 MIN_GRASPS = 40
 """Number of validation grasps that the gel check needs; thresholds of fewer grasps would reject too many touches."""
