@@ -208,7 +208,7 @@ def verification_sequences(
     rows, true = np.arange(len(sets)), np.searchsorted(objects, owner)
     highest = np.maximum.accumulate(ratios, axis=0)
     is_impostor = np.arange(len(objects)) != true[:, None]
-    similar = _most_similar(objects, scored.photo_owner, embeddings)[true]
+    similar = _nearest_objects(objects, scored.photo_owner, embeddings)[true]
     return VerificationSequences(
         owner,
         ratios[:, rows, true].T,
@@ -238,7 +238,7 @@ def fit_verification(
     )
 
 
-def _most_similar(objects: NDArray[np.int64], owner: NDArray[np.int64], embeddings: Floats) -> NDArray[np.int64]:
+def _nearest_objects(objects: NDArray[np.int64], owner: NDArray[np.int64], embeddings: Floats) -> NDArray[np.int64]:
     """Return for each object the place (O,) of the other object with the most similar mean embedding."""
     means = np.stack([embeddings[owner == name].mean(0) for name in objects])
     means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)

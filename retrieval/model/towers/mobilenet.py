@@ -31,7 +31,7 @@ class _StridedDepthwise(nn.Conv2d):
 
     def forward(self, x: Tensor) -> Tensor:
         with without_autocast(x):
-            return super().forward(x.float())
+            return super().forward(x.to(self.weight.dtype))
 
 
 def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
