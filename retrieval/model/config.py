@@ -141,7 +141,7 @@ class TrainingConfig:
         freeze_batch_norm: Keep the batch statistics of the initial weights.
         freeze_towers: Train only the layers after the towers. Every image is then encoded once per training run.
         freeze_stem: Keep the first layers of the towers (`Tower.stem_layers`) frozen if the towers are trained. Their
-            maps of every image are then computed once per training run, which makes a step several times faster.
+            maps of every image are then computed once per training run, and a step computes only the other layers.
         distil_steps: Steps that distil the candidate encoder after training (`retrieval.training.distil`).
         validation_fraction: Fraction of the objects that are validation objects.
         test_fraction: Fraction of the objects that are test objects.
