@@ -95,7 +95,7 @@ def verify(
     ):
         raise BadInput(
             f"{searcher.checkpoint.path} has no error rates for verification with this index: train a model with at "
-            "least 20 validation objects of 4 grasps, and build its index with its cells"
+            "least 20 validation objects of 5 grasps, and build its index with its cells"
         )
     bounds, shard = calibration.bounds(far), searcher.folder_shard
     number = int(shard.objects.numbers_of([expect])[0])
