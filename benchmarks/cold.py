@@ -43,7 +43,7 @@ import retrieval.search.query.searcher as search
 generation = step("open the index", lambda: opening.IndexStore(index).open(threads=1))
 stored = step("read the checkpoint", lambda: import_module(
     "retrieval.model.checkpoint_info").read_checkpoint_info(Path(model)))
-encoder = step("make the encoder", lambda: search.find_export(stored) or torch_encoder(stored))
+encoder = step("make the encoder", lambda: search.find_export(stored) or opening.torch_encoder(stored))
 scorer = step("read the head", lambda: search.scorer_for(stored, generation.manifest.about))
 shard = step("number objects", lambda: search.FolderShard(generation, scorer, stored.config.has_embeddings))
 searcher = search.Searcher(Path(index), shard, stored, encoder, scorer)

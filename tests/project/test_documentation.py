@@ -65,7 +65,7 @@ def of_program(name, *pages):
 @pytest.fixture
 def home(tmp_path, recording, catalogue, model, monkeypatch):
     """A folder with all files that the commands name: catalog/, gel images, recording/, billets/, data/, pictures/,
-    model.safetensors, rig.toml, mobilenet_v2.pth, benchmarks/models/shipped_rig.toml."""
+    model.safetensors, rig.toml, gels.toml, mobilenet_v2.pth, benchmarks/models/shipped_rig.toml."""
     shutil.copytree(recording, tmp_path / "recording")
     shutil.copytree(catalogue, tmp_path / "catalog")
     photos = min(folder for folder in catalogue.iterdir() if folder.is_dir())
@@ -89,6 +89,7 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
     (tmp_path / "benchmarks" / "models").mkdir(parents=True)
     shutil.copy(ROOT / "benchmarks" / "models" / "shipped_rig.toml", tmp_path / "benchmarks" / "models")
     (tmp_path / "points.csv").write_text(POINTS)
+    (tmp_path / "gels.toml").write_text('rig = "sim"\ngels = 2\n')
     (tmp_path / "grey.toml").write_text(next(block for block in blocks("toml") if "grey" in block))
     torch.save(build_tower("mobilenet_v2", "stages").state_dict(), tmp_path / "mobilenet_v2.pth")
     monkeypatch.chdir(tmp_path)
