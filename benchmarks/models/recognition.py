@@ -34,7 +34,7 @@ from retrieval.metrics.table import ScoreTable, object_scores
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.encode import batches, photo_features
 from retrieval.model.posterior import Posterior
-from retrieval.search.defaults import SHIPPED_NAMES, shipped_model
+from retrieval.search.defaults import find_model
 from retrieval.training.distil import feature_partials
 from retrieval.training.features import encode_recording
 
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         grasps = [replace(each, touches=each.touches[:1], backgrounds=each.backgrounds[:1]) for each in grasps]
     found: dict[str, dict[str, Measure]] = {}
     for name, _, file in (choice.partition("=") for choice in arguments.model):
-        checkpoint = load_checkpoint(shipped_model(SHIPPED_NAMES[file]) if file in SHIPPED_NAMES else Path(file))
+        checkpoint = load_checkpoint(find_model(file)[0])
         found[name] = measures(checkpoint, grasps, arguments.distractors, arguments.out / "features")
         if checkpoint.config.matcher.cell_dim:
             pooled = checkpoint.without_cells()
@@ -87,10 +87,9 @@ def measures(
     """Return the measures of a checkpoint by name."""
     features = encode_recording(grasps, checkpoint.matcher, checkpoint.config, cache)
     touches, photos = feature_partials(checkpoint.matcher, features)
-    names = sorted(set(features.object_ids))
-    owner = np.array([names.index(name) for name in features.object_ids])
+    owner, objects = features.owner, len(set(features.object_ids))
     others = distractor_partials(checkpoint, distractors) if distractors else photos[:0]
-    photo_owner = np.concatenate([owner, len(names) + np.arange(len(others))])
+    photo_owner = np.concatenate([owner, objects + np.arange(len(others))])
     scores = all_scores(checkpoint, touches, torch.cat([photos, others]))
     found: dict[str, Measure] = {}
     for count, shown in QUERIES:
@@ -104,7 +103,7 @@ def measures(
         for k in CANDIDATES:
             if len(scored.objects) >= k:
                 found[f"K = {k:,}, {what}"] = top1(scored, k, shown)
-        if checkpoint.posterior is not None and len(names) >= CATALOGUE:
+        if checkpoint.posterior is not None and objects >= CATALOGUE:
             small = scored.select(scored.touch_owner < CATALOGUE, photo_owner < CATALOGUE)
             weighted = replace(small, scores=checkpoint.posterior.weight(count) * small.scores)
             found[f"none of these, AUROC, {what}"] = reject(Posterior(1.0, checkpoint.posterior.offset), weighted).auroc

@@ -32,6 +32,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 import robot
 from retrieval.commands.main import main as run_command
@@ -42,7 +43,7 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkp
 from retrieval.model.checkpoint_info import PARTIALS_FROM
 from retrieval.model.config import load_config
 from retrieval.model.encode import default_device, one_thread
-from retrieval.model.reference_calibration import fit_reference_calibration
+from retrieval.model.reference_calibration import ReferenceTouches, fit_reference_calibration
 from retrieval.model.verification import fit_verification
 from retrieval.search import defaults
 from retrieval.training import distil
@@ -202,12 +203,7 @@ def calibrate_posterior(arguments: argparse.Namespace) -> int:
     grasps = collect_of(arguments.folder / "references", names, REFERENCE_GRASPS, arguments.jobs)
     if arguments.fingers == 1:
         grasps = [each_finger(grasp)[0] for grasp in grasps]
-    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
-    device = default_device()
-    with FrozenFeatures(shipped.config, device, features_by_image(grasps, features, device)) as source:
-        found = recorded_features(shipped.matcher, source, grasps, what="references", quiet=False)
-    trials = posterior_touches(shipped.matcher, grasps, *found)
-    assert trials is not None
+    trials, _ = scored_touches(shipped, grasps, arguments.folder / "features")
     calibrated = same_codes(dataclasses.replace(shipped, references=fit_reference_calibration(trials)), shipped)
     store(calibrated, arguments.folder / defaults.SHIPPED[arguments.fingers])
     return 0
@@ -223,17 +219,22 @@ def calibrate_verification(arguments: argparse.Namespace) -> int:
     grasps = load_grasps(recording)
     if arguments.fingers == 1:
         grasps = [each_finger(grasp)[0] for grasp in grasps]
-    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
-    device = default_device()
-    with FrozenFeatures(shipped.config, device, features_by_image(grasps, features, device)) as source:
-        touches, photos = recorded_features(shipped.matcher, source, grasps, what="verification", quiet=False)
-    trials = posterior_touches(shipped.matcher, grasps, touches, photos)
-    assert trials is not None
+    trials, photos = scored_touches(shipped, grasps, arguments.folder / "features")
     assert shipped.posterior is not None
     verification = fit_verification(trials.scored, photo_embeddings(shipped.matcher, photos), shipped.posterior)
     made = same_codes(dataclasses.replace(shipped, verification=verification), shipped)
     store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
     return 0
+
+
+def scored_touches(made: Checkpoint, grasps: list[Grasp], cache: Path) -> tuple[ReferenceTouches, dict[Path, Tensor]]:
+    """Return the touches of grasps, scored with their photos, and the features of each photo."""
+    features, device = encode_recording(grasps, made.matcher, made.config, cache), default_device()
+    with FrozenFeatures(made.config, device, features_by_image(grasps, features, device)) as source:
+        touches, photos = recorded_features(made.matcher, source, grasps, what="calibration", quiet=False)
+    trials = posterior_touches(made.matcher, grasps, touches, photos)
+    assert trials is not None
+    return trials, photos
 
 
 def collect_of(recording: Path, names: Sequence[str], grasps: int, jobs: int) -> list[Grasp]:

@@ -20,7 +20,7 @@ from retrieval.metrics.measure import object_means
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.posterior import ScoredTouches
 from retrieval.model.verification import MAX_GRASPS, verification_sequences
-from retrieval.search.defaults import SHIPPED_NAMES, shipped_model
+from retrieval.search.defaults import find_model
 from retrieval.training.distil import feature_partials
 from retrieval.training.features import encode_recording
 
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--cache", type=Path, help="folder for encoded features")
     arguments = parser.parse_args(argv)
     choice = arguments.model
-    checkpoint = load_checkpoint(shipped_model(SHIPPED_NAMES[choice]) if choice in SHIPPED_NAMES else Path(choice))
+    checkpoint = load_checkpoint(find_model(choice)[0])
     if checkpoint.verification is None:
         parser.error(f"{choice} has no error rates for verification")
     print("\n".join(table(checkpoint, arguments.recording, arguments.cache)))

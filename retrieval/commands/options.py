@@ -76,6 +76,24 @@ class OptionValues(tuple[str, ...]):
         return cls(joined.split(_SEPARATOR))
 
 
+GelSight = Annotated[
+    list[OptionValues],
+    typer.Option(
+        parser=OptionValues.parse,
+        metavar="IMAGE...",
+        help="gel images of one grasp, one per finger; repeat the option for more grasps of the same object",
+    ),
+]
+Background = Annotated[
+    OptionValues | None,
+    typer.Option(
+        parser=OptionValues.parse,
+        metavar="IMAGE...",
+        help="no-contact frames, one per finger; some models subtract them, others use them to detect contact",
+    ),
+]
+
+
 @dataclasses.dataclass(frozen=True)
 class NumberParser:
     """Parser of a number from `low` to `high`, which rejects other values before a command starts.

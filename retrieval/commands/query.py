@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import COUNT, FRACTION, Index, IndexModel, Json, NoVerify, OptionValues
+from retrieval.commands.options import COUNT, FRACTION, Background, GelSight, Index, IndexModel, Json, NoVerify
 from retrieval.console.files import PAGE, require_folder, require_ours, text_bytes, write_output
 from retrieval.console.memory import paused_collection
 from retrieval.console.output import print_json, say
@@ -14,22 +14,8 @@ from retrieval.console.output import print_json, say
 @paused_collection()
 def query(
     *,
-    gelsight: Annotated[
-        list[OptionValues],
-        typer.Option(
-            parser=OptionValues.parse,
-            metavar="IMAGE...",
-            help="gel images of one grasp, one per finger; repeat the option for more grasps of the same object",
-        ),
-    ],
-    background: Annotated[
-        OptionValues | None,
-        typer.Option(
-            parser=OptionValues.parse,
-            metavar="IMAGE...",
-            help="no-contact frames, one per finger; some models subtract them, others use them to detect contact",
-        ),
-    ] = None,
+    gelsight: GelSight,
+    background: Background = None,
     index: Index = None,
     model: IndexModel = None,
     top: Annotated[int, typer.Option(parser=COUNT, help="number of objects to return")] = 10,

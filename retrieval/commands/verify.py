@@ -5,25 +5,15 @@ from typing import Annotated
 
 import typer
 
-from retrieval.commands.options import FRACTION, Index, IndexModel, Json, NoVerify, OptionValues
+from retrieval.commands.options import FRACTION, Background, GelSight, Index, IndexModel, Json, NoVerify
 from retrieval.console.output import print_json, say
 
 
 def verify(
     *,
     expect: Annotated[str, typer.Option(metavar="OBJECT", help="the expected object of the catalogue")],
-    gelsight: Annotated[
-        list[OptionValues],
-        typer.Option(
-            parser=OptionValues.parse,
-            metavar="IMAGE...",
-            help="gel images of one grasp, one per finger; repeat the option for more grasps of the same object",
-        ),
-    ],
-    background: Annotated[
-        OptionValues | None,
-        typer.Option(parser=OptionValues.parse, metavar="IMAGE...", help="no-contact frames, one per finger"),
-    ] = None,
+    gelsight: GelSight,
+    background: Background = None,
     far: Annotated[
         float,
         typer.Option(metavar="RATE", parser=FRACTION, help="false-accept rate: accepted fraction of other objects"),

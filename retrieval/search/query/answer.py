@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from retrieval.errors import BadInput
-from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
+from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL, GelCheck
 from retrieval.model.information import Information, information, unlisted_probability
 from retrieval.model.posterior import Posterior, PosteriorProbabilities
+from retrieval.model.touches import TouchEncodings
 
 MATCH, NONE_OF_THESE, UNCALIBRATED = "match", "none of these", "uncalibrated"
 CLEAR_PROBABILITY = 0.5
@@ -236,6 +237,13 @@ def verdict_sentence(result: QueryResult) -> str:
             f"{best.object_id} with probability {best.probability_if_present:.2f}{remark}. {result.advice}"
         )
     return f"uncalibrated: {best.object_id} ranks first; this model has no probabilities{remark}"
+
+
+def gel_classes(check: GelCheck | None, codes: TouchEncodings) -> NDArray[np.str_]:
+    """Return the gel check (G,) of each encoded grasp; without a check or readings, every grasp has contact."""
+    if check is None or codes.readings is None:
+        return np.full(len(codes.partials), CONTACT)
+    return np.array(check.classify(codes.readings, codes.levels))
 
 
 def verdict_of(classes: Sequence[str], probabilities: PosteriorProbabilities | None) -> str:

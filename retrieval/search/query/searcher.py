@@ -29,7 +29,15 @@ from retrieval.model.touches import (
     TouchReader,
     parse_grasps,
 )
-from retrieval.search.query.answer import NONE_OF_THESE, Match, QueryResult, is_clear, require_counts, verdict_of
+from retrieval.search.query.answer import (
+    NONE_OF_THESE,
+    Match,
+    QueryResult,
+    gel_classes,
+    is_clear,
+    require_counts,
+    verdict_of,
+)
 from retrieval.search.query.objects import Objects
 from retrieval.search.query.opening import OpenShards, open_index, scorer_for, torch_encoder
 from retrieval.search.query.reference_touches import reference_summary
@@ -284,9 +292,7 @@ class Searcher:
             return []
         clock = Stopwatch()
         codes = self.reader.encode(grasps, self.reader.no_contact_frames(background), clock)
-        classes = np.full(len(codes.partials), CONTACT)
-        if self.gel_check is not None and codes.readings is not None:
-            classes = np.array(self.gel_check.classify(codes.readings, codes.levels))
+        classes = gel_classes(self.gel_check, codes)
         scored = []
         for span in spans:
             in_contact = (classes[span] == CONTACT) & (classes[span] != NOT_A_GEL).all()

@@ -12,6 +12,7 @@ from retrieval.errors import BadInput
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.touches import AnyImage, AnyTouches, Stopwatch, parse_grasps
 from retrieval.model.verification import ACCEPT, ANOTHER_GRASP, MAX_GRASPS, REJECT, DecisionBounds
+from retrieval.search.query.answer import gel_classes
 
 if TYPE_CHECKING:
     from retrieval.search.query.searcher import Searcher
@@ -105,10 +106,8 @@ def verify(
     grasps = parse_grasps(touches, reader.fingers)
     names = [[image.name for image in grasp] for grasp in grasps]
     codes = reader.encode(grasps, reader.no_contact_frames(background), Stopwatch())
-    classes = [CONTACT] * len(grasps)
-    if searcher.gel_check is not None and codes.readings is not None:
-        classes = searcher.gel_check.classify(codes.readings, codes.levels)
-    partials = codes.partials[np.array(classes) == CONTACT][:MAX_GRASPS]
+    checked = gel_classes(searcher.gel_check, codes)
+    partials, classes = codes.partials[checked == CONTACT][:MAX_GRASPS], checked.tolist()
     if NOT_A_GEL in classes or not len(partials):
         decision = NOT_A_GEL if NOT_A_GEL in classes else NO_CONTACT
         return Verification(expect, decision, names, classes, [], None)
