@@ -165,6 +165,8 @@ def collect(
         _check_can_continue(Path(out), info, strict=rig.can_run_jobs)
         attempter = AttemptRunner(rig, seed, attempt)
         with RecordingWriter(out, info) as writer, AttemptLog(Path(out), writer.grasp_ids) as log:
+            if known := {name: dict(labels) for name in names if (labels := rig.labels(name))}:
+                writer.update_info(objects=known)
             collection = _Collection(writer, log, names, settings, gate, progress)
             with WorkerPool(jobs, attempter.run, functools.partial(_make_work, make_rig, seed, attempt)) as workers:
                 collection.run(workers)

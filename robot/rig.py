@@ -98,6 +98,10 @@ class Rig:
         """Return names for `count` objects to collect; a simulated rig returns its own objects."""
         return [f"object-{number:04}" for number in range(1, count + 1)]
 
+    def labels(self, object_id: str) -> Mapping[str, float | bool | str]:
+        """Return what the rig knows of an object, for recording.json; nothing, unless the rig is simulated."""
+        return {}
+
     def prepare(self, object_id: str, number: int) -> None:
         """Ask a person to put this object on the table for attempt `number`.
 

@@ -1,31 +1,19 @@
-"""The checkpoint of the package: its training, and its accuracy on unseen objects.
+"""The checkpoints of the package: their training, and their accuracy on unseen objects.
 
     python -m benchmarks.models.shipped make FOLDER --init WEIGHTS
-        collect grasps on the simulated rig, photos and presses of other objects, pretrain both towers on relief, train
-        the matcher, and store it as float16 in FOLDER/simulated-mobilenet.safetensors; with --fingers 1 one for touches
-        of one gel image, of the same grasps
-    python -m benchmarks.models.shipped distil FOLDER
-        retrain the candidate encoder of the shipped checkpoint, from the recording, pictures and features that `make`
-        left in FOLDER; with --fingers 1 that of the one for one finger
-    python -m benchmarks.models.shipped verdicts FOLDER
-        fit the posterior and the gel check of the shipped checkpoint again, on its validation objects and as many
-        training ones, collected into FOLDER/verdicts
-    python -m benchmarks.models.shipped references FOLDER
-        fit the calibration of reference touches of the shipped checkpoint, on its validation objects, collected into
-        FOLDER/references; with --fingers 1 that of the one for one finger
-    python -m benchmarks.models.shipped verification FOLDER
-        fit the bounds of verifications of the shipped checkpoint, on objects that were not in training, collected into
-        FOLDER/verification; with --fingers 1 those of the one for one finger
+        collect grasps on simulated rigs, photos and presses of other objects; pretrain both towers on relief, train
+        them together, train a head for two fingers and one for one finger, calibrate both, and store them in FOLDER
+    python -m benchmarks.models.shipped calibrate FOLDER
+        calibrate the shipped checkpoints again; keep their weights
     python -m benchmarks.models.shipped score FOLDER
         collect other objects into FOLDER/recording, and evaluate the shipped checkpoint on them: FOLDER/report; with
         --fingers 1 that for one finger, in FOLDER/report-one-finger
 
-Accuracy on simulated touches does not predict accuracy on real sensors.
+An interrupted job continues. Accuracy on simulated touches does not predict accuracy on real sensors.
 """
 
 import argparse
 import dataclasses
-import functools
 import json
 import sys
 from collections.abc import Sequence
@@ -34,37 +22,38 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-import robot
 from retrieval.commands.main import main as run_command
-from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps, recording_source
+from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps
+from retrieval.data.labelled_pictures import load_object_labels
 from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
 from retrieval.methods.method import MethodSettings
-from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkpoint, write_tensors
 from retrieval.model.checkpoint_info import PARTIALS_FROM
-from retrieval.model.config import load_config
+from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
-from retrieval.model.reference_calibration import ReferenceTouches, fit_reference_calibration
+from retrieval.model.reference_calibration import ReferenceTouches
 from retrieval.model.verification import fit_verification
 from retrieval.search import defaults
 from retrieval.training import distil
 from retrieval.training.batches import FrozenFeatures, recorded_features
 from retrieval.training.features import Features, encode_recording, features_by_image
-from retrieval.training.train import labelled_pairs
+from retrieval.training.state import finish_training, unfinished_path
+from retrieval.training.train import Trainer
 from retrieval.training.verdicts import photo_embeddings, posterior_touches, with_verdicts
 
-# Seeds of the simulated rig. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0.
-SEED_TRAINED, SEED_SCORED = 10_000, 30_000
+RIGS = Path(__file__).parent
+RIG, TOUCH_RIG = RIGS / "shipped_rig.toml", RIGS / "shipped_touches.toml"
+PARTS = {"shipped_training.toml": (112_000, 20, 400), "shipped_varied.toml": (122_000, 5, 120)}
+"""Rigs of the training grasps: the first seed, the number of seeds, and the objects of each seed, which has its own
+gels."""
+SEED_VALIDATED, SEED_VERIFIED, SEED_SCORED = 150_000, 130_000, 30_000
+"""Seeds of other object sets. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0."""
 SEED_PHOTOS, SEED_TOUCHES = 60_000, 61_000
-SEED_VERIFIED = 130_000
-RIG, TOUCH_RIG = (Path(__file__).with_name(name) for name in ("shipped_rig.toml", "shipped_touches.toml"))
-PRESET = "relief"
-VALIDATION = 100
-"""Number of objects that choose the checkpoint and calibrate it."""
-VERDICT_GRASPS, REFERENCE_GRASPS = 4, 8
-"""Grasps of each object for fitting the posterior and the gel check, and the calibration of references."""
-VERIFIED, VERIFIED_GRASPS = 150, 5
-"""Objects on which the bounds of verifications are fitted, and grasps of each. Unlike validation objects they chose no
-training step."""
+TOWERS, PRESET = RIGS / "shipped_towers.toml", "relief-large"
+"""Configurations of the training of the towers and of the heads."""
+GRASPS, VALIDATED, VERIFIED = 2, (100, 8), (150, 5)
+"""Grasps of each training object; objects that choose the step and calibrate the model, and grasps of each; objects on
+which the bounds of verifications are fitted, and grasps of each."""
 FOREIGN = 8000
 """Number of non-gel pictures for training its check of touches: more than in an ordinary training."""
 DISTIL_STEPS = 4000
@@ -77,81 +66,97 @@ def main(argv: list[str] | None = None) -> int:
     """Run one of the jobs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     jobs = parser.add_subparsers(dest="job", required=True)
-    make = jobs.add_parser("make", help="collect and train the checkpoint that comes with the package")
-    make.add_argument("folder", type=Path)
+    make = jobs.add_parser("make", help="collect and train the checkpoints that come with the package")
     make.add_argument("--init", type=Path, required=True, help="state dict of MobileNetV2, torchvision's key names")
-    make.add_argument("--objects", type=int, default=1380, help="number of touched objects")
-    make.add_argument("--grasps", type=int, default=4, help="grasps of each of them")
     make.add_argument("--photos", type=int, default=10_000, help="number of photo-only objects")
     make.add_argument("--touches", type=int, default=9_361, help="number of touch-only objects")
     make.add_argument("--steps", type=int, default=2500, help="steps of pretraining each tower on relief")
-    make.add_argument("--iterations", type=int, default=2500, help="iterations of training the head")
-    distil_job = jobs.add_parser("distil", help="retrain only the candidate encoder of the shipped checkpoint")
-    distil_job.add_argument("folder", type=Path)
-    distil_job.add_argument("--steps", type=int, default=DISTIL_STEPS)
-    verdicts = jobs.add_parser("verdicts", help="fit only its posterior and its gel check again")
-    verdicts.add_argument("folder", type=Path)
-    references = jobs.add_parser("references", help="fit only the calibration of reference touches")
-    references.add_argument("folder", type=Path)
-    verification = jobs.add_parser("verification", help="fit only the bounds of verifications")
-    verification.add_argument("folder", type=Path)
-    score = jobs.add_parser("score", help="evaluate it on other objects")
-    score.add_argument("folder", type=Path)
+    calibrate_job = jobs.add_parser("calibrate", help="calibrate the shipped checkpoints again; keep their weights")
+    score = jobs.add_parser("score", help="evaluate a checkpoint on other objects")
     score.add_argument("--objects", type=int, default=120)
     score.add_argument("--grasps", type=int, default=8)
     score.add_argument("--model", type=Path, help="another checkpoint than the shipped one")
-    for job in (make, distil_job, references, verification, score):
-        job.add_argument(
-            "--fingers", type=int, choices=tuple(defaults.SHIPPED), default=2, help="gel images of a touch"
-        )
-    for job in (make, verdicts, references, verification, score):
+    score.add_argument("--fingers", type=int, choices=tuple(defaults.SHIPPED), default=2, help="gel images of a touch")
+    for job in (make, calibrate_job, score):
+        job.add_argument("folder", type=Path)
         job.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
-    run = {
-        "make": make_shipped,
-        "distil": distil_shipped,
-        "verdicts": calibrate_shipped,
-        "references": calibrate_posterior,
-        "verification": calibrate_verification,
-        "score": score_shipped,
-    }
-    return run[arguments.job](arguments)
+    return {"make": make_shipped, "calibrate": calibrate_shipped, "score": score_shipped}[arguments.job](arguments)
 
 
 def make_shipped(arguments: argparse.Namespace) -> int:
-    """Collect, encode and train; continue an interrupted run."""
+    """Collect, train the towers and both heads, and calibrate; continue an interrupted run."""
     folder = arguments.folder
-    recording = folder / "recording"
-    code = collect(recording, arguments, SEED_TRAINED) or pretrain_towers(arguments)
+    code = collect_training(arguments) or collect_calibration(arguments) or pretrain_towers(arguments)
     if code:
         return code
-    config = load_config(PRESET)
-    training = dataclasses.replace(
-        config.training.with_iterations(arguments.iterations),
-        init=str(arguments.init),
-        init_photo=str(folder / "photo-tower.safetensors"),
-        init_touch=str(folder / "touch-tower.safetensors"),
-        photos=str(folder / "photos"),
-        touches=str(folder / "touches"),
+    parts = sorted(path.parent for path in (folder / "recordings").glob("*/recording.json"))
+    train, validation = [grasp for part in parts for grasp in load_grasps(part)], load_grasps(folder / "validation")
+    towers = train_towers(folder, parts, train, validation)
+    config = head_config(folder, towers)
+    features, validated = (
+        encode_recording(each, frozen_matcher(config), config, folder / "features") for each in (train, validation)
     )
-    matcher = dataclasses.replace(config.matcher, fingers=arguments.fingers)
-    config = dataclasses.replace(config, matcher=matcher, training=training)
-    grasps, towers = load_grasps(recording), frozen_matcher(config)
-    if arguments.fingers == 1:
-        grasps = [each for grasp in grasps for each in each_finger(grasp)]
-    features, pairs = (
-        encode_recording(each, towers, config, folder / "features") for each in (grasps, labelled_pairs(config))
-    )
-    split = draw_split(grasps, train=None, validation=VALIDATION)
-    train, validation = features.of_objects(split.train).concatenate(pairs), features.of_objects(split.validation)
-    trained = folder / f"{arguments.fingers}-fingers"
-    checkpoint = trained_checkpoint(MethodSettings(config, folder=trained, quiet=False), train, validation)
-    about = {"source": recording_source(recording), "data_digest": data_digest(grasps), "pairs": len(pairs)}
-    # The split excludes its training objects from evaluations; no recording contains the pairs.
-    checkpoint = dataclasses.replace(checkpoint, provenance=checkpoint.provenance | about, split=split)
-    checkpoint = distilled(checkpoint, train, validation, DISTIL_STEPS)
-    store(fit_calibration(checkpoint, grasps, features), folder / defaults.SHIPPED[arguments.fingers])
+    for fingers in defaults.SHIPPED:
+        make_head(folder, fingers, config, (train, validation), (features, validated))
     return 0
+
+
+def train_towers(folder: Path, parts: Sequence[Path], train: list[Grasp], validation: list[Grasp]) -> Checkpoint:
+    """Train both towers, with the head of two fingers, from the towers that were pretrained on relief."""
+    config = load_config(TOWERS)
+    towers = {"init_photo": folder / "photo-tower.safetensors", "init_touch": folder / "touch-tower.safetensors"}
+    training = dataclasses.replace(config.training, **{name: str(file) for name, file in towers.items()})
+    labels = {name: each for part in parts for name, each in load_object_labels(part).items()}
+    done = folder / "towers.safetensors"
+    trainer = Trainer(
+        dataclasses.replace(config, training=training),
+        split_of(train, validation),
+        [*train, *validation],
+        unfinished_path(done),
+        source="simulated rigs",
+        labels=labels,
+    )
+    trainer.features.fill_cache(folder / "images", [*train, *validation])
+    return finish_training(trainer, done, quiet=False)
+
+
+def head_config(folder: Path, towers: Checkpoint) -> Config:
+    """Return the configuration of a head on the trained towers, and write the weights that it names."""
+    files = {}
+    for side, tower in (("touch", towers.matcher.touch_tower), ("photo", towers.matcher.photo_tower)):
+        file = folder / f"trained-{side}-tower.safetensors"
+        write_tensors(file, tower.state_dict(), {"from": towers.digest})
+        files[f"init_{side}"] = str(file)
+    config = load_config(PRESET)
+    return dataclasses.replace(config, training=dataclasses.replace(config.training, **files))
+
+
+def make_head(
+    folder: Path,
+    fingers: int,
+    config: Config,
+    grasps: tuple[list[Grasp], list[Grasp]],
+    features: tuple[Features, Features],
+) -> None:
+    """Train a head and its candidate encoder on features of training and validation grasps; calibrate and store it."""
+    if fingers == 1:
+        grasps = tuple([one for grasp in part for one in each_finger(grasp)] for part in grasps)  # type: ignore[assignment]
+        features = tuple(each_finger_features(part) for part in features)  # type: ignore[assignment]
+    matcher = dataclasses.replace(config.matcher, fingers=fingers)
+    settings = MethodSettings(
+        dataclasses.replace(config, matcher=matcher), folder=folder / f"{fingers}-fingers", quiet=False
+    )
+    made = trained_checkpoint(settings, *features)
+    about = {"source": "simulated rigs", "data_digest": data_digest([*grasps[0], *grasps[1]])}
+    made = dataclasses.replace(made, provenance=made.provenance | about, split=split_of(*grasps))
+    made = distilled(made, *features)
+    store(calibrated(made, folder, fingers), folder / defaults.SHIPPED[fingers])
+
+
+def split_of(train: list[Grasp], validation: list[Grasp]) -> Split:
+    """Return the split of training and validation grasps."""
+    return Split(0, *(tuple(sorted({grasp.object_id for grasp in part})) for part in (train, validation, [])))
 
 
 def each_finger(grasp: Grasp) -> list[Grasp]:
@@ -167,6 +172,39 @@ def each_finger(grasp: Grasp) -> list[Grasp]:
     ]
 
 
+def each_finger_features(features: Features) -> Features:
+    """Return the features of `each_finger` of all grasps."""
+    return Features(
+        tuple(f"{name}-{finger}" for name in features.grasp_ids for finger in "ab"),
+        tuple(name for name in features.object_ids for _ in "ab"),
+        features.touch.reshape(-1, 1, features.touch.shape[2]),
+        features.photo.repeat(2, axis=0),
+    )
+
+
+def collect_training(arguments: argparse.Namespace) -> int:
+    """Collect the training grasps, one recording for each seed."""
+    for rig, (first, seeds, objects) in PARTS.items():
+        for seed in range(first, first + seeds):
+            out = arguments.folder / "recordings" / str(seed)
+            size = ("--objects", objects, "--grasps", GRASPS, "--seed", seed, "--jobs", arguments.jobs)
+            if code := retrieve("collect", "--rig", RIGS / rig, *size, "--out", out):
+                return code
+    return 0
+
+
+def collect_calibration(arguments: argparse.Namespace) -> int:
+    """Collect the grasps of the validation objects, and of those on which the bounds of verifications are fitted."""
+    for name, (objects, grasps), seed in (
+        ("validation", VALIDATED, SEED_VALIDATED),
+        ("verification", VERIFIED, SEED_VERIFIED),
+    ):
+        size = ("--objects", objects, "--grasps", grasps, "--seed", seed, "--jobs", arguments.jobs)
+        if code := retrieve("collect", "--rig", RIG, *size, "--out", arguments.folder / name):
+            return code
+    return 0
+
+
 def pretrain_towers(arguments: argparse.Namespace) -> int:
     """Photograph and press objects of two other seeds, and pretrain each tower on relief with them."""
     for side, pictures, seed, rig in (
@@ -174,57 +212,43 @@ def pretrain_towers(arguments: argparse.Namespace) -> int:
         ("touch", "touches", SEED_TOUCHES, TOUCH_RIG),
     ):
         folder, tower = arguments.folder / pictures, arguments.folder / f"{side}-tower.safetensors"
+        if tower.exists():
+            continue
         size = ("--objects", getattr(arguments, pictures), "--seed", seed, "--jobs", arguments.jobs)
+        options = ("--config", "relief", "--init", arguments.init, "--iterations", arguments.steps)
         code = retrieve("collect", f"--{pictures}-only", "--rig", rig, *size, "--out", folder)
-        if not code and not tower.exists():
-            options = ("--config", PRESET, "--init", arguments.init, "--iterations", arguments.steps)
-            code = retrieve("train", folder, "--task", "relief", *options, "--out", tower)
-        if code:
+        if code := code or retrieve("train", folder, "--task", "relief", *options, "--out", tower):
             return code
     return 0
 
 
 def calibrate_shipped(arguments: argparse.Namespace) -> int:
-    """Fit posterior and gel check; keep all weights. Collect only the needed objects of the recording of `make`."""
-    shipped = load_checkpoint(defaults.shipped_model())
-    assert shipped.split is not None
-    names = sorted({*shipped.split.validation, *shipped.split.train[:: len(shipped.split.train) // VALIDATION]})
-    grasps = collect_of(arguments.folder / "verdicts", names, VERDICT_GRASPS, arguments.jobs)
-    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
-    store(fit_calibration(shipped, grasps, features), arguments.folder / defaults.SHIPPED[2])
-    return 0
-
-
-def calibrate_posterior(arguments: argparse.Namespace) -> int:
-    """Fit the calibration of reference touches; keep all weights and the posterior."""
-    shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
-    assert shipped.split is not None
-    names = shipped.split.validation
-    grasps = collect_of(arguments.folder / "references", names, REFERENCE_GRASPS, arguments.jobs)
-    if arguments.fingers == 1:
-        grasps = [each_finger(grasp)[0] for grasp in grasps]
-    trials, _ = scored_touches(shipped, grasps, arguments.folder / "features")
-    calibrated = same_codes(dataclasses.replace(shipped, references=fit_reference_calibration(trials)), shipped)
-    store(calibrated, arguments.folder / defaults.SHIPPED[arguments.fingers])
-    return 0
-
-
-def calibrate_verification(arguments: argparse.Namespace) -> int:
-    """Fit the bounds of verifications; keep everything else."""
-    shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
-    recording = arguments.folder / "verification"
-    size = ("--objects", VERIFIED, "--grasps", VERIFIED_GRASPS, "--seed", SEED_VERIFIED, "--jobs", arguments.jobs)
-    if code := retrieve("collect", "--rig", RIG, *size, "--out", recording):
+    """Calibrate both shipped checkpoints again: posterior, gel check, reference touches, bounds of verifications."""
+    if code := collect_calibration(arguments):
         return code
-    grasps = load_grasps(recording)
-    if arguments.fingers == 1:
-        grasps = [each_finger(grasp)[0] for grasp in grasps]
-    trials, photos = scored_touches(shipped, grasps, arguments.folder / "features")
-    assert shipped.posterior is not None
-    verification = fit_verification(trials.scored, photo_embeddings(shipped.matcher, photos), shipped.posterior)
-    made = same_codes(dataclasses.replace(shipped, verification=verification), shipped)
-    store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
+    for fingers, name in defaults.SHIPPED.items():
+        shipped = load_checkpoint(defaults.shipped_model(fingers))
+        made = calibrated(shipped, arguments.folder, fingers)
+        # Towers and head are the same, so indexes keep their partial activations.
+        partials_from = [*shipped.provenance.get(PARTIALS_FROM, []), shipped.digest]
+        made = dataclasses.replace(made, provenance=made.provenance | {PARTIALS_FROM: partials_from})
+        store(made, arguments.folder / name)
     return 0
+
+
+def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
+    """Return a checkpoint with its posterior, gel check, calibration of reference touches and bounds."""
+    validation, verification = (load_grasps(folder / name) for name in ("validation", "verification"))
+    if fingers == 1:
+        validation, verification = ([each_finger(grasp)[0] for grasp in part] for part in (validation, verification))
+    both = [*validation, *verification]
+    features, device = encode_recording(both, made.matcher, made.config, folder / "features"), default_device()
+    with FrozenFeatures(made.config, device, features_by_image(both, features, device)) as source:
+        made = with_verdicts(made, source, verification, validation, foreign=FOREIGN)
+    trials, photos = scored_touches(made, verification, folder / "features")
+    assert made.posterior is not None
+    bounds = fit_verification(trials.scored, photo_embeddings(made.matcher, photos), made.posterior)
+    return dataclasses.replace(made, verification=bounds)
 
 
 def scored_touches(made: Checkpoint, grasps: list[Grasp], cache: Path) -> tuple[ReferenceTouches, dict[Path, Tensor]]:
@@ -237,55 +261,9 @@ def scored_touches(made: Checkpoint, grasps: list[Grasp], cache: Path) -> tuple[
     return trials, photos
 
 
-def collect_of(recording: Path, names: Sequence[str], grasps: int, jobs: int) -> list[Grasp]:
-    """Collect these objects of the object set of `make`."""
-    robot.collect(
-        functools.partial(robot.load_rig, str(RIG), seed=SEED_TRAINED),
-        recording,
-        objects=names,
-        seed=SEED_TRAINED,
-        settings=robot.CollectSettings(grasps=grasps),
-        jobs=jobs,
-    )
-    return load_grasps(recording)
-
-
-def same_codes(made: Checkpoint, before: Checkpoint) -> Checkpoint:
-    """Return a checkpoint with the towers and head of the one before: indexes keep their partial activations."""
-    partials_from = [*before.provenance.get(PARTIALS_FROM, []), before.digest]
-    return dataclasses.replace(made, provenance=made.provenance | {PARTIALS_FROM: partials_from})
-
-
-def fit_calibration(made: Checkpoint, grasps: list[Grasp], features: Features) -> Checkpoint:
-    """Return a checkpoint with its posterior and its gel check."""
-    assert made.split is not None
-    device = default_device()
-    with FrozenFeatures(made.config, device, features_by_image(grasps, features, device)) as source:
-        parts = (made.split.select(grasps, part) for part in ("train", "validation"))
-        return with_verdicts(made, source, *parts, foreign=FOREIGN)
-
-
-def distil_shipped(arguments: argparse.Namespace) -> int:
-    """Retrain the candidate encoder on the shipped, rounded weights; keep towers, head, calibration and split."""
-    shipped = load_checkpoint(defaults.shipped_model(arguments.fingers))
-    grasps = load_grasps(arguments.folder / "recording")
-    if arguments.fingers == 1:
-        grasps = [part for grasp in grasps for part in each_finger(grasp)]
-    features = encode_recording(grasps, shipped.matcher, shipped.config, arguments.folder / "features")
-    assert shipped.split is not None
-    train, validation = (features.of_objects(part) for part in (shipped.split.train, shipped.split.validation))
-    paths = {"photos": str(arguments.folder / "photos"), "touches": str(arguments.folder / "touches")}
-    training = dataclasses.replace(shipped.config.training, **paths)
-    pairs = labelled_pairs(dataclasses.replace(shipped.config, training=training))
-    train = train.concatenate(encode_recording(pairs, shipped.matcher, shipped.config, arguments.folder / "features"))
-    made = same_codes(distilled(shipped, train, validation, arguments.steps), shipped)
-    store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
-    return 0
-
-
-def distilled(made: Checkpoint, train: Features, validation: Features, steps: int) -> Checkpoint:
+def distilled(made: Checkpoint, train: Features, validation: Features) -> Checkpoint:
     """Return a checkpoint with the preset's candidate encoder."""
-    training = dataclasses.replace(made.config.training, distil_steps=steps)
+    training = dataclasses.replace(made.config.training, distil_steps=DISTIL_STEPS)
     config = dataclasses.replace(made.config.with_candidate_encoder_of(load_config(PRESET)), training=training)
     with one_thread():  # like training on frozen features
         partials = (distil.feature_partials(made.matcher, part) for part in (train, validation))

@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from scipy.spatial.distance import cdist
 from _touch_retrieval.files import read_json, read_regular
 from retrieval.data.dataset import Grasp
 from retrieval.errors import DatasetError
+from robot.recording.folder import read_info
 
 KINDS = ("photo", "touch")
 FAMILIES = ("relief", "shape")
@@ -37,22 +38,14 @@ SHAPE_MISMATCH_DISTANCE = 3.0
 
 
 @dataclass(frozen=True)
-class LabelledPicture:
-    """A photo, or one finger's gel image with its no-contact frame, and the properties of its object.
+class ObjectLabels:
+    """The properties of a simulated object that both its touches and its photos show.
 
     Attributes:
-        file: File of the photo or gel image.
-        finger: Finger of the gel image; None for a photo.
-        before: File of the no-contact frame, if any.
-        object_id: The object.
         families: Its relief and shape families, in the order of `FAMILIES`.
         sizes: Sizes of its relief, in the order of `SIZES`; the amplitude of a smooth object is 0.
     """
 
-    file: Path
-    finger: str | None
-    before: Path | None
-    object_id: str
     families: tuple[str, ...]
     sizes: tuple[float, ...]
 
@@ -76,6 +69,52 @@ class LabelledPicture:
         """`sizes` for regression and comparison: logarithms of all but the sharpness."""
         pitch, amplitude, aspect, sharpness = self.sizes
         return math.log(pitch), math.log(max(amplitude, MIN_AMPLITUDE_MM)), math.log(aspect), sharpness
+
+    @classmethod
+    def from_dict(cls, row: Mapping[str, Any]) -> "ObjectLabels":
+        """Read the labels that the simulated rig writes. Raises ValueError if they are missing or impossible."""
+        try:
+            families, sizes = tuple(str(row[name]) for name in FAMILIES), tuple(float(row[name]) for name in SIZES)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"no labels: {error!r}") from error
+        pitch, amplitude, aspect, sharpness = sizes
+        if not (0 < pitch < math.inf and 0 <= amplitude < math.inf and 1 <= aspect < math.inf and 0 <= sharpness <= 1):
+            raise ValueError(
+                f"pitch and amplitude must be lengths in mm, aspect at least 1, sharpness within 0..1; got {sizes}"
+            )
+        return cls(families, sizes)
+
+
+@dataclass(frozen=True)
+class LabelledPicture:
+    """A photo, or one finger's gel image with its no-contact frame, and the labels of its object.
+
+    Attributes:
+        file: File of the photo or gel image.
+        finger: Finger of the gel image; None for a photo.
+        before: File of the no-contact frame, if any.
+        object_id: The object.
+        labels: Its labels.
+    """
+
+    file: Path
+    finger: str | None
+    before: Path | None
+    object_id: str
+    labels: ObjectLabels
+
+
+def load_object_labels(recording: Path) -> dict[str, ObjectLabels]:
+    """Return the labels of the objects of a simulated recording, from its recording.json.
+
+    Raises:
+        DatasetError: The recording has no labels, or they are damaged.
+    """
+    objects = read_info(recording).get("objects", {})
+    try:
+        return {name: ObjectLabels.from_dict(row) for name, row in objects.items()}
+    except (ValueError, AttributeError) as error:
+        raise DatasetError(f"{recording}: recording.json must hold the labels of each object; {error}") from error
 
 
 def load_labelled(folder: Path) -> tuple[str, list[LabelledPicture]]:
@@ -107,28 +146,19 @@ def labels_digest(pictures: Iterable[LabelledPicture]) -> str:
     """
     digest = hashlib.sha256()
     for each in pictures:
-        digest.update(json.dumps([each.file.name, each.finger, each.object_id, each.families, each.sizes]).encode())
+        labels = each.labels.families, each.labels.sizes
+        digest.update(json.dumps([each.file.name, each.finger, each.object_id, *labels]).encode())
     return digest.hexdigest()
 
 
 def _picture(folder: Path, number: int, line: str) -> LabelledPicture:
     try:
         row: dict[str, Any] = json.loads(line)
-        sizes = tuple(float(row[name]) for name in SIZES)
         before = folder / row["before_file_name"] if "before_file_name" in row else None
-        families = tuple(str(row[name]) for name in FAMILIES)
-        picture = LabelledPicture(
-            folder / row["file_name"], row.get("finger"), before, str(row["object_id"]), families, sizes
-        )
+        labels = ObjectLabels.from_dict(row)
+        return LabelledPicture(folder / row["file_name"], row.get("finger"), before, str(row["object_id"]), labels)
     except (ValueError, KeyError, TypeError) as error:
-        raise DatasetError(f"{folder}/metadata.jsonl, line {number}: not a labelled picture: {error!r}") from error
-    pitch, amplitude, aspect, sharpness = sizes
-    if not (0 < pitch < math.inf and 0 <= amplitude < math.inf and 1 <= aspect < math.inf and 0 <= sharpness <= 1):
-        raise DatasetError(
-            f"{folder}/metadata.jsonl, line {number}: pitch and amplitude must be lengths in mm, aspect at least 1, "
-            f"sharpness within 0..1; got {sizes}"
-        )
-    return picture
+        raise DatasetError(f"{folder}/metadata.jsonl, line {number}: not a labelled picture: {error}") from error
 
 
 # Pairs ---------------------------------------------------------------------------------------------------------------
@@ -179,8 +209,8 @@ def _pairs(pressed: list[LabelledPicture], photographed: list[LabelledPicture]) 
     rows_of: dict[str, tuple[list[int], list[int]]] = defaultdict(lambda: ([], []))
     for side, pictures in enumerate((pressed, photographed)):
         for row, picture in enumerate(pictures):
-            rows_of[picture.relief][side].append(row)
-    shapes = [np.array([each.shape for each in pictures]) for pictures in (pressed, photographed)]
+            rows_of[picture.labels.relief][side].append(row)
+    shapes = [np.array([each.labels.shape for each in pictures]) for pictures in (pressed, photographed)]
     touch_sizes, photo_sizes = _scaled(pressed, photographed), _scaled(photographed, photographed)
     pairs: set[tuple[int, int]] = set()
     for presses, photos in rows_of.values():
@@ -194,9 +224,9 @@ def _pairs(pressed: list[LabelledPicture], photographed: list[LabelledPicture]) 
 
 def _scaled(pictures: list[LabelledPicture], over: list[LabelledPicture]) -> NDArray[np.float64]:
     """Return (N, sizes) in weighted standard deviations over `over`; zeros for smooth objects, which have no sizes."""
-    deviation = np.array([each.size_targets for each in over]).std(0) + 1e-6
-    sizes = np.array([each.size_targets for each in pictures]) / deviation * np.sqrt(SIZE_WEIGHTS)
-    sizes[[each.is_smooth for each in pictures]] = 0.0
+    deviation = np.array([each.labels.size_targets for each in over]).std(0) + 1e-6
+    sizes = np.array([each.labels.size_targets for each in pictures]) / deviation * np.sqrt(SIZE_WEIGHTS)
+    sizes[[each.labels.is_smooth for each in pictures]] = 0.0
     return np.asarray(sizes)
 
 

@@ -140,8 +140,11 @@ class TrainingConfig:
             towers are trained.
         freeze_batch_norm: Keep the batch statistics of the initial weights.
         freeze_towers: Train only the layers after the towers. Every image is then encoded once per training run.
-        freeze_stem: Keep the first layers of the towers (`Tower.stem_layers`) frozen if the towers are trained. Their
-            maps of every image are then computed once per training run, and a step computes only the other layers.
+        freeze_stem: Keep the first layers of the towers (`Tower.stem_layers`) frozen if the towers are trained.
+        augment: Turn, scale, shift, flip and relight the images of each step at random, if the towers are trained
+            (`retrieval.training.augmentation`).
+        predict_labels: Weight of the loss of predicting the labels of a simulated object, its relief and shape, from
+            the features of each tower (`retrieval.training.labels`), if the towers are trained.
         distil_steps: Steps that distil the candidate encoder after training (`retrieval.training.distil`).
         validation_fraction: Fraction of the objects that are validation objects.
         test_fraction: Fraction of the objects that are test objects.
@@ -172,6 +175,8 @@ class TrainingConfig:
     freeze_batch_norm: bool = False
     freeze_towers: bool = False
     freeze_stem: bool = False
+    augment: bool = False
+    predict_labels: Weight = 0.0
     distil_steps: Count = 600
     validation_fraction: Fraction = 0.1
     test_fraction: Fraction = 0.184

@@ -148,18 +148,6 @@ def photo_features(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -
     return _in_batches(photos, batch, lambda part: fast.photo_features(to_batch(part, device)))
 
 
-def touch_stems(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> Tensor:
-    """Return the maps (B, fingers, C, H', W') of the touch tower's stem, float16 (`Matcher.touch_stem`)."""
-    device = next(matcher.parameters()).device
-    return _in_batches(touches, batch, lambda part: matcher.touch_stem(touch_batch(part, device)).half())
-
-
-def photo_stems(matcher: Matcher, photos: Iterable[Image], batch: int = 16) -> Tensor:
-    """Return the maps (B, views, C, H', W') of the photo tower's stem, float16 (`Matcher.photo_stem`)."""
-    device = next(matcher.parameters()).device
-    return _in_batches(photos, batch, lambda part: matcher.photo_stem(to_batch(part, device)).half())
-
-
 @torch.inference_mode()
 def encode_touches(matcher: Matcher, touches: Iterable[Sequence[Image]], batch: int = 32) -> ImageEncoding:
     """Return partial activations and embeddings of touches, each a sequence of finger images (H, W, 3), on the CPU.

@@ -195,48 +195,22 @@ class Matcher(nn.Module):
         Raises:
             BadInput: A touch has another number of images than this matcher has fingers.
         """
-        features: Tensor = self.touch_tower(self._finger_images(touches))
-        return features.float().view(len(touches), -1)
-
-    def photo_features(self, photos: Tensor) -> Tensor:
-        """Return features (B, photo_feature_count) of photos (B, 3, H, views * W) in 0..1."""
-        features: Tensor = self.photo_tower(self._view_images(photos))
-        return self.joined_views(features.float())
-
-    def touch_stem(self, touches: Tensor) -> Tensor:
-        """Return the stem's maps (B, fingers, C, H', W') of touches, as `touch_features` takes them."""
-        maps: Tensor = self.touch_tower.stem(self._finger_images(touches))
-        return maps.view(len(touches), -1, *maps.shape[1:])
-
-    def photo_stem(self, photos: Tensor) -> Tensor:
-        """Return the stem's maps (B, views, C, H', W') of photos, as `photo_features` takes them."""
-        maps: Tensor = self.photo_tower.stem(self._view_images(photos))
-        return maps.view(len(photos), -1, *maps.shape[1:])
-
-    def touch_features_of_stem(self, maps: Tensor) -> Tensor:
-        """Return `touch_features` from the maps of `touch_stem`."""
-        return self.touch_tower.encode_stem(maps.flatten(0, 1)).float().view(len(maps), -1)
-
-    def photo_features_of_stem(self, maps: Tensor) -> Tensor:
-        """Return `photo_features` from the maps of `photo_stem`."""
-        return self.joined_views(self.photo_tower.encode_stem(maps.flatten(0, 1)).float())
-
-    def _finger_images(self, touches: Tensor) -> Tensor:
-        """Return the images (B * fingers, 3, H, W) of touches. Raises BadInput for another number of fingers."""
         fingers = self.config.fingers
         if touches.ndim != 5 or touches.shape[1] != fingers:
             got = f"{touches.shape[1]} image(s)" if touches.ndim == 5 else f"an array of shape {tuple(touches.shape)}"
             raise BadInput(f"this matcher takes {fingers} gel image(s) for one touch; got {got}")
-        return touches.flatten(0, 1)
+        features: Tensor = self.touch_tower(touches.flatten(0, 1))
+        return features.float().view(len(touches), -1)
 
-    def _view_images(self, photos: Tensor) -> Tensor:
-        """Return the views (B * views, 3, H, W) of photos (B, 3, H, views * W)."""
-        if self.views == 1:
-            return photos
-        # One copy with channels last: without it, convolutions in training take 1.4 times as long.
-        count, _, height, _ = photos.shape
-        side_by_side = photos.permute(0, 2, 3, 1).reshape(count, height, self.views, -1, 3)
-        return side_by_side.transpose(1, 2).flatten(0, 1).permute(0, 3, 1, 2)
+    def photo_features(self, photos: Tensor) -> Tensor:
+        """Return features (B, photo_feature_count) of photos (B, 3, H, views * W) in 0..1."""
+        if self.views > 1:
+            # One copy with channels last: without it, convolutions in training take 1.4 times as long.
+            count, _, height, _ = photos.shape
+            side_by_side = photos.permute(0, 2, 3, 1).reshape(count, height, self.views, -1, 3)
+            photos = side_by_side.transpose(1, 2).flatten(0, 1).permute(0, 3, 1, 2)
+        features: Tensor = self.photo_tower(photos)
+        return self.joined_views(features.float())
 
     def joined_views(self, outputs: Tensor) -> Tensor:
         """Return features (B, photo_feature_count) of the tower's outputs (B * views, output_count).

@@ -1,11 +1,9 @@
 """Features of the distinct images of pairs, from towers in training or from frozen towers with cached features."""
 
-import copy
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -19,22 +17,19 @@ from retrieval.data.dataset import Grasp, ImageCache
 from retrieval.data.loading import TimedFunction, map_in_order, worker_count, worker_pool
 from retrieval.data.pairs import PairBatch
 from retrieval.errors import DatasetError, JobInterrupted
-from retrieval.model.checkpoint import tensors_digest
 from retrieval.model.config import Config
 from retrieval.model.encode import (
     Image,
     autocast,
-    for_inference,
     one_thread,
     photo_features,
-    photo_stems,
     to_batch,
     touch_batch,
     touch_features,
-    touch_stems,
 )
 from retrieval.model.fusion import Matcher
 from retrieval.training import distributed
+from retrieval.training.augmentation import augment_photos, augment_touches
 from retrieval.training.disk_image_cache import DiskImageCache
 
 
@@ -118,19 +113,33 @@ class BatchImages:
 class TrainedFeatures(BatchImages):
     """Features of towers in training: each rank encodes a part of the images and gathers the other parts."""
 
-    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[LoadedBatch]":
-        """Start loading this rank's part of the batch's images."""
-        return self._ahead.submit(self._load, batch)
+    def prepare(self, matcher: Matcher, batch: PairBatch, step: int) -> "Future[LoadedBatch]":
+        """Start loading this rank's part of the images of step `step`."""
+        return self._ahead.submit(self._load, batch, step)
 
-    def _load(self, batch: PairBatch) -> LoadedBatch:
+    def _load(self, batch: PairBatch, step: int) -> LoadedBatch:
         grasps = [batch.grasps[row] for row in distributed.rank_rows(len(batch.grasps))]
         photos = [batch.photos[row] for row in distributed.rank_rows(len(batch.photos))]
         touch_futures = [self._workers.submit(self.touch, grasp) for grasp in grasps]
         photo_futures = [self._workers.submit(self.photo, path) for path in photos]
-        touches = touch_batch([future.result() for future in touch_futures])
-        return LoadedBatch(
-            batch, self._to_device(touches), self._to_device(to_batch([future.result() for future in photo_futures]))
-        )
+        touch_images = touch_batch([future.result() for future in touch_futures])
+        photo_images = to_batch([future.result() for future in photo_futures])
+        if self.config.training.augment:
+            touch_images, photo_images = self._augment(batch, step, touch_images, photo_images)
+        return LoadedBatch(batch, self._to_device(touch_images), self._to_device(photo_images))
+
+    def _augment(self, batch: PairBatch, step: int, touches: Tensor, photos: Tensor) -> tuple[Tensor, Tensor]:
+        """Return this rank's images, augmented. The touches and photos of an object are mirrored together."""
+        seed, objects = self.config.training.seed, 1 + int(batch.photo_objects.max())
+        is_mirrored = np.random.default_rng([seed, 5, step]).random(objects) < 0.5
+        touch_objects = batch.touch_objects[distributed.rank_rows(len(batch.grasps))]
+        photo_objects = batch.photo_objects[distributed.rank_rows(len(batch.photos))]
+        rng = np.random.default_rng([seed, 6, step, distributed.rank()])
+        with one_thread():  # another thread computes the step
+            return (
+                augment_touches(touches, is_mirrored[touch_objects], rng),
+                augment_photos(photos, len(self.config.preprocessing.views), is_mirrored[photo_objects], rng),
+            )
 
     def _to_device(self, images: Tensor) -> Tensor:
         """Copy images to the device, from pinned memory while the device computes."""
@@ -172,8 +181,8 @@ class FrozenFeatures(BatchImages):
         super().__init__(config, device, keep_bytes=0)  # images are read once, since their features are cached
         self._features: dict[str | Path, Tensor] = dict(known)
 
-    def prepare(self, matcher: Matcher, batch: PairBatch) -> "Future[LoadedBatch]":
-        """Return the features of a batch, and encode new images before returning.
+    def prepare(self, matcher: Matcher, batch: PairBatch, step: int = 0) -> "Future[LoadedBatch]":
+        """Return the features of a batch, and encode new images before returning; `step` has no effect.
 
         This does not use the prefetch thread. PyTorch starts a separate team of workers for every calling thread, and
         two teams on the same cores wait for each other a hundred times as long as a step computes.
@@ -215,87 +224,8 @@ class FrozenFeatures(BatchImages):
         return loaded.touches, loaded.photos
 
 
-class StemFeatures(FrozenFeatures):
-    """Features of towers whose stem is frozen: the stem's maps of each image are computed once.
-
-    The maps are stored as float16, which rounds them by at most a two-thousandth.
-    """
-
-    def __init__(self, config: Config, device: torch.device, matcher: Matcher) -> None:
-        """Start without maps.
-
-        Args:
-            config: The configuration.
-            device: Device of the maps.
-            matcher: The matcher whose stems are frozen.
-        """
-        super().__init__(config, device, {})
-        self._stems = for_inference(copy.deepcopy(matcher).eval())
-
-    def _encode_touches(self, matcher: Matcher, touches: Iterable[Sequence[Image]]) -> Tensor:
-        return touch_stems(self._stems, touches)
-
-    def _encode_photos(self, matcher: Matcher, photos: Iterable[Image]) -> Tensor:
-        return photo_stems(self._stems, photos)
-
-    def fill_cache(self, folder: Path, grasps: Sequence[Grasp], *, quiet: bool = False) -> None:
-        """Compute the maps of all images of grasps, and store them in `folder`, from which later runs read them."""
-        from retrieval.training.features import FeatureCache  # it imports this module
-
-        settings, workers = self.config.preprocessing.digest(), self.config.training.workers
-        touch_by, photo_by = (
-            (f"{kind}_stem", tensors_digest(tower.stem_layers().state_dict(), type(tower).__name__), settings)
-            for kind, tower in (("touch", self._stems.touch_tower), ("photo", self._stems.photo_tower))
-        )
-        encode = partial(touch_stems, self._stems)
-        cache = FeatureCache(folder, touch_by, self.touch, encode, self.files, workers, quiet)
-        self._features |= zip((grasp.grasp_id for grasp in grasps), torch.from_numpy(cache.rows(grasps)), strict=True)
-        files = list(dict.fromkeys(grasp.photo for grasp in grasps))
-        encode = partial(photo_stems, self._stems)
-        photos = FeatureCache(folder, photo_by, self.photo, encode, lambda file: (file,), workers, quiet)
-        self._features |= zip(files, torch.from_numpy(photos.rows(files)), strict=True)
-
-    def step_context(self) -> AbstractContextManager[None]:
-        """Return the context of a training step; it changes nothing, since towers use every core."""
-        return nullcontext()
-
-    def train_features(self, matcher: Matcher, loaded: LoadedBatch) -> tuple[Tensor, Tensor]:
-        """Return features of the batch's touches and photos; each rank computes a part."""
-        touches, photos = len(loaded.batch.grasps), len(loaded.batch.photos)
-        own_touches, own_photos = (
-            part[distributed.rank_rows(len(part))].to(self.device).float() for part in (loaded.touches, loaded.photos)
-        )
-        with autocast(self.device, self.config.training.precision):
-            with distributed.counting_rank_rows(touches):
-                touch = matcher.touch_features_of_stem(own_touches)
-            with distributed.counting_rank_rows(photos):
-                photo = matcher.photo_features_of_stem(own_photos)
-        return distributed.gather_rows(touch, touches), distributed.gather_rows(photo, photos)
-
-    @torch.inference_mode()
-    def eval_features(self, matcher: Matcher, pairs: PairBatch) -> tuple[Tensor, Tensor]:
-        """Return features of the pairs' touches and photos."""
-        loaded = self.prepare(matcher, pairs).result()
-        return tuple(  # type: ignore[return-value]
-            torch.cat([encode(part.to(self.device).float()) for part in torch.split(maps, _CHUNK)])
-            for encode, maps in (
-                (matcher.touch_features_of_stem, loaded.touches),
-                (matcher.photo_features_of_stem, loaded.photos),
-            )
-        )
-
-
-FeatureSource = TrainedFeatures | FrozenFeatures | StemFeatures
+FeatureSource = TrainedFeatures | FrozenFeatures
 """The source of a training run's features."""
-
-
-def feature_source(
-    config: Config, device: torch.device, matcher: Matcher, known: Mapping[str | Path, Tensor]
-) -> FeatureSource:
-    """Return the source of a training run's features; `known` features of frozen towers are as in `FrozenFeatures`."""
-    if config.training.freeze_towers:
-        return FrozenFeatures(config, device, known)
-    return StemFeatures(config, device, matcher) if config.training.freeze_stem else TrainedFeatures(config, device)
 
 
 _CHUNK = 64

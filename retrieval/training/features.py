@@ -218,11 +218,11 @@ def encode_recording(
     with BatchImages(settings, device, keep_bytes=0) as images:
         touch_made_by = (touch_variant, _tower_digest(matcher.touch_tower), settings.preprocessing.digest())
         workers, encode = config.training.workers, partial(touch_features, matcher)
-        touch = FeatureCache(cache, touch_made_by, images.touch, encode, images.files, workers, quiet).rows(touched)
+        touch = _FeatureCache(cache, touch_made_by, images.touch, encode, images.files, workers, quiet).rows(touched)
         if photo_features_from is None:
             photo_made_by = (photo_variant, _tower_digest(matcher.photo_tower), settings.preprocessing.digest())
             encode = partial(photo_features, matcher)
-            parts = FeatureCache(cache, photo_made_by, images.photo, encode, lambda file: (file,), workers, quiet)
+            parts = _FeatureCache(cache, photo_made_by, images.photo, encode, lambda file: (file,), workers, quiet)
             files = {path: row for row, path in enumerate(dict.fromkeys(grasp.photo for grasp in grasps))}
             photo = parts.rows(list(files))[[files[grasp.photo] for grasp in grasps]]
         else:
@@ -274,14 +274,14 @@ def _tower_digest(tower: Tower) -> str:
 
 
 @dataclass(frozen=True)
-class FeatureCache(Generic[T]):
+class _FeatureCache(Generic[T]):
     """Features of images in parts: read from the cache, or encoded and stored.
 
     Attributes:
         cache: The cache folder, or None.
         made_by: Variant, tower and preprocessing.
         load: Returns the image (or images) of an item.
-        encode: Returns features (B, ...) of a list of images.
+        encode: Returns features (B, F) of a list of images.
         files: Returns the files of an item.
         workers: As for `retrieval.data.loading.worker_count`.
         quiet: No progress on stderr.
@@ -295,17 +295,17 @@ class FeatureCache(Generic[T]):
     workers: int | str
     quiet: bool
 
-    def rows(self, items: Sequence[T]) -> NDArray[Any]:
-        """Return the features (len(items), ...) of items, in their order, in the type of `encode`."""
+    def rows(self, items: Sequence[T]) -> NDArray[np.float32]:
+        """Return the features (len(items), F) of items, in their order."""
         variant = self.made_by[0]
-        unit = "photos" if variant.startswith(PHOTO_VARIANTS) else "grasps"
+        unit = "photos" if variant in PHOTO_VARIANTS else "grasps"
         with (
             Bar(f"encode {variant}", len(items), unit, quiet=self.quiet) as bar,
             worker_pool(self.workers) as pool,
         ):
             return np.concatenate([self._part(part, pool, bar) for part in batches(items, _PART)])
 
-    def _part(self, items: list[T], pool: Executor, bar: Bar) -> NDArray[Any]:
+    def _part(self, items: list[T], pool: Executor, bar: Bar) -> NDArray[np.float32]:
         path = self._path(items)
         if path and (cached := _read_cached(path)) is not None and len(cached) == len(items):
             bar.advance(len(items))

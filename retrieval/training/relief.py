@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torch.nn import functional
 
 from retrieval.console.interruption import interruption
 from retrieval.console.progress import Bar
@@ -31,12 +30,14 @@ from retrieval.model.config import Config
 from retrieval.model.encode import autocast, default_device, to_batch
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
+from retrieval.training.augmentation import augment, centre_crop
 from retrieval.training.disk_image_cache import DiskImageCache
 from retrieval.training.fit import RATE, Plan, fit
+from retrieval.training.labels import LabelHead
 from retrieval.training.state import load_state, require_no_unfinished_state, save_state, state_path
 
 BATCH, ITERATIONS, LEARNING_RATE = 32, 1500, 4e-4
-WEIGHT_DECAY, SMOOTHING, DROPOUT = 0.03, 0.05, 0.2
+WEIGHT_DECAY = 0.03
 HEAD_RATE_FACTOR = 5.0
 """Ratio of the head's learning rate to the tower's, since the head starts at zero."""
 VALIDATION, MAX_VALIDATION_OBJECTS = 0.05, 400
@@ -144,24 +145,19 @@ class ReliefTraining:
         self.device, seed = default_device(), config.training.seed
         objects = sorted({picture.object_id for picture in pictures})
         count = max(1, min(round(VALIDATION * len(objects)), MAX_VALIDATION_OBJECTS))
+        self.visible = VISIBLE_FRACTION if kind == "photo" else 1.0
         self.labels = labels_digest(pictures)
         held_out = set(np.random.default_rng([seed, 1]).permutation(objects)[:count].tolist())
         self.pictures = [picture for picture in pictures if picture.object_id not in held_out]
         self.validation = [picture for picture in pictures if picture.object_id in held_out]
-        self.families = [sorted({each.families[index] for each in self.pictures}) for index in range(len(FAMILIES))]
-        if len(self.families[0]) < 2:
-            raise DatasetError(f"training needs at least two relief families, got {', '.join(self.families[0])}")
-        sizes = np.array([each.size_targets for each in self.pictures if not each.is_smooth])
-        self.mean, self.deviation = sizes.mean(0), sizes.std(0) + 1e-6
+        reliefs = sorted({picture.labels.relief for picture in self.pictures})
+        if len(reliefs) < 2:
+            raise DatasetError(f"training needs at least two relief families, got {', '.join(reliefs)}")
         torch.manual_seed(seed)
         matcher = config.matcher
         self.tower = build_tower(matcher.tower, matcher.tower_output, matcher.architectures)
         initialise_tower(self.tower, config.training.init)
-        features = self.tower.feature_count
-        last = nn.Linear(features, sum(map(len, self.families)) + len(SIZES))
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
-        self.head = nn.Sequential(nn.BatchNorm1d(features, affine=False), nn.Dropout(DROPOUT), last)
+        self.head = LabelHead(self.tower.feature_count, [picture.labels for picture in self.pictures])
         self.modules = nn.ModuleDict({"tower": self.tower, "head": self.head}).to(self.device)
         groups: list[dict[str, Any]] = [
             {"params": self.tower.parameters()},
@@ -222,7 +218,7 @@ class ReliefTraining:
     def _batch(self, step: int) -> tuple[list[LabelledPicture], Tensor]:
         rng = np.random.default_rng([self.config.training.seed, 2, step])
         chosen = [self.pictures[row] for row in rng.integers(len(self.pictures), size=BATCH)]
-        return chosen, augment(self._images(chosen, rng), self.kind, rng)
+        return chosen, augment(self._images(chosen, rng), self.kind, rng, visible=self.visible)
 
     def _loss(self, batch: tuple[list[LabelledPicture], Tensor]) -> Tensor:
         pictures, images = batch
@@ -232,24 +228,12 @@ class ReliefTraining:
                 module.eval()  # keep the pretrained statistics, since a batch of 32 is too small for new ones
         self.head.train()
         torch.manual_seed(self.config.training.seed * 1_000_003 + self.step)  # the dropout mask
-        *families, sizes = self._readings(images)
-        has_relief = torch.tensor([not each.is_smooth for each in pictures], device=self.device)
-        loss = ((sizes - self._targets(pictures)).square().mean(1) * has_relief).mean()
-        for index, (names, logits) in enumerate(zip(self.families, families, strict=True)):
-            labels = torch.tensor([names.index(each.families[index]) for each in pictures], device=self.device)
-            loss = loss + functional.cross_entropy(logits, labels, label_smoothing=SMOOTHING)
-        return loss
+        return self.head.loss(self._features(images), [picture.labels for picture in pictures])
 
-    def _readings(self, images: Tensor) -> tuple[Tensor, ...]:
-        """Predict logits (B, kinds) of each of FAMILIES, then standardised SIZES (B, 4), of images (B, 3, H, W)."""
+    def _features(self, images: Tensor) -> Tensor:
         with autocast(self.device, self.config.training.precision):
-            features = self.tower(images.to(self.device, memory_format=torch.channels_last))
-        outputs: Tensor = self.head(features.float())
-        return torch.split(outputs, [*map(len, self.families), len(SIZES)], dim=1)
-
-    def _targets(self, pictures: Sequence[LabelledPicture]) -> Tensor:
-        sizes = (np.array([each.size_targets for each in pictures]) - self.mean) / self.deviation
-        return torch.from_numpy(sizes.astype(np.float32)).to(self.device)
+            features: Tensor = self.tower(images.to(self.device, memory_format=torch.channels_last))
+        return features
 
     @torch.inference_mode()
     def report(self) -> ReliefReport:
@@ -257,15 +241,16 @@ class ReliefTraining:
         self.tower.eval()
         self.head.eval()
         parts = [self.validation[start : start + BATCH] for start in range(0, len(self.validation), BATCH)]
-        outputs = [self._readings(centre_crop(self._images(part), self.kind)) for part in parts]
+        outputs = [self.head(self._features(self._middle(self._images(part)))) for part in parts]
         *families, sizes = (torch.cat(part).cpu().numpy() for part in zip(*outputs, strict=True))
         accuracies = {}
-        for index, (name, known, logits) in enumerate(zip(FAMILIES, self.families, families, strict=True)):
+        for index, (name, known, logits) in enumerate(zip(FAMILIES, self.head.families, families, strict=True)):
             predicted = np.array(known)[logits.argmax(1)]
-            correct = predicted == np.array([each.families[index] for each in self.validation])
+            correct = predicted == np.array([picture.labels.families[index] for picture in self.validation])
             accuracies[name] = float(correct.mean()), 1 / len(known)
-        has_relief = np.array([not each.is_smooth for each in self.validation])
-        targets = self._targets(self.validation).cpu().numpy()
+        labels = [picture.labels for picture in self.validation]
+        has_relief = np.array([not each.is_smooth for each in labels])
+        targets = self.head.size_targets(labels).cpu().numpy()
         everything = [*self.pictures, *self.validation]
         return ReliefReport(
             kind=self.kind,
@@ -275,6 +260,13 @@ class ReliefTraining:
             families=accuracies,
             sizes={name: _correlation(sizes[has_relief, at], targets[has_relief, at]) for at, name in enumerate(SIZES)},
         )
+
+    def _middle(self, images: Tensor) -> Tensor:
+        """Return images as the matcher uses them: the middle of a photo in grey, or a whole gel image."""
+        if self.kind == "touch":
+            return images
+        middle = centre_crop(images, self.visible)
+        return middle.mean(1, keepdim=True).expand_as(middle)
 
     def _identity(self) -> dict[str, Any]:
         """Return the settings that must not change between a training run and its resumption."""
@@ -290,53 +282,6 @@ class ReliefTraining:
             CheckpointError: There is no state, or it belongs to another training run.
         """
         self.step = load_state(out, self.modules, self.optimizer, self._identity())["step"]
-
-
-def augment(images: Tensor, kind: str, rng: np.random.Generator) -> Tensor:
-    """Return augmented images (B, 3, H, W) with the same relief.
-
-    Images are turned by up to .1 rad, scaled by up to 8 %, shifted, flipped, relit, and get noise. Photos are also
-    desaturated, since colour carries no information on relief. A gel's colours come from its lamps, which keep their
-    places. So a gel image is only flipped top to bottom (the same press with a turned finger), and its channels are
-    scaled equally.
-    """
-    count = len(images)
-
-    def draw(low: float, high: float, *shape: int) -> Tensor:
-        return torch.from_numpy(rng.uniform(low, high, (count, *shape)).astype(np.float32))
-
-    turn, size = draw(-0.1, 0.1), draw(0.92, 1.08)
-    flip = torch.from_numpy(np.where(rng.random(count) < 0.5, -1.0, 1.0).astype(np.float32))
-    visible = VISIBLE_FRACTION if kind == "photo" else 1.0
-    across, down = (flip, torch.ones(count)) if kind == "photo" else (torch.ones(count), flip)
-    cosine, sine = torch.cos(turn) * size * visible, torch.sin(turn) * size * visible
-    shift = draw(-0.1, 0.1, 2) if kind == "photo" else draw(-0.05, 0.05, 2)
-    maps = torch.stack([across * cosine, -down * sine, shift[:, 0], across * sine, down * cosine, shift[:, 1]], 1)
-    result = _sample_grid(images, maps.view(count, 2, 3), visible)
-    if kind == "photo":
-        grey, towards = result.mean(1, keepdim=True), draw(0.0, 1.0, 1, 1, 1)
-        result = torch.lerp(result, grey.expand_as(result), (towards + 0.5).clamp(max=1.0) * (towards > 0.25))
-        middle = result.mean((1, 2, 3), keepdim=True)
-        result = (result - middle) * draw(0.7, 1.3, 1, 1, 1) + middle + draw(-0.15, 0.15, 1, 1, 1)
-    else:
-        result = (result - 0.5) * draw(0.7, 1.4, 1, 1, 1) + 0.5
-    noise = torch.from_numpy(rng.standard_normal(result.shape, dtype=np.float32))
-    return (result + 0.01 * noise).clamp(0.0, 1.0)
-
-
-def centre_crop(images: Tensor, kind: str) -> Tensor:
-    """Return images for evaluation: the middle of a photo in grey, or a whole gel image."""
-    if kind == "touch":
-        return images
-    same = torch.tensor([[VISIBLE_FRACTION, 0.0, 0.0], [0.0, VISIBLE_FRACTION, 0.0]]).expand(len(images), 2, 3)
-    middle = _sample_grid(images, same, VISIBLE_FRACTION)
-    return middle.mean(1, keepdim=True).expand_as(middle)
-
-
-def _sample_grid(images: Tensor, maps: Tensor, visible: float) -> Tensor:
-    side = [max(round(visible * length), 1) for length in images.shape[2:]]
-    grid = functional.affine_grid(maps, [len(images), 3, *side], align_corners=False)
-    return functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)
 
 
 def _correlation(predictions: NDArray[np.float32], targets: NDArray[np.float32]) -> float:

@@ -8,6 +8,7 @@ import dataclasses
 import math
 import threading
 import time
+from collections.abc import Mapping
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from retrieval.data.dataset import (
     make_split,
     recording_source,
 )
-from retrieval.data.labelled_pictures import pair_by_label
+from retrieval.data.labelled_pictures import ObjectLabels, load_object_labels, pair_by_label
 from retrieval.data.loading import prefetch, worker_count
 from retrieval.data.pairs import PairSampler
 from retrieval.errors import CheckpointError, ConfigError, JobInterrupted
@@ -48,11 +49,12 @@ from retrieval.model.encode import default_device
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers.tower import Tower
 from retrieval.training import distributed
-from retrieval.training.batches import LoadedBatch, feature_source
+from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
 from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import Features, features_by_image
 from retrieval.training.fit import RATE, Plan, fit
 from retrieval.training.initial_weights import build_matcher
+from retrieval.training.labels import LabelLoss
 from retrieval.training.state import code_digest, load_state, require_no_unfinished_state, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
 from retrieval.training.verdicts import with_verdicts
@@ -109,7 +111,8 @@ def train(
         )
     else:
         require_fit(split, grasps)
-    trainer = Trainer(config, split, grasps, out, source=recording_source(recording))
+    labels = load_object_labels(recording) if settings.predict_labels else None
+    trainer = Trainer(config, split, grasps, out, source=recording_source(recording), labels=labels)
     if not resume:
         require_no_unfinished_state(out)
     else:
@@ -131,8 +134,12 @@ class Trainer:
         out: Path,
         source: str,
         known: Features | None = None,
+        labels: Mapping[str, ObjectLabels] | None = None,
     ) -> None:
-        """Prepare a run; `known` are features of all grasps for frozen towers, in place of their images."""
+        """Prepare a run.
+
+        `known` are features of all grasps for frozen towers, in place of their images; `labels` are by object.
+        """
         settings = config.training
         self.config, self.split, self.out, self.source = config, split, out, source
         pairs = labelled_pairs(config)
@@ -145,6 +152,10 @@ class Trainer:
         self.sampler = self._sampler([*split.select(grasps, "train"), *pairs])
         self.losses = WeightedLosses(settings.weights, self.matcher, len(self.sampler.grasps)).to(self.device)
         self.modules = nn.ModuleDict({"matcher": self.matcher, "losses": self.losses})
+        self.label_loss = None
+        if settings.predict_labels:
+            self.label_loss = LabelLoss(self.matcher, self.sampler.objects, labels or {}).to(self.device)
+            self.modules["label_loss"] = self.label_loss
         towers = (module for module in self.matcher.modules() if isinstance(module, Tower))
         self.code = code_digest(*map(type, (*self.losses.terms, *towers)))
         groups: list[dict[str, Any]] = [{"params": []}, {"params": [], RATE: settings.tower_rate}]
@@ -156,7 +167,11 @@ class Trainer:
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
         stored = features_by_image(grasps, known, self.device) if known else {}
-        self.features = feature_source(config, self.device, self.matcher, stored)
+        self.features: FeatureSource = (
+            FrozenFeatures(config, self.device, stored)
+            if settings.freeze_towers
+            else TrainedFeatures(config, self.device)
+        )
         set_training_mode(self.matcher, settings)
         self.step, self.best = 0, -math.inf
         self._image_count, self._compute_s = 0, 0.0
@@ -218,7 +233,7 @@ class Trainer:
 
     def _prepare(self, step: int) -> "Future[LoadedBatch]":
         batch = self.sampler.batch(step, self.config.training.touches_per_batch)
-        return self.features.prepare(self.matcher, batch)
+        return self.features.prepare(self.matcher, batch, step)
 
     def loss(self, loaded: LoadedBatch) -> Tensor:
         """Return the loss of a prepared batch."""
@@ -230,6 +245,8 @@ class Trainer:
         if settings.shuffle_fingers:
             touch = shuffle_fingers(touch, self.matcher.config.fingers)
         loss, logits = batch_loss(self.matcher, self.losses, batch, touch, photo)
+        if self.label_loss is not None:
+            loss = loss + settings.predict_labels * self.label_loss(batch, touch, photo)
         self._last_logits = logits.detach(), batch.labels
         return loss
 

@@ -43,11 +43,6 @@ def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups
     )
 
 
-def _statistics_and_map(maps: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """Return features of the stages' maps, and the map of cells: the two stages at stride 16."""
-    return stage_statistics(maps), torch.cat(maps[1:3], dim=1)
-
-
 class InvertedResidual(nn.Module):
     """1 x 1 expansion, 3 x 3 depthwise, linear 1 x 1 projection; a shortcut if the shapes are equal."""
 
@@ -113,7 +108,8 @@ class MobileNetV2(Tower):
     def _encode_with_map(self, images: Tensor) -> tuple[Tensor, Tensor]:
         with without_autocast(images):
             x = self.features[:_FLOAT32_LAYERS](images)
-        return _statistics_and_map(list(self._stages(x)))
+        maps = list(self._stages(x))
+        return stage_statistics(maps), torch.cat(maps[1:3], dim=1)  # cells: the two stages at stride 16
 
     def stem_layers(self) -> nn.Module:
         """Return the layers up to the first stage, at stride 8.
@@ -123,12 +119,9 @@ class MobileNetV2(Tower):
         """
         return self.features[:_STEM_LAYERS] if self.output == "stages" else super().stem_layers()
 
-    def _encode_maps(self, maps: Tensor) -> tuple[Tensor, Tensor]:
-        return _statistics_and_map([maps, *self._stages(maps, _STEM_LAYERS)])
-
-    def _stages(self, x: Tensor, first: int = _FLOAT32_LAYERS) -> Iterator[Tensor]:
-        """Yield the outputs of the stages, from the input of layer number `first`."""
-        for number, layer in enumerate(list(self.features)[first:], start=first):
+    def _stages(self, x: Tensor) -> Iterator[Tensor]:
+        """Yield the outputs of the stages."""
+        for number, layer in enumerate(list(self.features)[_FLOAT32_LAYERS:], start=_FLOAT32_LAYERS):
             x = layer(x)
             if number in _STAGE_OUTPUTS:
                 yield x

@@ -106,27 +106,12 @@ class Tower(nn.Module):
         return self._with_cells(*self._encode_with_map(images))
 
     def stem_layers(self) -> nn.Module:
-        """Return the first layers, which `freeze_stem` keeps frozen: normalised images (B, 3, H, W) to maps.
+        """Return the first layers, which `freeze_stem` keeps frozen.
 
         Raises:
             ConfigError: This kind of tower has no stem.
         """
         raise ConfigError(f"{type(self).__name__} has no stem to freeze; set freeze_stem = false")
-
-    def stem(self, images: Tensor) -> Tensor:
-        """Return the maps (B, C, H', W') of the stem for images as `forward` takes them."""
-        maps: Tensor = self.stem_layers()((images - self.mean) / self.std)
-        return maps
-
-    def encode_stem(self, maps: Tensor) -> Tensor:
-        """Return the outputs (B, output_count) of the maps of `stem`."""
-        # A training step takes three quarters of the time with channels last.
-        features, last = self._encode_maps(maps.contiguous(memory_format=torch.channels_last))
-        return features if not self.cells else self._with_cells(features, last)
-
-    def _encode_maps(self, maps: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `_encode_with_map` from the maps of `stem`; only for towers with `stem_layers`."""
-        raise NotImplementedError
 
     def _with_cells(self, features: Tensor, maps: Tensor) -> Tensor:
         cells = _grid_means(maps.float(), self.cells)

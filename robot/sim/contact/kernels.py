@@ -110,7 +110,7 @@ class LayerCorrection:
         return np.asarray(v * v * from_left + u * u * from_right)
 
 
-@functools.lru_cache(maxsize=64)
+@functools.lru_cache(maxsize=1024)
 def layer_correction(poisson: float) -> LayerCorrection:
     """Compute the correction for this Poisson's ratio, by Gauss-Legendre quadrature over x."""
     nodes, weights = np.polynomial.legendre.leggauss(_PANEL_POINTS)
@@ -123,7 +123,7 @@ def layer_correction(poisson: float) -> LayerCorrection:
     return LayerCorrection(rho, j0(angle) @ weight, -j1(angle) @ (weight * x))
 
 
-@functools.lru_cache(maxsize=128)
+@functools.lru_cache(maxsize=512)
 def influence(shape: Quadrant, thickness: float, poisson: float) -> Floats:
     """Return the quadrant (rows, cols) of the influence of a layer `thickness` pixels thick; inf is the half-space."""
     if math.isinf(thickness):

@@ -163,7 +163,7 @@ class GelSensor:
         return out.reshape(clean.shape)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=64)
 def _no_contact_image(sensor: GelSensor) -> Array:
     return sensor._render_surface(Surface(np.zeros((1, 1)), sensor.field))
 

@@ -1,0 +1,78 @@
+"""Random changes of training images that keep the relief."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional
+
+
+def augment(
+    images: Tensor,
+    kind: str,
+    rng: np.random.Generator,
+    flipped: NDArray[np.bool_] | None = None,
+    visible: float = 1.0,
+) -> Tensor:
+    """Return augmented images (B, 3, side, side') with the same relief.
+
+    Images are turned by up to .1 rad, scaled by up to 8 %, shifted, flipped, relit, and get noise. Photos are also
+    desaturated, since colour carries no information on relief. A gel's colours come from its lamps, which keep their
+    places. So a gel image is only flipped top to bottom (the same press with a turned finger), and its channels are
+    scaled equally.
+
+    Args:
+        images: (B, 3, H, W) in 0..1.
+        kind: "photo" or "touch".
+        rng: The random choices.
+        flipped: (B,) the images that are flipped; default: each with probability 1/2.
+        visible: Fraction of a side that is kept.
+    """
+    count = len(images)
+
+    def draw(low: float, high: float, *shape: int) -> Tensor:
+        return torch.from_numpy(rng.uniform(low, high, (count, *shape)).astype(np.float32))
+
+    turn, size = draw(-0.1, 0.1), draw(0.92, 1.08)
+    flip = torch.from_numpy(np.where(rng.random(count) < 0.5 if flipped is None else flipped, -1.0, 1.0)).float()
+    across, down = (flip, torch.ones(count)) if kind == "photo" else (torch.ones(count), flip)
+    cosine, sine = torch.cos(turn) * size * visible, torch.sin(turn) * size * visible
+    shift = draw(-0.1, 0.1, 2) if visible < 1 else draw(-0.05, 0.05, 2)
+    maps = torch.stack([across * cosine, -down * sine, shift[:, 0], across * sine, down * cosine, shift[:, 1]], 1)
+    result = _sample_grid(images, maps.view(count, 2, 3), visible)
+    if kind == "photo":
+        grey, towards = result.mean(1, keepdim=True), draw(0.0, 1.0, 1, 1, 1)
+        result = torch.lerp(result, grey.expand_as(result), (towards + 0.5).clamp(max=1.0) * (towards > 0.25))
+        middle = result.mean((1, 2, 3), keepdim=True)
+        result = (result - middle) * draw(0.7, 1.3, 1, 1, 1) + middle + draw(-0.15, 0.15, 1, 1, 1)
+    else:
+        result = (result - 0.5) * draw(0.7, 1.4, 1, 1, 1) + 0.5
+    noise = torch.from_numpy(rng.standard_normal(result.shape, dtype=np.float32))
+    return (result + 0.01 * noise).clamp(0.0, 1.0)
+
+
+def centre_crop(images: Tensor, visible: float) -> Tensor:
+    """Return the middle of images (B, 3, H, W): the fraction `visible` of each side."""
+    same = torch.tensor([[visible, 0.0, 0.0], [0.0, visible, 0.0]]).expand(len(images), 2, 3)
+    return _sample_grid(images, same, visible)
+
+
+def augment_touches(touches: Tensor, flipped: NDArray[np.bool_], rng: np.random.Generator) -> Tensor:
+    """Return augmented touches (B, fingers, 3, H, W); the fingers of a touch are flipped together."""
+    fingers = touches.shape[1]
+    result = augment(touches.flatten(0, 1), "touch", rng, flipped.repeat(fingers))
+    # Channels last in memory, as convolutions need it.
+    return result.contiguous(memory_format=torch.channels_last).view_as(touches)
+
+
+def augment_photos(photos: Tensor, views: int, flipped: NDArray[np.bool_], rng: np.random.Generator) -> Tensor:
+    """Return augmented photos (B, 3, H, views * W); the views of a photo are flipped together."""
+    each = torch.stack(photos.chunk(views, dim=3), dim=1)
+    result = augment(each.flatten(0, 1), "photo", rng, flipped.repeat(views)).view_as(each)
+    return torch.cat(list(result.unbind(1)), dim=3).contiguous(memory_format=torch.channels_last)
+
+
+def _sample_grid(images: Tensor, maps: Tensor, visible: float) -> Tensor:
+    side = [max(round(visible * length), 1) for length in images.shape[2:]]
+    grid = functional.affine_grid(maps, [len(images), 3, *side], align_corners=False)
+    return functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)
