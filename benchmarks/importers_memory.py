@@ -229,19 +229,21 @@ def rct(src: Path, rows: int) -> Options:
 
 
 def rosbag(src: Path, rows: int) -> Options:
-    """One bag with a grasp every 0.4 s."""
+    """Bags of 100 grasps, one every 0.4 s."""
     from tests.miniatures.rosbag import CAMERA, GEL_A, START_NS, gel, image_fields, write_bag
 
     images = [image_fields(gel("a", number), "rgb8") for number in (1, 27)]
 
     def messages() -> Iterator[Any]:
-        for number in range(8 * rows + 1):
+        for number in range(801):
             time_ns = START_NS + number * 50_000_000
             yield time_ns, GEL_A, "sensor_msgs/Image", images[number // 4 % 2]
             if number % 8 == 0:
                 yield time_ns, CAMERA, "sensor_msgs/Image", images[0]
 
-    write_bag(src / "mug.bag", messages(), chunk_bytes=2**20)
+    bag = write_bag(src.with_name("one.bag"), messages())
+    for number in range(rows // 100):
+        link(src / f"mug{number}.bag", bag)
     return {"touch_b": ""}
 
 

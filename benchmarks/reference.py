@@ -62,6 +62,7 @@ DATA_SETS_HEAD = """# Data sets
 retrieve import                                             # list the importers and their options
 retrieve import billets billets/ --out billets-recording/
 retrieve import folder pictures/ --out my-recording/ --option sensor="GelSight Mini" touch='{object}/touch_{n}'
+retrieve import rosbag bags/ --out lab-recording/ --option touch_a=/gel/a touch_b=/gel/b photo=/camera/color
 retrieve check recording/                                   # before training
 ```
 

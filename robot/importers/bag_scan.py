@@ -7,7 +7,6 @@ from array import array
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +66,9 @@ class BagScan:
     Attributes:
         times: Topic -> when the bag recorded its messages, in ns; images that cannot be decoded are left out.
         stamps: Topic -> time stamps of all its messages, in ns.
-        values: Topic of gripper, grasp or object -> its messages' values.
+        values: Topic of grasp or object -> its messages' values.
+        openings_mm: Opening in each message of the gripper; NaN if it has no positions.
+        forces_n: Force in each message of the gripper; NaN if it has no efforts.
         changes: Topic of a finger -> mean change of each gel image from the first one, in grey levels.
         changed: The same as the fraction of the gel's area that changed; empty if a topic marks the grasps.
         unreadable: Topic -> number of images that cannot be decoded or have another size.
@@ -78,7 +79,9 @@ class BagScan:
 
     times: dict[str, "array[int]"] = field(default_factory=lambda: defaultdict(lambda: array("q")))
     stamps: dict[str, "array[int]"] = field(default_factory=lambda: defaultdict(lambda: array("q")))
-    values: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
+    values: dict[str, list[bool | str]] = field(default_factory=lambda: defaultdict(list))
+    openings_mm: "array[float]" = field(default_factory=lambda: array("d"))
+    forces_n: "array[float]" = field(default_factory=lambda: array("d"))
     changes: dict[str, "array[float]"] = field(default_factory=lambda: defaultdict(lambda: array("d")))
     changed: dict[str, "array[float]"] = field(default_factory=lambda: defaultdict(lambda: array("d")))
     unreadable: Counter[str] = field(default_factory=Counter)
@@ -86,10 +89,15 @@ class BagScan:
     last_ns: int = 0
     is_cut_off: bool = False
 
-    def latest(self, topic: str, time_ns: int) -> Any:
-        """Return the value of the last message of a topic at or before a time; None if there is none."""
-        number = int(np.searchsorted(self.times[topic], time_ns, "right"))
-        return self.values[topic][number - 1] if number else None
+    def latest(self, topic: str, time_ns: int) -> int | None:
+        """Return the number of the last message of a topic at or before a time; None if there is none."""
+        after = int(np.searchsorted(self.times[topic], time_ns, "right"))
+        return after - 1 if after else None
+
+    def latest_value(self, topic: str, time_ns: int) -> bool | str | None:
+        """Return the value of this message of grasp or object."""
+        number = self.latest(topic, time_ns)
+        return None if number is None else self.values[topic][number]
 
 
 def scan_bag(bag: Bag, topics: BagTopics) -> BagScan:
@@ -121,8 +129,11 @@ def scan_bag(bag: Bag, topics: BagTopics) -> BagScan:
                 scan.changed[topic].append(gate.changed_fractions({"": GraspFrames(first[topic], gel)})[""])
         elif topic == topics.photo:
             picture_of(message)  # its encoding is checked
+        elif topic == topics.gripper:
+            scan.openings_mm.append(1000 * float(np.sum(message.position)) if len(message.position) else np.nan)
+            scan.forces_n.append(float(np.mean(np.abs(message.effort))) if len(message.effort) else np.nan)
         else:
-            scan.values[topic].append(message if topic == topics.gripper else message.data)
+            scan.values[topic].append(message.data)
         scan.times[topic].append(time_ns)
     scan.is_cut_off = bag.is_cut_off
     return scan
@@ -131,7 +142,7 @@ def scan_bag(bag: Bag, topics: BagTopics) -> BagScan:
 # Grasps ------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class BagGrasp:
     """When the images of one grasp were recorded, in ns.
 
@@ -164,7 +175,7 @@ def find_grasps(scan: BagScan, topics: BagTopics, contact: float, settle_s: floa
     # Everything is on the clock of the first finger: the other fingers' images nearest in time belong to its images.
     numbers = [np.arange(len(first)), *(_nearest(times, first) for times in others)]
     if topics.grasp:
-        is_held = np.array([bool(scan.latest(topics.grasp, time_ns)) for time_ns in first.tolist()])
+        is_held = np.array([bool(scan.latest_value(topics.grasp, time_ns)) for time_ns in first.tolist()])
     else:
         fingers = zip(topics.touch, numbers, strict=True)
         is_held = np.any([np.array(scan.changed[topic])[number] >= contact for topic, number in fingers], axis=0)

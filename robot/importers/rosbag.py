@@ -140,10 +140,12 @@ def _items(
             if isinstance(grasp, str):
                 yield Skip(grasp, name)
                 continue
-            if topics.object and scan.latest(topics.object, grasp.touch[0]) is None:
+            object_id = scan.latest_value(topics.object, grasp.touch[0]) if topics.object else bag.name
+            if object_id is None:
                 yield Skip(f"there is no message of {topics.object} before it", name)
                 continue
-            fields[name] = {"time_s": (grasp.touch[0] - start_ns) / 1e9, **_fields(grasp, scan, topics)}
+            time_s = (grasp.touch[0] - start_ns) / 1e9
+            fields[name] = {"object_id": object_id, "time_s": time_s, **_fields(grasp, scan, topics)}
             for column, place in _places(grasp, topics).items():
                 places[place].append((name, column))
         images: dict[str, dict[str, Source]] = defaultdict(dict)
@@ -151,8 +153,8 @@ def _items(
             for name, column in places.pop((message.topic, message.time_ns), ()):
                 images[name][column] = partial(_picture, message)
                 if len(images[name]) == 1 + 2 * len(topics.touch):
-                    object_id = fields[name].pop("object_id") or bag.name
-                    yield Item(name, object_id, images.pop(name), {"sequence_id": bag.name, **fields[name]})
+                    facts = fields.pop(name)
+                    yield Item(name, facts.pop("object_id"), images.pop(name), {"sequence_id": bag.name, **facts})
 
 
 def _places(grasp: BagGrasp, topics: BagTopics) -> dict[str, tuple[str, int]]:
@@ -163,18 +165,13 @@ def _places(grasp: BagGrasp, topics: BagTopics) -> dict[str, tuple[str, int]]:
     return found
 
 
-def _fields(grasp: BagGrasp, scan: BagScan, topics: BagTopics) -> dict[str, Any]:
-    """Return the fields of a grasp from the last messages at or before its touch; object_id is None without a name."""
-    time_ns = grasp.touch[0]
-    found: dict[str, Any] = {"object_id": scan.latest(topics.object, time_ns)}
-    if len(topics.touch) > 1:
-        found["touch_skew_s"] = (max(grasp.touch) - min(grasp.touch)) / 1e9
-    state = scan.latest(topics.gripper, time_ns)
-    if state is not None and len(state.position):
-        found["opening_mm"] = 1000 * float(np.sum(state.position))
-    if state is not None and len(state.effort):
-        found["force_n"] = float(np.mean(np.abs(state.effort)))
-    return found
+def _fields(grasp: BagGrasp, scan: BagScan, topics: BagTopics) -> dict[str, float]:
+    """Return the time between the fingers' images, and opening and force at the touch, as far as they were recorded."""
+    found = {"touch_skew_s": (max(grasp.touch) - min(grasp.touch)) / 1e9} if len(grasp.touch) > 1 else {}
+    number = scan.latest(topics.gripper, grasp.touch[0])
+    if number is not None:
+        found |= {"opening_mm": scan.openings_mm[number], "force_n": scan.forces_n[number]}
+    return {key: value for key, value in found.items() if not np.isnan(value)}
 
 
 def _picture(message: BagMessage) -> Any:
