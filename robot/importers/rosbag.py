@@ -20,7 +20,8 @@ names a sensor_msgs/JointState: the sum of positions, in metre, is the opening, 
 the force.
 
 The import prints a line on each topic: its rate (from the median interval), gaps of more than 3 intervals, and time
-stamps that repeat or go backwards. From a bag that is cut off, whole messages are imported.
+stamps that repeat or go backwards. From a bag that is cut off, whole messages are imported. A bag is read twice, one
+message at a time; only times and numbers of its messages stay in memory, 0.9 kB for a grasp of 9 messages.
 """
 
 from collections import defaultdict
