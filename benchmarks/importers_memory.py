@@ -13,7 +13,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -228,6 +228,25 @@ def rct(src: Path, rows: int) -> Options:
     return {"photo": "photo.*"}
 
 
+def rosbag(src: Path, rows: int) -> Options:
+    """Bags of 100 grasps, one every 0.4 s."""
+    from tests.miniatures.rosbag import CAMERA, GEL_A, START_NS, gel, image_fields, write_bag
+
+    images = [image_fields(gel("a", number), "rgb8") for number in (1, 27)]
+
+    def messages() -> Iterator[Any]:
+        for number in range(801):
+            time_ns = START_NS + number * 50_000_000
+            yield time_ns, GEL_A, "sensor_msgs/Image", images[number // 4 % 2]
+            if number % 8 == 0:
+                yield time_ns, CAMERA, "sensor_msgs/Image", images[0]
+
+    bag = write_bag(src.with_name("one.bag"), messages())
+    for number in range(rows // 100):
+        link(src / f"mug{number}.bag", bag)
+    return {"touch_b": ""}
+
+
 def ssvtp(src: Path, rows: int) -> Options:
     for folder, kind in (("images_tac", "tac"), ("images_rgb", "rgb")):
         pictures(src / folder, [f"image_{number}_{kind}.jpg" for number in range(rows)])
@@ -326,6 +345,7 @@ WIDE: Mapping[str, Callable[[Path, int], Options]] = {
     "open-x-tactile": open_x_tactile,
     "physiclear": physiclear,
     "rct": rct,
+    "rosbag": rosbag,
     "ssvtp": ssvtp,
     "touch-and-go": touch_and_go,
     "tvl": tvl,

@@ -62,18 +62,19 @@ DATA_SETS_HEAD = """# Data sets
 retrieve import                                             # list the importers and their options
 retrieve import billets billets/ --out billets-recording/
 retrieve import folder pictures/ --out my-recording/ --option sensor="GelSight Mini" touch='{object}/touch_{n}'
+retrieve import rosbag bags/ --out lab-recording/ --option touch_a=/gel/a touch_b=/gel/b photo=/camera/color
 retrieve check recording/                                   # before training
 ```
 
 An importer reads a public data set in its published layout, or your own pictures, and writes a
-[recording](formats.md#recording) for training, evaluation and search. It processes one grasp at a time, so memory grows
-only with names, not with pictures: 100,000 rows instead of 10,000 take 15 to 67 MB more, depending on the importer
-(`python -m benchmarks.importers_memory`). At the end, memory also holds the recording's lines, one per grasp. An
-interrupted import continues when you run it again. Unreadable items are skipped, counted by reason and reported.
-`recording.json` stores the counts under `skipped`, the licence and the citation, and under `objects` the data set's own
-information on them. Pictures that many grasps share, such as one no-contact frame, are stored once. A published split
-by objects is in `splits/<name>.json`, for `--split`. Some importers need packages of the extra:
-`pip install 'touch-retrieval[importers]'`.
+[recording](formats.md#recording) for training, evaluation and search. It processes one grasp at a time, so memory
+grows only with names, not with pictures: 100,000 rows instead of 10,000 take 15 to 67 MB more, depending on the
+importer ([bags](#rosbag): by their messages; `python -m benchmarks.importers_memory`). At the end, memory also holds
+the recording's lines, one per grasp. An interrupted import continues when you run it again. Unreadable items are
+skipped, counted by reason and reported. `recording.json` stores the counts under `skipped`, the licence (`retrieve
+check` prints it) and the citation, and under `objects` the data set's own information on them. Pictures that many
+grasps share, such as one no-contact frame, are stored once. A published split by objects is in `splits/<name>.json`,
+for `--split`. Some importers need packages of the extra: `pip install 'touch-retrieval[importers]'`.
 
 The data sets are not ours. Their own pages state the licence, which binds you and not us. If parts of a layout are not
 verified, the importer follows the authors' descriptions and other people's readers, and lists these parts when it ends.

@@ -21,6 +21,7 @@ def check(
     """Check a recording for broken files, duplicates, leakage and swapped folders."""
     from retrieval.data.check.appearance_checks import COMPARED_COPIES
     from retrieval.data.check.recording import check_recording
+    from robot.recording.folder import read_info
 
     if split and model:
         raise BadInput("give --split or --model, not both")
@@ -35,6 +36,8 @@ def check(
     for finding in findings:
         if finding.kind != COMPARED_COPIES:
             say(f"{finding.severity}: {finding.message}")
+    if licence := read_info(recording).get("licence"):
+        say(f"licence of the data: {licence}")
     errors, warnings = (sum(finding.severity == severity for finding in findings) for severity in ("error", "warning"))
     compared = [finding.message for finding in findings if finding.kind == COMPARED_COPIES]
     say("; ".join([f"{recording}: {errors} error(s), {warnings} warning(s)", *compared]))

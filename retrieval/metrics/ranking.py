@@ -3,6 +3,11 @@
 Each row is a query; the items of its gallery are ranked by score, and some are relevant. Recall at k is "any relevant
 item among the first k". All orders of equal scores are equally likely, so a constant scorer has exactly the value of
 chance.
+
+Without ties the values equal those of trec_eval: R@k is its success_k, the others are recip_rank and map. trec_eval
+orders equal scores by the names of the items, compares scores in single precision, and gives a query without a relevant
+item the value 0. Here such a query is refused, and the protocols leave it out. R@k is not trec_eval's recall_k, which
+is the fraction of the relevant items among the first k.
 """
 
 from typing import NamedTuple

@@ -49,6 +49,7 @@ IMPORTERS: "Registry[Importer]" = Registry(
         "open-x-tactile": "robot.importers.open_x_tactile:import_open_x_tactile",
         "physiclear": "robot.importers.physiclear:import_physiclear",
         "rct": "robot.importers.rct:import_rct",
+        "rosbag": "robot.importers.rosbag:import_rosbag",
         "ssvtp": "robot.importers.ssvtp:import_ssvtp",
         "touch-and-go": "robot.importers.touch_and_go:import_touch_and_go",
         "tvl": "robot.importers.tvl:import_tvl",

@@ -26,7 +26,7 @@ from robot.rig import load_rig
 from tests import real_data_sets, serving, synthetic
 from tests.documents import PAGES, README, ROOT, RUN_TOGETHER, blocks, text_of
 from tests.emulators.wsg50.gripper import EmulatedWSG50
-from tests.miniatures import physiclear
+from tests.miniatures import physiclear, rosbag
 from tests.project.test_project import pins
 from tests.replay_rig import replay_file
 from tests.retrieval.commands.test_rig import POINTS
@@ -65,7 +65,7 @@ def of_program(name, *pages):
 @pytest.fixture
 def home(tmp_path, recording, catalogue, model, monkeypatch):
     """A folder with all files that the commands name: catalog/, gel images, recording/, billets/, data/, pictures/,
-    model.safetensors, rig.toml, gels.toml, mobilenet_v2.pth, benchmarks/models/shipped_rig.toml."""
+    bags/, model.safetensors, rig.toml, gels.toml, mobilenet_v2.pth, benchmarks/models/shipped_rig.toml."""
     shutil.copytree(recording, tmp_path / "recording")
     shutil.copytree(catalogue, tmp_path / "catalog")
     photos = min(folder for folder in catalogue.iterdir() if folder.is_dir())
@@ -86,6 +86,7 @@ def home(tmp_path, recording, catalogue, model, monkeypatch):
         shutil.copy(next((tmp_path / "catalog").rglob("*.jpg")), tmp_path / "pictures" / name / "photo_1.jpg")
     real_data_sets.write_billets(tmp_path / "data" / "billets")
     physiclear.write(tmp_path / "data" / "physiclear")
+    rosbag.write(tmp_path / "bags")
     (tmp_path / "benchmarks" / "models").mkdir(parents=True)
     shutil.copy(ROOT / "benchmarks" / "models" / "shipped_rig.toml", tmp_path / "benchmarks" / "models")
     (tmp_path / "points.csv").write_text(POINTS)

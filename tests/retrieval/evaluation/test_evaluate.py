@@ -251,6 +251,25 @@ def test_results_are_byte_identical_and_contain_no_paths_or_times(made, run, tmp
     assert times["methods"]["retrieve_rerank"]["fit_s"] == times["methods"]["late_fusion"]["fit_s"]
 
 
+def test_trec_eval_computes_the_same_values_from_the_exported_rankings(made, run, grasped):
+    """trec_eval gives a value for each query; ours are means over the objects of the queries' means."""
+    trec_eval = pytest.importorskip("pytrec_eval")
+    run(made[1], seeds=2, trec=True)
+    folder = made[1] / "trec"
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*(f"{name}.run" for name in FEW), "qrels.txt"])
+    with open(folder / "qrels.txt") as qrels, open(folder / "cca.run") as ranking:
+        evaluator = trec_eval.RelevanceEvaluator(trec_eval.parse_qrel(qrels), {"recip_rank", "map", "success.1"})
+        found = evaluator.evaluate(trec_eval.parse_run(ranking))
+    objects = {grasp.grasp_id: grasp.object_id for grasp in load_grasps(grasped)}
+    measures = made[0]["methods"]["cca"]["measures"]
+    for name, theirs in (("mrr", "recip_rank"), ("map", "map"), ("recall_1", "success_1")):
+        by_object = defaultdict(list)
+        for query, values in found.items():
+            by_object[objects[query]].append(values[theirs])
+        expected = np.mean([np.mean(values) for values in by_object.values()])
+        assert measures[name]["by_seed"][0] == pytest.approx(expected, abs=1e-9)
+
+
 def test_a_second_run_fits_only_new_methods(made, run, monkeypatch):
     with monkeypatch.context() as during:
         no_fits(during)

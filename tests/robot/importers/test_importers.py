@@ -30,7 +30,7 @@ from tests.documents import text_of
 from tests.miniatures import encoded, picture, pixels
 
 PICTURES = {".png", ".jpg"}
-SOURCE_FACTS = ("folder", "lerobot", "open-x-tactile")
+SOURCE_FACTS = ("folder", "lerobot", "open-x-tactile", "rosbag")
 """Importers whose facts, such as the sensor, depend on the source."""
 
 pytestmark = pytest.mark.usefixtures("no_fsync")

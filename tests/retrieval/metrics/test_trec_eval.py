@@ -1,0 +1,107 @@
+"""Measures of a ranking compared with trec_eval (package pytrec-eval-terrier), and where their conventions differ."""
+
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+from retrieval.errors import BadInput
+from retrieval.metrics import protocols
+from retrieval.metrics.ranking import average_precision, first_relevant, recall_at, reciprocal_rank
+from retrieval.metrics.table import ScoreTable
+
+trec_eval = pytest.importorskip("pytrec_eval")
+
+KS = (1, 2, 3, 5)
+NAMES = {"map": "map", "mrr": "recip_rank", **{k: f"success_{k}" for k in KS}}
+"""Our measure -> that of trec_eval. R@k is "any relevant item among the first k", which trec_eval calls success."""
+
+
+def ours(scores, relevant, in_gallery):
+    first = first_relevant(scores, relevant, in_gallery)
+    measures = {"map": average_precision(scores, relevant, in_gallery), "mrr": reciprocal_rank(first)}
+    return measures | {k: recall_at(k, first) for k in KS}
+
+
+def theirs(scores, relevant, in_gallery, names=None):
+    """Return the values of trec_eval by query; `names` of items decide its order of ties."""
+    names = names or [f"{number:03}" for number in range(scores.shape[1])]
+    queries = range(len(scores))
+    qrels = {str(q): {names[i]: int(relevant[q, i]) for i in np.flatnonzero(in_gallery[q])} for q in queries}
+    run = {str(q): {names[i]: float(scores[q, i]) for i in np.flatnonzero(in_gallery[q])} for q in queries}
+    evaluator = trec_eval.RelevanceEvaluator(qrels, {"map", "recip_rank", "success." + ",".join(map(str, KS))})
+    found = evaluator.evaluate(run)
+    return {key: np.array([found[str(q)][name] for q in queries]) for key, name in NAMES.items()}
+
+
+def assert_equal(found, expected):
+    for key in NAMES:
+        np.testing.assert_allclose(found[key], expected[key], rtol=1e-12, atol=1e-14, err_msg=str(key))
+
+
+def random_table(rng, queries, items):
+    relevant = rng.random((queries, items)) < rng.uniform(0.05, 0.6, (queries, 1))
+    relevant[np.arange(queries), rng.integers(items, size=queries)] = True
+    return relevant
+
+
+@pytest.mark.parametrize("items", [1, 2, 7, 60, 300])
+def test_without_ties_the_measures_equal_those_of_trec_eval(items):
+    rng = np.random.default_rng(items)
+    relevant = random_table(rng, 40, items)
+    scores = rng.permuted(np.tile(np.arange(items, dtype=np.float32), (40, 1)), axis=1)
+    in_gallery = relevant | (rng.random(relevant.shape) < 0.8)
+    assert_equal(ours(scores, relevant, in_gallery), theirs(scores, relevant, in_gallery))
+
+
+def test_with_ties_the_measures_are_the_mean_of_trec_eval_over_all_names_of_items():
+    """trec_eval orders equal scores by name, so its value depends on the names. We take the mean over all orders."""
+    rng = np.random.default_rng(0)
+    relevant = random_table(rng, 60, 5)
+    scores = rng.integers(0, 3, relevant.shape).astype(np.float32)
+    scores[0] = 1  # a constant scorer
+    every = np.ones_like(relevant)
+    by_name = [theirs(scores, relevant, every, list(names)) for names in permutations("abcde")]
+    assert_equal(ours(scores, relevant, every), {key: np.mean([one[key] for one in by_name], axis=0) for key in NAMES})
+
+
+def test_a_name_decides_the_value_of_trec_eval_for_a_constant_scorer():
+    """By hand: of two items with equal scores one is relevant. trec_eval puts the later name first."""
+    scores, every = np.zeros((1, 2), np.float32), np.ones((1, 2), bool)
+    relevant = np.array([[True, False]])
+    assert theirs(scores, relevant, every, ["a", "b"])["mrr"] == 0.5
+    assert theirs(scores, relevant, every, ["b", "a"])["mrr"] == 1
+    assert ours(scores, relevant, every)["mrr"] == 0.75
+
+
+def test_trec_eval_compares_scores_in_single_precision():
+    scores, every = np.array([[1 + 1e-9, 1.0]]), np.ones((1, 2), bool)
+    relevant = np.array([[True, False]])
+    assert theirs(scores, relevant, every, ["a", "b"])["mrr"] == 0.5
+    assert ours(scores, relevant, every)["mrr"] == 1
+
+
+def test_a_query_without_a_relevant_item_is_0_for_trec_eval_and_no_query_for_us():
+    """Measures of a ranking refuse it; the protocols leave it out, and the gallery states how many are left out."""
+    scores = np.array([[3, 2, 1], [1, 2, 3]], np.float32)
+    owner, photos = np.array([0, 7]), np.array([1, 0, 0])
+    table = ScoreTable(scores, owner, photos, np.zeros((2, 3), bool))
+    every = np.ones((2, 3), bool)
+    assert theirs(scores, table.relevant, every)["mrr"].tolist() == [0.5, 0]
+    with pytest.raises(BadInput, match="row 1 has none"):
+        ours(scores, table.relevant, every)
+    measure = protocols.reciprocal_rank(table)
+    assert measure.values.tolist() == [[0.5]]
+    assert "1 touches left out" in measure.gallery
+
+
+def test_own_photos_are_neither_in_the_run_nor_in_the_qrels():
+    """The protocols equal trec_eval on the gallery of each query, which excludes photos of its own grasp."""
+    rng = np.random.default_rng(1)
+    touch_owner = np.repeat(np.arange(6), 4)
+    scores = rng.permuted(np.tile(np.arange(24, dtype=np.float32), (24, 1)), axis=1)
+    table = ScoreTable(scores, touch_owner, touch_owner, np.eye(24, dtype=bool))
+    expected = theirs(scores, table.relevant, ~table.own)
+    found = {"map": protocols.average_precision(table), "mrr": protocols.reciprocal_rank(table)}
+    found |= {k: protocols.recall(table, k) for k in KS}
+    assert_equal({key: measure.values[:, 0] for key, measure in found.items()}, expected)

@@ -1,0 +1,318 @@
+"""Importer of ROS bags; test_importers.py tests the common behaviour."""
+
+import sys
+import tracemalloc
+
+import cv2
+import numpy as np
+import pytest
+
+from robot.errors import ImporterError
+from robot.importers.rosbag import import_rosbag
+from tests.miniatures import encoded
+
+pytest.importorskip("rosbags")
+
+from rosbags.rosbag1 import Reader as Rosbag1Reader
+from rosbags.rosbag1 import Writer as Rosbag1Writer
+
+from robot.importers.bag_reader import Bag
+from robot.importers.bag_scan import BagScan, BagTopics, scan_bag, time_stamp_report
+from tests.miniatures import rosbag
+from tests.miniatures.rosbag import CAMERA, GEL_A, GEL_B, GRASP, GRIPPER, INTERVAL_NS, OBJECT, START_NS, write_bag
+
+pytestmark = pytest.mark.usefixtures("no_fsync")
+NAMES = ("mug.bag", "sqlite", "mcap")
+
+
+@pytest.fixture(params=NAMES)
+def name(request):
+    return request.param
+
+
+def pixels(recording, path):
+    return cv2.cvtColor(cv2.imread(str(recording.folder / path)), cv2.COLOR_BGR2RGB)
+
+
+def at(number, topic, short, **fields):
+    return START_NS + number * INTERVAL_NS, topic, short, fields
+
+
+def merged(*parts):
+    return sorted((message for part in parts for message in part), key=lambda message: message[0])
+
+
+def numbers_of(recording):
+    """Return the numbers of photo, no-contact frame and touch of each grasp, found by their pixels."""
+
+    def number_of(image):
+        return next(number for number in range(rosbag.FRAMES) if np.array_equal(image, rosbag.gel("a", number)))
+
+    return [
+        (int(pixels(recording, grasp.photo)[0, 0, 0]), number_of(pixels(recording, grasp.touches["a"])))
+        for grasp in recording.grasps
+    ]
+
+
+# Grasps --------------------------------------------------------------------------------------------------------
+
+
+def test_grasps_of_each_format_have_the_expected_images_and_fields(name, tmp_path):
+    """Contacts begin at images 20 and 50. The photos 18 and 48 are the last ones before; 19 and 49 have none."""
+    write_bag(tmp_path / name, rosbag.messages())
+    recording = import_rosbag(tmp_path / name, tmp_path / "out", gripper=GRIPPER, sensor="GelSight Mini")
+    stem = name.removesuffix(".bag")
+    assert [grasp.grasp_id for grasp in recording.grasps] == [f"{stem}-001", f"{stem}-002"]
+    # The first image is number 0, the first one after the release number 30: (0 + 20) / 2 and (30 + 50) / 2.
+    for grasp, photo, rest, touch in zip(recording.grasps, (18, 48), (10, 40), (27, 58), strict=True):
+        assert np.array_equal(pixels(recording, grasp.photo), rosbag.photo(photo))
+        for finger in "ab":
+            assert np.array_equal(pixels(recording, grasp.touches_before[finger]), rosbag.gel(finger, rest))
+            assert np.array_equal(pixels(recording, grasp.touches[finger]), rosbag.gel(finger, touch))
+        assert (grasp.object_id, grasp.sequence_id, grasp.touch_skew_s) == (stem, stem, 0.01)
+        assert grasp.time_s == pytest.approx(0.05 * touch)
+        assert grasp.opening_mm == pytest.approx(2 * touch)  # two joints of 1 mm an image
+        assert grasp.force_n == pytest.approx(5)
+    assert recording.info["sensor"] == "GelSight Mini"
+
+
+def test_topics_can_mark_the_grasps_and_name_the_object(name, tmp_path):
+    """The marks decide, not the contact: 22 to 26, then 55 to 70, whose strongest contacts are 25 and 58."""
+    marks = [
+        at(number, GRASP, "std_msgs/Bool", data=held) for number, held in ((22, True), (26, False), (55, 1), (70, 0))
+    ]
+    names = [at(1, OBJECT, "std_msgs/String", data="mug"), at(40, OBJECT, "std_msgs/String", data="red tin")]
+    write_bag(tmp_path / name, merged(marks, names, rosbag.messages()))
+    recording = import_rosbag(tmp_path / name, tmp_path / "out", grasp=GRASP, object=OBJECT)
+    assert numbers_of(recording) == [(20, 25), (54, 58)]
+    assert [grasp.object_id for grasp in recording.grasps] == ["mug", "red tin"]
+
+
+def test_a_grasp_before_the_first_name_is_skipped(tmp_path):
+    names = [at(40, OBJECT, "std_msgs/String", data="tin")]
+    write_bag(tmp_path / "a.bag", merged(names, rosbag.messages()))
+    recording = import_rosbag(tmp_path / "a.bag", tmp_path / "out", object=OBJECT)
+    assert [grasp.grasp_id for grasp in recording.grasps] == ["a-002"]
+    assert recording.info["skipped"] == {"there is no message of /object before it": 1}
+
+
+def test_a_grasp_without_a_camera_image_since_the_previous_one_is_skipped(tmp_path):
+    """The photo of the previous grasp may show another object."""
+    content = (message for message in rosbag.messages() if message[1] != CAMERA or message[0] < START_NS + 10**9)
+    write_bag(tmp_path / "a.bag", content)
+    recording = import_rosbag(tmp_path / "a.bag", tmp_path / "out")
+    assert numbers_of(recording) == [(18, 27)]
+    assert recording.info["skipped"] == {
+        "there is no camera image between the previous grasp and its contact": 1,
+    }
+
+
+def test_short_interruptions_and_short_grasps_are_ignored(tmp_path):
+    """The gels show no contact in image 24, and contact in image 5: 50 ms each."""
+
+    def content():
+        for time_ns, topic, short, fields in rosbag.messages():
+            number = (time_ns - START_NS) // INTERVAL_NS
+            if topic in (GEL_A, GEL_B) and number in (5, 24):
+                image = rosbag.gel(topic[-1], 27 if number == 5 else 9)
+                fields = rosbag.image_fields(image, "rgb8")
+            yield time_ns, topic, short, fields
+
+    write_bag(tmp_path / "a.bag", content())
+    assert numbers_of(import_rosbag(tmp_path / "a.bag", tmp_path / "out")) == [(18, 27), (48, 58)]
+    short = import_rosbag(tmp_path / "a.bag", tmp_path / "short", settle_s=0.01)
+    assert [number for _, number in numbers_of(short)] == [27, 23, 27, 58]
+
+
+def test_one_finger_is_enough(tmp_path):
+    write_bag(tmp_path / "a.bag", (message for message in rosbag.messages() if message[1] != GEL_B))
+    recording = import_rosbag(tmp_path / "a.bag", tmp_path / "out", touch_b="")
+    assert recording.info["fingers"] == 1
+    assert [sorted(grasp.touches) for grasp in recording.grasps] == [["a"], ["a"]]
+
+
+def test_compressed_images_are_stored_unchanged(tmp_path):
+    def content():
+        for time_ns, topic, short, fields in rosbag.messages():
+            if topic == CAMERA:
+                jpeg = encoded(".jpg", (time_ns - START_NS) // INTERVAL_NS)
+                fields = {"format": "jpeg", "data": np.frombuffer(jpeg, np.uint8)}
+            yield time_ns, topic, short, fields
+
+    write_bag(tmp_path / "a.bag", content())
+    recording = import_rosbag(tmp_path / "a.bag", tmp_path / "out")
+    photos = [(recording.folder / grasp.photo).read_bytes() for grasp in recording.grasps]
+    assert photos == [encoded(".jpg", 18), encoded(".jpg", 48)]
+
+
+# Bags ----------------------------------------------------------------------------------------------------------
+
+
+def storage_file(bag):
+    return bag if bag.is_file() else next(path for path in bag.iterdir() if path.suffix in (".mcap", ".db3"))
+
+
+def test_a_bag_that_is_cut_off_gives_its_whole_grasps_and_one_line(name, tmp_path):
+    """It is cut after the first grasp, and has no metadata.yaml, as after a crash of the recorder."""
+    (tmp_path / "src").mkdir()
+    bag = write_bag(tmp_path / "src" / name, rosbag.messages())
+    path = storage_file(bag)
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * 0.6)])
+    if bag.is_dir():
+        (bag / "metadata.yaml").unlink()
+    recording = import_rosbag(tmp_path / "src", tmp_path / "out")
+    assert numbers_of(recording)[0] == (18, 27)
+    assert {grasp.sequence_id for grasp in recording.grasps} == {name.removesuffix(".bag")}
+    (line,) = [note for note in recording.notes if "cut off or damaged" in note]
+    assert line.startswith(f"{name} is cut off or damaged: imported its whole messages, the first ")
+
+
+@pytest.mark.parametrize("fraction", [0.01, 0.1, 0.3, 0.45, 0.75, 0.9, 0.999])
+def test_a_bag_cut_off_anywhere_gives_the_grasps_before_or_one_error(name, fraction, tmp_path):
+    bag = write_bag(tmp_path / name, rosbag.messages())
+    path = storage_file(bag)
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * fraction)])
+    try:
+        recording = import_rosbag(bag, tmp_path / "out")
+    except ImporterError:
+        assert fraction < 0.5
+    else:
+        assert numbers_of(recording) == [(18, 27), (48, 58)][: len(recording.grasps)]
+
+
+def test_a_grasp_that_the_end_of_the_bag_cuts_off_is_skipped(tmp_path):
+    """The bag ends after image 56 of the grasp 50 to 65; the strongest contact may be later."""
+    until = START_NS + 57 * INTERVAL_NS
+    content = [message for message in rosbag.messages() if message[0] < until]
+    bag = write_bag(tmp_path / "a.bag", content, chunk_bytes=1_000)
+    assert numbers_of(import_rosbag(bag, tmp_path / "whole")) == [(18, 27), (48, 56)]
+    with Rosbag1Reader(bag) as reader:
+        last_chunk = reader.chunk_infos[-1].pos
+    bag.write_bytes(bag.read_bytes()[: last_chunk + 200])
+    recording = import_rosbag(bag, tmp_path / "out")
+    assert numbers_of(recording) == [(18, 27)]
+    assert recording.info["skipped"] == {"the bag is cut off during the grasp": 1}
+
+
+@pytest.mark.parametrize("compression", ["BZ2", "LZ4"])
+def test_compressed_chunks_of_a_bag_that_is_cut_off_are_read(compression, tmp_path, monkeypatch):
+    def writer_of(path):
+        writer = Rosbag1Writer(path)
+        writer.set_compression(Rosbag1Writer.CompressionFormat[compression])
+        return writer
+
+    monkeypatch.setattr(rosbag, "Rosbag1Writer", writer_of)
+    bag = write_bag(tmp_path / "a.bag", rosbag.messages())
+    bag.write_bytes(bag.read_bytes()[: int(bag.stat().st_size * 0.6)])
+    assert numbers_of(import_rosbag(bag, tmp_path / "out"))[0] == (18, 27)
+
+
+def test_a_bag_that_is_no_bag_is_one_error(tmp_path):
+    (tmp_path / "a.bag").write_bytes(b"nothing of the kind")
+    with pytest.raises(ImporterError, match=r"a\.bag: its bag"):
+        import_rosbag(tmp_path / "a.bag", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"photo": "/camera"}, r"must have the topic /camera of type .*; choose .* from: /camera/color \(sensor_msgs"),
+        ({"grasp": GEL_A}, "must have the topic /gel/a of type std_msgs/msg/Bool"),
+        ({"contact": 0.0}, r"contact must be above 0 and at most 1, got 0\.0"),
+    ],
+)
+def test_topics_and_options_are_checked(tmp_path, options, message):
+    write_bag(tmp_path / "a.bag", rosbag.messages())
+    with pytest.raises(ImporterError, match=message):
+        import_rosbag(tmp_path / "a.bag", tmp_path / "out", **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_encoding_is_an_error_that_names_the_known_ones(tmp_path):
+    content = [at(0, GEL_A, "sensor_msgs/Image", **rosbag.image_fields(rosbag.gel("a", 0), "yuv422"))]
+    write_bag(tmp_path / "a.bag", merged(content, list(rosbag.messages())[1:]))
+    with pytest.raises(ImporterError, match="must be rgb8, bgr8, mono8, got 'yuv422'"):
+        import_rosbag(tmp_path / "a.bag", tmp_path / "out")
+
+
+def test_an_error_names_the_extra_if_the_package_is_missing(tmp_path, monkeypatch):
+    write_bag(tmp_path / "a.bag", rosbag.messages())
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(ImporterError, match=r"needs rosbags, .*pip install 'touch-retrieval\[importers\]'"):
+        import_rosbag(tmp_path / "a.bag", tmp_path / "out")
+
+
+# Time stamps, memory -------------------------------------------------------------------------------------------
+
+
+def report_of(bag):
+    with Bag(bag) as opened:
+        scan = scan_bag(opened, BagTopics((GEL_A, GEL_B), CAMERA))
+    return time_stamp_report({bag.name: scan}, (GEL_A, GEL_B, CAMERA))
+
+
+def test_the_import_prints_a_line_on_the_time_stamps_of_each_topic(name, tmp_path):
+    """Images 40 to 44 of gel a are missing; gel b repeats the stamp of image 10 and goes back by 3 images at 20."""
+
+    def content():
+        for time_ns, topic, short, fields in rosbag.messages():
+            number = (time_ns - START_NS) // INTERVAL_NS
+            if topic == GEL_A and 40 <= number < 45:
+                continue
+            if topic == GEL_B and number in (11, 20):
+                fields = {**fields, "stamp_ns": time_ns - INTERVAL_NS * (1 if number == 11 else 4)}
+            yield time_ns, topic, short, fields
+
+    write_bag(tmp_path / name, content())
+    assert report_of(tmp_path / name) == [
+        f"/gel/a: 75 messages at 20.0 Hz, 1 gap(s) of more than 3 intervals, the longest 0.30 s in {name}",
+        # From 16 back to 21 are 5 intervals.
+        f"/gel/b: 80 messages at 20.0 Hz, 1 gap(s) of more than 3 intervals, the longest 0.25 s in {name}, "
+        "1 repeated time stamp(s), 1 time stamp(s) that go backwards",
+        "/camera/color: 40 messages at 10.0 Hz, no gap(s) of more than 3 intervals",
+    ]
+
+
+def test_images_that_cannot_be_decoded_are_counted(tmp_path):
+    def content():
+        for time_ns, topic, _, fields in rosbag.messages():
+            if topic == GEL_A:
+                number = (time_ns - START_NS) // INTERVAL_NS
+                fields = rosbag.png_fields(rosbag.gel("a", number))
+                if number in (7, 8):
+                    fields["data"] = fields["data"][:50]
+                yield time_ns, topic, "sensor_msgs/CompressedImage", fields
+            else:
+                yield time_ns, topic, "sensor_msgs/Image" if topic == GEL_B else _, fields
+
+    bag = write_bag(tmp_path / "a.bag", content())
+    assert report_of(bag)[0].endswith("no gap(s) of more than 3 intervals, 2 image(s) that cannot be decoded")
+    assert numbers_of(import_rosbag(bag, tmp_path / "out")) == [(18, 27), (48, 58)]
+
+
+def test_a_topic_without_messages_has_a_line_too():
+    assert time_stamp_report({"a.bag": BagScan()}, ("/gel/a",)) == ["/gel/a: 0 messages"]
+
+
+def test_images_are_not_all_in_memory(name, tmp_path):
+    """400 gel images of 230,400 bytes, in chunks of 1 MB."""
+
+    def content():
+        for number in range(400):
+            image = np.zeros((240, 320, 3), np.uint8)
+            image[60:180, 60:180] = 100 * (number % 40 >= 20)
+            yield at(number, GEL_A, "sensor_msgs/Image", **rosbag.image_fields(image, "rgb8"))
+            if number % 40 == 0:
+                yield at(number, CAMERA, "sensor_msgs/Image", **rosbag.image_fields(image, "rgb8"))
+
+    bag = write_bag(tmp_path / name, content(), chunk_bytes=1_000_000)
+    import_rosbag(bag, tmp_path / "first", touch_b="")  # packages imported on first use do not count
+    tracemalloc.start()
+    try:
+        recording = import_rosbag(bag, tmp_path / "out", touch_b="")
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert len(recording.grasps) == 10
+    assert peak < 25_000_000
