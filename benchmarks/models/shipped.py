@@ -32,6 +32,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 import robot
@@ -221,7 +222,8 @@ def calibrate_verification(arguments: argparse.Namespace) -> int:
         grasps = [each_finger(grasp)[0] for grasp in grasps]
     trials, photos = scored_touches(shipped, grasps, arguments.folder / "features")
     assert shipped.posterior is not None
-    verification = fit_verification(trials.scored, photo_embeddings(shipped.matcher, photos), shipped.posterior)
+    embeddings = photo_embeddings(shipped.matcher, torch.stack(list(photos.values())))
+    verification = fit_verification(trials.scored, embeddings, shipped.posterior)
     made = same_codes(dataclasses.replace(shipped, verification=verification), shipped)
     store(made, arguments.folder / defaults.SHIPPED[arguments.fingers])
     return 0
