@@ -166,6 +166,30 @@ def method(rng, name, grasps, split):
     }
 
 
+def verification(rng):
+    """Return error rates of verification that fall with the number of grasps; the lowest rate is refused."""
+
+    def rate(value, needed):
+        interval = {"value": value, "low": value / 2, "high": 2 * value}
+        return {**(dict.fromkeys(interval) if needed > 80 else interval), "objects_needed": needed}
+
+    def one(difficulty):
+        fars = np.geomspace(1e-4, 0.5, 60)
+        return {
+            "objects": 80,
+            "sequences": 640,
+            "eer": rate(float(0.1 * difficulty), 40),
+            "frr": {"0.1": rate(0.1 * difficulty, 25), "0.01": rate(0.3 * difficulty, 78), "0.001": rate(0.6, 246)},
+            "det": [[float(far), float((1 - far) ** 9 * difficulty * 0.8), bool(far > 0.01)] for far in fars],
+        }
+
+    difficulties = {"random": 1.0, "similar": 1.2}
+    return {
+        kind: {str(grasps): one(difficulty * rng.uniform(0.9, 1) / grasps) for grasps in (1, 2, 3, 5)}
+        for kind, difficulty in difficulties.items()
+    }
+
+
 CEILINGS = {"touch_to_touch": "two touches of one object", "photo_to_photo": "two photos of one object"}
 CONTROLS = {
     "no_contact": "the no-contact frame replaces the touch in fitting and in scoring",
@@ -230,6 +254,7 @@ def synthetic_results(recording, methods=tuple(SKILL), seed=0):
                 for name in methods
             },
         },
+        "verification": verification(np.random.default_rng([seed, 1])),
         "comparisons": [
             {
                 "a": methods[0],

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from retrieval.commands.main import main as run_command
@@ -247,7 +248,8 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
         made = with_verdicts(made, source, verification, validation, foreign=FOREIGN)
     trials, photos = scored_touches(made, verification, folder / "features")
     assert made.posterior is not None
-    bounds = fit_verification(trials.scored, photo_embeddings(made.matcher, photos), made.posterior)
+    embeddings = photo_embeddings(made.matcher, torch.stack(list(photos.values())))
+    bounds = fit_verification(trials.scored, embeddings, made.posterior)
     return dataclasses.replace(made, verification=bounds)
 
 

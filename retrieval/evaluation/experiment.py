@@ -13,9 +13,9 @@ from retrieval.data.dataset import Split
 from retrieval.evaluation.predictions import Predictions, predict, read_predictions, write_predictions
 from retrieval.evaluation.queries import Queries
 from retrieval.methods import METHODS
-from retrieval.methods.late_fusion import LateFusion
+from retrieval.methods.late_fusion import LateFusion, checkpoint_path
 from retrieval.methods.method import Method, MethodSettings
-from retrieval.model.checkpoint import Checkpoint
+from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.config import Config
 from retrieval.model.encode import one_thread
 from retrieval.model.fusion import Matcher
@@ -77,6 +77,10 @@ class Experiment:
         predictions = predict(method, self.features_for(name), self.queries, fit_s)
         write_predictions(path, predictions, cache_key)
         return predictions
+
+    def late_fusion_checkpoint(self, seed: int) -> Checkpoint:
+        """Return the given checkpoint, or the one that late fusion trained with this seed."""
+        return self.checkpoint or load_checkpoint(checkpoint_path(self.folder / "fits", seed))
 
     def cache_key(self, name: str, seed: int) -> dict[str, Any]:
         """Return all inputs that determine the predictions of a method, in JSON types."""

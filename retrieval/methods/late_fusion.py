@@ -87,7 +87,7 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
         training=dataclasses.replace(config.training, seed=settings.seed, freeze_towers=True, photos="", touches=""),
     )
     with nullcontext(settings.folder) if settings.folder else tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"late_fusion-{settings.seed}.safetensors"
+        path = checkpoint_path(Path(folder), settings.seed)
         trainer = Trainer(config, split, grasps, unfinished_path(path), SOURCE, known)
         expected, got = _feature_counts(trainer.matcher), (*known.touch.shape[1:], *known.photo.shape[1:])
         if expected != got:
@@ -99,6 +99,11 @@ def trained_checkpoint(settings: MethodSettings, train: Features, validation: Fe
         trainer.matcher.touch_tower.load_state_dict(towers.touch_tower.state_dict())
         trainer.matcher.photo_tower.load_state_dict(towers.photo_tower.state_dict())
         return finish_training(trainer, path, settings.quiet)
+
+
+def checkpoint_path(folder: Path, seed: int) -> Path:
+    """Return the path of the checkpoint that late fusion trains with a seed."""
+    return folder / f"late_fusion-{seed}.safetensors"
 
 
 def frozen_matcher(config: Config) -> Matcher:

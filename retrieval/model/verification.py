@@ -119,8 +119,7 @@ class VerificationCalibration:
         """
         if not (isinstance(far, int | float) and 0 < far <= LEVELS[-1]):
             raise BadInput(f"the false-accept rate must be above 0 and at most {LEVELS[-1]:g}, got {far}")
-        if far * self.pairs < ERRORS_NEEDED:
-            needed = math.ceil((1 + math.sqrt(1 + 8 * ERRORS_NEEDED / far)) / 2)
+        if self.objects < (needed := objects_needed(far)):
             raise BadInput(
                 f"a false-accept rate of {far:g} needs {needed:,} validation objects; the model has {self.objects}, "
                 f"enough for {ERRORS_NEEDED / self.pairs:.2g}: give a larger rate, or train with more objects"
@@ -132,9 +131,9 @@ class VerificationCalibration:
         return DecisionBounds(
             accept,
             reject,
-            _rate(far, self.pairs),
-            _rate(1 - _fraction_below(accept, self.similar), self.objects),
-            _rate(min(1.0, rejects + early), self.objects),
+            error_rate(far, self.pairs),
+            error_rate(1 - _fraction_below(accept, self.similar), self.objects),
+            error_rate(min(1.0, rejects + early), self.objects),
             tuple(1 - _fraction_below(accept, quantiles) for quantiles in self.genuine),
         )
 
@@ -153,19 +152,25 @@ def _fraction_below(value: float, quantiles: tuple[float, ...]) -> float:
     return float(np.interp(value, quantiles, QUANTILES, left=0.0, right=1.0))
 
 
-def _rate(value: float, trials: int) -> ErrorRate:
+def objects_needed(far: float) -> int:
+    """Return the number of objects whose pairs are enough for a false-accept rate of random impostors."""
+    return math.ceil((1 + math.sqrt(1 + 8 * ERRORS_NEEDED / far)) / 2)
+
+
+def error_rate(value: float, trials: int) -> ErrorRate:
+    """Return a rate with its interval for this number of independent trials (Clopper and Pearson 1934)."""
     from retrieval.metrics.k_way import clopper_pearson  # imports scipy, which queries do not need
 
     return ErrorRate(value, *clopper_pearson(value * trials, trials, 0.95))
 
 
 class VerificationSequences(NamedTuple):
-    """Log likelihood ratios of sequences of `MAX_GRASPS` grasps.
+    """Log likelihood ratios of sequences of G grasps.
 
     Attributes:
         owner: (S,) object of each sequence.
-        ratios: (S, MAX_GRASPS) ratios of the right object after 1, 2, ... grasps.
-        genuine: (MAX_GRASPS, S) the largest of them so far.
+        ratios: (S, G) ratios of the right object after 1, 2, ... grasps.
+        genuine: (G, S) the largest of them so far.
         impostor: (S, O - 1) largest ratio of each other object.
         similar: (S,) that of the most similar other object.
     """
@@ -178,32 +183,30 @@ class VerificationSequences(NamedTuple):
 
 
 def verification_sequences(
-    scored: ScoredTouches, embeddings: Floats, posterior: Posterior, seed: int = 0
+    scored: ScoredTouches, embeddings: Floats, posterior: Posterior, seed: int = 0, grasps: int = MAX_GRASPS
 ) -> VerificationSequences:
-    """Draw `SEQUENCES` sequences of each object with `MAX_GRASPS` grasps and a photo of another one, and score them.
+    """Draw `SEQUENCES` sequences of each object with that many grasps and a photo of another one, and score them.
 
     Args:
         scored: Match logits of the touches with the photos.
         embeddings: (N, d) embeddings of the photos, by which the most similar object is found.
         posterior: The posterior of the model.
-        seed: Seed of the sequences.
+        seed: Seed of the sequences. Shorter sequences of the same seed are the first grasps of longer ones.
+        grasps: Number of grasps, G.
     """
     rng = np.random.default_rng([seed, 7])
     sequences = []
     for name in np.unique(scored.touch_owner):
         touches, photos = np.flatnonzero(scored.touch_owner == name), scored.photo_owner == name
-        drawn = [rng.permutation(touches)[:MAX_GRASPS] for _ in range(SEQUENCES)]
-        sequences += [rows for rows in drawn if len(rows) == MAX_GRASPS and (photos & ~scored.own[rows].any(0)).any()]
-    sets = np.array(sequences, dtype=np.int64).reshape(-1, MAX_GRASPS)
+        drawn = [rng.permutation(touches)[:grasps] for _ in range(SEQUENCES)]
+        sequences += [rows for rows in drawn if len(rows) == grasps and (photos & ~scored.own[rows].any(0)).any()]
+    sets = np.array(sequences, dtype=np.int64).reshape(-1, grasps)
     owner, objects = scored.touch_owner[sets[:, 0]], np.unique(scored.photo_owner)
     if not len(sets):
-        none = np.zeros((0, MAX_GRASPS))
+        none = np.zeros((0, grasps))
         return VerificationSequences(owner, none, none.T, np.zeros((0, len(objects) - 1)), none[:, 0])
     ratios = np.stack(
-        [
-            IdentificationTrials.of(scored, sets[:, :count], seed).log_ratios(posterior)
-            for count in range(1, MAX_GRASPS + 1)
-        ]
+        [IdentificationTrials.of(scored, sets[:, :count], seed).log_ratios(posterior) for count in range(1, grasps + 1)]
     )
     rows, true = np.arange(len(sets)), np.searchsorted(objects, owner)
     highest = np.maximum.accumulate(ratios, axis=0)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from retrieval.model.verification import ERRORS_NEEDED
 from retrieval.report import galleries, plots, tables
 from retrieval.report.builder import Builder
 from retrieval.report.document import Block, Details, Listing, Text
@@ -143,3 +144,25 @@ def reject(builder: Builder) -> Iterator[Block | None]:
         yield tables.rejects_by_grasps(builder.results)
     elif any("reject" in one for one in builder.results.data["methods"].values()):
         yield Text(TOO_FEW)
+
+
+def verification(builder: Builder) -> Iterator[Block | None]:
+    """Yield the error rates of late fusion in verification, by number of grasps."""
+    if found := builder.results.data.get("verification"):
+        one = next(iter(found["random"].values()))
+        yield builder.picture(
+            "det.png",
+            "DET curves of late fusion, falling from left to right, for each number of grasps; the table below has the "
+            "numbers.",
+            "Detection error trade-off: false-reject rate (FRR) against false-accept rate (FAR), probit axes; on the "
+            "dashed diagonal both are equal (EER). Dotted: too few objects to support the FAR.",
+            plots.verification,
+            builder.results,
+        )
+        yield tables.verification(builder.results)
+        yield Text(
+            f"{one['sequences']:,} sequences of grasps of {one['objects']} unseen objects. A sequence is accepted if "
+            "its largest log likelihood ratio so far reaches the threshold. Impostors: every other unseen object, or "
+            "the one whose photos have the most similar embeddings. A FAR is refused if the trials would contain fewer "
+            f"than {ERRORS_NEEDED} errors (rule of 30)."
+        )

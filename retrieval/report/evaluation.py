@@ -137,6 +137,7 @@ SECTIONS: dict[str, Callable[[Builder], Iterator[Block | None]]] = {
     "Best and worst queries": error_analysis.examples,
     "Calibration": error_analysis.calibration,
     "Is the object in the catalogue?": error_analysis.reject,
+    "Is it the expected object?": error_analysis.verification,
     "Settings": _setting,
     "All measures": _everything,
 }

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from retrieval.methods import TRIVIAL_BASELINES
 from retrieval.metrics.registry import PHOTO_COUNTS, SET_SIZES, grasps_metric_name, photos_metric_name
-from retrieval.report.canvas import MUTED_COLOUR, PART_COLOURS, Axes, Figure, canvas, percent_axis, style_of
-from retrieval.report.results import Results, measure_label, method_label, percent, shortened
+from retrieval.report.canvas import MUTED_COLOUR, PART_COLOURS, Axes, Figure, Style, canvas, percent_axis, style_of
+from retrieval.report.results import IMPOSTORS, Results, measure_label, method_label, percent, shortened
 
 OVERVIEW = ("pair_accuracy", "topn_k5", "topn_k10", grasps_metric_name(5), "map")
 _LABELLED_OBJECTS = 130
@@ -269,6 +269,44 @@ def _decisions(panel: Axes, name: str, corners: Sequence[Sequence[float]]) -> No
     panel.plot(points[:, 0], points[:, 1], color=style.colour, ls=style.line)
     step = max(1, len(points) // 6)
     panel.plot(points[step:-1:step, 0], points[step:-1:step, 1], style.marker, color=style.colour, ms=5)
+
+
+DET_TICKS = (0.001, 0.01, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 0.95, 0.99)
+_GRASP_STYLES = {
+    "1": Style("#d55e00", "o"), "2": Style("#e69f00", "s"), "3": Style("#009e73", "D"), "5": Style("#0072b2", "^")
+}  # fmt: skip
+
+
+def verification(results: Results) -> Figure:
+    """Plot the false-reject rate against the false-accept rate on probit axes: a panel for each kind of impostor."""
+    from matplotlib.lines import Line2D
+    from scipy.stats import norm
+
+    found = results.data["verification"]
+    figure = canvas(10.5, 4.6)
+    panels = figure.subplots(1, 2, sharey=True)
+    for panel, kind in zip(panels, found, strict=True):
+        for grasps, style in _GRASP_STYLES.items():
+            if grasps not in found[kind]:
+                continue
+            far, frr, supported = np.array(found[kind][grasps]["det"]).T
+            x, y = norm.ppf(far), np.where((frr > 0) & (frr < 1), norm.ppf(frr), math.nan)
+            panel.plot(x, y, ":", color=style.colour, lw=1.2)
+            panel.plot(x, np.where(supported > 0, y, math.nan), color=style.colour)
+            panel.plot(x[::8], y[::8], style.marker, color=style.colour, ms=5)
+        panel.plot(norm.ppf([0.001, 0.5]), norm.ppf([0.001, 0.5]), color=MUTED_COLOUR, ls="--", lw=1.2)
+        ticks = [tick for tick in DET_TICKS if tick < 0.5]
+        panel.set_xticks(norm.ppf([*ticks, 0.5]), [f"{100 * tick:g}" for tick in [*ticks, 0.5]])
+        panel.set(xlim=norm.ppf([0.0008, 0.52]), xlabel="false-accept rate (FAR), %")
+        panel.set_title(f"impostors: {IMPOSTORS[kind]}")
+    panels[0].set_yticks(norm.ppf(DET_TICKS), [f"{100 * tick:g}" for tick in DET_TICKS])
+    panels[0].set_ylabel("false-reject rate (FRR), %")
+    handles = [
+        Line2D([], [], color=style.colour, marker=style.marker, label=f"grasps: {grasps}")
+        for grasps, style in _GRASP_STYLES.items()
+    ]
+    figure.legend(handles=handles, loc="outside right center", frameon=False)
+    return figure
 
 
 # Time ------------------------------------------------------------------------------------------------

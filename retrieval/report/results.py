@@ -29,6 +29,8 @@ METHOD_LABELS = {
     "chance": "random scores",
     "constant": "constant score",
 }
+IMPOSTORS = {"random": "random", "similar": "most similar object"}
+"""Labels of the impostors of verification."""
 Summary = Mapping[str, Any]
 
 

@@ -11,6 +11,7 @@ from retrieval.report.document import Table
 from retrieval.report.results import (
     FEW_OBJECTS_MARK,
     FEW_OBJECTS_NOTE,
+    IMPOSTORS,
     MISSING_VALUE,
     Results,
     Summary,
@@ -243,6 +244,28 @@ def rejects_by_grasps(results: Results) -> Table | None:
     header = ("%, by grasps in a query", *map(str, sizes))
     note = "A set of grasps is one query; each number of grasps has its own posterior."
     return _with_notes(Table(header, tuple(rows), (note,)))
+
+
+def verification(results: Results) -> Table:
+    """Return the equal error rate, and the false-reject rate at each false-accept rate, by impostors and grasps."""
+    found = results.data["verification"]
+    fars = sorted(next(iter(found["random"].values()))["frr"], key=float, reverse=True)
+    rows = [
+        (label, grasps, *map(_supported_rate, (one["eer"], *(one["frr"][far] for far in fars))))
+        for kind, label in IMPOSTORS.items()
+        for grasps, one in sorted(found[kind].items(), key=lambda item: int(item[0]))
+    ]
+    header = ("impostors", "grasps", "EER, %", *(f"FRR at a FAR of {100 * float(far):g} %, %" for far in fars))
+    note = "Interval: each object counts as one trial (Clopper and Pearson)."
+    return Table(header, tuple(rows), (note,), words=frozenset({0}))
+
+
+def _supported_rate(rate: Mapping[str, Any]) -> str:
+    """Return a rate with its interval in percent, or the number of objects that it needs."""
+    if rate["value"] is not None:
+        return f"{percent(rate['value'])} [{percent(rate['low'])}, {percent(rate['high'])}]"
+    needed = rate["objects_needed"]
+    return "refused: no errors" if needed is None else f"refused: needs {needed:,} objects"
 
 
 def _has_entry(results: Results, name: str, entry: str) -> bool:

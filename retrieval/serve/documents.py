@@ -177,8 +177,8 @@ class AgreementDocument(BaseModel):
 class IndexDocument(BaseModel):
     """Description of the index, its model and the service.
 
-    sensors: names of live sensors; can_grasp: whether POST /v1/grasp works; stores_history: whether queries and
-    feedback are stored; trials: number of unseen objects for the human baseline.
+    sensors: names of live sensors; can_grasp, can_verify: whether POST /v1/grasp and POST /v1/verify work;
+    stores_history: whether queries and feedback are stored; trials: number of unseen objects for the human baseline.
     """
 
     generation: str
@@ -194,6 +194,7 @@ class IndexDocument(BaseModel):
     candidates: int | None
     sensors: list[str]
     can_grasp: bool
+    can_verify: bool
     stores_history: bool
     trials: int
     version: str

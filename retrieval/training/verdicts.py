@@ -94,7 +94,7 @@ def with_verdicts(
     posterior, references = _fit_calibration(queries, seed)
     made = dataclasses.replace(made, posterior=posterior, references=references)
     if queries is not None and posterior is not None:
-        embeddings = photo_embeddings(matcher, photos)
+        embeddings = photo_embeddings(matcher, torch.stack(list(photos.values())))
         verification = fit_verification(queries.scored, embeddings, posterior, seed)
         made = dataclasses.replace(made, verification=verification)
     if matcher.config.cell_dim:
@@ -169,9 +169,9 @@ def posterior_touches(
 
 
 @torch.inference_mode()
-def photo_embeddings(matcher: Matcher, photos: dict[Path, Tensor]) -> NDArray[np.float64]:
-    """Return the contrastive embeddings (N, embedding_dim) of photos, given their features."""
-    embeddings = matcher.photo_encoding(torch.stack(list(photos.values()))).embedding
+def photo_embeddings(matcher: Matcher, photos: Tensor) -> NDArray[np.float64]:
+    """Return the contrastive embeddings (N, embedding_dim) of photos, given their features (N, F)."""
+    embeddings = matcher.photo_encoding(photos).embedding
     return np.asarray(embeddings.cpu().numpy().astype(np.float64))
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from retrieval.commands.main import main
+from retrieval.data.dataset import load_grasps, make_split
 from retrieval.model.checkpoint_info import read_header
 from retrieval.search.query.answer import EXIT_CODES
 from retrieval.serve.store import HistoryStore
@@ -77,12 +78,20 @@ def test_the_exit_codes_of_a_query():
 
 @pytest.mark.slow
 def test_the_results_of_an_evaluation(tmp_path, recording):
+    split = make_split(load_grasps(recording), validation=0.3, test=0.3, seed=0)
+    (tmp_path / "split.json").write_text(json.dumps(split.to_dict()))
     quick = ["--preset", "tiny", "--iterations", "2", "--methods", "late_fusion,chance"]
-    assert main(["evaluate", str(recording), "--out", str(tmp_path), *quick]) == 0
-    results = json.loads((tmp_path / "results.json").read_text())
+    quick += ["--split", str(tmp_path / "split.json")]
+    assert main(["evaluate", str(recording), "--out", str(tmp_path / "out"), *quick]) == 0
+    results = json.loads((tmp_path / "out" / "results.json").read_text())
     check(7, results)
     method = results["methods"]["late_fusion"]
     check(8, method)
+    assert set(results["verification"]) == {"random", "similar"}
+    verification = results["verification"]["random"]["1"]
+    check(9, verification)
+    row = re.search(r"^\| `eer` .*$", text_of(PAGE), re.M)[0]
+    assert set(re.findall(r"`(\w+)`", row)) - {"eer"} == set(verification["eer"])
     row = re.search(r"^\| `measures` .*$", text_of(PAGE), re.M)[0]
     assert set(re.findall(r"`(\w+)`", row)) - {"measures"} == set(method["measures"]["pair_auc"])
 
@@ -94,10 +103,10 @@ def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     quick = ["--preset", "tiny", "--seeds", "1", "--methods", "cca_pca", "--protocols", "billets-places,physiclear,rct"]
     assert main(["benchmark", "real", str(tmp_path), "--out", str(tmp_path / "out"), *quick]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
-    check(9, results)
+    check(10, results)
     assert set(results["skipped"]) == {"rct"}
     entry = results["protocols"]["billets-places"]
-    check(10, entry)
+    check(11, entry)
     row, control = entry["rows"]["cca_pca"], entry["controls"]["permuted"]
     page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
     documented = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}

@@ -11,7 +11,14 @@ import numpy as np
 from retrieval.errors import BadInput
 from retrieval.model.fusion_scorer import CONTACT, NO_CONTACT, NOT_A_GEL
 from retrieval.model.touches import AnyImage, AnyTouches, Stopwatch, parse_grasps
-from retrieval.model.verification import ACCEPT, ANOTHER_GRASP, MAX_GRASPS, REJECT, DecisionBounds
+from retrieval.model.verification import (
+    ACCEPT,
+    ANOTHER_GRASP,
+    MAX_GRASPS,
+    REJECT,
+    DecisionBounds,
+    VerificationCalibration,
+)
 from retrieval.search.query.answer import gel_classes
 
 if TYPE_CHECKING:
@@ -79,6 +86,12 @@ class Verification:
         )
 
 
+def calibration_of(searcher: Searcher) -> VerificationCalibration | None:
+    """Return the calibration of verifications; None if the model has none, or the index lacks the model's cells."""
+    has_cells = searcher.scorer.cell_dim == searcher.checkpoint.config.matcher.cell_dim
+    return searcher.checkpoint.verification if has_cells and searcher.posterior else None
+
+
 def verify(
     searcher: Searcher,
     touches: AnyTouches,
@@ -88,12 +101,8 @@ def verify(
     background: Sequence[AnyImage] | None = None,
 ) -> Verification:
     """Decide whether the object in the hand is the expected one; see `Searcher.verify`."""
-    calibration, posterior = searcher.checkpoint.verification, searcher.posterior
-    if (
-        calibration is None
-        or posterior is None
-        or searcher.scorer.cell_dim != searcher.checkpoint.config.matcher.cell_dim
-    ):
+    calibration, posterior = calibration_of(searcher), searcher.posterior
+    if calibration is None or posterior is None:
         raise BadInput(
             f"{searcher.checkpoint.path} has no error rates for verification with this index: train a model with at "
             "least 20 validation objects of 5 grasps, and build its index with its cells"

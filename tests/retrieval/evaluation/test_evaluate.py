@@ -197,6 +197,15 @@ def test_rejection_is_measured_for_single_grasps_and_by_number_of_grasps(made):
     ]  # one right of five, in half of the queries
 
 
+def test_six_test_objects_support_no_rate_of_verification(made, run, tmp_path):
+    for by_grasps in made[0]["verification"].values():
+        assert list(by_grasps) == ["1", "2", "3"]  # each object has four grasps
+        for one in by_grasps.values():
+            assert (one["objects"], one["sequences"]) == (6, 48)
+            assert {rate["value"] for rate in one["frr"].values()} == {None}
+    assert run(tmp_path / "without", methods=("constant",))["verification"] is None
+
+
 def test_only_methods_with_seeds_are_trained_for_each_seed(made):
     measures = {name: made[0]["methods"][name]["measures"]["pair_auc"] for name in FEW}
     assert [len(measures[name]["by_seed"]) for name in FEW] == [2, 2, 1, 1]

@@ -234,7 +234,7 @@ def test_missing_measures_are_left_out(report, tmp_path):
             for key in ("per_object", "confusions", "reliability", "calibration", "reject", "examples", "best_params"):
                 method.pop(key)
             method["measures"] = {"pair_accuracy": method["measures"]["pair_accuracy"]}
-        results |= {"controls": {}, "ceilings": {}, "low_contact": None, "comparisons": []}
+        results |= {"controls": {}, "ceilings": {}, "low_contact": None, "comparisons": [], "verification": None}
         results.pop("audit")
 
     _, text, files = remake(report, tmp_path, change=change)

@@ -99,11 +99,17 @@ export async function grasp(objectId = null) {
   };
 }
 
-export async function agreement(photo, touches, background, squares = 8) {
+/** Post gel images and other values as one JSON body. */
+async function postTouches(path, touches, background, values) {
   const all = await Promise.all(touches.map((grasp) => Promise.all(grasp.map(base64))));
   const frames = background ? await Promise.all(background.map(base64)) : null;
-  return json("/v1/agreement", jsonPost({ photo, touches: all, background: frames, squares }));
+  return json(path, jsonPost({ touches: all, background: frames, ...values }));
 }
+
+export const agreement = (photo, touches, background, squares = 8) =>
+  postTouches("/v1/agreement", touches, background, { photo, squares });
+export const verify = (expect, touches, background, far) =>
+  postTouches("/v1/verify", touches, background, { expect, far });
 
 export const catalogue = (parameters, signal = null) => json(withParameters("/v1/catalogue", parameters), { signal });
 export const nearest = (id, count = 12) => json(withParameters(`/v1/nearest/${encodedPath(id)}`, { count }));

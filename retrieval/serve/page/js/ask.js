@@ -5,9 +5,10 @@ import { announce, h, problemCard } from "./dom.js";
 import { answerPanel } from "./answer.js";
 import { livePanel } from "./live.js";
 import { Tray, chooser, finger, trayCards } from "./tray.js";
-import { count, verdict } from "./wording.js";
+import { expectedField, verificationPanel } from "./verify.js";
+import { count, verdict, verificationVerdict } from "./wording.js";
 
-const DEFAULTS = { top: 12, candidates: null, none_prior: 0.5 };
+const DEFAULTS = { top: 12, candidates: null, none_prior: 0.5, far: 0.01 };
 
 /** The query view. */
 export function askView(index) {
@@ -24,6 +25,7 @@ export function askView(index) {
   const askButton = h("button", { type: "button", class: "primary", onclick: () => ask() }, "Ask");
   const clearButton = h("button", { type: "button", class: "quiet", onclick: () => start() }, "Start again");
   const live = livePanel(index, tray);
+  const expected = expectedField(update);
   const again = h(
     "button",
     { type: "button", class: "quiet", onclick: () => graspSomething(graspedObject) },
@@ -55,6 +57,7 @@ export function askView(index) {
     rejected,
     drop,
     live.element,
+    index.can_verify && expected.element,
     optionsPanel(index, tray, options),
     h("div", { class: "actions" }, askButton, clearButton),
   );
@@ -81,9 +84,10 @@ export function askView(index) {
     const hasTouches = tray.grasps.length > 0;
     element.classList.toggle("has-touches", hasTouches);
     askButton.disabled = !tray.complete;
+    askButton.textContent = expected.value() ? "Verify" : "Ask";
     askButton.parentElement.hidden = !hasTouches;
     again.hidden = !graspedObject;
-    if (!result.hasAttribute("aria-busy")) result.replaceChildren(hasTouches ? waiting(tray) : "");
+    if (!result.hasAttribute("aria-busy")) result.replaceChildren(hasTouches ? waiting(tray, expected.value()) : "");
   }
 
   async function graspSomething(objectId = null) {
@@ -110,6 +114,7 @@ export function askView(index) {
     const own = (asking = new AbortController());
     const touches = tray.grasps.map((grasp) => [...grasp]);
     const background = tray.noContactFrames;
+    const object = expected.value();
     askButton.disabled = true;
     result.setAttribute("aria-busy", "true");
     result.replaceChildren(
@@ -117,17 +122,16 @@ export function askView(index) {
         "p",
         { class: "wait" },
         h("span", { class: "spinner", "aria-hidden": "true" }),
-        `Comparing with ${count(index.photos, "photo")} ...`,
+        `Comparing with ${object || count(index.photos, "photo")} ...`,
       ),
     );
     try {
-      const { answer, id } = await api.query(touches, background, options);
+      const asked = object ? verify(object, touches, background) : search(touches, background);
+      const { grasps, panel, text } = await asked;
       if (own.signal.aborted) return;
-      tray.marks = answer.query.grasps;
+      tray.marks = grasps;
       cards.replaceChildren(...trayCards(tray));
-      const query = { touches, background, options: { ...options }, graspedObject };
-      result.replaceChildren(answerPanel({ index, answer, id, query }));
-      const text = verdict(answer);
+      result.replaceChildren(panel());
       announce(`${text.above}: ${text.claim}. ${text.below}`);
       const { top } = result.getBoundingClientRect();
       if (top < 0 || top > innerHeight / 2) result.scrollIntoView();
@@ -137,6 +141,19 @@ export function askView(index) {
       result.removeAttribute("aria-busy");
       askButton.disabled = !tray.complete;
     }
+  }
+
+  async function search(touches, background) {
+    const { far, ...searchOptions } = options;
+    const { answer, id } = await api.query(touches, background, searchOptions);
+    const query = { touches, background, options: searchOptions, graspedObject };
+    return { grasps: answer.query.grasps, panel: () => answerPanel({ index, answer, id, query }), text: verdict(answer) };
+  }
+
+  async function verify(object, touches, background) {
+    const found = await api.verify(object, touches, background, options.far);
+    const panel = () => verificationPanel(found, graspedObject);
+    return { grasps: found.grasps, panel, text: verificationVerdict(found) };
   }
 
   async function showStored(id) {
@@ -185,9 +202,11 @@ function dropText(fingers) {
     : "One for each grasp; several grasps improve the answer";
 }
 
-function waiting(tray) {
+function waiting(tray, object) {
   const text = tray.complete
-    ? "Press \u201cAsk\u201d to rank the catalogue."
+    ? object
+      ? `Press \u201cVerify\u201d to compare with ${object}.`
+      : "Press \u201cAsk\u201d to rank the catalogue."
     : "A picture is missing: each grasp needs one of each finger.";
   return h("p", { class: "wait" }, text);
 }
@@ -240,6 +259,8 @@ function optionsPanel(index, tray, options) {
       { min: "0.001", max: "0.999", step: "any" },
       Number,
     ),
+    index.can_verify &&
+      number("far", "False-accept rate of a verification", { min: "0.00001", max: "0.5", step: "any" }, Number),
   );
 }
 

@@ -57,6 +57,46 @@ export function verdict(answer) {
   }
 }
 
+/** A log likelihood ratio with one decimal. */
+export function logRatio(value) {
+  return value.toFixed(1).replace(/^-0\.0$/, "0.0").replace("-", "\u2212");
+}
+
+/** The same texts of a verification. */
+export function verificationVerdict({ decision, expected, bounds, log_ratios: ratios }) {
+  const above = `Is it ${expected}?`;
+  if (!bounds) return { ...verdict({ verdict: decision, results: [] }), above };
+  const [last, largest] = [ratios.at(-1), Math.max(...ratios)].map(logRatio);
+  const [accept, reject] = [bounds.accept, bounds.reject].map(logRatio);
+  const range = ({ value, low, high }) => `${percent(value)} (95\u00a0% interval: ${percent(low)} to ${percent(high)})`;
+  switch (decision) {
+    case "accept":
+      return {
+        above,
+        claim: "Accept",
+        below:
+          `The largest log likelihood ratio, ${largest}, reaches ${accept}. ` +
+          `False-accept rate: ${range(bounds.false_accepts)}.`,
+      };
+    case "reject":
+      return {
+        above,
+        claim: "Reject",
+        below:
+          `The log likelihood ratio is ${last}; ${accept} is needed. ` +
+          `False-reject rate: ${range(bounds.false_rejects)}.`,
+      };
+    default:
+      return {
+        above,
+        claim: "Another grasp needed",
+        below:
+          `The log likelihood ratio, ${last}, lies between ${reject} (reject) and ${accept} (accept). ` +
+          "Add a grasp at another place.",
+      };
+  }
+}
+
 /** A sentence on the first object given that the catalogue contains it; older stored answers lack this probability. */
 function ifPresent(best) {
   if (best.probability_if_present == null) return "The nearest objects are shown.";

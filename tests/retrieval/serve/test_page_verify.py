@@ -1,0 +1,124 @@
+"""Verification on the page in a real browser: the expected object, the decision, and its error rates."""
+
+import dataclasses
+
+import pytest
+
+from retrieval.model.checkpoint import load_checkpoint, store_checkpoint
+from retrieval.search.build.build_index import build_index
+from retrieval.search.query.searcher import Searcher
+from tests.browser import address, choose, page, serious
+from tests.verification import POSTERIOR, calibration
+
+
+@pytest.fixture(scope="module")
+def served(model, catalogue, tmp_path_factory):
+    """Function that builds an index whose model accepts and rejects at these log likelihood ratios."""
+
+    def build(accept, reject):
+        folder = tmp_path_factory.mktemp("verified")
+        verification = calibration(accept, reject)
+        made = dataclasses.replace(load_checkpoint(model), verification=verification, posterior=POSTERIOR)
+        store_checkpoint(made, folder / "m.safetensors")
+        build_index(catalogue, load_checkpoint(folder / "m.safetensors"), folder / "index", quiet=True)
+        return folder / "index"
+
+    return build
+
+
+def verify(opened, name, files):
+    choose(opened, "Choose gel images", files)
+    opened.get_by_label("Expected object").fill(name)
+    opened.get_by_text(f"to compare with {name}").wait_for()
+    opened.get_by_role("button", name="Verify").click()
+    opened.locator(".answer").wait_for()
+
+
+def text_of(locator):
+    """Return a text with plain spaces and minus signs."""
+    return locator.inner_text().replace("\u00a0", " ").replace("\u2212", "-")
+
+
+def object_names(index):
+    with Searcher.open(index) as searcher:
+        return sorted({row["object_id"] for row in searcher.generation.rows})
+
+
+@pytest.mark.parametrize(
+    ("accept", "reject", "claim", "sentence"),
+    [
+        (-1e3, -2e3, "Accept", "reaches -1000.0. False-accept rate: 1.0"),
+        (1e3, 999.0, "Reject", "1000.0 is needed. False-reject rate: "),
+        (1e3, -1e3, "Another grasp needed", "lies between -1000.0 (reject) and 1000.0 (accept)."),
+    ],
+)
+def test_the_decision_on_the_expected_object_is_shown_with_its_ratio_and_error_rates(
+    served, browser, files, accept, reject, claim, sentence
+):
+    index = served(accept, reject)
+    name = object_names(index)[0]
+    with Searcher.open(index) as searcher:
+        expected = searcher.verify([files[:2]], name)
+    with address(index) as url, page(browser, url) as opened:
+        verify(opened, name, files[:2])
+        assert opened.locator(".above").inner_text() == f"Is it {name}?"
+        assert opened.locator(".claim").inner_text() == claim
+        below = text_of(opened.locator(".below"))
+        assert sentence in below
+        ratio = f"{expected.log_ratios[-1]:z.1f}"
+        assert ratio in below
+        rates = text_of(opened.get_by_label("Error rates"))
+        assert f"{ratio} after grasp 1" in rates
+        interval = expected.bounds.false_accepts
+        assert f"1.0 % [{100 * interval.low:.1f} %, {100 * interval.high:.1f} %]" in rates
+        assert claim in opened.get_by_role("status").first.inner_text()  # for screen readers
+
+
+@pytest.fixture(scope="module")
+def index_that_verifies(served):
+    return served(1e3, -1e3)
+
+
+def test_the_field_suggests_objects_of_the_catalogue_and_an_empty_field_searches(index_that_verifies, browser, files):
+    names = object_names(index_that_verifies)
+    with address(index_that_verifies) as url, page(browser, url) as opened:
+        opened.get_by_label("Expected object").focus()
+        opened.wait_for_function(f"document.querySelectorAll('#catalogue-objects option').length === {len(names)}")
+        options = opened.locator("#catalogue-objects option")
+        assert sorted(options.evaluate_all("all => all.map((one) => one.value)")) == names
+        verify(opened, names[0], files[:2])
+        opened.get_by_label("Expected object").fill("")
+        opened.get_by_role("button", name="Ask", exact=True).click()
+        opened.locator(".photos").wait_for()
+
+
+def test_the_false_accept_rate_is_an_option_and_a_rate_without_support_is_refused(index_that_verifies, browser, files):
+    name = object_names(index_that_verifies)[0]
+    with address(index_that_verifies) as url, page(browser, url) as opened:
+        opened.get_by_text("Options").click()
+        opened.get_by_label("False-accept rate of a verification").fill("0.001")
+        opened.get_by_label("Expected object").fill(name)
+        choose(opened, "Choose gel images", files[:2])
+        opened.get_by_role("button", name="Verify").click()
+        alert = opened.get_by_role("alert").get_by_text("a false-accept rate of 0.001 needs 246 validation objects")
+        alert.wait_for()
+
+
+def test_a_model_without_error_rates_has_no_field(index, browser):
+    with address(index) as url, page(browser, url) as opened:
+        assert opened.get_by_label("Expected object").count() == 0
+        opened.get_by_text("Options").click()
+        assert opened.get_by_label("False-accept rate").count() == 0
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 390])
+def test_axe_finds_nothing_serious_and_nothing_is_wider_than_the_screen(
+    index_that_verifies, browser, files, width, scheme
+):
+    name = object_names(index_that_verifies)[0]
+    with address(index_that_verifies) as url, page(browser, url, width, color_scheme=scheme) as opened:
+        assert serious(opened) == []
+        verify(opened, name, files)
+        assert serious(opened) == []
+        assert opened.evaluate("document.documentElement.scrollWidth") <= width
