@@ -30,13 +30,9 @@ from retrieval.evaluation.experiment import Experiment
 from retrieval.evaluation.low_contact import find_low_contact_touches, score_low_contact
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import draw_queries
-<<<<<<< HEAD
 from retrieval.evaluation.scoring import Measures, MethodScores, score_method
 from retrieval.evaluation.trec import TREC_FOLDER, write_trec
-=======
-from retrieval.evaluation.scoring import Measures, score_method
 from retrieval.evaluation.verification import score_verification
->>>>>>> verify-eval
 from retrieval.methods import METHODS
 from retrieval.methods.method import Method
 from retrieval.metrics.intervals import compare
