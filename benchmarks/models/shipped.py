@@ -32,7 +32,8 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkp
 from retrieval.model.checkpoint_info import PARTIALS_FROM
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
-from retrieval.model.reference_calibration import ReferenceTouches
+from retrieval.model.posterior import fit_posterior
+from retrieval.model.reference_calibration import ReferenceTouches, fit_reference_calibration
 from retrieval.model.verification import fit_verification
 from retrieval.search import defaults
 from retrieval.training import distil
@@ -55,6 +56,7 @@ TOWERS, PRESET = RIGS / "shipped_towers.toml", "relief-large"
 GRASPS, VALIDATED, VERIFIED = 2, (100, 8), (150, 5)
 """Grasps of each training object; objects that choose the step and calibrate the model, and grasps of each; objects on
 which the bounds of verifications are fitted, and grasps of each."""
+HEAD_STEPS = 1000
 FOREIGN = 8000
 """Number of non-gel pictures for training its check of touches: more than in an ordinary training."""
 DISTIL_STEPS = 4000
@@ -130,7 +132,8 @@ def head_config(folder: Path, towers: Checkpoint) -> Config:
         write_tensors(file, tower.state_dict(), {"from": towers.digest})
         files[f"init_{side}"] = str(file)
     config = load_config(PRESET)
-    return dataclasses.replace(config, training=dataclasses.replace(config.training, **files))
+    training = dataclasses.replace(config.training.with_iterations(HEAD_STEPS), **files)
+    return dataclasses.replace(config, training=training)
 
 
 def make_head(
@@ -152,6 +155,8 @@ def make_head(
     about = {"source": "simulated rigs", "data_digest": data_digest([*grasps[0], *grasps[1]])}
     made = dataclasses.replace(made, provenance=made.provenance | about, split=split_of(*grasps))
     made = distilled(made, *features)
+    if made.queries is not None:  # the file stays below 12 MB
+        made = dataclasses.replace(made, queries=made.queries[::2])
     store(calibrated(made, folder, fingers), folder / defaults.SHIPPED[fingers])
 
 
@@ -238,27 +243,41 @@ def calibrate_shipped(arguments: argparse.Namespace) -> int:
 
 
 def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
-    """Return a checkpoint with its posterior, gel check, calibration of reference touches and bounds."""
+    """Return a checkpoint with its gel check, posterior, calibration of reference touches and bounds."""
     validation, verification = (load_grasps(folder / name) for name in ("validation", "verification"))
     if fingers == 1:
         validation, verification = ([each_finger(grasp)[0] for grasp in part] for part in (validation, verification))
-    both = [*validation, *verification]
-    features, device = encode_recording(both, made.matcher, made.config, folder / "features"), default_device()
+    both, cache = [*validation, *verification], folder / "features"
+    features, device = encode_recording(both, made.matcher, made.config, cache), default_device()
     with FrozenFeatures(made.config, device, features_by_image(both, features, device)) as source:
         made = with_verdicts(made, source, verification, validation, foreign=FOREIGN)
-    trials, photos = scored_touches(made, verification, folder / "features")
+    return with_calibrations(made, validation, verification, cache)
+
+
+def with_calibrations(made: Checkpoint, validation: list[Grasp], verification: list[Grasp], cache: Path) -> Checkpoint:
+    """Return a checkpoint with its posterior and calibration of reference touches, fitted on all validation grasps."""
+    (touches, _), (pooled, _) = (scored_touches(made, validation, cache, pooled=each) for each in (False, True))
+    made = dataclasses.replace(
+        made,
+        posterior=fit_posterior(touches.scored),
+        references=fit_reference_calibration(touches),
+        pooled_posterior=fit_posterior(pooled.scored),
+        pooled_references=fit_reference_calibration(pooled),
+    )
+    trials, photos = scored_touches(made, verification, cache)
     assert made.posterior is not None
     embeddings = photo_embeddings(made.matcher, torch.stack(list(photos.values())))
-    bounds = fit_verification(trials.scored, embeddings, made.posterior)
-    return dataclasses.replace(made, verification=bounds)
+    return dataclasses.replace(made, verification=fit_verification(trials.scored, embeddings, made.posterior))
 
 
-def scored_touches(made: Checkpoint, grasps: list[Grasp], cache: Path) -> tuple[ReferenceTouches, dict[Path, Tensor]]:
+def scored_touches(
+    made: Checkpoint, grasps: list[Grasp], cache: Path, *, pooled: bool = False
+) -> tuple[ReferenceTouches, dict[Path, Tensor]]:
     """Return the touches of grasps, scored with their photos, and the features of each photo."""
     features, device = encode_recording(grasps, made.matcher, made.config, cache), default_device()
     with FrozenFeatures(made.config, device, features_by_image(grasps, features, device)) as source:
         touches, photos = recorded_features(made.matcher, source, grasps, what="calibration", quiet=False)
-    trials = posterior_touches(made.matcher, grasps, touches, photos)
+    trials = posterior_touches(made.matcher, grasps, touches, photos, pooled=pooled)
     assert trials is not None
     return trials, photos
 

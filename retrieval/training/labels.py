@@ -88,7 +88,7 @@ class LabelLoss(nn.Module):
         self.touch, self.photo = (LabelHead(count, self.labels) for count in self.counts)
 
     def forward(self, batch: PairBatch, touch_features: Tensor, photo_features: Tensor) -> Tensor:
-        """Return the sum of both losses (scalar) for a batch and its features, as `Matcher.touch_features` gives them."""
+        """Return the sum of both losses (scalar) of a batch and its features (`Matcher.touch_features`)."""
         touch, photo = ([self.labels[row] for row in part] for part in (batch.touch_objects, batch.photo_objects))
         each = touch_features.reshape(len(touch) * self.fingers, -1)[:, : self.counts[0]]
         repeated = [label for label in touch for _ in range(self.fingers)]
