@@ -37,6 +37,7 @@ from indexes.store.tables import Block
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.checkpoint_info import fingerprint
 from retrieval.model.encode import encode_photos
+from retrieval.model.stored_partials import to_stored
 from retrieval.search.build.build_index import build_index
 from retrieval.search.build.operating import SearchRequirements
 from retrieval.search.defaults import shipped_model
@@ -153,13 +154,13 @@ def write_index(catalogue: Path, out: Path, checkpoint: Checkpoint) -> None:
         digest = hashlib.sha256(path.read_bytes()).hexdigest()
         rows.append({"id": name, "object_id": path.parent.name, "path": name, "digest": digest, "metadata": {}})
     partials, requirements = (
-        rng.normal(size=(len(paths), matcher.partial_width)).astype(np.float16),
+        rng.uniform(-1, 1, (len(paths), matcher.partial_width)).astype(np.float32),
         asdict(SearchRequirements()),
     )
     measured = {"k": 100, "top1_agreement": 1.0, "interval": [0.99, 1.0], "queries": 398, "ms": 1.0}
     measured |= {"exhaustive_ms": 1.0, "kind": "flat", "parameters": {}, "requirements": requirements, "changed": 0}
     IndexStore(out).write_blocks(
-        [Block(rows, embeddings, {"partials": partials})],
+        [Block(rows, embeddings, to_stored(partials, matcher.pooled_width))],
         {"calibration": checkpoint.posterior.to_dict()} if checkpoint.posterior else {},
         fingerprint=fingerprint(checkpoint),
         about={

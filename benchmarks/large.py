@@ -32,8 +32,8 @@ SIZES = ((1024, 1024), (2048, 2048), (4000, 3000))
 def measure(photos: int = PHOTOS, side: int = SIDE, sizes: tuple[tuple[int, int], ...] = SIZES) -> Iterator[ResultLine]:
     """Yield a line for each (width, height), and one for photos of the first side that were saved again."""
     checkpoint = load_checkpoint(shipped_model())
-    tower, plain = checkpoint.config.matcher.tower, checkpoint.config.preprocessing
-    reduced = dataclasses.replace(plain, reduced=True)
+    tower, reduced = checkpoint.config.matcher.tower, checkpoint.config.preprocessing
+    plain = dataclasses.replace(reduced, reduced=False)
     pictures = [photographed(number, side) for number in range(photos)]
     with one_thread():
         for size in sizes:

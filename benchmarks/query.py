@@ -21,6 +21,7 @@ from retrieval.model.export import touch_encoder_to_onnx
 from retrieval.model.fusion import Matcher
 from retrieval.model.onnx_encoder import OnnxEncoder, with_checksum
 from retrieval.model.posterior import Posterior
+from retrieval.model.stored_partials import to_stored
 from retrieval.model.touches import TouchEncoder
 from retrieval.search.defaults import shipped_model
 from retrieval.search.query.searcher import Searcher
@@ -123,7 +124,7 @@ def stored_checkpoint(folder: Path, matcher: Matcher, config: Config) -> Checkpo
 def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
     """Write an index of synthetic photos, three of each object: random partial activations and unit embeddings."""
     rng, matcher = np.random.default_rng(0), checkpoint.config.matcher
-    partials = rng.normal(size=(photos, matcher.partial_width)).astype(np.float16)
+    partials = rng.uniform(-1, 1, (photos, matcher.partial_width)).astype(np.float32)
     embeddings = rng.normal(size=(photos, matcher.embedding_dim)).astype(np.float32)
     embeddings /= np.linalg.norm(embeddings, axis=1, keepdims=True)
     names = [f"object-{number // 3:06d}/{number % 3}.jpg" for number in range(photos)]
@@ -133,7 +134,7 @@ def write_index(out: Path, checkpoint: Checkpoint, photos: int) -> None:
             for number, name in enumerate(names)
         ],
         embeddings,
-        {"partials": partials},
+        to_stored(partials, matcher.pooled_width),
         {"calibration": Posterior().to_dict()},
         fingerprint=fingerprint(checkpoint),
         about={"catalogue": str(out), "checkpoint": str(checkpoint.path), "candidates": {"k": CANDIDATES}},

@@ -138,7 +138,7 @@ class BlendedPhotos:
 
 def blended_photos(model: Path, recording: Path, features: Path | None, by: str = "candidate_encoder") -> BlendedPhotos:
     """Return the blended photos of a recording; `features` caches the encoding."""
-    checkpoint = load_checkpoint(model)
+    checkpoint = load_checkpoint(model).without_cells()  # blended photos have no cells
     if checkpoint.queries is None or checkpoint.matcher.candidate_encoder is None:
         raise SystemExit(f"{model} has no stored touches or no candidate encoder; train it again")
     if by == "contrastive" and not checkpoint.config.matcher.cosine:

@@ -259,7 +259,7 @@ def main() -> None:
     parser.add_argument("--ray", action="store_true", help="also measure Ray, with the first of the sizes")
     parser.add_argument("--json", action="store_true", help="one JSON document per line")
     arguments = parser.parse_args()
-    crowd = drawn_photos(load_checkpoint(arguments.model))
+    crowd = drawn_photos(load_checkpoint(arguments.model).without_cells())
     with tempfile.TemporaryDirectory() as name:
         places = {f"{size:.0e}": Path(name) / str(int(size)) for size in arguments.sizes}
         for size, place in zip(arguments.sizes, places.values(), strict=True):

@@ -137,6 +137,11 @@ def recording_source(folder: Path) -> str:
     return str(read_info(folder)["source"])
 
 
+def recorded_objects(folder: Path) -> dict[str, Any]:
+    """Return what the recording.json of a recording states of each object; empty if it states nothing."""
+    return dict(read_info(folder).get("objects", {}))
+
+
 def finger_count(grasps: Sequence[Grasp]) -> int:
     """Return the number of gel images of each touch. Raises DatasetError if it differs between grasps."""
     first = grasps[0]

@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from _touch_retrieval.files import read_json, read_regular
-from retrieval.data.dataset import Grasp
+from retrieval.data.dataset import Grasp, recorded_objects
 from retrieval.errors import DatasetError
-from robot.recording.folder import read_info
 
 KINDS = ("photo", "touch")
 FAMILIES = ("relief", "shape")
@@ -110,9 +109,8 @@ def load_object_labels(recording: Path) -> dict[str, ObjectLabels]:
     Raises:
         DatasetError: The recording has no labels, or they are damaged.
     """
-    objects = read_info(recording).get("objects", {})
     try:
-        return {name: ObjectLabels.from_dict(row) for name, row in objects.items()}
+        return {name: ObjectLabels.from_dict(row) for name, row in recorded_objects(recording).items()}
     except (ValueError, AttributeError) as error:
         raise DatasetError(f"{recording}: recording.json must hold the labels of each object; {error}") from error
 

@@ -141,10 +141,8 @@ class TrainingConfig:
         freeze_batch_norm: Keep the batch statistics of the initial weights.
         freeze_towers: Train only the layers after the towers. Every image is then encoded once per training run.
         freeze_stem: Keep the first layers of the towers (`Tower.stem_layers`) frozen if the towers are trained.
-        augment: Turn, scale, shift, flip and relight the images of each step at random, if the towers are trained
-            (`retrieval.training.augmentation`).
-        predict_labels: Weight of the loss of predicting the labels of a simulated object, its relief and shape, from
-            the features of each tower (`retrieval.training.labels`), if the towers are trained.
+        augment: Change the images of each step at random (`retrieval.training.augmentation`), if towers are trained.
+        predict_labels: Weight of the loss of predicting relief and shape from each tower (`retrieval.training.labels`).
         distil_steps: Steps that distil the candidate encoder after training (`retrieval.training.distil`).
         validation_fraction: Fraction of the objects that are validation objects.
         test_fraction: Fraction of the objects that are test objects.

@@ -113,7 +113,7 @@ class BatchImages:
 class TrainedFeatures(BatchImages):
     """Features of towers in training: each rank encodes a part of the images and gathers the other parts."""
 
-    def prepare(self, matcher: Matcher, batch: PairBatch, step: int) -> "Future[LoadedBatch]":
+    def prepare(self, matcher: Matcher, batch: PairBatch, step: int = 0) -> "Future[LoadedBatch]":
         """Start loading this rank's part of the images of step `step`."""
         return self._ahead.submit(self._load, batch, step)
 
