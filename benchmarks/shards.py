@@ -97,7 +97,7 @@ def drawn_photos(checkpoint: Checkpoint, objects: int = 60) -> BlendedPhotos:
 def write(crowd: BlendedPhotos, photos: int, shards: int, out: Path) -> dict[str, float]:
     """Write the catalogue as one folder, `out`/index, and as shards, `out`/cluster; return seconds and bytes."""
     model = crowd.checkpoint
-    about = {"checkpoint": str(model.path.resolve()), "catalogue": "/drawn"}
+    about = {"checkpoint": str(model.path.resolve()), "catalogue": "/drawn", "cells": False}
     calibration = {"calibration": model.posterior.to_dict()} if model.posterior else {}
     options: dict[str, Any] = {"fingerprint": fingerprint(model), "self_check": 16, "threads": 1}
     start = time.perf_counter()

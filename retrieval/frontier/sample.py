@@ -85,7 +85,7 @@ class Sample:
     @cached_property
     def checkpoint(self) -> Checkpoint:
         """The loaded model."""
-        return load_checkpoint(self.model)
+        return load_checkpoint(self.model).without_cells()
 
     @cached_property
     def grasps(self) -> list[Grasp]:

@@ -32,5 +32,5 @@ def test_a_replayed_recording_gives_the_same_search_results_as_its_source(tmp_pa
         top1_objects = []
         for folder, each in ((source, before), (made, grasp)):
             touch = [folder / each.touches[finger] for finger in "ab"]
-            top1_objects.append(searcher.query([touch], top=1).results[0].object_id)
+            top1_objects.append([found.object_id for found in searcher.query([touch], top=1).results])
         assert top1_objects[0] == top1_objects[1]
