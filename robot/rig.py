@@ -99,7 +99,7 @@ class Rig:
         return [f"object-{number:04}" for number in range(1, count + 1)]
 
     def labels(self, object_id: str) -> Mapping[str, float | bool | str]:
-        """Return what the rig knows of an object, for recording.json; nothing, unless the rig is simulated."""
+        """Return the labels of an object, for recording.json. Only a simulated rig has labels; others return none."""
         return {}
 
     def prepare(self, object_id: str, number: int) -> None:

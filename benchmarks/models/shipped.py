@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from retrieval.commands.main import main as run_command
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps
@@ -32,8 +31,6 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint, store_checkp
 from retrieval.model.checkpoint_info import PARTIALS_FROM
 from retrieval.model.config import Config, load_config
 from retrieval.model.encode import default_device, one_thread
-from retrieval.model.posterior import fit_posterior
-from retrieval.model.reference_calibration import ReferenceTouches, fit_reference_calibration
 from retrieval.model.verification import fit_verification
 from retrieval.search import defaults
 from retrieval.training import distil
@@ -126,14 +123,19 @@ def train_towers(folder: Path, parts: Sequence[Path], train: list[Grasp], valida
 
 def head_config(folder: Path, towers: Checkpoint) -> Config:
     """Return the configuration of a head on the trained towers, and write the weights that it names."""
-    files = {}
-    for side, tower in (("touch", towers.matcher.touch_tower), ("photo", towers.matcher.photo_tower)):
-        file = folder / f"trained-{side}-tower.safetensors"
-        write_tensors(file, tower.state_dict(), {"from": towers.digest})
-        files[f"init_{side}"] = str(file)
     config = load_config(PRESET)
-    training = dataclasses.replace(config.training.with_iterations(HEAD_STEPS), **files)
+    training = dataclasses.replace(config.training.with_iterations(HEAD_STEPS), **tower_weights(folder, towers))
     return dataclasses.replace(config, training=training)
+
+
+def tower_weights(folder: Path, made: Checkpoint) -> dict[str, str]:
+    """Write the towers of a checkpoint into `folder`; return the settings that name them as initial weights."""
+    files = {}
+    for side, tower in (("touch", made.matcher.touch_tower), ("photo", made.matcher.photo_tower)):
+        file = folder / f"trained-{side}-tower.safetensors"
+        write_tensors(file, tower.state_dict(), {"from": made.digest})
+        files[f"init_{side}"] = str(file)
+    return files
 
 
 def make_head(
@@ -193,22 +195,17 @@ def collect_training(arguments: argparse.Namespace) -> int:
     for rig, (first, seeds, objects) in PARTS.items():
         for seed in range(first, first + seeds):
             out = arguments.folder / "recordings" / str(seed)
-            size = ("--objects", objects, "--grasps", GRASPS, "--seed", seed, "--jobs", arguments.jobs)
-            if code := retrieve("collect", "--rig", RIGS / rig, *size, "--out", out):
+            if code := collect(out, RIGS / rig, objects, GRASPS, seed, arguments.jobs):
                 return code
     return 0
 
 
 def collect_calibration(arguments: argparse.Namespace) -> int:
     """Collect the grasps of the validation objects, and of those on which the bounds of verifications are fitted."""
-    for name, (objects, grasps), seed in (
-        ("validation", VALIDATED, SEED_VALIDATED),
-        ("verification", VERIFIED, SEED_VERIFIED),
-    ):
-        size = ("--objects", objects, "--grasps", grasps, "--seed", seed, "--jobs", arguments.jobs)
-        if code := retrieve("collect", "--rig", RIG, *size, "--out", arguments.folder / name):
-            return code
-    return 0
+    folder, jobs = arguments.folder, arguments.jobs
+    return collect(folder / "validation", RIG, *VALIDATED, SEED_VALIDATED, jobs) or collect(
+        folder / "verification", RIG, *VERIFIED, SEED_VERIFIED, jobs
+    )
 
 
 def pretrain_towers(arguments: argparse.Namespace) -> int:
@@ -247,39 +244,16 @@ def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     validation, verification = (load_grasps(folder / name) for name in ("validation", "verification"))
     if fingers == 1:
         validation, verification = ([each_finger(grasp)[0] for grasp in part] for part in (validation, verification))
-    both, cache = [*validation, *verification], folder / "features"
-    features, device = encode_recording(both, made.matcher, made.config, cache), default_device()
+    both, device = [*validation, *verification], default_device()
+    features = encode_recording(both, made.matcher, made.config, folder / "features")
     with FrozenFeatures(made.config, device, features_by_image(both, features, device)) as source:
-        made = with_verdicts(made, source, verification, validation, foreign=FOREIGN)
-    return with_calibrations(made, validation, verification, cache)
-
-
-def with_calibrations(made: Checkpoint, validation: list[Grasp], verification: list[Grasp], cache: Path) -> Checkpoint:
-    """Return a checkpoint with its posterior and calibration of reference touches, fitted on all validation grasps."""
-    (touches, _), (pooled, _) = (scored_touches(made, validation, cache, pooled=each) for each in (False, True))
-    made = dataclasses.replace(
-        made,
-        posterior=fit_posterior(touches.scored),
-        references=fit_reference_calibration(touches),
-        pooled_posterior=fit_posterior(pooled.scored),
-        pooled_references=fit_reference_calibration(pooled),
-    )
-    trials, photos = scored_touches(made, verification, cache)
+        made = with_verdicts(made, source, verification, validation, foreign=FOREIGN, max_grasps=len(both))
+        touches, photos = recorded_features(made.matcher, source, verification, what="verification")
+    trials = posterior_touches(made.matcher, verification, touches, photos)
+    assert trials is not None
     assert made.posterior is not None
     embeddings = photo_embeddings(made.matcher, torch.stack(list(photos.values())))
     return dataclasses.replace(made, verification=fit_verification(trials.scored, embeddings, made.posterior))
-
-
-def scored_touches(
-    made: Checkpoint, grasps: list[Grasp], cache: Path, *, pooled: bool = False
-) -> tuple[ReferenceTouches, dict[Path, Tensor]]:
-    """Return the touches of grasps, scored with their photos, and the features of each photo."""
-    features, device = encode_recording(grasps, made.matcher, made.config, cache), default_device()
-    with FrozenFeatures(made.config, device, features_by_image(grasps, features, device)) as source:
-        touches, photos = recorded_features(made.matcher, source, grasps, what="calibration", quiet=False)
-    trials = posterior_touches(made.matcher, grasps, touches, photos, pooled=pooled)
-    assert trials is not None
-    return trials, photos
 
 
 def distilled(made: Checkpoint, train: Features, validation: Features) -> Checkpoint:
@@ -303,7 +277,7 @@ def store(made: Checkpoint, out: Path) -> None:
 def score_shipped(arguments: argparse.Namespace) -> int:
     """Write the whole report on objects of another seed, touched by other gels."""
     recording = arguments.folder / "recording"
-    if code := collect(recording, arguments, SEED_SCORED):
+    if code := collect(recording, RIG, arguments.objects, arguments.grasps, SEED_SCORED, arguments.jobs):
         return code
     split = recording.with_name("split.json")
     split.write_text(json.dumps(draw_split(load_grasps(recording), FITTED, FITTED).to_dict(), indent=1) + "\n")
@@ -328,19 +302,18 @@ def first_finger(recording: Path) -> Path:
     return out
 
 
-def draw_split(grasps: list[Grasp], train: int | None, validation: int) -> Split:
-    """Split objects: `validation` for validation, `train` for training (None for all others), the rest for test."""
+def draw_split(grasps: list[Grasp], train: int, validation: int) -> Split:
+    """Split objects: `validation` for validation, `train` for training, the rest for test."""
     names = sorted({grasp.object_id for grasp in grasps})
     names = [str(name) for name in np.random.default_rng(0).permutation(names)]
-    validated, others = names[:validation], names[validation:]
-    trained = others if train is None else others[:train]
-    return Split(0, tuple(sorted(trained)), tuple(sorted(validated)), tuple(sorted(set(others) - set(trained))))
+    parts = names[validation : validation + train], names[:validation], names[validation + train :]
+    return Split(0, *(tuple(sorted(part)) for part in parts))
 
 
-def collect(recording: Path, arguments: argparse.Namespace, seed: int) -> int:
-    """Run `retrieve collect` on the simulated rig."""
-    size = ("--objects", arguments.objects, "--grasps", arguments.grasps, "--seed", seed, "--jobs", arguments.jobs)
-    return retrieve("collect", "--rig", RIG, *size, "--out", recording)
+def collect(out: Path, rig: Path, objects: int, grasps: int, seed: int, jobs: int) -> int:
+    """Run `retrieve collect` on a simulated rig."""
+    size = ("--objects", objects, "--grasps", grasps, "--seed", seed, "--jobs", jobs)
+    return retrieve("collect", "--rig", rig, *size, "--out", out)
 
 
 def retrieve(*arguments: object) -> int:

@@ -138,7 +138,7 @@ def recording_source(folder: Path) -> str:
 
 
 def recorded_objects(folder: Path) -> dict[str, Any]:
-    """Return what the recording.json of a recording states of each object; empty if it states nothing."""
+    """Return the facts of each object in the recording.json of a recording, by object id; empty if it has none."""
     return dict(read_info(folder).get("objects", {}))
 
 

@@ -39,7 +39,7 @@ def augment(
     cosine, sine = torch.cos(turn) * size * visible, torch.sin(turn) * size * visible
     shift = draw(-0.1, 0.1, 2) if visible < 1 else draw(-0.05, 0.05, 2)
     maps = torch.stack([across * cosine, -down * sine, shift[:, 0], across * sine, down * cosine, shift[:, 1]], 1)
-    result = _sample_grid(images, maps.view(count, 2, 3), visible)
+    result = sample_grid(images, maps.view(count, 2, 3), visible)
     if kind == "photo":
         grey, towards = result.mean(1, keepdim=True), draw(0.0, 1.0, 1, 1, 1)
         result = torch.lerp(result, grey.expand_as(result), (towards + 0.5).clamp(max=1.0) * (towards > 0.25))
@@ -49,12 +49,6 @@ def augment(
         result = (result - 0.5) * draw(0.7, 1.4, 1, 1, 1) + 0.5
     noise = torch.from_numpy(rng.standard_normal(result.shape, dtype=np.float32))
     return (result + 0.01 * noise).clamp(0.0, 1.0)
-
-
-def centre_crop(images: Tensor, visible: float) -> Tensor:
-    """Return the middle of images (B, 3, H, W): the fraction `visible` of each side."""
-    same = torch.tensor([[visible, 0.0, 0.0], [0.0, visible, 0.0]]).expand(len(images), 2, 3)
-    return _sample_grid(images, same, visible)
 
 
 def augment_touches(touches: Tensor, flipped: NDArray[np.bool_], rng: np.random.Generator) -> Tensor:
@@ -72,7 +66,8 @@ def augment_photos(photos: Tensor, views: int, flipped: NDArray[np.bool_], rng: 
     return torch.cat(list(result.unbind(1)), dim=3).contiguous(memory_format=torch.channels_last)
 
 
-def _sample_grid(images: Tensor, maps: Tensor, visible: float) -> Tensor:
+def sample_grid(images: Tensor, maps: Tensor, visible: float) -> Tensor:
+    """Return images (B, 3, ...), a fraction `visible` of each side, sampled by affine maps (B, 2, 3) of coordinates."""
     side = [max(round(visible * length), 1) for length in images.shape[2:]]
     grid = functional.affine_grid(maps, [len(images), 3, *side], align_corners=False)
     return functional.grid_sample(images.contiguous(), grid, padding_mode="reflection", align_corners=False)

@@ -1,6 +1,6 @@
 """Features of the distinct images of pairs, from towers in training or from frozen towers with cached features."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -196,19 +196,13 @@ class FrozenFeatures(BatchImages):
         new = {grasp.grasp_id: grasp for grasp in batch.grasps if grasp.grasp_id not in self._features}
         if new:
             images = map_in_order(self._workers, self.touch, new.values())
-            self._features.update(zip(new, self._encode_touches(matcher, images), strict=True))
+            self._features.update(zip(new, touch_features(matcher, images), strict=True))
         photos = [path for path in batch.photos if path not in self._features]
         if photos:
             photo_images = map_in_order(self._workers, self.photo, photos)
-            self._features.update(zip(photos, self._encode_photos(matcher, photo_images), strict=True))
+            self._features.update(zip(photos, photo_features(matcher, photo_images), strict=True))
         touches = torch.stack([self._features[grasp.grasp_id] for grasp in batch.grasps])
         return LoadedBatch(batch, touches, torch.stack([self._features[path] for path in batch.photos]))
-
-    def _encode_touches(self, matcher: Matcher, touches: Iterable[Sequence[Image]]) -> Tensor:
-        return touch_features(matcher, touches)
-
-    def _encode_photos(self, matcher: Matcher, photos: Iterable[Image]) -> Tensor:
-        return photo_features(matcher, photos)
 
     def step_context(self) -> AbstractContextManager[None]:
         """Return the context of a training step: one thread, since more do not speed up the head's small products."""

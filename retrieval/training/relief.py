@@ -30,7 +30,7 @@ from retrieval.model.config import Config
 from retrieval.model.encode import autocast, default_device, to_batch
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
-from retrieval.training.augmentation import augment, centre_crop
+from retrieval.training.augmentation import augment, sample_grid
 from retrieval.training.disk_image_cache import DiskImageCache
 from retrieval.training.fit import RATE, Plan, fit
 from retrieval.training.labels import LabelHead
@@ -145,7 +145,6 @@ class ReliefTraining:
         self.device, seed = default_device(), config.training.seed
         objects = sorted({picture.object_id for picture in pictures})
         count = max(1, min(round(VALIDATION * len(objects)), MAX_VALIDATION_OBJECTS))
-        self.visible = VISIBLE_FRACTION if kind == "photo" else 1.0
         self.labels = labels_digest(pictures)
         held_out = set(np.random.default_rng([seed, 1]).permutation(objects)[:count].tolist())
         self.pictures = [picture for picture in pictures if picture.object_id not in held_out]
@@ -218,7 +217,8 @@ class ReliefTraining:
     def _batch(self, step: int) -> tuple[list[LabelledPicture], Tensor]:
         rng = np.random.default_rng([self.config.training.seed, 2, step])
         chosen = [self.pictures[row] for row in rng.integers(len(self.pictures), size=BATCH)]
-        return chosen, augment(self._images(chosen, rng), self.kind, rng, visible=self.visible)
+        visible = VISIBLE_FRACTION if self.kind == "photo" else 1.0
+        return chosen, augment(self._images(chosen, rng), self.kind, rng, visible=visible)
 
     def _loss(self, batch: tuple[list[LabelledPicture], Tensor]) -> Tensor:
         pictures, images = batch
@@ -241,7 +241,7 @@ class ReliefTraining:
         self.tower.eval()
         self.head.eval()
         parts = [self.validation[start : start + BATCH] for start in range(0, len(self.validation), BATCH)]
-        outputs = [self.head(self._features(self._middle(self._images(part)))) for part in parts]
+        outputs = [self.head(self._features(centre_crop(self._images(part), self.kind))) for part in parts]
         *families, sizes = (torch.cat(part).cpu().numpy() for part in zip(*outputs, strict=True))
         accuracies = {}
         for index, (name, known, logits) in enumerate(zip(FAMILIES, self.head.families, families, strict=True)):
@@ -261,13 +261,6 @@ class ReliefTraining:
             sizes={name: _correlation(sizes[has_relief, at], targets[has_relief, at]) for at, name in enumerate(SIZES)},
         )
 
-    def _middle(self, images: Tensor) -> Tensor:
-        """Return images as the matcher uses them: the middle of a photo in grey, or a whole gel image."""
-        if self.kind == "touch":
-            return images
-        middle = centre_crop(images, self.visible)
-        return middle.mean(1, keepdim=True).expand_as(middle)
-
     def _identity(self) -> dict[str, Any]:
         """Return the settings that must not change between a training run and its resumption."""
         return {"config": self.config.to_dict(), "iterations": self.iterations, "pictures": self.labels}
@@ -282,6 +275,15 @@ class ReliefTraining:
             CheckpointError: There is no state, or it belongs to another training run.
         """
         self.step = load_state(out, self.modules, self.optimizer, self._identity())["step"]
+
+
+def centre_crop(images: Tensor, kind: str) -> Tensor:
+    """Return images for evaluation: the middle of a photo in grey, or a whole gel image."""
+    if kind == "touch":
+        return images
+    same = torch.tensor([[VISIBLE_FRACTION, 0.0, 0.0], [0.0, VISIBLE_FRACTION, 0.0]]).expand(len(images), 2, 3)
+    middle = sample_grid(images, same, VISIBLE_FRACTION)
+    return middle.mean(1, keepdim=True).expand_as(middle)
 
 
 def _correlation(predictions: NDArray[np.float32], targets: NDArray[np.float32]) -> float:

@@ -63,6 +63,7 @@ def with_verdicts(
     validation: Sequence[Grasp],
     *,
     foreign: int = FOREIGN_COUNT,
+    max_grasps: int = MAX_GRASPS,
     quiet: bool = False,
     should_stop: StopRequested = lambda: False,
 ) -> Checkpoint:
@@ -77,6 +78,7 @@ def with_verdicts(
         train: Grasps of training objects.
         validation: Grasps of validation objects.
         foreign: Number of foreign pictures for fitting.
+        max_grasps: Largest number of grasps of each part that are used.
         quiet: No progress on stderr.
         should_stop: As for `recorded_features`.
 
@@ -84,7 +86,7 @@ def with_verdicts(
         JobInterrupted: `should_stop()` returned True.
     """
     seed, matcher = made.config.training.seed, made.matcher
-    train, validation = _sample_grasps(train, seed), _sample_grasps(validation, seed)
+    train, validation = (_sample_grasps(part, seed)[:max_grasps] for part in (train, validation))
     if not train or not validation:
         return made
     touches, photos = recorded_features(
@@ -113,13 +115,13 @@ def with_verdicts(
 
 
 def _sample_grasps(grasps: Sequence[Grasp], seed: int) -> list[Grasp]:
-    """Return at most MAX_GRASPS grasps, object by object in random order."""
+    """Return the grasps object by object, in random order of the objects."""
     by_object: dict[str, list[Grasp]] = {}
     for grasp in grasps:
         by_object.setdefault(grasp.object_id, []).append(grasp)
     names = sorted(by_object)
     order = np.random.default_rng([seed, 5]).permutation(len(names))
-    return [grasp for index in order for grasp in by_object[names[index]]][:MAX_GRASPS]
+    return [grasp for index in order for grasp in by_object[names[index]]]
 
 
 # The posterior ---------------------------------------------------------------------------------------------

@@ -15,9 +15,9 @@ from retrieval.errors import CheckpointError, ConfigError, DatasetError
 from retrieval.model.checkpoint import read_tensors
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.training import relief
-from retrieval.training.augmentation import augment, centre_crop
+from retrieval.training.augmentation import augment
 from retrieval.training.initial_weights import build_matcher
-from retrieval.training.relief import train_relief
+from retrieval.training.relief import centre_crop, train_relief
 
 CONFIG = Config(
     MatcherConfig(tower="small", tower_output="pooled", hidden=8),
@@ -138,9 +138,12 @@ def test_augmentation_keeps_a_gels_left_and_right_and_its_lamps():
     assert (images[:, 2, :, 15:].mean((1, 2)) > images[:, 2, :, :5].mean((1, 2))).all()
 
 
-def test_photos_are_evaluated_by_their_middle():
+def test_photos_are_evaluated_by_their_grey_middle():
     photo = torch.rand(2, 3, 20, 20)
-    torch.testing.assert_close(centre_crop(photo, 0.8), photo[:, :, 2:18, 2:18], atol=1e-5, rtol=0)
+    middle = centre_crop(photo, "photo")
+    assert middle.shape == (2, 3, 16, 16)
+    torch.testing.assert_close(middle[:, 1], photo[:, :, 2:18, 2:18].mean(1), atol=1e-5, rtol=0)
+    assert centre_crop(photo, "touch") is photo
 
 
 @pytest.mark.parametrize(
