@@ -28,8 +28,8 @@ from robot.grasping.attempt import AttemptRunner, GraspAttempt
 from robot.grasping.gates import ContactAreaGate, Gate, RecordedTouches, apply_gate
 from robot.grasping.settings import AttemptSettings
 from robot.recording.attempt_log import UNGRASPABLE, AttemptLog, LoggedAttempt, Tally, tally
-from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, software_version
-from robot.recording.grasp import check_name
+from robot.recording.folder import INFO_FILE, RecordingWriter, read_info, read_recording, software_version
+from robot.recording.grasp import RecordedGrasp, check_name
 from robot.rig import Rig
 from robot.workers import Work, WorkerPool
 
@@ -115,6 +115,7 @@ def collect(
     gate_name: str | None = None,
     jobs: int = 1,
     progress: Callable[[Progress], None] | None = None,
+    is_enough: Callable[[Sequence[RecordedGrasp]], bool] | None = None,
 ) -> list[Tally]:
     """Collect grasps into a recording, or continue an existing one.
 
@@ -128,6 +129,7 @@ def collect(
         gate_name: Name of the gate; it must be the same when a collection continues.
         jobs: Processes, each with its own rig.
         progress: Called after each attempt.
+        is_enough: Ends an object early: called with its accepted grasps after each one.
 
     Returns:
         The counts of each object.
@@ -167,7 +169,7 @@ def collect(
         with RecordingWriter(out, info) as writer, AttemptLog(Path(out), writer.grasp_ids) as log:
             if known := {name: dict(labels) for name in names if (labels := rig.labels(name))}:
                 writer.update_info(objects=known)
-            collection = _Collection(writer, log, names, settings, gate, progress)
+            collection = _Collection(writer, log, names, settings, gate, progress, is_enough)
             with WorkerPool(jobs, attempter.run, functools.partial(_make_work, make_rig, seed, attempt)) as workers:
                 collection.run(workers)
     return [collection.tallies[name] for name in names]
@@ -253,13 +255,19 @@ class _Collection:
         settings: CollectSettings,
         gate: Gate,
         progress: Callable[[Progress], None] | None,
+        is_enough: Callable[[Sequence[RecordedGrasp]], bool] | None,
     ) -> None:
         self.writer, self.log, self.names, self.settings, self.gate = writer, log, names, settings, gate
         _check_log(log, writer, names, settings.rounds)
         self.tallies = {name: Tally(name) for name in names} | tally(log.attempts)
         self._seconds = log.attempts[-1].ended_s if log.attempts else 0.0
         self._pending: dict[str, deque[Callable[[], GraspAttempt]]] = defaultdict(deque)
-        self._progress = progress
+        self._progress, self._is_enough = progress, is_enough
+        self._accepted: dict[str, list[RecordedGrasp]] = defaultdict(list)
+        self._ended: set[str] = set()
+        for grasp in read_recording(writer.folder).grasps if is_enough and writer.grasp_ids else ():
+            if grasp.grasped:  # a collection continues
+                self._add_accepted(grasp)
         self._start, self._done_at_start = time.monotonic(), self._count_done()
 
     def run(self, workers: WorkerPool[GraspAttempt]) -> None:
@@ -295,7 +303,7 @@ class _Collection:
         With `ahead`, assume that all pending attempts are accepted.
         """
         pending, counts = len(self._pending[name]) if ahead else 0, self.tallies[name]
-        if counts.skipped is not None:
+        if counts.skipped is not None or name in self._ended:
             return False
         return counts.accepted + pending < target and counts.attempts + pending < self.settings.limit
 
@@ -305,7 +313,7 @@ class _Collection:
         logged = self._log_entry(attempt)
         self.log.append(logged)
         if logged.grasp_id is not None:
-            self.writer.append(
+            grasp = self.writer.append(
                 logged.grasp_id,
                 attempt.object_id,
                 attempt.images,
@@ -315,10 +323,17 @@ class _Collection:
                 sequence_id=logged.grasp_id,
                 time_s=round(began + attempt.touch_time_s, 3),
             )
+            if logged.accepted and self._is_enough:
+                self._add_accepted(grasp)
         self.tallies[attempt.object_id].add(logged)
         if attempt.outcome == UNGRASPABLE:
             self._record_skipped_objects()
             del self._pending[attempt.object_id]
+
+    def _add_accepted(self, grasp: RecordedGrasp) -> None:
+        self._accepted[grasp.object_id].append(grasp)
+        if self._is_enough and self._is_enough(self._accepted[grasp.object_id]):
+            self._ended.add(grasp.object_id)
 
     def _record_skipped_objects(self) -> None:
         """Write the ungraspable objects, if any, to recording.json."""

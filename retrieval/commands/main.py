@@ -25,6 +25,7 @@ from retrieval.commands.evaluate import evaluate
 from retrieval.commands.export import export
 from retrieval.commands.export_recording import export_recording
 from retrieval.commands.frontier import frontier
+from retrieval.commands.identify import identify
 from retrieval.commands.import_ import import_
 from retrieval.commands.options import Command
 from retrieval.commands.query import query
@@ -49,7 +50,20 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
 )
-_COMMANDS = (demo, collect, import_, export_recording, check, train, adapt, build_index, query, verify, export)
+_COMMANDS = (
+    demo,
+    collect,
+    import_,
+    export_recording,
+    check,
+    train,
+    adapt,
+    build_index,
+    query,
+    verify,
+    identify,
+    export,
+)
 for _command in (*_COMMANDS, evaluate, frontier, serve):
     _name = _command.__name__.strip("_").replace("_", "-")
     app.command(_name, cls=Command)(_command)

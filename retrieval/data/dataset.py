@@ -27,6 +27,7 @@ class Grasp:
     Attributes:
         touches: Gel images, one file per finger, in order a, b.
         backgrounds: No-contact frames of the same fingers, if recorded.
+        height_mm: Height of the point between the fingertips, in the rig's frame, if recorded.
     """
 
     grasp_id: str
@@ -35,6 +36,7 @@ class Grasp:
     photo: Path
     touches: tuple[Path, ...]
     backgrounds: tuple[Path, ...]
+    height_mm: float | None = None
 
 
 AnyRecording = str | Path | Recording
@@ -110,6 +112,7 @@ def load_all_attempts(folder: Path) -> list[Attempt]:
                 photo=folder / line.photo,
                 touches=in_finger_order(line.touches),
                 backgrounds=in_finger_order(line.touches_before),
+                height_mm=None if line.pose is None else line.pose[2],
             ),
             outcome=line.outcome or {None: "unknown", True: "held", False: "failed"}[line.grasped],
             accepted=line.grasped is not False,

@@ -13,6 +13,7 @@ from retrieval.evaluation.cache import CacheKey, read_cached, write_cached
 from retrieval.evaluation.queries import Queries
 from retrieval.methods.method import Method, sum_over_sets
 from retrieval.model.encode import one_thread
+from retrieval.model.posterior import ScoredTouches
 from retrieval.training.features import Features
 
 Scores = NDArray[np.float32]
@@ -33,6 +34,17 @@ class Predictions:
     set_scores: dict[int, Scores]
     best_params: dict[str, Any]
     seconds: dict[str, float]
+
+
+def scored_touches(queries: Queries, predictions: Predictions, part: str) -> ScoredTouches:
+    """Return the scores of the touches with the photos of one part ("train", "validation" or "test")."""
+    touches, photos = queries.of_part(queries.touch_owner, part), queries.of_part(queries.photo_owner, part)
+    return ScoredTouches(
+        predictions.scores[np.ix_(touches, photos)],
+        queries.touch_owner[touches],
+        queries.photo_owner[photos],
+        queries.own_photo[touches][:, None] == photos,
+    )
 
 
 @one_thread()

@@ -17,8 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from retrieval.evaluation.experiment import Experiment
-from retrieval.evaluation.predictions import Predictions
-from retrieval.evaluation.queries import Queries
+from retrieval.evaluation.predictions import Predictions, scored_touches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.posterior import MIN_OBJECTS, Posterior, ScoredTouches, fit_posterior
 from retrieval.model.verification import (
@@ -99,7 +98,7 @@ def _test_touches(
     A head that was trained on features has no posterior; it is fitted on validation objects, as in training.
     """
     queries, posterior = experiment.queries, checkpoint.posterior
-    validation, test = (_scored_touches(queries, predictions, part) for part in ("validation", "test"))
+    validation, test = (scored_touches(queries, predictions, part) for part in ("validation", "test"))
     if posterior is None and len(np.unique(validation.photo_owner)) >= MIN_OBJECTS:
         posterior = fit_posterior(validation, seed=seed)
     if posterior is None or len(np.unique(test.photo_owner)) < MIN_OBJECTS:
@@ -107,16 +106,6 @@ def _test_touches(
     photos = queries.photos[queries.of_part(queries.photo_owner, "test")]
     features = torch.from_numpy(experiment.features_for("late_fusion").photo[photos])
     return test, photo_embeddings(checkpoint.matcher, features), posterior
-
-
-def _scored_touches(queries: Queries, predictions: Predictions, part: str) -> ScoredTouches:
-    touches, photos = queries.of_part(queries.touch_owner, part), queries.of_part(queries.photo_owner, part)
-    return ScoredTouches(
-        predictions.scores[np.ix_(touches, photos)],
-        queries.touch_owner[touches],
-        queries.photo_owner[photos],
-        queries.own_photo[touches][:, None] == photos,
-    )
 
 
 def false_rejects(far: float, genuine: Floats, impostors: Floats) -> float:

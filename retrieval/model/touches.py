@@ -297,8 +297,8 @@ class TouchReader:
             encoder: Its touch encoder.
             compares_contact: Compare each touch with its no-contact frame to decide whether there is a contact.
         """
-        self.encoder, self.fingers, self._compares_contact = encoder, config.matcher.fingers, compares_contact
-        self._preprocessing = config.preprocessing
+        self.encoder, self.fingers, self._preprocessing = encoder, config.matcher.fingers, config.preprocessing
+        self.takes_background = compares_contact or self._preprocessing.background != "none"
 
     def no_contact_frames(self, background: Sequence[AnyImage] | None) -> Sequence[GelImage | None]:
         """Return the no-contact frame of each finger, None for a model that uses none.
@@ -313,7 +313,7 @@ class TouchReader:
             )
         if background is None:
             return [None] * self.fingers
-        if policy == "none" and not self._compares_contact:
+        if not self.takes_background:
             raise BadInput("this model uses gel images unchanged and would ignore --background; leave it out")
         frames = parse_grasps(background, self.fingers, noun="background")
         if len(frames) != 1:

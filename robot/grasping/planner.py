@@ -14,7 +14,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -79,7 +79,7 @@ class GraspPlanner(ABC):
     ...         return robot.GraspPlan(pose, above, opening_mm=rig.gripper.stroke_mm, force_n=10.0)
     """
 
-    needs_depth: ClassVar[bool] = True
+    needs_depth: bool = True
 
     def check(self, rig: "Rig") -> None:
         """Raise RobotConfigError if this planner cannot plan for `rig`."""

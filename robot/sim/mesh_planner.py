@@ -1,7 +1,7 @@
 """Grasp planner for simulated meshes. It uses the true mesh and pose, up to the camera's calibration error."""
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from robot.sim.scene import Scene
 class MeshPlanner(GraspPlanner):
     """Draw one of the grasps of a mesh: first the approach (from above or from a side), then uniformly."""
 
-    needs_depth: ClassVar[bool] = False
+    needs_depth = False
 
     def check(self, rig: Rig) -> None:
         """Raise RobotConfigError unless `rig` is simulated and has meshes."""

@@ -42,6 +42,7 @@ SHORTER = {
     "build-index": [],
     "query": [],
     "verify": [],
+    "identify": ["--grasps", "2"],
     "export": [],
     "export-recording": [],
     "evaluate": ["--preset", "tiny", "--iterations", "2", "--seeds", "1", "--methods", "late_fusion,chance"],
@@ -115,6 +116,7 @@ def test_every_retrieve_command_of_a_page_runs_from_top_to_bottom(page, home):
             "export": {0, 1},
             "query": set(EXIT_CODES.values()),
             "verify": set(VERIFY_EXIT_CODES.values()),
+            "identify": {*EXIT_CODES.values(), *VERIFY_EXIT_CODES.values()},
         }.get(line[1], {0})
         assert main([*line[1:], *SHORTER[line[1]]]) in accepted, line
 

@@ -90,6 +90,7 @@ def test_the_results_of_an_evaluation(tmp_path, recording):
     assert set(results["verification"]) == {"random", "similar"}
     verification = results["verification"]["random"]["1"]
     check(9, verification)
+    check(10, results["next_grasp"]["policies"]["spread"])
     row = re.search(r"^\| `eer` .*$", text_of(PAGE), re.M)[0]
     assert set(re.findall(r"`(\w+)`", row)) - {"eer"} == set(verification["eer"])
     row = re.search(r"^\| `measures` .*$", text_of(PAGE), re.M)[0]
@@ -103,10 +104,10 @@ def test_the_results_of_the_benchmark_of_real_data(tmp_path):
     quick = ["--preset", "tiny", "--seeds", "1", "--methods", "cca_pca", "--protocols", "billets-places,physiclear,rct"]
     assert main(["benchmark", "real", str(tmp_path), "--out", str(tmp_path / "out"), *quick]) == 0
     results = json.loads((tmp_path / "out" / "results.json").read_text())
-    check(10, results)
+    check(11, results)
     assert set(results["skipped"]) == {"rct"}
     entry = results["protocols"]["billets-places"]
-    check(11, entry)
+    check(12, entry)
     row, control = entry["rows"]["cca_pca"], entry["controls"]["permuted"]
     page = text_of(PAGE).partition("### `results.json` of the benchmark")[2]
     documented = {key: re.search(rf"^\| `{key}` .*$", page, re.M)[0] for key in ("rows", "controls")}

@@ -179,6 +179,24 @@ def test_a_finished_collection_makes_no_attempt(tmp_path):
     assert files(tmp_path / "r") == before
 
 
+def test_an_object_ends_early_when_its_accepted_grasps_are_enough(tmp_path):
+    seen = []
+
+    def is_enough(grasps):
+        seen.append([grasp.grasp_id for grasp in grasps])
+        return grasps[0].object_id == "thin-1" or len(grasps) == 3
+
+    tallies = run(tmp_path, grasps=4, is_enough=is_enough)
+    accepted = [row["grasp_id"] for row in rows(tmp_path) if row["grasped"]]
+    assert [tallies[name].accepted for name in NAMES] == [3, 1, 3]
+    assert seen == [accepted[:1], accepted[:2], accepted[:3], accepted[3:4], *(accepted[4 : 4 + n] for n in (1, 2, 3))]
+    before = files(tmp_path)
+    seen.clear()
+    run(tmp_path, grasps=4, is_enough=is_enough)
+    assert files(tmp_path) == before  # a continued collection decides in the same way, and makes no attempt
+    assert [len(grasps) for grasps in seen] == [1, 2, 3, 1, 1, 2, 3]
+
+
 def test_more_objects_may_be_added(tmp_path):
     run(tmp_path / "r", NAMES[:1])
     run(tmp_path / "r", NAMES)

@@ -22,6 +22,7 @@ from retrieval.model.verification import (
 from retrieval.search.query.answer import gel_classes
 
 if TYPE_CHECKING:
+    from retrieval.model.posterior import Posterior
     from retrieval.search.query.searcher import Searcher
 
 VERIFY_EXIT_CODES = {ACCEPT: 0, REJECT: 3, NO_CONTACT: 4, NOT_A_GEL: 5, ANOTHER_GRASP: 6}
@@ -92,6 +93,26 @@ def calibration_of(searcher: Searcher) -> VerificationCalibration | None:
     return searcher.checkpoint.verification if has_cells and searcher.posterior else None
 
 
+def expected_object(searcher: Searcher, expect: str, far: float) -> tuple[int, DecisionBounds, Posterior]:
+    """Return the number of the expected object, the bounds of the decision and the posterior.
+
+    Raises:
+        BadInput: The catalogue lacks the object, the rate is too small for the model's validation objects, or the model
+            has no error rates.
+    """
+    calibration, posterior = calibration_of(searcher), searcher.posterior
+    if calibration is None or posterior is None:
+        raise BadInput(
+            f"{searcher.checkpoint.path} has no error rates for verification with this index: train a model with at "
+            "least 20 validation objects of 5 grasps, and build its index with its cells"
+        )
+    bounds = calibration.bounds(far)
+    number = int(searcher.folder_shard.objects.numbers_of([expect])[0])
+    if number < 0:
+        raise BadInput(f"the catalogue of {searcher.index} has no object {expect!r}; give the name of its folder")
+    return number, bounds, posterior
+
+
 def verify(
     searcher: Searcher,
     touches: AnyTouches,
@@ -101,16 +122,7 @@ def verify(
     background: Sequence[AnyImage] | None = None,
 ) -> Verification:
     """Decide whether the object in the hand is the expected one; see `Searcher.verify`."""
-    calibration, posterior = calibration_of(searcher), searcher.posterior
-    if calibration is None or posterior is None:
-        raise BadInput(
-            f"{searcher.checkpoint.path} has no error rates for verification with this index: train a model with at "
-            "least 20 validation objects of 5 grasps, and build its index with its cells"
-        )
-    bounds, shard = calibration.bounds(far), searcher.folder_shard
-    number = int(shard.objects.numbers_of([expect])[0])
-    if number < 0:
-        raise BadInput(f"the catalogue of {searcher.index} has no object {expect!r}; give the name of its folder")
+    number, bounds, posterior = expected_object(searcher, expect, far)
     reader = searcher.reader
     grasps = parse_grasps(touches, reader.fingers)
     names = [[image.name for image in grasp] for grasp in grasps]
@@ -121,7 +133,7 @@ def verify(
         decision = NOT_A_GEL if NOT_A_GEL in classes else NO_CONTACT
         return Verification(expect, decision, names, classes, [], None)
     ratios = [
-        float(posterior.log_ratio(shard.object_logit(number, partials[:count], posterior), count))
+        float(posterior.log_ratio(searcher.folder_shard.object_logit(number, partials[:count], posterior), count))
         for count in range(1, len(partials) + 1)
     ]
     return Verification(expect, bounds.decide(np.array(ratios)), names, classes, ratios, bounds)

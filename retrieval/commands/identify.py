@@ -1,0 +1,161 @@
+"""`retrieve identify`: grasp an object with a rig until its identity is clear."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from retrieval.commands.options import COUNT, FRACTION, SEED, Index, IndexModel, Json, NoVerify, announce_resume
+from retrieval.console.files import PAGE, require_folder, require_ours, text_bytes, write_output
+from retrieval.console.output import print_json, say
+from retrieval.errors import BadInput, RetrievalError
+
+if TYPE_CHECKING:
+    from retrieval.search.query.answer import QueryResult
+    from retrieval.search.query.searcher import Searcher
+    from robot.recording.grasp import RecordedGrasp
+    from robot.rig import Rig
+
+
+def identify(
+    *,
+    rig: Annotated[str, typer.Option(help="rig by name or TOML file; sim is the simulated rig")] = "sim",
+    out: Annotated[Path, typer.Option(help="recording of the grasps, to write or continue")],
+    object_id: Annotated[
+        str | None,
+        typer.Option("--object", metavar="NAME", help="name in the recording; with --rig sim the object on the table"),
+    ] = None,
+    expect: Annotated[
+        str | None, typer.Option(metavar="OBJECT", help="verify this object of the catalogue instead of searching")
+    ] = None,
+    far: Annotated[
+        float | None,
+        typer.Option(metavar="RATE", parser=FRACTION, help="false-accept rate of --expect (default: 0.01)"),
+    ] = None,
+    grasps: Annotated[int, typer.Option(parser=COUNT, help="largest number of accepted grasps")] = 5,
+    confidence: Annotated[
+        float,
+        typer.Option(metavar="P", parser=FRACTION, help="stop when an object, or none of these, has this probability"),
+    ] = 0.9,
+    seed: Annotated[int, typer.Option(parser=SEED, help="seed of all random choices")] = 0,
+    index: Index = None,
+    model: IndexModel = None,
+    json: Json = False,
+    html: Annotated[Path | None, typer.Option(help="also write an HTML page with photos and gel images")] = None,
+    no_verify: NoVerify = False,
+) -> int:
+    """Grasp the object with a rig until the answer is clear; stay next to a real rig. Resumes a stopped run.
+
+    Each grasp after the first touches another height of the object.
+    """
+    if far is not None and expect is None:
+        raise BadInput("--far is the false-accept rate of --expect; give both, or neither")
+    if html is not None:
+        if expect is not None:
+            raise BadInput("--html shows a ranking, and --expect ranks nothing; leave one of them out")
+        require_ours(html, PAGE)
+        require_folder(html)
+    from retrieval.search import defaults
+
+    path, reason = defaults.find_index(index)
+    if index is None:
+        say(f"index: {path} ({reason})")
+    from retrieval.search.query.answer import EXIT_CODES, verdict_sentence
+    from retrieval.search.query.searcher import Searcher
+    from retrieval.search.query.verification import VERIFY_EXIT_CODES, expected_object
+    from robot.collection import CollectSettings, collect
+    from robot.grasping.spread import SpreadPlanner
+    from robot.rig import load_rig
+
+    with Searcher.open(path, model=model, verify=not no_verify) as searcher:
+        run = _Run(searcher, out, expect, 0.01 if far is None else far, confidence, grasps)
+        if expect is not None:  # refuse it before the rig moves
+            expected_object(searcher, expect, run.far)
+
+        def make_rig() -> "Rig":
+            made = load_rig(rig, seed=seed)
+            if len(made.sensors) != searcher.reader.fingers:
+                raise BadInput(
+                    f"the model of {path} takes {searcher.reader.fingers} gel image(s) of a grasp, but the rig {rig} "
+                    f"has {len(made.sensors)} sensor(s); give --model, or another rig"
+                )
+            made.planner = SpreadPlanner(made.planner, run.heights_mm)
+            return made
+
+        name = object_id or make_rig().object_ids(1)[0]
+        with announce_resume(f"the grasps so far are stored in {out}"):
+            collect(
+                make_rig,
+                out,
+                objects=[name],
+                seed=seed,
+                settings=CollectSettings(grasps=grasps),
+                is_enough=run.is_enough,
+            )
+        if run.answer is None:
+            raise RetrievalError(f"no grasp of {name} was accepted; {out}/attempts.jsonl lists the reasons")
+        if html is not None:
+            from retrieval.report.query import query_html
+
+            write_output(html, text_bytes(query_html(run.answer, searcher.catalogue)), PAGE)
+            say(f"page: {html}")
+    if json:
+        print_json(run.answer.to_dict())
+    if expect is not None:
+        say(run.answer.sentence)
+        return VERIFY_EXIT_CODES[run.answer.decision]
+    say(verdict_sentence(run.answer))
+    return EXIT_CODES[run.answer.verdict]
+
+
+class _Run:
+    """The grasps of one run, and the answer after the last of them.
+
+    Attributes:
+        heights_mm: Height of each grasp.
+        answer: `QueryResult`, or `Verification` with an expected object; None before the first grasp.
+    """
+
+    def __init__(
+        self, searcher: "Searcher", folder: Path, expect: str | None, far: float, confidence: float, grasps: int
+    ) -> None:
+        self.searcher, self.folder, self.expect, self.far = searcher, folder, expect, far
+        self.confidence, self.grasps = confidence, grasps
+        self.heights_mm: list[float] = []
+        self.answer: Any = None
+
+    def is_enough(self, grasps: Sequence["RecordedGrasp"]) -> bool:
+        """Answer from all grasps so far, print the answer, and return whether it is final."""
+        from retrieval.model.verification import ACCEPT, REJECT
+
+        self.heights_mm[:] = [grasp.pose[2] for grasp in grasps if grasp.pose is not None]
+        touches = [self._files(grasp.touches) for grasp in grasps]
+        background = self._files(grasps[-1].touches_before) if self.searcher.reader.takes_background else None
+        if self.expect is None:
+            self.answer = self.searcher.query(touches, background=background)
+            is_final, now = self._is_clear(self.answer), _first_object(self.answer)
+        else:
+            self.answer = self.searcher.verify(touches, self.expect, far=self.far, background=background)
+            is_final, now = self.answer.decision in (ACCEPT, REJECT), self.answer.decision
+        say(f"grasp {len(grasps)} of at most {self.grasps}: {now}")
+        return is_final
+
+    def _files(self, images: Mapping[str, str]) -> list[Path]:
+        return [self.folder / images[finger] for finger in sorted(images)]
+
+    def _is_clear(self, answer: "QueryResult") -> bool:
+        """Return whether the first object, or none of these, has the required probability."""
+        if answer.none_probability is None:
+            return False
+        return max(answer.none_probability, answer.results[0].probability or 0.0) >= self.confidence
+
+
+def _first_object(answer: "QueryResult") -> str:
+    """Return the verdict without contact, or the first object and its probability."""
+    if not answer.results:
+        return answer.verdict
+    best = answer.results[0]
+    if answer.none_probability is None:
+        return f"{best.object_id} ranks first"
+    return f"{best.object_id} {best.probability:.2f}, none of these {answer.none_probability:.2f}"

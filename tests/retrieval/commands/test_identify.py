@@ -1,0 +1,102 @@
+"""`retrieve identify` on the simulated rig: when it stops, what it refuses before a motion, and how it continues."""
+
+import itertools
+import json
+
+import pytest
+
+from retrieval.commands.main import main
+from retrieval.data.dataset import load_grasps
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.search.build.build_index import build_index
+from retrieval.search.defaults import shipped_model
+from robot.collection import CollectSettings, collect
+from robot.recording.folder import read_recording
+from robot.rig import load_rig
+
+SEED = 41
+
+
+@pytest.fixture(scope="module")
+def index(tmp_path_factory):
+    """An index of six simulated objects; their photos come from grasps of another seed of the planner."""
+    folder = tmp_path_factory.mktemp("identify")
+    rig = load_rig("sim", seed=SEED)
+    collect(lambda: rig, folder / "recording", objects=6, seed=SEED, settings=CollectSettings(grasps=2))
+    for grasp in load_grasps(folder / "recording"):
+        photo = folder / "catalog" / grasp.object_id / grasp.photo.name
+        photo.parent.mkdir(parents=True, exist_ok=True)
+        photo.symlink_to(grasp.photo)
+    build_index(folder / "catalog", load_checkpoint(shipped_model()), folder / "index", quiet=True)
+    return folder / "index"
+
+
+@pytest.fixture
+def identify(index, tmp_path):
+    def run(*options, out="run"):
+        command = ["identify", "--rig", "sim", "--seed", str(SEED), "--index", str(index), "--out", str(tmp_path / out)]
+        return main([*command, *map(str, options)])
+
+    return run
+
+
+def names_of(index):
+    return sorted(folder.name for folder in (index.parent / "catalog").iterdir())
+
+
+def test_it_stops_at_the_first_grasp_whose_answer_is_clear(identify, tmp_path, capsys):
+    identify("--confidence", "0", "--json")
+    assert len(read_recording(tmp_path / "run").grasps) == 1
+    assert len(json.loads(capsys.readouterr().out)["query"]["touches"]) == 1
+
+
+def test_an_unclear_answer_takes_all_grasps_at_different_heights_and_continues_where_it_was_stopped(
+    identify, tmp_path, capsys
+):
+    identify("--confidence", "1", "--grasps", "3")
+    whole = capsys.readouterr().err
+    lines = (tmp_path / "run" / "metadata.jsonl").read_text().splitlines()
+    assert "grasp 3 of at most 3" in whole
+    heights_mm = sorted(grasp.pose[2] for grasp in read_recording(tmp_path / "run").grasps if grasp.grasped)
+    assert min(later - earlier for earlier, later in itertools.pairwise(heights_mm)) > 4
+    # A killed run: the second grasp and all later ones are missing.
+    attempts = tmp_path / "run" / "attempts.jsonl"
+    kept = next(row for row, line in enumerate(map(json.loads, attempts.read_text().splitlines())) if line["accepted"])
+    attempts.write_text("".join(f"{line}\n" for line in attempts.read_text().splitlines()[: kept + 1]))
+    recorded = [line for line in lines if json.loads(line)["grasp_id"] in attempts.read_text()]
+    (tmp_path / "run" / "metadata.jsonl").write_text("".join(f"{line}\n" for line in recorded))
+    identify("--confidence", "1", "--grasps", "3")
+    assert (tmp_path / "run" / "metadata.jsonl").read_text().splitlines() == lines
+    assert capsys.readouterr().err == whole
+
+
+def test_an_expected_object_ends_with_a_decision_or_after_all_grasps(identify, index, capsys):
+    code = identify("--expect", names_of(index)[0], "--far", "0.1", "--json")
+    assert {0: "accept", 3: "reject", 6: "another grasp"}[code] == json.loads(capsys.readouterr().out)["decision"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--expect", "teapot"), "has no object 'teapot'"),
+        (("--expect", "{object}", "--far", "0"), "0"),
+        (("--expect", "{object}", "--far", "1"), "1"),
+        (("--far", "0.1"), "--far is the false-accept rate of --expect"),
+        (("--expect", "{object}", "--html", "page.html"), "--html shows a ranking"),
+        (("--object", "teapot"), "has no 'teapot'"),
+    ],
+)
+def test_a_wrong_option_is_refused_in_one_line_before_the_rig_moves(
+    identify, index, tmp_path, capsys, options, message
+):
+    assert identify(*(option.format(object=names_of(index)[0]) for option in options)) == 2
+    refusal = capsys.readouterr().err.strip()
+    assert message in refusal
+    assert "\n" not in refusal
+    assert not (tmp_path / "run" / "attempts.jsonl").exists() or not (tmp_path / "run" / "attempts.jsonl").read_text()
+
+
+def test_a_model_for_one_finger_is_refused_by_a_rig_with_two_sensors(index, tmp_path, capsys):
+    build_index(index.parent / "catalog", load_checkpoint(shipped_model(1)), tmp_path / "one-finger", quiet=True)
+    assert main(["identify", "--index", str(tmp_path / "one-finger"), "--out", str(tmp_path / "run")]) == 2
+    assert "takes 1 gel image(s) of a grasp, but the rig sim has 2 sensor(s)" in capsys.readouterr().err
