@@ -4,6 +4,9 @@
 
 RECORDING holds grasps of unseen objects, five or more of each. Each sequence of four grasps is compared with every
 object of the recording. Intervals resample the touched objects. "similar": the object whose photos are most similar.
+
+The second table compares the sequential test with tests after a fixed number of grasps, whose thresholds give the same
+false-accept rate on this recording.
 """
 
 import argparse
@@ -19,7 +22,13 @@ from retrieval.metrics.intervals import bootstrap_interval
 from retrieval.metrics.measure import object_means
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.posterior import ScoredTouches
-from retrieval.model.verification import MAX_GRASPS, verification_sequences
+from retrieval.model.verification import (
+    MAX_GRASPS,
+    DecisionBounds,
+    VerificationCalibration,
+    VerificationSequences,
+    verification_sequences,
+)
 from retrieval.search.defaults import find_model
 from retrieval.training.distil import feature_partials
 from retrieval.training.features import encode_recording
@@ -38,20 +47,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     checkpoint = load_checkpoint(find_model(choice)[0])
     if checkpoint.verification is None:
         parser.error(f"{choice} has no error rates for verification")
-    print("\n".join(table(checkpoint, arguments.recording, arguments.cache)))
+    found = sequences(checkpoint, arguments.recording, arguments.cache)
+    print("\n".join([*rate_table(checkpoint.verification, found), "", *length_table(checkpoint.verification, found)]))
     return 0
 
 
-def table(checkpoint: Checkpoint, recording: Path, cache: Path | None) -> list[str]:
-    """Return the lines of a Markdown table: stated and achieved rates."""
-    assert checkpoint.verification is not None
+def sequences(checkpoint: Checkpoint, recording: Path, cache: Path | None) -> VerificationSequences:
+    """Return the log likelihood ratios of sequences of grasps of a recording."""
     assert checkpoint.posterior is not None
     features = encode_recording(load_grasps(recording), checkpoint.matcher, checkpoint.config, cache)
     touches, photos = feature_partials(checkpoint.matcher, features)
     owner, own = features.owner, np.eye(len(features), dtype=bool)
     scored = ScoredTouches(all_scores(checkpoint, touches, photos), owner, owner, own)
     columns = checkpoint.config.matcher.cosine_columns
-    found = verification_sequences(scored, photos[:, columns].numpy().astype(np.float64), checkpoint.posterior)
+    return verification_sequences(scored, photos[:, columns].numpy().astype(np.float64), checkpoint.posterior)
+
+
+def rate_table(calibration: VerificationCalibration, found: VerificationSequences) -> list[str]:
+    """Return the lines of a Markdown table: stated and achieved rates."""
     lines = [
         "| stated FAR | FAR, random | FAR, similar | stated FRR | FRR | "
         + " | ".join(f"accepted within {count}" for count in range(1, MAX_GRASPS + 1))
@@ -59,11 +72,11 @@ def table(checkpoint: Checkpoint, recording: Path, cache: Path | None) -> list[s
         "|---|---|---|---|---|" + "---|" * MAX_GRASPS,
     ]
     for far in RATES:
-        bounds = checkpoint.verification.bounds(far)
+        bounds = calibration.bounds(far)
         random = (found.impostor >= bounds.accept).mean(1)
         similar, stated = found.similar >= bounds.accept, bounds.false_rejects
-        decisions = [bounds.decide(ratios) for ratios in found.ratios]
-        rejected = np.array([decision != "accept" for decision in decisions])
+        outcomes = [bounds.decide(ratios) for ratios in found.ratios]
+        rejected = np.array([decision != "accept" for decision in outcomes])
         within = [found.genuine[count] >= bounds.accept for count in range(MAX_GRASPS)]
         cells = [cell(values, found.owner) for values in (random, similar)]
         cells += [f"{stated.value:.3f} [{stated.low:.3f}, {stated.high:.3f}]", cell(rejected, found.owner)]
@@ -71,11 +84,43 @@ def table(checkpoint: Checkpoint, recording: Path, cache: Path | None) -> list[s
     return lines
 
 
+def length_table(calibration: VerificationCalibration, found: VerificationSequences) -> list[str]:
+    """Return the lines of a Markdown table: grasps and false rejects of the sequential test and of fixed numbers."""
+    lines = [
+        "| FAR | test | grasps, right object | grasps, other object | FRR |",
+        "|---|---|---|---|---|",
+    ]
+    impostor_owner = np.repeat(found.owner, found.impostor.shape[1])
+    impostors = found.impostor_ratios.reshape(-1, MAX_GRASPS)
+    for far in RATES:
+        bounds = calibration.bounds(far)
+        accepted, grasps = decisions(bounds, found.ratios)
+        wrongly_accepted, impostor_grasps = decisions(bounds, impostors)
+        achieved = wrongly_accepted.mean()
+        cells = [cell(grasps, found.owner), cell(impostor_grasps, impostor_owner), cell(~accepted, found.owner)]
+        lines.append(f"| {achieved:.3f} | sequential, stated {far:g} | " + " | ".join(cells) + " |")
+        for count in range(1, MAX_GRASPS + 1):
+            threshold = np.quantile(impostors[:, count - 1], 1 - achieved)
+            rejected = cell(found.ratios[:, count - 1] < threshold, found.owner)
+            lines.append(f"| {achieved:.3f} | {count} grasp{'s' * (count > 1)} | {count} | {count} | {rejected} |")
+    return lines
+
+
+def decisions(bounds: DecisionBounds, ratios: NDArray[np.float64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Return whether each sequence (S, MAX_GRASPS) is accepted, and after how many grasps it is decided (S,)."""
+    never = MAX_GRASPS + 1
+    accepts, rejects = (
+        np.where(reached.any(1), reached.argmax(1) + 1, never)
+        for reached in (ratios >= bounds.accept, ratios <= bounds.reject)
+    )
+    return accepts <= np.minimum(rejects, MAX_GRASPS), np.minimum(np.minimum(accepts, rejects), MAX_GRASPS)
+
+
 def cell(values: NDArray[np.generic], owner: NDArray[np.int64]) -> str:
     """Return the mean over objects of values (S,) of sequences, with its interval."""
     means = object_means(values.astype(np.float64)[:, None], owner)[1]
     low, high = bootstrap_interval(means)
-    return f"{means.mean():.3f} [{max(low[0], 0):.3f}, {min(high[0], 1):.3f}]"
+    return f"{means.mean():.3f} [{max(low[0], 0):.3f}, {high[0]:.3f}]"
 
 
 if __name__ == "__main__":
