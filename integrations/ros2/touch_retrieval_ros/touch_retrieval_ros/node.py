@@ -2,6 +2,7 @@
 
 import math
 import sys
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -78,16 +79,18 @@ class RecogniserNode:
             cancel_callback=lambda goal: CancelResponse.ACCEPT,
             callback_group=requests,
         )
-        next_grasp = partial(self._trigger, self.recogniser.request_grasp)
-        no_contact = partial(self._trigger, self.recogniser.store_no_contact_frames)
-        node.create_service(Trigger, "~/next_grasp", next_grasp, callback_group=requests)
-        node.create_service(Trigger, "~/store_no_contact_frames", no_contact, callback_group=grasps)
+        for name, action, group in (
+            ("next_grasp", self.recogniser.request_grasp, requests),
+            ("store_no_contact_frames", self.recogniser.store_no_contact_frames, grasps),
+        ):
+            callback = partial(self._trigger, name, action)
+            node.create_service(Trigger, f"~/{name}", callback, callback_group=group)
         node.create_service(Verify, "~/verify", self._verify, callback_group=grasps)
         self.diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         node.create_timer(values["diagnostics_period_s"], self._publish_diagnostics)
         facts = self.recogniser.index_facts()
         node.get_logger().info(
-            f"{facts['index']}: {facts['objects']} objects; gel images: {', '.join(topics)}; ready for goals and requests"
+            f"{facts['index']}: {facts['objects']} objects; gel images: {', '.join(topics)}; waiting for requests"
         )
 
     def close(self) -> None:
@@ -126,11 +129,11 @@ class RecogniserNode:
         response.sentence, response.log_ratios = result.sentence, result.log_ratios
         return response
 
-    def _trigger(self, action: Any, request: Any, response: Any) -> Any:
+    def _trigger(self, name: str, action: Callable[[], None], request: Any, response: Any) -> Any:
         try:
             action()
         except _ERRORS as error:
-            response.message = self._warn("request", error)
+            response.message = self._warn(name, error)
         else:
             response.success = True
         return response
