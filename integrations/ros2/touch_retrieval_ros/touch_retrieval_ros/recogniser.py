@@ -85,7 +85,7 @@ class GelTopic:
 
 
 class Recogniser:
-    """Answers queries from the newest image of each finger. Its methods may be called by several threads.
+    """Answers queries from the newest image of each finger. Threads may add images and call its methods at once.
 
     A grasp consists of an image of each finger that is not older than the request: the gripper is closed when the
     client requests, so older images may show another state.
