@@ -138,7 +138,7 @@ def picture_of(message: Any) -> NDArray[np.uint8] | bytes:
     """Return the picture of an image message.
 
     Args:
-        message: A sensor_msgs/Image or sensor_msgs/CompressedImage.
+        message: A sensor_msgs/Image or sensor_msgs/CompressedImage, as rosbags or rclpy returns it.
 
     Returns:
         (H, W, 3) red first, or the content of the PNG or JPEG file.
@@ -151,9 +151,12 @@ def picture_of(message: Any) -> NDArray[np.uint8] | bytes:
     if message.encoding not in _CHANNELS:
         raise ImporterError(f"the encoding of its images must be {', '.join(_CHANNELS)}, got {message.encoding!r}")
     channels = _CHANNELS[message.encoding]
-    if message.data.size != message.height * message.step:
-        raise ImporterError(f"an image of {message.height} rows has {message.data.size} bytes, {message.step} in a row")
-    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
+    data = np.frombuffer(message.data, np.uint8)  # rclpy: array.array
+    if data.size != message.height * message.step or message.step < message.width * channels:
+        raise ImporterError(
+            f"an image of {message.height} x {message.width} pixels has {data.size} bytes, {message.step} in a row"
+        )
+    rows = data.reshape(message.height, message.step)
     pixels = rows[:, : message.width * channels].reshape(message.height, message.width, channels)
     if channels == 1:
         return np.repeat(pixels, 3, axis=2)
