@@ -66,7 +66,7 @@ PARTS: Mapping[str, Callable[[Config], Config]] = {
     "no crop of the object": views("grey"),
     "no grey view": views("crop"),
 }
-"""Rows of one part left out: a change of the configuration."""
+"""Rows by name: each changes one part of the configuration."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -76,11 +76,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--validation", type=Path, required=True)
     parser.add_argument("--test", type=Path, required=True)
     parser.add_argument("--model", default="shipped", help="checkpoint whose towers are used")
-    parser.add_argument("--objects", type=int, default=3200, help="training objects of all rows but --counts")
+    parser.add_argument("--objects", type=int, default=3200, help="training objects, except in the rows of --counts")
     parser.add_argument("--counts", type=int, nargs="*", default=[], help="rows with other numbers of objects")
     parser.add_argument("--seeds", type=int, default=1, help="trainings of the whole, with seeds 0, 1, ...")
     parser.add_argument("--steps", type=int, default=300)
-    parser.add_argument("--only", nargs="*", help="train only these rows")
+    parser.add_argument("--only", nargs="*", help="train only the whole and these rows")
     parser.add_argument("--out", type=Path, required=True)
     arguments = parser.parse_args(argv)
     arguments.out.mkdir(parents=True, exist_ok=True)
@@ -123,7 +123,7 @@ def trained_row(
 
 
 def first_objects(features: Features, count: int) -> Features:
-    """Return the features of the first `count` objects in a fixed order: fewer objects are among the more."""
+    """Return the features of the first `count` objects in a fixed order: smaller sets are nested."""
     names = list(dict.fromkeys(features.object_ids))
     return features if count >= len(names) else features.of_objects(names[:count])
 

@@ -1,10 +1,10 @@
 """Verification on test objects: false-reject rate (FRR) against false-accept rate (FAR) of late fusion.
 
 The score of a sequence of grasps is its largest log likelihood ratio so far, by which `retrieve verify` accepts
-(`retrieval.model.verification`). A rate is stated only if the trials would contain `ERRORS_NEEDED` false accepts: pairs
-of objects for random impostors, objects for the most similar ones. Intervals count each object as one trial, because
-its sequences are correlated. In simulations with 30 and 80 objects they contained the true FRR in 96 to 100 % of cases;
-a bootstrap over objects did so in 76 to 97 %, least for small rates.
+(`retrieval.model.verification`). A rate is stated only if the trials would contain `ERRORS_NEEDED` false accepts. For
+random impostors a trial is a pair of objects, for the most similar ones it is an object. Intervals count each object as
+one trial, because its sequences are correlated. In simulations with 30 and 80 objects they contained the true FRR in 96
+to 100 % of cases; a bootstrap over objects did so in 76 to 97 %, least for small rates.
 """
 
 import math
@@ -84,7 +84,7 @@ def score_verification(
 
 
 def _rate(value: float, objects: int, needed: int | None) -> dict[str, float | None]:
-    """Return a rate with its interval, or without them if it needs more objects; `needed` is None for no errors."""
+    """Return a rate and its interval, None for too few objects; `needed` is None if there are no errors."""
     if needed is None or objects < needed:
         return {"value": None, "low": None, "high": None, "objects_needed": needed}
     return {**asdict(error_rate(value, objects)), "objects_needed": needed}
@@ -95,7 +95,7 @@ def _test_touches(
 ) -> tuple[ScoredTouches, Floats, Posterior] | None:
     """Return match logits and photo embeddings of test objects, and the posterior; None for too few objects.
 
-    A head that was trained on features has no posterior; it is fitted on validation objects, as in training.
+    A head that was trained on features has no posterior; a posterior is fitted on validation objects, as in training.
     """
     queries, posterior = experiment.queries, checkpoint.posterior
     validation, test = (scored_touches(queries, predictions, part) for part in ("validation", "test"))

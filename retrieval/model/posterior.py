@@ -1,7 +1,7 @@
 """P(object | touches, catalogue), with "none of these" among the hypotheses: the one formula of every probability.
 
     w = slope / (1 + dependence * (grasps - 1))        weight of a sum of match logits over `grasps` grasps
-    l(o) = 1 / w * log mean exp(w * z)                 logit of object o; z: summed match logits of its photos
+    l(o) = 1 / w * log mean exp(w * z)                 logit of object o; z: a photo's summed match logits
     P(o)    proportional to  (1 - p) / O * exp(w * l(o) + offset)
     P(none) proportional to  p
 
@@ -151,7 +151,7 @@ class Posterior:
         top = np.full(len(counts), -np.inf)
         np.maximum.at(top, owner, scaled)
         total = np.bincount(owner, np.exp(scaled - top[owner]), len(counts))
-        return np.asarray((top + np.log(total / counts)) / weight)  # however many equal photos: the log is exactly 0
+        return np.asarray((top + np.log(total / counts)) / weight)  # exact for equal photos
 
     def probabilities(
         self,

@@ -1,14 +1,14 @@
 """Verification: does the hand hold the expected object? Thresholds with a stated false-accept rate.
 
-    accept           if the largest log likelihood ratio after 1, 2, ... grasps is at least a
-    reject           if the last one is at most b, or after MAX_GRASPS grasps
+    accept           if the largest log likelihood ratio after 1, 2, ... grasps is at least `a`
+    reject           if the last one is at most `b`, or after MAX_GRASPS grasps
     another grasp    otherwise
 
 The ratio compares "this object" with "an object that the catalogue lacks" (`retrieval.model.posterior`). This is a
-sequential test between two bounds (Wald 1945). Wald's own bounds hold for exact ratios of independent grasps; these are
-quantiles over sequences of grasps of validation objects. The fraction `far` of the impostors has a largest ratio over
-MAX_GRASPS grasps above a, so the rate holds for every number of grasps. The bound b adds a tenth of the false rejects
-that a alone causes, and at least MIN_EARLY_REJECTS.
+sequential test between two bounds (Wald 1945). Wald's own bounds need exact ratios of independent grasps; `a` and `b`
+are quantiles over sequences of grasps of validation objects. The largest ratio over MAX_GRASPS grasps exceeds `a` for
+the fraction `far` of the impostors; fewer grasps give no higher rate. The bound `b` adds at most a tenth of the false
+rejects that are due to `a`, or MIN_EARLY_REJECTS if this is more.
 
 Two kinds of impostors are measured: another object at random, and the object whose photos are most similar to those of
 the expected one. Terms follow ISO/IEC 19795-1: false-accept rate (FAR), false-reject rate (FRR), genuine, impostor.
@@ -62,9 +62,9 @@ class DecisionBounds:
         accept: Smallest log likelihood ratio that accepts.
         reject: Largest log likelihood ratio that rejects before the last grasp.
         false_accepts: False-accept rate for random impostors, the requested one.
-        similar_false_accepts: The same for the most similar object of about as many as were used for calibration.
+        similar_false_accepts: The same for the most similar other object, among as many objects as in calibration.
         false_rejects: False-reject rate after all `MAX_GRASPS` grasps.
-        accepted: Fraction of genuine sequences that are accepted within 1, 2, ... grasps.
+        accepted: Fraction of genuine sequences that are accepted within 1, 2, ... grasps, if none is rejected early.
     """
 
     accept: float
@@ -87,7 +87,7 @@ class VerificationCalibration:
 
     Attributes:
         objects: Number of validation objects.
-        impostors: Largest ratio of a random impostor that is exceeded at each rate of `LEVELS`.
+        impostors: Quantiles (1 - `LEVELS`) of the largest ratio of a random impostor.
         similar: Quantiles (`QUANTILES`) of the largest ratio of the most similar impostor.
         genuine: For 1 to `MAX_GRASPS` grasps, quantiles of the largest ratio of genuine sequences so far.
         lowest: Quantiles of the lowest ratio of genuine sequences before the last grasp.
@@ -120,9 +120,12 @@ class VerificationCalibration:
         if not (isinstance(far, int | float) and 0 < far <= LEVELS[-1]):
             raise BadInput(f"the false-accept rate must be above 0 and at most {LEVELS[-1]:g}, got {far}")
         if self.objects < (needed := objects_needed(far)):
+            supported = ERRORS_NEEDED / self.pairs
+            step = 10.0 ** (math.floor(math.log10(supported)) - 1)
             raise BadInput(
                 f"a false-accept rate of {far:g} needs {needed:,} validation objects; the model has {self.objects}, "
-                f"enough for {ERRORS_NEEDED / self.pairs:.2g}: give a larger rate, or train with more objects"
+                f"enough for {math.ceil(supported / step) * step:.2g}: give a larger rate, or train with more "
+                "validation objects"
             )
         accept = float(np.interp(math.log(far), np.log(LEVELS), self.impostors))
         rejects = _fraction_below(accept, self.genuine[-1])
@@ -187,7 +190,7 @@ class VerificationSequences(NamedTuple):
 def verification_sequences(
     scored: ScoredTouches, embeddings: Floats, posterior: Posterior, seed: int = 0, grasps: int = MAX_GRASPS
 ) -> VerificationSequences:
-    """Draw `SEQUENCES` sequences of each object with that many grasps and a photo of another one, and score them.
+    """Draw and score `SEQUENCES` sequences of each object that has `grasps` grasps and a photo of another grasp.
 
     Args:
         scored: Match logits of the touches with the photos.

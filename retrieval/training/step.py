@@ -27,7 +27,7 @@ class WeightedLosses(nn.Module):
             objects: Number of training objects.
 
         Raises:
-            ConfigError: No loss has a name.
+            ConfigError: A name is unknown.
         """
         super().__init__()
         self.weights = {name: weight for name, weight in weights.items() if weight > 0}
@@ -64,7 +64,7 @@ def batch_loss(
 
 
 def shuffle_fingers(touch_features: Tensor, fingers: int) -> Tensor:
-    """Return each touch's features (B, fingers * F) with randomly permuted fingers, by PyTorch's seed on the CPU."""
+    """Return features (B, fingers * F) with the fingers of each touch permuted, drawn by PyTorch's CPU generator."""
     each = touch_features.view(len(touch_features), fingers, -1)
     order = torch.rand(len(each), fingers).argsort(dim=1).to(each.device)
     return torch.take_along_dim(each, order[..., None], dim=1).flatten(1)

@@ -279,7 +279,7 @@ class Trainer:
             )
 
     def _complete(self, stop: threading.Event, quiet: bool) -> None:
-        """Add the parts that are fitted after training: candidate encoder, posterior and gel check."""
+        """Add the parts that are fitted after training: candidate encoder, calibrations and gel check."""
         train = [grasp for part in self.sampler.grasps for grasp in part]
         held_out = self.validation.grasps if self.validation else []
         made = load_checkpoint(self.out)

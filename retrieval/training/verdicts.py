@@ -1,4 +1,4 @@
-"""Fit the parts of a checkpoint that verdicts need, after training: a posterior, and the gel check.
+"""Fit the parts of a checkpoint that verdicts need, after training: calibrations and the gel check.
 
 The posterior (`retrieval.model.posterior`) is fitted on touches and photos of validation objects; a model with late
 interaction has a second one, for an index without cells. The gel check
@@ -45,9 +45,9 @@ FOREIGN_COUNT = 700
 FALSE_ALARM_RATE = 0.005
 """Fraction of validation gel images that may be classified as foreign, and of no-contact frames as touches."""
 MARGIN = 1.0
-"""Margin in log-odds added to both thresholds, since other gels differ a little."""
+"""Margin in log-odds between the thresholds and the pictures that they must separate; other gels differ a little."""
 LOW_CONTACT_RATE = 0.02
-"""Fraction of validation touches that may be classified as no contact; low-contact touches carry little information."""
+"""Smallest fraction of validation touches that is classified as no contact; these carry little information."""
 PENALTY = 0.02
 """Penalty on the squared weights of the check's linear layer, for features of unit variance; less for more pictures."""
 _MAX_PIECES = 100
@@ -67,7 +67,7 @@ def with_verdicts(
     quiet: bool = False,
     should_stop: StopRequested = lambda: False,
 ) -> Checkpoint:
-    """Return the checkpoint `made` with a posterior and a gel check, if there are enough validation grasps.
+    """Return the checkpoint `made` with calibrations and a gel check, if there are enough validation grasps.
 
     A posterior needs three validation objects, and a touch with a second photo of its object. A gel check needs
     `MIN_GRASPS` validation grasps.

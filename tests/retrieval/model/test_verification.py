@@ -95,10 +95,18 @@ def test_more_grasps_are_accepted_more_often(fitted):
 
 
 def test_a_rate_that_the_objects_cannot_support_is_refused_with_the_number_that_would():
-    small = fit_verification(*scored_objects(20, seed=2), POSTERIOR)  # 190 pairs
+    small = fit_verification(*scored_objects(20, seed=2), POSTERIOR)  # 190 pairs: 0.158, rounded up
     with pytest.raises(BadInput, match=r"0\.1 needs 25 validation objects; the model has 20, enough for 0\.16"):
         small.bounds(0.1)  # 30 errors need 300 pairs, which 25 objects have
     assert small.bounds(0.2).false_accepts.value == 0.2
+
+
+@pytest.mark.parametrize("objects", [21, 40, 50, 120, 200])
+def test_the_rate_that_a_refusal_proposes_is_supported(fitted, objects):
+    calibration = dataclasses.replace(fitted, objects=objects)
+    with pytest.raises(BadInput) as refused:
+        calibration.bounds(1e-4)
+    calibration.bounds(float(re.search(r"enough for ([\d.]+)", str(refused.value))[1]))
 
 
 @pytest.mark.parametrize("far", [0, 1, -0.1, 0.6, float("nan"), None])
