@@ -281,7 +281,7 @@ class _Collection:
                 self._report()
 
     def _turns(self) -> Iterator[tuple[int, str]]:
-        """Yield each turn: the total of accepted grasps that ends it, and its object."""
+        """Yield the turns: the number of accepted grasps at which a turn ends, and its object."""
         grasps = self.settings.grasps
         for target in range(1, grasps + 1) if self.settings.rounds else (grasps,):
             for name in self.names:
@@ -334,6 +334,7 @@ class _Collection:
         self._accepted[grasp.object_id].append(grasp)
         if self._is_enough and self._is_enough(self._accepted[grasp.object_id]):
             self._ended.add(grasp.object_id)
+            self._pending.pop(grasp.object_id, None)
 
     def _record_skipped_objects(self) -> None:
         """Write the ungraspable objects, if any, to recording.json."""

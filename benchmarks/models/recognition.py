@@ -2,12 +2,12 @@
 
     python -m benchmarks.models.recognition RECORDING --distractors PHOTOS --out FOLDER --model old=A --model new=B
 
-RECORDING holds grasps of objects that no model was trained on, eight of each for the rows with five grasps and three
-photos. PHOTOS is a folder of `retrieve collect --photos-only`: one photo of each further object of the catalogue. Every
-query is one to five grasps of an object. Every candidate has photos that were not taken in these grasps. Values are
-expectations over the other candidates; intervals resample the touched objects. A model with late interaction is also
-scored without its cells, as in an index of `build-index --no-cells`. Differences are to the first model, on
-the same queries. It writes recognition.json in FOLDER; features are reused.
+RECORDING holds grasps of objects that no model was trained on; rows with five grasps and three photos need eight of
+each. PHOTOS is a folder of `retrieve collect --photos-only`: one photo of each further object of the catalogue. Every
+query is one to five grasps of an object. Every candidate has photos that were not taken in these grasps. Top-1
+accuracies are means over draws of the other candidates; intervals resample the touched objects. A model with late
+interaction is also scored without its cells, as in an index of `build-index --no-cells`. Differences are to the first
+model, on the same queries. It writes FOLDER/recognition.json, and reuses the features of RECORDING.
 """
 
 import argparse
@@ -44,7 +44,7 @@ CANDIDATES = (10, 100, 1000)
 SETS = 4
 """Sets of several grasps of each object."""
 CATALOGUE = 100
-"""Objects of the catalogues in which "none of these" is measured."""
+"""Objects for "none of these"; each catalogue leaves one of them out."""
 DRAWS = 4
 
 

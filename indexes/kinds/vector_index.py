@@ -15,7 +15,7 @@ from indexes.kinds.checks import check_k, check_slots, check_unit
 from indexes.kinds.scores import Floats, Mask, Slots
 
 MAX_COUNT = 2**31 - 1
-"""Largest 32-bit integer: FAISS counts in 32 bits."""
+"""Largest 32-bit integer: settings and seeds of FAISS are such integers."""
 MAX_THREADS = 4096
 
 Ladder: TypeAlias = tuple[str, tuple[int, ...]]

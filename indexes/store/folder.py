@@ -121,8 +121,8 @@ class IndexStore:
     ) -> Generation:
         """Write a new generation with exactly these rows, make it current, and return it opened.
 
-        Rows that `parent.reusable` finds by their ids and digests reuse the parent's vectors and arrays. The
-        arguments have the other rows, F in number and in the same order; without a parent, all rows.
+        Rows that `parent.reusable` finds by their ids and digests reuse the parent's vectors and arrays.
+        `embeddings` and `arrays` are of the F other rows, in the same order; without a parent, of all rows.
 
         Args:
             rows: JSON objects with a distinct text "id", and a "digest" of the content for later reuse.

@@ -76,7 +76,7 @@ def build_index(
         int | None,
         typer.Option(
             parser=COUNT,
-            help="number of shards (index folders) to split the catalogue into (default: as in OUT, else no shards)",
+            help="number of shards (index folders) of the catalogue (default: as in OUT, else none; 1 for a URL)",
         ),
     ] = None,
     max_unreadable: Annotated[

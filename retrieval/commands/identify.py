@@ -47,7 +47,7 @@ def identify(
 ) -> int:
     """Grasp the object with a rig until the answer is clear; stay next to a real rig. Resumes a stopped run.
 
-    Each grasp after the first touches another height of the object.
+    Each further grasp is planned far in height from the earlier ones. Use another --out for each object.
     """
     if far is not None and expect is None:
         raise BadInput("--far is the false-accept rate of --expect; give both, or neither")
@@ -61,7 +61,7 @@ def identify(
     path, reason = defaults.find_index(index)
     if index is None:
         say(f"index: {path} ({reason})")
-    from retrieval.search.query.answer import EXIT_CODES, verdict_sentence
+    from retrieval.search.query.answer import EXIT_CODES
     from retrieval.search.query.searcher import Searcher
     from retrieval.search.query.verification import VERIFY_EXIT_CODES, expected_object
     from robot.collection import CollectSettings, collect
@@ -84,6 +84,7 @@ def identify(
             return made
 
         name = object_id or make_rig().object_ids(1)[0]
+        stored = _attempt_count(out)
         with announce_resume(f"the grasps so far are stored in {out}"):
             collect(
                 make_rig,
@@ -94,7 +95,9 @@ def identify(
                 is_enough=run.is_enough,
             )
         if run.answer is None:
-            raise RetrievalError(f"no grasp of {name} was accepted; {out}/attempts.jsonl lists the reasons")
+            raise RetrievalError(f"no grasp of {name} was accepted; see the attempts in {out}/attempts.jsonl")
+        if _attempt_count(out) == stored:  # the hand may hold another object now
+            raise BadInput(f"{out} holds a finished run: {run.sentence}. Give another --out for the next object")
         if html is not None:
             from retrieval.report.query import query_html
 
@@ -102,10 +105,9 @@ def identify(
             say(f"page: {html}")
     if json:
         print_json(run.answer.to_dict())
+    say(run.sentence)
     if expect is not None:
-        say(run.answer.sentence)
         return VERIFY_EXIT_CODES[run.answer.decision]
-    say(verdict_sentence(run.answer))
     return EXIT_CODES[run.answer.verdict]
 
 
@@ -127,6 +129,7 @@ class _Run:
 
     def is_enough(self, grasps: Sequence["RecordedGrasp"]) -> bool:
         """Answer from all grasps so far, print the answer, and return whether it is final."""
+        from retrieval.model.fusion_scorer import NOT_A_GEL
         from retrieval.model.verification import ACCEPT, REJECT
 
         self.heights_mm[:] = [grasp.pose[2] for grasp in grasps if grasp.pose is not None]
@@ -139,7 +142,14 @@ class _Run:
             self.answer = self.searcher.verify(touches, self.expect, far=self.far, background=background)
             is_final, now = self.answer.decision in (ACCEPT, REJECT), self.answer.decision
         say(f"grasp {len(grasps)} of at most {self.grasps}: {now}")
-        return is_final
+        return is_final or NOT_A_GEL in self.answer.grasps  # no further grasp would change it
+
+    @property
+    def sentence(self) -> str:
+        """The answer as a sentence."""
+        from retrieval.search.query.answer import verdict_sentence
+
+        return str(self.answer.sentence) if self.expect else verdict_sentence(self.answer)
 
     def _files(self, images: Mapping[str, str]) -> list[Path]:
         return [self.folder / images[finger] for finger in sorted(images)]
@@ -149,6 +159,14 @@ class _Run:
         if answer.none_probability is None:
             return False
         return max(answer.none_probability, answer.results[0].probability or 0.0) >= self.confidence
+
+
+def _attempt_count(folder: Path) -> int:
+    """Return the number of attempts in a recording; 0 if it does not exist."""
+    from robot.recording.attempt_log import ATTEMPTS_FILE
+
+    file = folder / ATTEMPTS_FILE
+    return file.read_bytes().count(b"\n") if file.exists() else 0
 
 
 def _first_object(answer: "QueryResult") -> str:

@@ -7,8 +7,8 @@ After a first grasp of an object, a policy chooses each further grasp among the 
     repeated     the first grasp again
     upper_bound  the one after which the true object leads by the largest margin: it knows the answer
 
-The catalogue has one photo of each test object, and an object has the photos of none of its replayed grasps. Objects
-are ranked by the sum of the match logits.
+The catalogue has one photo of each test object; the grasp of that photo is not replayed. Objects are ranked by the sum
+of the match logits.
 """
 
 import math
@@ -70,12 +70,12 @@ def score_next_grasp(
     for policy, each in measures.items():
         summary = summarise(each, seed=seed)
         (value, resampled), (random, random_resampled) = needed[policy], needed["random"]
-        with np.errstate(invalid="ignore"):  # neither policy reaches the accuracy
-            ratios = resampled / random_resampled
+        with np.errstate(invalid="ignore"):  # neither reaches the accuracy
+            ratios = np.where(np.isfinite(random_resampled), resampled / random_resampled, math.inf)
         found[policy] = {
             "accuracy": [list(row) for row in zip(summary["value"], summary["low"], summary["high"], strict=True)],
             "grasps_needed": _interval(value, resampled),
-            "relative_to_random": _interval(value / random, ratios),
+            "relative_to_random": _interval(value / random if math.isfinite(random) else math.inf, ratios),
         }
     return {"candidates": candidates, "objects": len(means["random"]), "sequences": len(owner), "policies": found}
 

@@ -37,7 +37,7 @@ class ImageEncoding(NamedTuple):
 
     Attributes:
         partial: (B, partial) terms of the head's first layer.
-        embedding: (B, embedding_dim) unit vectors of the metric space.
+        embedding: (B, embedding_dim) unit embeddings, contrastive or for search.
     """
 
     partial: Tensor
@@ -115,7 +115,7 @@ class FusionHead(nn.Module):
             nn.init.uniform_(parameter, -bound, bound)
 
     def forward(self, touch_partial: Tensor, photo_partial: Tensor) -> Tensor:
-        """Return match logits (P,) of pairs of partial activations (P, partial); (1, partial) broadcasts."""
+        """Return match logits (P,) of touches (P, a) with photos (P, b); a first axis of 1 broadcasts."""
         pooled = slice(self.second.in_features, self.cosine_end)
         logits = self._fusion(touch_partial, photo_partial)
         logits = logits + (touch_partial[..., pooled] * photo_partial[..., pooled]).sum(-1)
@@ -124,7 +124,7 @@ class FusionHead(nn.Module):
         return logits
 
     def all_logits(self, touch_partials: Tensor, photo_partials: Tensor) -> Tensor:
-        """Return match logits (T, N) of every touch (T, partial) with every photo (N, partial)."""
+        """Return match logits (T, N) of every touch (T, a) with every photo (N, b)."""
         pooled = slice(self.second.in_features, self.cosine_end)
         logits = self._fusion(touch_partials[:, None], photo_partials[None])
         logits = logits + touch_partials[:, pooled] @ photo_partials[:, pooled].T
@@ -172,7 +172,7 @@ class Matcher(nn.Module):
         self.head = FusionHead(
             touch_features, photo_features, config.hidden, config.dropout, cosine_dim, config.cell_dim
         )
-        # Created after the head, so that the head's random initial weights equal the paper's model.
+        # Created after the head: its random initial weights are then those of the paper's model.
         self.touch_projection = _projection(touch_features, config)
         self.photo_projection = _projection(photo_features, config)
         # In evaluation mode a fixed affine map, so the head's first layer remains a sum of two terms.
@@ -316,7 +316,7 @@ class Matcher(nn.Module):
 
     @torch.no_grad()
     def clamp_scale(self) -> None:
-        """Clamp the contrastive scale to 1 to 100, so that the gradient of `log_scale` can reduce it again."""
+        """Clamp the contrastive scale to 1..100 in the parameter; a clamp in the loss would stop its gradient."""
         self.log_scale.clamp_(0.0, LOG_SCALE_MAX)
 
 
@@ -364,8 +364,8 @@ def score_partials(
 
     Args:
         head: The fusion head.
-        touch_partials: (G, partial) partial activations of the grasps.
-        photo_partials: (N, partial) partial activations of the photos.
+        touch_partials: (G, a) partial activations of the grasps.
+        photo_partials: (N, b) partial activations of the photos.
         rows: Photos to score; None for all.
 
     Returns:

@@ -12,7 +12,7 @@ from torch.nn import functional
 CELL_HIDDEN = 128
 """Hidden units of the network of a cell."""
 WEIGHT_INIT = 0.25
-"""Initial weight of a touch cell; 32 cells then add at most 8 to the logit."""
+"""Approximate initial weight of a touch cell; 32 cells then add about 8 to the logit."""
 
 
 class CellEncoder(nn.Module):

@@ -71,12 +71,12 @@ def is_near(here: Pose, there: Pose) -> bool:
 
 
 def describe_pose(pose: Pose) -> str:
-    """Return the request for a pose; right and away are as in the picture of the camera on the -y side."""
-    sideways = f"{abs(pose.x_mm):.0f} mm to the {'right' if pose.x_mm >= 0 else 'left'} of the middle of the workspace"
-    along = f"{abs(pose.y_mm):.0f} mm {'away from' if pose.y_mm >= 0 else 'towards'} the camera"
+    """Return the request for a pose; right and behind are as the camera on the -y side sees them."""
+    sideways = f"{abs(pose.x_mm):.0f} mm to the {'right' if pose.x_mm >= 0 else 'left'} of the origin"
+    along = f"{abs(pose.y_mm):.0f} mm {'behind' if pose.y_mm >= 0 else 'in front of'} it as the camera sees it"
     turned = f"{math.degrees(math.remainder(pose.yaw_rad, math.tau)):.0f} deg"
     return (
-        f"Put the point between the fingertips {pose.z_mm:.0f} mm above the table, {sideways}, {along}, with the line "
-        f"from finger a to finger b turned by {turned} from the right, counter-clockwise seen from above; "
+        f"Put the point between the fingertips {pose.z_mm:.0f} mm above the table, {sideways}, {along}, with the "
+        f"direction from finger a to finger b {turned} counter-clockwise from the right, seen from above; "
         "then press Enter."
     )

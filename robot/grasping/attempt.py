@@ -1,7 +1,8 @@
 """One grasp attempt with any rig: photograph, plan, close, lift, put down.
 
 All random numbers of an attempt derive from (seed, object, number). On the simulated rig, the whole attempt depends
-only on these three values: it can be repeated in another process or after a crash.
+only on these three values, and on earlier grasps if the planner uses them: it can be repeated in another process or
+after a crash.
 """
 
 import contextlib
@@ -35,7 +36,7 @@ class GraspAttempt:
         number: Number of the attempt at this object.
         outcome: "held", "missed" or "slipped", as the gripper reports after the lift. Without images: "no_plan", or
             "ungraspable" if no further attempt can succeed; `reason` gives the cause.
-        images: Content of JPEG and PNG files by column.
+        images: Content of JPEG and PNG files by key (photo, touch_a, touch_a_before, ...).
         fields: Further fields of the recorded grasp.
         fit: The plan's description of the object, for the log.
         reason: Message of the PlanError, if any.
@@ -152,9 +153,10 @@ class AttemptRunner:
         arm = self.rig.arm
         if arm.is_manual:
             return
-        here, top = arm.pose(), arm.workspace.upper[2]
-        if here.z_mm < top and arm.workspace.contains(here):
-            arm.move_to(replace(here, z_mm=top), self.settings.approach_mm_s)
+        here = arm.pose()
+        above = replace(here, z_mm=arm.workspace.upper[2])
+        if here.z_mm < above.z_mm and arm.workspace.contains(above):
+            arm.move_to(above, self.settings.approach_mm_s)
 
     def _grasp(self, plan: GraspPlan) -> tuple[dict[str, bytes], dict[str, Any], float]:
         """Approach, close and lift; return touches, fields of the recorded grasp, and the time of the touch."""
@@ -179,7 +181,7 @@ class AttemptRunner:
         return touches | during, fields, touch_time
 
     def _read_touches(self, moment: str, since_s: float) -> tuple[dict[str, bytes], float]:
-        """Read gel images by column, at most `since_s` old, and their skew in s.
+        """Read gel images by key, at most `since_s` old, and their skew in s.
 
         With contact, `since_s` is the wait after the last motion, so no frame is older than the end of that motion.
         Without contact, frames from the approach are valid, too.
@@ -205,7 +207,8 @@ class AttemptRunner:
         low, high = np.array(rig.arm.workspace.lower), np.array(rig.arm.workspace.upper)
         x, y = (low + high)[:2] / 2 + settings.table_share * rng.uniform(-0.5, 0.5, 2) * (high - low)[:2]
         yaw = float(rng.uniform(0.0, math.pi))
-        if rig.object_fit is not None or plan.pose.tilt_rad:
+        is_returned = rig.object_fit is not None or bool(plan.pose.tilt_rad)
+        if is_returned:
             x, y, yaw = plan.pose.x_mm, plan.pose.y_mm, plan.pose.yaw_rad
         if held:
             z = min(plan.pose.z_mm + settings.release_mm, float(high[2]))
@@ -214,7 +217,7 @@ class AttemptRunner:
             rig.arm.move_to(replace(over, z_mm=z), settings.approach_mm_s)
         rig.gripper.open(rig.gripper.stroke_mm)
         if held:
-            rig.arm.move_to(plan.approach[-1] if plan.approach else over, settings.approach_mm_s)
+            rig.arm.move_to(plan.approach[-1] if plan.approach and is_returned else over, settings.approach_mm_s)
 
     def _pictures(self, image: RGBD) -> dict[str, bytes]:
         pictures = {"photo": self._jpeg(image.colour)}

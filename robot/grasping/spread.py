@@ -1,4 +1,4 @@
-"""A planner that spreads the grasps of an object over its height, so that each one touches another place."""
+"""A planner that spreads the grasps of an object over its height."""
 
 from collections.abc import Sequence
 
@@ -9,6 +9,7 @@ from robot.grasping.planner import GraspPlan, GraspPlanner
 from robot.grasping.settings import GraspSettings
 from robot.readings import RGBD
 from robot.rig import Rig
+from robot.settings import check_range
 
 
 class SpreadPlanner(GraspPlanner):
@@ -28,6 +29,7 @@ class SpreadPlanner(GraspPlanner):
     """
 
     def __init__(self, planner: GraspPlanner, heights_mm: Sequence[float], *, draws: int = 8) -> None:
+        check_range("draws", draws, 1, 1000, "")
         self.planner, self.heights_mm, self.draws = planner, heights_mm, draws
         self.needs_depth = planner.needs_depth
 

@@ -361,6 +361,51 @@ def test_a_motion_that_begins_low_is_vertical(faults, monkeypatch):
     assert all((here.x_mm, here.y_mm, here.yaw_rad) == (there.x_mm, there.y_mm, there.yaw_rad) for here, there in low)
 
 
+def test_an_arm_that_reports_a_height_below_the_workspace_still_rises_straight(monkeypatch):
+    """A pose is measured: after a grasp at the lowest height it may lie a little below it."""
+    moves, real = [], FakeArm._move_to
+
+    def recorded(self, pose, speed_mm_s):
+        moves.append((self.shared.pose, pose))
+        return real(self, pose, speed_mm_s)
+
+    monkeypatch.setattr(FakeArm, "_move_to", recorded)
+    rig = FakeRig(3)
+    with rig:
+        low = dataclasses.replace(rig.shared.pose, z_mm=rig.arm.workspace.lower[2] - 0.01)
+        rig.shared.pose = low
+        AttemptRunner(rig, 3, AttemptSettings()).run("round-0", 0)
+    assert moves[0] == (low, dataclasses.replace(low, z_mm=rig.arm.workspace.upper[2]))
+
+
+class Approaching(CylinderPlanner):
+    """Plans an upright grasp with a way of its own to it."""
+
+    def plan(self, rig, image, settings, rng):
+        plan = super().plan(rig, image, settings, rng)
+        return dataclasses.replace(plan, approach=(plan.above,))
+
+
+def test_the_open_hand_leaves_an_object_that_was_put_elsewhere_straight_up(monkeypatch):
+    """On the way back to the approach, the jaws would hit the object between them."""
+    moves, real = [], FakeArm._move_to
+
+    def recorded(self, pose, speed_mm_s):
+        moves.append((self.shared.pose, pose))
+        return real(self, pose, speed_mm_s)
+
+    monkeypatch.setattr(FakeArm, "_move_to", recorded)
+    rig = FakeRig(3)
+    rig.planner = Approaching()
+    with rig:
+        runner = AttemptRunner(rig, 3, AttemptSettings())
+        while runner.run("round-0", len(moves)).outcome != "held":
+            pass
+    here, there = moves[-1]
+    assert (here.x_mm, here.y_mm) == (there.x_mm, there.y_mm)
+    assert there.z_mm > here.z_mm
+
+
 def test_with_a_given_place_no_depth_is_read_and_the_object_is_put_back_there():
     rig = FakeRig(3)
     with rig:

@@ -65,7 +65,7 @@ def build_index(
 ) -> BuildReport:
     """Write the next generation of an index of a catalogue, or the first one.
 
-    Nothing is written if model, catalogue (with metadata) and settings are unchanged. Photos that cannot
+    No generation is written if model, catalogue, metadata and settings are unchanged. Photos that cannot
     be read are skipped and reported. An interrupted build stores its embeddings and partial activations for the next.
 
     Args:

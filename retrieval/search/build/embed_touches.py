@@ -48,7 +48,7 @@ class ReferenceBuild:
 
     Attributes:
         rows: Object, paths of the gel images and their digests, of each touch.
-        partials: Their partial activations (R, partial_width).
+        partials: Their partial activations (R, touch_partial_width).
         touch_only: Objects without photos.
         skipped: Touches that could not be used.
         encoded: Number of touches that were encoded now.

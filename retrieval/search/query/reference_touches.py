@@ -122,7 +122,7 @@ class References:
         return {path: (one, digest) for one in self._all for path, digest in zip(one.touch, one.digests, strict=True)}
 
     def similarities_to_objects(self, partials: Floats) -> Similarities:
-        """Return the similarities (count,) of grasps, given by partial activations (G, partial_width), with objects."""
+        """Return the similarities (count,) of grasps, as partial activations (G, touch_partial_width), with objects."""
         found = np.full(len(self._touch_only), np.nan)
         if len(self._objects):
             found[self._objects] = reference_similarity(
@@ -168,7 +168,7 @@ class References:
 
         Args:
             number: Number of the object.
-            partials: Partial activations (G, partial_width) of the grasps.
+            partials: Partial activations (G, touch_partial_width) of the grasps.
             logit: Logit of the object.
             photo_logits: Its logit from photos only; NaN without photos.
 

@@ -120,7 +120,7 @@ class Searcher:
         return cls(url_or_path(index), shard, stored, encoder, scorer_for(stored, shard.info.about))
 
     def close(self) -> None:
-        """Release the index and the model; running queries finish first. A second call does nothing."""
+        """Release the index and the model; running queries continue. A second call does nothing."""
         self._closed = True
         for name in ("shard", "encoder", "reader", "scorer"):
             vars(self).pop(name, None)
@@ -150,7 +150,8 @@ class Searcher:
         return shard
 
     def __enter__(self) -> Searcher:
-        return self._snapshot()
+        self._snapshot()  # refuses a closed searcher
+        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -237,7 +238,7 @@ class Searcher:
         return opened._results(every, spans, background, top, candidates, none_prior)
 
     def encode(self, touches: AnyTouches, *, background: Sequence[AnyImage] | None = None) -> EncodedTouches:
-        """Return the unit embeddings (G, embedding_dim) and partial activations (G, partial_width) of G grasps.
+        """Return the unit embeddings (G, embedding_dim) and partial activations (G, touch_partial_width) of G grasps.
 
         The inner product of a grasp's embedding with a photo's (`retrieval.embed_photos`) orders candidates; it is not
         a probability. `searcher.scorer.logits(partials, photo_partials)` gives match logits, summed over the grasps.

@@ -39,7 +39,7 @@ Rows = NDArray[np.int64]
 
 
 class ShardQuery(NamedTuple):
-    """Grasps with contact of one object: embeddings (G, embedding_dim) and partials (G, partial_width), G > 0."""
+    """Grasps with contact of one object: embeddings (G, embedding_dim), partials (G, touch_partial_width); G > 0."""
 
     embeddings: Floats
     partials: Floats
@@ -63,7 +63,7 @@ class ShardResult:
         best: The best objects, ordered by (-logit, name), at most the requested number.
         mass: Evidence mass of all objects; None if the model is not calibrated.
         searched: Number of photos that could be candidates: all photos, unless a shard did not answer.
-        timing_ms: Milliseconds by stage.
+        timing_ms: Milliseconds by stage; of several shards, those of the slowest.
     """
 
     photos: int
@@ -197,7 +197,7 @@ class FolderShard:
 
         Args:
             number: Number of the object (`Objects.numbers_of`).
-            partials: (G, partial_width) partial activations of the grasps.
+            partials: (G, touch_partial_width) partial activations of the grasps.
             posterior: The posterior of the model.
         """
         rows = self.objects.remaining_rows(np.array([number]), np.zeros(0, dtype=np.int64))

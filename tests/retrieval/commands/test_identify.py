@@ -3,6 +3,7 @@
 import itertools
 import json
 
+import numpy as np
 import pytest
 
 from retrieval.commands.main import main
@@ -10,6 +11,7 @@ from retrieval.data.dataset import load_grasps
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
 from retrieval.search.defaults import shipped_model
+from retrieval.search.query import answer, searcher
 from robot.collection import CollectSettings, collect
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
@@ -68,6 +70,23 @@ def test_an_unclear_answer_takes_all_grasps_at_different_heights_and_continues_w
     identify("--confidence", "1", "--grasps", "3")
     assert (tmp_path / "run" / "metadata.jsonl").read_text().splitlines() == lines
     assert capsys.readouterr().err == whole
+
+
+def test_a_finished_run_is_refused_since_the_hand_may_hold_another_object(identify, tmp_path, capsys):
+    identify("--confidence", "0")
+    before = {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()}
+    capsys.readouterr()
+    assert identify("--confidence", "0") == 2
+    refusal = capsys.readouterr().err.splitlines()[-1]
+    assert "holds a finished run" in refusal
+    assert "Give another --out" in refusal
+    assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
+
+
+def test_an_image_that_is_no_gel_image_ends_the_run_since_no_further_grasp_changes_it(identify, monkeypatch):
+    monkeypatch.setattr(answer, "gel_classes", lambda check, codes: np.full(len(codes.partials), "not a gel image"))
+    monkeypatch.setattr(searcher, "gel_classes", answer.gel_classes)
+    assert identify("--confidence", "1", "--grasps", "3") == 5
 
 
 def test_an_expected_object_ends_with_a_decision_or_after_all_grasps(identify, index, capsys):

@@ -95,5 +95,11 @@ def test_an_accuracy_that_is_not_reached_needs_no_number_of_grasps():
     assert found["grasps_needed"] == found["relative_to_random"] == {"value": None, "low": None, "high": None}
 
 
+def test_a_policy_that_alone_reaches_the_accuracy_has_no_ratio_to_random():
+    found = evaluated(HEIGHTS_MM * 3, clear=(4,))["policies"]
+    assert found["random"]["grasps_needed"]["value"] is None
+    assert found["upper_bound"]["relative_to_random"]["value"] is None
+
+
 def test_without_heights_there_is_nothing_to_choose():
     assert evaluated([None] * 18) is None

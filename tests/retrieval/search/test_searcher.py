@@ -116,12 +116,12 @@ def test_the_bad_one_of_several_objects_is_reported_before_reading(searcher, gra
 def test_a_closed_searcher_raises_and_can_be_closed_twice(index, touch):
     with Searcher.open(index) as searcher:
         assert searcher.query(touch).results
-    searcher.close()
     for use in (lambda: searcher.query(touch), lambda: searcher.query_many([touch]), lambda: searcher.encode(touch)):
         with pytest.raises(BadInput, match=r"this searcher of .*index is closed; open the index again"):
             use()
     with pytest.raises(BadInput, match="is closed"), searcher:
         pass
+    searcher.close()
 
 
 def test_pickling_a_searcher_raises_with_a_remedy(searcher):

@@ -23,10 +23,8 @@ def test_a_pose_is_requested_in_words_and_assumed_reached():
     target = Pose(-12.4, 30.0, 120.0, math.radians(35))
     assert arm.move_to(target, 100.0) == target == arm.pose()
     (text,) = requests
-    assert (
-        "120 mm above the table, 12 mm to the left of the middle of the workspace, 30 mm away from the camera" in text
-    )
-    assert "turned by 35 deg" in text
+    assert "120 mm above the table, 12 mm to the left of the origin, 30 mm behind it as the camera sees it" in text
+    assert "from finger a to finger b 35 deg counter-clockwise" in text
     assert text.endswith("then press Enter.")
 
 
