@@ -2,6 +2,7 @@
 
     indexes, robot, retrieval                   tests of the packages, in the same folders
     benchmarks, project                         tests of `benchmarks/`; of documentation, imports and packaging
+    integrations                                tests of `integrations/`, the packages for other projects
     conftest                                    pictures and models that several files use
     synthetic, labelled_pictures                synthetic pictures
     synthetic_evaluation, reference_model       synthetic results, and a model with reference calibration

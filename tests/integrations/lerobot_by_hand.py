@@ -43,7 +43,7 @@ from lerobot_camera_gelsight import GelSightCamera, GelSightCameraConfig  # noqa
 from robot.recording.folder import read_recording  # noqa: E402
 from tests.fake_video import FakeVideoDevice  # noqa: E402
 
-FPS, EPISODES, EPISODE_S = 10, 4, 2.6
+FPS, EPISODES, EPISODE_S = 10, 4, 3.0
 SIZES = {"scene": (160, 120), "gel_a": (320, 240), "gel_b": (320, 240)}
 RETURNED: dict[str, list[np.ndarray]] = {}
 
@@ -124,7 +124,7 @@ class BenchTeleopConfig(TeleoperatorConfig): ...
 class BenchTeleop(Teleoperator):
     config_class, name = BenchTeleopConfig, "bench_teleop"
     is_calibrated = is_connected = True
-    action_features, feedback_features = {"joint.pos": float}, {}  # noqa: RUF012
+    action_features, feedback_features = {"joint.pos": float}, {}
 
     def connect(self, calibrate=True): ...
     def calibrate(self): ...
@@ -139,9 +139,7 @@ class BenchTeleop(Teleoperator):
 def with_images(pipeline, initial_features, use_videos):
     """Store cameras as images, as LeRobot 0.6 does; with `--dataset.video=false` version 0.4.4 leaves them out."""
     found = aggregate_pipeline_dataset_features(pipeline, initial_features)
-    return {
-        name: about | {"dtype": "image"} if about["dtype"] == "video" else about for name, about in found.items()
-    }
+    return {name: about | {"dtype": "image"} if about["dtype"] == "video" else about for name, about in found.items()}
 
 
 def record(folder, *, video):
@@ -178,10 +176,15 @@ def record(folder, *, video):
     return LeRobotDataset("bench/gels", root=folder)
 
 
-def pixels_of(dataset, key):
-    """Return the pictures of a camera through LeRobot's loader: a list of (H, W, 3) uint8."""
-    pictures = (dataset[index][key] for index in range(len(dataset)))
-    return [(255 * picture.permute(1, 2, 0)).round().to(torch.uint8).numpy() for picture in pictures]
+def pixels_of(dataset):
+    """Return the pictures through LeRobot's loader: camera -> list of (H, W, 3) uint8."""
+    pictures = {key.removeprefix("observation.images."): [] for key in dataset.meta.camera_keys}
+    for index in range(len(dataset)):
+        step = dataset[index]
+        for name, found in pictures.items():
+            picture = step[f"observation.images.{name}"]
+            found.append((255 * picture.permute(1, 2, 0)).round().to(torch.uint8).numpy())
+    return pictures
 
 
 def rms(one, other):
@@ -194,10 +197,10 @@ def retrieve(*arguments):
     subprocess.run([sys.executable, "-m", "retrieval", *map(str, arguments)], check=True)
 
 
-def check_recorded(dataset, what):
+def check_recorded(pixels, what):
     """Compare the data set with what the cameras returned, and that with the emulated pictures."""
     for name, device in DEVICES.items():
-        loaded, returned = pixels_of(dataset, f"observation.images.{name}"), RETURNED[name]
+        loaded, returned = pixels[name], RETURNED[name]
         known = {expected(name, device.picture(number)).tobytes() for number in range(1, device.pictures + 1)}
         exact = sum(picture.tobytes() in known for picture in returned)
         worst = max(rms(one, other) for one, other in zip(loaded, returned, strict=True))
@@ -206,14 +209,13 @@ def check_recorded(dataset, what):
         )
 
 
-def check_imported(dataset, folder, what):
+def check_imported(pixels, folder, what):
     """Compare the touches of an imported recording with the frames that LeRobot's loader returns."""
     recording = read_recording(folder)
     for finger, name in (("a", "gel_a"), ("b", "gel_b")):
-        frames = pixels_of(dataset, f"observation.images.{name}")
         files = [path for grasp in recording.grasps for key, path in grasp.images().items() if f"touch_{finger}" in key]
         pictures = [cv2.imread(str(folder / path))[..., ::-1] for path in files]
-        nearest = [min(rms(picture, frame) for frame in frames) for picture in pictures]
+        nearest = [min(rms(picture, frame) for frame in pixels[name]) for picture in pictures]
         print(f"{what} {name}: {len(recording.grasps)} grasps, {len(pictures)} pictures; RMS {max(nearest):.3g}")
 
 
@@ -223,7 +225,7 @@ def check_exported(recording_folder):
     for format_ in ("lerobot", "imagefolder", "open-x-tactile"):
         retrieve("export-recording", recording_folder, "--to", format_, "--out", OUT / f"export-{format_}")
     dataset = LeRobotDataset("bench/export", root=OUT / "export-lerobot")
-    frames = pixels_of(dataset, "observation.images.touch_a")
+    frames = pixels_of(dataset)["touch_a"]
     moments = [int(dataset[index]["moment"]) for index in range(len(dataset))]
     touched = [frame for frame, moment in zip(frames, moments, strict=True) if moment == 1]
     stored = [cv2.imread(str(recording_folder / grasp.touches["a"]))[..., ::-1] for grasp in recording.grasps]
@@ -231,9 +233,7 @@ def check_exported(recording_folder):
     print(f"export lerobot: {dataset.num_episodes} episodes, {len(dataset)} frames; largest RMS of touch_a {worst:.3g}")
     print(f"export lerobot: task {dataset[0]['task']!r}; one batch {next(iter(loader(dataset)))['index'].shape}")
     rows = load_dataset("imagefolder", data_dir=str(OUT / "export-imagefolder"))["train"]
-    same = sum(
-        np.array_equal(np.asarray(row["touch_a"]), picture) for row, picture in zip(rows, stored, strict=True)
-    )
+    same = sum(np.array_equal(np.asarray(row["touch_a"]), picture) for row, picture in zip(rows, stored, strict=True))
     print(f"export imagefolder: {len(rows)} rows, columns {', '.join(rows.column_names)}; touch_a equal in {same}")
 
 
@@ -267,11 +267,11 @@ def main():
         by_path = {str((OUT / "dev" / name).resolve()): device for name, device in DEVICES.items()}
         stack.enter_context(mock.patch.object(cv2, "VideoCapture", lambda path, _: by_path[path].open(path)))
         for what in ("images", "videos"):
-            dataset = record(OUT / what, video=what == "videos")
-            check_recorded(dataset, f"record {what}")
+            pixels = pixels_of(record(OUT / what, video=what == "videos"))
+            check_recorded(pixels, f"record {what}")
             folder = OUT / f"recording-{what}"
             retrieve("import", "lerobot", OUT / what, "--out", folder)
-            check_imported(dataset, folder, f"import {what}")
+            check_imported(pixels, folder, f"import {what}")
         check_disconnect()
     check_exported(OUT / "recording-images")
 

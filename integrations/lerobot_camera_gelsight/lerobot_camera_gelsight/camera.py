@@ -17,7 +17,7 @@ from robot.drivers import discover
 from robot.drivers.gels.opencv import OpencvTactile
 from robot.errors import DeviceError
 from robot.real_rig import DRIVERS
-from robot.settings import build_named
+from robot.settings import build
 
 log = logging.getLogger(__name__)
 Picture = npt.NDArray[np.uint8]
@@ -46,6 +46,9 @@ class GelSightCameraConfig(CameraConfig):
 
     device: str
     sensor: str = "gelsight_mini"
+    fps: int | None = None
+    width: int | None = None
+    height: int | None = None
     settings: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -71,15 +74,15 @@ class GelSightCamera(Camera):
         """
         super().__init__(config)
         self.config = config
-        table: dict[str, Any] = {"driver": config.sensor, "device": config.device, **config.settings}
+        driver = DRIVERS["sensors"].resolve(config.sensor)
+        if not issubclass(driver, OpencvTactile):
+            raise ValueError(f"sensor must be gelsight, gelsight_mini, digit or uvc, got {config.sensor!r}")
+        table: dict[str, Any] = {"device": config.device, **config.settings}
         if config.fps:
             table["fps"] = float(config.fps)
         if config.width and config.height:
             table["output_px"] = [config.width, config.height]
-        sensor = build_named(DRIVERS["sensors"], table, "driver", where=str(self), finger="a")
-        if not isinstance(sensor, OpencvTactile):
-            raise ValueError(f"sensor must be gelsight, gelsight_mini, digit or uvc, got {config.sensor!r}")
-        self._sensor = sensor
+        self._sensor = build(driver, table, where=str(self), finger="a")
         self._last_s = -math.inf
 
     def __str__(self) -> str:
