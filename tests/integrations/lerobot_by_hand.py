@@ -219,6 +219,24 @@ def check_imported(pixels, folder, what):
         print(f"{what} {name}: {len(recording.grasps)} grasps, {len(pictures)} pictures; RMS {max(nearest):.3g}")
 
 
+def check_lost():
+    """Unplug a camera in the second episode; the first must be on disk."""
+    observe = Bench.get_observation
+
+    def observe_and_unplug(robot):
+        DEVICES["gel_a"].dead = len(RETURNED["gel_a"]) >= FPS * EPISODE_S + 5
+        return observe(robot)
+
+    with mock.patch.object(Bench, "get_observation", observe_and_unplug):
+        try:
+            record(OUT / "lost", video=False)
+        except TimeoutError as error:
+            print(f"lost while recording: {error}")
+    DEVICES["gel_a"].dead = False
+    dataset = LeRobotDataset("bench/gels", root=OUT / "lost")
+    print(f"lost while recording: {dataset.num_episodes} complete episode(s) of {len(dataset)} frames")
+
+
 def check_exported(recording_folder):
     """Load our exports with LeRobot and `datasets`."""
     recording = read_recording(recording_folder)
@@ -273,6 +291,7 @@ def main():
             retrieve("import", "lerobot", OUT / what, "--out", folder)
             check_imported(pixels, folder, f"import {what}")
         check_disconnect()
+        check_lost()
     check_exported(OUT / "recording-images")
 
 
