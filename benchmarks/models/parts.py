@@ -112,8 +112,10 @@ def trained_row(
 ) -> dict[str, Measure]:
     """Train one row, or read it, and return its measures on the test recording."""
     config, count, seed = row
-    towers = frozen_matcher(config)
-    train, validation, _ = (encode_recording(part, towers, config, out / "features") for part in recordings)
+    towers = frozen_matcher(matcher(cell_dim=load_config(PRESET).matcher.cell_dim)(config))
+    train, validation = (encode_recording(part, towers, config, out / "features") for part in recordings[:2])
+    if not config.matcher.cell_dim:
+        train, validation = train.pooled(towers), validation.pooled(towers)
     folder = out / name.replace(" ", "-").replace(",", "").replace("'", "")
     settings = MethodSettings(config, seed, folder, quiet=False)
     made = trained_checkpoint(settings, first_objects(train, count), validation)

@@ -66,6 +66,14 @@ class OpencvTactile(TactileSensor):
         """Failures of the stream since the sensor was connected, failed reopenings included."""
         return self._reader.lost_count
 
+    def read_after(self, time_s: float, timeout_s: float) -> Frame:
+        """Wait at most `timeout_s` for a frame newer than `time_s` and return the newest frame; else raise DeviceError.
+
+        Unlike `read`, it waits for a lost stream no longer than this. With `timeout_s` 0 it does not wait at all.
+        """
+        with self._use("cannot be read"):
+            return self._picture(self._reader.after(time_s, timeout_s))
+
     def _connect(self) -> None:
         self._reader = CaptureReader(self, self._options)
         self._reader.start()

@@ -111,13 +111,19 @@ class FrameReader:
         """
         return self._wait(self.settings.timeout_s)[-1]
 
-    def after(self, time_s: float) -> Frame:
-        """Wait for a frame newer than `time_s` and return it.
+    def after(self, time_s: float, timeout_s: float | None = None) -> Frame:
+        """Wait for a frame newer than `time_s` and return the newest frame.
+
+        Args:
+            time_s: A time on the reader's clock.
+            timeout_s: Longest wait; None for `timeout_s` + `warmup_s` of the settings: a lost stream warms up again.
 
         Raises:
-            DeviceError: No frame arrived within `timeout_s` + `warmup_s`; a lost stream warms up again.
+            DeviceError: No such frame arrived in this time.
         """
-        return self._wait(self.settings.timeout_s + self.settings.warmup_s, time_s)[-1]
+        if timeout_s is None:
+            timeout_s = self.settings.timeout_s + self.settings.warmup_s
+        return self._wait(timeout_s, time_s)[-1]
 
     def near(self, time_s: float) -> Frame:
         """Return the buffered frame nearest to `time_s`, on a tie the newer one; raise DeviceError without frames."""

@@ -175,6 +175,19 @@ def test_after_waits_for_a_newer_frame(script, make):
     assert reader.after(1.0).time_s == 2.0
 
 
+def test_after_waits_no_longer_than_its_own_timeout_also_for_a_lost_stream(script, make):
+    script.show(1.0)
+    reader = make(ReaderSettings(warmup_s=0.0, timeout_s=600.0))
+    reader.start()
+    assert reader.after(0.5, 0.0).time_s == 1.0
+    with pytest.raises(DeviceError, match="no picture within 0 s"):
+        reader.after(1.0, 0.0)
+    script.items.put(OSError(19, "No such device"))
+    wait_until(lambda: reader.lost_count == 1)
+    with pytest.raises(DeviceError, match=r"within 0\.01 s: .*No such device"):
+        reader.after(0.5, 0.01)
+
+
 def test_a_frame_equal_to_the_last_is_as_old_as_its_first_copy(script, make):
     reader = make()
     script.show(0.0)
