@@ -3,6 +3,7 @@
     rig = "real"
     source = "bench 3"                        # written into recording.json
     sensor = "gelsight mini"
+    licence = "CC BY 4.0"                     # of the recorded data; default: not stated
 
     [limits]                                  # upper limits of every commanded motion
     workspace_lower_mm = [-150, -150, 10]     # of the point between the fingertips; z = 0 is the table
@@ -156,6 +157,7 @@ class RealRig(Rig):
         planner: Mapping[str, Any] = {},
         source: str = "real rig",
         sensor: str = "gelsight",
+        licence: str = "",
     ) -> None:
         """Build the devices without connecting them; raise RobotConfigError, or UnknownName for a driver."""
         maxima = build(Limits, limits, where="[limits]")
@@ -175,6 +177,7 @@ class RealRig(Rig):
             info={
                 "source": source,
                 "sensor": sensor,
+                **({"licence": licence} if licence else {}),
                 "gels": [{finger: gels[finger].to_dict() for finger in gels}],
             },
             attempt=_attempt(attempt, grasp, maxima),

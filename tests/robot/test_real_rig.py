@@ -63,6 +63,7 @@ def test_a_file_becomes_a_rig_with_its_devices_under_its_limits(tmp_path):
     assert rig.gripper.max_force_n <= 15
     assert rig.gripper.max_speed_mm_s == 40
     assert rig.info["source"] == "bench 3"
+    assert "licence" not in rig.info
     assert rig.info["rig_settings"]["gripper"]["driver"] == "wsg50"
     assert not any(device.is_connected for device in rig.devices)
 
@@ -242,3 +243,8 @@ def test_a_wrong_file_is_refused_with_the_place_and_the_remedy(case, tmp_path):
 def test_every_driver_of_the_table_exists_and_refuses_an_unknown_key(role, name):
     with pytest.raises(RobotConfigError, match="no setting 'bort'"):
         load_driver(role, {"driver": name, "bort": 1}, "[x]")
+
+
+def test_a_file_states_the_licence_of_the_recorded_data(tmp_path):
+    text = TABLES[""] + '\nlicence = "CC BY 4.0"'
+    assert load_rig(written(tmp_path, **{"": text}), seed=0).info["licence"] == "CC BY 4.0"
