@@ -2,13 +2,14 @@
 
     indexes, robot, retrieval                   tests of the packages, in the same folders
     benchmarks, project                         tests of `benchmarks/`; of documentation, imports and packaging
+    integrations                                the examples of `integrations/`, with stubs of other software
     conftest                                    pictures and models that several files use
     synthetic, labelled_pictures                synthetic pictures
     synthetic_evaluation, reference_model       synthetic results, and a model with reference calibration
     miniatures, real_data_sets, data            small public data sets, and the folder of real ones
     emulators                                   a WSG-50 and a Sawyer as programs, based on the facts of the drivers
     emulated_rig                                hundreds of grasps with the real drivers and injected faults
-    fake_rig, replay_rig, views, meshes         rigs, depth pictures and solids from formulas and from files
+    fake_rig, own_rig, replay_rig, views, meshes    rigs, depth pictures and solids from formulas and from files
     fake_video, wsg50_bench, wsg50_packets      fake cameras and a fake gripper
     oracle, documents, pages                    expected search results; parsers of documents and pages
     verification                                a calibration of verifications with given bounds

@@ -6,7 +6,7 @@ from collections import Counter
 
 from tests.documents import CONTRIBUTING, NOTEBOOKS, PAGES, ROOT, text_of
 
-FOLDERS = ("retrieval", "robot", "indexes", "_touch_retrieval", "benchmarks", "tests")
+FOLDERS = ("retrieval", "robot", "indexes", "_touch_retrieval", "benchmarks", "integrations", "tests")
 CODE = [path for folder in FOLDERS for path in sorted((ROOT / folder).rglob("*.py")) if path.name != "test_language.py"]
 PAGE_CODE = sorted(path for ending in ("*.js", "*.html", "*.toml") for path in (ROOT / "retrieval").rglob(ending))
 
