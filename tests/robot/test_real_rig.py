@@ -163,7 +163,7 @@ def test_a_recorded_camera_without_depth_raises_when_it_is_connected(tmp_path, m
 
 
 BAD = {
-    "an unknown driver": ({"arm": 'driver = "kuka"'}, r"\[arm\]: driver must be one of manual, own, sawyer; got 'kuka'"),
+    "an unknown driver": ({"arm": 'driver = "kuka"'}, r"\[arm\]: driver must be one of .*, sawyer; got 'kuka'"),
     "no driver": ({"gripper": 'port = "a"'}, r"\[gripper\]: driver must be one of own, wsg50; got None"),
     "an unknown key": ({"gripper": 'driver = "wsg50"\nport = "a"\nbort = 1'}, r"\[gripper\] has no setting 'bort'"),
     "a key too few": ({"gripper": 'driver = "wsg50"'}, r"\[gripper\] requires 'port'"),
@@ -193,7 +193,7 @@ BAD = {
     "a grasp setting in [attempt]": ({"attempt": "grasp = 3"}, r"\[attempt\] has no setting 'grasp'"),
     "a force that is no range": ({"grasp": "force_n = 10"}, r"\[grasp\]: force_n must be a list"),
     "a force of three": ({"grasp": "force_n = [1, 2, 3]"}, r"force_n must be a list of length 2, got \[1, 2, 3\]"),
-    "a list of drivers": ({"arm": 'driver = ["manual"]'}, r"\[arm\]: driver must be one of manual, own, sawyer; got \['man"),
+    "a list of drivers": ({"arm": 'driver = ["manual"]'}, r"\[arm\]: driver must be one of .*, sawyer; got \['man"),
     "an infinite speed": ({"attempt": "travel_mm_s = inf"}, r"attempt\.travel_mm_s must be a finite number"),
     "a place that is not a number": (
         {"object": "x_mm = nan\ny_mm = 0\nheight_mm = 9\nradius_mm = 3"},

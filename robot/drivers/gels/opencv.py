@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from robot.devices import Clock, TactileSensor
+from robot.drivers.video.frames import Arrival
 from robot.drivers.video.opencv_stream import CaptureReader, CaptureSettings, UsbCameraSettings
 from robot.drivers.video.rectify import CropSettings, make_rectifier, to_rgb
 from robot.readings import Frame
@@ -65,6 +66,11 @@ class OpencvTactile(TactileSensor):
     def lost_count(self) -> int:
         """Failures of the stream since the sensor was connected, failed reopenings included."""
         return self._reader.lost_count
+
+    @property
+    def arrivals(self) -> list[Arrival]:
+        """The newest frames of the stream, as they arrived."""
+        return self._reader.arrivals
 
     def _connect(self) -> None:
         self._reader = CaptureReader(self, self._options)
