@@ -71,12 +71,14 @@ An importer reads a public data set in its published layout, or your own picture
 grows only with names, not with pictures: 100,000 rows instead of 10,000 take 15 to 67 MB more, depending on the
 importer ([bags](#rosbag): by their messages; `python -m benchmarks.importers_memory`). At the end, memory also holds
 the recording's lines, one per grasp. An interrupted import continues when you run it again. Unreadable items are
-skipped, counted by reason and reported. `recording.json` stores the counts under `skipped`, the licence (`retrieve
-check` prints it) and the citation, and under `objects` the data set's own information on them. Pictures that many
-grasps share, such as one no-contact frame, are stored once. A published split by objects is in `splits/<name>.json`,
-for `--split`. Some importers need packages of the extra: `pip install 'touch-retrieval[importers]'`.
+skipped, counted by reason and reported. `recording.json` stores the counts under `skipped`, the licence with its
+terms, the citation, and under `objects` the data set's own information on them. Pictures that many grasps share, such
+as one no-contact frame, are stored once. A published split by objects is in `splits/<name>.json`, for `--split`. Some
+importers need packages of the extra: `pip install 'touch-retrieval[importers]'`.
 
-The data sets are not ours. Their own pages state the licence, which binds you and not us. If parts of a layout are not
+The data sets are not ours, and their licences bind you. "Not stated" means that we know of no licence in the files or
+the repository of a data set: ask its authors. `retrieve check` and `retrieve train` print the licence, and a checkpoint
+[lists the licences](training.md#licences) of all data that trained it. If parts of a layout are not
 verified, the importer follows the authors' descriptions and other people's readers, and lists these parts when it ends.
 [Real data](real.md#what-counts-as-touch) defines the controls that the notes name.
 
@@ -192,7 +194,8 @@ def data_sets() -> str:
         verified = "parts are not verified" if facts.unverified else "verified on the data"
         frame = facts.background if facts.background != "none" else ""
         fingers = str(facts.fingers or "any")
-        rows.append((f"[`{name}`](#{name})", facts.expects, facts.sensor, fingers, frame, facts.licence, verified))
+        licence = f"{facts.licence}: {facts.terms}" if facts.terms else facts.licence
+        rows.append((f"[`{name}`](#{name})", facts.expects, facts.sensor, fingers, frame, licence, verified))
     table = "".join(f"| {' | '.join(row)} |\n" for row in rows)
     return DATA_SETS_HEAD + table + "".join(map(_data_set, sorted(IMPORTERS)))
 

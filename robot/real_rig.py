@@ -3,6 +3,7 @@
     rig = "real"
     source = "bench 3"                        # written into recording.json
     sensor = "gelsight mini"
+    licence = "CC BY 4.0"                     # of the recorded data; default: not stated
 
     [limits]                                  # upper limits of every commanded motion
     workspace_lower_mm = [-150, -150, 10]     # of the point between the fingertips; z = 0 is the table
@@ -73,9 +74,15 @@ def _drivers(role: str, base: str, **table: str) -> "Registry[type[Device]]":
 
 DRIVERS: Mapping[str, Registry[type[Device]]] = {
     "arm": _drivers(
-        "arm", "Arm", manual="robot.drivers.manual_arm:ManualArm", sawyer="robot.drivers.sawyer.driver:Sawyer"
+        "arm",
+        "Arm",
+        manual="robot.drivers.manual_arm:ManualArm",
+        own="robot.drivers.own_robot:OwnArm",
+        sawyer="robot.drivers.sawyer.driver:Sawyer",
     ),
-    "gripper": _drivers("gripper", "Gripper", wsg50="robot.drivers.wsg50.driver:WSG50"),
+    "gripper": _drivers(
+        "gripper", "Gripper", own="robot.drivers.own_robot:OwnGripper", wsg50="robot.drivers.wsg50.driver:WSG50"
+    ),
     "sensors": _drivers(
         "sensors",
         "TactileSensor",
@@ -156,6 +163,7 @@ class RealRig(Rig):
         planner: Mapping[str, Any] = {},
         source: str = "real rig",
         sensor: str = "gelsight",
+        licence: str = "",
     ) -> None:
         """Build the devices without connecting them; raise RobotConfigError, or UnknownName for a driver."""
         maxima = build(Limits, limits, where="[limits]")
@@ -175,6 +183,7 @@ class RealRig(Rig):
             info={
                 "source": source,
                 "sensor": sensor,
+                **({"licence": licence} if licence else {}),
                 "gels": [{finger: gels[finger].to_dict() for finger in gels}],
             },
             attempt=_attempt(attempt, grasp, maxima),

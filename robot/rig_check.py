@@ -6,23 +6,28 @@ a gripper without reference over its whole stroke. With motion=False, nothing mo
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from statistics import median
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from robot.devices import Device, TactileSensor, read_together
-from robot.errors import RobotError
-from robot.readings import RGBD, Frame
+from robot.devices import Camera, Device, TactileSensor, read_together
+from robot.drivers.discover import usb_port
+from robot.drivers.video.frames import Arrival
+from robot.errors import DeviceError, RobotError
 from robot.rig import Rig
 
 JAW_MM, ARM_MM, ARM_MM_S = 5.0, 10.0, 20.0
 MEASURE_S = 2.0
 """Duration of the frame rate measurement in s."""
+
+MIN_SHARE = 0.8
+"""Smallest rate of a camera with all cameras, as a fraction of its rate alone."""
 
 _POLL_S = 0.002
 _REPEATS = 20
@@ -35,7 +40,7 @@ class DeviceReport:
 
     Attributes:
         device: Name of the device.
-        role: "arm", "gripper", "gel", "camera" or "skew".
+        role: "arm", "gripper", "gel", "camera", "together" (all cameras at the same time) or "skew".
         measured: Measured figures by name, as text with units.
         refused: Settings that the device refused, each with the requested and the actual value.
         failure: Error message, or None if the device works.
@@ -55,7 +60,7 @@ class DeviceReport:
 
 
 def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[DeviceReport]:
-    """Check each device, then the time skew between the fingers' frames; yield one report for each.
+    """Check each device, then all cameras together and the time skew between the fingers' frames; yield the reports.
 
     A device error becomes the `failure` of its report.
 
@@ -68,9 +73,12 @@ def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[DeviceReport]:
         rig.prepare(rig.object_ids(1)[0], 0)
     yield _check_device([rig.arm], "arm", lambda: _check_arm(rig, motion))
     yield _check_device([rig.gripper], "gripper", lambda: _check_gripper(rig, motion))
+    alone: dict[str, float] = {}
     for sensor in rig.sensors.values():
-        yield _check_device([sensor], "gel", partial(_check_sensor, rig, sensor))
-    yield _check_device([rig.camera], "camera", lambda: _check_camera(rig))
+        yield _check_device([sensor], "gel", partial(_check_sensor, rig, sensor, alone))
+    yield _check_device([rig.camera], "camera", lambda: _check_camera(rig, alone))
+    if not rig.can_run_jobs:  # simulated cameras share no cable
+        yield _check_device(_cameras(rig), "together", lambda: _check_together(rig, alone))
     if len(rig.sensors) > 1:
         yield _check_device(list(rig.sensors.values()), "skew", lambda: _check_skew(rig))
 
@@ -130,15 +138,15 @@ def _round_trip(rig: Rig, query: Callable[[], Any]) -> dict[str, str]:
     return {"state in": f"{1000 * median(times):.2f} ms (slowest {1000 * max(times):.2f})"}
 
 
-def _check_sensor(rig: Rig, sensor: TactileSensor) -> dict[str, str]:
-    frame, measured = _measure_frames(rig, sensor.read)
-    return measured | _size(frame.pixels)
+def _check_sensor(rig: Rig, sensor: TactileSensor, alone: dict[str, float]) -> dict[str, str]:
+    watched = _watch_frames(rig, [sensor])[0]
+    return _describe_frames(watched, alone) | _size(watched.picture.pixels)
 
 
-def _check_camera(rig: Rig) -> dict[str, str]:
-    camera = rig.camera
-    image, measured = _measure_frames(rig, lambda: camera.read(depth=camera.has_depth))
-    measured |= _size(image.colour)
+def _check_camera(rig: Rig, alone: dict[str, float]) -> dict[str, str]:
+    watched = _watch_frames(rig, [rig.camera])[0]
+    image = watched.picture
+    measured = _describe_frames(watched, alone) | _size(image.colour)
     if image.depth_m is not None:
         known = np.isfinite(image.depth_m)
         middle = f", median {np.nanmedian(image.depth_m):.3f} m" if known.any() else ""
@@ -150,23 +158,112 @@ def _size(pixels: npt.NDArray[np.uint8]) -> dict[str, str]:
     return {"size": f"{pixels.shape[1]} x {pixels.shape[0]}", "mean grey level": f"{pixels.mean():.0f}"}
 
 
-_Picture = TypeVar("_Picture", Frame, RGBD)
+@dataclass
+class _WatchedFrames:
+    """The frames of one camera during a measurement.
+
+    Attributes:
+        device: The camera or gel.
+        times_s: Times of the frames that differ from the frame before.
+        arrived_s: Times of all frames.
+        ages_s: Age of the newest frame at each read.
+        repeated: Number of frames that equal the frame before; None if the driver does not count them.
+        picture: The last frame.
+    """
+
+    device: Camera | TactileSensor
+    times_s: set[float] = field(default_factory=set)
+    arrived_s: set[float] = field(default_factory=set)
+    ages_s: list[float] = field(default_factory=list)
+    repeated: int | None = None
+    picture: Any = None
+
+    @property
+    def rate_hz(self) -> float:
+        """Rate from the first frame to the last, so the phase of the measurement has no effect; 0 without frames."""
+        if len(self.times_s) < 2:
+            return 0.0
+        return (len(self.times_s) - 1) / (max(self.times_s) - min(self.times_s))
+
+    @property
+    def dropped(self) -> int:
+        """Number of missing frames in the gaps, by the median interval."""
+        intervals = np.diff(sorted(self.arrived_s))
+        return int(np.sum(np.rint(intervals / np.median(intervals)) - 1)) if len(intervals) else 0
 
 
-def _measure_frames(rig: Rig, read: Callable[[], _Picture]) -> tuple[_Picture, dict[str, str]]:
-    """Read frames for `MEASURE_S`; return the last one, with the rate of new frames and their median age."""
-    times, ages, began = set(), [], rig.clock()
+def _watch_frames(rig: Rig, devices: Sequence[Camera | TactileSensor]) -> list[_WatchedFrames]:
+    """Read the frames of all cameras at the same time for `MEASURE_S`.
+
+    A driver that records arrivals sees every frame; of other drivers, this loop sees the newest frame at each read.
+    """
+    watched, began = [_WatchedFrames(device) for device in devices], rig.clock()
     while True:
-        frame = read()
-        times.add(frame.time_s)
-        ages.append(rig.clock() - frame.time_s)
+        for each in watched:
+            device = each.device
+            picture = device.read(depth=device.has_depth) if isinstance(device, Camera) else device.read()
+            each.picture = picture
+            each.times_s.add(picture.time_s)
+            each.ages_s.append(rig.clock() - picture.time_s)
         if rig.clock() - began >= MEASURE_S:
             break
         rig.sleep(_POLL_S)
-    rate = f"{len(times)} frame(s) in {MEASURE_S:g} s"
-    if len(times) > 1:  # from the first frame to the last, so the phase of the measurement has no effect
-        rate = f"{(len(times) - 1) / (max(times) - min(times)):.1f} frames/s"
-    return frame, {"rate": rate, "age": f"{1000 * median(ages):.0f} ms"}
+    for each in watched:
+        each.arrived_s = each.times_s
+        arrivals: list[Arrival] | None = getattr(each.device, "arrivals", None)
+        if arrivals is not None:
+            recent = [arrival for arrival in arrivals if arrival.time_s >= began]
+            each.times_s = {arrival.time_s for arrival in recent if not arrival.is_repeat}
+            each.arrived_s = {arrival.time_s for arrival in recent}
+            each.repeated = sum(arrival.is_repeat for arrival in recent)
+    return watched
+
+
+def _describe_frames(watched: _WatchedFrames, alone: dict[str, float]) -> dict[str, str]:
+    """Return rate, dropped and repeated frames, age and USB socket as text; note the rate in `alone`."""
+    device, settings = watched.device, watched.device.settings()
+    alone[device.name] = watched.rate_hz
+    rate = (
+        f"{watched.rate_hz:.1f} frames/s" if watched.rate_hz else f"{len(watched.times_s)} frame(s) in {MEASURE_S:g} s"
+    )
+    promised = {"promised": f"{settings['fps']:g} frames/s"} if settings.get("fps") else {}
+    measured = {"rate": rate, **promised, "dropped": str(watched.dropped)}
+    if watched.repeated is not None:
+        measured["repeated"] = str(watched.repeated)
+    measured["age"] = f"{1000 * median(watched.ages_s):.0f} ms"
+    if (port := usb_port(str(settings.get("device", "")))) is not None:
+        measured["USB"] = str(port)
+    return measured
+
+
+def _check_together(rig: Rig, alone: Mapping[str, float]) -> dict[str, str]:
+    """Measure the rates of all cameras at the same time; raise DeviceError if one is much slower than alone."""
+    watched = _watch_frames(rig, _cameras(rig))
+    buses: dict[int, list[tuple[str, int]]] = defaultdict(list)
+    for each in watched:
+        if (port := usb_port(str(each.device.settings().get("device", "")))) is not None:
+            buses[port.bus].append((each.device.name, port.mbit_s))
+    shared = [
+        f"{' and '.join(name for name, _ in members)} share USB bus {bus} ({max(speed for _, speed in members)} Mbit/s)"
+        for bus, members in buses.items()
+        if len(members) > 1
+    ]
+    slow = [
+        f"{each.device.name} {each.rate_hz:.1f} frames/s, alone {alone[each.device.name]:.1f}"
+        for each in watched
+        if each.rate_hz < MIN_SHARE * alone.get(each.device.name, 0.0)
+    ]
+    if slow:
+        raise DeviceError(
+            f"with all cameras, frames are lost: {'; '.join([*slow, *shared])}. Connect the cameras to different USB "
+            "controllers, or lower width, height or fps"
+        )
+    rates = {each.device.name: f"{each.rate_hz:.1f} frames/s" for each in watched}
+    return rates | ({"shared": "; ".join(shared)} if shared else {})
+
+
+def _cameras(rig: Rig) -> list[Camera | TactileSensor]:
+    return [*rig.sensors.values(), rig.camera]
 
 
 def _check_skew(rig: Rig) -> dict[str, str]:

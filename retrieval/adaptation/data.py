@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from retrieval.data.dataset import Grasp, Split, finger_count, load_grasps
+from retrieval.data.dataset import Grasp, Split, finger_count, load_grasps, recording_licence
+from retrieval.data.licences import DataLicence
 from retrieval.errors import BadInput
 from retrieval.evaluation.real.protocol import read_recording_facts
 from retrieval.methods.cca_towers import TowerWidths
@@ -17,6 +18,7 @@ from retrieval.model.towers.concatenated import ConcatenatedTowers, feature_coun
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.features import Features, encode_recording
+from retrieval.training.licences import checkpoint_licences
 
 PRESET = "adapt"
 PUBLISHED_TOWER = "mobilenet_v2"
@@ -37,6 +39,7 @@ class AdaptationData:
         low_pass: The same with low-pass (8 x 6) touches.
         kind_of: The class of each object, if the recording has it.
         source: Source of the recording.
+        licences: Licences of the recording and of the start model's data.
     """
 
     grasps: list[Grasp]
@@ -46,6 +49,7 @@ class AdaptationData:
     low_pass: Features
     kind_of: dict[str, str] | None
     source: str
+    licences: list[DataLicence]
 
     @property
     def blocks(self) -> TowerWidths:
@@ -93,7 +97,8 @@ def load_adaptation_data(
     features = encode()
     low_pass = encode(touch_variant="low_pass", photo_features_from=features)
     facts = read_recording_facts(recording)
-    return AdaptationData(grasps, config, matcher, features, low_pass, facts.kind_of, facts.source)
+    licences = list(dict.fromkeys([*checkpoint_licences(start), recording_licence(recording)]))
+    return AdaptationData(grasps, config, matcher, features, low_pass, facts.kind_of, facts.source, licences)
 
 
 def config_for(start: Checkpoint, fingers: int, tower: str | type[Tower] | None, *, seed: int) -> Config:

@@ -11,6 +11,7 @@ from torch import nn
 from retrieval.adaptation.data import AdaptationData
 from retrieval.adaptation.estimate import Estimate
 from retrieval.data.dataset import Grasp, Split, data_digest
+from retrieval.data.licences import LICENCES
 from retrieval.methods.cca_towers import GRID, MAX_CALIBRATION_TOUCHES, CcaProjections, fit_projections
 from retrieval.metrics.pairs import fit_calibration
 from retrieval.model.checkpoint import Checkpoint
@@ -49,6 +50,7 @@ def fit_matcher(data: AdaptationData, estimate: Estimate | None, out: Path) -> C
         provenance={
             "step": 0,
             "source": data.source,
+            LICENCES: [dataclasses.asdict(licence) for licence in data.licences],
             "data_digest": data_digest(data.grasps),
             "metrics": estimate.to_dict() if estimate else {},
         },
@@ -135,7 +137,8 @@ def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estima
     checkpoint = _with_gel_check(start, data.grasps, estimate.baseline.features, quiet)
     folds = [sorted(set(fold.left_out.object_ids)) for fold in estimate.folds]
     about = {"source": data.source, "data_digest": data_digest(data.grasps)}
-    provenance = start.provenance | {"adapted_to": about, "metrics": estimate.to_dict()}
+    licences = [dataclasses.asdict(licence) for licence in data.licences]
+    provenance = start.provenance | {"adapted_to": about, LICENCES: licences, "metrics": estimate.to_dict()}
     made = _with_posterior(
         dataclasses.replace(checkpoint, provenance=provenance),
         estimate.baseline.reference_touches(folds, MAX_CALIBRATION_TOUCHES),

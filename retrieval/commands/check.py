@@ -21,7 +21,7 @@ def check(
     """Check a recording for broken files, duplicates, leakage and swapped folders."""
     from retrieval.data.check.appearance_checks import COMPARED_COPIES
     from retrieval.data.check.recording import check_recording
-    from robot.recording.folder import read_info
+    from retrieval.data.dataset import recording_licence
 
     if split and model:
         raise BadInput("give --split or --model, not both")
@@ -30,14 +30,14 @@ def check(
         from retrieval.model.checkpoint import load_checkpoint
 
         objects = load_checkpoint(model).split
-    findings = check_recording(recording, objects)
+    findings, licence = check_recording(recording, objects), recording_licence(recording)
     if json:
-        print_json({"findings": [dataclasses.asdict(finding) for finding in findings]})
+        found = [dataclasses.asdict(finding) for finding in findings]
+        print_json({"findings": found, "licence": dataclasses.asdict(licence)})
     for finding in findings:
         if finding.kind != COMPARED_COPIES:
             say(f"{finding.severity}: {finding.message}")
-    if licence := read_info(recording).get("licence"):
-        say(f"licence of the data: {licence}")
+    say(f"licence of the data: {licence}")
     errors, warnings = (sum(finding.severity == severity for finding in findings) for severity in ("error", "warning"))
     compared = [finding.message for finding in findings if finding.kind == COMPARED_COPIES]
     say("; ".join([f"{recording}: {errors} error(s), {warnings} warning(s)", *compared]))

@@ -1,7 +1,7 @@
 """`retrieve train`: train a matcher, pretrain a tower on relief, or train a gate for `retrieve collect`."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -21,6 +21,9 @@ from retrieval.commands.options import (
 )
 from retrieval.console.output import say
 from retrieval.errors import BadInput
+
+if TYPE_CHECKING:
+    from retrieval.data.licences import DataLicence
 
 
 def train(
@@ -70,6 +73,15 @@ def train(
     workers: Annotated[
         int | None, typer.Option(parser=WORKERS, help="with --cluster: number of ranks (default: 2)")
     ] = None,
+    require_licence: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAMES",
+            help="refuse data whose licence is not among these names, such as 'CC BY-NC 4.0,ours'; open: each licence "
+            "that allows any use, commercial use included, such as CC BY, CC BY-SA, MIT or GPL. Published initial "
+            "weights are not checked",
+        ),
+    ] = None,
 ) -> None:
     """Train a matcher, pretrain a tower on relief, or train a grasp-success gate for `collect`."""
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch, "photos": photos, "touches": touches}
@@ -79,8 +91,12 @@ def train(
     if task == "grasp-success":
         others = {"config": config, "split": split, "resume": resume, "cache": cache, **inits}
         refuse_options("does not apply to --task grasp-success, which takes --iterations and --seed", **others)
+        from retrieval.data.dataset import recording_licence
+        from retrieval.model.checkpoint import require_writable
         from retrieval.training.grasp_success import train_gate
 
+        require_writable(out)
+        _show_licences([recording_licence(recording)], require_licence)
         numbers = {"iterations": iterations, "seed": seed}
         gate: dict[str, Any] = {name: value for name, value in numbers.items() if value is not None}
         for line in train_gate(recording, out, **gate).lines():
@@ -91,6 +107,8 @@ def train(
             raise BadInput(
                 "--task relief does not take --split, --photos, --touches, --start, --init-photo or --init-touch"
             )
+        reason = "does not apply to --task relief, whose pictures state no licence"
+        refuse_options(reason, require_licence=require_licence)
         from retrieval.training.relief import ITERATIONS, train_relief
 
         settings = training_config(config, None, init=init, seed=seed)
@@ -100,12 +118,16 @@ def train(
             say(line)
         say(f"{out}: pass it to `retrieve train` or `retrieve evaluate` as --init-{report.kind}")
         return
+    from retrieval.model.checkpoint import require_writable
     from retrieval.search import defaults
     from retrieval.training import distributed
+    from retrieval.training.licences import training_licences
     from retrieval.training.train import train as train_matcher
 
     try:
         settings = training_config(config, iterations, seed=seed, **inits)
+        require_writable(out)
+        _show_licences(training_licences(recording, settings.training), require_licence)
         options: dict[str, Any] = {"split": read_split(split), "resume": resume, "cache": cache}
         if cluster:
             from retrieval.cluster.training import train_on_ray
@@ -121,3 +143,13 @@ def train(
     metrics = checkpoint.provenance["metrics"]
     figures = ", ".join(f"{name.replace('_', ' ')} {value:.3f}" for name, value in metrics.items())
     say(f"{out}: best step {checkpoint.provenance['step']}{', ' if figures else ''}{figures}")
+
+
+def _show_licences(licences: "list[DataLicence]", accepted: str | None) -> None:
+    """Print the licence of each source of training data; raise BadInput if one of them is not accepted."""
+    from retrieval.data.licences import require_licences
+
+    for licence in licences:
+        say(f"licence of {licence.source}: {licence}")
+    if accepted is not None:
+        require_licences(licences, [name.strip() for name in accepted.split(",")])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.documents import typed
 from _touch_retrieval.files import read_regular
+from retrieval.data.licences import NOT_STATED, DataLicence
 from retrieval.errors import DatasetError
 from robot.errors import RobotError
 from robot.recording.folder import Recording, read_info, read_recording
@@ -138,6 +139,12 @@ def load_attempts(folder: Path) -> list[Attempt]:
 def recording_source(folder: Path) -> str:
     """Return the source that a recording names in its recording.json."""
     return str(read_info(folder)["source"])
+
+
+def recording_licence(folder: Path) -> DataLicence:
+    """Return the licence that a recording names in its recording.json."""
+    info = read_info(folder)
+    return DataLicence(str(info["source"]), str(info.get("licence") or NOT_STATED), str(info.get("terms") or ""))
 
 
 def recorded_objects(folder: Path) -> dict[str, Any]:

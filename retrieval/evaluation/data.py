@@ -12,6 +12,7 @@ from retrieval.methods.late_fusion import frozen_matcher
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint, require_writable
 from retrieval.model.config import Config
 from retrieval.model.fusion import Matcher
+from retrieval.training.licences import training_licences
 from retrieval.training.state import finish_training, unfinished_path
 from retrieval.training.train import Trainer, labelled_pairs
 
@@ -77,7 +78,9 @@ def prepare(
     if checkpoint is None and not config.training.freeze_towers:
         done = out / "model.safetensors"
         require_writable(unfinished_path(done))
-        trainer = Trainer(config, split, grasps, unfinished_path(done), source=recording_source(recording))
+        licences = training_licences(recording, config.training)
+        source = recording_source(recording)
+        trainer = Trainer(config, split, grasps, unfinished_path(done), source=source, licences=licences)
         checkpoint = finish_training(trainer, done, quiet)
         config = _of_model(checkpoint, config)
     return EvaluationData(

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from _touch_retrieval.files import write_atomically
 from retrieval.console.files import CARD, CHECKPOINT, HEADER, require_ours
 from retrieval.data.dataset import Split
+from retrieval.data.licences import stored_licences
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.model.checkpoint_info import (
     FORMAT,
@@ -62,7 +63,7 @@ class Checkpoint(CheckpointInfo):
         path: The file.
         digest: SHA-256 of the file, in hexadecimal.
         config: Settings of towers, head and preprocessing.
-        provenance: Step, seed, data digest and metrics of the training.
+        provenance: Step, seed, data digest, licences of the data and metrics of the training.
         gel_check: Thresholds that separate touches, no-contact gels and other images; None without a gel head.
         verification: Error rates of `Searcher.verify`; None if there were too few validation objects.
         matcher: The towers, the fusion head and the projections.
@@ -131,7 +132,7 @@ def save_checkpoint(
         matcher: The model to store.
         config: Its settings.
         split: Its training, validation and test objects.
-        provenance: Source, step, seed, data digest and metrics of the training.
+        provenance: Source, step, seed, data digest, licences of the data and metrics of the training.
         posterior: Calibration of its logits.
         gel_check: Thresholds of its gel head.
         verification: Error rates of verifications with its logits.
@@ -356,6 +357,7 @@ def _model_card(name: str, header: Mapping[str, Any]) -> str:
         f"* Best step: {provenance['step']} of {header['config']['training']['iterations']}, "
         f"seed {header['config']['training']['seed']}",
     ]
+    lines += [f"* Licence of the data of {each.source}: {each}" for each in stored_licences(provenance)]
     if split:
         lines.append(
             "* Objects: " + ", ".join(f"{len(split[part])} {part}" for part in ("train", "validation", "test"))

@@ -1,6 +1,7 @@
 """`retrieve export`: the touch encoder as ONNX, if ONNX Runtime is faster on this machine."""
 
 import copy
+import json
 import logging
 import stat
 import statistics
@@ -19,6 +20,7 @@ from torch import Tensor, nn
 
 from _touch_retrieval.files import write_atomically
 from retrieval.console.files import EXPORT, make_cache_folder, require_folder, require_ours, require_private
+from retrieval.data.licences import LICENCES
 from retrieval.errors import BadInput, CheckpointError, RetrievalError
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import TorchEncoder, for_inference
@@ -27,6 +29,7 @@ from retrieval.model.late_interaction import CellEncoder
 from retrieval.model.onnx_encoder import (
     CHECKPOINT_KEY,
     EXPORT_SUFFIX,
+    LICENCES_KEY,
     OnnxEncoder,
     cached_export_path,
     read_checked_export,
@@ -136,17 +139,17 @@ def touch_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
     """Return the touch encoder as an ONNX model with the checkpoint's digest, for any number of touches at once."""
     side, fingers = checkpoint.config.preprocessing.touch_px, checkpoint.config.matcher.fingers
     outputs = ["partial", "embedding"] + (["readings"] if checkpoint.matcher.gel_head else [])
-    return _trace(_TouchEncoder(checkpoint.matcher), (fingers, side, side, 3), outputs, checkpoint.digest)
+    return _trace(_TouchEncoder(checkpoint.matcher), (fingers, side, side, 3), outputs, checkpoint)
 
 
 def photo_encoder_to_onnx(checkpoint: Checkpoint) -> bytes:
     """Return the photo encoder as ONNX: images (B, H, views * W, 3) to partial activations and embeddings."""
     side, views = checkpoint.config.preprocessing.photo_px, checkpoint.matcher.views
     encoder = _PhotoEncoder(checkpoint.matcher)
-    return _trace(encoder, (side, views * side, 3), ["partial", "embedding"], checkpoint.digest)
+    return _trace(encoder, (side, views * side, 3), ["partial", "embedding"], checkpoint)
 
 
-def _trace(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], digest: str) -> bytes:
+def _trace(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], checkpoint: Checkpoint) -> bytes:
     import onnx
 
     with TemporaryDirectory() as folder, warnings.catch_warnings(), torch.no_grad():
@@ -162,7 +165,8 @@ def _trace(encoder: nn.Module, shape: tuple[int, ...], outputs: list[str], diges
             dynamo=False,
         )
         model = onnx.load_model(str(Path(folder, "model.onnx")))
-    onnx.helper.set_model_props(model, {CHECKPOINT_KEY: digest})
+    licences = json.dumps(checkpoint.provenance.get(LICENCES, []))
+    onnx.helper.set_model_props(model, {CHECKPOINT_KEY: checkpoint.digest, LICENCES_KEY: licences})
     return bytes(model.SerializeToString())
 
 

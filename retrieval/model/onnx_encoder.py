@@ -28,6 +28,7 @@ from retrieval.model.touches import TouchEncodings
 log = logging.getLogger(__name__)
 EXPORT_SUFFIX = ".onnx"
 CHECKPOINT_KEY = "touch_retrieval.checkpoint"
+LICENCES_KEY = "touch_retrieval.licences"
 _SEAL_BYTES = 2 + 2 + len(SEAL) + 2 + 64
 Floats = NDArray[np.float32]
 

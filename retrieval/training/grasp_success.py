@@ -29,7 +29,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from retrieval.console.progress import Bar
-from retrieval.data.dataset import Attempt, ImageCache, Split, data_digest, load_attempts, make_split, recording_source
+from retrieval.data.dataset import (
+    Attempt,
+    ImageCache,
+    Split,
+    data_digest,
+    load_attempts,
+    make_split,
+    recording_licence,
+    recording_source,
+)
+from retrieval.data.licences import LICENCES
 from retrieval.data.loading import worker_pool
 from retrieval.errors import ConfigError, DatasetError
 from retrieval.metrics.intervals import FEW_OBJECTS
@@ -302,6 +312,7 @@ def _save(
     provenance = {
         **training,
         "source": recording_source(recording),
+        LICENCES: [dataclasses.asdict(recording_licence(recording))],
         "data_digest": data_digest(attempt.grasp for attempt in attempts),
         "outcomes": dict(Counter(attempt.outcome for attempt in attempts)),
         "metrics": {key: value for key, value in report.to_dict().items() if key != "path"},

@@ -8,7 +8,7 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,7 @@ from retrieval.data.dataset import (
     recording_source,
 )
 from retrieval.data.labelled_pictures import ObjectLabels, load_object_labels, pair_by_label
+from retrieval.data.licences import LICENCES, DataLicence
 from retrieval.data.loading import prefetch, worker_count
 from retrieval.data.pairs import PairSampler
 from retrieval.errors import CheckpointError, ConfigError, JobInterrupted
@@ -55,6 +56,7 @@ from retrieval.training.features import Features, features_by_image
 from retrieval.training.fit import RATE, Plan, fit
 from retrieval.training.initial_weights import build_matcher
 from retrieval.training.labels import LabelLoss
+from retrieval.training.licences import training_licences
 from retrieval.training.state import code_digest, load_state, require_no_unfinished_state, save_state, state_path
 from retrieval.training.step import WeightedLosses, batch_loss, pair_logits, shuffle_fingers
 from retrieval.training.verdicts import with_verdicts
@@ -112,7 +114,8 @@ def train(
     else:
         require_fit(split, grasps)
     labels = load_object_labels(recording) if settings.predict_labels else None
-    trainer = Trainer(config, split, grasps, out, source=recording_source(recording), labels=labels)
+    source, licences = recording_source(recording), training_licences(recording, settings)
+    trainer = Trainer(config, split, grasps, out, source, labels=labels, licences=licences)
     if not resume:
         require_no_unfinished_state(out)
     else:
@@ -135,13 +138,16 @@ class Trainer:
         source: str,
         known: Features | None = None,
         labels: Mapping[str, ObjectLabels] | None = None,
+        licences: Sequence[DataLicence] = (),
     ) -> None:
         """Prepare a run.
 
-        `known` are features of all grasps for frozen towers, in place of their images; `labels` are by object.
+        `known` are features of all grasps for frozen towers, in place of their images; `labels` are by object;
+        `licences` are those of the data.
         """
         settings = config.training
         self.config, self.split, self.out, self.source = config, split, out, source
+        self.licences = [dataclasses.asdict(licence) for licence in licences]
         pairs = labelled_pairs(config)
         self.data_digest = known.digest if known else data_digest([*grasps, *pairs])
         self.device = default_device()
@@ -318,17 +324,12 @@ class Trainer:
         provenance = {
             "step": self.step,
             "source": self.source,
+            LICENCES: self.licences,
             "data_digest": self.data_digest,
             "metrics": metrics,
             **self.code,
         }
-        save_checkpoint(
-            self.out,
-            self.matcher,
-            self.config_without_encoder,
-            split=self.split,
-            provenance=provenance,
-        )
+        save_checkpoint(self.out, self.matcher, self.config_without_encoder, split=self.split, provenance=provenance)
 
     def _identity(self) -> dict[str, Any]:
         """Return the settings that must not change between a run and its resumption."""

@@ -85,7 +85,7 @@ def _line(recording: Recording, grasp: RecordedGrasp, folder: Path, columns: Seq
 def _card(recording: Recording) -> str:
     facts = {
         key: recording.info[key]
-        for key in ("source", "sensor", "rig", "background", "licence", "citation", "notes")
+        for key in ("source", "sensor", "rig", "background", "licence", "terms", "citation", "notes")
         if recording.info.get(key)
     }
     lines = [f"* {key}: {'; '.join(value) if isinstance(value, list) else value}" for key, value in facts.items()]

@@ -245,7 +245,7 @@ def _info(
 ) -> dict[str, Any]:
     ends = list(itertools.accumulate(map(len, by_part.values())))
     episodes = ends[-1]
-    keys = ("source", "sensor", "rig", "licence", "citation", "background")
+    keys = ("source", "sensor", "rig", "licence", "terms", "citation", "background")
     return {
         "codebase_version": "v3.0",
         "robot_type": None,

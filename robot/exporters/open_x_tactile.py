@@ -25,7 +25,7 @@ from robot.recording.folder import RecordedGrasp, Recording
 
 STORE = "grasps.zarr"
 _WHAT = "the format of Open-X-Tactile"
-_INFO_KEYS = ("source", "sensor", "rig", "licence", "citation", "background")
+_INFO_KEYS = ("source", "sensor", "rig", "licence", "terms", "citation", "background")
 
 
 def export_open_x_tactile(

@@ -20,7 +20,8 @@ from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
     source="github.com/rumilog/gelsight-contrastive-learning",
-    licence="GPL-3.0, with its source; we may not pass the images on under another licence",
+    licence="GPL-3.0",
+    terms="the licence of the repository; we may not pass the images on under another licence",
     citation="github.com/rumilog/gelsight-contrastive-learning, no paper",
     sensor="GelSight Mini",
     rig="by hand, phone camera",

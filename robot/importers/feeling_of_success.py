@@ -22,6 +22,7 @@ import numpy.typing as npt
 
 from robot.errors import ImporterError
 from robot.importers.importing import (
+    NOT_STATED,
     DataSet,
     Images,
     Item,
@@ -37,7 +38,8 @@ from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
     source="The Feeling of Success",
-    licence="not stated in its files; see its page, doi 10.25532/OPARA-700",
+    licence=NOT_STATED,
+    terms="its files state none; see its page, doi 10.25532/OPARA-700",
     citation="Calandra, Owens, Upadhyaya, Yuan, Lin, Adelson, Levine, The Feeling of Success: Does Touch Sensing Help "
     "Predict Grasp Outcomes?, CoRL 2017",
     sensor="GelSight",

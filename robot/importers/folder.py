@@ -31,7 +31,17 @@ from string import ascii_lowercase
 from typing import Any, NoReturn
 
 from robot.errors import ImporterError, RecordingError
-from robot.importers.importing import DataSet, Images, Item, Progress, Skip, import_items, natural_sort_key, safe_name
+from robot.importers.importing import (
+    NOT_STATED,
+    DataSet,
+    Images,
+    Item,
+    Progress,
+    Skip,
+    import_items,
+    natural_sort_key,
+    safe_name,
+)
 from robot.recording.folder import Recording, SharedImage
 from robot.storage import parse_object
 
@@ -65,7 +75,7 @@ def import_folder(
     background: str = "",
     pairs: str = "",
     sensor: str = "unknown",
-    licence: str = "not stated",
+    licence: str = NOT_STATED,
 ) -> Recording:
     """Import pictures below `src`.
 

@@ -18,14 +18,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from robot.errors import ImporterError
-from robot.importers.importing import DataSet, Item, Progress, Skip, import_items, numbered_files, safe_name, subfolders
+from robot.importers.importing import (
+    NOT_STATED,
+    DataSet,
+    Item,
+    Progress,
+    Skip,
+    import_items,
+    numbered_files,
+    safe_name,
+    subfolders,
+)
 from robot.importers.pickled_arrays import MAX_BYTES, read_array
 from robot.recording.folder import Recording
 from robot.storage import read_content
 
 DATA_SET = DataSet(
     source="HapticMatch",
-    licence="not stated in its files; see github.com/MXMX0811/GelSight_Texture_Dataset",
+    licence=NOT_STATED,
+    terms="its files state none; see github.com/MXMX0811/GelSight_Texture_Dataset",
     citation="Zhang, Yao, Makino, Shinoda, Sugiyama, HapticMatch: An Exploration for Generative Material Haptic "
     "Simulation and Interaction, arXiv 2601.16639",
     sensor="GelSight Mini, height maps",

@@ -4,7 +4,7 @@ An importer yields the grasps of its data set one by one as `Item`, or as `Skip`
 `import_items` does the rest. Only the current item is in memory. Grasps that the recording already contains are not
 read again, so a stopped import resumes where it stopped.
 
-    recording.json        also: licence, citation, fingers, notes (caveats, and unverified parts of the layout),
+    recording.json        also: licence, terms, citation, fingers, notes (caveats, and unverified parts of the layout),
                           objects (object_id -> metadata of the data set), skipped (reason -> count)
     splits/<name>.json    a published split: {"seed": 0, "train": [object ids], "validation": [...], "test": [...]}
 """
@@ -34,6 +34,9 @@ Source = ImageSource | Callable[[], ImageSource]
 Images = Mapping[str, Source | SharedImage]
 """Column without `_file_name` -> image, as for `RecordingWriter`. A `SharedImage` is read and stored once."""
 
+NOT_STATED = "not stated"
+"""Licence of a data set whose files and repository state none, or of which we know none."""
+
 SPLITS_FOLDER = "splits"
 _MAX_REASONS, _EXAMPLES = 20, 3
 _END_MARKERS = {".png": b"IEND\xaeB`\x82", ".jpg": b"\xff\xd9"}
@@ -49,13 +52,14 @@ class DataSet:
 
     Attributes:
         source: Name or address of the data set.
-        licence: Licence of the data.
+        licence: Name of the licence of the data, such as "CC BY 4.0"; `NOT_STATED` if none is known.
         citation: Publication to cite.
         sensor: Tactile sensor.
         rig: Robot, camera and other devices.
         expects: Required content of its folder, in Markdown.
         fingers: Gel images per touch; 0 if that varies.
         background: When no-contact frames were taken, or "none".
+        terms: Conditions of use, or where to find them.
         caveats: Risks for results, one sentence each.
         unverified: Parts of the layout that were not verified on the data itself.
     """
@@ -68,6 +72,7 @@ class DataSet:
     expects: str
     fingers: int = 1
     background: str = "none"
+    terms: str = ""
     caveats: tuple[str, ...] = ()
     unverified: tuple[str, ...] = ()
 

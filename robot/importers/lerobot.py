@@ -28,6 +28,7 @@ import numpy as np
 from robot.errors import ImporterError
 from robot.importers.episodes import MOMENT_SUFFIXES, Episode, Picture, Step
 from robot.importers.importing import (
+    NOT_STATED,
     DataSet,
     DataSetMetadata,
     Item,
@@ -43,7 +44,8 @@ from robot.storage import decode_picture, read_json_object
 
 DATA_SET = DataSet(
     source="LeRobot data set",
-    licence="see the data set's own card",
+    licence=NOT_STATED,
+    terms="see the data set's own card",
     citation="see the data set's own card",
     sensor="names of the cameras",
     rig="see info.json",
@@ -138,11 +140,13 @@ class _LeRobotSource:
         self._videos: dict[str, tuple[Path, Any]] = {}
 
     def stored_facts(self) -> dict[str, Any]:
-        """Return source, licence, citation, rig and sensor from info.json, as far as it contains them."""
+        """Return source, licence, terms, citation, rig and sensor from info.json, as far as it contains them."""
         recording = self.info.get("recording")
         facts = recording if isinstance(recording, dict) else {"rig": self.info.get("robot_type")}
-        texts = {key: facts.get(key) for key in ("source", "licence", "citation", "rig", "sensor")}
-        return {"sensor": ", ".join(self.touch)} | {key: text for key, text in texts.items() if isinstance(text, str)}
+        keys = ("source", "licence", "terms", "citation", "rig", "sensor")
+        texts = {key: facts[key] for key in keys if isinstance(facts.get(key), str)}
+        own_terms = {"terms": ""} if "licence" in texts else {}
+        return {"sensor": ", ".join(self.touch)} | own_terms | texts
 
     def splits(self) -> dict[str, dict[str, list[str]]]:
         """Return the split of info.json ("0:80" for each part) if it has several parts."""

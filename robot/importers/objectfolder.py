@@ -22,6 +22,7 @@ from typing import Any
 
 from robot.errors import ImporterError
 from robot.importers.importing import (
+    NOT_STATED,
     DataSet,
     DataSetMetadata,
     Item,
@@ -37,7 +38,8 @@ from robot.storage import read_content, read_json_object
 
 DATA_SET = DataSet(
     source="ObjectFolder",
-    licence="CC BY 4.0 (ObjectFolder 2.0; for Real see its page)",
+    licence=NOT_STATED,
+    terms="ObjectFolder Real: see its page; simulated touches (ObjectFolder 2.0): CC BY 4.0",
     citation="Gao, Dou, Li and others, The ObjectFolder Benchmark: Multisensory Learning with Neural and Real Objects, "
     "CVPR 2023",
     sensor="GelSight",
@@ -53,6 +55,7 @@ DATA_SET = DataSet(
     ),
 )
 _SIMULATED = "GelSight, simulated (Taxim)"
+_SIMULATED_TERMS = "name the authors; the meshes of ObjectFolder 2.0 have licences of their own"
 _SIMULATED_WIDTH = 160
 _PICTURE = re.compile(r"(\d+)\.(png|jpg)")
 _NAMES = "objectfolder_real_metadata.csv"
@@ -80,7 +83,9 @@ def import_objectfolder(src: Path, out: Path, progress: Progress | None = None) 
         raise DATA_SET.mismatch_error(
             src, "it contains raw videos without photos" if is_raw else "it contains no touch of that kind"
         )
-    facts = replace(DATA_SET, sensor=_SIMULATED) if _width(examples[0]) == _SIMULATED_WIDTH else DATA_SET
+    facts = DATA_SET
+    if _width(examples[0]) == _SIMULATED_WIDTH:
+        facts = replace(facts, sensor=_SIMULATED, licence="CC BY 4.0", terms=_SIMULATED_TERMS)
     names = _names(src / _NAMES)
     metadata = DataSetMetadata(
         {name: names.get(name, {}) for name, _, _ in objects}, _split(src / "split.json") if is_pack else {}

@@ -23,6 +23,7 @@ import numpy as np
 from robot.errors import ImporterError
 from robot.importers.episodes import MOMENT_SUFFIXES, Episode, Step
 from robot.importers.importing import (
+    NOT_STATED,
     DataSet,
     DataSetMetadata,
     Item,
@@ -37,7 +38,8 @@ from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
     source="Open-X-Tactile",
-    licence="see each store's own page",
+    licence=NOT_STATED,
+    terms="see each store's own page",
     citation="see each store's own page",
     sensor="see the stores",
     rig="see the stores",
@@ -108,8 +110,10 @@ def _store_facts(tasks: list["_TaskStore"]) -> DataSet:
     sensors = sorted({sensor for task in tasks for sensor in task.sensors()})
     recording = tasks[0].store.attributes().get("recording") if len(tasks) == 1 else None
     facts = recording if isinstance(recording, dict) else {}
-    texts = {key: facts[key] for key in ("source", "licence", "citation", "rig") if isinstance(facts.get(key), str)}
-    return replace(DATA_SET, sensor=", ".join(sensors) or "unknown", **texts)
+    keys = ("source", "licence", "terms", "citation", "rig")
+    texts = {key: facts[key] for key in keys if isinstance(facts.get(key), str)}
+    own_terms = {"terms": ""} if "licence" in texts else {}
+    return replace(DATA_SET, sensor=", ".join(sensors) or "unknown", **(own_terms | texts))
 
 
 class _TaskStore:

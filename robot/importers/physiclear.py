@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from robot.errors import ImporterError
 from robot.importers.importing import (
+    NOT_STATED,
     DataSet,
     Item,
     Progress,
@@ -34,7 +35,8 @@ from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="PhysiCLeAR",
-    licence="none stated; we may not pass the videos on",
+    licence=NOT_STATED,
+    terms="its repository states none, so we may not pass the videos on",
     citation="Yu, Lin, Xiao, Duan, Soh, Octopi: Object Property Reasoning with Large Tactile-Language Models, RSS 2024",
     sensor="GelSight Mini",
     rig="by hand",

@@ -16,13 +16,23 @@ from dataclasses import replace
 from pathlib import Path
 
 from robot.errors import ImporterError
-from robot.importers.importing import DataSet, DataSetMetadata, Item, Progress, Skip, import_items, safe_name
+from robot.importers.importing import (
+    NOT_STATED,
+    DataSet,
+    DataSetMetadata,
+    Item,
+    Progress,
+    Skip,
+    import_items,
+    safe_name,
+)
 from robot.importers.tvl import csv_rows
 from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="RCT, arXiv 2606.31694",
-    licence="see the data set's own page",
+    licence=NOT_STATED,
+    terms="see the data set's own page",
     citation="RCT: A Robot-Collected Touch-Vision-Language Dataset for Tactile Generalization, arXiv 2606.31694",
     sensor="DIGIT",
     rig="robot arm, presses along z",

@@ -38,7 +38,17 @@ import numpy as np
 from robot.errors import ImporterError
 from robot.importers.bag_reader import Bag, BagMessage, bag_paths, picture_of
 from robot.importers.bag_scan import BagGrasp, BagScan, BagTopics, find_grasps, scan_bag, time_stamp_report
-from robot.importers.importing import DataSet, Item, Progress, Skip, Source, import_extra, import_items, safe_name
+from robot.importers.importing import (
+    NOT_STATED,
+    DataSet,
+    Item,
+    Progress,
+    Skip,
+    Source,
+    import_extra,
+    import_items,
+    safe_name,
+)
 from robot.recording.folder import Recording
 
 DATA_SET = DataSet(
@@ -72,7 +82,7 @@ def import_rosbag(
     contact: float = 0.01,
     settle_s: float = 0.2,
     sensor: str = "unknown",
-    licence: str = "not stated",
+    licence: str = NOT_STATED,
 ) -> Recording:
     """Import the grasps of the bag `src`, or of the bags in the folder `src`.
 

@@ -19,6 +19,7 @@ from typing import Any
 
 from robot.errors import ImporterError
 from robot.importers.importing import (
+    NOT_STATED,
     DataSet,
     DataSetMetadata,
     Images,
@@ -30,12 +31,13 @@ from robot.importers.importing import (
     numbered_files,
 )
 from robot.importers.row_splits import RowSplit
-from robot.importers.tvl import LICENCE, csv_rows
+from robot.importers.tvl import TERMS, csv_rows
 from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="tactile-vlm.github.io, SSVTP",
-    licence=LICENCE,
+    licence=NOT_STATED,
+    terms=TERMS,
     citation="Kerr, Huang, Wilcox, Hoque, Ichnowski, Calandra, Goldberg, Self-Supervised Visuo-Tactile Pretraining to "
     "Locate and Follow Garment Features, RSS 2023",
     sensor="DIGIT",

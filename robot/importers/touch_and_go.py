@@ -18,13 +18,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from robot.errors import ImporterError
-from robot.importers.importing import DataSet, DataSetMetadata, Images, Item, Progress, Skip, import_items, safe_name
+from robot.importers.importing import (
+    NOT_STATED,
+    DataSet,
+    DataSetMetadata,
+    Images,
+    Item,
+    Progress,
+    Skip,
+    import_items,
+    safe_name,
+)
 from robot.importers.row_splits import RowSplit, Split
 from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="touch-and-go.github.io",
-    licence="see touch-and-go.github.io",
+    licence=NOT_STATED,
+    terms="the authors' repository states none; see touch-and-go.github.io",
     citation="Yang, Ma, Zhang, Zhu, Yuan, Owens, Touch and Go: Learning from Human-Collected Vision and Touch, NeurIPS "
     "2022 Datasets and Benchmarks",
     sensor="GelSight",

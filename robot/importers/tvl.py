@@ -19,6 +19,7 @@ from typing import Any
 
 from robot.errors import ImporterError
 from robot.importers.importing import (
+    NOT_STATED,
     DataSet,
     DataSetMetadata,
     Images,
@@ -36,10 +37,11 @@ CITATION = (
     "Fu, Datta, Huang, Panitch, Drake, Ortiz, Mukadam, Lambeta, Calandra, Goldberg, A Touch, Vision, and Language "
     "Dataset for Multimodal Alignment, ICML 2024"
 )
-LICENCE = "see the data set's card on Hugging Face (mlfu7/Touch-Vision-Language-Dataset)"
+TERMS = "see the data set's card on Hugging Face (mlfu7/Touch-Vision-Language-Dataset)"
 DATA_SET = DataSet(
     source="tactile-vlm.github.io, HCT",
-    licence=LICENCE,
+    licence=NOT_STATED,
+    terms=TERMS,
     citation=CITATION,
     sensor="DIGIT",
     rig="by hand, webcam next to the sensor",

@@ -21,6 +21,7 @@ import numpy as np
 
 from robot.errors import ImporterError
 from robot.importers.importing import (
+    NOT_STATED,
     DataSet,
     DataSetMetadata,
     Item,
@@ -36,7 +37,8 @@ from robot.storage import decode_picture, read_content
 
 DATA_SET = DataSet(
     source="VisGel",
-    licence="not stated in the authors' repository",
+    licence=NOT_STATED,
+    terms="the authors' repository states none",
     citation="Li, Zhu, Tedrake, Torralba, Connecting Touch and Vision via Cross-Modal Prediction, CVPR 2019",
     sensor="GelSight",
     rig="KUKA iiwa arm; webcam",

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from robot.importers.importing import (
+    NOT_STATED,
     DataSet,
     DataSetMetadata,
     Images,
@@ -35,7 +36,8 @@ from robot.recording.folder import Recording, SharedImage
 
 DATA_SET = DataSet(
     source="github.com/Exhor/deep_visuotactile_classification",
-    licence="none stated; we may not pass the images on",
+    licence=NOT_STATED,
+    terms="its files state none, so we may not pass the images on",
     citation="Corradi, Hall, Iravani, Object recognition combining vision and touch, Robotics and Biomimetics 4:2 "
     "(2017), doi 10.1186/s40638-017-0058-2",
     sensor="hemispherical optical finger (VT60)",

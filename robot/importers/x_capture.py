@@ -16,6 +16,7 @@ import numpy as np
 
 from robot.errors import ImporterError
 from robot.importers.importing import (
+    NOT_STATED,
     DataSet,
     Images,
     Item,
@@ -31,7 +32,8 @@ from robot.storage import decode_picture, read_content
 
 DATA_SET = DataSet(
     source="X-Capture",
-    licence="see xcapture.github.io",
+    licence=NOT_STATED,
+    terms="see xcapture.github.io",
     citation="X-Capture: An Open-Source Portable Device for Multi-Sensory Learning, ICCV 2025",
     sensor="DIGIT-like",
     rig="by hand, a portable device",

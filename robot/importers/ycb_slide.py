@@ -19,6 +19,7 @@ from robot.recording.folder import Recording
 DATA_SET = DataSet(
     source="YCB-Slide",
     licence="CC BY-SA 4.0",
+    terms="state the authors; pass changed data on under the same licence",
     citation="Suresh, Si, Anderson, Kaess, Mukadam, MidasTouch: Monte-Carlo inference over distributions across "
     "sliding touch, CoRL 2022",
     sensor="DIGIT",

@@ -3,8 +3,10 @@
 import pytest
 
 from robot import rig_check
+from robot.drivers.discover import UsbPort
+from robot.drivers.video.frames import Arrival
 from robot.errors import RobotConfigError
-from robot.readings import GripperState, Pose
+from robot.readings import Frame, GripperState, Pose
 from robot.rig_check import check_rig
 from tests.fake_rig import FakeGripper, FakeRig, FakeSensor
 
@@ -17,6 +19,14 @@ def _short_measurement(monkeypatch):
 @pytest.fixture
 def rig():
     return FakeRig(5)
+
+
+@pytest.fixture
+def real_rig(rig, monkeypatch):
+    """The fake rig as a rig of real cameras, with an object on the table."""
+    rig.prepare("round-1", 0)
+    monkeypatch.setattr(FakeRig, "can_run_jobs", False)
+    return rig
 
 
 def test_every_device_is_checked_moved_back_and_closed(rig):
@@ -100,3 +110,51 @@ def test_a_frozen_stream_counts_as_one_frame(rig, monkeypatch):
     monkeypatch.setattr(FakeSensor, "_read", lambda self: first.setdefault(self.finger, real(self)))
     row = next(row for row in check_rig(rig) if row.role == "gel")
     assert row.measured["rate"] == "1 frame(s) in 0.1 s"
+
+
+def test_the_promised_rate_is_next_to_the_measured_one(rig, monkeypatch):
+    monkeypatch.setattr(FakeSensor, "_settings", lambda self: {"fps": 60.0})
+    row = next(row for row in check_rig(rig) if row.role == "gel")
+    assert row.measured["rate"] == "500.0 frames/s"  # one at each read, every 2 ms
+    assert row.measured["promised"] == "60 frames/s"
+    assert row.measured["dropped"] == "0"
+    assert "repeated" not in row.measured
+    assert "USB" not in row.measured
+
+
+def test_dropped_and_repeated_frames_are_counted_from_the_arrivals_of_a_driver(rig):
+    """Frames of 100 Hz from 0 to 0.2 s: those at 0.05, 0.06 and 0.12 s never arrive, two others are repeats."""
+    times = [number / 100 for number in range(21) if number not in (5, 6, 12)]
+    rig.sensors["a"].arrivals = [Arrival(time_s, time_s in (0.08, 0.15)) for time_s in times]
+    row = next(row for row in check_rig(rig, motion=False) if row.role == "gel")
+    assert (row.measured["dropped"], row.measured["repeated"]) == ("3", "2")
+    assert row.measured["rate"] == "75.0 frames/s"  # 16 different frames from 0 to 0.2 s
+
+
+def test_cameras_that_starve_each_other_on_one_usb_bus_are_a_failure_that_names_them(real_rig, monkeypatch):
+    ports = {"a": UsbPort(3, "1.2", 480), "b": UsbPort(3, "1.4", 480)}
+    monkeypatch.setattr(FakeSensor, "_settings", lambda self: {"device": self.finger})
+    monkeypatch.setattr(rig_check, "usb_port", ports.get)
+    real = FakeSensor._read
+
+    def starved(self):
+        frame = real(self)
+        step_s = 0.05 if self.finger == "b" and real_rig.camera.is_connected else 0.01
+        return Frame(frame.pixels, step_s * int(frame.time_s / step_s))
+
+    monkeypatch.setattr(FakeSensor, "_read", starved)
+    rows = {row.role: row for row in check_rig(real_rig, motion=False)}
+    assert rows["gel"].measured["USB"] == "bus 3, port 1.4, 480 Mbit/s"
+    assert rows["together"].failure == (
+        "with all cameras, frames are lost: fake gel b 20.0 frames/s, alone 100.0; fake gel a and fake gel b share USB "
+        "bus 3 (480 Mbit/s). Connect the cameras to different USB controllers, or lower width, height or fps"
+    )
+
+
+def test_a_shared_usb_bus_without_loss_is_reported(real_rig, monkeypatch):
+    monkeypatch.setattr(FakeSensor, "_settings", lambda self: {"device": self.finger})
+    monkeypatch.setattr(rig_check, "usb_port", lambda device: UsbPort(3, device, 5000) if device else None)
+    (row,) = [row for row in check_rig(real_rig, motion=False) if row.role == "together"]
+    assert row.failure is None
+    assert set(row.measured) == {"fake gel a", "fake gel b", "fake camera", "shared"}
+    assert row.measured["shared"] == "fake gel a and fake gel b share USB bus 3 (5000 Mbit/s)"

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from robot.devices import Camera, Clock
+from robot.drivers.video.frames import Arrival
 from robot.drivers.video.opencv_stream import CaptureReader, UsbCameraSettings
 from robot.drivers.video.rectify import to_rgb
 from robot.readings import RGBD
@@ -35,6 +36,11 @@ class UvcCamera(Camera):
         super().__init__("usb camera", extrinsics, clock=clock)
         self._options = UvcSettings(**settings)
         self._reader = CaptureReader(self, self._options)
+
+    @property
+    def arrivals(self) -> list[Arrival]:
+        """The newest frames of the stream, as they arrived."""
+        return self._reader.arrivals
 
     def _connect(self) -> None:
         self._reader = CaptureReader(self, self._options)

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from robot.devices import Clock, TactileSensor
+from robot.drivers.video.frames import Arrival
 from robot.drivers.video.opencv_stream import CaptureReader, CaptureSettings, UsbCameraSettings
 from robot.drivers.video.rectify import CropSettings, make_rectifier, to_rgb
 from robot.readings import Frame
@@ -66,6 +67,7 @@ class OpencvTactile(TactileSensor):
         """Failures of the stream since the sensor was connected, failed reopenings included."""
         return self._reader.lost_count
 
+<<<<<<< HEAD
     def read_after(self, time_s: float, timeout_s: float) -> Frame:
         """Wait at most `timeout_s` for a frame newer than `time_s` and return the newest frame; else raise DeviceError.
 
@@ -73,6 +75,12 @@ class OpencvTactile(TactileSensor):
         """
         with self._use("cannot be read"):
             return self._picture(self._reader.after(time_s, timeout_s))
+=======
+    @property
+    def arrivals(self) -> list[Arrival]:
+        """The newest frames of the stream, as they arrived."""
+        return self._reader.arrivals
+>>>>>>> robots
 
     def _connect(self) -> None:
         self._reader = CaptureReader(self, self._options)

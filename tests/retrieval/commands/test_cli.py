@@ -441,14 +441,16 @@ def test_completion_is_printed_and_installed_for_a_shell(option, tmp_path):
     assert "complete -o default -F _retrieve_completion retrieve" in script
 
 
-def test_check_prints_the_licence_that_an_importer_stores(recording, tmp_path, capsys):
+def test_check_prints_licence_and_terms_or_that_none_is_stated(recording, tmp_path, capsys):
     shutil.copytree(recording, tmp_path / "r")
     path = tmp_path / "r" / "recording.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"licence": "CC BY 4.0"}))
-    assert main(["check", str(tmp_path / "r")]) == 0
-    assert "licence of the data: CC BY 4.0" in capsys.readouterr().err.splitlines()
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"licence": "CC BY 4.0", "terms": "name the authors"}))
+    assert main(["check", str(tmp_path / "r"), "--json"]) == 0
+    output = capsys.readouterr()
+    assert "licence of the data: CC BY 4.0 (name the authors)" in output.err.splitlines()
+    assert json.loads(output.out)["licence"]["licence"] == "CC BY 4.0"
     assert main(["check", str(recording)]) == 0
-    assert "licence" not in capsys.readouterr().err
+    assert "licence of the data: not stated" in capsys.readouterr().err.splitlines()
 
 
 def test_check_exits_with_1_if_it_finds_errors(recording, tmp_path, capsys):

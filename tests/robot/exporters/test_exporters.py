@@ -12,6 +12,7 @@ from retrieval.commands.main import main
 from robot.errors import ImporterError, RecordingError, StorageError, UnknownName
 from robot.exporters import EXPORTERS
 from robot.exporters.exporting import atomic_folder, letterbox, read_picture
+from robot.importers import load_importer
 from robot.recording.folder import RecordingWriter, read_recording
 
 RNG = np.random.default_rng(0)
@@ -26,7 +27,13 @@ def smooth(height, width):
 def source(tmp_path_factory):
     """Three objects with two grasps each: two fingers, before and during; the last photo has another size."""
     folder = tmp_path_factory.mktemp("source") / "recording"
-    info = {"source": "synthetic", "sensor": "GelSight Mini", "licence": "CC0", "background": "before each grasp"}
+    info = {
+        "source": "synthetic",
+        "sensor": "GelSight Mini",
+        "licence": "CC0",
+        "terms": "none",
+        "background": "before each grasp",
+    }
     with RecordingWriter(folder, info) as writer:
         for number in range(6):
             images = {"photo": smooth(30, 40) if number < 5 else smooth(48, 48)}
@@ -204,6 +211,15 @@ def test_an_imagefolder_copies_files_byte_for_byte_and_states_the_licence(source
     name = source.grasps[2].photo
     assert (tmp_path / "out" / "train" / name).read_bytes() == (source.folder / name).read_bytes()
     assert "* licence: CC0" in (tmp_path / "out" / "README.md").read_text()
+
+
+@pytest.mark.parametrize(("name", "packages"), [("lerobot", ("av", "pyarrow.parquet")), ("open-x-tactile", ("zarr",))])
+def test_an_export_that_is_imported_again_keeps_licence_and_terms(name, packages, source, tmp_path):
+    for package in packages:
+        pytest.importorskip(package)
+    EXPORTERS.load(name)(source, tmp_path / "out")
+    info = load_importer(name)(tmp_path / "out", tmp_path / "again").info
+    assert (info["licence"], info["terms"]) == ("CC0", "none")
 
 
 # open-x-tactile --------------------------------------------------------------------------------------------

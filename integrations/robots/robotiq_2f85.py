@@ -1,0 +1,96 @@
+"""A Robotiq 2F-85 behind its URCap on a Universal Robots controller, for `driver = "own"` of [gripper].
+
+The URCap answers on TCP port 63352: "SET POS 255 GTO 1" with "ack", "GET POS" with "POS 255". POS is 0 when the jaws
+are open and 255 when they are closed; SPE and FOR are 0 to 255 for 20 to 150 mm/s and 20 to 235 N. OBJ is 0 during a
+motion, 1 or 2 at an object, 3 at the requested position. Activate the gripper on the teach pendant before use:
+activation moves the jaws.
+"""
+
+import socket
+import time
+
+STROKE_MM, SPEED_MM_S, FORCE_N = 85.0, (20.0, 150.0), (20.0, 235.0)
+ACTIVE, MOVING, AT_OBJECT, AT_POSITION = 3, 0, 2, 3
+TIMEOUT_S, POLL_S = 10.0, 0.02
+
+
+class Robotiq2F85:
+    """The gripper. Its force counts for both fingers: we take half of it as the force on each finger.
+
+    Args:
+        host: Address of the robot's controller.
+        port: Port of the URCap.
+    """
+
+    def __init__(self, host, port=63352):
+        self.link = socket.create_connection((host, port), TIMEOUT_S)
+        self.answers = self.link.makefile("rb")
+        self.force_n = None
+
+    def open(self, opening_mm, speed_mm_s):
+        """Open or narrow the jaws."""
+        self.force_n = None
+        self._move(round(255 * (1 - opening_mm / STROKE_MM)), speed_mm_s, FORCE_N[0])
+
+    def grasp(self, force_n, speed_mm_s):
+        """Close until the gripper has the force or is closed."""
+        self._move(255, speed_mm_s, 2 * force_n)
+        self.force_n = force_n
+
+    def state(self):
+        """Return opening, force on each finger and status."""
+        opening_mm = STROKE_MM * (1 - self._get("POS") / 255)
+        at = self._get("OBJ")
+        if at == MOVING:
+            status = "moving"
+        elif self.force_n is None:
+            status = "idle"
+        elif at == AT_OBJECT:
+            status = "holding"
+        else:
+            status = "no_part"
+        force_n = self.force_n if status == "holding" else 0.0
+        return {"opening_mm": opening_mm, "force_n": force_n, "status": status}
+
+    def stop(self):
+        """Stop the jaws."""
+        self._set(GTO=0)
+
+    def disconnect(self):
+        """Close the connection."""
+        self.answers.close()
+        self.link.close()
+
+    def _move(self, position, speed_mm_s, force_n):
+        if self._get("STA") != ACTIVE:
+            raise RuntimeError("the gripper is not active; activate it on the teach pendant (its jaws move)")
+        speed, force = _to_byte(min(speed_mm_s, SPEED_MM_S[1]), SPEED_MM_S), _to_byte(force_n, FORCE_N)
+        self._set(POS=position, SPE=speed, FOR=force, GTO=1)
+        end_s = time.monotonic() + TIMEOUT_S
+        while self._get("PRE") != position or self._get("OBJ") == MOVING:  # PRE: the position that it works towards
+            if time.monotonic() > end_s:
+                raise TimeoutError(f"the jaws still move after {TIMEOUT_S:g} s")
+            time.sleep(POLL_S)
+
+    def _set(self, **values):
+        words = " ".join(f"{name} {value}" for name, value in values.items())
+        if (answer := self._ask(f"SET {words}")) != "ack":
+            raise RuntimeError(f"the gripper must answer ack to SET {words}, got {answer!r}")
+
+    def _get(self, name):
+        answer = self._ask(f"GET {name}").split()
+        if len(answer) != 2 or answer[0] != name or not answer[1].isdigit():
+            raise RuntimeError(f"the gripper must answer GET {name} with its value, got {answer}")
+        return int(answer[1])
+
+    def _ask(self, command):
+        self.link.sendall(command.encode() + b"\n")
+        return self.answers.readline().decode("ascii", "replace").strip()
+
+
+def _to_byte(value, limits):
+    """Return a speed or a force as 0 to 255; raise ValueError outside the gripper's range."""
+    low, high = limits
+    if not low <= value <= high:
+        raise ValueError(f"speed or force must be from {low:g} to {high:g}, got {value:g}; change the rig's file")
+    return int(255 * (value - low) / (high - low))  # rounded down: never above the limit

@@ -1,0 +1,268 @@
+"""The examples of integrations/robots against stubs of the documented interfaces of their vendors."""
+
+import math
+import socketserver
+import sys
+import threading
+import types
+from pathlib import Path
+
+import pytest
+
+from robot.devices import Arm
+from robot.drivers.own_robot import OwnArm, OwnGripper
+from robot.errors import DeviceError
+from robot.readings import Pose, Region
+
+FOLDER = Path(__file__).parents[2] / "integrations" / "robots"
+WORKSPACE = Region((-150.0, -150.0, 10.0), (150.0, 150.0, 400.0))
+ORIGIN = {"origin_mm": [500.0, 100.0, -20.0], "tool_mm": 120.0}
+
+
+@pytest.fixture(autouse=True)
+def examples(monkeypatch):
+    """The examples can be imported; vendor modules and examples are forgotten afterwards."""
+    monkeypatch.syspath_prepend(str(FOLDER))
+    yield
+    for name in ("ur_arm", "franka", "robotiq_2f85"):
+        sys.modules.pop(name, None)
+
+
+class FakeUR:
+    """The parts of rtde_control and rtde_receive that the example uses; a motion takes three polls."""
+
+    def __init__(self, host=""):
+        self.pose, self.goal, self.polls, self.finished = [0.5, 0.1, 0.4, math.pi, 0.0, 0.0], None, 0, -1
+        self.calls, self.reachable, self.is_stopped = [], True, False
+
+    def moveL(self, target, speed, acceleration, asynchronous):
+        self.calls.append(("moveL", speed))
+        self.goal, self.polls = target, 3
+        return True
+
+    def getAsyncOperationProgress(self):
+        """-1 or -2 if no operation runs, in turn; the motion begins one poll late, as on a robot."""
+        if self.goal is None:
+            return self.finished
+        self.polls -= 1
+        if self.polls == 2:
+            return self.finished
+        if self.polls:
+            return 0
+        self.pose, self.goal, self.finished = self.goal, None, -3 - self.finished
+        return self.finished
+
+    def isPoseWithinSafetyLimits(self, target):
+        return self.reachable
+
+    def isProtectiveStopped(self):
+        return self.is_stopped
+
+    def isEmergencyStopped(self):
+        return False
+
+    def getActualTCPPose(self):
+        return self.pose
+
+    def stopL(self, acceleration):
+        self.calls.append("stopL")
+
+    def stopScript(self):
+        self.calls.append("stopScript")
+
+    def disconnect(self): ...
+
+
+@pytest.fixture
+def ur(monkeypatch):
+    fake = FakeUR()
+    for module, name in (("rtde_control", "RTDEControlInterface"), ("rtde_receive", "RTDEReceiveInterface")):
+        monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**{name: lambda host: fake}))
+    with OwnArm(workspace=WORKSPACE, robot="ur_arm:URArm", settings={"host": "ur", **ORIGIN}) as arm:
+        yield fake, arm
+
+
+class FakeFranka:
+    """The parts of franky that the example uses."""
+
+    def __init__(self, host=""):
+        self.tip = types.SimpleNamespace(translation=[0.5, 0.1, 0.4], quaternion=[1.0, 0.0, 0.0, 0.0])
+        self.calls, self.relative_dynamics_factor, self.joins = [], None, 0
+        self.translation_velocity_limit = types.SimpleNamespace(set=lambda speed: self.calls.append(("speed", speed)))
+
+    @property
+    def current_cartesian_state(self):
+        return types.SimpleNamespace(pose=types.SimpleNamespace(end_effector_pose=self.tip))
+
+    def move(self, motion, asynchronous):
+        self.calls.append("move")
+        self.tip, self.joins = motion, 2
+
+    def join_motion(self, timeout):
+        self.joins -= 1
+        return self.joins <= 0
+
+    def stop(self):
+        self.calls.append("stop")
+
+    def recover_from_errors(self):
+        self.calls.append("recover")
+
+
+class FakeHand:
+    max_width = 0.08
+
+    def __init__(self, host="", object_m=0.03):
+        self.width, self.is_grasped, self.object_m, self.calls = 0.08, False, object_m, []
+
+    def move(self, width, speed):
+        self.width, self.is_grasped = width, False
+        return True
+
+    def grasp(self, width, speed, force, epsilon_inner, epsilon_outer):
+        self.calls.append(("grasp", speed, force))
+        self.width, self.is_grasped = self.object_m, self.object_m > 0
+
+    def stop(self):
+        self.calls.append("stop")
+
+
+@pytest.fixture
+def franka(monkeypatch):
+    robot, hand = FakeFranka(), FakeHand()
+    module = types.SimpleNamespace(
+        Robot=lambda host: robot,
+        Gripper=lambda host: hand,
+        RelativeDynamicsFactor=lambda *factors: factors,
+        Affine=lambda translation, quaternion: types.SimpleNamespace(translation=translation, quaternion=quaternion),
+        CartesianMotion=lambda goal: goal,
+    )
+    monkeypatch.setitem(sys.modules, "franky", module)
+    return robot, hand
+
+
+class URCap(socketserver.StreamRequestHandler):
+    """The URCap's protocol; its jaws are closed by an object of 40 mm, and a motion takes two questions."""
+
+    def handle(self):
+        values, calls, self.wait = self.server.values, self.server.calls, 0
+        for line in self.rfile:
+            words = line.decode().split()
+            calls.append(" ".join(words))
+            if words[0] == "SET":
+                values |= {name: int(value) for name, value in zip(words[1::2], words[2::2], strict=True)}
+                if "POS" in words:
+                    requested, held = values["POS"], self.server.object_at
+                    stopped = requested > held
+                    values |= {"PRE": requested, "POS": min(requested, held), "OBJ": 2 if stopped else 3}
+                    self.wait = 2
+                self.wfile.write(b"ack\n")
+                continue
+            value = values[words[1]]
+            if words[1] == "OBJ" and self.wait:
+                self.wait, value = self.wait - 1, 0
+            self.wfile.write(f"{words[1]} {value}\n".encode())
+
+
+@pytest.fixture
+def robotiq():
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), URCap) as server:
+        server.daemon_threads = True
+        server.values, server.calls = {"POS": 0, "PRE": 0, "OBJ": 3, "STA": 3}, []
+        server.object_at = round(255 * (1 - 40 / 85))
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        settings = {"host": "127.0.0.1", "port": server.server_address[1]}
+        gripper = OwnGripper(
+            stroke_mm=85.0, min_force_n=10.0, max_force_n=40.0, robot="robotiq_2f85:Robotiq2F85", settings=settings
+        )
+        with gripper:
+            yield server, gripper
+        server.shutdown()
+        thread.join(10)
+
+
+def moves_and_reports(arm: Arm, goal: Pose, speed_mm_s: float) -> None:
+    reached = arm.move_to(goal, speed_mm_s)
+    assert reached.as_tuple() == pytest.approx(goal.as_tuple(), abs=1e-6)
+    assert arm.pose() == reached
+
+
+@pytest.mark.parametrize("yaw_rad", [-3.0, -1.2, 0.0, 0.7, 3.1])
+def test_a_ur_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_rigs_frame(ur, yaw_rad):
+    fake, arm = ur
+    moves_and_reports(arm, Pose(30.0, -40.0, 100.0, yaw_rad), 150.0)
+    assert fake.calls == [("moveL", 0.15)]
+    assert fake.pose[:3] == pytest.approx([0.53, 0.06, 0.2])  # origin + pose, and the tool above the fingertips
+
+
+def test_two_motions_of_a_ur_arm_follow_each_other(ur):
+    _, arm = ur
+    moves_and_reports(arm, Pose(30.0, -40.0, 100.0, 0.5), 150.0)
+    moves_and_reports(arm, Pose(-30.0, 40.0, 200.0, 0.0), 50.0)
+
+
+def test_a_ur_arm_is_stopped_after_a_protective_stop(ur):
+    fake, arm = ur
+    fake.is_stopped = True
+    with pytest.raises(DeviceError, match=r"move_to of ur_arm:URArm failed: the robot stopped itself; unlock it"):
+        arm.move_to(Pose(0.0, 0.0, 100.0, 0.0), 100.0)
+    assert fake.calls[-1] == "stopL"
+
+
+def test_a_ur_arm_does_not_move_to_a_pose_outside_its_safety_limits(ur):
+    fake, arm = ur
+    fake.reachable = False
+    with pytest.raises(DeviceError, match="cannot reach"):
+        arm.move_to(Pose(0.0, 0.0, 100.0, 0.0), 100.0)
+    assert "moveL" not in str(fake.calls)
+
+
+@pytest.mark.parametrize("yaw_rad", [-2.0, 0.0, 1.5])
+def test_a_franka_arm_moves_at_the_requested_speed_and_reports_the_pose_of_the_rigs_frame(franka, yaw_rad):
+    robot, _ = franka
+    with OwnArm(workspace=WORKSPACE, robot="franka:FrankaArm", settings={"host": "fr3", **ORIGIN}) as arm:
+        moves_and_reports(arm, Pose(30.0, -40.0, 100.0, yaw_rad), 150.0)
+        assert robot.calls == [("speed", 0.15), "move"]
+        arm.recover()
+        arm.stop()
+        assert robot.calls[2:] == ["recover", "stop"]
+
+
+def test_a_franka_hand_grasps_with_twice_the_force_on_each_finger(franka):
+    _, hand = franka
+    with OwnGripper(
+        stroke_mm=80.0, min_force_n=5.0, max_force_n=35.0, robot="franka:FrankaHand", settings={"host": "fr3"}
+    ) as gripper:
+        assert gripper.open(60.0).status == "idle"
+        state = gripper.grasp(20.0, 50.0)
+        assert (state.status, state.force_n) == ("holding", 20.0)
+        assert state.opening_mm == pytest.approx(30.0)
+        assert hand.calls == [("grasp", 0.05, 40.0)]
+        hand.is_grasped = False
+        assert gripper.state().status == "part_lost"
+        hand.object_m = 0.0
+        assert gripper.grasp(20.0, 50.0).status == "no_part"
+        assert gripper.open(80.0).status == "idle"
+
+
+def test_a_robotiq_gripper_grasps_opens_and_stops(robotiq):
+    server, gripper = robotiq
+    state = gripper.grasp(20.0, 85.0)
+    assert (state.status, state.force_n) == ("holding", 20.0)
+    assert state.opening_mm == pytest.approx(40.0, abs=0.4)
+    assert "SET POS 255 SPE 127 FOR 23 GTO 1" in server.calls  # 85 mm/s; 40 N for both fingers
+    server.object_at = 255
+    assert gripper.grasp(20.0, 85.0).status == "no_part"
+    opened = gripper.open(85.0)
+    assert (opened.status, opened.opening_mm) == ("idle", 85.0)
+    gripper.stop()
+    assert server.calls[-1] == "SET GTO 0"
+
+
+def test_a_robotiq_gripper_that_is_not_active_does_not_move(robotiq):
+    server, gripper = robotiq
+    server.values["STA"] = 0
+    with pytest.raises(DeviceError, match="activate it on the teach pendant"):
+        gripper.grasp(20.0, 85.0)
+    assert not any("POS" in call for call in server.calls if call.startswith("SET"))

@@ -1,0 +1,147 @@
+"""Licences: which ones --require-licence accepts, and that checkpoint, model card and export repeat them."""
+
+import dataclasses
+import json
+import shutil
+
+import onnx
+import pytest
+
+from retrieval.adaptation.recipe import adapt
+from retrieval.commands.main import main
+from retrieval.data.dataset import recording_licence
+from retrieval.data.licences import DataLicence, require_licences, stored_licences
+from retrieval.errors import BadInput
+from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.export import touch_encoder_to_onnx
+from retrieval.search.defaults import shipped_model
+from retrieval.training.licences import checkpoint_licences, training_licences
+from retrieval.training.train import train
+from tests.conftest import TINY
+
+TERMS = "name the authors"
+SETTINGS = TINY.training
+
+
+@pytest.fixture
+def licensed(recording, tmp_path):
+    """A function that copies the recording and states a licence in it."""
+
+    def copy(licence, terms=TERMS):
+        folder = tmp_path / f"recording {licence}"
+        shutil.copytree(recording, folder)
+        info = json.loads((folder / "recording.json").read_text())
+        (folder / "recording.json").write_text(json.dumps(info | {"licence": licence, "terms": terms}))
+        return folder
+
+    return copy
+
+
+@pytest.mark.parametrize(
+    "licence",
+    [
+        "CC0 1.0",
+        "CC BY 4.0",
+        "cc-by-sa-4.0",
+        "MIT",
+        "Apache-2.0",
+        "BSD-3-Clause",
+        "GPL-3.0",
+        "LGPL-3.0-or-later",
+        "ODbL",
+    ],
+)
+def test_open_accepts_licences_that_allow_any_use(licence):
+    require_licences([DataLicence("data", licence)], ["open"])
+
+
+@pytest.mark.parametrize(
+    "licence",
+    [
+        "not stated",
+        "",
+        "CC BY-NC 4.0",
+        "CC-BY-NC-SA-4.0",
+        "CC BY-ND 4.0",
+        "MIT, research only",
+        "see its page",
+        "openly",
+    ],
+)
+def test_open_refuses_all_other_licences(licence):
+    with pytest.raises(BadInput, match="--require-licence accepts open, but the licence of data is"):
+        require_licences([DataLicence("data", licence)], ["open"])
+
+
+def test_a_licence_is_accepted_by_its_name_in_any_spelling():
+    found = [DataLicence("data", "CC BY-NC 4.0"), DataLicence("more", "MIT")]
+    require_licences(found, ["open", "cc-by-nc-4.0"])
+    with pytest.raises(BadInput, match="the licence of more is MIT"):
+        require_licences(found, ["cc-by-nc-4.0"])
+
+
+def test_a_recording_without_a_licence_is_not_stated(recording, licensed):
+    assert recording_licence(recording).licence == "not stated"
+    assert str(recording_licence(licensed("MIT"))) == f"MIT ({TERMS})"
+
+
+def test_the_licences_of_a_training_are_those_of_all_its_data(recording, licensed, tmp_path):
+    start = tmp_path / "start.safetensors"
+    train(licensed("CC BY 4.0"), start, TINY, quiet=True)
+    settings = dataclasses.replace(SETTINGS, start=str(start), init_touch="tower.safetensors", photos="p", touches="t")
+    source = recording_licence(recording).source
+    assert training_licences(recording, settings) == [
+        DataLicence(source),
+        DataLicence(source, "CC BY 4.0", TERMS),
+        DataLicence("tower.safetensors"),
+        DataLicence("p"),
+        DataLicence("t"),
+    ]
+
+
+def test_a_shipped_model_is_mit_and_an_older_checkpoint_not_stated(model, tmp_path):
+    shipped = load_checkpoint(shipped_model())
+    assert [each.licence for each in checkpoint_licences(shipped)] == ["MIT"]
+    older = dataclasses.replace(shipped, path=tmp_path / "own.safetensors", provenance={"source": "a rig"})
+    assert checkpoint_licences(older) == [DataLicence("a rig")]
+
+
+def test_damaged_licences_in_a_checkpoint_are_an_error():
+    with pytest.raises(BadInput, match="licences"):
+        stored_licences({"licences": [{"source": 3}]})
+
+
+def test_checkpoint_card_and_export_repeat_the_licences(licensed, tmp_path):
+    folder, out = licensed("CC BY 4.0"), tmp_path / "m.safetensors"
+    checkpoint = train(folder, out, TINY, quiet=True)
+    (licence,) = stored_licences(checkpoint.provenance)
+    assert (licence.licence, licence.terms) == ("CC BY 4.0", TERMS)
+    card = out.with_suffix(".md").read_text()
+    assert f"* Licence of the data of {licence.source}: CC BY 4.0 ({TERMS})\n" in card
+    exported = onnx.load_model_from_string(touch_encoder_to_onnx(checkpoint))
+    properties = {entry.key: entry.value for entry in exported.metadata_props}
+    assert json.loads(properties["touch_retrieval.licences"]) == [dataclasses.asdict(licence)]
+
+
+def test_an_adapted_model_lists_the_licences_of_both_data(licensed, model, tmp_path):
+    out = tmp_path / "own.safetensors"
+    adapt(licensed("CC BY 4.0"), out, load_checkpoint(model), init="none", quiet=True)
+    licences = stored_licences(load_checkpoint(out).provenance)
+    assert [each.licence for each in licences] == ["not stated", "CC BY 4.0"]
+
+
+@pytest.mark.parametrize("task", ["match", "grasp-success"])
+def test_the_command_refuses_a_licence_before_it_trains(task, licensed, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    command = ["train", str(licensed("CC BY-NC 4.0")), "--task", task, "--out", "m.safetensors"]
+    assert main([*command, "--require-licence", "open"]) == 2
+    error = capsys.readouterr().err
+    assert f": CC BY-NC 4.0 ({TERMS})" in error
+    assert "--require-licence accepts open, but the licence of" in error
+    assert "add the name to --require-licence" in error
+    assert not (tmp_path / "m.safetensors").exists()
+
+
+def test_pretraining_on_labelled_pictures_refuses_the_option(tmp_path, capsys):
+    assert main(["train", "r", "--task", "relief", "--out", "t.safetensors", "--require-licence", "open"]) == 2
+    assert "--require-licence does not apply to --task relief" in capsys.readouterr().err

@@ -1,0 +1,245 @@
+"""Arms and grippers of a user's own program: a Python object, and an HTTP endpoint."""
+
+import json
+import math
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+import pytest
+
+from robot.collection import CollectSettings, collect
+from robot.drivers.own_robot import OwnArm, OwnGripper
+from robot.errors import DeviceError, RobotConfigError, UnknownName
+from robot.readings import Pose, Region
+from robot.real_rig import load_driver
+from tests import plugins
+from tests.fake_rig import FakeRig
+from tests.own_rig import own_rig
+
+WORKSPACE = Region((-100.0, -100.0, 10.0), (100.0, 100.0, 300.0))
+GOAL = Pose(10.0, 20.0, 30.0, 0.5)
+HERE = f"{__name__}:"
+
+
+class Program:
+    """A robot program with all methods of arm and gripper; it records its calls."""
+
+    last: "Program"
+
+    def __init__(self, lag_mm=0.0, fault=None):
+        self.at = {"x_mm": 0.0, "y_mm": 0.0, "z_mm": 100.0, "yaw_rad": 0.0}
+        self.jaws = {"opening_mm": 80.0, "force_n": 0.0, "status": "idle"}
+        self.lag_mm, self.fault, self.calls = lag_mm, fault, []
+        Program.last = self
+
+    def move_to(self, *, speed_mm_s, **pose):
+        self.calls.append(("move_to", speed_mm_s))
+        if self.fault:
+            raise self.fault
+        self.at = {**pose, "x_mm": np.float64(pose["x_mm"] - self.lag_mm)}
+
+    def pose(self):
+        return self.at
+
+    def open(self, opening_mm, speed_mm_s):
+        self.calls.append(("open", speed_mm_s))
+        self.jaws = {"opening_mm": opening_mm, "force_n": 0.0, "status": "idle"}
+
+    def grasp(self, force_n, speed_mm_s):
+        self.calls.append(("grasp", force_n, speed_mm_s))
+        self.jaws = {"opening_mm": 40.0, "force_n": force_n, "status": "holding"}
+
+    def state(self):
+        return self.jaws
+
+    def stop(self):
+        self.calls.append("stop")
+
+    def disconnect(self):
+        self.calls.append("disconnect")
+
+
+class Incomplete:
+    def pose(self): ...
+
+
+def python_arm(**settings):
+    return OwnArm(workspace=WORKSPACE, robot=f"{HERE}Program", settings=settings, max_speed_mm_s=200.0)
+
+
+class Endpoint(BaseHTTPRequestHandler):
+    """A robot program behind HTTP."""
+
+    def do_POST(self):
+        values = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        status, content = 200, b""
+        try:
+            answer = getattr(self.server.program, self.path.removeprefix("/robot/"))(**values)
+            content = json.dumps(answer, default=float).encode() if answer is not None else b""
+        except RuntimeError as error:
+            status, content = 409, str(error).encode()
+        content = self.server.garbled or content
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *_): ...
+
+
+@pytest.fixture
+def server():
+    with ThreadingHTTPServer(("127.0.0.1", 0), Endpoint) as server:
+        server.program, server.garbled = Program(), b""
+        server.url = f"http://127.0.0.1:{server.server_address[1]}/robot"
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join(10)
+
+
+@pytest.fixture(params=["python", "http"])
+def where(request, server):
+    """The settings of a driver that name a working program, in both ways."""
+    return {"robot": f"{HERE}Program"} if request.param == "python" else {"url": server.url}
+
+
+def test_an_arm_moves_as_requested_and_connecting_moves_nothing(where):
+    with OwnArm(workspace=WORKSPACE, **where) as arm:
+        assert Program.last.calls == []
+        assert arm.pose() == Pose(0.0, 0.0, 100.0, 0.0)
+        assert arm.move_to(GOAL, 50.0) == GOAL
+        assert Program.last.calls == [("move_to", 50.0)]
+        arm.stop()
+        assert Program.last.calls[-1] == "stop"
+
+
+def test_a_gripper_opens_at_the_speed_limit_and_grasps_with_the_requested_force(where):
+    with OwnGripper(stroke_mm=80.0, min_force_n=5.0, max_force_n=20.0, max_speed_mm_s=60.0, **where) as gripper:
+        assert Program.last.calls == []
+        assert gripper.open(70.0).opening_mm == 70.0
+        state = gripper.grasp(15.0, 40.0)
+        assert (state.status, state.force_n) == ("holding", 15.0)
+        assert Program.last.calls == [("open", 60.0), ("grasp", 15.0, 40.0)]
+
+
+def test_nothing_beyond_the_limits_reaches_the_program(where):
+    with OwnArm(workspace=WORKSPACE, max_speed_mm_s=200.0, **where) as arm:
+        for pose, speed in ((Pose(0.0, 0.0, 5.0, 0.0), 50.0), (GOAL, 201.0), (GOAL, math.nan)):
+            with pytest.raises(DeviceError, match="must be"):
+                arm.move_to(pose, speed)
+    with OwnGripper(stroke_mm=80.0, min_force_n=5.0, max_force_n=20.0, max_speed_mm_s=60.0, **where) as gripper:
+        for force, speed in ((21.0, 40.0), (4.0, 40.0), (15.0, 61.0)):
+            with pytest.raises(DeviceError, match="must be"):
+                gripper.grasp(force, speed)
+    assert {"move_to", "grasp"}.isdisjoint(call[0] for call in Program.last.calls)
+
+
+def test_an_arm_that_does_not_arrive_is_stopped_and_the_message_says_how_far_it_is():
+    with python_arm(lag_mm=12.0) as arm:
+        with pytest.raises(DeviceError, match=r"within 5 mm and 5 deg of its goal .* it is 12\.0 mm and 0\.0 deg away"):
+            arm.move_to(GOAL, 50.0)
+        assert Program.last.calls[-1] == "stop"
+
+
+@pytest.mark.parametrize("fault", [RuntimeError("brake engaged"), OSError("link lost")])
+def test_an_exception_of_the_program_is_a_device_error_and_stops_the_arm(fault):
+    with python_arm(fault=fault) as arm:
+        with pytest.raises(DeviceError, match=r"brake engaged|link lost"):
+            arm.move_to(GOAL, 50.0)
+        assert Program.last.calls[-1] == "stop"
+
+
+def test_ctrl_c_in_the_program_stops_the_arm():
+    with python_arm(fault=KeyboardInterrupt()) as arm:
+        with pytest.raises(KeyboardInterrupt):
+            arm.move_to(GOAL, 50.0)
+        assert Program.last.calls[-1] == "stop"
+
+
+def test_closing_calls_disconnect_once():
+    arm = python_arm()
+    arm.connect()
+    arm.close()
+    arm.close()
+    assert Program.last.calls == ["disconnect"]
+
+
+def test_an_object_without_a_method_is_refused_when_it_connects():
+    arm = OwnArm(workspace=WORKSPACE, robot=f"{HERE}Incomplete")
+    with pytest.raises(DeviceError, match="must have the methods move_to, pose, stop; it lacks move_to, stop"):
+        arm.connect()
+
+
+def test_a_wrong_setting_of_the_program_is_an_error_when_it_connects():
+    with pytest.raises(DeviceError, match=r"Program cannot be made: .*unexpected keyword argument 'wheels'"):
+        python_arm(wheels=4).connect()
+
+
+def test_a_pose_that_is_incomplete_is_an_error():
+    arm = python_arm()
+    with arm:
+        Program.last.at = {"x_mm": 1.0}
+        with pytest.raises(DeviceError, match=r"pose of .*y_mm"):
+            arm.pose()
+
+
+def test_an_error_status_is_an_error_with_its_text(server):
+    server.program.fault = RuntimeError("protective stop")
+    with OwnArm(workspace=WORKSPACE, url=server.url) as arm:
+        with pytest.raises(DeviceError, match=r"/robot/move_to answered 409: protective stop"):
+            arm.move_to(GOAL, 50.0)
+        assert server.program.calls[-1] == "stop"
+
+
+def test_an_answer_that_is_not_json_is_an_error(server):
+    server.garbled = b"<html>"
+    with pytest.raises(DeviceError, match=r"must answer with JSON, got b'<html>'"):
+        OwnArm(workspace=WORKSPACE, url=server.url).connect()
+
+
+def test_an_endpoint_that_does_not_run_is_an_error_with_the_remedy():
+    with pytest.raises(DeviceError, match=r"127.0.0.1:9/pose does not answer \(.*\); start it, or correct url"):
+        OwnArm(workspace=WORKSPACE, url="http://127.0.0.1:9").connect()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "give robot or url"),
+        ({"robot": f"{HERE}Program", "url": "http://a"}, "give robot or url"),
+        ({"url": "ftp://a"}, "url must begin with http"),
+        ({"url": "http://a", "timeout_s": 0.0}, "timeout_s must be from 0.1"),
+    ],
+)
+def test_wrong_settings_are_refused_before_anything_connects(settings, message):
+    with pytest.raises(RobotConfigError, match=message):
+        OwnArm(workspace=WORKSPACE, **settings)
+
+
+def test_a_smallest_force_above_the_limit_of_the_rig_is_refused():
+    with pytest.raises(RobotConfigError, match=r"min_force_n must be from 0.001 to 20 N, got 30"):
+        OwnGripper(stroke_mm=80.0, min_force_n=30.0, max_force_n=20.0, url="http://a")
+
+
+def test_an_unknown_class_is_refused_with_the_remedy():
+    with pytest.raises(UnknownName, match=r"robot 'nowhere:Arm' cannot be imported .* PYTHONPATH"):
+        OwnArm(workspace=WORKSPACE, robot="nowhere:Arm")
+
+
+def test_a_rig_file_builds_it_and_a_package_adds_a_robot_by_an_entry_point(tmp_path, monkeypatch):
+    plugins.install(tmp_path / "site", monkeypatch, robots={"mine": f"{HERE}Program"})
+    table = {"driver": "own", "robot": "mine", "settings": {"lag_mm": 1.0}}
+    with load_driver("arm", table, "[arm]", workspace=WORKSPACE, max_speed_mm_s=100.0, max_state_age_s=0.5) as arm:
+        assert arm.max_speed_mm_s == 100.0
+        assert Program.last.lag_mm == 1.0
+
+
+def test_a_collection_with_a_users_robot_records_what_the_rigs_own_arm_records(tmp_path):
+    settings = CollectSettings(grasps=2)
+    for name, make in (("own", own_rig), ("fake", FakeRig)):
+        collect(lambda make=make: make(5), tmp_path / name, objects=["round-1", "round-2"], seed=5, settings=settings)
+    own, fake = (tmp_path / name / "metadata.jsonl" for name in ("own", "fake"))
+    assert own.read_text() == fake.read_text()
