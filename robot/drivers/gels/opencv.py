@@ -67,7 +67,6 @@ class OpencvTactile(TactileSensor):
         """Failures of the stream since the sensor was connected, failed reopenings included."""
         return self._reader.lost_count
 
-<<<<<<< HEAD
     def read_after(self, time_s: float, timeout_s: float) -> Frame:
         """Wait at most `timeout_s` for a frame newer than `time_s` and return the newest frame; else raise DeviceError.
 
@@ -75,12 +74,11 @@ class OpencvTactile(TactileSensor):
         """
         with self._use("cannot be read"):
             return self._picture(self._reader.after(time_s, timeout_s))
-=======
+
     @property
     def arrivals(self) -> list[Arrival]:
         """The newest frames of the stream, as they arrived."""
         return self._reader.arrivals
->>>>>>> robots
 
     def _connect(self) -> None:
         self._reader = CaptureReader(self, self._options)
