@@ -453,6 +453,21 @@ def test_check_prints_licence_and_terms_or_that_none_is_stated(recording, tmp_pa
     assert "licence of the data: not stated" in capsys.readouterr().err.splitlines()
 
 
+def test_check_prints_which_grasps_have_depth_force_and_opening(recording, tmp_path, capsys):
+    shutil.copytree(recording, tmp_path / "r")
+    path = tmp_path / "r" / "metadata.jsonl"
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    for line in lines:
+        for key in ("force_n", "opening_mm", "depth_file_name"):
+            line.pop(key, None)
+    lines[0] |= {"force_n": 3.0, "depth_file_name": lines[0]["photo_file_name"]}
+    lines[1] |= {"force_n": 24.75}
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    main(["check", str(tmp_path / "r")])
+    expected = f"depth of 1 of {len(lines)} grasps, force of 2 (3 to 24.8 N), opening of 0"
+    assert f"recorded with the touches: {expected}" in capsys.readouterr().err.splitlines()
+
+
 def test_check_exits_with_1_if_it_finds_errors(recording, tmp_path, capsys):
     assert main(["check", str(recording)]) == 0
     broken = tmp_path / "recording"
