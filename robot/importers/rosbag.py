@@ -5,8 +5,9 @@
     <name>.mcap             <name>.db3                ROS 2, a file without its folder
 
 The package rosbags (extra `importers`) reads them without ROS. The source is a bag or a folder of bags. A bag is a
-sequence. The options name its topics; `touch_b` is empty for a sensor with one finger. Images are sensor_msgs/Image
-(rgb8, bgr8, mono8) or CompressedImage, whose files are stored unchanged.
+sequence; with a topic of names (`object`) the grasps of one object in a bag are. The options name its topics; `touch_b`
+is empty for a sensor with one finger. Images are sensor_msgs/Image (rgb8, bgr8, mono8) or CompressedImage, whose files
+are stored unchanged.
 
 A grasp lasts while the gel of any finger differs from the first image of its bag over the fraction `contact` of its
 area, by the rule of the contact-area gate. If a topic marks the grasps, the option `grasp` names it (std_msgs/Bool,
@@ -156,7 +157,9 @@ def _items(
                 yield Skip(f"there is no message of {topics.object} before it", name)
                 continue
             time_s = (grasp.touch[0] - start_ns) / 1e9
-            fields[name] = {"object_id": object_id, "time_s": time_s, **_fields(grasp, scan, topics)}
+            sequence = f"{bag.name}-{object_id}" if topics.object else bag.name
+            facts = {"object_id": object_id, "sequence_id": sequence, "time_s": time_s}
+            fields[name] = {**facts, **_fields(grasp, scan, topics)}
             for column, place in _places(grasp, topics).items():
                 places[place].append((name, column))
         images: dict[str, dict[str, Source]] = defaultdict(dict)
@@ -165,7 +168,7 @@ def _items(
                 images[name][column] = partial(_picture, message)
                 if len(images[name]) == 1 + 2 * len(topics.touch):
                     facts = fields.pop(name)
-                    yield Item(name, facts.pop("object_id"), images.pop(name), {"sequence_id": bag.name, **facts})
+                    yield Item(name, str(facts.pop("object_id")), images.pop(name), facts)
 
 
 def _places(grasp: BagGrasp, topics: BagTopics) -> dict[str, tuple[str, int]]:

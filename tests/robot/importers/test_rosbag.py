@@ -86,6 +86,8 @@ def test_topics_can_mark_the_grasps_and_name_the_object(name, tmp_path):
     recording = import_rosbag(tmp_path / name, tmp_path / "out", grasp=GRASP, object=OBJECT)
     assert numbers_of(recording) == [(20, 25), (54, 58)]
     assert [grasp.object_id for grasp in recording.grasps] == ["mug", "red tin"]
+    # A split must be able to separate the objects of one bag.
+    assert len({grasp.sequence_id for grasp in recording.grasps}) == 2
 
 
 def test_a_grasp_before_the_first_name_is_skipped(tmp_path):
