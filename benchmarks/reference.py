@@ -76,10 +76,11 @@ terms, the citation, and under `objects` the data set's own information on them.
 as one no-contact frame, are stored once. A published split by objects is in `splits/<name>.json`, for `--split`. Some
 importers need packages of the extra: `pip install 'touch-retrieval[importers]'`.
 
-The data sets are not ours, and their licences bind you. "Not stated" means that we know of no licence in the files or
-the repository of a data set: ask its authors. `retrieve check` and `retrieve train` print the licence, and a checkpoint
-[lists the licences](training.md#licences) of all data that trained it. If parts of a layout are not
-verified, the importer follows the authors' descriptions and other people's readers, and lists these parts when it ends.
+The data sets are not ours, and their licences bind you. "Not stated" means that we know of no licence: look at the
+page of the data set, ask its authors, and write the answer into `recording.json`. `retrieve check` and `retrieve train`
+print the licence, and a checkpoint [lists the licences](training.md#licences) of all data that trained it. If parts of
+a layout are not verified, the importer follows the authors' descriptions and other people's readers, and lists these
+parts when it ends.
 [Real data](real.md#what-counts-as-touch) defines the controls that the notes name.
 
 """

@@ -77,9 +77,9 @@ def train(
         str | None,
         typer.Option(
             metavar="NAMES",
-            help="refuse data whose licence is not among these names, such as 'CC BY-NC 4.0,ours'; open: each licence "
-            "that allows any use, commercial use included, such as CC BY, CC BY-SA, MIT or GPL. Published initial "
-            "weights are not checked",
+            help="refuse data whose licence is not in this list, separated by commas, such as 'open,CC BY-NC 4.0'. "
+            "open: every licence that allows any use, commercial use included, such as CC BY, CC BY-SA, MIT or GPL. "
+            "Published initial weights are not checked",
         ),
     ] = None,
 ) -> None:

@@ -9,10 +9,13 @@ from pathlib import Path
 
 import pytest
 
+from retrieval.commands.main import main
 from robot.devices import Arm
 from robot.drivers.own_robot import OwnArm, OwnGripper
 from robot.errors import DeviceError
 from robot.readings import Pose, Region
+from robot.recording.folder import read_recording
+from tests.replay_rig import replay_file
 
 FOLDER = Path(__file__).parents[2] / "integrations" / "robots"
 WORKSPACE = Region((-150.0, -150.0, 10.0), (150.0, 150.0, 400.0))
@@ -74,12 +77,17 @@ class FakeUR:
 
 
 @pytest.fixture
-def ur(monkeypatch):
+def fake_ur(monkeypatch):
     fake = FakeUR()
     for module, name in (("rtde_control", "RTDEControlInterface"), ("rtde_receive", "RTDEReceiveInterface")):
         monkeypatch.setitem(sys.modules, module, types.SimpleNamespace(**{name: lambda host: fake}))
+    return fake
+
+
+@pytest.fixture
+def ur(fake_ur):
     with OwnArm(workspace=WORKSPACE, robot="ur_arm:URArm", settings={"host": "ur", **ORIGIN}) as arm:
-        yield fake, arm
+        yield fake_ur, arm
 
 
 class FakeFranka:
@@ -165,21 +173,26 @@ class URCap(socketserver.StreamRequestHandler):
 
 
 @pytest.fixture
-def robotiq():
+def urcap():
     with socketserver.ThreadingTCPServer(("127.0.0.1", 0), URCap) as server:
         server.daemon_threads = True
         server.values, server.calls = {"POS": 0, "PRE": 0, "OBJ": 3, "STA": 3}, []
         server.object_at = round(255 * (1 - 40 / 85))
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
-        settings = {"host": "127.0.0.1", "port": server.server_address[1]}
-        gripper = OwnGripper(
-            stroke_mm=85.0, min_force_n=10.0, max_force_n=40.0, robot="robotiq_2f85:Robotiq2F85", settings=settings
-        )
-        with gripper:
-            yield server, gripper
+        yield server
         server.shutdown()
         thread.join(10)
+
+
+@pytest.fixture
+def robotiq(urcap):
+    settings = {"host": "127.0.0.1", "port": urcap.server_address[1]}
+    gripper = OwnGripper(
+        stroke_mm=85.0, min_force_n=10.0, max_force_n=40.0, robot="robotiq_2f85:Robotiq2F85", settings=settings
+    )
+    with gripper:
+        yield urcap, gripper
 
 
 def moves_and_reports(arm: Arm, goal: Pose, speed_mm_s: float) -> None:
@@ -266,3 +279,38 @@ def test_a_robotiq_gripper_that_is_not_active_does_not_move(robotiq):
     with pytest.raises(DeviceError, match="activate it on the teach pendant"):
         gripper.grasp(20.0, 85.0)
     assert not any("POS" in call for call in server.calls if call.startswith("SET"))
+
+
+def test_collect_records_grasps_with_the_examples_in_a_rig_file(fake_ur, urcap, tmp_path):
+    """The arm and the gripper of the rig's file are replaced by the examples; camera and gels are recordings."""
+    with replay_file() as path:
+        rig = path.read_text()
+        arm = f"""
+driver = "own"
+robot = "ur_arm:URArm"
+settings = {{host = "ur", origin_mm = [500, 100, -20], tool_mm = 120}}
+
+[gripper]
+driver = "own"
+robot = "robotiq_2f85:Robotiq2F85"
+settings = {{host = "127.0.0.1", port = {urcap.server_address[1]}}}
+stroke_mm = 85
+min_force_n = 10
+
+[grasp]
+force_n = [10, 20]
+
+[sensors.a]"""
+        path.write_text(rig[: rig.index("[arm]") + 5] + arm + rig.split("[sensors.a]")[1])
+        out = tmp_path / "grasps"
+        command = ["collect", "--rig", str(path), "--objects", "1", "--grasps", "1", "--out", str(out)]
+        assert main(command) == 0
+    recording = read_recording(out)
+    accepted = [grasp for grasp in recording.grasps if grasp.grasped]
+    assert len(accepted) == 1
+    assert accepted[0].outcome == "held"
+    assert accepted[0].opening_mm == pytest.approx(40.0, abs=0.4)
+    assert 10 <= accepted[0].force_n <= 20
+    assert recording.info["rig_settings"]["arm"]["robot"] == "ur_arm:URArm"
+    assert {call[0] for call in fake_ur.calls} >= {"moveL"}
+    assert fake_ur.calls[-1] == "stopScript"
