@@ -28,7 +28,10 @@ GRASPS = 5
 """Grasps of a sequence."""
 ACCURACY = 0.8
 """Accuracy for which the number of grasps is stated."""
+CATALOGUES = 4
+"""Draws of the catalogue's photos."""
 DRAWS = 2000
+"""Resamples of the objects."""
 
 Rows = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -84,23 +87,25 @@ def replay(scored: ScoredTouches, heights_mm: Floats, seed: int) -> tuple[Rows, 
     """Return the object (S,) of each sequence, and by policy whether it ranks first after each grasp (S, GRASPS)."""
     rng = np.random.default_rng([seed, 21])
     objects = np.unique(scored.photo_owner)
-    catalogue = np.array([rng.choice(np.flatnonzero(scored.photo_owner == name)) for name in objects])
-    logits = scored.logits[:, catalogue].astype(np.float64)
     owners: list[int] = []
     correct: dict[str, list[NDArray[np.bool_]]] = {}
-    for place, name in enumerate(objects):
-        usable = (scored.touch_owner == name) & ~scored.own[:, catalogue[place]] & np.isfinite(heights_mm)
-        rows = np.flatnonzero(usable).tolist()
-        if len(rows) < GRASPS:
-            continue
-        for first in rows:
-            owners.append(int(name))
-            for policy, choose in _policies(logits, place, heights_mm, rng).items():
-                order = [first]
-                while len(order) < GRASPS:
-                    order.append(choose(order, [row for row in rows if row not in order]))
-                ranked_first = logits[order].cumsum(axis=0).argmax(axis=1)
-                correct.setdefault(policy, []).append(ranked_first == place)
+    for _ in range(CATALOGUES):
+        catalogue = np.array([rng.choice(np.flatnonzero(scored.photo_owner == name)) for name in objects])
+        logits = scored.logits[:, catalogue].astype(np.float64)
+        for place, name in enumerate(objects):
+            usable = (scored.touch_owner == name) & ~scored.own[:, catalogue[place]] & np.isfinite(heights_mm)
+            rows = np.flatnonzero(usable).tolist()
+            if len(rows) < GRASPS:
+                continue
+            policies = _policies(logits, place, heights_mm, rng)
+            for first in rows:
+                owners.append(int(name))
+                for policy, choose in policies.items():
+                    order = [first]
+                    while len(order) < GRASPS:
+                        order.append(choose(order, [row for row in rows if row not in order]))
+                    ranked_first = logits[order].cumsum(axis=0).argmax(axis=1)
+                    correct.setdefault(policy, []).append(ranked_first == place)
     return np.array(owners, dtype=np.int64), {policy: np.array(each) for policy, each in correct.items()}
 
 

@@ -15,7 +15,7 @@ from robot.settings import check_range
 class SpreadPlanner(GraspPlanner):
     """Draws several grasps from another planner; plans the one whose height differs most from those of earlier grasps.
 
-    With recorded grasps of simulated objects, two such grasps identify an object as often as three random ones
+    With recorded grasps of simulated objects this recognises an object a little more often than random grasps do
     (docs/measurements/next_grasp.md).
 
     Args:

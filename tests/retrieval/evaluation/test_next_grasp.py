@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from retrieval.evaluation.next_grasp import grasps_needed, replay, score_next_grasp
+from retrieval.evaluation.next_grasp import CATALOGUES, grasps_needed, replay, score_next_grasp
 from retrieval.evaluation.predictions import Predictions
 from retrieval.evaluation.queries import Queries
 from retrieval.model.posterior import ScoredTouches
@@ -36,10 +36,10 @@ def test_the_spread_policy_takes_the_grasp_at_the_most_different_height():
     owner, correct = replayed()
     far = correct["spread"]
     # The grasp at 80 mm is clear; from any other one it is the farthest, unless its photo is the catalogue's.
-    assert far[:, 1].sum() >= 10
+    assert far[:, 1].mean() >= 0.6
     for policy in ("random", "repeated"):
         assert correct[policy][:, 1].sum() < far[:, 1].sum()
-    assert len(owner) == len(far) == 15  # five grasps of each object, since one gives the catalogue's photo
+    assert len(owner) == len(far) == CATALOGUES * 15  # five grasps of each object; one gives the catalogue's photo
 
 
 def test_the_upper_bound_takes_the_grasp_after_which_the_true_object_leads_by_most():
@@ -84,7 +84,7 @@ def evaluated(heights_mm, clear=(4,)):
 
 def test_the_results_give_each_policy_its_accuracy_and_the_grasps_that_it_needs():
     found = evaluated(HEIGHTS_MM * 3, clear=(0, 1, 2, 3, 4, 5))
-    assert (found["candidates"], found["objects"], found["sequences"]) == (3, 3, 15)
+    assert (found["candidates"], found["objects"], found["sequences"]) == (3, 3, CATALOGUES * 15)
     assert found["policies"]["random"]["accuracy"] == [[1.0, 1.0, 1.0]] * 5
     assert found["policies"]["spread"]["grasps_needed"] == {"value": 1.0, "low": 1.0, "high": 1.0}
     assert found["policies"]["spread"]["relative_to_random"]["value"] == 1.0
