@@ -2,8 +2,7 @@
 
 Lengths in mm, forces in N, angles in rad, times in s. The origin of the rig's frame lies on the table, by convention at
 the centre of the workspace, with z up; the camera stands on the -y side. Every gripper force is the force on each
-finger; manufacturers often state the sum over both fingers, which is twice as large. Images are uint8 RGB, row 0 on
-top.
+finger; manufacturers often state the sum over both fingers, twice as much. Images are uint8 RGB, row 0 on top.
 
 The base classes check arguments and results and raise DeviceError: no value out of range reaches a driver, and no
 stale frame reaches a recording. A driver implements `_connect`, `_close` and the abstract methods of its base class;

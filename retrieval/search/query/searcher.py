@@ -170,13 +170,12 @@ class Searcher:
         """Rank the objects of the catalogue by one or more grasps of the object in the hand.
 
         Grasps without contact are ignored. If any image is not a gel image, nothing is ranked. Match logits of grasps
-        add up; `retrieval.model.posterior` converts the sums to probabilities of the objects and of "none of these".
+        add up; `retrieval.model.posterior` converts them to probabilities of the objects and of "none of these".
 
         Args:
             touches: One grasp, a list with an image for each finger in their order; or a list of such grasps. For a
                 model with one finger a single image is a grasp too. An image is a path, the bytes of a file, a Pillow
-                image, or an array (height, width, 3) of uint8, red first. OpenCV arrays have blue first: convert them
-                with `image[..., ::-1]`. A file and its decoded array give the same answer.
+                image, or an array (height, width, 3) of uint8, red first (OpenCV: `image[..., ::-1]`).
             background: The fingers' no-contact frames, for a model that uses them.
             top: Number of objects to return.
             candidates: Number of photos to rerank in each shard, raised to `top` if smaller: those nearest to the sum

@@ -63,8 +63,8 @@ def test_an_unclear_answer_takes_all_grasps_at_different_heights_and_continues_w
     assert min(later - earlier for earlier, later in itertools.pairwise(heights_mm)) > 4
     # A killed run: the second grasp and all later ones are missing.
     attempts = tmp_path / "run" / "attempts.jsonl"
-    kept = next(row for row, line in enumerate(map(json.loads, attempts.read_text().splitlines())) if line["accepted"])
-    attempts.write_text("".join(f"{line}\n" for line in attempts.read_text().splitlines()[: kept + 1]))
+    last = next(row for row, line in enumerate(map(json.loads, attempts.read_text().splitlines())) if line["accepted"])
+    attempts.write_text("".join(f"{line}\n" for line in attempts.read_text().splitlines()[: last + 1]))
     recorded = [line for line in lines if json.loads(line)["grasp_id"] in attempts.read_text()]
     (tmp_path / "run" / "metadata.jsonl").write_text("".join(f"{line}\n" for line in recorded))
     identify("--confidence", "1", "--grasps", "3")
