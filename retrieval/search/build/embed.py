@@ -253,26 +253,26 @@ class Embedder:
         return embeddings
 
     def _encode(self, found: BuildPart | list[_ReadItem]) -> BuildPart:
-        """Decode and encode the photos that have no code. Runs on threads."""
+        """Decode and encode the photos that have no code, each content once. Runs on threads."""
         if isinstance(found, BuildPart):
             return found
         part, photos, images = BuildPart(), list[_Photo](), list[Image]()
+        rows: dict[str, dict[str, Any]] = {}
         for item in found:
             result: _ReadItem = item
-            if isinstance(item, _Photo) and item.file is not None:
+            if isinstance(item, _Photo) and item.file is not None and item.row["digest"] not in rows:
                 image = decode_photo(item.file, self._preprocess)
                 if isinstance(image, SkippedPhoto):
                     result = image
                 else:
                     images.append(image)
+                    rows[item.row["digest"]] = item.row
             if isinstance(result, SkippedPhoto):
                 part.skipped.append(result)
             else:
                 photos.append(result)
-        made = iter(
-            self._encode_images([photo.row for photo in photos if photo.file is not None], images) if images else ()
-        )
-        part.codes = [photo.code or next(made) for photo in photos if photo.code or photo.file]
+        made = dict(zip(rows, self._encode_images(list(rows.values()), images), strict=True)) if images else {}
+        part.codes = [photo.code or made[photo.row["digest"]] for photo in photos if photo.code or photo.file]
         part.rows = [photo.row for photo in photos]
         part.objects = [row["object_id"] for row in part.rows]
         return part
