@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from benchmarks.models.recognition import all_scores, interval
+from benchmarks.models.recognition import all_scores, summary_cell
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.data.labelled_pictures import ObjectLabels, load_object_labels
@@ -83,8 +83,7 @@ def accuracy_table(grasps: Sequence[Grasp], first: NDArray[np.int64], labels: Ma
         for value in np.unique(values):
             rows = values == value
             measure = Measure(right[rows, None].astype(float), owner[rows], np.array([1 / len(names)]), "all objects")
-            summary = summarise([measure], seed=0)
-            cell = interval(*(summary[part][0] for part in ("value", "low", "high")))
+            cell = summary_cell(summarise([measure], seed=0))
             lines.append(f"| {what} | {value} | {len(np.unique(owner[rows]))} | {cell} |")
     return lines
 

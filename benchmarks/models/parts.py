@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.models.recognition import interval, measures
+from benchmarks.models.recognition import interval, measures, summary_cell
 from benchmarks.models.shipped import PRESET, tower_weights
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
@@ -137,8 +137,7 @@ def table(found: Mapping[str, Mapping[str, Measure]]) -> str:
     for name, row in found.items():
         cells = []
         for key in SHOWN:
-            value = summarise([row[key]], seed=0)
-            cells.append(interval(*(value[part][0] for part in ("value", "low", "high"))))
+            cells.append(summary_cell(summarise([row[key]], seed=0)))
         difference = compare([row[SHOWN[1]]], [found[WHOLE][SHOWN[1]]], seed=0)
         cells.append("" if name == WHOLE else interval(*(difference[part] for part in ("difference", "low", "high"))))
         lines.append(f"| {name} | {' | '.join(cells)} |")

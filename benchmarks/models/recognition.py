@@ -181,11 +181,16 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
             continue
         cells = [f"{summary['chance'][0]:.3f}"]
         for name, each in rows.items():
-            cells.append(interval(each[key]["value"][0], each[key]["low"][0], each[key]["high"][0]))
+            cells.append(summary_cell(each[key]))
             if name != first:
                 cells.append(interval(*(each[key]["against_first"][part] for part in ("difference", "low", "high"))))
         lines.append(f"| {key} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def summary_cell(summary: dict[str, Any]) -> str:
+    """Return the value of a summary (`summarise`) with its interval."""
+    return interval(*(summary[part][0] for part in ("value", "low", "high")))
 
 
 def interval(value: float, low: float, high: float) -> str:

@@ -23,6 +23,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.models.recognition import summary_cell
 from retrieval.data.dataset import Grasp, data_digest, load_grasps
 from retrieval.evaluation.calibrate import calibrate_pairs
 from retrieval.evaluation.evaluate import DRAWS
@@ -235,14 +236,10 @@ def table(points: Sequence[dict[str, Any]]) -> str:
         "|---|---|---|---|" + "---|" * len(measures),
     ]
     for point in points:
-        cells = [_cell(point[name]) for name in measures]
+        cells = [summary_cell(point[name]) for name in measures]
         sizes = (f"{point['objects']:,}", str(point["grasps"]), f"{point['photographed']:,}")
         lines.append("| " + " | ".join((point["method"], *sizes, *cells)) + " |")
     return "\n".join(lines)
-
-
-def _cell(summary: dict[str, Any]) -> str:
-    return f"{summary['value'][0]:.3f} [{summary['low'][0]:.3f}, {summary['high'][0]:.3f}]"
 
 
 def plot(points: Sequence[dict[str, Any]]) -> Figure:

@@ -83,20 +83,22 @@ def identify(
             made.planner = SpreadPlanner(made.planner, run.heights_mm)
             return made
 
-        name = object_id or make_rig().object_ids(1)[0]
-        stored = _attempt_count(out)
+        attempts: set[int] = set()  # the number before the first new attempt, and after each one
         with announce_resume(f"the grasps so far are stored in {out}"):
-            collect(
+            (tally,) = collect(
                 make_rig,
                 out,
-                objects=[name],
+                objects=[object_id] if object_id else 1,
                 seed=seed,
                 settings=CollectSettings(grasps=grasps),
+                progress=lambda now: attempts.add(now.attempts),
                 is_enough=run.is_enough,
             )
         if run.answer is None:
-            raise RetrievalError(f"no grasp of {name} was accepted; see the attempts in {out}/attempts.jsonl")
-        if _attempt_count(out) == stored:  # the hand may hold another object now
+            raise RetrievalError(
+                f"no grasp of {tally.object_id} was accepted; see the attempts in {out}/attempts.jsonl"
+            )
+        if len(attempts) == 1:  # no new attempt: the hand may hold another object now
             raise BadInput(f"{out} holds a finished run: {run.sentence}. Give another --out for the next object")
         if html is not None:
             from retrieval.report.query import query_html
@@ -159,14 +161,6 @@ class _Run:
         if answer.none_probability is None:
             return False
         return max(answer.none_probability, answer.results[0].probability or 0.0) >= self.confidence
-
-
-def _attempt_count(folder: Path) -> int:
-    """Return the number of attempts in a recording; 0 if it does not exist."""
-    from robot.recording.attempt_log import ATTEMPTS_FILE
-
-    file = folder / ATTEMPTS_FILE
-    return file.read_bytes().count(b"\n") if file.exists() else 0
 
 
 def _first_object(answer: "QueryResult") -> str:

@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -30,6 +30,8 @@ Parts = Mapping[str, Sequence[str]]
 
 MOMENT_SUFFIXES = {"before": "_before", "during": "", "after": "_after"}
 """Suffix of the columns of each step of an episode."""
+_FACTS = ("source", "sensor", "rig", "licence", "terms", "citation", "background")
+"""Keys of recording.json that a store repeats."""
 _MARK = ".touch-retrieval-export"
 
 
@@ -136,6 +138,11 @@ def grasps_by_part(recording: Recording, parts: Parts | None) -> tuple[dict[str,
         raise RecordingError("the split contains no object of the recording")
     left_out = len(recording.grasps) - sum(map(len, exported.values()))
     return exported, [f"left out {left_out} grasp(s) of objects that are not in the split"] if left_out else []
+
+
+def recording_facts(recording: Recording) -> dict[str, Any]:
+    """Return the facts of recording.json that a store repeats; None for one that is missing."""
+    return {key: recording.info.get(key) for key in _FACTS}
 
 
 def plain_fields(grasp: RecordedGrasp) -> dict[str, object]:

@@ -32,6 +32,7 @@ from robot.exporters.exporting import (
     atomic_folder,
     grasps_by_part,
     plain_fields,
+    recording_facts,
 )
 from robot.importers.importing import Progress, import_extra
 from robot.recording.folder import RecordedGrasp, Recording
@@ -245,7 +246,6 @@ def _info(
 ) -> dict[str, Any]:
     ends = list(itertools.accumulate(map(len, by_part.values())))
     episodes = ends[-1]
-    keys = ("source", "sensor", "rig", "licence", "terms", "citation", "background")
     return {
         "codebase_version": "v3.0",
         "robot_type": None,
@@ -264,7 +264,7 @@ def _info(
             name: {"dtype": "float32" if name == "timestamp" else "int64", "shape": [1], "names": None}
             for name in _STEP_COLUMNS
         },
-        "recording": {key: recording.info.get(key) for key in keys},
+        "recording": recording_facts(recording),
     }
 
 

@@ -19,13 +19,20 @@ from typing import Any
 
 import numpy as np
 
-from robot.exporters.exporting import EpisodeSteps, Parts, RecordingExport, atomic_folder, grasps_by_part, plain_fields
+from robot.exporters.exporting import (
+    EpisodeSteps,
+    Parts,
+    RecordingExport,
+    atomic_folder,
+    grasps_by_part,
+    plain_fields,
+    recording_facts,
+)
 from robot.importers.importing import Progress, import_extra
 from robot.recording.folder import RecordedGrasp, Recording
 
 STORE = "grasps.zarr"
 _WHAT = "the format of Open-X-Tactile"
-_INFO_KEYS = ("source", "sensor", "rig", "licence", "terms", "citation", "background")
 
 
 def export_open_x_tactile(
@@ -56,7 +63,7 @@ def export_open_x_tactile(
         root = zarr.open_group(str(folder / STORE), mode="w", zarr_format=2)
         ends = np.cumsum([0, *map(len, found.values())]).tolist()
         root.attrs["splits"] = {part: [ends[number], ends[number + 1]] for number, part in enumerate(found)}
-        root.attrs["recording"] = {key: recording.info.get(key) for key in _INFO_KEYS}
+        root.attrs["recording"] = recording_facts(recording)
         data, meta = root.create_group("data"), root.create_group("meta")
         photo, touch = (steps.sizes[name] for name in ("photo", f"touch_{steps.fingers[0]}"))
         photos = _frames(data, "camera_main_rgb", len(grasps) * length, (*photo, 3))

@@ -341,16 +341,22 @@ def test_the_order_of_the_calls_of_an_attempt():
     assert calls == [*start, *gels, *close, *gels, *up, *gels, "arm", "arm", "open", "arm"]
 
 
-@pytest.mark.parametrize("faults", [{}, {"grasp": {1}}, {"gel a": {3}}, {"open": {3}}])
-def test_a_motion_that_begins_low_is_vertical(faults, monkeypatch):
-    """On a slant, open jaws would hit the object that was just put down."""
-    moves, real = [], FakeArm._move_to
+@pytest.fixture
+def moves(monkeypatch):
+    """The motions of the fake arm: each pose before it and its goal."""
+    found, real = [], FakeArm._move_to
 
     def recorded(self, pose, speed_mm_s):
-        moves.append((self.shared.pose, pose))
+        found.append((self.shared.pose, pose))
         return real(self, pose, speed_mm_s)
 
     monkeypatch.setattr(FakeArm, "_move_to", recorded)
+    return found
+
+
+@pytest.mark.parametrize("faults", [{}, {"grasp": {1}}, {"gel a": {3}}, {"open": {3}}])
+def test_a_motion_that_begins_low_is_vertical(faults, moves):
+    """On a slant, open jaws would hit the object that was just put down."""
     rig = FakeRig(3, faults=faults)
     with rig:
         attempter = AttemptRunner(rig, 3, AttemptSettings())
@@ -361,15 +367,8 @@ def test_a_motion_that_begins_low_is_vertical(faults, monkeypatch):
     assert all((here.x_mm, here.y_mm, here.yaw_rad) == (there.x_mm, there.y_mm, there.yaw_rad) for here, there in low)
 
 
-def test_an_arm_that_reports_a_height_below_the_workspace_still_rises_straight(monkeypatch):
+def test_an_arm_that_reports_a_height_below_the_workspace_still_rises_straight(moves):
     """A pose is measured: after a grasp at the lowest height it may lie a little below it."""
-    moves, real = [], FakeArm._move_to
-
-    def recorded(self, pose, speed_mm_s):
-        moves.append((self.shared.pose, pose))
-        return real(self, pose, speed_mm_s)
-
-    monkeypatch.setattr(FakeArm, "_move_to", recorded)
     rig = FakeRig(3)
     with rig:
         low = dataclasses.replace(rig.shared.pose, z_mm=rig.arm.workspace.lower[2] - 0.01)
@@ -386,15 +385,8 @@ class Approaching(CylinderPlanner):
         return dataclasses.replace(plan, approach=(plan.above,))
 
 
-def test_the_open_hand_leaves_an_object_that_was_put_elsewhere_straight_up(monkeypatch):
+def test_the_open_hand_leaves_an_object_that_was_put_elsewhere_straight_up(moves):
     """On the way back to the approach, the jaws would hit the object between them."""
-    moves, real = [], FakeArm._move_to
-
-    def recorded(self, pose, speed_mm_s):
-        moves.append((self.shared.pose, pose))
-        return real(self, pose, speed_mm_s)
-
-    monkeypatch.setattr(FakeArm, "_move_to", recorded)
     rig = FakeRig(3)
     rig.planner = Approaching()
     with rig:
