@@ -5,7 +5,7 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -40,7 +40,7 @@ from retrieval.evaluation.real.reference_rows import (
     facts_with_references,
     features_with_references,
 )
-from retrieval.evaluation.real.touch_to_touch import TouchToTouch, touch_to_touch_entry
+from retrieval.evaluation.real.touch_to_touch import FROZEN, TouchToTouch, touch_to_touch_entry
 from retrieval.evaluation.real.verdict import Aggregation, MeasuresBySeed, control_entry, reliability_entry, row_entry
 from retrieval.evaluation.scoring import MethodScores
 from retrieval.methods import METHODS, TRIVIAL_BASELINES
@@ -66,6 +66,7 @@ def benchmark(
     preset: str | None = None,
     methods: Sequence[str | type[Method]] = DEFAULT_METHODS,
     models: Mapping[str, Path] = MappingProxyType({}),
+    towers: Mapping[str, Config] = MappingProxyType({}),
     seeds: int = 3,
     skipped: Mapping[str, str] = MappingProxyType({}),
     cache: Path | None = None,
@@ -84,6 +85,7 @@ def benchmark(
         preset: Name of the configuration in the report. Default: the configuration's name.
         methods: Names, or your own classes.
         models: Name to checkpoint; each is a separate row, which is not fitted.
+        towers: Name to configuration; its frozen touch tower is a separate row of touch-to-touch protocols.
         seeds: Number of draws of the folds and of fits.
         skipped: Protocol to the reason why it is left out, for the report.
         cache: Folder of features and measures. Default: `out`/cache.
@@ -117,6 +119,8 @@ def benchmark(
     config, preset_name = named_config(config, preset)
     cache = cache or out / "cache"
     selected = dict(map(_named, protocols))
+    if equal := set(towers) & {FROZEN, *models}:
+        raise BadInput(f"Each row needs a name of its own; {min(equal)} is that of another row. Rename these towers.")
     if not isinstance(recordings, Mapping):
         recordings = dict.fromkeys((protocol.data_set for protocol in selected.values()), recordings)
     facts = {name: read_recording_facts(folder_of(recording)) for name, recording in recordings.items()}
@@ -129,8 +133,10 @@ def benchmark(
             if data_set not in rows:
                 rows[data_set] = _rows(facts[data_set], config, names, models, cache / "features", quiet)
             if isinstance(protocol, TouchToTouch):
+                encoder = partial(TowerEncoder.of_config, facts[data_set].grasps, cache=cache / "features", quiet=quiet)
+                others = [BenchmarkRow(row, "", encoder(each)) for row, each in towers.items()]
                 tables[name] = touch_to_touch_entry(
-                    protocol, facts[data_set], rows[data_set], list(range(seeds)), cache, DRAWS, quiet
+                    protocol, facts[data_set], [*rows[data_set], *others], list(range(seeds)), cache, DRAWS, quiet
                 )
                 continue
             usable = [row for row in rows[data_set] if protocol.entry == PHOTO or row.method in ANY_WIDTH_METHODS]
@@ -152,6 +158,7 @@ def benchmark(
             "seeds": list(range(seeds)),
             "draws": DRAWS,
             "max_grasps": MAX_GRASPS,
+            "towers": {name: each.without_paths() for name, each in towers.items()},
         },
         "protocols": tables,
         "skipped": left_out,

@@ -226,7 +226,7 @@ class _SequenceEncoder:
         return self._features(frames, touch_variant).astype(np.float64)
 
     def _features(self, grasps: Sequence[Grasp], touch_variant: str) -> NDArray[np.float32]:
-        """Return the features (G, fingers * F) of these touches; photos are not encoded."""
+        """Return the features (G, fingers * F) of these touches without cells, whose place in the image would count."""
         fingers = self.towers.config.matcher.fingers
         if fingers > 1 and len(grasps[0].touches) == 1:  # both fingers of the model get the same touch
             grasps = [
@@ -245,7 +245,8 @@ class _SequenceEncoder:
             photo_features_from=no_photos,
             quiet=towers.quiet,
         )
-        return found.touch.reshape(len(ids), -1)
+        pooled = found.touch[..., : towers.matcher.pooled_counts[0]]
+        return pooled.reshape(len(ids), -1)
 
 
 def touch_to_touch_entry(
@@ -334,12 +335,12 @@ def touch_to_touch_entry(
 
 
 def _towers(rows: Sequence[BenchmarkRow]) -> Iterator[tuple[str, TowerEncoder]]:
-    """Yield the name and the towers of the rows, each towers once."""
+    """Yield the name and the towers of the rows, each towers once; the rows of methods come first."""
     distinct: list[TowerEncoder] = []
     for row in rows:
         if not any(row.towers is one for one in distinct):
+            yield (FROZEN if not distinct and row.towers.checkpoint is None else row.name), row.towers
             distinct.append(row.towers)
-            yield (row.name if row.towers.checkpoint else FROZEN), row.towers
 
 
 def _measures(protocol: Protocol, sequences: Sequences, vectors: Vectors) -> dict[str, Measure]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from importlib import resources
 from pathlib import Path
 
 import cv2
@@ -12,8 +13,15 @@ from retrieval.commands.main import main
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.images import read_rgb
 from retrieval.errors import DatasetError
-from retrieval.evaluation.real.touch_to_touch import Sequences, leave_one_out_scores, with_common_frame
+from retrieval.evaluation.real.conditions import TowerEncoder
+from retrieval.evaluation.real.touch_to_touch import (
+    Sequences,
+    _SequenceEncoder,
+    leave_one_out_scores,
+    with_common_frame,
+)
 from retrieval.metrics import protocols
+from retrieval.model.config import load_config
 from robot.importers.physiclear import import_physiclear
 from tests.miniatures import physiclear
 
@@ -167,6 +175,10 @@ def test_frames_of_two_sizes_are_refused(recording, tmp_path):
 # The protocol ----------------------------------------------------------------------------------------------
 
 
+def load_preset(name):
+    return (resources.files("retrieval") / "configs" / f"{name}.toml").read_text()
+
+
 def benchmark(recording, out, *more):
     options = ["--preset", "tiny", "--protocols", "physiclear", "--seeds", "2", "--methods", "chance", *more]
     return main(["benchmark", "real", str(recording / "data"), "--out", str(out), *options])
@@ -210,6 +222,46 @@ def test_a_second_run_is_byte_identical(recording, out):
     before = (out / "results.json").read_bytes()
     assert benchmark(recording, out) == 0
     assert (out / "results.json").read_bytes() == before
+
+
+def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(recording, tmp_path, out):
+    larger = tmp_path / "larger.toml"
+    larger.write_text(load_preset("tiny").replace("touch_px = 32", "touch_px = 48"))
+    assert benchmark(recording, tmp_path / "report", "--towers", "same=tiny", f"larger={larger}") == 0
+    rows = json.loads((tmp_path / "report" / "results.json").read_text())["protocols"]["physiclear"]["rows"]
+    assert set(rows) == {
+        f"{name}-{representation}"
+        for name in ("frozen", "same", "larger")
+        for representation in ("difference", "common-frame")
+    }
+    same, first = rows["same-difference"], rows["frozen-difference"]
+    assert same["measures"] == first["measures"]
+    assert [same["tower_differences"]["map"][key] for key in ("low", "difference", "high")] == [0, 0, 0]
+    assert rows["larger-difference"]["tower_differences"] is not None
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        ("tiny", "--towers must have the form NAME=CONFIG, got 'tiny'"),
+        ("frozen=tiny", "frozen is that of another row"),
+    ],
+)
+def test_a_tower_without_a_name_of_its_own_is_refused(recording, tmp_path, capsys, choice, message):
+    assert benchmark(recording, tmp_path / "report", "--towers", choice) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_cells_are_not_compared_since_a_part_is_pressed_at_any_place(recording, tmp_path):
+    grasps = load_grasps(recording / "recording")
+    config = load_config("small")
+    config = dataclasses.replace(
+        config, matcher=dataclasses.replace(config.matcher, tower_output="stages", cosine=True, cell_dim=4)
+    )
+    towers = TowerEncoder.of_config(grasps, config, tmp_path, True)
+    assert towers.matcher.touch_tower.output_count > towers.matcher.touch_tower.feature_count
+    encoder = _SequenceEncoder(Sequences.of(grasps), towers, grasps)
+    assert encoder.vectors("difference", "touch").shape[1] == towers.matcher.touch_tower.feature_count
 
 
 @pytest.mark.slow
