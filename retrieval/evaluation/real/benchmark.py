@@ -5,7 +5,7 @@ import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -133,10 +133,11 @@ def benchmark(
             if data_set not in rows:
                 rows[data_set] = _rows(facts[data_set], config, names, models, cache / "features", quiet)
             if isinstance(protocol, TouchToTouch):
-                encoder = partial(TowerEncoder.of_config, facts[data_set].grasps, cache=cache / "features", quiet=quiet)
-                others = [BenchmarkRow(row, "", encoder(each)) for row, each in towers.items()]
+                compared = {row.name if row.towers.checkpoint else FROZEN: row.towers for row in rows[data_set]}
+                for row_name, each in towers.items():
+                    compared[row_name] = TowerEncoder.of_config(facts[data_set].grasps, each, cache / "features", quiet)
                 tables[name] = touch_to_touch_entry(
-                    protocol, facts[data_set], [*rows[data_set], *others], list(range(seeds)), cache, DRAWS, quiet
+                    protocol, facts[data_set], compared, list(range(seeds)), cache, DRAWS, quiet
                 )
                 continue
             usable = [row for row in rows[data_set] if protocol.entry == PHOTO or row.method in ANY_WIDTH_METHODS]

@@ -28,7 +28,6 @@ from retrieval.errors import DatasetError
 from retrieval.evaluation.example_grasps import ExampleGrasps
 from retrieval.evaluation.real.conditions import (
     CONTROLS,
-    BenchmarkRow,
     TowerEncoder,
     clock_features,
     missing_no_contact_reason,
@@ -245,14 +244,13 @@ class _SequenceEncoder:
             photo_features_from=no_photos,
             quiet=towers.quiet,
         )
-        pooled = found.touch[..., : towers.matcher.pooled_counts[0]]
-        return pooled.reshape(len(ids), -1)
+        return found.pooled(towers.matcher).touch.reshape(len(ids), -1)
 
 
 def touch_to_touch_entry(
     protocol: TouchToTouch,
     facts: RecordingFacts,
-    rows: Sequence[BenchmarkRow],
+    towers_of: Mapping[str, TowerEncoder],
     seeds: Sequence[int],
     cache: Path,
     draws: int,
@@ -263,7 +261,7 @@ def touch_to_touch_entry(
     Args:
         protocol: The protocol.
         facts: The recording. Each touch must have a no-contact frame, and each object two sequences.
-        rows: Rows whose towers are used, each once; methods are not fitted.
+        towers_of: Towers by name of their row; the others are compared with the first.
         seeds: Seeds of the permutations of the objects.
         cache: Folder of features and of images on the common frame.
         draws: Resamples of an interval.
@@ -283,7 +281,7 @@ def touch_to_touch_entry(
     controls: dict[str, list[dict[str, Measure]]] = {"order": [order]}
     first_row: tuple[str, ScoreTable] | None = None
     frozen: dict[str, dict[str, Measure]] = {}
-    for label, towers in _towers(rows):
+    for label, towers in towers_of.items():
         encoder = _SequenceEncoder(sequences, towers, common)
         no_contact = _measures(protocol, sequences, encoder.no_contact())
         controls.setdefault("no_contact", [no_contact])
@@ -332,15 +330,6 @@ def touch_to_touch_entry(
         },
         "examples": {"row": first_row[0], **examples},
     }
-
-
-def _towers(rows: Sequence[BenchmarkRow]) -> Iterator[tuple[str, TowerEncoder]]:
-    """Yield the name and the towers of the rows, each towers once; the rows of methods come first."""
-    distinct: list[TowerEncoder] = []
-    for row in rows:
-        if not any(row.towers is one for one in distinct):
-            yield (FROZEN if not distinct and row.towers.checkpoint is None else row.name), row.towers
-            distinct.append(row.towers)
 
 
 def _measures(protocol: Protocol, sequences: Sequences, vectors: Vectors) -> dict[str, Measure]:

@@ -175,10 +175,6 @@ def test_frames_of_two_sizes_are_refused(recording, tmp_path):
 # The protocol ----------------------------------------------------------------------------------------------
 
 
-def load_preset(name):
-    return (resources.files("retrieval") / "configs" / f"{name}.toml").read_text()
-
-
 def benchmark(recording, out, *more):
     options = ["--preset", "tiny", "--protocols", "physiclear", "--seeds", "2", "--methods", "chance", *more]
     return main(["benchmark", "real", str(recording / "data"), "--out", str(out), *options])
@@ -224,9 +220,10 @@ def test_a_second_run_is_byte_identical(recording, out):
     assert (out / "results.json").read_bytes() == before
 
 
-def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(recording, tmp_path, out):
+def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(recording, tmp_path):
     larger = tmp_path / "larger.toml"
-    larger.write_text(load_preset("tiny").replace("touch_px = 32", "touch_px = 48"))
+    tiny = (resources.files("retrieval") / "configs" / "tiny.toml").read_text()
+    larger.write_text(tiny.replace("touch_px = 32", "touch_px = 48"))
     assert benchmark(recording, tmp_path / "report", "--towers", "same=tiny", f"larger={larger}") == 0
     rows = json.loads((tmp_path / "report" / "results.json").read_text())["protocols"]["physiclear"]["rows"]
     assert set(rows) == {
