@@ -349,7 +349,7 @@ def overview(entries: Mapping[str, Entry]) -> Figure:
         panel.axvline(100 * chance, color=MUTED_COLOUR, ls="--", lw=1, zorder=0)
         panel.set_yticks(range(len(names)), [_label(name, entry["rows"][name]) for name in names])
         panel.set_ylim(len(names) - 0.5, -0.5)
-        panel.set_title(entry["title"], fontsize=9, loc="left")
+        panel.set_title(entry["title"], fontsize=9, loc="left", wrap=True)
         panel.set_xlabel(f"{entry['labels'][entry['main']]}, %")
         panel.set_xlim(0, None)
         panel.tick_params(axis="y", length=0)
