@@ -48,8 +48,7 @@ class CollectSettings:
         grasps: Accepted grasps of each object.
         most_attempts: Upper limit of attempts at each object; None for 4 attempts per grasp, plus 10.
         attempt: Settings of the attempts; None for the rig's own.
-        rounds: Collect in rounds: one accepted grasp of each object, then the next round. Otherwise collect object by
-            object.
+        rounds: Collect one accepted grasp of each object, then the next round. Otherwise collect object by object.
 
     >>> robot.CollectSettings(grasps=2).limit
     18
@@ -266,7 +265,7 @@ class _Collection:
         self._accepted: dict[str, list[RecordedGrasp]] = defaultdict(list)
         self._ended: set[str] = set()
         for grasp in read_recording(writer.folder).grasps if is_enough and writer.grasp_ids else ():
-            if grasp.grasped:  # a collection continues
+            if grasp.grasped:  # accepted before the collection was stopped
                 self._add_accepted(grasp)
         self._start, self._done_at_start = time.monotonic(), self._count_done()
 
@@ -281,7 +280,7 @@ class _Collection:
                 self._report()
 
     def _turns(self) -> Iterator[tuple[int, str]]:
-        """Yield the turns: the number of accepted grasps at which a turn ends, and its object."""
+        """Yield (target, object) in order: attempt the object until it has `target` accepted grasps, then go on."""
         grasps = self.settings.grasps
         for target in range(1, grasps + 1) if self.settings.rounds else (grasps,):
             for name in self.names:
@@ -376,7 +375,7 @@ class _Collection:
 
 
 def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str], rounds: bool) -> None:
-    """Raise RecordingError unless the log contains every grasp, in the order of this collection."""
+    """Raise RecordingError unless the log has every grasp, and its objects are the first of `names`, in this order."""
     logged = {attempt.grasp_id for attempt in log.attempts} - {None}
     if lost := writer.grasp_ids - logged:
         raise RecordingError(f"{log.folder}: attempts.jsonl lacks grasp {min(lost)}; restore it or give a new folder")
@@ -384,7 +383,8 @@ def _check_log(log: AttemptLog, writer: RecordingWriter, names: Sequence[str], r
     order = list(tallies)
     if order != list(names[: len(order)]):
         raise RecordingError(
-            f"{log.folder} was collected with other objects ({', '.join(order[:3])}, ...); give the same or more"
+            f"{log.folder} was collected with other objects ({', '.join(order[:3])}, ...); give these objects first, "
+            "in the same order; more may follow"
         )
     if rounds and len(order) < len(names) and any(counts.accepted > 1 for counts in tallies.values()):
         raise RecordingError(

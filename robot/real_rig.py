@@ -11,7 +11,8 @@
     arm_speed_mm_s = 200
     force_n = 20                              # on each finger
     jaw_speed_mm_s = 60
-    state_age_s = 0.5                         # a moving actuator is stopped if it reports no state for this long
+    state_age_s = 0.5                         # wsg50, sawyer: a moving actuator is stopped if it reports no state for
+                                              # this long; the drivers own and manual do not use it
 
     [arm]
     driver = "manual"                         # a person moves the hand

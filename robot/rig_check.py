@@ -1,8 +1,8 @@
 """`retrieve rig check`: connect one device of a rig after another, move it a little, and report measurements.
 
 All devices are checked, also after one has failed. Nothing is grasped. The jaws move by `JAW_MM`, the arm moves up by
-`ARM_MM` (down, at the top of the workspace), and both return. Connecting may enable the motors of an arm, and may home
-a gripper without reference over its whole stroke. With motion=False, nothing moves.
+`ARM_MM` (down, at the top of the workspace), and both return. Connecting may enable the motors of an arm. A gripper
+that has lost its reference may be homed: its jaws then move over the whole stroke. With motion=False, nothing moves.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ MEASURE_S = 2.0
 """Duration of the frame rate measurement in s."""
 
 MIN_SHARE = 0.8
-"""Smallest rate of a camera with all cameras, as a fraction of its rate alone."""
+"""Smallest accepted rate of a camera while all cameras are read, as a fraction of its rate when it is read alone."""
 
 _POLL_S = 0.002
 _REPEATS = 20
@@ -62,7 +62,7 @@ class DeviceReport:
 def check_rig(rig: Rig, *, motion: bool = True) -> Iterator[DeviceReport]:
     """Check each device, then all cameras together and the time skew between the fingers' frames; yield the reports.
 
-    A device error becomes the `failure` of its report.
+    A RobotError of a check becomes the `failure` of its report.
 
     Args:
         rig: The rig, not connected.
@@ -91,7 +91,7 @@ def _check_device(devices: Sequence[Device], role: str, check: Callable[[], dict
                 connected.enter_context(device)
             refused = dict(devices[0].refused) if len(devices) == 1 else {}
             row = replace(row, measured=check(), refused=refused)
-    except RobotError as error:  # also if a person must act and there is no terminal
+    except RobotError as error:
         return replace(row, failure=str(error))
     return row
 
@@ -102,7 +102,7 @@ def _check_arm(rig: Rig, motion: bool) -> dict[str, str]:
     if arm.is_manual:
         return {"moved": "by a person"}
     if not motion:
-        return {"moved": "not"} | _round_trip(rig, arm.pose)
+        return {"motion": "none"} | _round_trip(rig, arm.pose)
     start = arm.pose()
     top = arm.workspace.upper[2]
     target = replace(start, z_mm=start.z_mm + ARM_MM if start.z_mm + ARM_MM <= top else start.z_mm - ARM_MM)
@@ -125,7 +125,7 @@ def _check_gripper(rig: Rig, motion: bool) -> dict[str, str]:
         gripper.open(min(state.opening_mm, gripper.stroke_mm))
         measured["moved"] = f"{JAW_MM:g} mm, off by {abs(reached.opening_mm - target_mm):.2f} mm"
     elif motion:
-        measured["moved"] = f"not: it is {state.status}"
+        measured["motion"] = f"none, because it is {state.status}"
     return measured
 
 
@@ -135,7 +135,7 @@ def _round_trip(rig: Rig, query: Callable[[], Any]) -> dict[str, str]:
         began = rig.clock()
         query()
         times.append(rig.clock() - began)
-    return {"state in": f"{1000 * median(times):.2f} ms (slowest {1000 * max(times):.2f})"}
+    return {"answer to a query in": f"{1000 * median(times):.2f} ms (slowest {1000 * max(times):.2f})"}
 
 
 def _check_sensor(rig: Rig, sensor: TactileSensor, alone: dict[str, float]) -> dict[str, str]:
@@ -180,14 +180,18 @@ class _WatchedFrames:
 
     @property
     def rate_hz(self) -> float:
-        """Rate from the first frame to the last, so the phase of the measurement has no effect; 0 without frames."""
+        """Number of frames after the first, divided by the time from the first to the last; 0 without two frames.
+
+        Time before the first frame and after the last one is not counted, because it depends on the moments at which
+        the measurement starts and ends.
+        """
         if len(self.times_s) < 2:
             return 0.0
         return (len(self.times_s) - 1) / (max(self.times_s) - min(self.times_s))
 
     @property
     def dropped(self) -> int:
-        """Number of missing frames in the gaps, by the median interval."""
+        """Estimated number of dropped frames: a gap of n median intervals counts as n - 1 frames."""
         intervals = np.diff(sorted(self.arrived_s))
         return int(np.sum(np.rint(intervals / np.median(intervals)) - 1)) if len(intervals) else 0
 

@@ -9,7 +9,7 @@ POSTERIOR = Posterior(slope=1.0, offset=0.0)
 def calibration(accept, reject):
     """Return a calibration whose bounds are these at every rate."""
     return VerificationCalibration(
-        objects=100,
+        group_sizes=(100,),
         impostors=(accept,) * len(LEVELS),
         similar=(accept - 1,) * len(QUANTILES),
         genuine=((accept + 1,) * len(QUANTILES),) * MAX_GRASPS,

@@ -4,7 +4,7 @@
     gen-000007/           a generation: written under a temporary name, checked, renamed; immutable afterwards
       manifest.json       its description, and size and SHA-256 of every other file; written last
       rows.jsonl          rows as lines of JSON
-      table.npy           slot, end and keys of each line (`indexes.store.rows`)
+      table.npy           for each line: slot (row of embeddings.npy), end, keys (`indexes.store.rows`)
       NAME.npy            per-row arrays, and documents that are arrays
       embeddings.npy      (slots, d) float32, from which any kind of index is built
       vectors.faiss       structure of the index, for kinds that have one
@@ -14,8 +14,8 @@
     folders.stat          stat cache of their folders, for all generations
     unfinished.sqlite     codes of an interrupted build, for all generations (`indexes.store.unfinished`)
 
-A generation is self-contained: its folder together with a CURRENT is an index, also as a copy. A generation with a
-parent copies the rows that it reuses: a million photos (1 GB) in 2 to 7 seconds.
+A generation is self-contained. You can copy its folder and a CURRENT file elsewhere; the copy is a complete index. A
+generation with a parent copies the rows that it reuses: a million photos (1 GB) in 2 to 7 seconds.
 
 There is one writer and any number of readers. If a writer is killed at any moment, the old or the new generation is
 current and complete; the next writer deletes the unfinished files.
@@ -108,7 +108,11 @@ class IndexStore:
         return text
 
     def lock(self) -> WriterLock:
-        """Return the writer lock: `with store.lock():` excludes other writers during several steps, such as `write`."""
+        """Return the writer lock.
+
+        Within `with store.lock():` you may call `write` and do other steps. Other writers get `LockedIndex` until the
+        block ends.
+        """
         return self._lock
 
     def write(
@@ -121,8 +125,9 @@ class IndexStore:
     ) -> Generation:
         """Write a new generation with exactly these rows, make it current, and return it opened.
 
-        Rows that `parent.reusable` finds by their ids and digests reuse the parent's vectors and arrays.
-        `embeddings` and `arrays` are of the F other rows, in the same order; without a parent, of all rows.
+        Rows that `parent.reusable` finds by their ids and digests reuse the parent's vectors and arrays. Pass
+        `embeddings` and `arrays` only for the F rows that are not reused, in the order of `rows`. Without a parent,
+        these are all rows.
 
         Args:
             rows: JSON objects with a distinct text "id", and a "digest" of the content for later reuse.
@@ -153,7 +158,8 @@ class IndexStore:
     ) -> Generation:
         """Write a new generation from blocks of rows, with one block in memory at a time, and make it current.
 
-        After `WriteFailed` the index is the old or the new one, complete; after any other error it is unchanged.
+        After `WriteFailed` the current generation is the old or the new one, and complete. After any other error the
+        index is unchanged.
 
         Args:
             blocks: Blocks of rows; a range selects rows of the parent, which are copied without parsing.
@@ -168,8 +174,9 @@ class IndexStore:
             threads: Number of threads; None for the library's own setting.
             choose_kind: Chooses kind, parameters and further entries of `about` when all rows are on the disk.
             queries: Unit vectors (Q, d) to measure recall with; None to draw them near the vectors of the index.
-            self_check: Number of new rows that must be found by their own vectors before the switch. Of the rows that
-                the parent had in the same structure, a sixteenth of this number is checked (`Generation.self_check`).
+            self_check: Number of new rows that must be found by their own vectors before the switch. If the
+                parent's structure is reused, a sixteenth of this number of its rows is also checked
+                (`Generation.self_check`).
             keep: Number of earlier generations that stay on the disk for readers that are opening them.
 
         Raises:
@@ -215,7 +222,9 @@ class IndexStore:
         path = self.path / "CURRENT"
         try:
             if not self._numbers() and read_regular(path).strip():
-                raise NoIndex(f"{path} is not of an index and was not changed; give another folder for the index")
+                raise NoIndex(
+                    f"{path} does not belong to an index and was not changed; give another folder for the index"
+                )
         except (FileNotFoundError, NotADirectoryError):  # if the path is a file, locking it fails with a message
             return
         except OSError as error:
@@ -228,7 +237,8 @@ class IndexStore:
         try:
             folder.mkdir()
             inherited = write_generation(folder, name, blocks, job)
-            generation = read_generation(folder, verify=False, threads=job.threads)  # the digests are new
+            # no need to verify: the digests were just computed from these files
+            generation = read_generation(folder, verify=False, threads=job.threads)
             generation.self_check(self_check, since=inherited)
             folder.rename(self.path / name)
         except BaseException:

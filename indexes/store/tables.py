@@ -21,7 +21,7 @@ from indexes.store.generation import EMBEDDINGS, ROWS, TABLE, Generation
 from indexes.store.rows import KEYS, MAX_LINE_BYTES, RECORD, are_distinct, json_of, keys_of
 
 MAX_TOMBSTONE_FRACTION = 0.10
-"""Fraction of slots without a row beyond which slots are renumbered and the structure is rebuilt."""
+"""If more than this fraction of the slots has no row, slots are renumbered and the structure is rebuilt."""
 
 RESERVED = {"rows", "table", "embeddings", "vectors", "manifest"}
 
@@ -62,8 +62,9 @@ class Tables:
 class TableWriter:
     """Writes blocks of rows (`add`) and the parent's rows (`add_parent_rows`) to `folder`; `close` maps the files.
 
-    Rows are written once, in order. The embeddings are those of the parent, then the new ones. They are written again
-    at the end if some new ones are equal, or if many of the parent's have no row.
+    Rows are written once, in order. The file of embeddings starts with those of the parent; new ones follow. The file
+    is rewritten at the end if a new vector equals an earlier one, or if slots are renumbered: because too many have no
+    row, or because no row of the parent was reused.
     """
 
     def __init__(self, folder: Path, parent: Generation | None, fingerprint: Mapping[str, str]) -> None:
@@ -238,8 +239,9 @@ class TableWriter:
     def _number_slots(self, table: NDArray[Any]) -> bool:
         """Merge equal vectors into one slot, in the table and in the file.
 
-        A structure cannot delete vectors, so the parent's slots stay, also without rows, until more than
-        `MAX_TOMBSTONE_FRACTION` of all slots have none. Renumbered slots follow the order of the rows.
+        A structure cannot delete vectors, so the parent's slots are kept even if they have no rows. If more than
+        `MAX_TOMBSTONE_FRACTION` of all slots have no row, or no row of the parent was reused, slots are renumbered in
+        the order of the rows, and the empty ones are dropped.
 
         Returns:
             Whether the parent's slots have other numbers.

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from retrieval.adaptation.folds import FoldAccuracy, score_accuracy
 from retrieval.data.dataset import Grasp
+from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import one_thread
-from retrieval.model.fusion import Matcher, score_partials
+from retrieval.model.fusion import ImageEncoding, Matcher, score_partials
 from retrieval.model.posterior import ScoredTouches
-from retrieval.model.reference_calibration import ReferenceTouches, touch_embeddings
+from retrieval.model.reference_calibration import unit_embeddings
 from retrieval.training.features import Features, encode_recording
 
 
@@ -41,32 +42,31 @@ class UnadaptedBaseline:
         return cls(start, replace(found, touch=np.ascontiguousarray(found.touch[:, fingers])))
 
     @one_thread()
-    def logits(self, features: Features, *, pooled: bool = False) -> NDArray[np.float32]:
-        """Return match logits (n, n) of the touch of every grasp with the photo of every grasp.
-
-        Args:
-            features: Features of the n grasps.
-            pooled: Score without late interaction.
-        """
-        matcher, touches = self.start.matcher, self._partials(features)
-        with torch.inference_mode():
-            photos = matcher.photo_encoding(torch.from_numpy(features.photo)).partial.numpy()
-        if pooled:
-            photos = photos[:, : matcher.config.pooled_width]
-        return np.stack([score_partials(matcher.head, touch[None], photos) for touch in touches])
-
-    @torch.inference_mode()
-    def _partials(self, features: Features) -> torch.Tensor:
-        return self.start.matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1)).partial
-
     def fold_accuracies(self, folds: Sequence[Sequence[str]]) -> list[FoldAccuracy]:
         """Return the accuracy of the model among the objects of each fold."""
-        return [score_accuracy(self.logits(features), features) for features in map(self.features.of_objects, folds)]
+        return [
+            score_accuracy(self._logits(*self._encoded(features)), features)
+            for features in map(self.features.of_objects, folds)
+        ]
 
-    def reference_touches(
+    @torch.inference_mode()
+    def _encoded(self, features: Features) -> tuple[ImageEncoding, ImageEncoding]:
+        matcher = self.start.matcher
+        touches = matcher.touch_encoding(torch.from_numpy(features.touch).flatten(1))
+        return touches, matcher.photo_encoding(torch.from_numpy(features.photo))
+
+    def _logits(self, touches: ImageEncoding, photos: ImageEncoding, *, pooled: bool = False) -> NDArray[np.float32]:
+        """Return match logits (n, n) of every touch with every photo; `pooled`: without late interaction."""
+        matcher, partials = self.start.matcher, photos.partial.numpy()
+        if pooled:
+            partials = partials[:, : matcher.config.pooled_width]
+        return np.stack([score_partials(matcher.head, touch[None], partials) for touch in touches.partial])
+
+    @one_thread()
+    def calibration_touches(
         self, folds: Sequence[Sequence[str]], max_touches: int, *, pooled: bool = False
-    ) -> list[ReferenceTouches]:
-        """Return the touches of each fold that calibrate the posterior and the reference touches.
+    ) -> list[CalibrationTouches]:
+        """Return the touches of each fold, for the calibrations.
 
         Args:
             folds: Objects of each fold.
@@ -77,9 +77,11 @@ class UnadaptedBaseline:
         for fold in map(self.features.of_objects, folds):
             features = fold.select(first_rows(fold, max_touches))
             own = np.eye(len(features), dtype=np.bool_)
-            projections = touch_embeddings(self._partials(features).numpy(), self.start.config.matcher.cosine_columns)
-            scored = ScoredTouches(self.logits(features, pooled=pooled), features.owner, features.owner, own)
-            parts.append(ReferenceTouches(scored, projections))
+            touches, photos = self._encoded(features)
+            logits = self._logits(touches, photos, pooled=pooled)
+            embeddings = unit_embeddings(touches.partial.numpy(), self.start.config.matcher.cosine_columns)
+            scored = ScoredTouches(logits, features.owner, features.owner, own)
+            parts.append(CalibrationTouches(scored, embeddings, photos.embedding.numpy()))
         return parts
 
 

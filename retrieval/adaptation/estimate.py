@@ -70,7 +70,7 @@ class Estimate:
         if self.is_baseline_better:
             lines.append(
                 "  The unadapted model is used: its pair accuracy is at least that of the fit. "
-                "Only its probabilities and its check of gel images are fitted."
+                "Only its calibrations and its check of gel images are fitted."
             )
         return lines
 

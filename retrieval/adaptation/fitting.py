@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +15,16 @@ from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.data.licences import LICENCES
 from retrieval.methods.cca_towers import GRID, MAX_CALIBRATION_TOUCHES, CcaProjections, fit_projections
 from retrieval.metrics.pairs import fit_calibration
+from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device, one_thread
 from retrieval.model.fusion import Matcher
-from retrieval.model.posterior import ScoredTouches, fit_posterior
-from retrieval.model.reference_calibration import ReferenceTouches, fit_reference_calibration
+from retrieval.model.posterior import Posterior, ScoredTouches, fit_posterior
+from retrieval.model.reference_calibration import ReferenceCalibration, fit_reference_calibration
+from retrieval.model.verification import fit_verification
 from retrieval.training.batches import FrozenFeatures
 from retrieval.training.features import Features, features_by_image
-from retrieval.training.verdicts import with_verdicts
+from retrieval.training.verdicts import with_gel_check
 
 
 @one_thread()
@@ -102,31 +105,37 @@ def install_projections(matcher: Matcher, projections: CcaProjections, scale: fl
 def calibrate_fit(
     checkpoint: Checkpoint, data: AdaptationData, estimate: Estimate | None, *, quiet: bool
 ) -> Checkpoint:
-    """Add the gel check and the posterior to a fitted checkpoint.
+    """Add the gel check and the calibrations to a fitted checkpoint.
 
-    The posterior is fitted on held-out objects, because the projections are overfitted to the fitted objects.
+    The calibrations are fitted on held-out objects, because the projections are overfitted to the fitted objects.
 
     Args:
         checkpoint: The fitted checkpoint.
         data: The recorded grasps and their features.
-        estimate: Contains the held-out touches; without it the checkpoint has no posterior.
+        estimate: Contains the held-out touches; without it the checkpoint has no calibrations.
         quiet: No progress on stderr.
     """
     checkpoint = _with_gel_check(checkpoint, data.grasps, data.features, quiet)
     if estimate is None:
-        return dataclasses.replace(checkpoint, posterior=None, references=None)
+        return dataclasses.replace(checkpoint, posterior=None, references=None, verification=None)
     # Touches of held-out objects (half of each kind at a time), with the match logits of the matcher.
     assert checkpoint.matcher.cosine_scale is not None
     scale, offset = checkpoint.matcher.cosine_scale.item(), checkpoint.matcher.head.out.bias.item()
     left_out = [
-        ReferenceTouches(dataclasses.replace(part.scored, logits=scale * part.scored.logits + offset), part.embeddings)
+        dataclasses.replace(part, scored=dataclasses.replace(part.scored, logits=scale * part.scored.logits + offset))
         for part in estimate.choice.held_out_touches
     ]
-    return _with_posterior(checkpoint, left_out)
+    posterior, references = _fit_calibrations(left_out)
+    return dataclasses.replace(
+        checkpoint,
+        posterior=posterior,
+        references=references,
+        verification=fit_verification(left_out, posterior),
+    )
 
 
 def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estimate, *, quiet: bool) -> Checkpoint:
-    """Return the start model with a gel check and a posterior fitted to the recorded objects.
+    """Return the start model with a gel check and calibrations fitted to the recorded objects.
 
     Args:
         start: The start model.
@@ -139,20 +148,24 @@ def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estima
     about = {"source": data.source, "data_digest": data_digest(data.grasps)}
     licences = [dataclasses.asdict(licence) for licence in data.licences]
     provenance = start.provenance | {"adapted_to": about, LICENCES: licences, "metrics": estimate.to_dict()}
-    made = _with_posterior(
-        dataclasses.replace(checkpoint, provenance=provenance),
-        estimate.baseline.reference_touches(folds, MAX_CALIBRATION_TOUCHES),
+    touches = partial(estimate.baseline.calibration_touches, max_touches=MAX_CALIBRATION_TOUCHES)
+    posterior, references = _fit_calibrations(touches(folds))
+    made = dataclasses.replace(
+        checkpoint,
+        provenance=provenance,
+        posterior=posterior,
+        references=references,
+        # Nothing was fitted to the objects, so all of them can be compared with each other.
+        verification=fit_verification(touches([data.features.object_ids]), posterior),
     )
-    if not start.config.matcher.cell_dim:
-        return made
-    pooled = _with_posterior(made, estimate.baseline.reference_touches(folds, MAX_CALIBRATION_TOUCHES, pooled=True))
-    return dataclasses.replace(made, pooled_posterior=pooled.posterior, pooled_references=pooled.references)
+    if start.config.matcher.cell_dim:
+        posterior, references = _fit_calibrations(touches(folds, pooled=True))
+        made = dataclasses.replace(made, pooled_posterior=posterior, pooled_references=references)
+    return made
 
 
-def _with_posterior(checkpoint: Checkpoint, left_out: list[ReferenceTouches]) -> Checkpoint:
-    """Return the checkpoint with posterior and reference calibration, fitted on touches of held-out objects."""
-    posterior = fit_posterior(*(part.scored for part in left_out))
-    return dataclasses.replace(checkpoint, posterior=posterior, references=fit_reference_calibration(*left_out))
+def _fit_calibrations(left_out: list[CalibrationTouches]) -> tuple[Posterior, ReferenceCalibration | None]:
+    return fit_posterior(*(part.scored for part in left_out)), fit_reference_calibration(*left_out)
 
 
 def _with_gel_check(checkpoint: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:
@@ -162,4 +175,4 @@ def _with_gel_check(checkpoint: Checkpoint, grasps: list[Grasp], features: Featu
     groups = [[grasp for grasp in grasps if grasp.object_id in names[side::2]] for side in (0, 1)]
     checkpoint.matcher.to(device)
     with FrozenFeatures(checkpoint.config, device, features_by_image(grasps, features, device)) as source:
-        return with_verdicts(checkpoint, source, *groups, quiet=quiet)
+        return with_gel_check(checkpoint, source, *groups, quiet=quiet)

@@ -70,7 +70,7 @@ def adapt(
     """Fit a model to a recording from another sensor with your objects, and write the checkpoint `out`.
 
     If the pair accuracy of the start model on held-out objects is at least that of the fit, `out` is a copy of the
-    start model with newly fitted probabilities and gel check.
+    start model with newly fitted calibrations and gel check.
 
     Args:
         recording: A folder, or the object that `robot.read_recording` returns.

@@ -1,7 +1,8 @@
 """Building of shards with Ray Data: each process of a pool embeds and writes one shard after another.
 
-Only names are sent; one process on one machine reads, embeds and writes a photo. A lost process is replaced, and its
-shard continues from the codes in its folder, which must be visible to all machines.
+Jobs contain the paths and metadata of photos, not their bytes. The process that reads a photo also embeds it and writes
+its row. A lost process is replaced. Its shard continues from the embeddings and partial activations in its folder,
+which must be visible to all machines.
 
 If Ray has GPUs, each process has a GPU of its own, and the towers run there.
 """
@@ -23,7 +24,8 @@ from retrieval.model.encode import default_device
 from retrieval.search.sharding.build_sharded import ShardBuild, ShardJob, ShardRunner, build_shard
 
 RELEASE_TIMEOUT_S, MAX_FAILURES = 60.0, 3
-"""Time until a lost process releases its shard, and largest number of failures without a finished shard in between."""
+"""Longest wait for a lost process to release its shard's lock, and largest number of failures without a finished shard
+in between."""
 
 
 class BuildWorkerPool(NamedTuple):
@@ -40,7 +42,7 @@ class ShardBuildWorker:
     def __init__(self, model: Path, has_gpu: bool) -> None:
         self._checkpoint = load_checkpoint(model)
         if has_gpu:
-            torch.backends.cudnn.allow_tf32 = False  # an index may mix codes of CPU and GPU, which must be equal
+            torch.backends.cudnn.allow_tf32 = False  # an index may mix codes of CPU and GPU: compute both in float32
             self._checkpoint.matcher.to(default_device())
 
     def __call__(self, batch: dict[str, Any]) -> dict[str, Any]:
@@ -113,8 +115,8 @@ def _results(
 def ray_worker_pool(ray: Any) -> BuildWorkerPool:
     """Return the worker pool of a Ray cluster.
 
-    It has a process for each GPU, with an equal number of the machine's CPUs, which read and decode. Without a GPU that
-    PyTorch can use, it has a process for each CPU.
+    It has one process for each GPU. Each requests the same number of CPUs, which read and decode: the smallest number
+    of CPUs per GPU of any machine that has GPUs. Without a GPU that PyTorch can use, it has a process for each CPU.
     """
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     gpu_nodes = [node for node in nodes if node.get("GPU", 0) >= 1]

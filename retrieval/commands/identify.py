@@ -24,7 +24,12 @@ def identify(
     out: Annotated[Path, typer.Option(help="recording of the grasps, to write or continue")],
     object_id: Annotated[
         str | None,
-        typer.Option("--object", metavar="NAME", help="name in the recording; with --rig sim the object on the table"),
+        typer.Option(
+            "--object",
+            metavar="NAME",
+            help="name of the object in the recording. A simulated rig also puts this object on the table, so it must "
+            "be one of the rig's names (default: the rig's first name)",
+        ),
     ] = None,
     expect: Annotated[
         str | None, typer.Option(metavar="OBJECT", help="verify this object of the catalogue instead of searching")
@@ -36,7 +41,11 @@ def identify(
     grasps: Annotated[int, typer.Option(parser=COUNT, help="largest number of accepted grasps")] = 5,
     confidence: Annotated[
         float,
-        typer.Option(metavar="P", parser=FRACTION, help="stop when an object, or none of these, has this probability"),
+        typer.Option(
+            metavar="P",
+            parser=FRACTION,
+            help='stop when an object, or the answer "none of these", has at least this probability',
+        ),
     ] = 0.9,
     seed: Annotated[int, typer.Option(parser=SEED, help="seed of all random choices")] = 0,
     index: Index = None,
@@ -47,7 +56,8 @@ def identify(
 ) -> int:
     """Grasp the object with a rig until the answer is clear; stay next to a real rig. Resumes a stopped run.
 
-    Each further grasp is planned far in height from the earlier ones. Use another --out for each object.
+    Each further grasp is planned at a height that differs much from those of the earlier grasps. Use another --out for
+    each object.
     """
     if far is not None and expect is None:
         raise BadInput("--far is the false-accept rate of --expect; give both, or neither")
@@ -83,7 +93,7 @@ def identify(
             made.planner = SpreadPlanner(made.planner, run.heights_mm)
             return made
 
-        attempts: set[int] = set()  # the number before the first new attempt, and after each one
+        attempts: set[int] = set()  # total counts of attempts: at the start, then after each new attempt
         with announce_resume(f"the grasps so far are stored in {out}"):
             (tally,) = collect(
                 make_rig,
@@ -157,14 +167,14 @@ class _Run:
         return [self.folder / images[finger] for finger in sorted(images)]
 
     def _is_clear(self, answer: "QueryResult") -> bool:
-        """Return whether the first object, or none of these, has the required probability."""
+        """Return whether the first object, or the answer "none of these", has at least the required probability."""
         if answer.none_probability is None:
             return False
         return max(answer.none_probability, answer.results[0].probability or 0.0) >= self.confidence
 
 
 def _first_object(answer: "QueryResult") -> str:
-    """Return the verdict without contact, or the first object and its probability."""
+    """Return the verdict if there are no results; else the first object, with its probability if the model has one."""
     if not answer.results:
         return answer.verdict
     best = answer.results[0]

@@ -145,8 +145,8 @@ class Command(TyperCommand):
     """
 
     def get_short_help_str(self, limit: int = 0) -> str:
-        """Return the whole help text for the list of commands; typer would cut it."""
-        return self.help or ""
+        """Return the first paragraph of the help text for the list of commands; typer would cut it."""
+        return (self.help or "").split("\n\n")[0]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Join the values of each option of several values to one word; see `OptionValues.parse`."""

@@ -73,7 +73,7 @@ def score_next_grasp(
     for policy, each in measures.items():
         summary = summarise(each, seed=seed)
         (value, resampled), (random, random_resampled) = needed[policy], needed["random"]
-        with np.errstate(invalid="ignore"):  # neither reaches the accuracy
+        with np.errstate(invalid="ignore"):  # inf / inf: neither this policy nor "random" reaches the accuracy
             ratios = np.where(np.isfinite(random_resampled), resampled / random_resampled, math.inf)
         found[policy] = {
             "accuracy": [list(row) for row in zip(summary["value"], summary["low"], summary["high"], strict=True)],
@@ -142,7 +142,7 @@ def grasps_needed(accuracy: Floats, level: float = ACCURACY) -> float:
 
 
 def resampled_grasps(means: Floats, seed: int) -> Floats:
-    """Return `grasps_needed` (DRAWS,) of resamples of the objects, the same for all policies.
+    """Return `grasps_needed` (DRAWS,) for resamples of the objects. All policies use the same resamples.
 
     Args:
         means: (R, GRASPS) accuracy of each object.

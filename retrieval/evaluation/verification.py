@@ -27,7 +27,6 @@ from retrieval.model.verification import (
     objects_needed,
     verification_sequences,
 )
-from retrieval.training.verdicts import photo_embeddings
 
 GRASPS = (1, 2, 3, 5)
 """Numbers of grasps of the sequences."""
@@ -92,7 +91,7 @@ def _rate(value: float, objects: int, needed: int | None) -> dict[str, float | N
 
 def _test_touches(
     experiment: Experiment, predictions: Predictions, checkpoint: Checkpoint, seed: int
-) -> tuple[ScoredTouches, Floats, Posterior] | None:
+) -> tuple[ScoredTouches, NDArray[np.floating[Any]], Posterior] | None:
     """Return match logits and photo embeddings of test objects, and the posterior; None for too few objects.
 
     A head that was trained on features has no posterior; a posterior is fitted on validation objects, as in training.
@@ -105,7 +104,9 @@ def _test_touches(
         return None
     photos = queries.photos[queries.of_part(queries.photo_owner, "test")]
     features = torch.from_numpy(experiment.features_for("late_fusion").photo[photos])
-    return test, photo_embeddings(checkpoint.matcher, features), posterior
+    with torch.inference_mode():
+        embeddings = checkpoint.matcher.photo_encoding(features).embedding.numpy()
+    return test, embeddings, posterior
 
 
 def false_rejects(far: float, genuine: Floats, impostors: Floats) -> float:

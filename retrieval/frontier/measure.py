@@ -1,4 +1,7 @@
-"""Measure the approximations. Each row is stored in the folder, so that a stopped run resumes."""
+"""Measure the error and time of each approximation of a search (one row of the report).
+
+Each finished row is stored, so a stopped run continues with the missing rows.
+"""
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -44,8 +47,9 @@ def measure_frontier(
         model: A checkpoint; None for the shipped one.
         recording: Grasps of unseen objects; a function that returns the folder is called only if a row needs it.
         only: Names of rows; empty for all.
-        photos: Number of photos of the catalogue that is blended from the recording.
-        queries: Number of query touches for that catalogue.
+        photos: Number of photos of a synthetic catalogue. The features of each are a weighted mean of those of two
+            photos of the recording.
+        queries: Largest number of query touches for that catalogue.
         repeats: Number of timings; the result is their median.
         quick: Use the smallest grids and sizes, as a smoke test.
         table: Name to "module:function" of each approximation.
@@ -86,8 +90,8 @@ def measure(
 ) -> dict[str, Any]:
     """Measure approximations and write `out`/frontier.json.
 
-    Stored rows are reused if software, model, recording, scale and machine are the same. Each row is printed on stderr
-    as soon as it is measured, one line per panel.
+    Stored rows are reused if software, model, recording, scale and machine are the same. Each row, measured or stored,
+    is printed on stderr: one line for each plot of error against time (`Panel`).
 
     Args:
         sample: Model, grasps and scale.

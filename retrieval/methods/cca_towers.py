@@ -30,9 +30,9 @@ from retrieval.methods.cca import (
 from retrieval.methods.method import Array, Method
 from retrieval.methods.selection import Validator, held_out_folds, validation_rows
 from retrieval.methods.standardise import Standardiser
+from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.config import Config
 from retrieval.model.posterior import ScoredTouches, fit_posterior
-from retrieval.model.reference_calibration import ReferenceTouches
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.concatenated import feature_counts_of
 
@@ -48,7 +48,7 @@ COMPONENTS = 64
 MAX_CHOICE_TOUCHES = 240
 """Touches of a fold with which settings are chosen."""
 MAX_CALIBRATION_TOUCHES = 60
-"""Touches per object with which a posterior is fitted."""
+"""Touches per object with which the calibrations are fitted."""
 
 
 class CcaSettings(NamedTuple):
@@ -194,13 +194,13 @@ class CcaSelection:
         auc: Their mean AUC over the folds.
         projections: The maps, fitted to all objects.
         held_out_touches: For each fold, the cosines of its touches with its photos by maps that were fitted without its
-            objects, and the encodings of these touches: the input of the fits of posterior and reference calibration.
+            objects, and the encodings of both: the input of the calibrations.
     """
 
     settings: CcaSettings
     auc: float
     projections: CcaProjections
-    held_out_touches: list[ReferenceTouches]
+    held_out_touches: list[CalibrationTouches]
 
 
 def select_settings(
@@ -247,8 +247,8 @@ def select_settings(
 
 def held_out_touches(
     features: "Features", projections: CcaProjections, touch: NDArray[np.floating], photo: NDArray[np.floating]
-) -> ReferenceTouches:
-    """Return touches of objects that the projections were fitted without, for the fit of a posterior.
+) -> CalibrationTouches:
+    """Return touches of objects that the projections were fitted without, for the calibrations.
 
     Args:
         features: The grasps. Of each object at most `MAX_CALIBRATION_TOUCHES` are used, evenly spaced.
@@ -259,7 +259,9 @@ def held_out_touches(
     rows = validation_rows(features, MAX_CALIBRATION_TOUCHES * len(set(features.object_ids)))
     owner, own = features.owner[rows], np.eye(len(rows), dtype=np.bool_)
     scored = ScoredTouches(projections.cosines(touch[rows], photo[rows]), owner, owner, own)
-    return ReferenceTouches(scored, unit_rows(projections.touch(touch[rows])))
+    return CalibrationTouches(
+        scored, unit_rows(projections.touch(touch[rows])), unit_rows(projections.photo(photo[rows]))
+    )
 
 
 class CcaTowers(Method):

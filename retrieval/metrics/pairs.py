@@ -25,7 +25,7 @@ class Calibration:
     Attributes:
         slope: Factor of the logit.
         intercept: Offset.
-        reject_log_odds: Threshold of "no match": largest balanced accuracy on those pairs.
+        reject_log_odds: Threshold for "no match". It has the largest balanced accuracy on those pairs.
         positives: Pairs of one object in the fit.
         negatives: Pairs of two objects in the fit.
         nll_before: Mean negative log-likelihood in nats on the same pairs, before the fit.
@@ -48,7 +48,7 @@ class Calibration:
         """Return the calibrated log-odds of match logits.
 
         Raises:
-            NumericalError: A logit is not finite. It would exceed no threshold, and be classified as "no match".
+            NumericalError: A logit is not finite. NaN, for example, would silently be classified as "no match".
         """
         z = np.asarray(logit, dtype=np.float64)
         if not np.isfinite(z).all():
@@ -106,11 +106,12 @@ def fit_calibration(logits: ArrayLike, labels: ArrayLike) -> Calibration:
 
 
 def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Return slope, within its bounds, and intercept of the smallest loss, by two nested root searches.
+    """Return the slope (within its bounds) and the intercept with the smallest loss.
 
-    The loss is convex in both. Its derivative by the intercept grows with the intercept, and at the best intercept its
-    derivative by the slope grows with the slope. Bracketed roots are found at any scale and offset of the logits; a
-    quasi-Newton search over both stops early at logits of 1000 +- 1.
+    Two nested root searches find them. The loss is convex in both. Its derivative by the intercept grows with the
+    intercept, and at the best intercept its derivative by the slope grows with the slope. Bracketed roots are found at
+    any scale and offset of the logits. A quasi-Newton search for slope and intercept together stops too
+    early if, for example, the logits are 1000 +- 1.
     """
     from scipy.optimize import brentq  # slow to import; queries do not need it
 
@@ -125,7 +126,9 @@ def _likeliest(z: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, f
         return np.asarray(weights * (_expit(slope * z + intercept) - targets))
 
     def best_intercept(slope: float) -> float:
-        reach = slope * float(np.abs(z).max()) + 50  # where every probability is 0 (or 1) and the targets are not
+        # At an intercept of -reach every probability is almost 0, and at +reach almost 1. Every target is between these
+        # values. So the sum of the slack changes its sign between -reach and +reach.
+        reach = slope * float(np.abs(z).max()) + 50
         return float(brentq(lambda intercept: slack(slope, intercept).sum(), -reach, reach, maxiter=1000))
 
     def derivative(log_slope: float) -> float:
@@ -162,15 +165,17 @@ def reliability_bins(probability: ArrayLike, outcomes: ArrayLike) -> dict[str, A
 
     Args:
         probability: (P,) predicted probabilities.
-        outcomes: (P,) 1 or 0, or a fraction if ties were broken at random.
+        outcomes: (P,) 1 if what was predicted is true, 0 if not; 1/n if n answers tie and one of them is right.
 
     Returns:
-        {"ece", "bins": [{"probability", "frequency", "count"}]}. The expected calibration error is the mean of
-        |probability - frequency| of the bin over all predictions.
+        {"ece", "bins": [{"probability", "frequency", "count"}]}. Each prediction has the error
+        |probability - frequency| of its bin. The expected calibration error is the mean over all predictions.
     """
     p, y = np.asarray(probability, dtype=np.float64), np.asarray(outcomes, dtype=np.float64)
     if p.shape != y.shape or p.ndim != 1 or not len(p) or not ((p >= 0) & (p <= 1)).all():
-        raise BadInput(f"give probabilities between 0 and 1 and as many outcomes; got {p.shape} and {y.shape}")
+        raise BadInput(
+            f"probabilities must be between 0 and 1, and each needs one outcome; got shapes {p.shape} and {y.shape}"
+        )
     which = np.minimum((p * BINS).astype(int), BINS - 1)
     used, place, counts = np.unique(which, return_inverse=True, return_counts=True)
     mean_probability, frequency = (np.bincount(place, weights=values) / counts for values in (p, y))
@@ -195,11 +200,15 @@ def _checked(logits: ArrayLike, labels: ArrayLike) -> tuple[NDArray[np.float64],
 
 
 def _best_threshold(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """Return the lowest accepted value of the largest balanced accuracy: midway to the next lower value, if any."""
+    """Return the threshold with the largest balanced accuracy.
+
+    It is midway between the lowest accepted value and the next lower value, if there is one.
+    """
     values, place = np.unique(x, return_inverse=True)
     true_below = np.cumsum(np.bincount(place, weights=y)) / y.sum()
     false_below = np.cumsum(np.bincount(place, weights=1 - y)) / (1 - y).sum()
-    # Accepting from values[i] on gains the pairs below it. Accepting from values[0] on accepts everything and gains 0.
+    # If values[i] and all higher values are accepted, the gain is the fraction of false pairs below values[i] minus
+    # that of true pairs. With values[0] all pairs are accepted, and the gain is 0.
     best = int(np.argmax(np.append(0.0, (false_below - true_below)[:-1])))
     middle = (values[best] + values[max(best - 1, 0)]) / 2
     return float(middle if best == 0 or middle > values[best - 1] else values[best])

@@ -37,12 +37,11 @@ from retrieval.model.fusion_scorer import GelCheck
 from retrieval.model.gel_head import GelHead
 from retrieval.model.posterior import Posterior
 from retrieval.model.reference_calibration import ReferenceCalibration
-from retrieval.model.verification import VerificationCalibration
+from retrieval.model.verification import CARD_FAR, VerificationCalibration
 from retrieval.version import __version__
 
 _QUERIES = "queries.touch_partials"
 _GEL_HEAD = "gel_head."
-_CARD_FAR = 0.2  # smaller rates need more than the smallest number of validation objects
 _DTYPES = {
     torch.float16,
     torch.bfloat16,
@@ -376,9 +375,9 @@ def _model_card(name: str, header: Mapping[str, Any]) -> str:
             "were left out"
         )
     if header["verification"]:
-        bounds = VerificationCalibration.from_dict(header["verification"]).bounds(_CARD_FAR)
+        bounds = VerificationCalibration.from_dict(header["verification"]).bounds(CARD_FAR)
         lines.append(
-            f"* Verification at a false-accept rate of {_CARD_FAR:g}: false-reject rate "
+            f"* Verification at a false-accept rate of {CARD_FAR:g}: false-reject rate "
             f"{bounds.false_rejects.value:.3f} [{bounds.false_rejects.low:.3f}, {bounds.false_rejects.high:.3f}]"
         )
     if gel_check:

@@ -1,7 +1,7 @@
 """Late interaction: cells of the gel images against cells of a photo (Khattab and Zaharia, SIGIR 2020, eq. 3).
 
 A tower divides an image into a grid of cells (`Tower.divide`), and a small network maps each cell to a vector. The
-score of a touch with a photo is a sum over the cells of the touch: of each, the largest inner product with a cell of
+score of a touch with a photo is a sum over the cells of the touch. Each adds its largest inner product with a cell of
 the photo. Vectors of photo cells have unit length. The length of a touch cell's vector is its weight. The weight is
 learned, so that cells without contact count little. Scores of several grasps add up.
 """
@@ -12,7 +12,7 @@ from torch.nn import functional
 CELL_HIDDEN = 128
 """Hidden units of the network of a cell."""
 WEIGHT_INIT = 0.25
-"""Approximate initial weight of a touch cell; 32 cells then add about 8 to the logit."""
+"""Approximate initial weight of a touch cell. 32 cells then add at most about 8 to the logit."""
 
 
 class CellEncoder(nn.Module):

@@ -1,19 +1,19 @@
-"""P(object | touches, catalogue), with "none of these" among the hypotheses: the one formula of every probability.
+"""P(o | touches, catalogue): the posterior of an answer, with "none of these" among the hypotheses.
 
     w = slope / (1 + dependence * (grasps - 1))        weight of a sum of match logits over `grasps` grasps
     l(o) = 1 / w * log mean exp(w * z)                 logit of object o; z: a photo's summed match logits
     P(o)    proportional to  (1 - p) / O * exp(w * l(o) + offset)
     P(none) proportional to  p
 
-O is the number of objects in the catalogue. p is the prior probability that the object in the hand is none of them; the
-objects have equal priors. `w * l(o) + offset` is the log of the ratio of two likelihoods of these touches: on object o,
-and on an object that the catalogue lacks. The photos of an object are equally likely views of it, so their
-likelihoods are averaged. An object with one photo has just its match logit.
+All probabilities of an answer come from this formula. The catalogue has O objects. p is the prior probability that the
+object in the hand is none of them; the objects have equal priors. `w * l(o) + offset` is the log of the ratio of two
+likelihoods of these touches: on object o, and on an object that the catalogue lacks. The photos of an object are
+equally likely views of it, so their likelihoods are averaged. If an object has one photo, l(o) is its match logit.
 
 slope, offset and dependence maximise the likelihood of the right answer over random catalogues of validation
-objects, with the true object and without it. Grasps of one object are correlated by `dependence` (0: independent,
-their logits add; 1: more grasps add no information): n of them count as n / (1 + dependence (n - 1)) independent ones
-(the design effect of cluster sampling; Kish 1965, section 5.4).
+objects, with the true object and without it. Grasps of one object are correlated by `dependence`. At 0 they are
+independent, and their logits add; at 1 more grasps add no information. n grasps count as n / (1 + dependence (n - 1))
+independent ones (the design effect of cluster sampling; Kish 1965, section 5.4).
 
 Objects that were not scored keep their part of the probability, estimated from a sample of them.
 
@@ -22,9 +22,9 @@ Objects that were not scored keep their part of the probability, estimated from 
 P(o | present) is the probability of o given that the catalogue has the object. p and offset cancel out. It is computed
 from the logits, never as P(o) / (1 - P(none)): that quotient is 0 / 0 if P(none) rounds to 1.
 
-A query passes through four files: `fusion_scorer.py` sums the match logits z of a photo over the grasps;
-`search/query/objects.py` computes l(o) of each object, which reference touches change (`reference_calibration.py`);
-`search/query/shard.py` chooses the photos to score and samples the others; `EvidenceMass.merged` below sums the shards.
+A query passes through four files. `fusion_scorer.py` sums the match logits z of a photo over the grasps.
+`search/query/objects.py` computes l(o) of each object; reference touches change it (`reference_calibration.py`).
+`search/query/shard.py` chooses the photos to score and samples the others. `EvidenceMass.merged` below sums the shards.
 """
 
 import math
@@ -61,8 +61,8 @@ class PosteriorProbabilities:
         none: Probability that the catalogue lacks it.
         objects: (J,) probability of each scored object, in the order of the logits.
         unscored: Probability that it is one of the objects that were not scored.
-        objects_if_present: (J,) the same as `objects`, given that the catalogue has the object; over all its objects
-            these add up to 1.
+        objects_if_present: (J,) the same as `objects`, given that the catalogue has the object. Over all objects of
+            the catalogue, scored or not, these probabilities add up to 1.
     """
 
     none: float
@@ -104,7 +104,7 @@ class EvidenceMass:
         )
 
     def extrapolated(self, objects: int) -> "EvidenceMass":
-        """Return the evidence with `objects` more objects, each with the mean likelihood of those in this one."""
+        """Return the evidence after adding `objects` objects, each with the mean likelihood of the present ones."""
         if not objects:
             return self
         mean = float(np.logaddexp(self.scored, self.unscored)) - math.log(self.objects)
@@ -151,7 +151,7 @@ class Posterior:
         top = np.full(len(counts), -np.inf)
         np.maximum.at(top, owner, scaled)
         total = np.bincount(owner, np.exp(scaled - top[owner]), len(counts))
-        return np.asarray((top + np.log(total / counts)) / weight)  # exact for equal photos
+        return np.asarray((top + np.log(total / counts)) / weight)  # if all photos have one logit: log 1 = 0, exactly
 
     def probabilities(
         self,
@@ -191,11 +191,11 @@ class Posterior:
     def probabilities_given(
         self, logits: ArrayLike, mass: EvidenceMass, grasps: int = 1, none_prior: float = NONE_PRIOR
     ) -> PosteriorProbabilities:
-        """Return the probabilities of some of the objects in `mass`, those with these logits (J,)."""
+        """Return the probabilities of the objects with these logits (J,). `mass` must include these objects."""
         some = _finite(logits, "every logit")
         each = math.log1p(-none_prior) - math.log(mass.objects) + self.offset
         none = math.log(none_prior) if none_prior else -math.inf
-        # In logarithms relative to the largest: exp of a logit of 1000 is infinite, and its fraction would be NaN.
+        # Logarithms relative to the largest one: exp(1000) is infinite, and a fraction with it would be NaN.
         none -= each + mass.top
         present = float(np.logaddexp(mass.unscored, mass.scored))
         whole = float(np.logaddexp(none, present))
@@ -207,11 +207,11 @@ class Posterior:
         """Estimate how many more grasps make the best object more likely than "none of these".
 
         More grasps are assumed to resemble the g made so far: the same mean match logit, so the summed logit of n
-        grasps is n / g * l. The best object is more likely than none from the first n with
+        grasps is n / g * l. The best object is more likely than "none of these" from the first n on that satisfies
 
             slope * n / (1 + dependence * (n - 1)) * l / g + offset  >  log objects + log (p / (1 - p))
 
-        From n = 1 on, the term with l grows at most by a factor 1 / dependence (trials: docs/measurements/answers.md).
+        The term with l is at most 1 / dependence times its value at n = 1 (trials: docs/measurements/answers.md).
 
         Args:
             logit: Logit l of the best object, which is not more likely than none yet.
@@ -254,7 +254,7 @@ def _finite(values: ArrayLike, name: str) -> Floats:
 # Fitting ---------------------------------------------------------------------------------------------------
 
 CATALOGUE_SIZES = (20, 1000)
-"""Numbers of objects in the catalogues of a fit, at most all validation objects but one."""
+"""Numbers of objects in the catalogues of a fit. The maximum is the number of validation objects minus one."""
 MIN_OBJECTS = 3
 """Smallest number of objects of a fit; with two objects, every catalogue would have only one."""
 _SETS = 4
@@ -311,7 +311,7 @@ class IdentificationTrials:
         scores: (T, N) summed match logits, photos sorted by object, -inf for a masked photo.
         counts: (T, O) number of unmasked photos of each object.
         starts: (O,) first photo of each object.
-        catalogues: (T, K + 1) objects, the true one first. The first K are a catalogue with it, the last K one without.
+        catalogues: (T, K + 1) objects, the true one first. First K columns: a catalogue with it; last K: one without.
     """
 
     grasps: int
@@ -378,7 +378,7 @@ def fit_posterior_to_trials(trials: Sequence[IdentificationTrials]) -> Posterior
     count = sum(len(part.scores) for part in trials)
     several = any(part.grasps > 1 for part in trials)
     finite = np.concatenate([part.scores[np.isfinite(part.scores)] / part.grasps for part in trials])
-    # Measured from the median of the logits, the offset hardly depends on the slope, and the search finds both.
+    # Subtract the median from the logits. Then the best offset hardly depends on the slope, and the search finds both.
     middle, unit = float(np.median(finite)), float(np.std(finite))
     low, high = np.log(SLOPE_BOUNDS)
     start = float(np.clip(-math.log(unit) if unit > 0 else 0.0, low, high))

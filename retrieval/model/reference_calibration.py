@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.documents import check_fields, typed
 from retrieval.errors import BadInput
+from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.posterior import (
     MIN_OBJECTS,
     Posterior,
@@ -84,11 +85,11 @@ class ReferenceCalibration:
         return typed(data, cls, "references", complete=True, error=BadInput)
 
 
-def touch_embeddings(partials: NDArray[np.floating[Any]], columns: slice) -> Floats:
-    """Return the unit contrastive embeddings (G, d) of touches.
+def unit_embeddings(partials: NDArray[np.floating[Any]], columns: slice) -> Floats:
+    """Return the unit contrastive embeddings (B, d) of touches or photos.
 
     Args:
-        partials: (G, partial) partial activations.
+        partials: (B, partial) partial activations.
         columns: Their d columns with the scaled embeddings (`MatcherConfig.cosine_columns`). d is 0 for a model whose
             logit has no cosine.
     """
@@ -106,19 +107,6 @@ def reference_similarity(cosines: NDArray[np.floating[Any]], starts: Numbers) ->
 
 
 # Fitting ---------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class ReferenceTouches:
-    """Touches of known objects in the order of capture, for the fit.
-
-    Attributes:
-        scored: Match logits of the touches with photos, possibly none.
-        embeddings: (T, d) embeddings of the touches.
-    """
-
-    scored: ScoredTouches
-    embeddings: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +128,7 @@ class _ReferenceTrials:
         return len(np.unique(self.photos.photo_owner)) >= MIN_OBJECTS and bool((own & ~self.photos.own).any())
 
 
-def fit_reference_calibration(*parts: ReferenceTouches, seed: int = 0) -> ReferenceCalibration | None:
+def fit_reference_calibration(*parts: CalibrationTouches, seed: int = 0) -> ReferenceCalibration | None:
     """Fit on touches of objects that have at least two.
 
     References come from the first half of an object's touches, or from the first quarter if that suffices, at most
@@ -154,7 +142,7 @@ def fit_reference_calibration(*parts: ReferenceTouches, seed: int = 0) -> Refere
     Returns:
         The calibration; None for fewer than three such objects, or for a model without embeddings.
     """
-    encoded = [part for part in parts if part.embeddings.shape[1]]
+    encoded = [part for part in parts if part.touch_embeddings.shape[1]]
     many, one = (
         [found for part in encoded if (found := _reference_trials(part, max_references)) is not None]
         for max_references in (MAX_REFERENCES, 1)
@@ -177,7 +165,7 @@ def fit_reference_calibration(*parts: ReferenceTouches, seed: int = 0) -> Refere
     )
 
 
-def _reference_trials(part: ReferenceTouches, max_references: int) -> _ReferenceTrials | None:
+def _reference_trials(part: CalibrationTouches, max_references: int) -> _ReferenceTrials | None:
     """Return the trials with at most `max_references` references per object; None for too few objects."""
     scored = part.scored
     rows = [np.flatnonzero(scored.touch_owner == name) for name in np.unique(scored.touch_owner)]
@@ -190,7 +178,7 @@ def _reference_trials(part: ReferenceTouches, max_references: int) -> _Reference
     ]
     queries = np.concatenate([mine[len(mine) // 2 :] for mine in rows])
     owner = np.repeat(np.arange(len(rows)), [len(mine) - len(mine) // 2 for mine in rows])
-    cosines = part.embeddings[queries] @ part.embeddings[np.concatenate(references)].T
+    cosines = part.touch_embeddings[queries] @ part.touch_embeddings[np.concatenate(references)].T
     near = reference_similarity(cosines, np.cumsum([0, *(len(some) for some in references[:-1])]))
     number = {int(scored.touch_owner[mine[0]]): place for place, mine in enumerate(rows)}
     known = np.flatnonzero(np.isin(scored.photo_owner, list(number)))

@@ -5,17 +5,19 @@
     another grasp    otherwise
 
 The ratio compares "this object" with "an object that the catalogue lacks" (`retrieval.model.posterior`). This is a
-sequential test between two bounds (Wald 1945). Wald's own bounds need exact ratios of independent grasps; `a` and `b`
-are quantiles over sequences of grasps of validation objects. The largest ratio over MAX_GRASPS grasps exceeds `a` for
-the fraction `far` of the impostors; fewer grasps give no higher rate. The bound `b` adds at most a tenth of the false
-rejects that are due to `a`, or MIN_EARLY_REJECTS if this is more.
+sequential test between two bounds (Wald 1945). Wald's own bounds need exact ratios of independent grasps. Here `a` and
+`b` are quantiles over sequences of grasps of validation objects. The largest ratio over MAX_GRASPS grasps exceeds `a`
+for the fraction `far` of the impostors; fewer grasps give no higher rate. The bound `b` causes additional false
+rejects. They are at most a tenth of those that `a` causes, or MIN_EARLY_REJECTS if that is larger.
 
-Two kinds of impostors are measured: another object at random, and the object whose photos are most similar to those of
-the expected one. Terms follow ISO/IEC 19795-1: false-accept rate (FAR), false-reject rate (FRR), genuine, impostor.
+An impostor is a false claim: the hand does not hold the expected object. Two kinds of false claims are measured. The
+expected object is any other object, or the object whose photos are most similar to those of the object in the hand.
+Terms follow ISO/IEC 19795-1: false-accept rate (FAR), false-reject rate (FRR), genuine, impostor.
 """
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
@@ -25,18 +27,21 @@ from numpy.typing import NDArray
 
 from _touch_retrieval.documents import check_fields, typed
 from retrieval.errors import BadInput
+from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.posterior import IdentificationTrials, Posterior, ScoredTouches
 
 MAX_GRASPS = 4
 """Largest number of grasps before a decision."""
 MIN_OBJECTS = 20
 """Number of validation objects that a calibration needs."""
+CARD_FAR = 0.2
+"""False-accept rate of the model card. Every calibration supports it."""
 SEQUENCES = 8
 """Sequences of grasps of each validation object."""
 MIN_EARLY_REJECTS = 0.005
-"""Smallest fraction of genuine sequences that the lower bound rejects."""
+"""The bound `b` may always reject this fraction of the genuine sequences, even if `a` rejects none of them."""
 ERRORS_NEEDED = 30
-"""A rate is supported by the data if they would contain this many errors (rule of 30, Doddington et al. 2000)."""
+"""The data support a rate if at least this many errors are expected at it (rule of 30, Doddington et al. 2000)."""
 LEVELS = tuple(float(level) for level in np.round(np.geomspace(1e-5, 0.5, 95), 9))
 """False-accept rates whose thresholds are stored."""
 QUANTILES = tuple(float(level) for level in np.round(np.linspace(0, 1, 201), 3))
@@ -61,10 +66,13 @@ class DecisionBounds:
     Attributes:
         accept: Smallest log likelihood ratio that accepts.
         reject: Largest log likelihood ratio that rejects before the last grasp.
-        false_accepts: False-accept rate for random impostors, the requested one.
-        similar_false_accepts: The same for the most similar other object, among as many objects as in calibration.
+        false_accepts: The requested false-accept rate, for random impostors.
+        similar_false_accepts: The false-accept rate if the expected object is the one most similar to the object in the
+            hand. It is valid for a catalogue with as many objects as one group of validation objects
+            (`VerificationCalibration.group_sizes`).
         false_rejects: False-reject rate after all `MAX_GRASPS` grasps.
-        accepted: Fraction of genuine sequences that are accepted within 1, 2, ... grasps, if none is rejected early.
+        accepted: Fraction of genuine sequences that reach `accept` within 1, 2, ... grasps. It ignores early
+            rejections.
     """
 
     accept: float
@@ -86,14 +94,14 @@ class VerificationCalibration:
     """Log likelihood ratios of sequences of grasps of validation objects.
 
     Attributes:
-        objects: Number of validation objects.
+        group_sizes: Number of validation objects in each group. Objects of two groups were not compared.
         impostors: Quantiles (1 - `LEVELS`) of the largest ratio of a random impostor.
         similar: Quantiles (`QUANTILES`) of the largest ratio of the most similar impostor.
         genuine: For 1 to `MAX_GRASPS` grasps, quantiles of the largest ratio of genuine sequences so far.
         lowest: Quantiles of the lowest ratio of genuine sequences before the last grasp.
     """
 
-    objects: Annotated[int, Meta(ge=MIN_OBJECTS)]
+    group_sizes: tuple[Annotated[int, Meta(ge=1)], ...]
     impostors: tuple[float, ...]
     similar: tuple[float, ...]
     genuine: tuple[tuple[float, ...], ...]
@@ -105,11 +113,20 @@ class VerificationCalibration:
         expected = [len(LEVELS), *[len(QUANTILES)] * (2 + len(self.genuine)), MAX_GRASPS]
         if sizes != expected:
             raise BadInput(f"verification must have {expected} numbers, got {sizes}")
+        if not _are_enough(self.group_sizes):
+            raise BadInput(
+                f"verification must have at least {MIN_OBJECTS} objects, got groups of {list(self.group_sizes)}"
+            )
+
+    @property
+    def objects(self) -> int:
+        """Number of validation objects."""
+        return sum(self.group_sizes)
 
     @property
     def pairs(self) -> int:
-        """Number of pairs of different validation objects."""
-        return self.objects * (self.objects - 1) // 2
+        """Number of pairs of different validation objects that were compared."""
+        return _pairs(self.group_sizes)
 
     def bounds(self, far: float) -> DecisionBounds:
         """Return the bounds at a false-accept rate.
@@ -119,13 +136,14 @@ class VerificationCalibration:
         """
         if not (isinstance(far, int | float) and 0 < far <= LEVELS[-1]):
             raise BadInput(f"the false-accept rate must be above 0 and at most {LEVELS[-1]:g}, got {far}")
-        if self.objects < (needed := objects_needed(far)):
+        if self.pairs < ERRORS_NEEDED / far:
+            needed = objects_needed(far, len(self.group_sizes))
             supported = ERRORS_NEEDED / self.pairs
             step = 10.0 ** (math.floor(math.log10(supported)) - 1)
             raise BadInput(
                 f"a false-accept rate of {far:g} needs {needed:,} validation objects; the model has {self.objects}, "
-                f"enough for {math.ceil(supported / step) * step:.2g}: give a larger rate, or train with more "
-                "validation objects"
+                f"enough for {math.ceil(supported / step) * step:.2g}: give a larger rate, or fit the model "
+                "with more such objects (`retrieve train`: validation objects; `retrieve adapt`: recorded objects)"
             )
         accept = float(np.interp(math.log(far), np.log(LEVELS), self.impostors))
         rejects = _fraction_below(accept, self.genuine[-1])
@@ -150,14 +168,25 @@ class VerificationCalibration:
         return typed(data, cls, "verification", complete=True, error=BadInput)
 
 
+def _are_enough(group_sizes: tuple[int, ...]) -> bool:
+    return sum(group_sizes) >= MIN_OBJECTS and _pairs(group_sizes) >= ERRORS_NEEDED / CARD_FAR
+
+
+def _pairs(group_sizes: tuple[int, ...]) -> int:
+    return sum(size * (size - 1) // 2 for size in group_sizes)
+
+
 def _fraction_below(value: float, quantiles: tuple[float, ...]) -> float:
     """Return the fraction of a distribution that lies below a value."""
     return float(np.interp(value, quantiles, QUANTILES, left=0.0, right=1.0))
 
 
-def objects_needed(far: float) -> int:
-    """Return the number of objects whose pairs are enough for a false-accept rate of random impostors."""
-    return math.ceil((1 + math.sqrt(1 + 8 * ERRORS_NEEDED / far)) / 2)
+def objects_needed(far: float, groups: int = 1) -> int:
+    """Return how many validation objects in `groups` groups this false-accept rate needs.
+
+    `ERRORS_NEEDED` errors must be expected among all pairs of objects that share a group.
+    """
+    return math.ceil((groups + math.sqrt(groups**2 + 8 * groups * ERRORS_NEEDED / far)) / 2)
 
 
 def error_rate(value: float, trials: int) -> ErrorRate:
@@ -191,7 +220,11 @@ class VerificationSequences(NamedTuple):
 
 
 def verification_sequences(
-    scored: ScoredTouches, embeddings: Floats, posterior: Posterior, seed: int = 0, grasps: int = MAX_GRASPS
+    scored: ScoredTouches,
+    embeddings: NDArray[np.floating[Any]],
+    posterior: Posterior,
+    seed: int = 0,
+    grasps: int = MAX_GRASPS,
 ) -> VerificationSequences:
     """Draw and score `SEQUENCES` sequences of each object that has `grasps` grasps and a photo of another grasp.
 
@@ -230,26 +263,43 @@ def verification_sequences(
 
 
 def fit_verification(
-    scored: ScoredTouches, embeddings: Floats, posterior: Posterior, seed: int = 0
+    parts: Sequence[CalibrationTouches], posterior: Posterior, seed: int = 0
 ) -> VerificationCalibration | None:
-    """Return the calibration from touches and photos of validation objects; arguments of `verification_sequences`.
+    """Return the calibration from touches and photos of validation objects.
 
-    None if fewer than `MIN_OBJECTS` objects have sequences.
+    Args:
+        parts: Touches and photos of one matcher or several. Objects are compared only within a part.
+        posterior: The posterior of the model.
+        seed: Seed of the sequences of grasps.
+
+    Returns:
+        The calibration; None if fewer than `MIN_OBJECTS` objects have sequences (`verification_sequences`), or if
+        their pairs do not support `CARD_FAR`.
     """
-    found = verification_sequences(scored, embeddings, posterior, seed)
-    objects = len(np.unique(found.owner))
-    if objects < MIN_OBJECTS:
+    found = [verification_sequences(part.scored, part.photo_embeddings, posterior, seed) for part in parts]
+    found = [each for each in found if len(each.owner)]
+    sizes = tuple(len(np.unique(each.owner)) for each in found)
+    if not _are_enough(sizes):
         return None
+    impostors = np.concatenate([each.impostor.ravel() for each in found])
+    genuine = np.concatenate([each.genuine for each in found], axis=1)
+    lowest = np.concatenate([each.ratios[:, :-1].min(1) for each in found])
     return VerificationCalibration(
-        objects,
-        tuple(np.quantile(found.impostor, 1 - np.array(LEVELS)).tolist()),
-        tuple(np.quantile(found.similar, QUANTILES).tolist()),
-        tuple(tuple(np.quantile(values, QUANTILES).tolist()) for values in found.genuine),
-        tuple(np.quantile(found.ratios[:, :-1].min(1), QUANTILES).tolist()),
+        sizes,
+        _quantiles(impostors, 1 - np.array(LEVELS)),
+        _quantiles(np.concatenate([each.similar for each in found])),
+        tuple(map(_quantiles, genuine)),
+        _quantiles(lowest),
     )
 
 
-def _nearest_objects(objects: NDArray[np.int64], owner: NDArray[np.int64], embeddings: Floats) -> NDArray[np.int64]:
+def _quantiles(values: Floats, at: Sequence[float] | Floats = QUANTILES) -> tuple[float, ...]:
+    return tuple(np.quantile(values, at).tolist())
+
+
+def _nearest_objects(
+    objects: NDArray[np.int64], owner: NDArray[np.int64], embeddings: NDArray[np.floating[Any]]
+) -> NDArray[np.int64]:
     """Return for each object the place (O,) of the other object with the most similar mean embedding."""
     means = np.stack([embeddings[owner == name].mean(0) for name in objects])
     means /= np.maximum(np.linalg.norm(means, axis=1, keepdims=True), 1e-9)

@@ -1,8 +1,9 @@
 """Limits on client connections: their number, the time for one request, and the size of its headers.
 
 uvicorn has no such limits: half-sent headers hold a connection for ever, and at its limit of concurrent connections it
-answers 503 to every client. This module accepts every new connection. If that exceeds a limit, it closes the oldest
-connection that waits for its client, first those that never completed a request.
+answers 503 to every client. This module accepts every new connection. Above a limit, it closes one connection that
+waits for its client. It chooses the oldest one that never completed a request. If there is none, it chooses the one
+that has waited longest.
 """
 
 import asyncio
@@ -30,8 +31,8 @@ MAX_HEADER_BYTES = 16_384
 MAX_HEADERS = 100
 """Maximum number of headers of one request; one header costs as much work as a hundred bytes."""
 FREE_CHUNKS, MIN_CHUNK_BYTES = 1_000, 256
-"""A body may have FREE_CHUNKS chunks of any size, and one more for each MIN_CHUNK_BYTES bytes; a chunk costs as much
-work as 1 kB."""
+"""A body may have FREE_CHUNKS chunks of any size, and one more for each MIN_CHUNK_BYTES bytes of the body. A chunk
+costs as much work as 1 kB."""
 _HEADER_PIECE, _BODY_PIECE = 4_096, 65_536
 
 
@@ -43,7 +44,7 @@ class ConnectionTable:
         self._by_address: dict[str, _Group] = {}
 
     def admit(self, connection: "Connection") -> None:
-        """Count a new connection; if that exceeds a limit, close the oldest one that waits for its client."""
+        """Count a new connection; above a limit, close one that waits for its client, as the module states."""
         groups = (
             self._by_address.setdefault(connection.address, _Group(self._limit_of_address)),
             self._all,

@@ -62,7 +62,7 @@ BACKGROUND = 0
 class StoredQuery:
     """A query of the history; times are Unix times in seconds.
 
-    feedback: one of `FEEDBACK_VALUES`, with the object that it names; both None if there is no feedback.
+    feedback: one of `FEEDBACK_VALUES`; None if there is no feedback. object_id: the object that the feedback names.
     """
 
     id: str
@@ -87,7 +87,7 @@ class TrialRun:
 
 @dataclass(frozen=True)
 class TrialChoice:
-    """Result of one trial: the photos, counted from 1, that are the person's choice, right, and the model's choice."""
+    """Result of one trial, as photo numbers from 1: the person's choice, the right photo, and the model's choice."""
 
     number: int
     choice: int
@@ -143,7 +143,9 @@ class HistoryStore:
             )
         found = execute("PRAGMA application_id").fetchone()[0], execute("PRAGMA user_version").fetchone()[0]
         if found != (_APPLICATION, _VERSION):
-            raise sqlite3.DatabaseError(f"a file of another program or version, {found[1]} instead of {_VERSION}")
+            raise sqlite3.DatabaseError(
+                f"it belongs to another program, or its version is {found[1]} instead of {_VERSION}"
+            )
 
     def close(self) -> None:
         """Write the log into the file, and close the file."""
@@ -313,7 +315,9 @@ class HistoryStore:
     # Feedback -------------------------------------------------------------------------------------------------
 
     def add_feedback(self, name: str, feedback: str, object_id: str | None, photo: bytes | None) -> bool:
-        """Store the feedback on a query, with the file of the object's photo, without which it is not recorded.
+        """Store the feedback on a query, and the file of the object's photo.
+
+        Feedback without a photo is stored, but its grasps are not added to the recording.
 
         Returns:
             True if the feedback is new, False if the same feedback is stored already.

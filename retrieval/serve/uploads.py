@@ -1,4 +1,4 @@
-"""Request bodies: limits of size and time, which apply before memory is spent, and parsing.
+"""Parsing of request bodies, and limits on their size and time. The limits apply before memory is used.
 
 application/json      {"touches": [["<base64>", "<base64>"], ...], "background": [...], "top": 10, ...}
 multipart/form-data   gelsight, once for each image, fingers in their order, grasp after grasp; background; top; ...
@@ -34,7 +34,8 @@ MAX_SMALL_BODIES_BYTES = 20_000_000
 MAX_INLINE_PARSE_BYTES = 1 << 18
 """Maximum size of a body that is parsed in the event loop, which is faster than starting a thread."""
 MAX_JSON_VALUES = 2_000
-"""Maximum number of JSON values of a body; `MAX_PICTURES`, each in lists of its own, and all options need below 800."""
+"""Maximum number of JSON values of a body. A body with `MAX_PICTURES` pictures, each in its own lists, and with all
+options has fewer than 800 values."""
 MAX_FIELD_BYTES = 1000
 """Maximum size of an option in a form."""
 Body = TypeVar("Body", bound=BaseModel)
@@ -331,8 +332,8 @@ async def _body_of(request: Request) -> bytes:
 def _parsed(data: bytes, model: type[Body]) -> Body:
     """Parse a body after a check that it cannot have more than `MAX_JSON_VALUES` values.
 
-    Each JSON value but the first follows one of `,:[{`, which do not occur in base64. Raises HttpProblem and
-    ValidationError.
+    Every JSON value except the first comes after one of `,:[{`. These characters do not occur in base64. Raises
+    HttpProblem and ValidationError.
     """
     values = 1 + sum(map(data.count, (b",", b":", b"[", b"{")))
     if values > MAX_JSON_VALUES:

@@ -13,18 +13,21 @@ from retrieval.model.towers.weights import initialise_tower
 from retrieval.search.defaults import shipped_model
 from retrieval.training import distributed
 
+_TOWERS = ("touch_tower.", "photo_tower.")
+
 
 def build_matcher(config: Config) -> Matcher:
     """Return a matcher with the configured initial weights in both towers."""
     settings, matcher = config.training, Matcher(config.matcher, len(config.preprocessing.views))
-    for tower, init, side in (
-        (matcher.touch_tower, settings.init_touch, "touch_tower"),
-        (matcher.photo_tower, settings.init_photo, "photo_tower"),
-    ):
-        shipped = partial(_shipped_tower, config.matcher.fingers, side)
-        initialise_tower(tower, settings.tower_init(init), shipped)
     if settings.start:
         _start_from(matcher, Path(settings.start))
+    else:
+        for tower, init, side in (
+            (matcher.touch_tower, settings.init_touch, "touch_tower"),
+            (matcher.photo_tower, settings.init_photo, "photo_tower"),
+        ):
+            shipped = partial(_shipped_tower, config.matcher.fingers, side)
+            initialise_tower(tower, settings.tower_init(init), shipped)
     for tower in (matcher.touch_tower, matcher.photo_tower):
         tower.requires_grad_(not settings.freeze_towers)
         if settings.freeze_stem:
@@ -36,13 +39,18 @@ def build_matcher(config: Config) -> Matcher:
 def _start_from(matcher: Matcher, path: Path) -> None:
     """Copy the weights of a checkpoint into a matcher.
 
-    Layers that only one of the two has keep their initial weights: the candidate encoder, the gel head, the layers of
-    cells.
+    Layers outside the towers that only one of the two has keep their initial weights: the candidate encoder, the gel
+    head, the layers of cells.
 
     Raises:
-        CheckpointError: The checkpoint cannot be read, or one of its layers has another size.
+        CheckpointError: The checkpoint cannot be read, has other towers, or one of its layers has another size.
     """
     ours, theirs = matcher.state_dict(), load_checkpoint(path).matcher.state_dict()
+    if missing := [name for name in ours if name.startswith(_TOWERS) and name not in theirs]:
+        raise CheckpointError(
+            f"{path} cannot start this training: it has no {missing[0]}; use its configuration, whose towers are of "
+            "the same kind, or another checkpoint"
+        )
     shared = {name: tensor for name, tensor in theirs.items() if name in ours}
     for name, tensor in shared.items():
         if tensor.shape != ours[name].shape:

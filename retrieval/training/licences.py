@@ -25,11 +25,12 @@ def training_licences(recording: Path, settings: TrainingConfig) -> list[DataLic
         CheckpointError: The checkpoint `start` cannot be read.
     """
     found = [recording_licence(recording)]
-    if settings.start:
+    if settings.start:  # replaces the initial weights, which are not read
         found += checkpoint_licences(read_checkpoint_info(Path(settings.start)))
-    inits = {settings.tower_init(init) for init in (settings.init_touch, settings.init_photo)}
-    for name in sorted({part for init in inits for part in init.split(TOWER_SEPARATOR)} - {"random", "imagenet"}):
-        found.append(_SHIPPED if name == "shipped" else DataLicence(name))
+    else:
+        inits = {settings.tower_init(init) for init in (settings.init_touch, settings.init_photo)}
+        for name in sorted({part for init in inits for part in init.split(TOWER_SEPARATOR)} - {"random", "imagenet"}):
+            found.append(_SHIPPED if name == "shipped" else DataLicence(name))
     found += [DataLicence(folder) for folder in (settings.photos, settings.touches) if folder]
     return list(dict.fromkeys(found))
 

@@ -79,10 +79,10 @@ def train(
     Args:
         recording: A folder, or the result of `robot.read_recording`. It decides the number of fingers.
         out: The checkpoint (.safetensors).
-        config: An object (`Config.using` accepts your own towers and losses), or an argument of `load_config`.
+        config: A `Config` (`Config.using` accepts your own towers and losses), or an argument of `load_config`.
         split: Objects of each part. Default: a random split as the configuration sets it.
         resume: Continue from the state next to `out`.
-        cache: Folder of decoded images, or of the maps of frozen stems, for towers that are trained.
+        cache: Folder of decoded images. It works only for towers that are trained.
         quiet: No progress on stderr.
 
     Raises:
@@ -142,8 +142,8 @@ class Trainer:
     ) -> None:
         """Prepare a run.
 
-        `known` are features of all grasps for frozen towers, in place of their images; `labels` are by object;
-        `licences` are those of the data.
+        `known`: features of all grasps. They replace the images if the towers are frozen. `labels`: labels by object.
+        `licences`: licences of the data.
         """
         settings = config.training
         self.config, self.split, self.out, self.source = config, split, out, source
@@ -168,7 +168,8 @@ class Trainer:
         for name, parameter in self.modules.named_parameters():
             if parameter.requires_grad:
                 groups[name.startswith(TOWERS)]["params"].append(parameter)
-        # On a CPU, PyTorch's default optimizer reads every tensor eight times, the fused one once. CUDA's is fast.
+        # On a CPU, PyTorch's default optimizer reads every tensor eight times. The fused optimizer reads it once. On
+        # CUDA the default optimizer is fast.
         self.optimizer = torch.optim.Adam(groups, lr=settings.learning_rate, fused=self.device.type == "cpu")
         held_out = split.select(grasps, "validation")
         self.validation = self._sampler(held_out).evaluation_pairs() if split.validation else None
@@ -257,7 +258,8 @@ class Trainer:
         return loss
 
     def _after_step(self, done: int) -> None:
-        # Fused steps do not increment the versions of weights, and values cached from weights would seem up to date.
+        # Fused steps do not increment the versions of the weights. Without this line, values that were cached from old
+        # weights would seem up to date.
         increment_version(list(self.matcher.parameters()))
         self.matcher.clamp_scale()
         self.losses.clamp()
@@ -359,8 +361,8 @@ class Trainer:
     def _load_own_checkpoint(self) -> Checkpoint:
         """Return the best checkpoint so far, which is part of the state.
 
-        After a crash between the writing of the two, the checkpoint is newer than the state; repeating the steps
-        gives the same checkpoint.
+        A run writes the checkpoint before the state file. After a crash in between, the checkpoint is newer than the
+        state file. The resumed run repeats these steps and writes the same checkpoint again.
         """
         stored = load_checkpoint(self.out)
         mine = (stored.split, stored.provenance.get("data_digest")) == (self.split, self.data_digest)
@@ -385,7 +387,7 @@ def labelled_pairs(config: Config) -> list[Grasp]:
 def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
     """Put the matcher into training mode; frozen parts stay in evaluation mode, so their running statistics are fixed.
 
-    Frozen towers are not switched even briefly, since another thread may encode with them.
+    Frozen towers never enter training mode, not even for a moment, because another thread may encode with them.
     """
     towers = (matcher.touch_tower, matcher.photo_tower)
     for part in matcher.children():

@@ -3,7 +3,8 @@
 The posterior (`retrieval.model.posterior`) is fitted on touches and photos of validation objects; a model with late
 interaction has a second one, for an index without cells. The gel check
 (`retrieval.model.fusion_scorer`) uses the touch tower's features. Its linear layer is fitted on touches and no-contact
-frames of training objects and on foreign pictures. Its thresholds are chosen on those of validation objects.
+frames of training objects and on foreign pictures. Its thresholds are chosen on touches and no-contact frames of
+validation objects.
 """
 
 import dataclasses
@@ -20,6 +21,7 @@ from torch import Tensor
 from retrieval.data.dataset import Grasp
 from retrieval.data.images import read_rgb
 from retrieval.data.preprocessing import Preprocessing
+from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, touch_features
 from retrieval.model.fusion import MIN_RELATIVE_DEVIATION, Matcher, scorer_of
@@ -28,9 +30,8 @@ from retrieval.model.gel_head import GEL_CLASSES, GelHead
 from retrieval.model.posterior import Posterior, ScoredTouches, fit_posterior
 from retrieval.model.reference_calibration import (
     ReferenceCalibration,
-    ReferenceTouches,
     fit_reference_calibration,
-    touch_embeddings,
+    unit_embeddings,
 )
 from retrieval.model.verification import fit_verification
 from retrieval.training.batches import FeatureSource, recorded_features
@@ -39,17 +40,20 @@ from retrieval.training.foreign_images import draw_foreign
 MAX_GRASPS = 400
 """Largest number of grasps from each part of the split."""
 MIN_GRASPS = 40
-"""Number of validation grasps that the gel check needs; thresholds of fewer grasps would reject too many touches."""
+"""Number of validation grasps that the gel check needs; thresholds from fewer grasps would reject too many touches."""
 FOREIGN_COUNT = 700
 """Number of foreign pictures for fitting; half as many others are drawn for validation."""
 FALSE_ALARM_RATE = 0.005
-"""Fraction of validation gel images that may be classified as foreign, and of no-contact frames as touches."""
+"""At most this fraction of validation gel images may be classified as foreign. At most this fraction of no-contact
+frames may be classified as touches."""
 MARGIN = 1.0
-"""Margin in log-odds between the thresholds and the pictures that they must separate; other gels differ a little."""
+"""A threshold in log-odds is at least this much above the quantile of the validation images, because other gels differ
+a little."""
 LOW_CONTACT_RATE = 0.02
-"""Smallest fraction of validation touches that is classified as no contact; these carry little information."""
+"""At least this fraction of validation touches is classified as no contact: the weakest carry little information."""
 PENALTY = 0.02
-"""Penalty on the squared weights of the check's linear layer, for features of unit variance; less for more pictures."""
+"""Penalty on the squared weights of the check's linear layer, for features of unit variance. The penalty is smaller if
+there are more foreign pictures."""
 _MAX_PIECES = 100
 
 StopRequested = Callable[[], bool]
@@ -92,25 +96,48 @@ def with_verdicts(
     touches, photos = recorded_features(
         matcher, source, validation, what="posterior", quiet=quiet, should_stop=should_stop
     )
-    queries = posterior_touches(matcher, validation, touches, photos)
+    queries = calibration_touches(matcher, validation, touches, photos)
     posterior, references = _fit_calibration(queries, seed)
     made = dataclasses.replace(made, posterior=posterior, references=references)
     if queries is not None and posterior is not None:
-        embeddings = photo_embeddings(matcher, torch.stack(list(photos.values())))
-        verification = fit_verification(queries.scored, embeddings, posterior, seed)
-        made = dataclasses.replace(made, verification=verification)
+        made = dataclasses.replace(made, verification=fit_verification([queries], posterior, seed))
     if matcher.config.cell_dim:
-        queries = posterior_touches(matcher, validation, touches, photos, pooled=True)
+        queries = calibration_touches(matcher, validation, touches, photos, pooled=True)
         posterior, references = _fit_calibration(queries, seed)
         made = dataclasses.replace(made, pooled_posterior=posterior, pooled_references=references)
-    if len(validation) < MIN_GRASPS:
+    return _with_gel_check(made, source, train, (validation, touches), foreign, quiet, should_stop)
+
+
+def with_gel_check(
+    made: Checkpoint, source: FeatureSource, train: Sequence[Grasp], validation: Sequence[Grasp], *, quiet: bool = False
+) -> Checkpoint:
+    """Return the checkpoint `made` with a gel check, if there are enough validation grasps; see `with_verdicts`."""
+    seed = made.config.training.seed
+    train, validation = (_sample_grasps(part, seed)[:MAX_GRASPS] for part in (train, validation))
+    touches, _ = recorded_features(made.matcher, source, validation, what="gel check", quiet=quiet)
+    return _with_gel_check(made, source, train, (validation, touches), FOREIGN_COUNT, quiet)
+
+
+def _with_gel_check(
+    made: Checkpoint,
+    source: FeatureSource,
+    train: Sequence[Grasp],
+    validation: tuple[Sequence[Grasp], Tensor],
+    foreign: int,
+    quiet: bool,
+    should_stop: StopRequested = lambda: False,
+) -> Checkpoint:
+    """Add the gel check; `validation` are the grasps and the features of their touches."""
+    seed, matcher = made.config.training.seed, made.matcher
+    grasps, touches = validation
+    if len(grasps) < MIN_GRASPS:
         return made
     train_touches, _ = recorded_features(matcher, source, train, what="gel check", quiet=quiet, should_stop=should_stop)
     preprocessing = made.config.preprocessing
     fitting = GelCheckFeatures.of(matcher, preprocessing, train, train_touches, foreign, seed)
-    test = GelCheckFeatures.of(matcher, preprocessing, validation, touches, foreign // 2, seed + 1)
+    test = GelCheckFeatures.of(matcher, preprocessing, grasps, touches, foreign // 2, seed + 1)
     matcher.gel_head = fit_gel_head(fitting, PENALTY * FOREIGN_COUNT / foreign)
-    check = fit_gel_check(matcher.gel_head, test, contact_levels(validation))
+    check = fit_gel_check(matcher.gel_head, test, contact_levels(grasps))
     return dataclasses.replace(made, gel_check=check)
 
 
@@ -128,22 +155,22 @@ def _sample_grasps(grasps: Sequence[Grasp], seed: int) -> list[Grasp]:
 
 
 def _fit_calibration(
-    queries: ReferenceTouches | None, seed: int
+    queries: CalibrationTouches | None, seed: int
 ) -> tuple[Posterior | None, ReferenceCalibration | None]:
     if queries is None:
         return None, None
     return fit_posterior(queries.scored, seed=seed), fit_reference_calibration(queries, seed=seed)
 
 
-def posterior_touches(
+def calibration_touches(
     matcher: Matcher,
     grasps: Sequence[Grasp],
     touches: Tensor,
     photos: dict[Path, Tensor],
     *,
     pooled: bool = False,
-) -> ReferenceTouches | None:
-    """Return the data that a posterior is fitted on; None if there are too few objects or photos.
+) -> CalibrationTouches | None:
+    """Return the data of the calibrations; None if there are too few objects or photos.
 
     Args:
         matcher: The matcher.
@@ -161,20 +188,14 @@ def posterior_touches(
         return None
     with torch.inference_mode():
         touch_partials = matcher.touch_encoding(touches).partial.cpu().numpy()
-        photo_partials = matcher.photo_encoding(torch.stack(list(photos.values()))).partial.cpu().numpy()
+        encoded = matcher.photo_encoding(torch.stack(list(photos.values())))
+    photo_partials, photo_embeddings = encoded.partial.cpu().numpy(), encoded.embedding.cpu().numpy()
     if pooled:
         photo_partials = photo_partials[:, : matcher.config.pooled_width]
     scorer = scorer_of(matcher.head)
     logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
-    embeddings = touch_embeddings(touch_partials, matcher.config.cosine_columns)
-    return ReferenceTouches(ScoredTouches(logits, touch_owner, photo_owner, own), embeddings)
-
-
-@torch.inference_mode()
-def photo_embeddings(matcher: Matcher, photos: Tensor) -> NDArray[np.float64]:
-    """Return the contrastive embeddings (N, embedding_dim) of photos, given their features (N, F)."""
-    embeddings = matcher.photo_encoding(photos).embedding
-    return np.asarray(embeddings.cpu().numpy().astype(np.float64))
+    embeddings = unit_embeddings(touch_partials, matcher.config.cosine_columns)
+    return CalibrationTouches(ScoredTouches(logits, touch_owner, photo_owner, own), embeddings, photo_embeddings)
 
 
 # The gel check ---------------------------------------------------------------------------------------------

@@ -13,15 +13,16 @@ Both have the same methods, with values in mm, rad, mm/s and N:
               grasp(force_n, speed_mm_s)                        return when the force is reached or the jaws are closed
               state()         -> {"opening_mm": ..., "force_n": ..., "status": "idle"}
     both      stop()          stop now and stay usable
-              recover(), disconnect()    optional, of a Python object only: clear a fault after which the robot may
-                              move again without a person; end
+              recover()       optional, Python object only: clear a fault where this is safe without a person, else
+                              raise an exception
+              disconnect()    optional, Python object only: end the connection
 
 A Python object is made when the rig connects: `settings` are its keyword arguments. An HTTP endpoint gets a POST
 request to `url`/`method` with the values as JSON; it answers with JSON, or with an error status and a text.
 
 Connecting asks for the pose or the state and moves nothing. The limits of the rig's file hold as for every arm and
-gripper: a pose outside the workspace, a speed or a force above its limit is refused before the program is called. An
-arm that is not near its goal after `move_to` is an error.
+gripper: a pose outside the workspace, or a speed or a force above its limit, is refused before the program is called.
+Only `state_age_s` is not used. An arm that is not near its goal after `move_to` is an error.
 """
 
 import contextlib

@@ -107,7 +107,7 @@ class GraspPlanner(ABC):
 class CylinderPlanner(GraspPlanner):
     """The planner of the paper: fit a cylinder to the depth picture and pinch it from above (`plan_grasp`).
 
-    A given `object_fit` of the rig replaces the fit.
+    If the rig has an `object_fit`, it replaces the fit.
 
     Args:
         search_margin_mm: Width of the border around the workspace that is searched for objects too.
@@ -149,7 +149,8 @@ def plan_grasp(
 
     The point between the fingertips lies on the cylinder's axis plus a jitter, at a random height within the object.
     The closing direction is uniform over half a turn, and the force is uniform over its range. All numbers are drawn
-    before the first check, so that failures of other attempts do not change a draw.
+    before the first check. So a plan that fails uses as many random numbers as one that succeeds, and later plans from
+    the same `rng` do not change.
 
     Args:
         fit: The cylinder.
@@ -189,5 +190,8 @@ def _above(pose: Pose, fit: CylinderFit, settings: GraspSettings, workspace: Reg
     if not (workspace.contains(pose) and workspace.contains(above)):
         raise PlanError(f"the grasp is out of the workspace {workspace.lower} to {workspace.upper}: {pose}")
     if above.z_mm < fit.height_mm + settings.floor_mm:
-        raise PlanError(f"the object is too high: {fit.height_mm:.0f} mm, and the arm rises to {above.z_mm:.0f} mm")
+        raise PlanError(
+            f"the object is too high: it is {fit.height_mm:.0f} mm high, and the fingertips rise to "
+            f"{above.z_mm:.0f} mm, but they must rise to {settings.floor_mm:g} mm above it"
+        )
     return above

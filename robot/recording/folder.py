@@ -1,7 +1,8 @@
 """The recording: a folder of grasps, appended one at a time and read by training.
 
     recording.json    schema_version, source, sensor, rig, units, seed, software_version, background, gels (for each
-                      pair used: thickness_mm, modulus_mpa, poisson by finger, or "unknown"), and the writer's own keys
+                      pair used: thickness_mm, modulus_mpa, poisson by finger, or "unknown"), and further keys that the
+                      caller of RecordingWriter gives
     metadata.jsonl    one line with a JSON object for each grasp
     images/           PNG or JPEG files; several grasps may share one
     attempts.jsonl    only if a rig collected it: all attempts, those without a grasp included
@@ -277,7 +278,8 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
             raise RecordingError(f"the writer of {self.folder} is closed; open another")
         if not isinstance(grasp_id, str) or not GRASP_ID.fullmatch(grasp_id):
             raise RecordingError(
-                f"grasp_id must be at most 128 ASCII letters, digits and ._-, not beginning with ._-, got {grasp_id!r}"
+                "grasp_id must have 1 to 128 characters: ASCII letters, digits, '.', '_' or '-'; the first must be a "
+                f"letter or a digit; got {grasp_id!r}"
             )
         if grasp_id in self._grasp_ids:
             raise RecordingError(f"the recording already contains grasp {grasp_id}; see grasp_ids")
@@ -306,8 +308,8 @@ class RecordingWriter(contextlib.AbstractContextManager["RecordingWriter"]):
         """Return whether the recording contains the shared image `name`; raise RecordingError for an invalid name."""
         if not GRASP_ID.fullmatch(name):
             raise RecordingError(
-                "the name of a shared image must be at most 128 ASCII letters, digits and ._-, not beginning with ._-, "
-                f"got {name!r}"
+                "the name of a shared image must have 1 to 128 characters: ASCII letters, digits, '.', '_' or '-'; the "
+                f"first must be a letter or a digit; got {name!r}"
             )
         if name not in self._shared:
             for suffix in (".png", ".jpg"):

@@ -7,7 +7,8 @@ reliable, a cruder method is used. `method` and `notes` of the result name it:
     circle              robust circle through the visible side of an upright cylinder
     box                 the cylinder inscribed in a box, as for a packet
     lying               a cylinder on its side
-    enclosing circle    smallest circle around all points: too few points on the side, or too short an arc
+    enclosing circle    smallest circle around the points without outliers, if the side has too few points, shows too
+                        short an arc or fits no circle, or if no simple solid fits
     silhouette          outline in the colour picture, for objects without depth, such as glass
 """
 
@@ -48,7 +49,11 @@ _OUTLINE_ERROR = 0.15
 """Standard error of a silhouette fit relative to the radius, measured on cylinders with a visible base."""
 
 _CRUDE_MM, _ROUGH_MM, _GUESS_MM = 3.0, 6.0, 10.0
-"""Standard error of the centre when the hidden side is guessed: simple solid, other shape, box without visible top."""
+"""Smallest standard errors of the centre when the hidden side is guessed.
+
+`_CRUDE_MM` for a box, a lying cylinder or an enclosing circle; `_ROUGH_MM` for an enclosing circle if no simple solid
+fits; `_GUESS_MM` for a box whose top is not visible.
+"""
 
 
 @dataclass(frozen=True)
@@ -87,16 +92,19 @@ class CylinderFit:
         return self.method not in ("box", "lying")
 
     def width_mm(self, yaw_rad: float, finger_mm: float) -> float:
-        """Return the opening at which fingers of width `finger_mm` pass the object on both sides of its centre.
+        """Return the smallest opening with which two fingers pass the object on both sides.
 
-        For a rectangular footprint this is its extent along the closing direction `yaw_rad`, within the strip that a
-        finger sweeps, in closed form.
+        Each finger is `finger_mm` wide and centred on the object.
+
+        For a rectangular footprint the opening is its extent along the closing direction `yaw_rad`, within the strip
+        that a finger sweeps, in closed form.
         """
         if self.is_round:
             return 2 * self.radius_mm
         (a, b), turn, strip = self.half_mm, yaw_rad - self.yaw_rad, finger_mm / 2
         c, s = abs(math.cos(turn)), abs(math.sin(turn))
-        if c * b - s * a > strip:  # the corner lies outside the strip, which leaves through the end of length a
+        if c * b - s * a > strip:
+            # The corner lies outside the strip, so the strip's edge meets the side whose distance from the centre is a.
             return 2 * (a + s * strip) / c
         if s * a - c * b > strip:
             return 2 * (b + c * strip) / s
@@ -187,7 +195,7 @@ def _box_candidate(points: Array, box: Cuboid, top: float, noise: float) -> _Can
     """Return the box as a candidate; without a visible top, its far side is a guess."""
     if (np.abs(points[:, 2] - top) < 2 * noise).mean() > _MIN_TOP_FRACTION:
         return _Candidate(box, "box", _CRUDE_MM)
-    return _Candidate(box, "box", _GUESS_MM, note="its top is not visible, so its depth is a guess")
+    return _Candidate(box, "box", _GUESS_MM, note="its top is not visible, so the place of its far side is a guess")
 
 
 def _to_fit(best: _Candidate, points: Array, noise: float, notes: tuple[str, ...]) -> CylinderFit:
@@ -245,7 +253,7 @@ def _upright_candidate(points: Array, top: float, noise: float, rays: Rays, box:
     away = viewing / max(float(np.hypot(*viewing)), 1e-9)
     circle = fit_circle(side, noise, away, largest)
     if circle is None:
-        return _enclosing_candidate(points, top, "no circle of its size fits its side")
+        return _enclosing_candidate(points, top, "no circle fits its visible side")
     arc = _arc_deg(circle, side)
     start = np.array([circle.x, circle.y]), circle.radius
     whole = refine_circle(points[:, :2], *start, noise, largest, away, top - points[:, 2])
@@ -282,5 +290,5 @@ def _enclosing_candidate(points: Array, top: float, reason: str, error_mm: float
     low, high = np.quantile(plan, [0.02, 0.98], axis=0)
     inner = plan[((plan > low - _OUTLIER_MM) & (plan < high + _OUTLIER_MM)).all(1)]
     (x, y), radius = cv2.minEnclosingCircle(inner.astype(np.float32))
-    note = f"{reason}: the smallest circle around all its points is used"
+    note = f"{reason}: the smallest circle around its points, without outliers, is used"
     return _Candidate(UprightCylinder(float(x), float(y), float(radius), top), "enclosing circle", error_mm, 0.0, note)

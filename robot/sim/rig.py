@@ -1,4 +1,4 @@
-"""The simulated rig: virtual devices over one Scene. Seed, object and number determine the whole attempt."""
+"""The simulated rig: virtual devices over one Scene. Seed, object and attempt number determine the whole attempt."""
 
 import math
 import zlib
@@ -75,7 +75,7 @@ class SimState:
 
     @property
     def is_lifted(self) -> bool:
-        """Whether the hand has moved away from the pose in which it closed."""
+        """Whether the hand is more than 1 mm above the pose in which it closed."""
         grip = self.current_scene().grip
         return grip is not None and self.pose.z_mm > grip.pose.z_mm + 1.0
 
@@ -95,8 +95,8 @@ class SimSettings(TypedSettings):
         contact_grid: rows and columns of the contact solver.
         contact_tolerance: tolerance of the contact solver.
         shadow: whether the lamp casts a shadow.
-        focal_px: focal length of the camera. Its pictures have 256 px a side; at 860 they show about 190 mm, and part
-            of larger objects.
+        focal_px: focal length of the camera. Its pictures have 256 x 256 px. At the default of 860 px they show about
+            190 mm; a larger object is cut off.
         localisation_mm: range from which the error of the camera's calibration is drawn.
         grasp: the table [grasp], as for a real rig: random grasps (robot.grasping.settings.GraspSettings).
         attempt: the table [attempt]: speeds, waits, retries (robot.grasping.settings.AttemptSettings).
@@ -273,11 +273,11 @@ class SimRig(Rig):
         return {} if scene.pinch.miss_reason else {finger: scene.pinch.gap(finger) for finger in self.sensors}
 
     def _find_object(self, object_id: str) -> SimObject:
-        """Return the object of this name: a procedural name ends in its index, a mesh name begins with its file's."""
+        """Return the object of this name."""
         if self.meshes is not None:
-            candidates = self.meshes.candidates(object_id)
+            candidates = self.meshes.candidates(object_id)  # the name begins with `mesh.` and the name of the file
         else:
-            index = object_id.rsplit("-", 1)[-1]
+            index = object_id.rsplit("-", 1)[-1]  # the name ends with the index
             candidates = [_procedural(self._seed, int(index), self._families)] if index.isdecimal() else []
         for candidate in candidates:
             if candidate.object_id == object_id:

@@ -430,7 +430,7 @@ def test_every_error_has_the_documented_exit_code():
 
 def test_user_files_in_an_index_folder_are_not_changed(tmp_path):
     (tmp_path / "CURRENT").write_text("my notes on electricity")
-    with pytest.raises(NoIndex, match="is not of an index and was not changed"):
+    with pytest.raises(NoIndex, match="does not belong to an index and was not changed"):
         filled(tmp_path)
     assert (tmp_path / "CURRENT").read_text() == "my notes on electricity"
     (tmp_path / "CURRENT").unlink()

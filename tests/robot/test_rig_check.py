@@ -52,8 +52,8 @@ def test_every_device_is_checked_moved_back_and_closed(rig):
 
 def test_without_motion_arm_and_jaws_do_not_move(rig):
     rows = list(check_rig(rig, motion=False))
-    assert rows[0].measured["moved"] == "not"
-    assert rows[0].measured["state in"].startswith("0.00 ms")
+    assert rows[0].measured["motion"] == "none"
+    assert rows[0].measured["answer to a query in"].startswith("0.00 ms")
     assert {"arm", "open", "grasp"}.isdisjoint(rig.shared.calls)
 
 
@@ -87,7 +87,7 @@ def test_a_held_object_is_not_released(rig, monkeypatch):
     monkeypatch.setattr(FakeGripper, "_state", lambda self: GripperState(40.0, 10.0, "holding"))
     monkeypatch.setattr(FakeGripper, "_open", lambda *_: pytest.fail("it opened"))
     (row,) = [row for row in check_rig(rig) if row.role == "gripper"]
-    assert row.measured["moved"] == "not: it is holding"
+    assert row.measured["motion"] == "none, because it is holding"
 
 
 def test_refused_settings_are_reported(rig, monkeypatch):

@@ -84,10 +84,10 @@ def benchmark(
             `load_config`.
         preset: Name of the configuration in the report. Default: the configuration's name.
         methods: Names, or your own classes.
-        models: Name to checkpoint; each is a separate row, which is not fitted.
-        towers: Name to configuration; its frozen touch tower is a separate row of touch-to-touch protocols.
-        seeds: Number of draws of the folds and of fits.
-        skipped: Protocol to the reason why it is left out, for the report.
+        models: Checkpoints by name. Each is a separate row and is not fitted.
+        towers: Configurations by name. The frozen touch tower of each is a separate row of touch-to-touch protocols.
+        seeds: Number of seeds. Each seed draws the folds again and fits the methods again.
+        skipped: Why a protocol is left out, by its name. The report states these reasons.
         cache: Folder of features and measures. Default: `out`/cache.
         quiet: No progress on stderr.
 
@@ -120,7 +120,11 @@ def benchmark(
     cache = cache or out / "cache"
     selected = dict(map(_named, protocols))
     if equal := set(towers) & {FROZEN, *models}:
-        raise BadInput(f"Each row needs a name of its own; {min(equal)} is that of another row. Rename these towers.")
+        raise BadInput(f"Another row is already named {min(equal)}. Give this entry of `towers` a different name.")
+    if towers and not any(isinstance(protocol, TouchToTouch) for protocol in selected.values()):
+        raise BadInput(
+            f"Only touch-to-touch protocols compare towers, got {', '.join(selected)}. Add one, such as physiclear."
+        )
     if not isinstance(recordings, Mapping):
         recordings = dict.fromkeys((protocol.data_set for protocol in selected.values()), recordings)
     facts = {name: read_recording_facts(folder_of(recording)) for name, recording in recordings.items()}
@@ -210,11 +214,12 @@ class _ProtocolRun:
 
     @cached_property
     def _contact(self) -> dict[str, float] | None:
-        """Gel change of each grasp, grey levels; None without no-contact frames. Stored: it reads all touches."""
+        """Gel change of each grasp, grey levels; None without no-contact frames."""
         grasps = self.all_facts.grasps
         if any(len(grasp.backgrounds) != len(grasp.touches) for grasp in grasps):
             return None
         digest = data_digest(grasps)
+        # The result is stored, because computing it reads all touches.
         return cached_document(self.cache / "contact" / f"{digest[:32]}.json", {"grasps": digest}, self._gel_changes)
 
     def _gel_changes(self) -> dict[str, float]:

@@ -1,7 +1,9 @@
-"""Embed the photos of a catalogue: some threads read and decode files while others encode.
+"""Embed the photos of a catalogue. Some threads read and hash files; others decode and encode them.
 
-One thread processes a whole batch, from files to codes. PyTorch's default, several threads for each matrix product,
-waits for threads whose cores are decoding files.
+Several batches are processed at once, each decoded and encoded by a single thread. PyTorch therefore computes each
+matrix product on one thread. With its default of several, a product would wait for cores that are busy decoding.
+
+The code of a photo is its embedding and its stored partial activation.
 """
 
 from collections import Counter
@@ -38,7 +40,7 @@ R = TypeVar("R")
 
 BATCH = 16
 READ = 32
-"""Files that a thread reads in one task: the overhead of a task is a tenth of the time to read and hash a photo."""
+"""Files that a thread reads in one task. The overhead of a task is a tenth of the time to read and hash one photo."""
 MIN_PHOTOS_TO_TUNE = 256
 """Smallest number of new photos for which a faster encoder is tried; the trial takes as long as encoding 100 photos."""
 MAX_REUSED_PER_PART = 256
@@ -59,7 +61,10 @@ class _PhotoEncoding(NamedTuple):
 
 @dataclass(slots=True)
 class _Photo:
-    """The row of a photo that was read; if the parent lacks it, also its file or the code of an equal file."""
+    """The row of a photo. If the parent has no row with this path and content: also the file's bytes, or a stored code.
+
+    The stored code is of a photo with the same content.
+    """
 
     row: dict[str, Any]
     file: PhotoBytes | None = None
@@ -72,7 +77,7 @@ class BuildPart:
 
     Attributes:
         rows: Rows of the photos that could be read.
-        codes: Codes of those rows that the parent lacks, in their order.
+        codes: Codes of the rows that the parent lacks, in the order of `rows`.
         skipped: Photos that could not be read.
         unchanged: Numbers of unchanged rows of the parent; a part has either these or rows.
         objects: Object of each photo of the part.
@@ -107,7 +112,7 @@ class Embedder:
         index: Folder of the index.
         parent: The current generation, if it is of this model.
         donors: Other generations of this model, whose codes are reused for photos with the same content.
-        partials: A generation with the same partial activations as this model would give, but other embeddings.
+        partials: A generation whose partial activations are those of this model, but whose embeddings are not.
 
     Attributes:
         objects: Number of photos of each object.
@@ -351,7 +356,10 @@ def _steps(
 
 
 def _full_batches(found: Iterable[BuildPart | list[_ReadItem]]) -> Iterator[BuildPart | list[_ReadItem]]:
-    """Regroup photos into lists with a full batch to encode, except the last list and lists before unchanged rows."""
+    """Regroup photos into lists that each have a full batch to encode.
+
+    A list ends earlier at the end, before unchanged rows, and after `MAX_REUSED_PER_PART` reused codes.
+    """
     waiting = list[_ReadItem]()
     new = reused = 0
     for step in found:

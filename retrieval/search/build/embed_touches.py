@@ -20,6 +20,7 @@ from retrieval.data.catalogue_touches import CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.images import decode_rgb
 from retrieval.errors import BadInput, ImageError
+from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, batches, touch_features
 from retrieval.model.fusion import scorer_of
@@ -28,9 +29,8 @@ from retrieval.model.posterior import ScoredTouches
 from retrieval.model.reference_calibration import (
     REFERENCE_PARTIALS,
     REFERENCE_ROWS,
-    ReferenceTouches,
     fit_reference_calibration,
-    touch_embeddings,
+    unit_embeddings,
 )
 from retrieval.model.stored_partials import StoredPartials
 
@@ -112,7 +112,7 @@ class ReferenceBuild:
             return {"by": "objects that the model was not fitted to", "calibration": checkpoint.references.to_dict()}
         names = np.array([row["object_id"] for row in self.rows])
         sample = _sample_objects(names)
-        codes = touch_embeddings(self.partials[sample], checkpoint.config.matcher.cosine_columns)
+        codes = unit_embeddings(self.partials[sample], checkpoint.config.matcher.cosine_columns)
         photographed = ~np.isin(tables.objects, keys_of(self.touch_only))
         touched, owner = np.unique(names[sample], return_inverse=True)
         keys = keys_of(touched.tolist())
@@ -122,8 +122,9 @@ class ReferenceBuild:
         scorer = scorer_of(checkpoint.matcher.head)
         touch_partials, photo_partials = self.partials[sample].astype(np.float32), StoredPartials(tables.arrays)[photos]
         logits = np.stack([scorer.logits(partial[None], photo_partials) for partial in touch_partials])
-        none = np.zeros(logits.shape, np.bool_)
-        fitted = fit_reference_calibration(ReferenceTouches(ScoredTouches(logits, owner, photo_owner, none), codes))
+        scored = ScoredTouches(logits, owner, photo_owner, np.zeros(logits.shape, np.bool_))
+        photo_codes = unit_embeddings(photo_partials, checkpoint.config.matcher.cosine_columns)
+        fitted = fit_reference_calibration(CalibrationTouches(scored, codes, photo_codes))
         if fitted is None or (fitted.with_photos is None and len(set(names) - set(self.touch_only))):
             raise self.too_few_error()
         return {"by": "the catalogue's own touches", "calibration": fitted.to_dict()}

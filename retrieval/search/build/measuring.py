@@ -30,7 +30,7 @@ SHORT_LADDER = (250, 100, 50, 25, 10)
 TIMED_QUERIES = 15
 MIN_QUERIES = 50
 MEASUREMENT_FLOPS = 3e12
-"""Floating-point operations for exhaustive search: 150 touches over 100,000 partial activations of 256 numbers."""
+"""Floating-point operations for exhaustive search: enough for 228 touches over 100,000 photos with `hidden` = 256."""
 
 NEIGHBOURS, DRAWN_QUERIES = 10, 64
 """Neighbours to find for each query, and queries to draw, if the checkpoint stores no touches."""

@@ -5,13 +5,14 @@ top-1 of a touch is the photo that the fusion head ranks first if it scores ever
 is exact nearest-neighbour search by embedding). The agreement@k with exhaustive search ("recall" below) is the fraction
 of touches whose exhaustive top-1 is among the k candidates.
 
-    no bound       exact search, and the smallest k of `candidate_steps` with a recall of 0.99
-    min_recall     the first point with this recall whose search takes no longer than its reranking: exact search,
-                   then approximate kinds. If there is none, the fastest point with this recall
-    max_ms         the first point with a recall of 0.99 within the time: exact search, then approximate kinds. If
-                   there is none, the point with the highest recall within the time. If no point is within the time,
-                   the fastest point with a recall of 0.99
-    both           the first point with this recall within the time; if there is none, the fastest with this recall
+    no bound       use exact search with the smallest k of `candidate_steps` that has a recall of 0.99
+    min_recall     try exact search, then approximate kinds. Take the first point with this recall whose search takes
+                   no longer than its reranking. If there is none, take the fastest point with this recall
+    max_ms         try exact search, then approximate kinds. Take the first point with a recall of 0.99 within the
+                   time. If there is none, take the point with the highest recall within the time. If no point is
+                   within the time, take the fastest point with a recall of 0.99
+    both           try exact search, then approximate kinds. Take the first point with this recall within the time. If
+                   there is none, take the fastest point with this recall
 
 A required kind is the only choice; its search may take longer than its reranking. The cost of exhaustive search grows
 with the catalogue, so larger catalogues use fewer touches. A measurement is reused until a tenth of the photos has
@@ -140,10 +141,11 @@ def choose_operating_point(
     record = previous and carry_over(previous.about.get("candidates"), requirements, photos, changed)
     if previous is not None and record:
         parameters = load_kind(previous.kind).parameters_from(previous.requested)
-        return OperatingPoint(previous.kind, parameters, operating_point_sentence(record), record)
+        return OperatingPoint(previous.kind, parameters, operating_point_sentence(record, photos), record)
     if not checkpoint.config.has_embeddings or not needs_measurement(photos, requirements):
         kind, candidates = requirements.kind or "flat", exhaustive_record(photos, requirements)
-        return OperatingPoint(kind, load_kind(kind).parameters_type(), operating_point_sentence(candidates), candidates)
+        reason = operating_point_sentence(candidates, photos)
+        return OperatingPoint(kind, load_kind(kind).parameters_type(), reason, candidates)
     if not can_measure(checkpoint):
         return choose_by_neighbours(tables.vectors, tables.slots, requirements)
     partials = StoredPartials(tables.arrays)
@@ -160,7 +162,7 @@ def choose_by_agreement(bench: SearchBench, requirements: SearchRequirements) ->
     """Choose the operating point by measured agreement with exhaustive search."""
     point = _choose_point(bench, requirements)
     candidates = _record(point, requirements, bench)
-    return OperatingPoint(point.kind, point.parameters, operating_point_sentence(candidates), candidates)
+    return OperatingPoint(point.kind, point.parameters, operating_point_sentence(candidates, bench.count), candidates)
 
 
 def choose_by_neighbours(vectors: Floats, slots: Slots, requirements: SearchRequirements) -> OperatingPoint:
@@ -198,7 +200,8 @@ def _points(bench: SearchBench, requirements: SearchRequirements) -> Iterator[Se
     """Yield points of exact search with more and more candidates until one has the recall, then of approximate kinds.
 
     Approximate kinds start with the number of candidates of the last exact point. If an approximate kind is required,
-    exact search is measured only to find this number and not yielded; the last point has all photos.
+    exact search is measured only to find this number, and its points are not yielded. The last point of the required
+    kind reranks all photos.
     """
     approximate = None if requirements.kind is None or load_kind(requirements.kind).exact else requirements.kind
     exact = bench.index_of_kind("flat" if requirements.kind is None or approximate else requirements.kind)
@@ -248,7 +251,10 @@ def _is_sufficient(point: SearchPoint, requirements: SearchRequirements) -> bool
 def _points_within_time(
     bench: SearchBench, requirements: SearchRequirements, tried: Sequence[SearchPoint]
 ) -> Iterator[SearchPoint]:
-    """Yield points below the smallest step that fit the time, if the user set only a time bound."""
+    """For each tried kind and search setting, yield the point with the most candidates that fits the time.
+
+    It has fewer candidates than the smallest step. Only if the user set a time bound and no minimum recall.
+    """
     if requirements.max_ms is None or requirements.min_recall is not None:
         return
     for kind in dict.fromkeys(point.kind for point in tried):
@@ -319,13 +325,18 @@ def carry_over(
     total = previous["changed"] + changed
     if total > MAX_CHANGED_FRACTION * previous["photos"]:
         return None
-    every = previous["k"] >= previous["photos"]
-    return {**previous, "changed": total, "k": photos if every else min(previous["k"], photos)}
+    k = previous["k"]  # may exceed the number of photos, so that a catalogue that shrank may grow again
+    return {**previous, "changed": total, "k": max(k, photos) if k >= previous["photos"] else k}
 
 
-def operating_point_sentence(candidates: Mapping[str, Any]) -> str:
-    """Return a record as text: the candidates, their agreement with exhaustive search, and unmet requirements."""
-    k, photos = candidates["k"], candidates["photos"]
+def operating_point_sentence(candidates: Mapping[str, Any], photos: int) -> str:
+    """Return a record as text: the candidates, their agreement with exhaustive search, and unmet requirements.
+
+    Args:
+        candidates: The record.
+        photos: Number of photos now; a reused record has the number of photos that were measured.
+    """
+    k = candidates["k"]
     if not candidates["queries"]:
         return f"The fusion head scores all {photos} photos."
     low, high = candidates["interval"]
@@ -343,7 +354,7 @@ def _unmet_requirements(recall: float, ms: float, requirements: Mapping[str, Any
     target = TARGET if requirements["min_recall"] is None else requirements["min_recall"]
     unmet = []
     if recall < target:
-        unmet.append(f"a recall of {target:g}")
+        unmet.append(f"does not reach a recall of {target:g}")
     if requirements["max_ms"] is not None and ms > requirements["max_ms"]:
-        unmet.append(f"{requirements['max_ms']:g} ms")
-    return f" This setting misses {' and '.join(unmet)}; no measured one meets all requirements." if unmet else ""
+        unmet.append(f"is slower than {requirements['max_ms']:g} ms")
+    return f" This setting {' and '.join(unmet)}. No measured setting meets all requirements." if unmet else ""

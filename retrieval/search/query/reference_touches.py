@@ -22,7 +22,7 @@ from retrieval.model.reference_calibration import (
     Numbers,
     ReferenceCalibration,
     reference_similarity,
-    touch_embeddings,
+    unit_embeddings,
 )
 from retrieval.search.query.answer import NearestReference
 from retrieval.search.query.objects import Objects, ScoredObjects
@@ -96,7 +96,7 @@ class References:
         order = np.flatnonzero(numbers >= 0)  # an object without a readable photo has no number
         order = order[np.argsort(numbers[order], kind="stable")]
         self._touches, self._all = [touches[row].touch for row in order], touches
-        self._codes: Floats = touch_embeddings(partials[order], columns)
+        self._codes: Floats = unit_embeddings(partials[order], columns)
         self._objects, self._starts = np.unique(numbers[order], return_index=True)
         self._columns, self._touch_only = columns, np.zeros(objects.count, np.bool_)
         self._touch_only[without_photos[without_photos >= 0]] = True
@@ -126,7 +126,7 @@ class References:
         found = np.full(len(self._touch_only), np.nan)
         if len(self._objects):
             found[self._objects] = reference_similarity(
-                touch_embeddings(partials, self._columns) @ self._codes.T, self._starts
+                unit_embeddings(partials, self._columns) @ self._codes.T, self._starts
             ).sum(0)
         return found
 
@@ -180,7 +180,7 @@ class References:
             return None
         start = int(self._starts[place])
         stop = int(self._starts[place + 1]) if place + 1 < len(self._starts) else len(self._codes)
-        cosines = (touch_embeddings(partials, self._columns) @ self._codes[start:stop].T).max(0)
+        cosines = (unit_embeddings(partials, self._columns) @ self._codes[start:stop].T).max(0)
         best = int(cosines.argmax())
         adds = None if np.isnan(photo_logits) else logit - photo_logits
         return NearestReference(self._touches[start + best], float(cosines[best]), adds)

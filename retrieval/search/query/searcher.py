@@ -178,10 +178,10 @@ class Searcher:
                 image, or an array (height, width, 3) of uint8, red first (OpenCV: `image[..., ::-1]`).
             background: The fingers' no-contact frames, for a model that uses them.
             top: Number of objects to return.
-            candidates: Number of photos to rerank in each shard, raised to `top` if smaller: those nearest to the sum
-                of the grasps' embeddings. Default: as measured by `build-index`. The best objects' other photos, and
-                those of the objects with the nearest reference touches, are scored too. All photos of a shard are
-                scored if it has no more than this number, or if the model has no trained embeddings.
+            candidates: Number of photos that each shard reranks, at least `top`: those nearest to the sum of the
+                grasps' embeddings. Default: as measured by `build-index`. All photos of the best objects, and of the
+                objects with the nearest reference touches, are scored too. If a shard has no more photos than this
+                number, or the model has no trained embeddings, all its photos are scored.
             none_prior: Prior probability that the catalogue lacks the object.
 
         Raises:

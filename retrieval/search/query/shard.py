@@ -31,7 +31,7 @@ from retrieval.search.query.reference_touches import References, Similarities
 
 DEFAULT_CANDIDATES = 1000
 MIN_COMPLETED_OBJECTS = 20
-"""Smallest number of best objects whose photos are all scored."""
+"""All photos of at least this many of the best objects are scored."""
 MIN_SUM_NORM = 1e-5
 """A sum of unit embeddings with a smaller norm is only rounding error."""
 Floats = NDArray[np.float32]
@@ -145,7 +145,8 @@ class FolderShard:
     """The photos of one generation of an index folder, opened in this process.
 
     Its index finds candidates, and the model's head reranks them. Reference touches contribute to the logits of their
-    objects. Threads may search at once. Only `page` with words may wait, until all rows' text is read.
+    objects. Threads may search at once. Only `page` with words may block: the first call reads the text of all rows,
+    and other calls wait for it.
 
     Args:
         generation: The opened generation.
@@ -212,7 +213,8 @@ class FolderShard:
         if self.references is None:
             return found
         images = map(self.references.image, ids)
-        # A gel image that represents an object without photos has a photo's row too; merge both.
+        # For an object without photos, the index has a gel image as a row, in place of a photo. The result has the
+        # fields of this row, and the key `touch`.
         return [row if image is None else {**image, **(row or {})} for row, image in zip(found, images, strict=True)]
 
     def page(self, words: Sequence[str], object_id: str | None, offset: int, limit: int) -> Page:
@@ -274,7 +276,8 @@ class FolderShard:
         objects = self.objects.aggregate(rows, logits, posterior, grasps)
         if self.references is None or similarities is None:
             return objects
-        with_photos = self.references.calibration.with_photos  # posterior of photos, for objects with both
+        # Objects with both photos and reference touches have a posterior of their own.
+        with_photos = self.references.calibration.with_photos
         both = None if with_photos is None else self.objects.aggregate(rows, logits, with_photos, grasps)
         return self.references.combine(objects, both, similarities, posterior, grasps)
 

@@ -103,8 +103,8 @@ def expected_object(searcher: Searcher, expect: str, far: float) -> tuple[int, D
     calibration, posterior = calibration_of(searcher), searcher.posterior
     if calibration is None or posterior is None:
         raise BadInput(
-            f"{searcher.checkpoint.path} has no error rates for verification with this index: train a model with at "
-            "least 20 validation objects of 5 grasps, and build its index with its cells"
+            f"{searcher.checkpoint.path} has no error rates for verification with this index: fit a model with at "
+            "least 20 objects of 5 grasps (`retrieve train`: validation objects), and build its index with its cells"
         )
     bounds = calibration.bounds(far)
     number = int(searcher.folder_shard.objects.numbers_of([expect])[0])

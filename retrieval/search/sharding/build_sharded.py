@@ -1,8 +1,9 @@
 """Build a sharded index: several index folders over one catalogue, which are switched together.
 
-All photos of an object go to one shard, and each shard is built as an ordinary index. Codes are reused from the shard,
-from the shards of another division, and from an interrupted build. The manifest is written when every shard is on the
-disk: a killed build does not change the index.
+All photos of an object go to one shard, and each shard is built as an ordinary index. Codes (embeddings and stored
+partial activations) are reused from the same shard, from the shards of an earlier build with another number of shards,
+and from an interrupted build. The manifest is written when every shard is on the disk, so a killed build does not
+change the index.
 
 A sharded index in an object store is built in a local folder, and each shard is uploaded as soon as it is complete
 (`retrieval.search.sharding.object_store`).
@@ -72,7 +73,7 @@ class ShardJob:
         catalogue: The shard's photos and touches.
         model: Path of the checkpoint.
         options: As for an index folder.
-        donors: Shards of another division, whose codes may be reused.
+        donors: Shards of an earlier build with another number of shards, whose codes may be reused.
     """
 
     index: str | Path
@@ -174,8 +175,8 @@ def build_sharded(
         catalogue = list_photos(folder, naming)
         if catalogue.touches and checkpoint.references is None:
             raise BadInput(
-                "a sharded index with reference touches needs a model with a calibration for them, because each shard "
-                "would otherwise fit its own, and this model has none; use a model of `retrieve adapt`"
+                "this model has no calibration of reference touches. A sharded index needs one in the model, because "
+                "each shard would otherwise fit its own. Use a shipped model or one of `retrieve adapt`"
             )
         _delete_old_shards(own, before, shards)
         old_generations = {} if stored is None else stored.generations()
@@ -248,7 +249,7 @@ def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBui
 
 
 def _delete_old_shards(out: Path, before: ShardedManifest | None, shards: int) -> None:
-    """Delete shards of divisions that neither the current index nor the new one uses."""
+    """Delete the shards of earlier builds with another number of shards, except those of the current index."""
     known = set() if before is None else {entry.folder for entry in before.shards}
     for path in out.iterdir():
         division = SHARD_FOLDER.fullmatch(path.name)

@@ -202,7 +202,8 @@ class RemoteShardedIndex:
         content = sharded_manifest_bytes(manifest)
 
         def put(path: str) -> bool:
-            condition = self._unchanged(path)  # read before the content, which must not be older
+            # Take the condition (ETag) first. Taken after the content, a switch in between would go unnoticed.
+            condition = self._unchanged(path)
             current = self._content(path)
             if current == content:  # written by a request whose response was lost
                 return True
@@ -318,8 +319,14 @@ class RemoteShardedIndex:
         if file.is_file() and file_digest(file) == sha256:
             return
         size = (self._try(name, self._info) or {}).get("size")
-        if size is None or (size > MAX_MANIFEST_BYTES if must is None else size != must):
-            what = "is missing" if size is None else f"has {size} bytes instead of {must or MAX_MANIFEST_BYTES}"
+        what = None
+        if size is None:
+            what = "is missing"
+        elif must is None and size > MAX_MANIFEST_BYTES:
+            what = f"has {size} bytes; a manifest must have at most {MAX_MANIFEST_BYTES}"
+        elif must is not None and size != must:
+            what = f"has {size} bytes instead of {must}"
+        if what is not None:
             raise CorruptIndex(f"{self.url}/{name} {what}; {AGAIN}")
 
         def fetch(path: str) -> None:

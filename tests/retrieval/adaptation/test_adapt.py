@@ -30,19 +30,23 @@ from retrieval.errors import BadInput, CheckpointError
 from retrieval.methods import cca_towers
 from retrieval.methods.cca_towers import GRID, AffineMap, CcaSettings, fit_projections, select_settings
 from retrieval.methods.selection import Validator
+from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.model.fusion import Matcher
+from retrieval.model.posterior import ScoredTouches, fit_posterior
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.small import SmallTower
 from retrieval.model.towers.weights import initialise_tower
+from retrieval.model.verification import fit_verification, verification_sequences
 from retrieval.training.features import Features
 from retrieval.training.initial_weights import build_matcher
+from tests.verification import calibration
 
 
 @pytest.fixture
 def unchecked(monkeypatch):
     """Skip the gel check, whose 700 foreign images take most of the time."""
-    monkeypatch.setattr("retrieval.adaptation.fitting.with_verdicts", lambda made, *_, **__: made)
+    monkeypatch.setattr("retrieval.adaptation.fitting.with_gel_check", lambda made, *_, **__: made)
 
 
 def correlated_features(objects=30, grasps=6, seed=0):
@@ -214,9 +218,45 @@ def test_the_adapted_checkpoint_is_an_ordinary_checkpoint(recording, model, cata
     assert 0 <= answer.none_probability <= 1
 
 
+def test_thresholds_of_verifications_come_from_objects_outside_the_fit():
+    """A fit separates its own objects too well, so thresholds from them would accept other objects too often."""
+    touch, photo, owner = correlated_features(objects=60)
+    names = tuple(f"object-{name:02d}" for name in owner)
+    ids = tuple(str(row) for row in range(len(owner)))
+    features, objects = Features(ids, names, touch[:, None], photo), sorted(set(names))
+    choice = select_settings(features, ((12,), (10,)), [objects[::2], objects[1::2]])
+    posterior = fit_posterior(*(part.scored for part in choice.held_out_touches))
+    found = fit_verification(choice.held_out_touches, posterior)
+    assert found.group_sizes == (30, 30)
+
+    def scored(touch, photo, owner):
+        cosines = choice.projections.cosines(touch, photo)
+        own, photos = np.eye(len(owner), dtype=bool), choice.projections.photo(photo)
+        return CalibrationTouches(ScoredTouches(cosines, owner, owner, own), photos, photos)
+
+    unseen = scored(*correlated_features(objects=80, seed=1))
+    ratios = verification_sequences(unseen.scored, unseen.photo_embeddings, posterior).impostor
+    fitted = fit_verification([scored(touch, photo, owner)], posterior)
+    assert (ratios >= found.bounds(0.05).accept).mean() == pytest.approx(0.05, abs=0.015)
+    assert (ratios >= fitted.bounds(0.05).accept).mean() > 0.065
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_the_calibrations_of_a_fit_are_fitted_on_held_out_touches(recording, model, tmp_path, monkeypatch):
+    monkeypatch.setattr(Estimate, "is_baseline_better", False)
+    given = []
+    monkeypatch.setattr("retrieval.adaptation.fitting.fit_verification", lambda parts, posterior: given.extend(parts))
+    made = adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", quiet=True)
+    held_out = made.estimate.choice.held_out_touches
+    assert len(given) == len(held_out) > 1
+    scale, offset = made.checkpoint.matcher.cosine_scale.item(), made.checkpoint.matcher.head.out.bias.item()
+    for part, expected in zip(given, held_out, strict=True):
+        np.testing.assert_allclose(part.scored.logits, scale * expected.scored.logits + offset, rtol=1e-5)
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model, tmp_path, monkeypatch):
-    start = load_checkpoint(model)
+    start = dataclasses.replace(load_checkpoint(model), verification=calibration(accept=1.0, reject=-1.0))
     estimate = adapt(recording, tmp_path / "own.safetensors", start, init="none", quiet=True).estimate
     assert estimate.is_baseline_better == (
         estimate.baseline_pair_accuracy.by_object()[1].mean() >= estimate.pair_accuracy.by_object()[1].mean()
@@ -229,6 +269,8 @@ def test_a_better_baseline_is_stored_with_fitted_probabilities(recording, model,
     for name, tensor in start.matcher.state_dict().items():
         assert torch.equal(tensor, made.matcher.state_dict()[name])
     assert made.posterior != start.posterior
+    # Those of the start model are for its posterior; 12 objects are too few for new ones
+    assert made.verification is None
     assert set(made.provenance["adapted_to"]) == {"source", "data_digest"}
     other = dataclasses.replace(estimate, folds=estimate.folds)
     object.__setattr__(other.baseline.start.config.matcher, "fingers", 1)
@@ -254,7 +296,7 @@ def test_too_few_objects_give_a_checkpoint_without_probabilities(recording, mode
     split = Split(0, tuple(names[:4]), (), tuple(names[4:]))
     estimate = adapt(recording, tmp_path / "own.safetensors", load_checkpoint(model), init="none", split=split).estimate
     made = load_checkpoint(tmp_path / "own.safetensors")
-    assert (estimate, made.posterior, made.provenance["metrics"]) == (None, None, {})
+    assert (estimate, made.posterior, made.verification, made.provenance["metrics"]) == (None, None, None, {})
     assert (
         "no accuracy estimate: Leaving each object out once needs at least 6 objects, got 4." in capsys.readouterr().err
     )

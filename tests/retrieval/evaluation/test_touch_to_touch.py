@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
+import retrieval
 from retrieval.commands.main import main
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.data.images import read_rgb
-from retrieval.errors import DatasetError
+from retrieval.errors import BadInput, DatasetError
 from retrieval.evaluation.real.conditions import TowerEncoder
 from retrieval.evaluation.real.touch_to_touch import (
     Sequences,
@@ -241,12 +242,18 @@ def test_the_towers_of_other_configurations_are_rows_compared_with_the_first(rec
     ("choice", "message"),
     [
         ("tiny", "--towers must have the form NAME=CONFIG, got 'tiny'"),
-        ("frozen=tiny", "frozen is that of another row"),
+        ("frozen=tiny", "Another row is already named frozen"),
     ],
 )
 def test_a_tower_without_a_name_of_its_own_is_refused(recording, tmp_path, capsys, choice, message):
     assert benchmark(recording, tmp_path / "report", "--towers", choice) == 2
     assert message in capsys.readouterr().err
+
+
+def test_towers_without_a_protocol_that_compares_them_are_refused(tmp_path):
+    options = {"protocols": ["vt60-choices"], "towers": {"other": load_config("tiny")}}
+    with pytest.raises(BadInput, match="Only touch-to-touch protocols compare towers, got vt60-choices"):
+        retrieval.benchmark({}, tmp_path, **options)
 
 
 def test_cells_are_not_compared_since_a_part_is_pressed_at_any_place(recording, tmp_path):

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput
+from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.posterior import ScoredTouches
 from retrieval.model.reference_calibration import (
     SHARPNESS,
     ReferenceCalibration,
-    ReferenceTouches,
     fit_reference_calibration,
     reference_similarity,
-    touch_embeddings,
+    unit_embeddings,
 )
 from tests.reference_model import REFERENCE_CALIBRATION
 
@@ -40,8 +40,8 @@ def test_several_references_are_averaged_as_likelihoods():
 
 def test_embeddings_are_columns_of_partial_activations_at_norm_one():
     partials = np.float16([[9, 9, 3, 4, 7], [9, 9, 0, -2, 7]])
-    np.testing.assert_allclose(touch_embeddings(partials, slice(2, 4)), [[0.6, 0.8], [0, -1]], atol=1e-6)
-    assert touch_embeddings(partials, slice(4, 4)).shape == (2, 0)
+    np.testing.assert_allclose(unit_embeddings(partials, slice(2, 4)), [[0.6, 0.8], [0, -1]], atol=1e-6)
+    assert unit_embeddings(partials, slice(4, 4)).shape == (2, 0)
 
 
 def test_a_calibration_is_stored_and_read_again():
@@ -69,7 +69,8 @@ def reference_touches(objects=10, touches=4, noise=0.3, photos=True, seed=0):
     embeddings = (embeddings / np.linalg.norm(embeddings, axis=1, keepdims=True)).astype(np.float32)
     photo_owner = np.arange(objects if photos else 0)
     logits = rng.normal(size=(len(owner), len(photo_owner))) + (owner[:, None] == photo_owner)
-    return ReferenceTouches(ScoredTouches(logits, owner, photo_owner, np.zeros(logits.shape, bool)), embeddings)
+    scored = ScoredTouches(logits, owner, photo_owner, np.zeros(logits.shape, bool))
+    return CalibrationTouches(scored, embeddings, np.zeros((len(photo_owner), 16), np.float32))
 
 
 def test_near_touches_get_a_large_weight_and_noise_a_small_one():
@@ -93,7 +94,10 @@ def test_too_few_objects_touches_or_dimensions_give_no_calibration():
     assert fit_reference_calibration(reference_touches(objects=2)) is None
     assert fit_reference_calibration(reference_touches(touches=1)) is None
     touches = reference_touches()
-    assert fit_reference_calibration(dataclasses.replace(touches, embeddings=touches.embeddings[:, :0])) is None
+    assert (
+        fit_reference_calibration(dataclasses.replace(touches, touch_embeddings=touches.touch_embeddings[:, :0]))
+        is None
+    )
 
 
 @pytest.mark.parametrize("references", [1, 3])
@@ -101,7 +105,7 @@ def test_one_reference_and_three_are_both_calibrated(references):
     """On other objects, the mean probability of the best object equals its accuracy."""
     calibration = fit_reference_calibration(reference_touches(objects=80, touches=8, noise=0.2, photos=False))
     others = reference_touches(objects=80, touches=8, noise=0.2, photos=False, seed=1)
-    embeddings = others.embeddings.reshape(80, 8, -1)
+    embeddings = others.touch_embeddings.reshape(80, 8, -1)
     shown, queries = embeddings[:, :references].reshape(80 * references, -1), embeddings[:, 4:].reshape(320, -1)
     near = reference_similarity(queries @ shown.T, np.arange(80) * references)
     ratios = np.array([calibration.touch_only.log_ratio(row, 1) for row in near])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from retrieval.errors import BadInput
+from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.posterior import Posterior, ScoredTouches
 from retrieval.model.verification import (
     ACCEPT,
@@ -18,6 +19,7 @@ from retrieval.model.verification import (
     REJECT,
     VerificationCalibration,
     fit_verification,
+    verification_sequences,
 )
 
 POSTERIOR = Posterior(slope=1.0, offset=-2.0, dependence=0.5)
@@ -35,7 +37,9 @@ def scored_objects(objects, seed, grasps=MAX_GRASPS + 1):
     logits = of_objects[owner][:, owner] + rng.normal(size=(len(owner), len(owner))) * 1.3
     logits += 3.0 * (owner[:, None] == owner)
     embeddings = rng.normal(size=(len(owner), EMBEDDING_DIM))
-    return ScoredTouches(logits, owner, owner, np.eye(len(owner), dtype=bool)), embeddings
+    return CalibrationTouches(
+        ScoredTouches(logits, owner, owner, np.eye(len(owner), dtype=bool)), embeddings, embeddings
+    )
 
 
 def sequences(scored, seed=3):
@@ -65,11 +69,11 @@ def sequences(scored, seed=3):
 
 @pytest.fixture(scope="module")
 def fitted():
-    return fit_verification(*scored_objects(100, seed=0), POSTERIOR)
+    return fit_verification([scored_objects(100, seed=0)], POSTERIOR)
 
 
 def test_the_stated_false_accept_rate_holds_on_other_objects_whenever_the_decision_falls(fitted):
-    ratios, true = sequences(scored_objects(120, seed=1)[0])
+    ratios, true = sequences(scored_objects(120, seed=1).scored)
     bounds = fitted.bounds(0.02)
     impostor = np.ones(ratios[:, 0].shape, dtype=bool)
     impostor[np.arange(len(true)), true] = False
@@ -81,7 +85,7 @@ def test_the_stated_false_accept_rate_holds_on_other_objects_whenever_the_decisi
 
 def test_a_threshold_for_one_grasp_accepts_too_many_impostors_over_a_sequence(fitted):
     """The naive way: the quantile of single grasps, applied after each grasp."""
-    ratios, true = sequences(scored_objects(120, seed=1)[0])
+    ratios, true = sequences(scored_objects(120, seed=1).scored)
     impostor = np.ones(ratios[:, 0].shape, dtype=bool)
     impostor[np.arange(len(true)), true] = False
     naive = np.quantile(ratios[:, 0][impostor], 0.98)
@@ -96,7 +100,7 @@ def test_more_grasps_are_accepted_more_often(fitted):
 
 
 def test_a_rate_that_the_objects_cannot_support_is_refused_with_the_number_that_would():
-    small = fit_verification(*scored_objects(20, seed=2), POSTERIOR)  # 190 pairs: 0.158, rounded up
+    small = fit_verification([scored_objects(20, seed=2)], POSTERIOR)  # 190 pairs: 0.158, rounded up
     with pytest.raises(BadInput, match=r"0\.1 needs 25 validation objects; the model has 20, enough for 0\.16"):
         small.bounds(0.1)  # 30 errors need 300 pairs, which 25 objects have
     assert small.bounds(0.2).false_accepts.value == 0.2
@@ -104,7 +108,7 @@ def test_a_rate_that_the_objects_cannot_support_is_refused_with_the_number_that_
 
 @pytest.mark.parametrize("objects", [21, 40, 50, 120, 200])
 def test_the_rate_that_a_refusal_proposes_is_supported(fitted, objects):
-    calibration = dataclasses.replace(fitted, objects=objects)
+    calibration = dataclasses.replace(fitted, group_sizes=(objects,))
     with pytest.raises(BadInput) as refused:
         calibration.bounds(1e-4)
     calibration.bounds(float(re.search(r"enough for ([\d.]+)", str(refused.value))[1]))
@@ -133,17 +137,44 @@ def test_a_decision_follows_the_two_bounds(fitted, ratios, decision):
 
 
 def test_similar_impostors_are_the_objects_with_the_most_similar_photos():
-    scored, embeddings = scored_objects(40, seed=5)
+    scored = scored_objects(40, seed=5).scored
     owner = scored.photo_owner
     embeddings = np.eye(20)[owner // 2]  # objects 2 k and 2 k + 1 look alike
     scored.logits[scored.touch_owner[:, None] // 2 == owner // 2] += 3.0
-    bounds = fit_verification(scored, embeddings, POSTERIOR).bounds(0.1)
+    bounds = fit_verification([CalibrationTouches(scored, embeddings, embeddings)], POSTERIOR).bounds(0.1)
     assert bounds.similar_false_accepts.value > 3 * bounds.false_accepts.value
 
 
 def test_too_few_objects_or_grasps_give_no_calibration():
-    assert fit_verification(*scored_objects(19, seed=0), POSTERIOR) is None
-    assert fit_verification(*scored_objects(30, seed=0, grasps=MAX_GRASPS), POSTERIOR) is None
+    assert fit_verification([scored_objects(19, seed=0)], POSTERIOR) is None
+    assert fit_verification([scored_objects(30, seed=0, grasps=MAX_GRASPS)], POSTERIOR) is None
+
+
+def test_objects_of_two_groups_are_not_compared_with_each_other():
+    """Two folds of `retrieve adapt` have different maps, whose logits are not on one scale."""
+    first, second = scored_objects(50, seed=0), scored_objects(50, seed=6)
+    both = fit_verification([first, second], POSTERIOR)
+    assert (both.group_sizes, both.objects, both.pairs) == ((50, 50), 100, 2 * 50 * 49 // 2)
+    expected = [verification_sequences(part.scored, part.photo_embeddings, POSTERIOR) for part in (first, second)]
+    level = np.quantile(np.concatenate([part.impostor.ravel() for part in expected]), 0.95)
+    assert both.bounds(0.05).accept == pytest.approx(level, abs=0.02)
+    with pytest.raises(BadInput, match=r"0\.01 needs 111 validation objects; the model has 100"):
+        both.bounds(0.01)  # 3,000 pairs: two groups of 55.5 objects
+
+
+def test_groups_of_any_size_count_their_own_pairs_and_a_group_without_enough_grasps_counts_nothing():
+    parts = [scored_objects(30, seed=0), scored_objects(12, seed=6), scored_objects(9, seed=7, grasps=MAX_GRASPS)]
+    found = fit_verification(parts, POSTERIOR)
+    assert (found.group_sizes, found.pairs) == ((30, 12), 30 * 29 // 2 + 12 * 11 // 2)
+
+
+@pytest.mark.parametrize("sizes", [(7, 7, 8, 8), (1,) * 20])
+def test_objects_with_too_few_pairs_give_no_calibration_that_the_model_card_could_not_state(fitted, sizes):
+    """30 errors at a rate of 0.2 need 150 pairs; four groups of 30 objects in all have 98."""
+    parts = [scored_objects(size, seed=number) for number, size in enumerate(sizes) if size > 1]
+    assert fit_verification(parts, POSTERIOR) is None
+    with pytest.raises(BadInput, match="at least 20 objects, got groups of"):
+        dataclasses.replace(fitted, group_sizes=sizes)
 
 
 def test_the_document_of_a_calibration_gives_the_same_calibration(fitted):
@@ -154,4 +185,4 @@ def test_the_document_of_a_calibration_gives_the_same_calibration(fitted):
     with pytest.raises(BadInput, match="verification must have"):
         VerificationCalibration.from_dict({**document, "impostors": [1.0]})
     with pytest.raises(BadInput, match=r"verification.*objects"):
-        VerificationCalibration.from_dict({**document, "objects": 3})
+        VerificationCalibration.from_dict({**document, "group_sizes": [3]})

@@ -327,7 +327,7 @@ def test_exact_search_is_the_default_and_vectors_are_measured_only_for_a_time_bo
     assert measured == []
     report = build_index(catalogue_copy, checkpoint, index, max_ms=1e-9, quiet=True)
     assert (measured, report.candidates) == ([24], None)
-    assert "misses 1e-09 ms; no measured one meets all requirements" in report.reason
+    assert "is slower than 1e-09 ms. No measured setting meets all requirements." in report.reason
     assert "stores no touches to measure candidates with, so recall is that of nearest neighbours" in report.reason
     assert "hnsw" in "\n".join(build_index(catalogue_copy, checkpoint, index, kind="hnsw", quiet=True).lines())
     assert Searcher.open(index).generation.manifest.kind == "hnsw"

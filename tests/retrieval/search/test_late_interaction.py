@@ -226,8 +226,8 @@ def test_the_pooled_posterior_is_fitted_on_the_logits_of_the_matcher_without_cel
     each, count = pooled.touch_tower.feature_count, pooled.photo_feature_count
     short = {photo: features[:count] for photo, features in photos.items()}
     short_touches = touches.reshape(12, 2, -1)[..., :each].reshape(12, -1)
-    expected = verdicts.posterior_touches(pooled, grasps, short_touches, short)
-    found = verdicts.posterior_touches(matcher, grasps, touches, photos, pooled=True)
+    expected = verdicts.calibration_touches(pooled, grasps, short_touches, short)
+    found = verdicts.calibration_touches(matcher, grasps, touches, photos, pooled=True)
     np.testing.assert_allclose(found.scored.logits, expected.scored.logits, atol=1e-5)
     monkeypatch.setattr(verdicts, "recorded_features", lambda *_, **__: (touches, photos))
     monkeypatch.setattr(verdicts, "_sample_grasps", lambda some, _: some)  # keeps their order

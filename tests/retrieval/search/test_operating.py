@@ -208,15 +208,15 @@ QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.
             QUICK,
             "flat",
             100,
-            "misses a recall of 0.99; no measured one meets all requirements",
+            "does not reach a recall of 0.99. No measured setting meets all requirements",
         ),
-        (SearchRequirements(max_ms=0.1), QUICK, "hnsw", 500, "misses 0.1 ms; no measured one meets all requirements"),
+        (SearchRequirements(max_ms=0.1), QUICK, "hnsw", 500, "is slower than 0.1 ms. No measured setting meets all"),
         (
             SearchRequirements(min_recall=0.99, max_ms=1),
             QUICK,
             "hnsw",
             500,
-            "misses 1 ms; no measured one meets all requirements",
+            "is slower than 1 ms. No measured setting meets all requirements",
         ),
         (SearchRequirements("ivf_sq8"), QUICK, "ivf_sq8", 500, ""),
         (SearchRequirements("ivf_sq8"), EXACT, "ivf_sq8", 1000, ""),  # all are scored before a top-1 is lost
@@ -225,7 +225,7 @@ QUICK = {**EXACT, ("ivf_sq8", 500): (99, 0.5, 2.5), ("hnsw", 500): (100, 0.2, 2.
             QUICK,
             "flat",
             500,
-            "misses 1 ms; no measured one meets all requirements",
+            "is slower than 1 ms. No measured setting meets all requirements",
         ),
     ],
 )
@@ -233,7 +233,7 @@ def test_the_requirements_decide(requirements, points, kind, k, message):
     point = choose_by_agreement(Scripted(points), requirements)
     assert (point.kind, point.candidates["k"]) == (kind, k)
     assert message in point.reason
-    assert bool(message) == ("no measured one meets" in point.reason)
+    assert bool(message) == ("No measured setting meets" in point.reason)
 
 
 def test_an_approximate_kind_is_built_only_if_exact_search_is_not_sufficient():
@@ -253,7 +253,8 @@ def test_few_photos_are_all_scored_unless_that_may_be_too_slow():
     assert needs_measurement(5, SearchRequirements())
     assert needs_measurement(4, SearchRequirements(max_ms=5))
     assert (
-        operating_point_sentence(exhaustive_record(4, SearchRequirements())) == "The fusion head scores all 4 photos."
+        operating_point_sentence(exhaustive_record(4, SearchRequirements()), 4)
+        == "The fusion head scores all 4 photos."
     )
 
 
@@ -274,11 +275,23 @@ def test_a_measurement_is_reused_until_a_tenth_of_the_photos_changed(checkpoint,
 def test_the_sentence_of_a_point_has_its_interval():
     record = {"k": 500, "top1_agreement": 0.99, "interval": [0.9455, 0.9997], "queries": 100, "ms": 4.5}
     record |= {"exhaustive_ms": 50.0, "requirements": dataclasses.asdict(SearchRequirements()), "photos": 1000}
-    assert operating_point_sentence(record) == (
+    assert operating_point_sentence(record, 1000) == (
         "The fusion head reranks the best 500 of 1000 photos. The candidates contain the exhaustive top-1 for 99 of "
         "100 validation touches (95 % interval 0.946 to 1.000). Search and reranking take 4.5 ms, scoring all photos "
         "50 ms."
     )
+
+
+def test_the_sentence_of_a_reused_measurement_has_the_present_number_of_photos():
+    requirements = SearchRequirements()
+    record = {"k": 1000, "top1_agreement": 1.0, "interval": [0.96, 1.0], "queries": 100, "ms": 4.5, "changed": 0}
+    record |= {"exhaustive_ms": 5.0, "requirements": dataclasses.asdict(requirements), "photos": 1000}
+    fewer = carry_over(record, requirements, 950, 50)
+    assert "The fusion head scores every photo." in operating_point_sentence(fewer, 950)
+    again = carry_over(fewer, requirements, 990, 40)
+    assert "The fusion head scores every photo." in operating_point_sentence(again, 990)
+    more = carry_over(record | {"k": 500}, requirements, 1050, 50)
+    assert "reranks the best 500 of 1050 photos." in operating_point_sentence(more, 1050)
 
 
 def test_measuring_needs_touches_and_a_candidate_encoder():
@@ -321,8 +334,8 @@ def timed(monkeypatch):
         ({"flat": 3.0}, "flat", ""),
         ({"flat": 30.0, "ivf_sq8": 0.5}, "ivf_sq8", ""),
         ({"flat": 30.0, "ivf_sq8": 8.0, "hnsw": 2.0}, "hnsw", ""),
-        ({"flat": 30.0, "ivf_sq8": 8.0, "hnsw": 9.0}, "ivf_sq8", "misses 5 ms; no measured one meets all requirements"),
-        ({"flat": 30.0, "ivf_sq8": 40.0, "hnsw": 50.0}, "flat", "misses 5 ms; no measured one meets all requirements"),
+        ({"flat": 30.0, "ivf_sq8": 8.0, "hnsw": 9.0}, "ivf_sq8", "slower than 5 ms. No measured setting meets all"),
+        ({"flat": 30.0, "ivf_sq8": 40.0, "hnsw": 50.0}, "flat", "slower than 5 ms. No measured setting meets all"),
     ],
 )
 def test_the_first_kind_with_time_and_recall_is_chosen(ms, kind, message, timed):
@@ -332,7 +345,7 @@ def test_the_first_kind_with_time_and_recall_is_chosen(ms, kind, message, timed)
     assert point.kind == kind
     assert set(timed[1]) == set(ms)
     assert message in point.reason
-    assert bool(message) == ("no measured one meets" in point.reason)
+    assert bool(message) == ("No measured setting meets" in point.reason)
     found, of = map(int, point.reason.split(" finds ")[1].split(" neighbours")[0].split(" of "))
     assert of == 640
     assert found >= 0.99 * of

@@ -10,7 +10,7 @@ import pytest
 from indexes.errors import CorruptIndex
 from indexes.store.folder import IndexStore
 from retrieval.errors import BadInput
-from retrieval.model.reference_calibration import SHARPNESS, ReferenceCalibration, touch_embeddings
+from retrieval.model.reference_calibration import SHARPNESS, ReferenceCalibration, unit_embeddings
 from retrieval.report.query import query_html
 from retrieval.report.terminal import print_table
 from retrieval.search.build.build_index import build_index
@@ -60,7 +60,7 @@ def other_cosine(model, grasps):
     from retrieval.model.encode import encode_touches
 
     load = model.config.preprocessing.load_touch
-    codes = touch_embeddings(
+    codes = unit_embeddings(
         encode_touches(model.matcher, [[load(path) for path in one] for one in grasps]).partial.numpy(), EMBEDDING
     )
     return float(codes[0] @ codes[1])
@@ -78,8 +78,8 @@ def test_photos_and_references_of_an_object_combine_as_computed_by_hand(
         rows = [at for at, row in enumerate(searcher.generation.rows) if row["object_id"] == NAMES[0]]
         photos = searcher.scorer.logits(partials, searcher.generation.arrays["partials"][rows])
         mine = [at for at, row in enumerate(searcher.generation.documents["references"]["touches"]) if at < 2]
-        stored = touch_embeddings(searcher.generation.documents["touches"][mine], EMBEDDING)
-    cosines = touch_embeddings(partials, EMBEDDING) @ stored.T
+        stored = unit_embeddings(searcher.generation.documents["touches"][mine], EMBEDDING)
+    cosines = unit_embeddings(partials, EMBEDDING) @ stored.T
     near = math.log(np.exp(SHARPNESS * cosines.astype(float)).mean()) / SHARPNESS
     slope = REFERENCE_CALIBRATION.with_photos.slope
     photo_logits = math.log(np.exp(slope * (photos.astype(float) + REFERENCE_CALIBRATION.weight * near)).mean()) / slope
@@ -235,7 +235,7 @@ def test_a_model_without_reference_calibration_builds_nothing(catalogue_with_tou
     model = write_reference_model(tmp_path / "other.safetensors", references=None, **changed)
     with pytest.raises(BadInput, match=message):
         build_index(catalogue_with_touches, model, tmp_path / "index", quiet=True)
-    with pytest.raises(BadInput, match="needs a model with a calibration for them"):
+    with pytest.raises(BadInput, match="this model has no calibration of reference touches"):
         build_sharded(catalogue_with_touches, model, tmp_path / "sharded", 2, quiet=True)
     assert not (tmp_path / "index" / "CURRENT").exists()
 

@@ -74,7 +74,7 @@ def test_the_information_of_an_answer_is_shown_as_the_service_sends_it(opened, f
     text = opened.get_by_role("region", name="Another grasp").inner_text()
     assert "would add about 0.38 of the 2.5 remaining bits of uncertainty" in text
     assert "3 grasps of one object count as 1.63 independent ones" in text
-    assert "The matcher cannot suggest where to grasp" in text
+    assert "Grasp at another height than before." in text
     section = opened.get_by_role("region", name="Grasp by grasp")
     sentence = section.get_by_text("gives the most information").inner_text()
     assert "grasp 2 gives the most information: 3.1 of the 4.0 bits" in sentence

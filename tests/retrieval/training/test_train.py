@@ -671,13 +671,21 @@ def test_fingers_are_shuffled_within_a_touch_by_the_seed():
 
 
 def test_training_continues_from_the_towers_and_the_head_of_a_checkpoint(model):
-    started = build_matcher(with_training(TINY, start=str(model))).state_dict()
+    """The initial weights that the checkpoint replaces are not read, so they need not be there."""
+    started = build_matcher(with_training(TINY, start=str(model), init="missing.safetensors")).state_dict()
     assert same_weights(started, load_checkpoint(model).matcher.state_dict())
 
 
 def test_a_checkpoint_with_layers_of_another_size_cannot_start_a_training(model):
     config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, hidden=64))
     with pytest.raises(CheckpointError, match=r"head\.\S+ is .*, must be"):
+        build_matcher(with_training(config, start=str(model)))
+
+
+def test_a_checkpoint_with_other_towers_cannot_start_a_training(model):
+    """Otherwise the towers would keep random weights, if the other layers have the same sizes."""
+    config = dataclasses.replace(TINY, matcher=dataclasses.replace(TINY.matcher, tower="resnet18"))
+    with pytest.raises(CheckpointError, match=r"it has no touch_tower\.\S+; use its configuration"):
         build_matcher(with_training(config, start=str(model)))
 
 

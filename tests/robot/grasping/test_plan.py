@@ -103,7 +103,11 @@ REFUSED = {
     ),
     "a smaller stroke": ({}, {"stroke": 60.0}, "wider than the stroke"),
     "outside the workspace": ({"x_mm": 152.0}, {}, "out of the workspace"),
-    "too high for the arm": ({"height_mm": 495.0}, {}, "too high: 495 mm, and the arm rises to 500 mm"),
+    "too high for the arm": (
+        {"height_mm": 495.0},
+        {},
+        "too high: it is 495 mm high, and the fingertips rise to 500 mm, but they must rise to 10 mm above it",
+    ),
 }
 
 

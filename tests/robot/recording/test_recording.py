@@ -414,7 +414,7 @@ def test_a_writer_updates_recording_json_except_its_fixed_values(tmp_path):
 
 @pytest.mark.parametrize("grasp_id", ["", "../x", "a/b", ".hidden", "x" * 129, 5, None])
 def test_a_grasp_id_must_be_safe_in_a_file_name(tmp_path, grasp_id):
-    with RecordingWriter(tmp_path, INFO) as writer, pytest.raises(RecordingError, match="grasp_id must be"):
+    with RecordingWriter(tmp_path, INFO) as writer, pytest.raises(RecordingError, match="grasp_id must have"):
         writer.append(grasp_id, "mug", pictures())
 
 

@@ -19,6 +19,11 @@ export function nextGraspSection({ posterior, information }) {
       { class: "summary-line" },
       `${expected}: for this model, ${posterior.grasps + 1} grasps of one object count as ${effective.toFixed(2)} independent ones.`,
     ),
-    h("p", { class: "muted" }, "The matcher cannot suggest where to grasp: it compares whole photos."),
+    h(
+      "p",
+      { class: "muted" },
+      "Grasp at another height than before. The matcher cannot name a better place: " +
+        "places chosen by the photo were no better than random ones.",
+    ),
   );
 }
