@@ -99,9 +99,11 @@ def make_shipped(arguments: argparse.Namespace) -> int:
         return code
     files = {f"init_{side}": str(folder / f"{side}-tower.safetensors") for side in ("photo", "touch")}
     first = train_round(folder, 0, files)
-    last = train_round(folder, 1, {"start": str(train_head(first, 2).path), **SECOND_ROUND})
+    start = train_head(for_fingers(first, 2))
+    last = train_round(folder, 1, {"start": str(start.path), **SECOND_ROUND})
     for fingers, name in defaults.SHIPPED.items():
-        made = distilled(train_head(last, fingers), *fingers_of(last, fingers).features)
+        trained = for_fingers(last, fingers)
+        made = distilled(train_head(trained), *trained.features)
         if made.queries is not None:  # the file stays below 12 MB
             made = dataclasses.replace(made, queries=made.queries[::2])
         store(calibrated(made, folder, fingers), folder / name)
@@ -144,7 +146,6 @@ def train_towers(
     config = load_config(TOWERS)
     training = dataclasses.replace(config.training, **settings)
     labels = {name: each for part in parts for name, each in load_object_labels(part).items()}
-    folder.mkdir(exist_ok=True)
     done = folder / "towers.safetensors"
     trainer = Trainer(
         dataclasses.replace(config, training=training),
@@ -175,18 +176,18 @@ def tower_weights(folder: Path, made: Checkpoint) -> dict[str, str]:
     return files
 
 
-def train_head(trained: Round, fingers: int) -> Checkpoint:
-    """Train a head for a number of fingers."""
-    trained = fingers_of(trained, fingers)
-    settings = MethodSettings(trained.config, folder=trained.folder / f"{fingers}-fingers", quiet=False)
+def train_head(trained: Round) -> Checkpoint:
+    """Train a head on the features of a round, for its number of fingers."""
+    folder = trained.folder / f"{trained.config.matcher.fingers}-fingers"
+    settings = MethodSettings(trained.config, folder=folder, quiet=False)
     made = trained_checkpoint(settings, *trained.features)
     train, validation = trained.grasps
     about = {"source": "simulated rigs", "data_digest": data_digest([*train, *validation])}
     return dataclasses.replace(made, provenance=made.provenance | about, split=split_of(train, validation))
 
 
-def fingers_of(trained: Round, fingers: int) -> Round:
-    """Return the same for heads of one finger, whose grasps are the touches of each finger, or of two."""
+def for_fingers(trained: Round, fingers: int) -> Round:
+    """Return the round for heads of one finger, whose grasps are the touches of each finger, or of two."""
     matcher = dataclasses.replace(trained.config.matcher, fingers=fingers)
     trained = trained._replace(config=dataclasses.replace(trained.config, matcher=matcher))
     if fingers == 2:

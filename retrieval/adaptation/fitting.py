@@ -15,16 +15,14 @@ from retrieval.data.dataset import Grasp, Split, data_digest
 from retrieval.data.licences import LICENCES
 from retrieval.methods.cca_towers import GRID, MAX_CALIBRATION_TOUCHES, CcaProjections, fit_projections
 from retrieval.metrics.pairs import fit_calibration
-from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import default_device, one_thread
 from retrieval.model.fusion import Matcher
-from retrieval.model.posterior import Posterior, ScoredTouches, fit_posterior
-from retrieval.model.reference_calibration import ReferenceCalibration, fit_reference_calibration
+from retrieval.model.posterior import ScoredTouches
 from retrieval.model.verification import fit_verification
 from retrieval.training.batches import FrozenFeatures
 from retrieval.training.features import Features, features_by_image
-from retrieval.training.verdicts import with_gel_check
+from retrieval.training.verdicts import fit_calibrations, with_gel_check
 
 
 @one_thread()
@@ -125,7 +123,7 @@ def calibrate_fit(
         dataclasses.replace(part, scored=dataclasses.replace(part.scored, logits=scale * part.scored.logits + offset))
         for part in estimate.choice.held_out_touches
     ]
-    posterior, references = _fit_calibrations(left_out)
+    posterior, references = fit_calibrations(left_out)
     return dataclasses.replace(
         checkpoint,
         posterior=posterior,
@@ -149,7 +147,7 @@ def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estima
     licences = [dataclasses.asdict(licence) for licence in data.licences]
     provenance = start.provenance | {"adapted_to": about, LICENCES: licences, "metrics": estimate.to_dict()}
     touches = partial(estimate.baseline.calibration_touches, max_touches=MAX_CALIBRATION_TOUCHES)
-    posterior, references = _fit_calibrations(touches(folds))
+    posterior, references = fit_calibrations(touches(folds))
     made = dataclasses.replace(
         checkpoint,
         provenance=provenance,
@@ -159,13 +157,9 @@ def calibrate_baseline(start: Checkpoint, data: AdaptationData, estimate: Estima
         verification=fit_verification(touches([data.features.object_ids]), posterior),
     )
     if start.config.matcher.cell_dim:
-        posterior, references = _fit_calibrations(touches(folds, pooled=True))
+        posterior, references = fit_calibrations(touches(folds, pooled=True))
         made = dataclasses.replace(made, pooled_posterior=posterior, pooled_references=references)
     return made
-
-
-def _fit_calibrations(left_out: list[CalibrationTouches]) -> tuple[Posterior, ReferenceCalibration | None]:
-    return fit_posterior(*(part.scored for part in left_out)), fit_reference_calibration(*left_out)
 
 
 def _with_gel_check(checkpoint: Checkpoint, grasps: list[Grasp], features: Features, quiet: bool) -> Checkpoint:

@@ -165,7 +165,7 @@ def reliability_bins(probability: ArrayLike, outcomes: ArrayLike) -> dict[str, A
 
     Args:
         probability: (P,) predicted probabilities.
-        outcomes: (P,) 1 if what was predicted is true, 0 if not; 1/n if n answers tie and one of them is right.
+        outcomes: (P,) 1 if the prediction is true, 0 if not; 1/n if n answers tie and one of them is right.
 
     Returns:
         {"ece", "bins": [{"probability", "frequency", "count"}]}. Each prediction has the error

@@ -13,7 +13,8 @@ from retrieval.model.towers.weights import initialise_tower
 from retrieval.search.defaults import shipped_model
 from retrieval.training import distributed
 
-_TOWERS = ("touch_tower.", "photo_tower.")
+TOWER_WEIGHTS = ("touch_tower.", "photo_tower.")
+"""Prefixes of the names of the towers' weights in a matcher."""
 
 
 def build_matcher(config: Config) -> Matcher:
@@ -46,7 +47,7 @@ def _start_from(matcher: Matcher, path: Path) -> None:
         CheckpointError: The checkpoint cannot be read, has other towers, or one of its layers has another size.
     """
     ours, theirs = matcher.state_dict(), load_checkpoint(path).matcher.state_dict()
-    if missing := [name for name in ours if name.startswith(_TOWERS) and name not in theirs]:
+    if missing := [name for name in ours if name.startswith(TOWER_WEIGHTS) and name not in theirs]:
         raise CheckpointError(
             f"{path} cannot start this training: it has no {missing[0]}; use its configuration, whose towers are of "
             "the same kind, or another checkpoint"

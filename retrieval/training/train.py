@@ -54,7 +54,7 @@ from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatc
 from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import Features, features_by_image
 from retrieval.training.fit import RATE, Plan, fit
-from retrieval.training.initial_weights import build_matcher
+from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher
 from retrieval.training.labels import LabelLoss
 from retrieval.training.licences import training_licences
 from retrieval.training.state import code_digest, load_state, require_no_unfinished_state, save_state, state_path
@@ -374,7 +374,7 @@ class Trainer:
         return stored
 
 
-TOWERS = ("matcher.touch_tower.", "matcher.photo_tower.")
+TOWERS = tuple(f"matcher.{prefix}" for prefix in TOWER_WEIGHTS)
 """Prefixes of the names of the towers' weights."""
 
 

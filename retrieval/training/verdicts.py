@@ -97,13 +97,13 @@ def with_verdicts(
         matcher, source, validation, what="posterior", quiet=quiet, should_stop=should_stop
     )
     queries = calibration_touches(matcher, validation, touches, photos)
-    posterior, references = _fit_calibration(queries, seed)
+    posterior, references = fit_calibrations([queries], seed) if queries else (None, None)
     made = dataclasses.replace(made, posterior=posterior, references=references)
     if queries is not None and posterior is not None:
         made = dataclasses.replace(made, verification=fit_verification([queries], posterior, seed))
     if matcher.config.cell_dim:
         queries = calibration_touches(matcher, validation, touches, photos, pooled=True)
-        posterior, references = _fit_calibration(queries, seed)
+        posterior, references = fit_calibrations([queries], seed) if queries else (None, None)
         made = dataclasses.replace(made, pooled_posterior=posterior, pooled_references=references)
     return _with_gel_check(made, source, train, (validation, touches), foreign, quiet, should_stop)
 
@@ -154,12 +154,11 @@ def _sample_grasps(grasps: Sequence[Grasp], seed: int) -> list[Grasp]:
 # The posterior ---------------------------------------------------------------------------------------------
 
 
-def _fit_calibration(
-    queries: CalibrationTouches | None, seed: int
-) -> tuple[Posterior | None, ReferenceCalibration | None]:
-    if queries is None:
-        return None, None
-    return fit_posterior(queries.scored, seed=seed), fit_reference_calibration(queries, seed=seed)
+def fit_calibrations(
+    parts: Sequence[CalibrationTouches], seed: int = 0
+) -> tuple[Posterior, ReferenceCalibration | None]:
+    """Return the posterior and the calibration of reference touches; `parts` come from one matcher or several."""
+    return fit_posterior(*(part.scored for part in parts), seed=seed), fit_reference_calibration(*parts, seed=seed)
 
 
 def calibration_touches(

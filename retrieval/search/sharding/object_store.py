@@ -319,14 +319,9 @@ class RemoteShardedIndex:
         if file.is_file() and file_digest(file) == sha256:
             return
         size = (self._try(name, self._info) or {}).get("size")
-        what = None
-        if size is None:
-            what = "is missing"
-        elif must is None and size > MAX_MANIFEST_BYTES:
-            what = f"has {size} bytes; a manifest must have at most {MAX_MANIFEST_BYTES}"
-        elif must is not None and size != must:
-            what = f"has {size} bytes instead of {must}"
-        if what is not None:
+        if size is None or (size > MAX_MANIFEST_BYTES if must is None else size != must):
+            expected = f"at most {MAX_MANIFEST_BYTES}" if must is None else must
+            what = "is missing" if size is None else f"has {size} bytes instead of {expected}"
             raise CorruptIndex(f"{self.url}/{name} {what}; {AGAIN}")
 
         def fetch(path: str) -> None:
