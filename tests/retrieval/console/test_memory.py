@@ -1,0 +1,31 @@
+"""Freed memory in commands that compute with large tensors."""
+
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import resource
+import numpy as np
+from retrieval.console.memory import keep_freed_memory
+
+if {kept}:
+    keep_freed_memory()
+np.ones(2**25)  # 256 MB
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(4):
+    np.ones(2**25)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def page_faults(*, kept: bool) -> int:
+    """Return the page faults of four more arrays in a new process."""
+    program = PROGRAM.format(kept=kept)
+    return int(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only the GNU C library returns freed memory like this")
+def test_kept_memory_serves_the_next_large_array_without_page_faults():
+    assert page_faults(kept=True) < page_faults(kept=False) / 10
