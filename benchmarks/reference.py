@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 import indexes
 import retrieval
 import robot
-from retrieval.commands.main import app
+from retrieval.commands.main import application
 from robot.importers import IMPORTERS, data_set_of, load_importer, options_of, title_of
 
 PACKAGES = (retrieval, robot, indexes)
@@ -175,12 +175,13 @@ def _paragraph(text: str) -> str:
 
 def commands() -> str:
     """Return docs/commands.md."""
-    return COMMANDS_HEAD + "".join(_help("retrieve", typer.main.get_command(app)))
+    return COMMANDS_HEAD + "".join(_help("retrieve", typer.main.get_command(application())))
 
 
 def _help(title: str, command: Any) -> Iterator[str]:
     """Yield the help of a command and of its subcommands."""
-    result = CliRunner().invoke(app, [*title.split()[1:], "--help"], prog_name="retrieve", terminal_width=WIDTH)
+    words = [*title.split()[1:], "--help"]
+    result = CliRunner().invoke(application(), words, prog_name="retrieve", terminal_width=WIDTH)
     yield f"\n## {title}\n\n```\n{result.stdout.strip()}\n```\n"
     for name, below in getattr(command, "commands", {}).items():
         yield from _help(f"{title} {name}", below)

@@ -252,6 +252,15 @@ def test_help_imports_no_large_packages(command):
     assert "Usage: retrieve" in done.stdout
 
 
+def test_a_command_imports_no_other_command():
+    code = (
+        "import sys\nfrom retrieval.commands.main import main\nmain(['--debug', 'query', '--help'])\n"
+        "print(sorted(name for name in sys.modules if name.startswith('retrieval.commands.')))"
+    )
+    modules = ["main", "options", "query"]
+    assert run_blocked(code, ()).stdout.splitlines()[-1] == str([f"retrieval.commands.{name}" for name in modules])
+
+
 def test_the_guard_blocks_imports():
     assert "blocked: torch" in run_blocked("import torch", ("torch",)).stderr
 

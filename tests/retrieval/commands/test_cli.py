@@ -13,7 +13,7 @@ import pytest
 import typer
 
 from indexes import KINDS
-from retrieval.commands.main import app, main
+from retrieval.commands.main import application, main
 from retrieval.commands.options import Command
 from retrieval.errors import BadInput
 from retrieval.frontier import APPROXIMATIONS
@@ -220,7 +220,7 @@ def numeric_options():
             if option.type.name.split()[0] in ("int", "float"):
                 yield pytest.param(words, command, option, id=f"{' '.join(words)} {option.opts[0]}")
 
-    return list(walk(typer.main.get_command(app), []))
+    return list(walk(typer.main.get_command(application()), []))
 
 
 def required_words(command):
