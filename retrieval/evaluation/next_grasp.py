@@ -2,7 +2,7 @@
 
 After a first grasp of an object, a policy chooses each further grasp among the recorded ones:
 
-    spread       the one whose height differs most from those of the earlier grasps (`robot.SpreadPlanner`)
+    spread       the one whose place is farthest from those of the earlier grasps (by height: `robot.SpreadPlanner`)
     random       any
     repeated     the first grasp again
     upper_bound  the one after which the true object leads by the largest margin: it knows the answer
@@ -13,7 +13,7 @@ of the match logits.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,18 @@ Policy = Callable[[list[int], list[int]], int]
 """Returns the next grasp, given the earlier and the remaining ones."""
 
 
+class Replay(NamedTuple):
+    """Replayed sequences of grasps.
+
+    Attributes:
+        owner: (S,) object of each sequence.
+        ranks_first: By policy, whether this object ranks first after each grasp (S, GRASPS).
+    """
+
+    owner: Rows
+    ranks_first: dict[str, NDArray[np.bool_]]
+
+
 def score_next_grasp(
     queries: Queries, predictions: Sequence[Predictions], heights_mm: Sequence[float | None], seed: int
 ) -> dict[str, Any] | None:
@@ -56,11 +68,21 @@ def score_next_grasp(
     """
     touches = queries.of_part(queries.touch_owner, "test")
     heights = np.array([math.nan if heights_mm[row] is None else heights_mm[row] for row in touches], dtype=np.float64)
-    replayed = [replay(scored_touches(queries, scores, "test"), heights, seed) for scores in predictions]
+    replayed = [replay(scored_touches(queries, scores, "test"), heights[:, None], seed) for scores in predictions]
     if not replayed or len(np.unique(replayed[0][0])) < MIN_OBJECTS:
         return None
+    return compare_policies(replayed, queries.part_of.count("test"), seed)
+
+
+def compare_policies(replayed: Sequence[Replay], candidates: int, seed: int) -> dict[str, Any]:
+    """Return the accuracy of each policy, and its number of grasps to `ACCURACY`, with intervals over objects.
+
+    Args:
+        replayed: The same sequences with the scores of each training seed.
+        candidates: Number of objects that each sequence is compared with.
+        seed: Seed of the resamples.
+    """
     owner, policies = replayed[0]
-    candidates = queries.part_of.count("test")
     chance = np.full(GRASPS, 1 / candidates)
     measures = {
         policy: [Measure(correct[policy].astype(float), owner, chance, "test objects") for _, correct in replayed]
@@ -83,8 +105,14 @@ def score_next_grasp(
     return {"candidates": candidates, "objects": len(means["random"]), "sequences": len(owner), "policies": found}
 
 
-def replay(scored: ScoredTouches, heights_mm: Floats, seed: int) -> tuple[Rows, dict[str, NDArray[np.bool_]]]:
-    """Return the object (S,) of each sequence, and by policy whether it ranks first after each grasp (S, GRASPS)."""
+def replay(scored: ScoredTouches, places: Floats, seed: int) -> Replay:
+    """Replay sequences of grasps that start with each usable touch.
+
+    Args:
+        scored: Match logits of the touches with the photos.
+        places: (T, d) coordinates of each touch; touches with nan are not replayed.
+        seed: Seed of the random choices.
+    """
     rng = np.random.default_rng([seed, 21])
     objects = np.unique(scored.photo_owner)
     owners: list[int] = []
@@ -92,12 +120,12 @@ def replay(scored: ScoredTouches, heights_mm: Floats, seed: int) -> tuple[Rows, 
     for _ in range(CATALOGUES):
         catalogue = np.array([rng.choice(np.flatnonzero(scored.photo_owner == name)) for name in objects])
         logits = scored.logits[:, catalogue].astype(np.float64)
-        for place, name in enumerate(objects):
-            usable = (scored.touch_owner == name) & ~scored.own[:, catalogue[place]] & np.isfinite(heights_mm)
+        for column, name in enumerate(objects):
+            usable = (scored.touch_owner == name) & ~scored.own[:, catalogue[column]] & np.isfinite(places).all(1)
             rows = np.flatnonzero(usable).tolist()
             if len(rows) < GRASPS:
                 continue
-            policies = _policies(logits, place, heights_mm, rng)
+            policies = _policies(logits, column, places, rng)
             for first in rows:
                 owners.append(int(name))
                 for policy, choose in policies.items():
@@ -105,19 +133,22 @@ def replay(scored: ScoredTouches, heights_mm: Floats, seed: int) -> tuple[Rows, 
                     while len(order) < GRASPS:
                         order.append(choose(order, [row for row in rows if row not in order]))
                     ranked_first = logits[order].cumsum(axis=0).argmax(axis=1)
-                    correct.setdefault(policy, []).append(ranked_first == place)
-    return np.array(owners, dtype=np.int64), {policy: np.array(each) for policy, each in correct.items()}
+                    correct.setdefault(policy, []).append(ranked_first == column)
+    return Replay(np.array(owners, dtype=np.int64), {policy: np.array(each) for policy, each in correct.items()})
 
 
-def _policies(logits: Floats, true: int, heights_mm: Floats, rng: np.random.Generator) -> dict[str, Policy]:
+def _policies(logits: Floats, true: int, places: Floats, rng: np.random.Generator) -> dict[str, Policy]:
     """Return the policies for one object, by name."""
 
     def lead(rows: list[int]) -> float:
         total = logits[rows].sum(axis=0)
         return float(total[true] - np.delete(total, true).max())
 
+    def distance(row: int, earlier: list[int]) -> float:
+        return float(np.linalg.norm(places[earlier] - places[row], axis=1).min())
+
     return {
-        "spread": lambda earlier, left: max(left, key=lambda row: np.abs(heights_mm[earlier] - heights_mm[row]).min()),
+        "spread": lambda earlier, left: max(left, key=lambda row: distance(row, earlier)),
         "random": lambda _, left: int(rng.choice(left)),
         "repeated": lambda earlier, _: earlier[0],
         "upper_bound": lambda earlier, left: max(left, key=lambda row: lead([*earlier, row])),
