@@ -2,8 +2,8 @@
 
     python -m benchmarks.models.shipped make FOLDER --init WEIGHTS
         collect grasps on simulated rigs, photos and presses of other objects; pretrain both towers on relief, train
-        them together in two rounds on different objects, train a head for two fingers and one for one finger, calibrate
-        both, and store them in FOLDER
+        them together in three rounds, train a head for two fingers and one for one finger, calibrate both, and store
+        them in FOLDER
     python -m benchmarks.models.shipped calibrate FOLDER
         calibrate the shipped checkpoints again; keep their weights
     python -m benchmarks.models.shipped score FOLDER
@@ -46,17 +46,22 @@ RIG, TOUCH_RIG = RIGS / "shipped_rig.toml", RIGS / "shipped_touches.toml"
 ROUNDS = (
     {"shipped_training.toml": (112_000, 20, 400), "shipped_varied.toml": (122_000, 5, 120)},
     {"shipped_training.toml": (112_020, 15, 400), "shipped_varied.toml": (122_010, 1, 150)},
+    {"shipped_training.toml": (112_035, 15, 400), "shipped_varied.toml": (122_011, 1, 150)},
 )
-"""Rigs of the training grasps of each round: the first seed, the number of seeds, and the objects of each seed, which
-has its own gels."""
+"""Rigs of the training grasps that each round adds: the first seed, the number of seeds, and the objects of each seed,
+which has its own gels."""
+TRAINED_ON = ((0,), (1,), (1, 2))
+"""Rounds whose training grasps each round uses."""
 SEED_VALIDATED, SEED_VERIFIED, SEED_SCORED = 150_000, 130_000, 30_000
 """Seeds of other object sets. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0."""
 SEED_PHOTOS, SEED_TOUCHES = 60_000, 61_000
 TOWERS, PRESET = RIGS / "shipped_towers.toml", "relief-large"
 """Configurations of the training of the towers and of the heads."""
-SECOND_ROUND = {"iterations": 800, "validate_every": 800, "learning_rate": 1e-3, "tower_rate": 0.5}
-"""Settings of the towers' second round, which starts from the towers and the head of the first. Its last step is used:
-the head that is trained together with the towers does not tell which step has the best towers."""
+LATER_ROUND = {"learning_rate": 1e-3, "tower_rate": 0.5}
+LATER_STEPS = 800, 1100
+"""Settings and steps of the towers' second and third round. Each starts from the towers and the head of the round
+before. The last step is used: the head that is trained together with the towers does not tell which step has the best
+towers."""
 GRASPS, VALIDATED, VERIFIED = 2, (100, 8), (150, 5)
 """Grasps of each training object; objects that choose the step and calibrate the model, and grasps of each; objects on
 which the bounds of verifications are fitted, and grasps of each."""
@@ -98,9 +103,10 @@ def make_shipped(arguments: argparse.Namespace) -> int:
     if code:
         return code
     files = {f"init_{side}": str(folder / f"{side}-tower.safetensors") for side in ("photo", "touch")}
-    first = train_round(folder, 0, files)
-    start = train_head(for_fingers(first, 2))
-    last = train_round(folder, 1, {"start": str(start.path), **SECOND_ROUND})
+    last = train_round(folder, 0, files)
+    for number, steps in enumerate(LATER_STEPS, start=1):
+        start = {"start": str(train_head(for_fingers(last, 2)).path)}
+        last = train_round(folder, number, start | LATER_ROUND | {"iterations": steps, "validate_every": steps})
     for fingers, name in defaults.SHIPPED.items():
         trained = for_fingers(last, fingers)
         made = distilled(train_head(trained), *trained.features)
@@ -122,7 +128,9 @@ class Round(NamedTuple):
 def train_round(folder: Path, number: int, settings: Mapping[str, Any]) -> Round:
     """Train both towers on the recordings of one round; `settings` are its changes of TOWERS."""
     out = folder / f"round-{number}"
-    parts = sorted(path.parent for path in (out / "recordings").glob("*/recording.json"))
+    parts = [
+        part for each in TRAINED_ON[number] for part in sorted((folder / f"round-{each}" / "recordings").iterdir())
+    ]
     train, validation = [grasp for part in parts for grasp in load_grasps(part)], load_grasps(folder / "validation")
     config = head_config(out, train_towers(out, settings, parts, train, validation))
     features, validated = (

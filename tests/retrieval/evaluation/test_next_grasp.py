@@ -11,6 +11,8 @@ from retrieval.evaluation.queries import Queries
 from retrieval.model.posterior import ScoredTouches
 
 HEIGHTS_MM = [10.0, 11.0, 12.0, 13.0, 80.0, 14.0]
+PLACES = np.array(HEIGHTS_MM * 3)[:, None]
+"""Places of the touches of three objects."""
 
 
 def scored(objects=3, seed=0, clear=(4,)):
@@ -29,7 +31,7 @@ def scored(objects=3, seed=0, clear=(4,)):
 
 def replayed(clear=(4,), seed=0):
     found = scored(clear=clear)
-    return replay(found, np.array(HEIGHTS_MM * 3), seed)
+    return replay(found, PLACES, seed)
 
 
 def test_the_spread_policy_takes_the_grasp_at_the_most_different_height():
@@ -40,6 +42,13 @@ def test_the_spread_policy_takes_the_grasp_at_the_most_different_height():
     for policy in ("random", "repeated"):
         assert correct[policy][:, 1].sum() < far[:, 1].sum()
     assert len(owner) == len(far) == CATALOGUES * 15  # five grasps of each object; one gives the catalogue's photo
+
+
+def test_places_may_have_several_coordinates():
+    aside = np.column_stack([np.zeros(18), np.array([0.0, 0.0, 0.0, 0.0, 70.0, 0.0] * 3)])  # all at the same height
+    _, by_height = replay(scored(), aside[:, :1], 0)
+    _, by_place = replay(scored(), aside, 0)
+    assert by_place["spread"][:, 1].sum() > by_height["spread"][:, 1].sum()
 
 
 def test_the_upper_bound_takes_the_grasp_after_which_the_true_object_leads_by_most():
@@ -60,9 +69,7 @@ def test_all_policies_have_the_same_first_grasps():
 def test_a_touch_is_not_compared_with_the_photo_of_its_own_grasp():
     found = scored(clear=())
     logits = found.logits + 100.0 * found.own  # with its own photo, each touch would find its object
-    _, correct = replay(
-        ScoredTouches(logits, found.touch_owner, found.photo_owner, found.own), np.array(HEIGHTS_MM * 3), 0
-    )
+    _, correct = replay(ScoredTouches(logits, found.touch_owner, found.photo_owner, found.own), PLACES, 0)
     assert not correct["upper_bound"].any()
 
 
