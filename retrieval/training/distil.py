@@ -34,6 +34,8 @@ from retrieval.training.batches import FeatureSource, recorded_features
 from retrieval.training.features import Features
 from retrieval.training.fit import Plan, fit
 
+ROWS = 2048
+"""Grasps of `feature_partials` at a time."""
 BATCH_TOUCHES, BATCH_PHOTOS = 32, 2048
 """Numbers of touches and photos in a batch; every touch is scored with every photo."""
 LEARNING_RATE = 2e-3
@@ -254,8 +256,10 @@ def recorded_partials(
 @torch.inference_mode()
 def feature_partials(matcher: Matcher, features: Features) -> tuple[Tensor, Tensor]:
     """Return partial activations (G, P) of the touches and of the photos of features."""
-    touch, photo = torch.from_numpy(features.touch).flatten(1), torch.from_numpy(features.photo)
-    return matcher.touch_encoding(touch).partial, matcher.photo_encoding(photo).partial
+    # One part after another, because the hidden layer of the cells takes more memory than the features.
+    touch = [matcher.touch_encoding(part.flatten(1)).partial for part in torch.from_numpy(features.touch).split(ROWS)]
+    photo = [matcher.photo_encoding(part).partial for part in torch.from_numpy(features.photo).split(ROWS)]
+    return torch.cat(touch), torch.cat(photo)
 
 
 def select_queries(touch_partials: Tensor, seed: int) -> NDArray[np.float16] | None:

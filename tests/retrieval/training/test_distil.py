@@ -16,7 +16,7 @@ from retrieval.model.checkpoint import Checkpoint, load_checkpoint, read_tensors
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
 from retrieval.model.fusion import Matcher
 from retrieval.training import distil
-from retrieval.training.features import encode_recording
+from retrieval.training.features import Features, encode_recording
 from retrieval.training.initial_weights import build_matcher
 from tests.conftest import TINY
 
@@ -333,3 +333,16 @@ def test_with_a_candidate_encoder_the_best_candidate_is_late_fusions_best_photo(
         best.append(method.score(method.encode_touch(features.touch), method.encode_photo(features.photo)).argmax(1))
     assert method.best_params["reranked_fraction"] == 0.25
     np.testing.assert_array_equal(*best)
+
+
+def test_partial_activations_of_parts_are_those_of_all_features(matcher, monkeypatch):
+    rng = np.random.default_rng(0)
+    names = tuple(map(str, range(7)))
+    count = matcher.touch_tower.feature_count
+    touch, photo = (rng.normal(size=shape).astype(np.float32) for shape in ((7, 1, count), (7, count)))
+    expected = distil.feature_partials(matcher, Features(names, names, touch, photo))
+    monkeypatch.setattr(distil, "ROWS", 3)
+    for got, whole in zip(
+        distil.feature_partials(matcher, Features(names, names, touch, photo)), expected, strict=True
+    ):
+        torch.testing.assert_close(got, whole)
