@@ -1,6 +1,7 @@
 """The benchmarks run, at sizes too small for times to matter."""
 
 import json
+import math
 import sys
 import time
 from importlib.util import find_spec
@@ -135,7 +136,7 @@ def test_the_benchmark_of_a_rebuild_has_each_arm():
     (line,) = again.measure(photos=6, rounds=1)
     encoding = {"started", "first_encoding", "encoding"}
     assert set(line.figures) == {"photos", "unnoted", "verify", "nothing", "one", "looking"} | encoding
-    assert min(line.figures.values()) > 0
+    assert all(map(math.isfinite, line.figures.values()))  # differences of times may be below 0 for so few photos
 
 
 def test_every_engine_uses_the_least_width_that_finds_enough():
