@@ -257,9 +257,10 @@ def recorded_partials(
 def feature_partials(matcher: Matcher, features: Features) -> tuple[Tensor, Tensor]:
     """Return partial activations (G, P) of the touches and of the photos of features."""
     # One part after another, because the hidden layer of the cells takes more memory than the features.
-    touch = [matcher.touch_encoding(part.flatten(1)).partial for part in torch.from_numpy(features.touch).split(ROWS)]
-    photo = [matcher.photo_encoding(part).partial for part in torch.from_numpy(features.photo).split(ROWS)]
-    return torch.cat(touch), torch.cat(photo)
+    touch, photo = (torch.split(torch.from_numpy(each), ROWS) for each in (features.touch, features.photo))
+    touch_partials = [matcher.touch_encoding(part.flatten(1)).partial for part in touch]
+    photo_partials = [matcher.photo_encoding(part).partial for part in photo]
+    return torch.cat(touch_partials), torch.cat(photo_partials)
 
 
 def select_queries(touch_partials: Tensor, seed: int) -> NDArray[np.float16] | None:

@@ -10,7 +10,7 @@ import resource
 import numpy as np
 from retrieval.console.memory import keep_freed_memory
 
-if {kept}:
+if {is_enabled}:
     keep_freed_memory()
 np.ones(2**25)  # 256 MB
 before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
@@ -20,12 +20,12 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
-def page_faults(*, kept: bool) -> int:
+def page_faults(*, is_enabled: bool) -> int:
     """Return the page faults of four more arrays in a new process."""
-    program = PROGRAM.format(kept=kept)
+    program = PROGRAM.format(is_enabled=is_enabled)
     return int(subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only the GNU C library returns freed memory like this")
 def test_kept_memory_serves_the_next_large_array_without_page_faults():
-    assert page_faults(kept=True) < page_faults(kept=False) / 10
+    assert page_faults(is_enabled=True) < page_faults(is_enabled=False) / 10

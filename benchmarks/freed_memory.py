@@ -1,6 +1,6 @@
 """Training and encoding with freed memory kept in the process (`keep_freed_memory`), and returned to the system.
 
-    python -m benchmarks.kept_memory
+    python -m benchmarks.freed_memory
 
 Each repetition is a new process with two threads; the arms run in turn. The tower is that of the shipped checkpoint,
 with random images: a training step of 96 photos above the frozen stem, and the encoding of 64 photos.
