@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from retrieval.commands.main import main as run_command
+from retrieval.console.memory import keep_freed_memory
 from retrieval.data.dataset import Grasp, Split, data_digest, load_grasps
 from retrieval.data.labelled_pictures import load_object_labels
 from retrieval.methods.late_fusion import frozen_matcher, trained_checkpoint
@@ -93,6 +94,7 @@ def main(argv: list[str] | None = None) -> int:
         job.add_argument("folder", type=Path)
         job.add_argument("--jobs", type=int, default=2)
     arguments = parser.parse_args(argv)
+    keep_freed_memory()
     return {"make": make_shipped, "calibrate": calibrate_shipped, "score": score_shipped}[arguments.job](arguments)
 
 

@@ -7,7 +7,6 @@ import typer
 
 from retrieval.commands.options import SEED, SPLIT, CheckpointOut, Recording, read_split
 from retrieval.console.files import TEXT, require_ours
-from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import say
 
 
@@ -40,7 +39,6 @@ def adapt(
     from retrieval.data.check.recording import check_gel_layout
     from retrieval.search import defaults
 
-    keep_freed_memory()
     if report:
         require_ours(report / "curve.md", TEXT)
     for finding in check_gel_layout(recording):

@@ -20,7 +20,6 @@ from retrieval.commands.options import (
     training_config,
 )
 from retrieval.console.files import PAGE, RESULTS, TEXT, require_ours
-from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
 from retrieval.evaluation.real import PROTOCOLS
@@ -91,7 +90,6 @@ def real(
     from retrieval.evaluation.real.benchmark import benchmark
     from retrieval.report.real import print_verdicts, write_report
 
-    keep_freed_memory()
     for name, kind in OUTPUT_FILES.items():
         require_ours(out / name, kind)
     requested = list(dict.fromkeys(protocols.split(","))) if protocols else PROTOCOLS.names()

@@ -9,7 +9,6 @@ import typer
 from indexes import KINDS
 from retrieval.commands.options import COUNT, FRACTION, Json, Model, NumberParser, announce_resume
 from retrieval.console.files import PREVIEW, require_ours
-from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import print_json, say
 from retrieval.data.storage import is_url
 from retrieval.errors import BadInput, RetrievalError
@@ -113,7 +112,6 @@ def build_index(
     from retrieval.search.sharding import build_sharded
     from retrieval.search.sharding.object_store import RemoteShardedIndex
 
-    keep_freed_memory()
     if not is_url(out):
         require_separate_folders(catalogue, out)
     sheet = _preview_path(catalogue, out) if preview else None

@@ -23,7 +23,6 @@ from retrieval.commands.options import (
     training_config,
 )
 from retrieval.console.files import PAGE, RESULTS, TEXT, TIMINGS, require_ours
-from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import print_json, say
 from retrieval.errors import BadInput
 from retrieval.methods import METHODS
@@ -68,7 +67,6 @@ def evaluate(
     from retrieval.evaluation.evaluate import evaluate as run
     from retrieval.report.evaluation import write_report
 
-    keep_freed_memory()
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch}
     if model and (preset or any(inits.values())):
         raise BadInput("--model already defines towers and settings; give either --model or --preset and --init")

@@ -18,6 +18,7 @@ import typer
 
 from retrieval.commands.options import Command
 from retrieval.console.interruption import record_interrupts
+from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import checked_stdout, discard_stdout, prepare_streams, printable, say, show
 from retrieval.version import __version__
 
@@ -30,14 +31,16 @@ _BAD_PATH_ERRNOS = {
     *(errno.EINVAL, errno.ENAMETOOLONG, errno.ELOOP, errno.EEXIST),
 }
 
+GROUPS = ("benchmark", "rig")
 COMMANDS = (
     *("demo", "collect", "import", "export-recording", "check", "train", "adapt", "build-index", "query", "verify"),
-    *("identify", "export", "evaluate", "frontier", "serve"),
+    *("identify", "export", "evaluate", "frontier", "serve", *GROUPS),
 )
-GROUPS = ("benchmark", "rig")
+KEEP_FREED_MEMORY = {"train", "adapt", "build-index", "evaluate", "benchmark"}
+"""Commands that compute with large tensors until they end."""
 
 
-def application(names: Sequence[str] = (*COMMANDS, *GROUPS)) -> typer.Typer:
+def application(names: Sequence[str] = COMMANDS) -> typer.Typer:
     """Return the command line with the named commands and groups, which it imports."""
     app = typer.Typer(
         # Without markup, rich is not imported.
@@ -61,7 +64,7 @@ def named_commands(words: Sequence[str]) -> Sequence[str]:
     The other commands take a tenth of the time of a query to import.
     """
     first = next((word for word in words if not word.startswith("-")), None)
-    return [first] if first in (*COMMANDS, *GROUPS) else (*COMMANDS, *GROUPS)
+    return [first] if first in COMMANDS else COMMANDS
 
 
 def _print_version(is_given: bool) -> None:
@@ -87,14 +90,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: Words after the program name; None for those of `sys.argv`.
     """
+    words = list(sys.argv[1:] if argv is None else argv)
+    names = named_commands(words)
     if argv is None:  # the process ends with the command: its end need not search all objects for reference cycles
         atexit.register(gc.freeze)
+        if KEEP_FREED_MEMORY.issuperset(names):
+            keep_freed_memory()
     # A stream that the shell closed (`2>&-`) is None, and printing to None prints to stdout.
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     prepare_streams()
-    words = list(sys.argv[1:] if argv is None else argv)
-    program = typer.main.get_command(application(named_commands(words)))
+    program = typer.main.get_command(application(names))
     if os.environ.get("_RETRIEVE_COMPLETE"):  # set by a shell that completes a command
         program(prog_name="retrieve")
     context: Any = None

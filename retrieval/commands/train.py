@@ -19,7 +19,6 @@ from retrieval.commands.options import (
     refuse_options,
     training_config,
 )
-from retrieval.console.memory import keep_freed_memory
 from retrieval.console.output import say
 from retrieval.errors import BadInput
 
@@ -85,7 +84,6 @@ def train(
     ] = None,
 ) -> None:
     """Train a matcher, pretrain a tower on relief, or train a grasp-success gate for `collect`."""
-    keep_freed_memory()
     inits = {"init": init, "init_photo": init_photo, "init_touch": init_touch, "photos": photos, "touches": touches}
     inits["start"] = start
     if (cluster and task != "match") or (workers is not None and not cluster):

@@ -1,6 +1,5 @@
 """Memory in commands: when reference cycles are collected, and when freed memory returns to the system."""
 
-import ctypes
 import gc
 import sys
 from collections.abc import Iterator
@@ -28,6 +27,8 @@ def keep_freed_memory() -> None:
     """
     if sys.platform != "linux":
         return
+    import ctypes  # other commands do not need it
+
     library = ctypes.CDLL(None)
     if hasattr(library, "gnu_get_libc_version"):  # other C libraries have other options, or ignore them
         library.mallopt(_M_MMAP_MAX, 0)
