@@ -20,7 +20,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.models.recognition import all_scores
+from benchmarks.models.recognition import interval
+from benchmarks.models.verify import scored_grasps
 from retrieval.adaptation.recipe import adapt
 from retrieval.console.memory import keep_freed_memory
 from retrieval.data.dataset import Grasp, Split
@@ -30,9 +31,7 @@ from retrieval.evaluation.real.protocol import read_recording_facts
 from retrieval.evaluation.verification import GRASPS, equal_error_rate, false_rejects
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.posterior import ScoredTouches
-from retrieval.model.verification import error_rate, verification_sequences
-from retrieval.training.distil import feature_partials
-from retrieval.training.features import encode_recording
+from retrieval.model.verification import VerificationSequences, error_rate, verification_sequences
 from robot.importers.vt60 import import_vt60
 
 FITS = 6
@@ -73,14 +72,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         import_vt60(arguments.data, recording)
     facts = read_recording_facts(recording)
     folds = PROTOCOLS.load("vt60-choices").folds(facts, 0)[: arguments.fits]
-    scored = []
+    places, scored = touch_places(arguments.data), []
     for number, split in enumerate(folds):
         file = arguments.out / f"adapted-{number}.safetensors"
         if not file.exists():
             fitted = dataclasses.replace(split, train=(*split.train, *split.validation), validation=())
             adapt(recording, file, init=arguments.init, split=fitted, cache=cache)
         grasps = left_out(facts.grasps, split)
-        scored.append(score(load_checkpoint(file), grasps, facts.names, touch_places(arguments.data), cache))
+        scored.append(score(load_checkpoint(file), grasps, facts.names, places, cache))
     print("\n".join([*verification_table(scored), "", *next_grasp_table(scored)]))
     return 0
 
@@ -118,14 +117,10 @@ def score(
 
     `names`: the names of all objects. Objects are numbered by them.
     """
-    features = encode_recording(grasps, checkpoint.matcher, checkpoint.config, cache)
-    touches, photos = feature_partials(checkpoint.matcher, features)
-    own = np.zeros((len(features), len(features)), dtype=bool)
-    owner = np.array([names.index(name) for name in features.object_ids])
-    logits = all_scores(checkpoint, touches, photos)
-    embeddings = photos[:, checkpoint.config.matcher.cosine_columns].numpy().astype(np.float64)
-    where = np.array([places[name] for name in features.grasp_ids])
-    return Scored(checkpoint, ScoredTouches(logits, owner, owner, own), embeddings, where)
+    scored, embeddings = scored_grasps(checkpoint, grasps, cache)
+    owner = np.array([names.index(grasp.object_id) for grasp in grasps])
+    touches = ScoredTouches(scored.logits, owner, owner, np.zeros_like(scored.own))
+    return Scored(checkpoint, touches, embeddings, np.array([places[grasp.grasp_id] for grasp in grasps]))
 
 
 def verification_table(fits: Sequence[Scored]) -> list[str]:
@@ -133,17 +128,19 @@ def verification_table(fits: Sequence[Scored]) -> list[str]:
     header = " | ".join(f"FRR at FAR {far:g}" for far in FARS)
     lines = [f"| impostor | grasps | EER | {header} |", "|---|---|---|" + "---|" * len(FARS)]
     objects = len(np.unique(np.concatenate([fit.touches.touch_owner for fit in fits])))
+    drawn_by_grasps: dict[int, list[VerificationSequences]] = {grasps: [] for grasps in GRASPS}
+    for fit in fits:
+        posterior = fit.checkpoint.posterior
+        assert posterior is not None
+        for grasps, drawn in drawn_by_grasps.items():
+            drawn.append(verification_sequences(fit.touches, fit.embeddings, posterior, 0, grasps))
     for kind in ("random", "similar"):
-        for grasps in GRASPS:
-            drawn = []
-            for fit in fits:
-                assert fit.checkpoint.posterior is not None
-                drawn.append(verification_sequences(fit.touches, fit.embeddings, fit.checkpoint.posterior, 0, grasps))
+        for grasps, drawn in drawn_by_grasps.items():
             genuine = np.concatenate([each.genuine[-1] for each in drawn])
             impostors = np.concatenate([each.impostor.ravel() if kind == "random" else each.similar for each in drawn])
             rates = [equal_error_rate(genuine, impostors), *(false_rejects(far, genuine, impostors) for far in FARS)]
             stated = [error_rate(rate, objects) for rate in rates]
-            cells = [f"{each.value:.3f} [{each.low:.3f}, {each.high:.3f}]" for each in stated]
+            cells = [interval(each.value, each.low, each.high) for each in stated]
             lines.append(f"| {kind} | {grasps} | {' | '.join(cells)} |")
     return lines
 
@@ -161,7 +158,7 @@ def next_grasp_table(fits: Sequence[Scored]) -> list[str]:
     counts = " | ".join(f"{count} grasps" for count in range(1, 6))
     lines = [about, "", f"| next grasp | {counts} | grasps to 80 % | relative to random |", "|---|" + "---|" * 7]
     for policy, found in entry["policies"].items():
-        cells = [f"{value:.3f} [{low:.3f}, {high:.3f}]" for value, low, high in found["accuracy"]]
+        cells = [interval(*ends) for ends in found["accuracy"]]
         cells += [number(found[name]) for name in ("grasps_needed", "relative_to_random")]
         lines.append(f"| {policy} | {' | '.join(cells)} |")
     return lines

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.models.recognition import all_scores
-from retrieval.data.dataset import load_grasps
+from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.metrics.intervals import bootstrap_interval
 from retrieval.metrics.measure import object_means
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
@@ -55,12 +55,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 def sequences(checkpoint: Checkpoint, recording: Path, cache: Path | None) -> VerificationSequences:
     """Return the log likelihood ratios of sequences of grasps of a recording."""
     assert checkpoint.posterior is not None
-    features = encode_recording(load_grasps(recording), checkpoint.matcher, checkpoint.config, cache)
+    scored, embeddings = scored_grasps(checkpoint, load_grasps(recording), cache)
+    return verification_sequences(scored, embeddings, checkpoint.posterior)
+
+
+def scored_grasps(
+    checkpoint: Checkpoint, grasps: list[Grasp], cache: Path | None
+) -> tuple[ScoredTouches, NDArray[np.float64]]:
+    """Return the match logits of the touches of all grasps with the photos of all, and the photos' embeddings."""
+    features = encode_recording(grasps, checkpoint.matcher, checkpoint.config, cache)
     touches, photos = feature_partials(checkpoint.matcher, features)
     owner, own = features.owner, np.eye(len(features), dtype=bool)
     scored = ScoredTouches(all_scores(checkpoint, touches, photos), owner, owner, own)
-    columns = checkpoint.config.matcher.cosine_columns
-    return verification_sequences(scored, photos[:, columns].numpy().astype(np.float64), checkpoint.posterior)
+    return scored, photos[:, checkpoint.config.matcher.cosine_columns].numpy().astype(np.float64)
 
 
 def rate_table(calibration: VerificationCalibration, found: VerificationSequences) -> list[str]:
