@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -105,3 +105,12 @@ def as_text(ratio: tuple[float, float, float]) -> str:
 def duration(seconds: float) -> str:
     """Return seconds or milliseconds with three digits as text."""
     return f"{seconds:.3g} s" if seconds >= 1 else f"{1e3 * seconds:.3g} ms"
+
+
+def spread(figures: Sequence[float], unit: str) -> str:
+    """Return median, minimum and maximum as text."""
+    if not figures:
+        return ""
+    values = (float(np.median(figures)), min(figures), max(figures))
+    median, least, greatest = (f"{value:,.0f}" if value >= 100 else f"{value:.3g}" for value in values)
+    return f"{median} ({least} to {greatest}) {unit}"

@@ -11,7 +11,7 @@ import json
 import subprocess
 import sys
 
-from benchmarks.common import REPETITIONS, Times, as_text, duration
+from benchmarks.common import REPETITIONS, Times, as_text, spread
 
 PROGRAM = """
 import json, sys, time
@@ -56,12 +56,9 @@ def main() -> int:
     runs = [{arm: run(arm) for arm in ("returned", "kept")} for _ in range(repetitions)]
     for work in runs[0]["kept"]:
         times = Times({arm: [each[arm][work] for each in runs] for arm in ("returned", "kept")})
-        spread = {
-            arm: f"{duration(times.median(arm))} ({duration(min(each))} to {duration(max(each))})"
-            for arm, each in times.seconds.items()
-        }
+        returned, kept = (spread([1e3 * each for each in times.seconds[arm]], "ms") for arm in ("returned", "kept"))
         ratio = as_text(times.ratio("returned", "kept"))
-        print(f"{work}: {spread['returned']} with memory returned, {spread['kept']} with memory kept: {ratio} faster")
+        print(f"{work}: {returned} with memory returned, {kept} with memory kept: {ratio} faster")
     return 0
 
 

@@ -12,13 +12,13 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from benchmarks import again, build, cold, peers, rerank, simulation, step
-from benchmarks.common import config_of
+from benchmarks.common import config_of, spread
 
 PHOTOS = 100_000
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -47,15 +47,6 @@ class TableRow:
         ratio = f"{np.median(self.ours) / np.median(self.theirs):.2f}" if self.theirs else ""
         cells = (self.what, spread(self.ours, self.unit), self.against, spread(self.theirs, self.unit), ratio)
         return f"| {' | '.join(cells)} |"
-
-
-def spread(figures: Sequence[float], unit: str) -> str:
-    """Return median, minimum and maximum as text."""
-    if not figures:
-        return ""
-    values = (float(np.median(figures)), min(figures), max(figures))
-    median, least, greatest = (f"{value:,.0f}" if value >= 100 else f"{value:.3g}" for value in values)
-    return f"{median} ({least} to {greatest}) {unit}"
 
 
 def building() -> Iterator[TableRow]:
