@@ -56,9 +56,8 @@ def main() -> int:
     runs = [{arm: run(arm) for arm in ("returned", "kept")} for _ in range(repetitions)]
     for work in runs[0]["kept"]:
         times = Times({arm: [each[arm][work] for each in runs] for arm in ("returned", "kept")})
-        returned, kept = (spread([1e3 * each for each in times.seconds[arm]], "ms") for arm in ("returned", "kept"))
-        ratio = as_text(times.ratio("returned", "kept"))
-        print(f"{work}: {returned} with memory returned, {kept} with memory kept: {ratio} faster")
+        each = [f"{spread([1e3 * one for one in some], 'ms')} with memory {arm}" for arm, some in times.seconds.items()]
+        print(f"{work}: {', '.join(each)}: {as_text(times.ratio('returned', 'kept'))} faster")
     return 0
 
 
