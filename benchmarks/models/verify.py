@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.models.recognition import all_scores
+from benchmarks.models.recognition import all_scores, interval
 from retrieval.data.dataset import Grasp, load_grasps
 from retrieval.metrics.intervals import bootstrap_interval
 from retrieval.metrics.measure import object_means
@@ -86,7 +86,7 @@ def rate_table(calibration: VerificationCalibration, found: VerificationSequence
         rejected = np.array([decision != "accept" for decision in outcomes])
         within = [found.genuine[count] >= bounds.accept for count in range(MAX_GRASPS)]
         cells = [cell(values, found.owner) for values in (random, similar)]
-        cells += [f"{stated.value:.3f} [{stated.low:.3f}, {stated.high:.3f}]", cell(rejected, found.owner)]
+        cells += [interval(stated.value, stated.low, stated.high), cell(rejected, found.owner)]
         lines.append(f"| {far:g} | " + " | ".join(cells + [cell(values, found.owner) for values in within]) + " |")
     return lines
 
@@ -127,7 +127,7 @@ def cell(values: NDArray[np.generic], owner: NDArray[np.int64]) -> str:
     """Return the mean over objects of values (S,) of sequences, with its interval."""
     means = object_means(values.astype(np.float64)[:, None], owner)[1]
     low, high = bootstrap_interval(means)
-    return f"{means.mean():.3f} [{max(low[0], 0):.3f}, {high[0]:.3f}]"
+    return interval(means.mean(), max(low[0], 0), high[0])
 
 
 if __name__ == "__main__":

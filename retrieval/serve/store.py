@@ -143,9 +143,8 @@ class HistoryStore:
             )
         found = execute("PRAGMA application_id").fetchone()[0], execute("PRAGMA user_version").fetchone()[0]
         if found != (_APPLICATION, _VERSION):
-            raise sqlite3.DatabaseError(
-                f"it belongs to another program, or its version is {found[1]} instead of {_VERSION}"
-            )
+            whose = "another program" if found[0] != _APPLICATION else f"version {found[1]}, not {_VERSION}"
+            raise sqlite3.DatabaseError(f"it is a database of {whose}")
 
     def close(self) -> None:
         """Write the log into the file, and close the file."""

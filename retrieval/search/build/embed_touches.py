@@ -196,8 +196,8 @@ def _require_fit(checkpoint: Checkpoint) -> None:
     if not checkpoint.config.matcher.cosine or checkpoint.posterior is None:
         raise BadInput(
             "the catalogue has touches (touch_* files next to photos), but this model cannot compare touches: its "
-            "match logit has no cosine term, or it is not calibrated. Use a shipped model or one of `retrieve adapt`, "
-            "or rename the files"
+            "match logit has no cosine term, or it is not calibrated. Use a shipped model, or one of `retrieve adapt` "
+            "or `retrieve train` (preset relief, with validation objects), or rename the files"
         )
     if checkpoint.config.preprocessing.background != "none":
         raise BadInput(

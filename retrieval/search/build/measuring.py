@@ -226,7 +226,10 @@ def query_codes(checkpoint: Checkpoint, count: int | None = None) -> tuple[torch
         BadInput: The checkpoint stores no touches or has no candidate encoder (`can_measure`).
     """
     if checkpoint.queries is None or checkpoint.matcher.candidate_encoder is None:
-        raise BadInput(f"{checkpoint.path} must have touches to measure with and a candidate encoder; train it again")
+        raise BadInput(
+            f"{checkpoint.path} must have touches to measure with and a candidate encoder; train it again with "
+            "`retrieve train` (a preset with candidate_width above 0)"
+        )
     partials, candidate_encoder = (
         torch.from_numpy(checkpoint.queries[:count].astype(np.float32)),
         checkpoint.matcher.candidate_encoder,

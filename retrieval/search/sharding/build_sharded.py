@@ -176,7 +176,8 @@ def build_sharded(
         if catalogue.touches and checkpoint.references is None:
             raise BadInput(
                 "this model has no calibration of reference touches. A sharded index needs one in the model, because "
-                "each shard would otherwise fit its own. Use a shipped model or one of `retrieve adapt`"
+                "each shard would otherwise fit its own. Use a shipped model, or one of `retrieve adapt` or `retrieve "
+                "train` with enough validation objects"
             )
         _delete_old_shards(own, before, shards)
         old_generations = {} if stored is None else stored.generations()
