@@ -2,7 +2,7 @@
 
     python -m benchmarks.models.shipped make FOLDER --init WEIGHTS
         collect grasps on simulated rigs, photos and presses of other objects; pretrain both towers on relief, train
-        them together in four rounds, train a head for two fingers and one for one finger, calibrate both, and store
+        them together in three rounds, train a head for two fingers and one for one finger, calibrate both, and store
         them in FOLDER
     python -m benchmarks.models.shipped calibrate FOLDER
         calibrate the shipped checkpoints again; keep their weights
@@ -48,11 +48,10 @@ ROUNDS = (
     {"shipped_training.toml": (112_000, 20, 400), "shipped_varied.toml": (122_000, 5, 120)},
     {"shipped_training.toml": (112_020, 15, 400), "shipped_varied.toml": (122_010, 1, 150)},
     {"shipped_training.toml": (112_035, 15, 400), "shipped_varied.toml": (122_011, 1, 150)},
-    {"shipped_training.toml": (112_050, 15, 400)},
 )
 """Rigs of the training grasps that each round adds: the first seed, the number of seeds, and the objects of each seed,
 which has its own gels."""
-TRAINED_ON = ((0,), (1,), (1, 2), (2, 3))
+TRAINED_ON = ((0,), (1,), (1, 2))
 """Rounds whose training grasps each round uses."""
 SEED_VALIDATED, SEED_VERIFIED, SEED_SCORED = 150_000, 130_000, 30_000
 """Seeds of other object sets. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0."""
@@ -60,7 +59,7 @@ SEED_PHOTOS, SEED_TOUCHES = 60_000, 61_000
 TOWERS, PRESET = RIGS / "shipped_towers.toml", "relief-large"
 """Configurations of the training of the towers and of the heads."""
 LATER_ROUND = {"learning_rate": 1e-3, "tower_rate": 0.5}
-LATER_STEPS = 800, 1100, 1000
+LATER_STEPS = 800, 1100
 """Settings and steps of the towers' later rounds. Each starts from the towers and the head of the round
 before. The last step is used: the head that is trained together with the towers does not tell which step has the best
 towers."""
