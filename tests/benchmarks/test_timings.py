@@ -29,6 +29,7 @@ from benchmarks import (
     step,
     table,
     training,
+    versions,
 )
 from retrieval.model.encode import has_fast_bfloat16
 from tests.conftest import TINY
@@ -158,6 +159,18 @@ def test_the_parts_of_a_simulated_grasp_are_compared_with_another_checkout():
     assert set(made["ours"]) == set(made["before"]) >= {"photo of 256 px", "two contacts", "attempt with its files"}
     texts = [simulation.line(part, ours, made["before"][part]) for part, ours in made["ours"].items()]
     assert all(" ms, " in each and " times (" in each for each in texts)
+
+
+@pytest.mark.slow
+def test_two_versions_are_compared_by_what_a_user_waits_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(versions, "PHOTOS", 3)
+    monkeypatch.setattr(versions, "OBJECTS", 2)
+    compared = {name: versions.Version(versions.ROOT, tmp_path / name) for name in ("before", "now")}
+    lines = [line.split(" | ") for line in versions.lines(compared, tmp_path, repetitions=1)]
+    assert len(lines) == 7
+    assert all(before.endswith(" ms") and now.endswith(" ms") for _, before, now, _ in lines)
+    assert (tmp_path / "now" / "build 0" / "CURRENT").exists()
+    assert (tmp_path / "before" / "two 0" / "recording.json").exists()
 
 
 def test_the_slope_of_a_growth_is_its_power():
