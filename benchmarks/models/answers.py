@@ -30,6 +30,7 @@ from retrieval.search.query.searcher import Searcher
 from retrieval.search.query.shard import ShardQuery
 
 OBJECTS = 30
+FALSE_ACCEPTS = 0.05
 BINS = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.0)
 
 
@@ -42,12 +43,14 @@ class Answer:
         match: whether the verdict is "match".
         if_present: P(first object | present).
         more: the number of further grasps that the answer recommends, or None.
+        odds: P(first object) / P(none of these).
     """
 
     right: bool
     match: bool
     if_present: float
     more: int | None
+    odds: float
 
     @property
     def advice(self):
@@ -142,13 +145,17 @@ def answer(posterior, grasps_and_logits, catalogue, name):
         float(probabilities.objects_if_present[best]),
     )
     more = None if match or not is_clear(if_present) else posterior.more_grasps(own[best], len(own), grasps)
-    return Answer(catalogue[best] == name, match, if_present, more)
+    odds = float(probabilities.objects[best] / probabilities.none)
+    return Answer(catalogue[best] == name, match, if_present, more, odds)
 
 
 def verdicts(series):
     """Yield table rows by the number of grasps."""
-    yield "| grasps | R@1 | match, right | match, wrong | none, ranking right | none, ranking wrong | absent: match |"
-    yield "|---|---|---|---|---|---|---|"
+    yield (
+        "| grasps | R@1 | match, right | match, wrong | none, ranking right | none, ranking wrong | absent: match "
+        f"| none at {FALSE_ACCEPTS:.0%} false accepts |"
+    )
+    yield "|---|---|---|---|---|---|---|---|"
     for grasps in range(1, len(series[0].answers) + 1, 2):
         present, absent = split(series, grasps)
         cells = [
@@ -158,6 +165,7 @@ def verdicts(series):
             fraction(present, lambda one: not one.match and one.right),
             fraction(present, lambda one: not one.match and not one.right),
             fraction(absent, lambda one: one.match),
+            called_absent(present, absent),
         ]
         yield f"| {grasps} | " + " | ".join(cells) + " |"
 
@@ -175,6 +183,18 @@ def fraction(pairs, holds):
     owners = np.unique([owner for owner, _ in pairs], return_inverse=True)[1]
     values = np.array([holds(one) for _, one in pairs], dtype=float)
     value, low, high = interval(lambda rows: float(values[rows].mean()), np.arange(len(values)), list(redrawn(owners)))
+    return f"{value:.3f} [{low:.3f}, {high:.3f}]"
+
+
+def called_absent(present, absent):
+    """Return the fraction of present objects that are not accepted if `FALSE_ACCEPTS` of the absent ones are."""
+    owners = np.unique([owner for owner, _ in present], return_inverse=True)[1]
+    there, not_there = (np.array([one.odds for _, one in pairs]) for pairs in (present, absent))
+
+    def rate(rows):
+        return float(np.mean(there[rows] <= np.quantile(not_there[rows], 1 - FALSE_ACCEPTS)))
+
+    value, low, high = interval(rate, np.arange(len(there)), list(redrawn(owners)))
     return f"{value:.3f} [{low:.3f}, {high:.3f}]"
 
 
