@@ -6,8 +6,8 @@ once, and answered when the slowest shard has answered. A shard has replicas, ea
 arrival, and takes the less loaded of two random ones, as Ray Serve does. Its time is log-normal, with the measured
 median and 99th percentile, and grows with its photos like the measured times.
 
-The tables show storage, memory and hours of embedding (of one core); then p50 and p99 of answers by number of shards,
-with one slow shard (three times slower), and with one replica lost.
+The tables show storage, memory and hours of embedding with the shipped checkpoint; then p50 and p99 of answers by
+number of shards, with one slow shard (three times slower), and with one replica lost.
 """
 
 import argparse
@@ -21,14 +21,15 @@ from typing import Any
 
 import numpy as np
 
-ENCODE_S = 0.050
-"""Encoding of one touch, by one core."""
+from retrieval.model.checkpoint_info import read_checkpoint_info
+from retrieval.search.defaults import shipped_model
+
+ENCODE_S = 0.008
+"""Decoding and encoding of one touch, by one core (benchmarks.versions: a query on an open index)."""
 HOP_S = 0.004
 """Transfer to a shard and back."""
-EMBED_PER_S = 20.0
-"""Photos per second, by one core, with the shipped model."""
-CODES = 64 * 4 + 256 * 2
-"""Bytes of a photo's embedding and partial activation, which a search reads."""
+EMBED_PER_S = 90.0
+"""Photos per second, by one core, with the shipped model (benchmarks.versions: half of the rate of two cores)."""
 PLANS = {1e6: (1, 8), 1e7: (1, 10, 40), 1e8: (20, 100), 1e9: (100, 1000)}
 """Photos -> numbers of shards."""
 REQUESTS, SLOWER = 4000, 3.0
@@ -117,14 +118,14 @@ def _ended(arrivals: np.ndarray, times: np.ndarray, servers: int, rng: np.random
 def tables(measured: Sequence[Mapping[str, Any]], rate: float) -> Iterator[str]:
     """Yield the lines of the Markdown tables."""
     disk, shard = measured[-1]["bytes_per_photo"], measured[-1]["photos"]
-    yield "| photos | on disk | codes, in memory | embedding, one core | with 100 cores |"
-    yield "|---|---|---|---|---|"
+    each = photo_bytes()
+    yield "| photos | disk, no cells | disk | memory, `flat` | memory, `ivf_sq8` | embedding, 1 core | 100 cores |"
+    yield "|---|---|---|---|---|---|---|"
     for photos in PLANS:
         hours = photos / EMBED_PER_S / 3600
-        yield (
-            f"| {photos:.0e} | {_bytes(disk * photos)} | {_bytes(CODES * photos)} | {hours:,.0f} h | "
-            f"{hours / 100:,.1f} h |"
-        )
+        sizes = disk, disk + each["cells"], each["embedding"], each["list entry"]
+        cells = " | ".join(_bytes(size * photos) for size in sizes)
+        yield f"| {photos:.0e} | {cells} | {hours:,.0f} h | {hours / 100:,.1f} h |"
     yield ""
     yield (
         f"| photos | shards of | shard's own time | replicas for {rate:g}/s | p50 | p99 | p99, one shard {SLOWER:g} x "
@@ -145,6 +146,16 @@ def tables(measured: Sequence[Mapping[str, Any]], rate: float) -> Iterator[str]:
             )
     yield ""
     yield f"Measured at shards of up to {shard:,.0f} photos; larger shards are extrapolated."
+
+
+def photo_bytes() -> dict[str, int]:
+    """Return the bytes of a photo with the shipped checkpoint: embedding, entry of an `ivf_sq8` list, and cells."""
+    sizes = read_checkpoint_info(shipped_model()).config.matcher
+    return {
+        "embedding": 4 * sizes.embedding_dim,  # float32
+        "list entry": sizes.embedding_dim + 8,  # one byte of each component, and the row
+        "cells": sizes.photo_cells**2 * sizes.cell_dim,  # int8
+    }
 
 
 def _bytes(count: float) -> str:
