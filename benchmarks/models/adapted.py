@@ -5,7 +5,7 @@
 Half of the instances of each class are left out, in the six ways of choosing two instance numbers of four. `retrieve
 adapt` fits a checkpoint to the others. Then sequences of grasps of each left-out object are verified against each
 left-out object, and the next grasp is replayed with a catalogue of all left-out objects. The thresholds of the first
-table come from these sequences themselves: 18 fitted objects are too few for bounds in the checkpoint. Intervals of
+table come from these sequences themselves: 22 fitted objects are too few for bounds in the checkpoint. Intervals of
 error rates count each object as one trial, the others resample the objects. A stopped run continues.
 """
 
