@@ -8,8 +8,9 @@ import pytest
 
 def touch_data(relative: str) -> Path:
     """Return a file or folder of the real data, or skip the test if it is missing."""
-    root = Path(os.environ.get("TOUCH_DATA", Path(__file__).parents[1] / ".." / "shared" / "data"))
-    path = root / relative
+    if not (root := os.environ.get("TOUCH_DATA")):
+        pytest.skip("real data are missing: the variable TOUCH_DATA is not set")
+    path = Path(root) / relative
     if not path.exists():
-        pytest.skip(f"real data are missing: no {relative} under TOUCH_DATA")
+        pytest.skip(f"real data are missing: {path} does not exist")
     return path

@@ -60,8 +60,8 @@ def main(argv: list[str] | None = None) -> int:
     folder, checkpoint = arguments.folder, load_checkpoint(arguments.model)
     if checkpoint.posterior is None or checkpoint.gel_check is None:
         parser.error(f"{arguments.model} has no posterior or no check of touches; train it again")
-    options = argparse.Namespace(objects=TOUCHED, grasps=GRASPS, jobs=arguments.jobs)
-    if code := shipped.collect(folder / "recording", options, shipped.SEED_SCORED):
+    size = (TOUCHED, GRASPS, shipped.SEED_SCORED, arguments.jobs)
+    if code := shipped.collect(folder / "recording", shipped.RIG, *size):
         return code
     photograph(folder / "photographed")
     catalogues, curves = evaluate_catalogues(checkpoint, folder)
@@ -280,7 +280,7 @@ def inputs(made: Checkpoint, folder: Path, jobs: int) -> Iterator[tuple[str, str
         yield name, NOT_A_GEL, [alike(picture) for picture in pictures]
     yield "photos, whole", NOT_A_GEL, [alike(photo) for photo in photos]
     yield f"another sensor: simulated {OTHER_OPTICS} gels", NOT_A_GEL, other_optics(folder, jobs, files)
-    data = Path(os.environ.get("TOUCH_DATA", Path(__file__).parents[2] / ".." / "shared" / "data"))
+    data = Path(os.environ.get("TOUCH_DATA", "data"))
     for name, pattern, step in (
         ("another sensor: real optical finger (VT60)", "vt60/touch/*/*/*.jpg", 50),
         ("another sensor: real GelSight Mini (billets)", "billets/*/*_touch.png", 1),
