@@ -47,7 +47,7 @@ from robot.sim.objects.draw import draw_object
 TOUCHED, PHOTOGRAPHED, GRASPS = 120, 1000, 8
 SIZES, SET_SIZES, SETS = (20, 100, 1000), (1, 2, 3, 5), 4
 INPUTS, DRAWS = 1000, 1000
-OTHER_OPTICS = "gelsight"
+OTHER_OPTICS, OTHER_OBJECTS = "gelsight", 50
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -297,7 +297,9 @@ def other_optics(folder: Path, jobs: int, files: Callable[[Sequence[Path]], Read
     rig.write_text(f'rig = "sim"\noptics = "{OTHER_OPTICS}"\n', "utf-8")
     recording = folder / "other_optics"
     make = partial(load_rig, str(rig), seed=shipped.SEED_SCORED)
-    collect(make, recording, objects=50, seed=shipped.SEED_SCORED, settings=CollectSettings(grasps=2), jobs=jobs)
+    collect(
+        make, recording, objects=OTHER_OBJECTS, seed=shipped.SEED_SCORED, settings=CollectSettings(grasps=2), jobs=jobs
+    )
     return [files(grasp.touches) for grasp in load_grasps(recording)]
 
 
