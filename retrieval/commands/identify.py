@@ -105,8 +105,13 @@ def identify(
                 is_enough=run.is_enough,
             )
         if run.answer is None:
+            from robot.recording.attempt_log import read_attempts
+            from robot.recording.folder import read_recording
+
+            last = read_attempts(out, {grasp.grasp_id for grasp in read_recording(out).grasps})[-1]
             raise RetrievalError(
-                f"no grasp of {tally.object_id} was accepted; see the attempts in {out}/attempts.jsonl"
+                f"no grasp of {tally.object_id} was accepted; the last attempt: {last.reason or last.outcome} (all "
+                f"attempts are in {out}/attempts.jsonl)"
             )
         if len(attempts) == 1:  # no new attempt: the hand may hold another object now
             raise BadInput(f"{out} holds a finished run: {run.sentence}. Give another --out for the next object")

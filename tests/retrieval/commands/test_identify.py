@@ -83,6 +83,15 @@ def test_a_finished_run_is_refused_since_the_hand_may_hold_another_object(identi
     assert {path: path.read_bytes() for path in (tmp_path / "run").rglob("*") if path.is_file()} == before
 
 
+def test_without_an_accepted_grasp_the_error_states_why_the_last_attempt_failed(index, tmp_path, capsys):
+    rig = tmp_path / "high.toml"
+    rig.write_text('rig = "sim"\n[grasp]\nfloor_mm = 500\n')
+    assert main(["identify", "--rig", str(rig), "--index", str(index), "--out", str(tmp_path / "run")]) == 1
+    error = capsys.readouterr().err
+    assert "was accepted; the last attempt: the object is " in error
+    assert "but the lowest height of the fingers is 500 mm (all attempts are in " in error
+
+
 def test_an_image_that_is_no_gel_image_ends_the_run_since_no_further_grasp_changes_it(identify, monkeypatch):
     monkeypatch.setattr(answer, "gel_classes", lambda check, codes: np.full(len(codes.partials), "not a gel image"))
     monkeypatch.setattr(searcher, "gel_classes", answer.gel_classes)
