@@ -1,6 +1,6 @@
 """Foreign pictures (not gel images), for training the gel check.
 
-Synthetic pictures (plain, noise, clouds, ramps, stripes), pieces of photos, and gel images in false colours.
+Synthetic pictures (plain, noise, clouds, ramps, stripes), photos, pieces of photos, and gel images in false colours.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,7 +22,7 @@ def draw_foreign(
     Args:
         count: Number of pictures.
         px: Side in pixels.
-        photos: Photos (H, W, 3) to cut pieces from; may be empty.
+        photos: Photos (H, W, 3) to resize, and to cut pieces from; may be empty.
         gels: Gel images (H, W, 3) to recolour; may be empty.
         seed: The same seed gives the same pictures.
 
@@ -33,7 +33,8 @@ def draw_foreign(
         raise BadInput(f"count must be at least 1 and px at least 8; got {count} and {px}")
     kinds: dict[str, _Draw] = dict(SYNTHETIC_KINDS)
     if len(photos):
-        kinds["photo"] = lambda rng, px: _piece(photos[int(rng.integers(len(photos)))], rng, px)
+        kinds["photo"] = lambda rng, px: _whole(photos[int(rng.integers(len(photos)))], rng, px)
+        kinds["piece of a photo"] = lambda rng, px: _piece(photos[int(rng.integers(len(photos)))], rng, px)
     if len(gels):
         kinds["false colours"] = lambda rng, px: _false_colours(gels[int(rng.integers(len(gels)))], rng, px)
     names = list(kinds)
@@ -86,6 +87,11 @@ SYNTHETIC_KINDS: dict[str, _Draw] = {
     "ramp": _ramp,
     "stripes": _stripes,
 }
+
+
+def _whole(photo: RgbImage, rng: np.random.Generator, px: int) -> np.ndarray:
+    """Resize the photo like a gel image, and make it lighter or darker."""
+    return rng.uniform(0.5, 1.4) * _resized(photo, px, cv2.INTER_AREA)
 
 
 def _piece(photo: RgbImage, rng: np.random.Generator, px: int) -> np.ndarray:

@@ -21,6 +21,7 @@ from torch import Tensor
 from retrieval.data.dataset import Grasp
 from retrieval.data.images import read_rgb
 from retrieval.data.preprocessing import Preprocessing
+from retrieval.data.resize import RgbImage, resize
 from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.encode import Image, touch_features
@@ -54,7 +55,8 @@ LOW_CONTACT_RATE = 0.02
 PENALTY = 0.02
 """Penalty on the squared weights of the check's linear layer, for features of unit variance. The penalty is smaller if
 there are more foreign pictures."""
-_MAX_PIECES = 100
+_MAX_PHOTOS, _PHOTO_PX = 400, 256
+"""Largest number of photos, and of gel images, for foreign pictures; shorter side of these photos in pixels."""
 
 StopRequested = Callable[[], bool]
 Readings = NDArray[np.float32]
@@ -232,10 +234,10 @@ class GelCheckFeatures:
         """
         fingers = matcher.config.fingers
         frames = list(_no_contact_images(settings, grasps, fingers))
-        sample = [
-            grasps[row] for row in np.linspace(0, len(grasps) - 1, min(_MAX_PIECES, len(grasps))).round().astype(int)
-        ]
-        photos = [settings.load_photo(grasp.photo) for grasp in sample]
+        rows = np.linspace(0, len(grasps) - 1, min(_MAX_PHOTOS, len(grasps))).round().astype(int)
+        sample = [grasps[row] for row in rows]
+        # Whole photos, not the model's views of them: a photo given instead of a gel image is mostly background.
+        photos = [_small_photo(grasp.photo) for grasp in sample]
         gels = [settings.load_touch(grasp.touches[0], *grasp.backgrounds[:1]) for grasp in sample]
         names, drawn = zip(*draw_foreign(count, settings.touch_px, photos, gels, seed), strict=True)
         pooled = matcher.touch_tower.feature_count
@@ -251,6 +253,13 @@ class GelCheckFeatures:
             of_fingers(touch_features(matcher, [[picture] * fingers for picture in drawn]))[:, 0],
             np.array([name != "false colours" for name in names]),
         )
+
+
+def _small_photo(path: Path) -> RgbImage:
+    photo = read_rgb(path)
+    scale = min(1.0, _PHOTO_PX / min(photo.shape[:2]))
+    height, width = (max(1, round(scale * side)) for side in photo.shape[:2])
+    return resize(photo, (height, width))
 
 
 def _no_contact_images(settings: Preprocessing, grasps: Sequence[Grasp], fingers: int) -> Iterator[list[Image]]:

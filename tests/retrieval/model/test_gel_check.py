@@ -103,16 +103,25 @@ def test_any_other_content_of_the_file_is_refused_with_one_sentence(data):
 
 def test_every_kind_takes_its_turn_and_a_seed_draws_the_same_pictures_again():
     photo, gel = np.full((40, 60, 3), 0.4, dtype=np.float32), np.full((30, 40, 3), 0.6, dtype=np.float32)
-    drawn = list(draw_foreign(21, 16, [photo], [gel], seed=3))
-    assert [name for name, _ in drawn[:7]] == [*SYNTHETIC_KINDS, "photo", "false colours"]
+    drawn = list(draw_foreign(24, 16, [photo], [gel], seed=3))
+    assert [name for name, _ in drawn[:8]] == [*SYNTHETIC_KINDS, "photo", "piece of a photo", "false colours"]
     for _, picture in drawn:
         assert picture.shape == (16, 16, 3)
         assert picture.dtype == np.float32
         assert (picture >= 0).all()
         assert (picture <= 1).all()
-    again = list(draw_foreign(21, 16, [photo], [gel], seed=3))
+    again = list(draw_foreign(24, 16, [photo], [gel], seed=3))
     assert all((one == other).all() for (_, one), (_, other) in zip(drawn, again, strict=True))
     assert {name for name, _ in draw_foreign(9, 16, [], [])} == set(SYNTHETIC_KINDS)
+
+
+def test_a_photo_is_drawn_whole_as_a_gel_image_would_be_resized():
+    photo = np.zeros((40, 80, 3), dtype=np.float32)
+    photo[:, 40:] = 0.5  # the right half of the picture, lighter or darker
+    whole = dict(draw_foreign(8, 16, [photo], [], seed=1))["photo"]
+    assert (whole[:, :8] == 0).all()
+    assert 0.25 <= whole[0, 8, 0] <= 0.7
+    assert np.ptp(whole[:, 8:]) < 1e-6
 
 
 @pytest.mark.parametrize(("count", "px"), [(0, 16), (5, 4)])
