@@ -3,10 +3,15 @@
 import json
 
 import pytest
+import torch
 
 from benchmarks.models import shipped
+from retrieval.data.images import to_float
 from retrieval.model.checkpoint import load_checkpoint
+from retrieval.model.encode import touch_features
+from retrieval.model.fusion_scorer import NOT_A_GEL
 from retrieval.search import defaults
+from robot.rig import load_rig
 
 
 @pytest.mark.slow
@@ -27,3 +32,16 @@ def test_the_shipped_checkpoints_calibrate_reference_touches_with_and_without_ph
     apart, equal = references.touch_only.log_ratio([-0.2, 0.9], 1)
     assert apart < 0 < equal  # a dissimilar touch is evidence against the object
     assert references.weight * references.with_photos.slope > 1
+
+
+@pytest.mark.parametrize("fingers", defaults.SHIPPED)
+def test_the_shipped_checkpoints_do_not_take_a_photo_for_a_gel_image(fingers):
+    made, photos = load_checkpoint(defaults.shipped_model(fingers)), []
+    with load_rig("sim", seed=990) as rig:
+        for name in rig.object_ids(20):
+            rig.prepare(name, 0)
+            photos.append(made.config.preprocessing.touch(to_float(rig.camera.read(depth=False).colour)))
+    features = touch_features(made.matcher, [[photo] * fingers for photo in photos])
+    with torch.inference_mode():
+        verdicts = made.gel_check.classify(made.matcher.gel_readings(features).numpy())
+    assert verdicts.count(NOT_A_GEL) >= 17
