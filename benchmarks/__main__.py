@@ -16,6 +16,7 @@ WITHOUT_TOWER = {
     "cylinder": cylinder.measure,
     "grasp": grasp.measure,
     "shipped": query.measure_shipped,
+    "cells": rerank.measure_shipped,
     "cold": cold.measure,
     "gripper": gripper.measure,
     "arm": arm.measure,

@@ -9,10 +9,12 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from benchmarks.common import REPETITIONS, ResultLine, as_text, duration, in_turns, matcher_of, random_images
+from retrieval.model.checkpoint_info import read_checkpoint_info
 from retrieval.model.config import Config
 from retrieval.model.encode import encode_photos, encode_touches, to_batch, touch_batch
 from retrieval.model.fusion import FusionHead, scorer_of
 from retrieval.model.stored_partials import StoredPartials, to_stored
+from retrieval.search.defaults import shipped_model
 
 BATCH = 16
 CELL_DIM = 32
@@ -69,6 +71,11 @@ def measure(
             {"partials": times.seconds[str(count)], "product": times.seconds[f"product {count}"]},
         )
     yield measure_cells(config, candidates[-1], repetitions)
+
+
+def measure_shipped() -> Iterator[ResultLine]:
+    """Yield the line of `measure_cells` with the sizes of the shipped checkpoint."""
+    yield measure_cells(read_checkpoint_info(shipped_model()).config)
 
 
 def measure_cells(config: Config, candidates: int = 1000, repetitions: int = REPETITIONS) -> ResultLine:

@@ -25,6 +25,8 @@ PHOTOS, OBJECTS, GRASPS = 400, 24, 2
 """Photos of the catalogue; objects to collect, and grasps of each."""
 COMMAND = "import sys; from retrieval.commands.main import main; sys.exit(main())"
 """The program `retrieve`: its process ends with the command."""
+NONE_OF_THESE = 3
+"""Exit code of a query with this verdict."""
 ONE_QUERY = "import sys, retrieval; print(retrieval.open(sys.argv[1]).query([sys.argv[2:]]).verdict)"
 WARM_QUERY = """
 import sys, time, retrieval
@@ -65,8 +67,10 @@ class Version(NamedTuple):
         command = [sys.executable, "-P", "-c", program, *map(str, words)]
         environment = os.environ | {"PYTHONPATH": str(self.root.resolve())}
         before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
         seconds, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+        if done.returncode not in (0, NONE_OF_THESE):
+            raise SystemExit(f"{' '.join(map(str, words))} of {self.root} failed: {done.stderr}")
         cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
         return Done(seconds, cpu_s, done.stdout)
 
