@@ -29,7 +29,7 @@ ENCODE_S = 0.008
 HOP_S = 0.004
 """Transfer to a shard and back."""
 EMBED_PER_S = 90.0
-"""Photos per second, by one core, with the shipped model (benchmarks.versions: half of the rate of two cores)."""
+"""Photos per second, by one core, with the shipped model (half of `build-index` on two cores in benchmarks.table)."""
 PLANS = {1e6: (1, 8), 1e7: (1, 10, 40), 1e8: (20, 100), 1e9: (100, 1000)}
 """Photos -> numbers of shards."""
 REQUESTS, SLOWER = 4000, 3.0
