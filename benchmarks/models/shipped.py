@@ -43,7 +43,7 @@ from retrieval.training.train import Trainer
 from retrieval.training.verdicts import calibration_touches, with_verdicts
 
 RIGS = Path(__file__).parent
-RIG, TOUCH_RIG = RIGS / "shipped_rig.toml", RIGS / "shipped_touches.toml"
+RIG, TOUCH_RIG, GELS_RIG = (RIGS / f"shipped_{name}.toml" for name in ("rig", "touches", "gels"))
 ROUNDS = (
     {"shipped_training.toml": (112_000, 20, 400), "shipped_varied.toml": (122_000, 5, 120)},
     {"shipped_training.toml": (112_020, 15, 400), "shipped_varied.toml": (122_010, 1, 150)},
@@ -53,7 +53,7 @@ ROUNDS = (
 which has its own gels."""
 TRAINED_ON = ((0,), (1,), (1, 2))
 """Rounds whose training grasps each round uses."""
-SEED_VALIDATED, SEED_VERIFIED, SEED_SCORED = 150_000, 130_000, 30_000
+SEED_VALIDATED, SEED_VERIFIED, SEED_GELS, SEED_SCORED = 150_000, 130_000, 140_000, 30_000
 """Seeds of other object sets. The demo has its own (retrieval.commands.demo.SEED), the benchmark has 0."""
 SEED_PHOTOS, SEED_TOUCHES = 60_000, 61_000
 TOWERS, PRESET = RIGS / "shipped_towers.toml", "relief-large"
@@ -63,9 +63,10 @@ LATER_STEPS = 800, 1100
 """Settings and steps of the towers' later rounds. Each starts from the towers and the head of the round
 before. The last step is used: the head that is trained together with the towers does not tell which step has the best
 towers."""
-GRASPS, VALIDATED, VERIFIED = 2, (100, 8), (150, 5)
+GRASPS, VALIDATED, VERIFIED, GELS = 2, (100, 8), (150, 5), (400, 2)
 """Grasps of each training object; objects that choose the step and calibrate the model, and grasps of each; objects on
-which the bounds of verifications are fitted, and grasps of each."""
+which the bounds of verifications are fitted, and grasps of each; further objects for the check of gel images, and
+grasps of each."""
 HEAD_STEPS = 1000
 FOREIGN = 8000
 """Number of non-gel pictures for training its check of touches: more than in an ordinary training."""
@@ -247,10 +248,12 @@ def collect_training(arguments: argparse.Namespace) -> int:
 
 
 def collect_calibration(arguments: argparse.Namespace) -> int:
-    """Collect the grasps of the validation objects, and of those on which the bounds of verifications are fitted."""
+    """Collect the grasps of the validation objects, and those that `calibrated` needs besides."""
     folder, jobs = arguments.folder, arguments.jobs
-    return collect(folder / "validation", RIG, *VALIDATED, SEED_VALIDATED, jobs) or collect(
-        folder / "verification", RIG, *VERIFIED, SEED_VERIFIED, jobs
+    return (
+        collect(folder / "validation", RIG, *VALIDATED, SEED_VALIDATED, jobs)
+        or collect(folder / "verification", RIG, *VERIFIED, SEED_VERIFIED, jobs)
+        or collect(folder / "gels", GELS_RIG, *GELS, SEED_GELS, jobs)
     )
 
 
@@ -287,13 +290,15 @@ def calibrate_shipped(arguments: argparse.Namespace) -> int:
 
 def calibrated(made: Checkpoint, folder: Path, fingers: int) -> Checkpoint:
     """Return a checkpoint with its gel check, posterior, calibration of reference touches and bounds."""
-    validation, verification = (load_grasps(folder / name) for name in ("validation", "verification"))
+    parts = [load_grasps(folder / name) for name in ("validation", "verification", "gels")]
     if fingers == 1:
-        validation, verification = ([each_finger(grasp)[0] for grasp in part] for part in (validation, verification))
-    both, device = [*validation, *verification], default_device()
-    features = encode_recording(both, made.matcher, made.config, folder / "features")
-    with FrozenFeatures(made.config, device, features_by_image(both, features, device)) as source:
-        made = with_verdicts(made, source, verification, validation, foreign=FOREIGN, max_grasps=len(both))
+        parts = [[each_finger(grasp)[0] for grasp in part] for part in parts]
+    validation, verification, gels = parts
+    every, device = [*validation, *verification, *gels], default_device()
+    features = encode_recording(every, made.matcher, made.config, folder / "features")
+    with FrozenFeatures(made.config, device, features_by_image(every, features, device)) as source:
+        known = [*verification, *gels]
+        made = with_verdicts(made, source, known, validation, foreign=FOREIGN, max_grasps=len(every))
         touches, photos = recorded_features(made.matcher, source, verification, what="verification")
     trials = calibration_touches(made.matcher, verification, touches, photos)
     assert trials is not None
