@@ -23,7 +23,7 @@ from robot.importers.physiclear import StrongestFrames
 from robot.sim.gel.sensor import draw_sensor
 from robot.sim.rig import SimRig
 
-TOUCHES, CHANGED, RECORDINGS, SENSORS = 20, 5, 400, 100
+TOUCHES, CHANGED, RECORDINGS, SENSORS = 20, 5, 400, 500
 SMALL = (6, 8)
 
 
@@ -87,9 +87,9 @@ def main() -> None:
     for optics in ("gelsight_mini", "led", "varied", "grey"):
         simulated = [simulated_touches(optics, seed) for seed in range(SENSORS)]
         print(f"| simulated, {optics} | {' | '.join(rates(simulated))} |", flush=True)
-    centre = np.median(no_contact_gels("led", SENSORS), axis=0)
+    centre = np.median(no_contact_gels("led", 100), axis=0)
     print("\n| gels against the mean simulated gel (led) | nearer with red and blue exchanged, % |\n|---|---|")
-    for name, gels in {**real, "varied": no_contact_gels("varied", 3 * SENSORS)}.items():
+    for name, gels in {**real, "varied": no_contact_gels("varied", 300)}.items():
         nearer = distance(gels[..., ::-1], centre) < distance(gels, centre)
         print(f"| {name} | {interval(int(nearer.sum()), len(gels))} |")
 
