@@ -12,6 +12,7 @@ They are not installed with the package. Each runs in a checkout of the reposito
     python -m benchmarks.again          rebuilds of an index
     python -m benchmarks.large          large photos, decoded at full and at reduced size
     python -m benchmarks.simulation     parts of a simulated grasp, compared with another checkout
+    python -m benchmarks.versions       builds, queries and collection, compared with another checkout
     python -m benchmarks.growth         growth of collection with grasps and objects, and of a query with its grasps
     python -m benchmarks.training       images per second in training
     python -m benchmarks.gpu            speed-up by a GPU
@@ -27,6 +28,8 @@ They are not installed with the package. Each runs in a checkout of the reposito
     python -m benchmarks.models.scaling        accuracy against the number of training objects and grasps
     python -m benchmarks.models.recognition    checkpoints compared: one object among 10, 100 and 1,000
     python -m benchmarks.models.verify         stated and achieved error rates of verification
+    python -m benchmarks.models.adapted        verification and the next grasp on VT60 after `retrieve adapt`
+    python -m benchmarks.models.attended       occlusion maps of real touches
     python -m benchmarks.models.in_double      a command in float64
     python -m benchmarks.importers_memory      memory of the importers for many rows
     python -m benchmarks.service_load          the service under load

@@ -24,6 +24,8 @@ from robot.sim.gel.sensor import draw_sensor
 from robot.sim.rig import SimRig
 
 TOUCHES, CHANGED, RECORDINGS, SENSORS = 20, 5, 400, 500
+GELS, COMPARED_GELS = 100, 300
+"""No-contact gels of the mean gel, and gels of any make that are compared with it."""
 SMALL = (6, 8)
 
 
@@ -87,9 +89,9 @@ def main() -> None:
     for optics in ("gelsight_mini", "led", "varied", "grey"):
         simulated = [simulated_touches(optics, seed) for seed in range(SENSORS)]
         print(f"| simulated, {optics} | {' | '.join(rates(simulated))} |", flush=True)
-    centre = np.median(no_contact_gels("led", 100), axis=0)
+    centre = np.median(no_contact_gels("led", GELS), axis=0)
     print("\n| gels against the mean simulated gel (led) | nearer with red and blue exchanged, % |\n|---|---|")
-    for name, gels in {**real, "varied": no_contact_gels("varied", 300)}.items():
+    for name, gels in {**real, "varied": no_contact_gels("varied", COMPARED_GELS)}.items():
         nearer = distance(gels[..., ::-1], centre) < distance(gels, centre)
         print(f"| {name} | {interval(int(nearer.sum()), len(gels))} |")
 

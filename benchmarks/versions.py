@@ -1,4 +1,4 @@
-"""What a user waits for, compared with another checkout of this project.
+"""Times of builds, queries and collection, compared with another checkout of this project.
 
     git worktree add ../before v0.1.0
     python -m benchmarks.versions --before ../before
@@ -47,7 +47,7 @@ class Done(NamedTuple):
     Attributes:
         seconds: Wall time.
         cpu_s: CPU time.
-        output: What it printed on stdout.
+        output: Text on stdout.
     """
 
     seconds: float
@@ -56,7 +56,7 @@ class Done(NamedTuple):
 
 
 class Version(NamedTuple):
-    """A checkout, and the folder of what it makes."""
+    """A checkout, and the folder of its indexes and recordings."""
 
     root: Path
     folder: Path
@@ -96,7 +96,7 @@ def lines(versions: dict[str, Version], folder: Path, repetitions: int) -> Itera
 
     Args:
         versions: The versions `before` and `now`.
-        folder: Empty folder for photos, touches and what both versions make.
+        folder: Empty folder for photos, touches, indexes and recordings.
         repetitions: Number of times that each version does each kind of work; one more is not counted, because Numba
             compiles and the system reads files for the first time.
     """

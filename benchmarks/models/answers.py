@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.models.verdicts import interval, redrawn
+from benchmarks.models.recognition import interval
+from benchmarks.models.verdicts import redrawn, resampled
 from retrieval.data.dataset import load_grasps
 from retrieval.model.checkpoint import load_checkpoint
 from retrieval.search.build.build_index import build_index
@@ -180,22 +181,24 @@ def split(series, grasps):
 
 def fraction(pairs, holds):
     """Return the fraction for which it holds, with its interval over objects."""
-    owners = np.unique([owner for owner, _ in pairs], return_inverse=True)[1]
     values = np.array([holds(one) for _, one in pairs], dtype=float)
-    value, low, high = interval(lambda rows: float(values[rows].mean()), np.arange(len(values)), list(redrawn(owners)))
-    return f"{value:.3f} [{low:.3f}, {high:.3f}]"
+    return over_objects(pairs, lambda rows: float(values[rows].mean()))
 
 
 def called_absent(present, absent):
     """Return the fraction of present objects that are not accepted if `FALSE_ACCEPTS` of the absent ones are."""
-    owners = np.unique([owner for owner, _ in present], return_inverse=True)[1]
     there, not_there = (np.array([one.odds for _, one in pairs]) for pairs in (present, absent))
 
     def rate(rows):
         return float(np.mean(there[rows] <= np.quantile(not_there[rows], 1 - FALSE_ACCEPTS)))
 
-    value, low, high = interval(rate, np.arange(len(there)), list(redrawn(owners)))
-    return f"{value:.3f} [{low:.3f}, {high:.3f}]"
+    return over_objects(present, rate)
+
+
+def over_objects(pairs, measure):
+    """Return a measure of rows of the pairs, with its interval over objects."""
+    owners = np.unique([owner for owner, _ in pairs], return_inverse=True)[1]
+    return interval(*resampled(measure, np.arange(len(pairs)), list(redrawn(owners))))
 
 
 def calibration(series):

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from benchmarks.models import shipped
+from benchmarks.models.recognition import interval
 from retrieval.console.progress import Bar
 from retrieval.data.dataset import load_grasps
 from retrieval.data.images import read_rgb
@@ -174,7 +175,7 @@ def measured(ratios: OpenSetRatios) -> dict[str, Any]:
     }
     draws = list(redrawn(ratios.owner))
     every = np.arange(len(ratios.owner))
-    values = {name: interval(measure, every, draws) for name, measure in found.items()}
+    values = {name: resampled(measure, every, draws) for name, measure in found.items()}
     probabilities = np.concatenate([present[:, 1:].max(1), absent[:, 1:].max(1)])
     is_right = np.concatenate([first_right, np.zeros(len(absent), dtype=bool)])
     return {**values, "calibration_error": calibration_error(probabilities, is_right)}
@@ -194,9 +195,10 @@ def redrawn(owner: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
         yield np.concatenate([rows[place] for place in rng.integers(len(rows), size=len(rows))])
 
 
-def interval(
+def resampled(
     measure: Callable[[NDArray[np.int64]], float], every: NDArray[np.int64], draws: Sequence[NDArray[np.int64]]
 ) -> list[float]:
+    """Return a measure with its 95 % interval over draws of rows."""
     values = [measure(rows) for rows in draws]
     return [measure(every), *(float(bound) for bound in np.quantile(values, (0.025, 0.975)))]
 
@@ -320,18 +322,14 @@ def as_markdown(document: dict[str, Any]) -> Iterator[str]:
     yield "| objects | grasps | " + " | ".join(columns.values()) + " | calibration error |"
     yield "|---|---|" + "---|" * (len(columns) + 1)
     for row in document["catalogues"]:
-        cells = [_with_interval(row[name]) for name in columns]
+        cells = [interval(*row[name]) for name in columns]
         yield f"| {row['objects']:,} | {row['grasps']} | " + " | ".join(cells) + f" | {row['calibration_error']:.3f} |"
     yield ""
     yield "| input | number | expected verdict | fraction | contact / no contact / not a gel image |"
     yield "|---|---|---|---|---|"
     for row in document["inputs"]:
         counts = " / ".join(str(count) for count in row["called"].values())
-        yield f"| {row['input']} | {row['count']} | {row['wanted']} | {_with_interval(row['share'])} | {counts} |"
-
-
-def _with_interval(values: Sequence[float]) -> str:
-    return f"{values[0]:.3f} [{values[1]:.3f}, {values[2]:.3f}]"
+        yield f"| {row['input']} | {row['count']} | {row['wanted']} | {interval(*row['share'])} | {counts} |"
 
 
 def plot(curves: dict[str, Any], path: Path) -> None:

@@ -33,15 +33,19 @@ def draw_foreign(
         raise BadInput(f"count must be at least 1 and px at least 8; got {count} and {px}")
     kinds: dict[str, _Draw] = dict(SYNTHETIC_KINDS)
     if len(photos):
-        kinds["photo"] = lambda rng, px: _whole(photos[int(rng.integers(len(photos)))], rng, px)
-        kinds["piece of a photo"] = lambda rng, px: _piece(photos[int(rng.integers(len(photos)))], rng, px)
+        kinds |= {"photo": _of_one(photos, _whole), "piece of a photo": _of_one(photos, _piece)}
     if len(gels):
-        kinds["false colours"] = lambda rng, px: _false_colours(gels[int(rng.integers(len(gels)))], rng, px)
+        kinds["false colours"] = _of_one(gels, _false_colours)
     names = list(kinds)
     for number in range(count):
         name = names[number % len(names)]
         picture = kinds[name](np.random.default_rng([seed, number]), px)
         yield name, np.ascontiguousarray(np.clip(picture, 0, 1), dtype=np.float32)
+
+
+def _of_one(pictures: Sequence[RgbImage], change: Callable[[RgbImage, np.random.Generator, int], np.ndarray]) -> _Draw:
+    """Return a function that changes a random one of the pictures."""
+    return lambda rng, px: change(pictures[int(rng.integers(len(pictures)))], rng, px)
 
 
 def _plain(rng: np.random.Generator, px: int) -> np.ndarray:

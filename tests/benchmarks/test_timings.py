@@ -162,7 +162,7 @@ def test_the_parts_of_a_simulated_grasp_are_compared_with_another_checkout():
 
 
 @pytest.mark.slow
-def test_two_versions_are_compared_by_what_a_user_waits_for(tmp_path, monkeypatch):
+def test_builds_queries_and_collection_of_two_versions_are_compared(tmp_path, monkeypatch):
     monkeypatch.setattr(versions, "PHOTOS", 3)
     monkeypatch.setattr(versions, "OBJECTS", 2)
     compared = {name: versions.Version(versions.ROOT, tmp_path / name) for name in ("before", "now")}

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from retrieval.data.resize import resize
+from retrieval.data.resize import shrink
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.touches import AnyImage, AnyTouches, read_image
@@ -72,11 +72,9 @@ def agreement(
     partials = searcher.encode(touches, background=background).partials
     model = model or load_checkpoint(searcher.checkpoint.path)
     image = read_image(photo, "the photo")
-    scale = min(1.0, LONGER_SIDE / max(image.shape[:2]))
-    height, width = (max(1, round(scale * side)) for side in image.shape[:2])
-    whole = np.rint(255 * resize(image, (height, width))).astype(np.uint8)
+    whole = np.rint(255 * shrink(image, LONGER_SIDE / max(image.shape[:2]))).astype(np.uint8)
     plain = np.rint(whole.mean(axis=(0, 1))).astype(np.uint8)
-    rows, columns = (np.linspace(0, side, squares + 1).round().astype(int) for side in (height, width))
+    rows, columns = (np.linspace(0, side, squares + 1).round().astype(int) for side in whole.shape[:2])
 
     def logits(photos: list[NDArray[np.uint8]]) -> NDArray[np.float32]:
         return searcher.scorer.logits(partials, embed_photos(photos, model=model).partials)
