@@ -30,6 +30,7 @@ They are not installed with the package. Each runs in a checkout of the reposito
     python -m benchmarks.models.verify         stated and achieved error rates of verification
     python -m benchmarks.models.adapted        verification and the next grasp on VT60 after `retrieve adapt`
     python -m benchmarks.models.attended       occlusion maps of real touches
+    python -m benchmarks.models.gel_tower      training of the package's touch tower for real gels
     python -m benchmarks.models.in_double      a command in float64
     python -m benchmarks.importers_memory      memory of the importers for many rows
     python -m benchmarks.service_load          the service under load

@@ -6,7 +6,7 @@ RECORDING holds touches of one finger with no-contact frames, and two or more se
 physiclear`). A touch is compared by the cosine of its features minus those of its no-contact frame. Each square in turn
 is replaced by the no-contact frame (Zeiler and Fergus, ECCV 2014); the map shows the decrease of the cosine with the
 most similar other sequence of the same object. FOLDER/attended.png shows six objects that both towers find, and six
-that the shipped tower misses, each with the touch that was found instead.
+that the gel tower misses, each with the touch that was found instead.
 """
 
 import argparse
@@ -33,7 +33,7 @@ from retrieval.training.features import encode_recording
 
 TOUCH_PX, SQUARES, SHOWN = 192, 12, 6
 """Size of the gel images, as in preset `adapt`; squares along each side; objects in each half of the picture."""
-TOWERS = {"ImageNet": "", "shipped": "shipped"}
+TOWERS = {"ImageNet": "", "gel": "gel"}
 """Name of each touch tower and its `init_touch`."""
 
 
@@ -74,8 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     found = {name: sequences.owner[rows] == sequences.owner for name, rows in nearest.items()}
     for name, right in found.items():
         print(f"{name}: {right.sum()} of {len(right)} sequences find their object")
-    shown = [*spread(np.flatnonzero(found["ImageNet"] & found["shipped"])), *spread(np.flatnonzero(~found["shipped"]))]
-    figure = picture(grasps, sequences.owner, compared, nearest["shipped"], shown, configs["shipped"])
+    shown = [*spread(np.flatnonzero(found["ImageNet"] & found["gel"])), *spread(np.flatnonzero(~found["gel"]))]
+    figure = picture(grasps, sequences.owner, compared, nearest["gel"], shown, configs["gel"])
     figure.savefig(arguments.out / "attended.png", dpi=80)
     return 0
 
@@ -148,7 +148,7 @@ def picture(
         files = grasps[row].touches[0], grasps[row].backgrounds[0]
         touch, frame = map(config.preprocessing.load_touch, files)
         show(cells[0], touch, grasps[row].object_id)
-        cosines = compared["shipped"].codes @ compared["shipped"].codes[row]
+        cosines = compared["gel"].codes @ compared["gel"].codes[row]
         same = np.flatnonzero((owner == owner[row]) & (np.arange(len(owner)) != row))
         other = same[cosines[same].argmax()]
         for axis, (name, each) in zip(cells[1:], compared.items(), strict=False):

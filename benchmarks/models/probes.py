@@ -1,9 +1,10 @@
 """Linear probes: how well the features of each tower predict the relief, shape, pitch and amplitude of an object.
 
-    python -m benchmarks.models.probes RECORDING ... --test TEST [--model shipped] [--cache FOLDER]
+    python -m benchmarks.models.probes RECORDING ... --test TEST [--model shipped | --config FILE] [--cache FOLDER]
 
 Ridge regressions from the pooled features of a touch (all fingers), or of a photo (all views), to the labels of the
-simulated objects are fitted on the RECORDINGs and scored on TEST. The model should not have been trained on any of
+simulated objects are fitted on the RECORDINGs and scored on TEST. With --config the towers are those with which a
+training of this configuration starts. The model should not have been trained on any of
 these objects. For relief and shape the table has the fraction of right answers, for pitch and amplitude the correlation
 of the logarithms over objects with relief. "Both": the answers for the touch and for the photo of a grasp are right.
 Intervals are 95 %, over objects.
@@ -18,8 +19,10 @@ from numpy.typing import NDArray
 from sklearn.linear_model import Ridge, RidgeClassifier
 
 from benchmarks.models.recognition import interval
+from retrieval.commands.options import training_config
 from retrieval.data.dataset import load_grasps
 from retrieval.data.labelled_pictures import FAMILIES, SIZES, ObjectLabels, load_object_labels
+from retrieval.methods.late_fusion import frozen_matcher
 from retrieval.metrics.intervals import bootstrap_interval
 from retrieval.metrics.measure import object_means
 from retrieval.model.checkpoint import load_checkpoint
@@ -39,17 +42,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("recording", type=Path, nargs="+")
     parser.add_argument("--test", type=Path, required=True)
     parser.add_argument("--model", default="shipped")
+    parser.add_argument("--config", help="configuration whose initial towers are used instead of the model's")
+    parser.add_argument("--init", help="its initial weights, as in `retrieve train`")
     parser.add_argument("--cache", type=Path, help="folder for encoded features")
     arguments = parser.parse_args(argv)
-    checkpoint, folders = load_checkpoint(find_model(arguments.model)[0]), [*arguments.recording, arguments.test]
+    if arguments.config:
+        config = training_config(arguments.config, None, init=arguments.init)
+        matcher = frozen_matcher(config)
+    else:
+        checkpoint = load_checkpoint(find_model(arguments.model)[0])
+        config, matcher = checkpoint.config, checkpoint.matcher
+    folders = [*arguments.recording, arguments.test]
     labels = {name: each for folder in folders for name, each in load_object_labels(folder).items()}
     train, test = (
         encode_recording(
-            [grasp for folder in part for grasp in load_grasps(folder)],
-            checkpoint.matcher,
-            checkpoint.config,
-            arguments.cache,
-        ).pooled(checkpoint.matcher)
+            [grasp for folder in part for grasp in load_grasps(folder)], matcher, config, arguments.cache
+        ).pooled(matcher)
         for part in (arguments.recording, [arguments.test])
     )
     print("\n".join(table(train, test, labels)))

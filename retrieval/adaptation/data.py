@@ -1,6 +1,12 @@
-"""Inputs of a fit: the recorded grasps, encoded by the frozen towers of the start model and a published tower."""
+"""Inputs of a fit: the recorded grasps, encoded by frozen towers.
+
+Touches are encoded by the tower of the start model, by the gel tower of the package
+(`retrieval.model.towers.weights.gel_tower`) and by a published tower; photos by the tower of the start model and by the
+published one. The photo tower of a shipped model is left out, since it has seen simulated photos only.
+"""
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,12 +17,13 @@ from retrieval.errors import BadInput
 from retrieval.evaluation.real.protocol import read_recording_facts
 from retrieval.methods.cca_towers import TowerWidths
 from retrieval.model.checkpoint import Checkpoint
-from retrieval.model.config import Config, load_config
+from retrieval.model.config import Config, MatcherConfig, load_config
 from retrieval.model.fusion import Matcher
 from retrieval.model.towers import TOWER_SEPARATOR, architectures_of, tower_name
-from retrieval.model.towers.concatenated import ConcatenatedTowers, feature_counts_of
+from retrieval.model.towers.concatenated import feature_counts_of, parts_of
 from retrieval.model.towers.tower import Tower
-from retrieval.model.towers.weights import initialise_tower
+from retrieval.model.towers.weights import GEL, initialise_tower
+from retrieval.search.defaults import is_shipped
 from retrieval.training.features import Features, encode_recording
 from retrieval.training.licences import checkpoint_licences
 
@@ -25,6 +32,8 @@ PUBLISHED_TOWER = "mobilenet_v2"
 """Published tower that is combined with the towers of the start model by default."""
 NO_TOWER = "none"
 """Value of `init` for no published tower."""
+GEL_TOWER = "mobilenet_v2"
+"""Backbone of the gel tower."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +64,7 @@ class AdaptationData:
     def blocks(self) -> TowerWidths:
         """Feature widths of the combined towers, for a touch and for a photo."""
         touch, photo = feature_counts_of(self.matcher.touch_tower), feature_counts_of(self.matcher.photo_tower)
-        return touch * self.config.matcher.fingers, photo * self.matcher.views
+        return TowerWidths(touch * self.config.matcher.fingers, photo * self.matcher.views, len(touch))
 
 
 def load_adaptation_data(
@@ -91,8 +100,7 @@ def load_adaptation_data(
         raise BadInput("A fit needs a recording of at least 2 objects. Record more.")
     config = config_for(start, finger_count(grasps), None if init == NO_TOWER else tower, seed=seed)
     matcher = Matcher(config.matcher, len(config.preprocessing.views)).eval()
-    load_start_weights(matcher.touch_tower, start.matcher.touch_tower, init)
-    load_start_weights(matcher.photo_tower, start.matcher.photo_tower, init)
+    load_towers(matcher, start, init)
     encode = partial(encode_recording, grasps, matcher, config, cache, quiet=quiet)
     features = encode()
     low_pass = encode(touch_variant="low_pass", photo_features_from=features)
@@ -102,34 +110,57 @@ def load_adaptation_data(
 
 
 def config_for(start: Checkpoint, fingers: int, tower: str | type[Tower] | None, *, seed: int) -> Config:
-    """Return the preset for the towers of the start model and, if not None, a published tower.
+    """Return the preset with the towers of the fit.
 
     Args:
         start: The start model.
         fingers: Fingers of a touch.
-        tower: The published tower.
+        tower: The published tower; None for the towers of the start model only.
         seed: Seed of the configuration.
     """
     preset, source = load_config(PRESET), start.config.matcher
-    published = [] if tower is None else [tower_name(tower)]
+    touch, photo, architectures = [source.tower], [source.photo_tower or source.tower], dict(source.architectures)
+    if tower is not None:
+        published = tower_name(tower)
+        touch += [*([GEL_TOWER] if has_gel_tower(source) else []), published]
+        photo = [published] if is_shipped(start.path) else [*photo, published]
+        architectures |= architectures_of(published)
     matcher = dataclasses.replace(
         preset.matcher,
-        tower=TOWER_SEPARATOR.join([source.tower, *published]),
+        tower=TOWER_SEPARATOR.join(touch),
+        photo_tower=TOWER_SEPARATOR.join(photo),
         tower_output=source.tower_output,
         fingers=fingers,
-        architectures={**source.architectures, **(architectures_of(published[0]) if published else {})},
+        architectures=architectures,
     )
     training = dataclasses.replace(preset.training, init="random", init_touch="", init_photo="", seed=seed)
     return dataclasses.replace(preset, matcher=matcher, training=training)
 
 
-def load_start_weights(tower: Tower, start: Tower, init: str) -> None:
-    """Load the weights of the start model and, into the last part of a combined tower, the published ones."""
-    if init == NO_TOWER:
-        tower.load_state_dict(start.state_dict())
-        return
-    assert isinstance(tower, ConcatenatedTowers)
-    *parts, published = tower.parts
-    for part, source in zip(parts, start.parts if isinstance(start, ConcatenatedTowers) else [start], strict=True):
+def has_gel_tower(start: MatcherConfig) -> bool:
+    """Return whether the gel tower is used with the towers of this model: its features are statistics of stages."""
+    return start.tower_output == "stages"
+
+
+def load_towers(matcher: Matcher, start: Checkpoint, init: str) -> None:
+    """Load the weights of the towers of `config_for`.
+
+    Args:
+        matcher: The matcher with the towers.
+        start: The start model.
+        init: Weights of the published tower, or "none" for no such tower.
+    """
+    own, published = start.matcher, [] if init == NO_TOWER else [init]
+    gel = [GEL] if published and has_gel_tower(start.config.matcher) else []
+    _load_parts(matcher.touch_tower, parts_of(own.touch_tower), [*gel, *published])
+    only_published = published and is_shipped(start.path)
+    _load_parts(matcher.photo_tower, [] if only_published else parts_of(own.photo_tower), published)
+
+
+def _load_parts(tower: Tower, start: Sequence[Tower], inits: Sequence[str]) -> None:
+    """Load the weights of the start model into the first parts of a tower, and those of `inits` into the others."""
+    parts = parts_of(tower)
+    for part, source in zip(parts, start, strict=False):
         part.load_state_dict(source.state_dict())
-    initialise_tower(published, init)  # type: ignore[arg-type]
+    for part, init in zip(parts[len(start) :], inits, strict=True):
+        initialise_tower(part, init)

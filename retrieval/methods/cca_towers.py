@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby, product
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,17 +23,17 @@ from retrieval.methods.cca import (
     CcaView,
     canonical_correlations,
     cosine,
-    decompose,
     decompose_standardised,
     unit_rows,
 )
 from retrieval.methods.method import Array, Method
+from retrieval.methods.reduced_features import AffineMap, ReducedFeatures
 from retrieval.methods.selection import Validator, held_out_folds, validation_rows
 from retrieval.methods.standardise import Standardiser
 from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.config import Config
+from retrieval.model.fusion import Matcher
 from retrieval.model.posterior import ScoredTouches, fit_posterior
-from retrieval.model.towers import build_tower
 from retrieval.model.towers.concatenated import feature_counts_of
 
 if TYPE_CHECKING:
@@ -42,13 +42,25 @@ if TYPE_CHECKING:
 Matrix = NDArray[np.float64]
 Rows = NDArray[np.float32]
 Numbers = NDArray[np.int64]
-TowerWidths = tuple[Sequence[int], Sequence[int]]
-"""Feature widths of concatenated towers, of a touch and of a photo."""
 COMPONENTS = 64
 MAX_CHOICE_TOUCHES = 240
 """Touches of a fold with which settings are chosen."""
 MAX_CALIBRATION_TOUCHES = 60
 """Touches per object with which the calibrations are fitted."""
+
+
+class TowerWidths(NamedTuple):
+    """Feature widths of concatenated towers.
+
+    Attributes:
+        touch: Of each touch tower for the first finger, then for the next one.
+        photo: Of each photo tower for the first view, then for the next one.
+        touch_towers: Number of touch towers.
+    """
+
+    touch: Sequence[int]
+    photo: Sequence[int]
+    touch_towers: int = 1
 
 
 class CcaSettings(NamedTuple):
@@ -59,31 +71,17 @@ class CcaSettings(NamedTuple):
         photo_ridge: The same for photos.
         directions: Directions of each tower's features.
         power: Power of the correlation that weights a canonical variate.
+        last_tower: Use only the last of the touch towers.
     """
 
     ridge: float = 0.3
     photo_ridge: float = 1.0
     directions: int = 256
     power: int = 1
+    last_tower: bool = False
 
 
 GRID = tuple(CcaSettings(*one) for one in product((0.1, 0.3, 1.0), (0.3, 1.0, 3.0), (64, 128, 256), (1, 2)))
-MAX_GRID_DIRECTIONS = max(one.directions for one in GRID)
-
-
-class AffineMap(NamedTuple):
-    """`x @ weight + bias`: weight (F, k), bias (k,)."""
-
-    weight: Matrix
-    bias: Matrix
-
-    def __call__(self, x: NDArray[np.floating]) -> Matrix:
-        """Return (n, k) for rows x (n, F)."""
-        return np.asarray(x @ self.weight + self.bias)
-
-    def compose(self, other: "AffineMap") -> "AffineMap":
-        """Return this map followed by another, as one map."""
-        return AffineMap(self.weight @ other.weight, self.bias @ other.weight + other.bias)
 
 
 class CcaProjections(NamedTuple):
@@ -95,47 +93,6 @@ class CcaProjections(NamedTuple):
     def cosines(self, touch: NDArray[np.floating], photo: NDArray[np.floating]) -> Rows:
         """Return cosines (T, N) of features (T, F) and (N, F')."""
         return unit_rows(self.touch(touch)) @ unit_rows(self.photo(photo)).T
-
-
-@dataclass(frozen=True, eq=False)
-class ReducedFeatures:
-    """One modality of n items in the widest directions of each tower's features.
-
-    Attributes:
-        views: A decomposition for each tower, of at most `MAX_GRID_DIRECTIONS` directions.
-        widths: Feature width of each tower.
-    """
-
-    views: tuple[CcaView, ...]
-    widths: tuple[int, ...]
-
-    @classmethod
-    def of(cls, x: Rows, blocks: Sequence[int], max_directions: int = MAX_GRID_DIRECTIONS) -> Self:
-        """Return the reduction of features x (n, F) of concatenated towers, whose widths are `blocks`."""
-        parts = np.split(x, np.cumsum(blocks)[:-1], axis=1)
-        return cls(tuple(decompose(part, max_directions) for part in parts), tuple(blocks))
-
-    def items(self, directions: int) -> Matrix:
-        """Return the items (n, k) in `directions` directions of each tower; the variances of each tower add up to 1."""
-        columns = slice(directions)
-        parts = [view.left[:, columns] * view.singular[columns] / _size(view, directions) for view in self.views]
-        return np.concatenate(parts, axis=1)
-
-    def map(self, directions: int) -> AffineMap:
-        """Return the map from features to `items`."""
-        ranks = [min(view.rank, directions) for view in self.views]
-        weight, bias = np.zeros((sum(self.widths), sum(ranks))), []
-        row = column = 0
-        for view, width, rank in zip(self.views, self.widths, ranks, strict=True):
-            part = view.right[:rank].T / view.standardise.scale[:, None] / _size(view, directions)
-            weight[row + view.standardise.columns, column : column + rank] = part
-            bias.append(-(view.standardise.mean @ part))
-            row, column = row + width, column + rank
-        return AffineMap(weight, np.concatenate(bias))
-
-
-def _size(view: CcaView, directions: int) -> float:
-    return float(np.sqrt((view.singular[:directions] ** 2).sum() / len(view.left)))
 
 
 def fit_projections(
@@ -151,18 +108,28 @@ def fit_projections(
         settings: The settings to fit.
     """
     limit = max(one.directions for one in settings)
-    touch_view, photo_view = ReducedFeatures.of(touch, blocks[0], limit), ReducedFeatures.of(photo, blocks[1], limit)
+    touch_view = ReducedFeatures.of(touch, blocks.touch, limit, towers=blocks.touch_towers)
+    photo_view = ReducedFeatures.of(photo, blocks.photo, limit)
     for one, projections in _fit(touch_view, photo_view, np.arange(len(owner)), owner, settings):
-        maps = touch_view.map(one.directions), photo_view.map(one.directions)
-        yield one, CcaProjections(maps[0].compose(projections.touch), maps[1].compose(projections.photo))
+        yield one, _of_features(touch_view, photo_view, one, projections)
+
+
+def _of_features(
+    touch: ReducedFeatures, photo: ReducedFeatures, settings: CcaSettings, projections: CcaProjections
+) -> CcaProjections:
+    """Return the projections of features, given those of reduced items."""
+    touch_map = touch.map(settings.directions, last_tower=settings.last_tower)
+    return CcaProjections(
+        touch_map.compose(projections.touch), photo.map(settings.directions).compose(projections.photo)
+    )
 
 
 def _fit(
     touch: ReducedFeatures, photo: ReducedFeatures, rows: Numbers, owner: Numbers, settings: Sequence[CcaSettings]
 ) -> Iterator[tuple[CcaSettings, CcaProjections]]:
     """Yield the projections of reduced items, fitted on the given rows."""
-    for directions, some in groupby(sorted(settings, key=lambda one: one.directions), lambda one: one.directions):
-        items = [part.items(directions)[rows] for part in (touch, photo)]
+    for (directions, last_tower), some in groupby(sorted(settings, key=_reduction), _reduction):
+        items = [touch.items(directions, last_tower=last_tower)[rows], photo.items(directions)[rows]]
         means = [part.mean(0) for part in items]
         touch_view, photo_view = (_centred_view(part - mean) for part, mean in zip(items, means, strict=True))
         for (ridge, photo_ridge), alike in groupby(sorted(some), lambda one: one[:2]):
@@ -176,6 +143,10 @@ def _fit(
                         *(AffineMap(each, -mean @ each) for each, mean in zip(variates, means, strict=True))
                     ),
                 )
+
+
+def _reduction(settings: CcaSettings) -> tuple[int, bool]:
+    return settings.directions, settings.last_tower
 
 
 def _centred_view(x: Matrix) -> CcaView:
@@ -204,7 +175,10 @@ class CcaSelection:
 
 
 def select_settings(
-    features: "Features", blocks: TowerWidths, folds: Sequence[Sequence[str]], settings: Sequence[CcaSettings] = GRID
+    features: "Features",
+    blocks: TowerWidths,
+    folds: Sequence[Sequence[str]],
+    settings: Sequence[CcaSettings] | None = None,
 ) -> CcaSelection:
     """Choose the settings that rank photos of held-out objects best; among ties, the largest.
 
@@ -214,13 +188,17 @@ def select_settings(
         features: Features of grasps.
         blocks: Feature widths of the concatenated towers, of touches and of photos.
         folds: Objects of `features` that are held out together; the fit uses the others.
-        settings: The settings to choose from.
+        settings: The settings to choose from. Default: `GRID`, and with several touch towers the same for the last one.
     """
-    touch_view, photo_view = (
-        ReducedFeatures.of(_rows(features), blocks[0]),
-        ReducedFeatures.of(features.photo, blocks[1]),
-    )
-    items = {one: (touch_view.items(one), photo_view.items(one)) for one in {each.directions for each in settings}}
+    if settings is None:
+        settings = GRID if blocks.touch_towers == 1 else (*GRID, *(one._replace(last_tower=True) for one in GRID))
+    limit = max(one.directions for one in settings)
+    touch_view = ReducedFeatures.of(_rows(features), blocks.touch, limit, towers=blocks.touch_towers)
+    photo_view = ReducedFeatures.of(features.photo, blocks.photo, limit)
+    items = {
+        one: (touch_view.items(one[0], last_tower=one[1]), photo_view.items(one[0]))
+        for one in set(map(_reduction, settings))
+    }
     found: dict[CcaSettings, list[tuple[float, CcaProjections]]] = {one: [] for one in settings}
     rows_of = [np.flatnonzero(np.isin(features.object_ids, fold)) for fold in folds]
     for rows in rows_of:
@@ -229,20 +207,17 @@ def select_settings(
         validator, places = Validator(held_out.select(some)), rows[some]
         others = np.setdiff1d(np.arange(len(features)), rows)
         for one, projections in _fit(touch_view, photo_view, others, features.owner, settings):
-            touch, photo = items[one.directions]
+            touch, photo = items[_reduction(one)]
             found[one].append((validator.touch_auc(projections.cosines(touch[places], photo[places])), projections))
     aucs = {one: float(np.mean([auc for auc, _ in each])) for one, each in found.items()}
     best = max(aucs, key=lambda one: (aucs[one], one))
     parts = [
-        held_out_touches(features.select(rows), projections, *(part[rows] for part in items[best.directions]))
+        held_out_touches(features.select(rows), projections, *(part[rows] for part in items[_reduction(best)]))
         for rows, (_, projections) in zip(rows_of, found[best], strict=True)
     ]
     every = np.arange(len(features))
     projections = dict(_fit(touch_view, photo_view, every, features.owner, [best]))[best]
-    maps = touch_view.map(best.directions), photo_view.map(best.directions)
-    return CcaSelection(
-        best, aucs[best], CcaProjections(maps[0].compose(projections.touch), maps[1].compose(projections.photo)), parts
-    )
+    return CcaSelection(best, aucs[best], _of_features(touch_view, photo_view, best, projections), parts)
 
 
 def held_out_touches(
@@ -279,7 +254,7 @@ class CcaTowers(Method):
 
     def _fit(self, train: "Features", validation: "Features") -> None:
         blocks = tower_widths(self.settings.config, train)
-        self._width = sum(blocks[1])
+        self._width = sum(blocks.photo)
         photos_only, held_out = (replace(part, photo=part.photo[:, : self._width]) for part in (train, validation))
         known, folds = photos_only.concatenate(held_out), [tuple(sorted(set(held_out.object_ids)))]
         if self.settings.fit_on_validation:
@@ -353,9 +328,10 @@ def tower_widths(config: Config, features: "Features") -> TowerWidths:
     import torch
 
     with torch.device("meta"):
-        matcher = config.matcher
-        widths = feature_counts_of(build_tower(matcher.tower, matcher.tower_output, matcher.architectures))
-    touch_view, photo_view = widths * features.touch.shape[1], widths * len(config.preprocessing.views)
+        matcher = Matcher(config.matcher)
+    towers = feature_counts_of(matcher.touch_tower)
+    touch_view = towers * features.touch.shape[1]
+    photo_view = feature_counts_of(matcher.photo_tower) * len(config.preprocessing.views)
     expected, got = (sum(touch_view), sum(photo_view)), (_rows(features).shape[1], features.photo.shape[1])
     accepted = {sum(photo_view) + sum(touch_view): photo_view, sum(touch_view): touch_view, sum(photo_view): photo_view}
     if expected[0] != got[0] or got[1] not in accepted:
@@ -363,4 +339,4 @@ def tower_widths(config: Config, features: "Features") -> TowerWidths:
             f"features must be those of the towers {config.matcher.tower} ({config.matcher.tower_output}), "
             f"{expected[0]} of a touch and {expected[1]} of a photo; got {got[0]} and {got[1]}; use these towers"
         )
-    return touch_view, accepted[got[1]]
+    return TowerWidths(touch_view, accepted[got[1]], len(towers))

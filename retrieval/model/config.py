@@ -37,6 +37,7 @@ class MatcherConfig:
 
     Attributes:
         tower: Backbone of both towers (`retrieval.model.towers`).
+        photo_tower: Backbone of the photo tower, if not empty; `tower` is then that of the touch tower.
         tower_output: "classes" (the paper: the 1000-way outputs are fused), "pooled" or "stages".
         fingers: Gel images in one touch. Training takes the number from the recording.
         hidden: Width of the fusion head.
@@ -59,6 +60,7 @@ class MatcherConfig:
     """
 
     tower: str = "resnet50"
+    photo_tower: str = ""
     tower_output: str = "classes"
     fingers: Count = 2
     hidden: Count = 1024
@@ -116,7 +118,7 @@ class TrainingConfig:
     depends on `workers`, `prefetch` and `pinned_memory`, so checkpoints and caches omit them.
 
     Attributes:
-        init: Initial weights of the towers: "random", "imagenet", "shipped" or the path of a state dict.
+        init: Initial weights of the towers: "random", "imagenet", "shipped", "gel" or the path of a state dict.
         init_touch: Initial weights of the touch tower, if not empty (`retrieval.training.relief` makes such weights).
             For concatenated towers the part "init" stands for the value of `init`.
         init_photo: The same for the photo tower.
@@ -227,11 +229,8 @@ class TrainingConfig:
         for name, value in dataclasses.asdict(self).items():
             if name in LOADER_SETTINGS:
                 continue
-            table |= (
-                {f"{loss}{WEIGHT_SUFFIX}": weight for loss, weight in value.items()}
-                if name == "weights"
-                else {name: value}
-            )
+            weights = name == "weights"
+            table |= {f"{loss}{WEIGHT_SUFFIX}": weight for loss, weight in value.items()} if weights else {name: value}
         return table
 
     @classmethod
@@ -261,8 +260,7 @@ SCHEDULES: dict[str, Callable[[int, int], float]] = {
     "warmup": lambda step, steps: min(1.0, 20 * (step + 1) / steps) * 0.5 * (1 + math.cos(math.pi * step / steps)),
     "halving": lambda step, steps: 0.5 ** (4 * step // steps),
 }
-"""Name -> factor of the learning rate at a step (from 0) of all `steps`. "warmup" is "cosine" with a linear rise over
-the first twentieth of the steps; "halving" halves after each quarter."""
+"""Factor of the learning rate. "warmup" is "cosine" with a linear rise over the first twentieth of the steps."""
 NEGATIVES = ("auto", "batch", "dataset")
 PRECISIONS = ("auto", "float32", "bfloat16")
 
@@ -319,7 +317,9 @@ class Config:
         config = self
         if tower is not None:
             name = tower_name(tower)
-            matcher = dataclasses.replace(config.matcher, tower=name, architectures=architectures_of(name))
+            photo = config.matcher.photo_tower if name == config.matcher.tower else ""
+            known = architectures_of(TOWER_SEPARATOR.join(filter(None, (name, photo))))
+            matcher = dataclasses.replace(config.matcher, tower=name, photo_tower=photo, architectures=known)
             config = dataclasses.replace(config, matcher=matcher)
         if losses is not None:
             weights = {LOSSES.name_of(loss): weight for loss, weight in losses.items()}
@@ -329,15 +329,15 @@ class Config:
     def without_paths(self) -> dict[str, Any]:
         """Return `to_dict` with the names of files and folders in place of their paths on this machine."""
         tables = self.to_dict()
+        training = tables["training"]
         for name in ("init", "init_photo", "init_touch", "start", "photos", "touches"):
-            parts = tables["training"][name].split(TOWER_SEPARATOR)
-            tables["training"][name] = TOWER_SEPARATOR.join(Path(part).name for part in parts)
+            training[name] = TOWER_SEPARATOR.join(Path(part).name for part in training[name].split(TOWER_SEPARATOR))
         matcher = tables["matcher"]
-        for part in matcher["architectures"]:
+        for part in matcher.pop("architectures"):
             family, _, model = part.partition(":")
             if Path(model).is_absolute():
-                matcher["tower"] = matcher["tower"].replace(part, f"{family}:{Path(model).name}")
-        del matcher["architectures"]
+                for side in ("tower", "photo_tower"):
+                    matcher[side] = matcher[side].replace(part, f"{family}:{Path(model).name}")
         return tables
 
     def to_dict(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from retrieval.data.licences import DataLicence, stored_licences
 from retrieval.model.checkpoint_info import CheckpointInfo, read_checkpoint_info
 from retrieval.model.config import TrainingConfig
 from retrieval.model.towers import TOWER_SEPARATOR
+from retrieval.model.towers.weights import GEL, SHIPPED
 from retrieval.search.defaults import is_shipped
 
 _SHIPPED = DataLicence("simulated objects of the shipped models", "MIT", "as touch-retrieval")
@@ -30,7 +31,7 @@ def training_licences(recording: Path, settings: TrainingConfig) -> list[DataLic
     else:
         inits = {settings.tower_init(init) for init in (settings.init_touch, settings.init_photo)}
         for name in sorted({part for init in inits for part in init.split(TOWER_SEPARATOR)} - {"random", "imagenet"}):
-            found.append(_SHIPPED if name == "shipped" else DataLicence(name))
+            found.append(_SHIPPED if name in (SHIPPED, GEL) else DataLicence(name))
     found += [DataLicence(folder) for folder in (settings.photos, settings.touches) if folder]
     return list(dict.fromkeys(found))
 

@@ -16,15 +16,15 @@ class ConcatenatedTowers(Tower):
         self.parts = nn.ModuleList(parts)
         self.feature_count = sum(part.feature_count for part in parts)
 
-    @property
-    def widths(self) -> list[int]:
-        """Number of features of each part."""
-        return [part.feature_count for part in self.parts]  # type: ignore[misc]
-
     def _encode(self, images: Tensor) -> Tensor:
         return torch.cat([part._encode(images) for part in self.parts], dim=1)  # type: ignore[operator]
 
 
+def parts_of(tower: Tower) -> list[Tower]:
+    """Return the concatenated towers, or a single tower."""
+    return list(tower.parts) if isinstance(tower, ConcatenatedTowers) else [tower]  # type: ignore[arg-type]
+
+
 def feature_counts_of(tower: Tower) -> list[int]:
     """Return the number of features of each concatenated tower, or of a single tower."""
-    return tower.widths if isinstance(tower, ConcatenatedTowers) else [tower.feature_count]
+    return [part.feature_count for part in parts_of(tower)]

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.error import URLError
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 State = dict[str, Tensor]
 SHIPPED = "shipped"
 """Value of init for the weights of the checkpoint in the package."""
+GEL = "gel"
+"""Value of init for the touch tower of the package that was trained for real gels (`gel_tower`)."""
 log = logging.getLogger(__name__)
 
 
@@ -27,9 +30,9 @@ def initialise_tower(tower: "Tower", init: str, shipped: Callable[[], State] | N
     Args:
         tower: A tower, or concatenated ones.
         init: "random" leaves it as built. "imagenet" loads the published weights (`Tower.published_weights`), "shipped"
-            those of `shipped`. Anything else is the path of a .pth, .pt or .safetensors state dict with the tower's key
-            names, which for our own towers are torchvision's. Concatenated towers take one value for all, or one each,
-            joined by `TOWER_SEPARATOR`.
+            those of `shipped`, "gel" the file `gel_tower`. Anything else is the path of a .pth, .pt or .safetensors
+            state dict with the tower's key names, which for our own towers are torchvision's. Concatenated towers take
+            one value for all, or one each, joined by `TOWER_SEPARATOR`.
         shipped: Returns the state dict for "shipped".
 
     Raises:
@@ -51,8 +54,20 @@ def initialise_tower(tower: "Tower", init: str, shipped: Callable[[], State] | N
     if init == SHIPPED and shipped is not None:
         load_tower_state(tower, shipped(), "the shipped checkpoint")
         return
+    if init == GEL:
+        load_tower_state(tower, read_state(gel_tower()), "the gel tower of the package")
+        return
     state = tower.published_weights() if init == "imagenet" else read_state(Path(init))
     load_tower_state(tower, state, f"the published {type(tower).__name__}" if init == "imagenet" else init)
+
+
+def gel_tower() -> Path:
+    """Return the file of the package's touch tower for real gels: MobileNetV2 with the output "stages".
+
+    It was trained on simulated presses of random surfaces by gel sensors of any make
+    (`python -m benchmarks.models.gel_tower`).
+    """
+    return Path(str(resources.files("retrieval") / "shipped" / "gel-tower.safetensors"))
 
 
 def load_tower_state(tower: "Tower", state: State, source: str) -> None:

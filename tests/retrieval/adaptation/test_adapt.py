@@ -13,13 +13,16 @@ from retrieval.adaptation import folds
 from retrieval.adaptation.curve import (
     ADAPTED,
     LOW_PASS,
-    PUBLISHED_TOWERS,
-    START_TOWERS,
+    LOW_PASS_TOUCHES_ONLY,
+    ONLY_PUBLISHED,
+    TOUCHES_ONLY,
     UNADAPTED,
+    WITHOUT_PUBLISHED,
     learning_curve,
+    touches_as_photos,
     write_curve,
 )
-from retrieval.adaptation.data import PUBLISHED_TOWER, config_for, load_adaptation_data, load_start_weights
+from retrieval.adaptation.data import PUBLISHED_TOWER, config_for, load_adaptation_data, load_towers
 from retrieval.adaptation.estimate import Estimate
 from retrieval.adaptation.folds import draw_folds, measure, pair_accuracy, score_accuracy
 from retrieval.adaptation.recipe import adapt
@@ -28,7 +31,8 @@ from retrieval.commands.options import training_config
 from retrieval.data.dataset import Split, load_grasps
 from retrieval.errors import BadInput, CheckpointError
 from retrieval.methods import cca_towers
-from retrieval.methods.cca_towers import GRID, AffineMap, CcaSettings, fit_projections, select_settings
+from retrieval.methods.cca_towers import GRID, CcaSettings, TowerWidths, fit_projections, select_settings
+from retrieval.methods.reduced_features import AffineMap
 from retrieval.methods.selection import Validator
 from retrieval.model.calibration_touches import CalibrationTouches
 from retrieval.model.checkpoint import load_checkpoint
@@ -68,18 +72,20 @@ def top1_accuracy(projections, touch, photo, owner):
 def test_codes_distinguish_unseen_objects():
     touch, photo, owner = correlated_features()
     other = correlated_features(seed=1)
-    projections = dict(fit_projections(touch, photo, owner, ([12], [10])))
+    projections = dict(fit_projections(touch, photo, owner, TowerWidths([12], [10])))
     assert set(projections) == set(GRID)
     assert all(top1_accuracy(found, *other) > 0.9 for found in projections.values())  # chance 1 / 30
     permuted = np.random.default_rng(2).permutation(30)[owner]  # photos of other objects
-    control = dict(fit_projections(touch, photo[np.argsort(permuted, kind="stable")], owner, ([12], [10])))
+    control = dict(fit_projections(touch, photo[np.argsort(permuted, kind="stable")], owner, TowerWidths([12], [10])))
     assert all(top1_accuracy(found, *other) < 0.2 for found in control.values())
 
 
 def test_combined_towers_have_equal_weight_at_any_scale():
     touch, photo, owner = correlated_features()
     scaled = touch * np.where(np.arange(12) < 4, 1000, 1).astype(np.float32)
-    plain, rescaled = (dict(fit_projections(x, photo, owner, ([4, 8], [10])))[CcaSettings()] for x in (touch, scaled))
+    plain, rescaled = (
+        dict(fit_projections(x, photo, owner, TowerWidths([4, 8], [10])))[CcaSettings()] for x in (touch, scaled)
+    )
     assert np.allclose(plain.cosines(touch, photo), rescaled.cosines(scaled, photo), atol=1e-4)
 
 
@@ -120,7 +126,7 @@ def test_a_held_out_fold_affects_neither_settings_nor_fit(monkeypatch):
     touch, photo, owner = correlated_features(objects=24)
     names = tuple(f"object-{number:02}" for number in owner)
     features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
-    data = SimpleNamespace(grasps=[], kind_of=None, blocks=([12], [10]))
+    data = SimpleNamespace(grasps=[], kind_of=None, blocks=TowerWidths([12], [10]))
     drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
     calls = []
     monkeypatch.setattr(folds, "select_settings", lambda *args: calls.append(args) or select_settings(*args))
@@ -145,7 +151,7 @@ def test_a_setting_that_is_best_only_on_the_held_out_fold_is_not_selected(monkey
     touch, photo, owner = correlated_features(objects=24)
     names = tuple(f"object-{number:02}" for number in owner)
     features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
-    data = SimpleNamespace(grasps=[], kind_of=None, blocks=([12], [10]))
+    data = SimpleNamespace(grasps=[], kind_of=None, blocks=TowerWidths([12], [10]))
     drawn = [names[start : start + 8 * 6 : 6] for start in range(0, len(names), 8 * 6)]
     planted, plain = GRID[0], GRID[-1]
     current = []
@@ -161,7 +167,7 @@ def test_a_setting_that_is_best_only_on_the_held_out_fold_is_not_selected(monkey
     found = list(folds.fit_folds(features, drawn, data, seed=0, label="touches", quiet=True))
     assert found[0].settings == plain
     # With the fold itself the planted setting is selected.
-    assert select_settings(features, ([12], [10]), drawn[:1]).settings == planted
+    assert select_settings(features, TowerWidths([12], [10]), drawn[:1]).settings == planted
 
 
 def test_accuracy_of_hand_made_scores():
@@ -179,21 +185,42 @@ def test_accuracy_of_hand_made_scores():
     assert pair_accuracy([found]) == pytest.approx(np.mean(by_object))
 
 
-def test_the_preset_builds_the_same_towers_as_adapt_with_the_shipped_model(tmp_path):
-    torch.manual_seed(0)
-    weights = tmp_path / "published.pth"
-    torch.save(build_tower("mobilenet_v2", "stages").state_dict(), weights)
-    preset = training_config("adapt", None, init=str(weights))
+def test_the_preset_builds_the_same_towers_as_adapt_with_the_shipped_model(published):
+    preset = training_config("adapt", None, init=str(published))
     preset = dataclasses.replace(preset, matcher=dataclasses.replace(preset.matcher, fingers=1))
     start = load_checkpoint(retrieval.shipped_model(1))
     expected = Matcher(config_for(start, 1, PUBLISHED_TOWER, seed=0).matcher, 2)
+    load_towers(expected, start, str(published))
     made = build_matcher(preset)
     for side in ("touch_tower", "photo_tower"):
-        load_start_weights(getattr(expected, side), getattr(start.matcher, side), str(weights))
         for name, tensor in getattr(expected, side).state_dict().items():
             assert torch.equal(getattr(made, side).state_dict()[name], tensor), name
     training = preset.without_paths()["training"]
-    assert (training["init"], training["init_touch"]) == ("published.pth", "shipped+init")
+    assert (training["init"], training["init_touch"]) == (published.name, "shipped+gel+init")
+
+
+def test_touches_are_encoded_by_the_shipped_the_gel_and_the_published_tower_and_photos_by_the_last(published):
+    start = load_checkpoint(retrieval.shipped_model(1))
+    matcher = Matcher(config_for(start, 1, PUBLISHED_TOWER, seed=0).matcher)
+    load_towers(matcher, start, str(published))
+    gel, added = build_tower("mobilenet_v2", "stages"), build_tower("mobilenet_v2", "stages")
+    initialise_tower(gel, "gel")
+    initialise_tower(added, str(published))
+    images, pooled = torch.rand(2, 3, 64, 64), start.matcher.touch_tower.feature_count
+    with torch.inference_mode():
+        shipped = start.matcher.touch_tower.eval()(images)[:, :pooled]  # without cells
+        parts = [gel.eval()(images), added.eval()(images)]
+        assert torch.allclose(matcher.touch_tower.eval()(images), torch.cat([shipped, *parts], 1), atol=1e-5)
+        assert torch.allclose(matcher.photo_tower.eval()(images), parts[1], atol=1e-5)
+
+
+def test_without_a_published_tower_the_shipped_towers_are_used():
+    start = load_checkpoint(retrieval.shipped_model(1))
+    matcher = Matcher(config_for(start, 1, None, seed=0).matcher)
+    load_towers(matcher, start, "none")
+    for side in ("touch_tower", "photo_tower"):
+        for name, tensor in getattr(start.matcher, side).state_dict().items():
+            assert torch.equal(getattr(matcher, side).state_dict()[name], tensor), name
 
 
 @pytest.mark.slow
@@ -224,7 +251,7 @@ def test_thresholds_of_verifications_come_from_objects_outside_the_fit():
     names = tuple(f"object-{name:02d}" for name in owner)
     ids = tuple(str(row) for row in range(len(owner)))
     features, objects = Features(ids, names, touch[:, None], photo), sorted(set(names))
-    choice = select_settings(features, ((12,), (10,)), [objects[::2], objects[1::2]])
+    choice = select_settings(features, TowerWidths((12,), (10,)), [objects[::2], objects[1::2]])
     posterior = fit_posterior(*(part.scored for part in choice.held_out_touches))
     found = fit_verification(choice.held_out_touches, posterior)
     assert found.group_sizes == (30, 30)
@@ -318,7 +345,7 @@ def test_features_of_combined_towers_are_those_of_each(model, published):
     start = load_checkpoint(model)
     config = config_for(start, 2, PUBLISHED_TOWER, seed=0)
     matcher = Matcher(config.matcher, 2).eval()
-    load_start_weights(matcher.touch_tower, start.matcher.touch_tower, str(published))
+    load_towers(matcher, start, str(published))
     own, added = start.matcher.touch_tower, build_tower("mobilenet_v2", "pooled").eval()
     initialise_tower(added, str(published))
     images = torch.rand(2, 3, 64, 64)
@@ -344,6 +371,17 @@ def test_initial_weights_are_for_all_towers_or_for_each(published):
         initialise_tower(two, "random+random+random")
 
 
+def test_touches_only_compares_a_touch_with_another_touch_of_each_object():
+    touch, photo, owner = correlated_features(objects=6, grasps=4)
+    names = tuple(f"object-{number}" for number in owner)
+    features = Features(tuple(map(str, range(len(names)))), names, touch[:, None], photo)
+    alone = touches_as_photos(features)
+    assert np.array_equal(alone.photo, touch)
+    scores = touch @ touch.T
+    np.fill_diagonal(scores, 1e6)  # a touch itself would always rank first
+    assert score_accuracy(scores, alone).top1.mean() < 1
+
+
 @pytest.mark.slow
 def test_the_curve_has_smaller_fits_and_their_comparisons(recording, model, published, tmp_path, monkeypatch):
     monkeypatch.setattr("retrieval.adaptation.curve.OBJECTS", (4, 1000))
@@ -358,8 +396,11 @@ def test_the_curve_has_smaller_fits_and_their_comparisons(recording, model, publ
         ADAPTED,
         ADAPTED,
         LOW_PASS,
-        START_TOWERS,
-        PUBLISHED_TOWERS,
+        WITHOUT_PUBLISHED,
+        ONLY_PUBLISHED,
+        TOUCHES_ONLY,
+        TOUCHES_ONLY,
+        LOW_PASS_TOUCHES_ONLY,
     ]
     assert [(point.objects, point.touches) for point in points[1:5]] == [(4, 1), (4, 3), (6, 1), (6, 3)]
     assert all(low <= value <= high for point in points for value, low, high in (point.top1, point.pair_accuracy))

@@ -8,7 +8,14 @@ import pytest
 
 from retrieval.errors import BadInput, ConfigError, NumericalError
 from retrieval.methods import METHODS, cca_towers
-from retrieval.methods.cca_towers import GRID, CcaSettings, fit_projections, select_settings, tower_widths
+from retrieval.methods.cca_towers import (
+    GRID,
+    CcaSettings,
+    TowerWidths,
+    fit_projections,
+    select_settings,
+    tower_widths,
+)
 from retrieval.methods.method import Method, MethodSettings
 from retrieval.methods.selection import Validator, next_rows_of_object, ranking_auc, validation_rows
 from retrieval.methods.standardise import Standardiser
@@ -273,13 +280,33 @@ def test_concatenated_towers_are_also_fitted_on_validation_objects_after_the_set
     method = METHODS.load("cca_towers")(MethodSettings(CONFIG, fit_on_validation=True))
     method.fit(TRAIN, VALIDATION)
     blocks = tower_widths(CONFIG, TRAIN)
-    assert blocks == ([FEATURES, FEATURES], [FEATURES])
+    assert blocks == ([FEATURES, FEATURES], [FEATURES], 1)
     best_params = settings_of(method)
     projections = dict(
         fit_projections(both.touch.reshape(len(both), -1), both.photo, both.owner, blocks, [best_params])
     )
     expected = projections[best_params].cosines(TEST.touch.reshape(len(TEST), -1), TEST.photo)
     np.testing.assert_array_equal(method.score(*encodings(method)), expected)
+
+
+@pytest.mark.parametrize("fingers", [1, 2])
+def test_a_touch_tower_without_information_is_left_out(fingers):
+    """The first tower of each finger sees noise, so the projections are those of a fit to the last tower only."""
+    informative = planted(16, 6, noise=1.0)
+    touch = informative.touch[:, :fingers]
+    noise = np.random.default_rng(0).standard_normal(touch.shape).astype(np.float32)
+    both = replace(informative, touch=np.concatenate([noise, touch], axis=2))
+    only = replace(informative, touch=np.ascontiguousarray(touch))
+    folds = [tuple(sorted(set(both.object_ids)))[start::2] for start in range(2)]
+    photo = [both.photo.shape[1]]
+    widths = [noise.shape[2], touch.shape[2]]
+    choice = select_settings(both, TowerWidths(widths * fingers, photo, 2), folds)
+    expected = select_settings(only, TowerWidths(widths[1:] * fingers, photo), folds)
+    assert choice.settings == expected.settings._replace(last_tower=True)
+    rows = [part.touch.reshape(len(part), -1) for part in (both, only)]
+    np.testing.assert_allclose(
+        choice.projections.cosines(rows[0], both.photo), expected.projections.cosines(rows[1], only.photo), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("name", ["cca", "cca_pca"])
@@ -344,7 +371,7 @@ def test_a_reference_touch_after_a_photo_is_encoded_as_a_touch_and_weighted_on_v
 
 def test_touches_may_take_the_place_of_photos():
     touches = replace(TRAIN, photo=TRAIN.touch.reshape(len(TRAIN), -1))
-    assert tower_widths(CONFIG, touches) == ([FEATURES, FEATURES], [FEATURES, FEATURES])
+    assert tower_widths(CONFIG, touches) == ([FEATURES, FEATURES], [FEATURES, FEATURES], 1)
 
 
 def test_concatenated_towers_accept_only_their_own_features():

@@ -13,6 +13,7 @@ import retrieval
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.errors import ConfigError
 from retrieval.model.config import LOADER_SETTINGS, Config, MatcherConfig, TrainingConfig, load_config, preset_names
+from retrieval.model.fusion import Matcher
 from retrieval.model.losses import LOSSES
 from retrieval.model.towers import OUTPUTS, TOWER_SEPARATOR, TOWERS
 
@@ -86,6 +87,15 @@ def test_every_preset_but_paper_exact_has_embeddings_for_candidate_search(name):
     assert config.has_embeddings
     # A model of `adapt` scores by its embeddings, and a model of `benchmark real` is never searched.
     assert (config.matcher.candidate_width > 0) == (name not in ("adapt", "real"))
+
+
+def test_photos_may_have_another_tower_and_another_tower_for_both_replaces_it():
+    config = load_config("adapt")
+    assert (config.matcher.tower, config.matcher.photo_tower) == ("+".join(3 * ["mobilenet_v2"]), "mobilenet_v2")
+    matcher = Matcher(config.matcher)
+    assert matcher.touch_tower.feature_count == 3 * matcher.photo_tower.feature_count
+    assert config.using(losses={}).matcher.photo_tower == "mobilenet_v2"
+    assert config.using(tower="small").matcher.photo_tower == ""
 
 
 # Files -----------------------------------------------------------------------------------------------------
