@@ -149,9 +149,13 @@ class Command(TyperCommand):
         return (self.help or "").split("\n\n")[0]
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Join the values of each option of several values to one word; see `OptionValues.parse`."""
+        """Join the values of each option of several values to one word; see `OptionValues.parse`.
+
+        If an option that is given once is repeated, its values are added to the first ones.
+        """
         options = {name: option for option in self.params for name in option.opts if name.startswith("-")}
         joined: list[str] = []
+        place_of: dict[Any, int] = {}
         while args and args[0] != "--":
             word, *args = args
             joined.append(word)
@@ -162,8 +166,13 @@ class Command(TyperCommand):
                 ctx.fail(f"{word} needs a value")
             if (option.metavar or "").endswith("..."):
                 values = list(takewhile(lambda value: not value.startswith("-"), args))
-                joined.append(_SEPARATOR.join(values))
                 args = args[len(values) :]
+                if option in place_of and not option.multiple:
+                    joined.pop()
+                    joined[place_of[option]] = _SEPARATOR.join([joined[place_of[option]], *values])
+                else:
+                    place_of[option] = len(joined)
+                    joined.append(_SEPARATOR.join(values))
             else:
                 joined += args[:1]
                 args = args[1:]

@@ -380,6 +380,15 @@ def test_an_option_of_several_values_takes_the_words_up_to_the_next_option(monke
     assert (calls[2]["only"], calls[2]["quick"]) == (("closing", "contact"), True)
 
 
+def test_a_repeated_option_of_several_values_keeps_all_of_them(monkeypatch):
+    calls = []
+    monkeypatch.setattr(Command, "invoke", lambda self, context: calls.append(context.params))
+    towers = ["--towers", "a=adapt", "b=real", "--towers", "c=relief"]
+    assert main(["benchmark", "real", "data", "--out", "o", *towers, "--seeds", "1"]) == 0
+    assert calls[-1]["towers"] == ("a=adapt", "b=real", "c=relief")
+    assert calls[-1]["seeds"] == 1
+
+
 def test_the_package_runs_the_command_line():
     command = [sys.executable, "-m", "retrieval", "train", "--help"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
