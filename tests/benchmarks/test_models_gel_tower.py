@@ -73,14 +73,24 @@ def test_the_distance_from_imagenet_ignores_a_common_offset():
 def test_a_training_writes_a_tower_that_loads(tmp_path, monkeypatch):
     for name, value in {"SURFACES": 4, "SURFACES_OF_STEP": 3, "LABELLED_OF_STEP": 4, "TOUCH_PX": 64}.items():
         monkeypatch.setattr(gel_tower, name, value)
-    weights = tmp_path / "imagenet.pth"
-    torch.save(build_tower("mobilenet_v2", "stages").state_dict(), weights)
-    line = [str(tmp_path), "--init", str(weights), "--sensors", "2", "--labelled", "12", "--jobs", "1", "--steps"]
+    line = [
+        str(tmp_path),
+        "--init",
+        str(packaged_gel_tower()),
+        "--sensors",
+        "2",
+        "--labelled",
+        "12",
+        "--jobs",
+        "1",
+        "--steps",
+    ]
     assert gel_tower.main([*line, "2"]) == 0
     tower = build_tower("mobilenet_v2", "stages")
     initialise_tower(tower, str(tmp_path / "gel-tower.safetensors"))
-    changed = torch.load(weights, weights_only=True)["features.10.conv.0.0.weight"]
-    assert not torch.allclose(tower.state_dict()["features.10.conv.0.0.weight"], changed, atol=1e-4)
+    before = read_tensors(packaged_gel_tower())[0]["features.10.conv.0.0.weight"]
+    assert not torch.equal(tower.state_dict()["features.10.conv.0.0.weight"], before.float())
+    assert "2 sensors" in (tmp_path / "gel-tower.md").read_text()
 
 
 def test_the_packaged_tower_is_a_mobilenet_of_half_precision():
