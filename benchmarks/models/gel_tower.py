@@ -29,6 +29,7 @@ from benchmarks.models.random_surfaces import RandomSurface, presses
 from benchmarks.models.shipped import retrieve
 from retrieval.console.interruption import interruption
 from retrieval.console.memory import keep_freed_memory
+from retrieval.console.output import say
 from retrieval.console.progress import Bar
 from retrieval.data.images import read_rgb, to_float
 from retrieval.data.labelled_pictures import LabelledPicture, load_labelled
@@ -85,7 +86,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
     training = GelTowerTraining(files, load_labelled(folder / "labelled")[1], str(arguments.init), folder / "images")
     out = folder / "gel-tower.safetensors"
-    return 0 if training.run(out, arguments.steps) else 1
+    if training.run(out, arguments.steps):
+        return 0
+    say(f"stopped at step {training.step} of {arguments.steps}; run the command again to continue")
+    return 1
 
 
 # Presses of random surfaces ------------------------------------------------------------------------------------
