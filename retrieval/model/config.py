@@ -37,7 +37,6 @@ class MatcherConfig:
 
     Attributes:
         tower: Backbone of both towers (`retrieval.model.towers`).
-        photo_tower: Backbone of the photo tower, if not empty; `tower` is then that of the touch tower.
         tower_output: "classes" (the paper: the 1000-way outputs are fused), "pooled" or "stages".
         fingers: Gel images in one touch. Training takes the number from the recording.
         hidden: Width of the fusion head.
@@ -57,10 +56,10 @@ class MatcherConfig:
         cosine: Add the scaled cosine of the contrastive embeddings to the match logit. The paper does not do this.
         architectures: Architecture by name of each backbone that another library builds, so that a checkpoint needs
             neither its files nor a network. `Config.using` fills it in.
+        photo_tower: Backbone of the photo tower, if not empty; `tower` is then that of the touch tower.
     """
 
     tower: str = "resnet50"
-    photo_tower: str = ""
     tower_output: str = "classes"
     fingers: Count = 2
     hidden: Count = 1024
@@ -75,6 +74,7 @@ class MatcherConfig:
     photo_cells: Count = 10
     cosine: bool = False
     architectures: Mapping[str, Any] = field(default_factory=dict)
+    photo_tower: str = ""
 
     @property
     def pooled_width(self) -> int:
