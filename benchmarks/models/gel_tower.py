@@ -35,13 +35,14 @@ from retrieval.data.images import read_rgb, to_float
 from retrieval.data.labelled_pictures import LabelledPicture, load_labelled
 from retrieval.data.loading import prefetch
 from retrieval.data.resize import resize
-from retrieval.model.checkpoint import write_tensors
+from retrieval.model.checkpoint import as_float16, write_tensors
 from retrieval.model.encode import autocast, default_device
 from retrieval.model.towers import build_tower
 from retrieval.model.towers.tower import Tower
 from retrieval.model.towers.weights import initialise_tower
+from retrieval.training.augmentation import sample_grid
 from retrieval.training.disk_image_cache import DiskImageCache
-from retrieval.training.fit import RATE, Plan, fit
+from retrieval.training.fit import RATE, Plan, fit, freeze_batch_norm
 from retrieval.training.labels import LabelHead
 from retrieval.training.state import load_state, save_state, state_path
 from robot.sim.gel.sensor import draw_sensor
@@ -126,6 +127,7 @@ def sensor_pictures(_: str, number: int) -> NDArray[np.uint8]:
     pictures, seed = [sensor.background(1)], 1000 * number
     while len(pictures) < 1 + SURFACES * PRESSES:
         made = presses(RandomSurface.draw(seed), sensor, rng, 3 * PRESSES)
+        # This draws one press more than it uses. The tower of the package was trained with these draws.
         some = [picture for picture, _ in zip(made, range(PRESSES), strict=False)]
         pictures += some if len(some) == PRESSES else []
         seed += 1
@@ -212,8 +214,7 @@ def sample(
     maps[:, 0, 0], maps[:, 0, 1] = scale * np.cos(turn_rad), -scale * np.sin(turn_rad) * flips
     maps[:, 1, 0], maps[:, 1, 1] = scale * np.sin(turn_rad), scale * np.cos(turn_rad) * flips
     maps[:, :, 2] = shift
-    grid = functional.affine_grid(torch.from_numpy(maps), [len(x), 3, TOUCH_PX, TOUCH_PX], align_corners=False)
-    return functional.grid_sample(x, grid, padding_mode="reflection", align_corners=False)
+    return sample_grid(x, torch.from_numpy(maps), TOUCH_PX / x.shape[2])
 
 
 def as_batch(images: NDArray[np.uint8]) -> Tensor:
@@ -289,9 +290,7 @@ class GelTowerTraining:
             )
         if self.step < steps:
             return False
-        weights = {
-            name: each.half() if each.is_floating_point() else each for name, each in self.tower.state_dict().items()
-        }
+        weights = as_float16(self.tower.state_dict(), out)
         write_tensors(out, weights, {"tower": "mobilenet_v2", "tower_output": "stages", **identity})
         write_atomically(out.with_suffix(".md"), self.card(steps).encode())
         state_path(out).unlink(missing_ok=True)
@@ -324,9 +323,7 @@ class GelTowerTraining:
         """Return the loss (scalar) of a batch."""
         images, pictures = batch[0].to(self.device), batch[1]
         self.modules.train()
-        for module in self.tower.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.eval()  # keep ImageNet's statistics
+        freeze_batch_norm(self.tower)
         features = encode(self.tower, images)
         with torch.no_grad():
             published = encode(self.published, images)
@@ -367,7 +364,7 @@ def distance(features: Tensor, published: Tensor) -> Tensor:
 def deviation(features: Tensor) -> Tensor:
     """Return the standard deviation (F,) of each feature (n, F), at least the first quartile of all."""
     each: Tensor = features.std(0)
-    return each.clamp(min=float(each.quantile(0.25)))
+    return each.clamp(min=each.quantile(0.25))
 
 
 def encode(tower: Tower, images: Tensor) -> Tensor:

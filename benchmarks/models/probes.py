@@ -4,10 +4,9 @@
 
 Ridge regressions from the pooled features of a touch (all fingers), or of a photo (all views), to the labels of the
 simulated objects are fitted on the RECORDINGs and scored on TEST. With --config the towers are those with which a
-training of this configuration starts. The model should not have been trained on any of
-these objects. For relief and shape the table has the fraction of right answers, for pitch and amplitude the correlation
-of the logarithms over objects with relief. "Both": the answers for the touch and for the photo of a grasp are right.
-Intervals are 95 %, over objects.
+training of this configuration starts. They should not have been trained on any of these objects. For relief and shape
+the table has the fraction of right answers, for pitch and amplitude the correlation of the logarithms over objects with
+relief. "Both": the answers for the touch and for the photo of a grasp are right. Intervals are 95 %, over objects.
 """
 
 import argparse

@@ -18,6 +18,7 @@ from robot.sim.gel.sensor import GelSensor, Picture
 from robot.sim.objects.relief import RELIEFS, Relief, Sheet
 
 Floats = NDArray[np.float32]
+Places = NDArray[np.float64]
 Rng = np.random.Generator
 
 SIDE_MM, NODES = 48.0, 480
@@ -38,6 +39,12 @@ def log_uniform(rng: Rng, low: float, high: float) -> float:
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
+def turned(x: Places, y: Places, angle_rad: float) -> tuple[Places, Places]:
+    """Return the coordinates of places along and across an axis at an angle to x."""
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    return cosine * x + sine * y, cosine * y - sine * x
+
+
 # Textures: height maps (NODES, NODES) of about 0..1 -----------------------------------------------------------
 
 
@@ -46,9 +53,8 @@ def noise(rng: Rng) -> Floats:
     frequency = np.fft.fftfreq(NODES, NODE_MM)
     x, y = np.meshgrid(frequency, frequency)
     angle, stretch = rng.uniform(0, math.pi), math.exp(rng.uniform(0, 1.4)) if rng.random() < 0.5 else 1.0
-    along = (x * math.cos(angle) + y * math.sin(angle)) * stretch
-    across = (y * math.cos(angle) - x * math.sin(angle)) / stretch
-    waves = np.hypot(along, across) * log_uniform(rng, 0.4, 8.0)
+    along, across = turned(x, y, angle)
+    waves = np.hypot(along * stretch, across / stretch) * log_uniform(rng, 0.4, 8.0)
     if rng.random() < 0.5:
         spectrum = np.exp(-0.5 * ((waves - 1) / rng.uniform(0.1, 0.6)) ** 2)
     else:
@@ -173,7 +179,7 @@ class RandomSurface:
             bool(rng.random() < 0.5),
         )
 
-    def gap_mm(self, rng: Rng, pixel_mm: float) -> NDArray[np.float64]:
+    def gap_mm(self, rng: Rng, pixel_mm: float) -> Places:
         """Return the gap (GRID) below the surface at a random place and turn, 0 at its highest point.
 
         Args:
@@ -183,23 +189,21 @@ class RandomSurface:
         x, y = np.meshgrid(*((np.arange(count) - (count - 1) / 2) * pixel_mm for count in GRID[::-1]))
         turn = rng.uniform(0, 2 * math.pi) if self.turns else rng.normal(0, 0.15)
         across, down = rng.normal(0, 2.5 if self.outline == "whole" else 1.5, 2)
-        u = math.cos(turn) * (x - across) + math.sin(turn) * (y - down)
-        v = math.cos(turn) * (y - down) - math.sin(turn) * (x - across)
+        u, v = turned(x - across, y - down, turn)
         starts = rng.uniform(0, NODES, 2)
         columns, rows = (
             np.mod(along / NODE_MM + start, NODES).astype(np.float32)
             for along, start in zip((u, v), starts, strict=True)
         )
         height = cv2.remap(self.heights_mm, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP).astype(float)
-        p = math.cos(self.angle_rad) * u + math.sin(self.angle_rad) * v
-        q = math.cos(self.angle_rad) * v - math.sin(self.angle_rad) * u
+        p, q = turned(u, v, self.angle_rad)
         height -= 0.5 * (self.curvatures[0] * p**2 + self.curvatures[1] * q**2) + 0.5 * (x**2 + y**2) / self.bow_mm
         outside = np.clip(self._outside_mm(p, q), 0, None)
         height -= outside**1.5 / self.rounding + np.where(outside > 3 * self.rounding, 3.0, 0.0)
         height += math.tan(rng.normal(0, 0.03)) * x + math.tan(rng.normal(0, 0.03)) * y
         return np.asarray(height.max() - height)
 
-    def _outside_mm(self, p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _outside_mm(self, p: Places, q: Places) -> Places:
         """Return the distance from the outline at places on the body's axes; negative inside."""
         size, aspect = self.size_mm, self.aspect
         match self.outline:

@@ -159,13 +159,19 @@ def save_checkpoint(
         header["pooled_references"] = pooled_references.to_dict() if pooled_references else None
     state = matcher.state_dict()
     if float16:
-        state = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in state.items()}
-        if over := [name for name, tensor in state.items() if not bool(torch.isfinite(tensor).all())]:
-            raise CheckpointError(f"{path}: {over[0]} exceeds 65504, the limit of float16; store it as float32")
+        state = as_float16(state, path)
     if queries is not None:
         state[_QUERIES] = torch.from_numpy(queries)
     write_tensors(path, state, header)
     write_atomically(sibling_file(path, ".md"), _model_card(path.name, header).encode())
+
+
+def as_float16(state: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """Return weights for the file `path` as float16. Raises CheckpointError if one exceeds its range."""
+    half = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in state.items()}
+    if over := [name for name, tensor in half.items() if not bool(torch.isfinite(tensor).all())]:
+        raise CheckpointError(f"{path}: {over[0]} exceeds 65504, the limit of float16; store it as float32")
+    return half
 
 
 CHECKPOINT_FIELDS = (

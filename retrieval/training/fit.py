@@ -98,6 +98,13 @@ def fit(
     return done
 
 
+def freeze_batch_norm(module: nn.Module) -> None:
+    """Put every batch normalisation of a module into evaluation mode: it uses its statistics and keeps them."""
+    for part in module.modules():
+        if isinstance(part, nn.BatchNorm2d):
+            part.eval()
+
+
 @dataclass(frozen=True)
 class BestStep:
     """The step with the highest score on validation objects.

@@ -32,7 +32,7 @@ from retrieval.model.towers import build_tower
 from retrieval.model.towers.weights import initialise_tower
 from retrieval.training.augmentation import augment, sample_grid
 from retrieval.training.disk_image_cache import DiskImageCache
-from retrieval.training.fit import RATE, Plan, fit
+from retrieval.training.fit import RATE, Plan, fit, freeze_batch_norm
 from retrieval.training.labels import LabelHead
 from retrieval.training.state import load_state, require_no_unfinished_state, save_state, state_path
 
@@ -223,9 +223,7 @@ class ReliefTraining:
     def _loss(self, batch: tuple[list[LabelledPicture], Tensor]) -> Tensor:
         pictures, images = batch
         self.tower.train()
-        for module in self.tower.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                module.eval()  # keep the pretrained statistics, since a batch of 32 is too small for new ones
+        freeze_batch_norm(self.tower)  # a batch of 32 is too small for new statistics
         self.head.train()
         torch.manual_seed(self.config.training.seed * 1_000_003 + self.step)  # the dropout mask
         return self.head.loss(self._features(images), [picture.labels for picture in pictures])

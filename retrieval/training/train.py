@@ -53,7 +53,7 @@ from retrieval.training import distributed
 from retrieval.training.batches import FeatureSource, FrozenFeatures, LoadedBatch, TrainedFeatures
 from retrieval.training.distil import add_candidate_encoder
 from retrieval.training.features import Features, features_by_image
-from retrieval.training.fit import RATE, Plan, fit
+from retrieval.training.fit import RATE, Plan, fit, freeze_batch_norm
 from retrieval.training.initial_weights import TOWER_WEIGHTS, build_matcher
 from retrieval.training.labels import LabelLoss
 from retrieval.training.licences import training_licences
@@ -395,6 +395,5 @@ def set_training_mode(matcher: Matcher, settings: TrainingConfig) -> None:
     if settings.freeze_stem:
         for tower in towers:
             tower.stem_layers().eval()
-    for module in matcher.modules():
-        if settings.freeze_batch_norm and isinstance(module, nn.BatchNorm2d):
-            module.eval()
+    if settings.freeze_batch_norm:
+        freeze_batch_norm(matcher)
