@@ -9,7 +9,6 @@ import pytest
 from tests.documents import CONTRIBUTING, NOTEBOOKS, PAGES, README, ROOT, SITE, anchors, links, table_rows, text_of
 
 LINKED = (*PAGES, CONTRIBUTING, *NOTEBOOKS)
-MAX_README_LINES = 150
 OURS = r"(?:retrieval|robot|indexes|tests|benchmarks)"
 
 
@@ -34,10 +33,6 @@ def test_pages_of_the_site_link_within_the_site():
 def test_every_page_and_picture_is_linked():
     reached = {(page.parent / link.partition("#")[0]).resolve() for page in LINKED for link in links(page)}
     assert {*SITE, *(ROOT / "docs" / "images").iterdir()} - {ROOT / "docs" / "index.md"} <= reached
-
-
-def test_the_readme_is_short():
-    assert len(text_of(README).splitlines()) <= MAX_README_LINES
 
 
 def test_the_tables_of_the_readme_are_parts_of_those_in_the_pages():

@@ -5,8 +5,6 @@ import tomllib
 from itertools import chain
 from pathlib import Path
 
-import tests
-
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
@@ -51,10 +49,3 @@ def test_only_our_packages_are_installed():
 def test_every_folder_with_modules_is_a_package():
     folders = {path.parent for name in ("retrieval", "robot", "indexes") for path in (ROOT / name).rglob("*.py")}
     assert [folder for folder in sorted(folders) if not (folder / "__init__.py").exists()] == []
-
-
-def test_test_helpers_are_listed():
-    names = {
-        path.stem for path in (ROOT / "tests").iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
-    }
-    assert {name for name in names if not name.startswith(("test_", "__"))} <= set(re.findall(r"\w+", tests.__doc__))
