@@ -34,7 +34,6 @@ They are not installed with the package. Each runs in a checkout of the reposito
     python -m benchmarks.models.in_double      a command in float64
     python -m benchmarks.importers_memory      memory of the importers for many rows
     python -m benchmarks.service_load          the service under load
-    python -m benchmarks.faults                faults of a sharded index, and their consequences
     python -m benchmarks.rehearsal             collect, check, train, index and query without hardware
     python -m benchmarks.structure             files, lines and imports of the packages; call paths through the code
     python -m benchmarks.reference             writes docs/reference.md, docs/commands.md and docs/datasets.md

@@ -6,7 +6,6 @@ exits with `exit_code`; any other error is a bug.
     RetrievalError             the job ran and failed (exit code 1)
     +-- NumericalError         a value is NaN or infinite
     +-- TooManyUnreadable      more photos are unreadable than the user allows
-    +-- RemoteStorageError     storage behind a URL keeps failing, or returns other data than was written
     +-- IncompleteSearch       shards did not answer, and too little of the catalogue was searched
     +-- JobInterrupted         the user stopped the job; results so far are stored
     +-- BadInput               wrong use or bad input (exit code 2)
@@ -41,10 +40,6 @@ class NumericalError(RetrievalError):
 
 class TooManyUnreadable(RetrievalError):
     """More photos of a catalogue are unreadable than the user allows; the index is unchanged."""
-
-
-class RemoteStorageError(RetrievalError):
-    """Storage behind a URL keeps failing, or returns other data than was written; the job can continue later."""
 
 
 class IncompleteSearch(RetrievalError):

@@ -16,7 +16,7 @@
     hard_case                                   one stiff or extreme input
     hostile_pictures, decoding                  pictures that are slow to decode; processes that hang
     plugins                                     entry points of a package that is not installed
-    serving, browser, s3, ray_processes, waiting    other processes, and waits with a limit
+    serving, browser, ray_processes, waiting    other processes, and waits with a limit
 
 The stiff and extreme inputs of a kernel are next to its tests, in `hard_*.py`.
 """

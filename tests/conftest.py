@@ -16,7 +16,7 @@ from hypothesis import HealthCheck, settings
 
 from retrieval.data.preprocessing import Preprocessing
 from retrieval.model.config import Config, MatcherConfig, TrainingConfig
-from tests import s3, synthetic
+from tests import synthetic
 
 # With `-n 2` each process has one thread: two processes with more threads slow each other down on two cores.
 THREADS = 1 if int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")) > 1 else 2
@@ -203,13 +203,6 @@ def embedded(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(photo_encoder, "encode_photos", counting_encode)
     return sizes
-
-
-@pytest.fixture(scope="module")
-def s3_server() -> Iterator[s3.S3Faults]:
-    """An S3 server, without faults until a test sets them; the environment contains its address."""
-    with s3.run_server() as faults:
-        yield faults
 
 
 def pytest_configure() -> None:

@@ -25,7 +25,6 @@ from indexes.errors import IndexesError
 from indexes.store.generation import check_fingerprint
 from indexes.store.sharded import ShardedManifest, ShardEntry, open_shard
 from retrieval.console.output import say
-from retrieval.data.storage import is_url
 from retrieval.errors import BadInput, IncompleteSearch, RetrievalError
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info
 from retrieval.model.posterior import Posterior
@@ -39,7 +38,6 @@ from retrieval.search.query.shard import (
     merge_results,
     merge_rows,
 )
-from retrieval.search.sharding.object_store import local_folder
 
 OWNERS = "touch-retrieval"
 APPLICATION = re.compile(r"shard-\d+-of-\d+-[0-9a-f]{16}-([0-9a-f]{8})")
@@ -88,7 +86,7 @@ class ShardReplica:
 
     def __init__(self, index: str, entry: ShardEntry, fingerprint: dict[str, str], model: str, verify: bool) -> None:
         stored = read_checkpoint_info(Path(model))
-        generation = open_shard(local_folder(index, entry), entry, fingerprint, verify=verify, threads=1)
+        generation = open_shard(Path(index), entry, fingerprint, verify=verify, threads=1)
         self._shard = folder_shard(generation, stored)
         threadpool_limits(1, "blas")  # for the whole process: idle BLAS threads spin on CPUs that others need
 
@@ -223,7 +221,7 @@ class Deployments:
         """Open a sharded index on Ray Serve, and return when all its shards are ready.
 
         Args:
-            index: Its folder or URL.
+            index: Its folder.
             manifest: Its manifest.
             stored: Header of the checkpoint.
 
@@ -235,8 +233,7 @@ class Deployments:
         names = {entry.folder: f"{entry.folder}-{entry.sha256[:16]}-{self._owner_id}" for entry in manifest.shards}
         self._close_handles()
         with self._lock:
-            where = index if is_url(index) else Path(index).resolve()
-            self._deploy(names, str(where), manifest, stored)
+            self._deploy(names, str(Path(index).resolve()), manifest, stored)
             self._users.update(names.values())
             for name in set(names.values()) - set(self._handles):
                 # Create its router now: concurrent first calls would create several, and only one could be shut down.

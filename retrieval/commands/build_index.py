@@ -1,6 +1,5 @@
 """`retrieve build-index`: make a folder of photos searchable."""
 
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +9,6 @@ from indexes import KINDS
 from retrieval.commands.options import COUNT, FRACTION, Json, Model, NumberParser, announce_resume
 from retrieval.console.files import PREVIEW, require_ours
 from retrieval.console.output import print_json, say
-from retrieval.data.storage import is_url
 from retrieval.errors import BadInput, RetrievalError
 
 if TYPE_CHECKING:
@@ -23,10 +21,8 @@ PREVIEW_PHOTOS = 16
 
 def build_index(
     catalogue: Annotated[
-        str,
-        typer.Argument(
-            help="folder with <object>/<photo> or <object>.<ext>; or URL of a folder, of Parquet files or of tar files"
-        ),
+        Path,
+        typer.Argument(help="folder with <object>/<photo> or <object>.<ext>"),
     ],
     *,
     objects_from: Annotated[
@@ -39,7 +35,7 @@ def build_index(
         ),
     ] = None,
     model: Model = None,
-    out: Annotated[str, typer.Option(help="index folder, or a URL for the shards")] = "index",
+    out: Annotated[Path, typer.Option(help="index folder")] = Path("index"),
     kind: Annotated[
         str | None,
         typer.Option(
@@ -76,7 +72,7 @@ def build_index(
         int | None,
         typer.Option(
             parser=COUNT,
-            help="number of shards (index folders) of the catalogue (default: as in OUT, else none; 1 for a URL)",
+            help="number of shards (index folders) of the catalogue (default: as in OUT, else none)",
         ),
     ] = None,
     max_unreadable: Annotated[
@@ -97,8 +93,7 @@ def build_index(
         bool,
         typer.Option(
             "--verify",
-            help="read every photo, even if its size, times and inode did not change; with a URL as OUT, also check "
-            "the uploaded files",
+            help="read every photo, even if its size, times and inode did not change",
         ),
     ] = False,
     json: Json = False,
@@ -110,10 +105,8 @@ def build_index(
     from retrieval.search import defaults
     from retrieval.search.build import build_index as build
     from retrieval.search.sharding import build_sharded
-    from retrieval.search.sharding.object_store import RemoteShardedIndex
 
-    if not is_url(out):
-        require_separate_folders(catalogue, out)
+    require_separate_folders(catalogue, out)
     sheet = _preview_path(catalogue, out) if preview else None
     shards = _shard_count(shards, out, has_shard_options=max_unreadable is not None or cluster)
     path, reason = defaults.find_model(model, out)
@@ -132,9 +125,9 @@ def build_index(
         from retrieval.cluster.building import ray_runner
 
         run = ray_runner()
-    with announce_resume(f"embedded photos are stored in {RemoteShardedIndex(out).work if is_url(out) else out}"):
+    with announce_resume(f"embedded photos are stored in {out}"):
         if shards is None:
-            report = build.build_index(catalogue, checkpoint, Path(out), **options)
+            report = build.build_index(catalogue, checkpoint, out, **options)
         else:
             allowed = build_sharded.MAX_UNREADABLE if max_unreadable is None else max_unreadable
             report = build_sharded.build_sharded(
@@ -146,7 +139,7 @@ def build_index(
     for line in report.lines():
         say(line)
     if sheet is not None:
-        _write_views(sheet, Path(catalogue), Path(out), report, checkpoint)
+        _write_views(sheet, catalogue, out, report, checkpoint)
     if json:
         print_json(report.to_dict())
     if report.without_photo:
@@ -154,45 +147,37 @@ def build_index(
         raise RetrievalError(f"the index is written, but {count} object(s) have no readable photo; see above")
 
 
-def _preview_path(catalogue: str, out: str) -> Path:
+def _preview_path(catalogue: Path, out: Path) -> Path:
     """Return the path of the preview picture.
 
     Raises:
-        BadInput: The preview cannot be written there, or the catalogue or the index is not a local folder.
+        BadInput: The preview cannot be written there.
     """
-    from retrieval.data.sources import is_url_or_archive
-
-    folder = Path(out).resolve()
+    folder = out.resolve()
     sheet = folder.with_name(f"{folder.name}-views.png")
     require_ours(sheet, PREVIEW)
-    if Path(catalogue).resolve() in sheet.parents:
+    if catalogue.resolve() in sheet.parents:
         raise BadInput(
             f"{sheet} would become a photo of the catalogue {catalogue}; choose an --out outside it for --preview"
         )
-    for location, is_remote in ((catalogue, is_url_or_archive), (out, is_url)):
-        if is_remote(location):
-            raise BadInput(f"--preview needs a local folder as catalogue and as --out, got {location}")
     return sheet
 
 
-def _shard_count(requested: int | None, out: str, *, has_shard_options: bool) -> int | None:
+def _shard_count(requested: int | None, out: Path, *, has_shard_options: bool) -> int | None:
     """Return the number of shards to build: the requested one, else that of `out`; None for one index folder.
 
     Args:
         requested: The value of `--shards`.
-        out: Index folder or URL.
+        out: Index folder.
         has_shard_options: Whether options were given that apply to shards only.
 
     Raises:
         BadInput: Options that apply to shards only were given without shards.
     """
-    from indexes.errors import NoIndex
-    from retrieval.search.sharding.object_store import is_sharded, read_sharded_manifest
+    from indexes.store.sharded import is_sharded, read_sharded_manifest
 
     if requested is None and is_sharded(out):
-        with suppress(NoIndex):
-            return read_sharded_manifest(out).of
-        return 1  # a URL that contains no index yet
+        return read_sharded_manifest(out).of
     if requested is None and has_shard_options:
         raise BadInput("--max-unreadable and --cluster need shards; give --shards too")
     return requested

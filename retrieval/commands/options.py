@@ -25,9 +25,7 @@ SPLIT = "JSON file with train, validation and test objects"
 Json = Annotated[bool, typer.Option("--json", help="print one JSON document on stdout")]
 Index = Annotated[
     str | None,
-    typer.Option(
-        help="index folder, or the URL of a sharded index (default: ./index, else the last one built in this folder)"
-    ),
+    typer.Option(help="index folder (default: ./index, else the last one built in this folder)"),
 ]
 IndexModel = Annotated[str | None, typer.Option(help="checkpoint (default: that of the index)")]
 NoVerify = Annotated[

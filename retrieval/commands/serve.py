@@ -4,7 +4,7 @@ import os
 import webbrowser
 from collections.abc import Mapping
 from contextlib import ExitStack
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -114,7 +114,6 @@ def serve(
         from retrieval.serve.settings import ServiceSettings
     except ImportError as error:
         raise BadInput(f"{error.name} is missing; run: pip install 'touch-retrieval[serve]'") from error
-    from retrieval.data.storage import is_url
     from retrieval.search import defaults
     from retrieval.serve.rig import load_live_rig, simulated_live_rig
 
@@ -131,7 +130,7 @@ def serve(
     path, reason = defaults.find_index(index)
     if index is None:
         say(f"index: {path} ({reason})")
-    local = Path(PurePosixPath(path).name if is_url(path) else path).resolve()
+    local = path.resolve()
     settings = ServiceSettings(
         index=path,
         model=Path(model) if model else None,
@@ -165,7 +164,7 @@ def _ray_shards(index: str | Path, stack: ExitStack, options: Mapping[str, Any],
     """Return the function that opens shards on Ray; join or start Ray first.
 
     Args:
-        index: Folder or URL of the index.
+        index: Folder of the index.
         stack: Closes the session and the deployments.
         options: Values of the options of `--cluster`; None for those left out.
         verify: Whether to check the index files against their checksums.
@@ -173,11 +172,11 @@ def _ray_shards(index: str | Path, stack: ExitStack, options: Mapping[str, Any],
     Raises:
         BadInput: The index is not sharded.
     """
+    from indexes.store.sharded import is_sharded
     from retrieval.cluster.serving import Deployments, ReplicaSettings
     from retrieval.cluster.session import ray_session
-    from retrieval.search.sharding.object_store import is_sharded
 
-    if not is_sharded(index):
+    if not is_sharded(Path(index)):
         raise BadInput(f"{index} has no shards; build a sharded index with `retrieve build-index --shards`")
     values = {name.replace("shard_timeout", "wait_s"): value for name, value in options.items() if value is not None}
     settings = ReplicaSettings(**values)

@@ -1,4 +1,4 @@
-r"""Check that text can be encoded as UTF-8.
+r"""Check text from files that other people made: it must be UTF-8, and a path must stay in its folder.
 
 JSON may contain a lone surrogate such as `"\ud83d"`, as from a truncated emoji. Python reads it, but no file, terminal
 or HTTP response can contain it.
@@ -6,6 +6,7 @@ or HTTP response can contain it.
 
 import json
 import re
+from pathlib import PurePosixPath
 from typing import Any
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
@@ -28,6 +29,17 @@ def require_utf8(document: Any) -> None:
     """
     if not is_utf8(document):
         raise ValueError("contains a lone surrogate such as \\ud83d; write the whole character")
+
+
+def is_inside(path: object) -> bool:
+    """Return whether `path` is a relative path that stays below its folder.
+
+    Paths in indexes are untrusted: a path with ".." could lead to other files of the user.
+    """
+    if not isinstance(path, str) or "\0" in path:
+        return False
+    parts = PurePosixPath(path).parts
+    return bool(parts) and not path.startswith("/") and ".." not in parts
 
 
 def replace_surrogates(document: Any) -> Any:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from _touch_retrieval.files import file_digest, read_json, write_atomically
-from retrieval.data.storage import is_url, url_or_path
 from retrieval.errors import BadInput, CheckpointError
 
 if TYPE_CHECKING:
@@ -59,7 +58,7 @@ def find_model(choice: str | None, index: str | Path = INDEX) -> tuple[Path, str
     Args:
         choice: A path or one of `SHIPPED_NAMES`; None for the checkpoint of `index`, else the last one trained in this
             folder, else the shipped one.
-        index: Index folder, or URL of a sharded index.
+        index: Index folder or sharded index.
 
     Raises:
         CheckpointError: There is no checkpoint, or the one of `index` is missing.
@@ -89,19 +88,17 @@ def manifest_of(index: str | Path) -> "Manifest | ShardedManifest":
     """Return the manifest of the current generation of an index.
 
     Args:
-        index: An index folder, or the folder or URL of a sharded index.
+        index: An index folder, or the folder of a sharded index.
 
     Raises:
         IndexesError: The index is missing or damaged.
-        StorageError: The storage behind the URL fails.
     """
     from indexes.store.folder import IndexStore
     from indexes.store.manifest import read_manifest
-    from retrieval.search.sharding.object_store import is_sharded, read_sharded_manifest
+    from indexes.store.sharded import is_sharded, read_sharded_manifest
 
-    return (
-        read_sharded_manifest(index) if is_sharded(index) else read_manifest(Path(index) / IndexStore(index).current())
-    )
+    folder = Path(index)
+    return read_sharded_manifest(folder) if is_sharded(folder) else read_manifest(folder / IndexStore(folder).current())
 
 
 def model_of(manifest: "Manifest | ShardedManifest") -> Path:
@@ -124,23 +121,23 @@ def model_of(manifest: "Manifest | ShardedManifest") -> Path:
     )
 
 
-def find_index(choice: str | None) -> tuple[str | Path, str]:
-    """Return the index to use, a folder or a URL, and the reason.
+def find_index(choice: str | None) -> tuple[Path, str]:
+    """Return the index folder to use, and the reason.
 
     Args:
-        choice: A folder or URL; None for ./index, else the last index built from this folder.
+        choice: A folder; None for ./index, else the last index built from this folder.
 
     Raises:
         BadInput: There is no index.
     """
     if choice is not None:
-        if not is_url(choice) and Path(choice).is_file():
+        if Path(choice).is_file():
             raise BadInput(f"{choice} is a file; an index is a folder, which `retrieve build-index` writes")
-        return url_or_path(choice), "given"
+        return Path(choice), "given"
     if _is_index(INDEX):
         return INDEX, "in this folder"
-    if (last := _last_of_folder().get("index")) and (is_url(last) or _is_index(Path(last))):
-        return url_or_path(last), "the last one built from this folder"
+    if (last := _last_of_folder().get("index")) and _is_index(Path(last)):
+        return Path(last), "the last one built from this folder"
     raise BadInput(
         "there is no index in this folder and none was built from it; run `retrieve build-index CATALOGUE` first, "
         "or name one with --index"
@@ -157,7 +154,7 @@ def remember(kind: str, path: str | Path) -> None:
     try:
         here = str(Path.cwd())
         state = _read_state()
-        mine = {**state.pop(here, {}), kind: str(path if is_url(path) else Path(path).resolve())}
+        mine = {**state.pop(here, {}), kind: str(Path(path).resolve())}
         state = {**dict(list(state.items())[-MAX_FOLDERS + 1 :]), here: mine}
         _state_file().parent.mkdir(parents=True, exist_ok=True)
         write_atomically(_state_file(), json.dumps(state).encode())

@@ -18,7 +18,6 @@ from indexes.errors import IndexesError
 from indexes.store.folder import IndexStore
 from indexes.store.sharded import is_sharded, read_sharded_manifest
 from retrieval.data.images import encode_image
-from retrieval.data.storage import is_url
 from retrieval.errors import BadInput
 from retrieval.search.query.objects import listed_photo
 from retrieval.serve.service import GraspResult, LiveRig
@@ -71,12 +70,7 @@ def simulated_live_rig(index: str | Path) -> LiveRig | None:
 
 
 def _seed(index: str | Path) -> int | None:
-    """Return the seed of the simulated objects of an index.
-
-    None if the first object is not one of the simulated rig, and for an index behind a URL.
-    """
-    if is_url(index):
-        return None
+    """Return the seed of the simulated objects of an index; None if the first object is not of the simulated rig."""
     try:
         folder = Path(index)
         folder = folder / read_sharded_manifest(folder).shards[0].folder if is_sharded(folder) else folder

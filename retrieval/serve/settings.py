@@ -24,7 +24,7 @@ class ServiceSettings:
     """Options of `retrieve serve`.
 
     Attributes:
-        index: Index folder or URL.
+        index: Index folder.
         model: Checkpoint; None for the one that the index names.
         verify: Whether to verify checksums when the index opens.
         host: Host to listen on; a host other than this machine requires a `token`.

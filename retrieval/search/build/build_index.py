@@ -17,9 +17,8 @@ from indexes.store.manifest import read_manifest
 from indexes.store.stat_cache import FolderCache
 from indexes.store.tables import Tables
 from indexes.store.writing import RECALL_QUERIES, KindChoice
-from retrieval.data.catalogue import Catalogue
+from retrieval.data.catalogue import Catalogue, list_catalogue
 from retrieval.data.naming import FOLDER, Naming, count_summary, naming_warnings
-from retrieval.data.sources import RemoteCatalogue, list_photos
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint import Checkpoint
 from retrieval.model.checkpoint_info import can_reuse_partials, fingerprint
@@ -69,7 +68,7 @@ def build_index(
     be read are skipped and reported. An interrupted build stores its embeddings and partial activations for the next.
 
     Args:
-        folder: The catalogue: a local folder or a URL (`retrieval.data.sources`).
+        folder: The catalogue folder (`retrieval.data.catalogue`).
         checkpoint: The model.
         out: The index folder.
         objects_from: Rule that names the object of a photo (`retrieval.data.naming`); None for the rule of the existing
@@ -104,7 +103,7 @@ def build_index(
     naming, note = naming_by(objects_from, before)
     options = BuildOptions(naming, requirements, quiet, verify, note, cells=stores_cells(cells, before, checkpoint))
     folders = FolderCache(out, known=not verify)
-    catalogue = list_photos(folder, naming, folders)
+    catalogue = list_catalogue(folder, naming, folders)
     report = build_listed(catalogue, checkpoint, out, options)
     folders.write()
     return report
@@ -192,11 +191,7 @@ def build_listed(catalogue: Catalogue, checkpoint: Checkpoint, out: Path, option
         removed=embedder.removed,
         unread=int((known >= 0).sum()),
         skipped=[*embedder.skipped, *references.skipped],
-        ignored=[
-            name
-            for name in catalogue.ignored
-            if isinstance(catalogue, RemoteCatalogue) or not (catalogue.folder / name).resolve().is_relative_to(inside)
-        ],
+        ignored=[name for name in catalogue.ignored if not (catalogue.folder / name).resolve().is_relative_to(inside)],
         without_photo=sorted(set(catalogue.object_ids) - objects.keys()),
         notes=list(catalogue.notes),
         kind=manifest.kind,

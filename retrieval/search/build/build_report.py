@@ -18,7 +18,7 @@ class BuildReport:
     """The result of a build; `lines` yields it as text.
 
     Attributes:
-        index: Folder or URL of the index.
+        index: Folder of the index.
         generation: Name of the current generation.
         written: Whether a new generation was written; False if nothing changed.
         model: Path of the checkpoint.

@@ -21,7 +21,6 @@ from indexes.store.generation import Generation
 from indexes.store.rows import key_of, keys_of
 from indexes.store.stat_cache import MIN_AGE_NS, STATUS, StatRecords, Statuses
 from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable
-from retrieval.data.sources import RemoteCatalogue
 
 MIN_RUN = 256
 """Smallest run of unchanged photos that is copied as a block; each run ends a batch of photos to encode."""
@@ -52,9 +51,7 @@ class StatCache:
         self._records = StatRecords(index)
         self._verify = verify
         self._file_statuses, self._recordable = _file_statuses(catalogue)
-        self.lacks_records = (
-            not isinstance(catalogue, RemoteCatalogue) and not verify and not len(self._records.records)
-        )
+        self.lacks_records = not verify and not len(self._records.records)
 
     def known(self, parent: Generation | None) -> Slots:
         """Return the parent's row (N,) of each photo whose file is not read again, else -1."""
@@ -120,8 +117,6 @@ def _file_statuses(catalogue: Catalogue) -> tuple[Statuses, NDArray[np.bool_]]:
     """Return the stat (N, 4) of each file, zeros if unknown, and whether it is older than `MIN_AGE_NS` (N,)."""
     now, paths, packed = time.time_ns(), catalogue.photos.paths, list[bytes]()
     unknown = np.zeros((len(paths), len(STATUS)), np.uint64), np.zeros(len(paths), bool)
-    if isinstance(catalogue, RemoteCatalogue):
-        return unknown
     try:
         folder = os.open(catalogue.folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError:  # removed since it was listed

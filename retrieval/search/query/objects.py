@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
 from indexes.store.rows import keys_of
-from retrieval.data.storage import is_inside
-from retrieval.data.text import replace_surrogates
+from retrieval.data.text import is_inside, replace_surrogates
 from retrieval.model.posterior import Posterior
 from retrieval.model.stored_partials import Layout
 

@@ -8,7 +8,7 @@ from typing import Any
 from indexes.store.folder import IndexStore
 from indexes.store.generation import Generation, check_fingerprint
 from indexes.store.manifest import Manifest
-from indexes.store.sharded import ShardedManifest, open_shard
+from indexes.store.sharded import ShardedManifest, is_sharded, open_shard, read_sharded_manifest
 from retrieval.model.checkpoint_info import CheckpointInfo, fingerprint, read_checkpoint_info, read_scorer
 from retrieval.model.fusion_scorer import FusionScorer
 from retrieval.model.stored_partials import CELLS, stored_layout
@@ -16,10 +16,9 @@ from retrieval.model.touches import TouchEncoder
 from retrieval.search import defaults
 from retrieval.search.query.objects import check_usable
 from retrieval.search.query.shard import FolderShard, IndexInfo, Shard, Shards
-from retrieval.search.sharding.object_store import is_sharded, local_folder, read_sharded_manifest
 
 OpenShards = Callable[[str | Path, ShardedManifest, CheckpointInfo], Shard]
-"""Opens the shards of a sharded index in a folder or behind a URL, in this process or elsewhere."""
+"""Opens the shards of a sharded index, in this process or elsewhere."""
 
 
 def open_index(
@@ -28,7 +27,7 @@ def open_index(
     """Open the current generation of an index folder or of a sharded index.
 
     Args:
-        index: A folder, or the URL of a sharded index.
+        index: Its folder.
         model: Path of the checkpoint, if it was moved.
         verify: Compare the checksums of the files.
         shards: Opens the shards; None to open them in this process.
@@ -40,6 +39,7 @@ def open_index(
         IndexesError: The index is missing, damaged, or of another model.
         CheckpointError: The checkpoint is missing or damaged.
     """
+    index = Path(index)
     if not is_sharded(index):
         generation = IndexStore(index).open(verify=verify, threads=1)  # one query at a time
         stored = read_checkpoint_of(generation.manifest, model)
@@ -95,19 +95,17 @@ def open_sharded_index(
     """Open all shards of a sharded index in this process.
 
     Args:
-        index: Its folder, or its URL, from which the shards are fetched first.
+        index: Its folder.
         manifest: Its manifest.
         stored: Header of the checkpoint.
         verify: Compare the checksums of the files.
 
     Raises:
         IndexesError: A shard is missing or damaged, or the index is of another model.
-        StorageError: The storage behind the URL fails.
     """
     check_fingerprint(index, manifest.fingerprint, fingerprint(stored))
     opened = (
-        open_shard(local_folder(index, entry), entry, manifest.fingerprint, verify=verify, threads=1)
-        for entry in manifest.shards
+        open_shard(Path(index), entry, manifest.fingerprint, verify=verify, threads=1) for entry in manifest.shards
     )
     return Shards([folder_shard(generation, stored) for generation in opened], sharded_index_info(manifest))
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from _touch_retrieval.documents import typed
 from indexes.errors import AGAIN, CorruptIndex
 from indexes.store.generation import Generation
-from retrieval.data.storage import is_inside
+from retrieval.data.text import is_inside
 from retrieval.errors import BadInput
 from retrieval.model.posterior import Posterior
 from retrieval.model.reference_calibration import (

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from indexes.errors import UnsupportedFormat
 from indexes.store.generation import Generation
-from retrieval.data.storage import url_or_path
 from retrieval.errors import BadInput
 from retrieval.model.checkpoint_info import CheckpointInfo
 from retrieval.model.fusion_scorer import CONTACT, NOT_A_GEL, FusionScorer
@@ -97,7 +96,7 @@ class Searcher:
         encodes touches, without PyTorch.
 
         Args:
-            index: Its folder; or the URL of a sharded index, whose shards are fetched once into the user's cache.
+            index: Its folder.
             model: Path of the checkpoint, if it was moved.
             verify: Compare the checksums of the index's files.
             threads: Number of threads of the encoder (with PyTorch: of the process). Default: the library's choice.
@@ -117,7 +116,7 @@ class Searcher:
         """
         shard, stored = open_index(index, model, verify, shards)
         encoder = find_export(stored, threads) or torch_encoder(stored, threads)
-        return cls(url_or_path(index), shard, stored, encoder, scorer_for(stored, shard.info.about))
+        return cls(Path(index), shard, stored, encoder, scorer_for(stored, shard.info.about))
 
     def close(self) -> None:
         """Release the index and the model; running queries continue. A second call does nothing."""

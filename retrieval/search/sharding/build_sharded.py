@@ -4,9 +4,6 @@ All photos of an object go to one shard, and each shard is built as an ordinary 
 partial activations) are reused from the same shard, from the shards of an earlier build with another number of shards,
 and from an interrupted build. The manifest is written when every shard is on the disk, so a killed build does not
 change the index.
-
-A sharded index in an object store is built in a local folder, and each shard is uploaded as soon as it is complete
-(`retrieval.search.sharding.object_store`).
 """
 
 from collections import Counter, defaultdict
@@ -38,12 +35,10 @@ from indexes.store.sharded import (
     sharded_generation_name,
     write_sharded_manifest,
 )
-from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable
+from retrieval.data.catalogue import Catalogue, CataloguePhoto, PhotoTable, list_catalogue
 from retrieval.data.catalogue_touches import CatalogueTouch
 from retrieval.data.folder_walk import SkippedPhoto
 from retrieval.data.naming import Naming, count_summary, naming_warnings
-from retrieval.data.sources import list_photos
-from retrieval.data.storage import is_url
 from retrieval.errors import BadInput, NoReadablePhoto, TooManyUnreadable
 from retrieval.model.checkpoint import Checkpoint, load_checkpoint
 from retrieval.model.checkpoint_info import fingerprint
@@ -53,7 +48,6 @@ from retrieval.search.build.build_index import BuildOptions, build_listed, namin
 from retrieval.search.build.build_report import BuildReport
 from retrieval.search.build.embed import no_photo
 from retrieval.search.build.operating import SearchRequirements
-from retrieval.search.sharding.object_store import RemoteShardedIndex, generation_names, local_folder
 from retrieval.version import __version__
 
 MAX_UNREADABLE = 0.05
@@ -68,7 +62,7 @@ class ShardJob:
     """One shard to build, as sent to the process that builds it.
 
     Attributes:
-        index: Folder or URL of the sharded index.
+        index: Folder of the sharded index.
         folder: Folder of the shard in it.
         catalogue: The shard's photos and touches.
         model: Path of the checkpoint.
@@ -76,7 +70,7 @@ class ShardJob:
         donors: Shards of an earlier build with another number of shards, whose codes may be reused.
     """
 
-    index: str | Path
+    index: Path
     folder: str
     catalogue: Catalogue
     model: Path
@@ -128,7 +122,7 @@ def build_sharded(
     Args:
         folder: The catalogue, as for `build_index`.
         checkpoint: The model.
-        out: Folder or URL of the sharded index.
+        out: Folder of the sharded index.
         shards: Number of shards.
         objects_from: As for `build_index`.
         kind: As for `build_index`.
@@ -146,23 +140,20 @@ def build_sharded(
     Raises:
         BadInput: The number of shards is out of range, or `out` is an index folder.
         TooManyUnreadable: More photos than `max_unreadable` cannot be read.
-        StorageError: The storage behind the URL fails repeatedly, or another build finished first.
     """
     if not 1 <= shards <= MAX_SHARDS:
         raise BadInput(f"shards must be from 1 to {MAX_SHARDS}; got {shards}")
     if not 0 <= max_unreadable <= 1:
         raise BadInput(f"the fraction of unreadable photos must be from 0 to 1; got {max_unreadable}")
-    stored = RemoteShardedIndex(str(out)) if is_url(out) else None
-    own = Path(out) if stored is None else stored.work
+    own = Path(out)
     if (own / "CURRENT").is_file():
         raise BadInput(f"{out} is an index folder; give another folder for a sharded index of {shards} shards")
     requirements = SearchRequirements.of(kind, min_recall, max_ms)
     with WriterLock(own / "LOCK"):
-        current = None if stored is None else stored.manifest()
         before: ShardedManifest | None = None
         note = ""
         try:
-            before = read_sharded_manifest(own) if stored is None else stored.parse_manifest(current)
+            before = read_sharded_manifest(own)
         except NoIndex:
             pass
         except (CorruptIndex, UnsupportedFormat) as error:
@@ -172,7 +163,7 @@ def build_sharded(
         cells = stores_cells(cells, about, checkpoint)
         if cells is False:
             checkpoint = checkpoint.without_cells()
-        catalogue = list_photos(folder, naming)
+        catalogue = list_catalogue(folder, naming)
         if catalogue.touches and checkpoint.references is None:
             raise BadInput(
                 "this model has no calibration of reference touches. A sharded index needs one in the model, because "
@@ -180,11 +171,10 @@ def build_sharded(
                 "train` with enough validation objects"
             )
         _delete_old_shards(own, before, shards)
-        old_generations = {} if stored is None else stored.generations()
         donors = [] if before is None or before.of == shards else before.shards
         options = BuildOptions(naming, requirements, quiet, verify, keep=_KEEP_ALL, cells=cells)
         jobs = [
-            ShardJob(out, folder, part, checkpoint.path, replace(options, about={"shard": folder}), donors)
+            ShardJob(own, folder, part, checkpoint.path, replace(options, about={"shard": folder}), donors)
             for folder, part in _split_catalogue(catalogue, shards)
         ]
         built = sorted((run or build_in_process)(jobs, checkpoint), key=lambda one: one.folder)
@@ -199,12 +189,8 @@ def build_sharded(
             )
         manifest = _manifest(before, built, shards, checkpoint, catalogue, report, requirements)
         written = before is None or manifest.generation != before.generation
-        if written and stored is None:
+        if written:
             write_sharded_manifest(own, manifest)
-        elif written and stored is not None:
-            stored.switch(current, manifest)
-            in_use = generation_names([*manifest.shards, *([] if before is None else before.shards)])
-            stored.discard(old_generations.keys() - in_use)
         for entry in manifest.shards:
             IndexStore(own / entry.folder).discard_before(entry.generation)
     reason = " ".join(filter(None, (renamed, note, report.reason)))
@@ -228,24 +214,17 @@ def build_shard(job: ShardJob, checkpoint: Checkpoint | None = None) -> ShardBui
         RetrievalError: As for `build_index`, except if none of the shard's photos can be read.
     """
     model = checkpoint or load_checkpoint(job.model)
-    stored = RemoteShardedIndex(str(job.index)) if is_url(job.index) else None
-    index = Path(job.index) if stored is None else stored.work
-    if stored is not None:
-        stored.restore(job.folder)
-    store, donors = IndexStore(index / job.folder), list[Generation]()
+    store, donors = IndexStore(job.index / job.folder), list[Generation]()
     for donor in job.donors:
         with suppress(IndexesError):  # an unusable donor is skipped
-            place = local_folder(job.index, donor) / donor.folder
-            donors.append(IndexStore(place).open(name=donor.generation, expect=fingerprint(model)))
+            donors.append(IndexStore(job.index / donor.folder).open(name=donor.generation, expect=fingerprint(model)))
     try:
         report = build_listed(job.catalogue, model, store.path, replace(job.options, donors=donors))
     except NoReadablePhoto as error:
         return ShardBuild(job.folder, None, None, [], error.skipped)
     generation = store.open(name=report.generation, verify=False)
     counts = np.bincount(generation.codes("object_id")).tolist()
-    entry = shard_entry(index, job.folder, generation, len(counts))
-    if stored is not None:
-        stored.put(entry, job.options.verify)
+    entry = shard_entry(job.index, job.folder, generation, len(counts))
     return ShardBuild(job.folder, entry, report, counts, report.skipped)
 
 

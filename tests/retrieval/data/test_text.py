@@ -1,14 +1,11 @@
 """Text that cannot be encoded as UTF-8 is refused on input, or shown as U+FFFD."""
 
-import io
 import json
 import shutil
-import tarfile
 
 import pytest
 
 from retrieval.data.catalogue import list_catalogue
-from retrieval.data.sources import list_photos
 from retrieval.data.text import is_utf8, replace_surrogates
 from retrieval.errors import DatasetError
 from retrieval.model.checkpoint import load_checkpoint
@@ -44,27 +41,6 @@ def test_a_surrogate_pair_of_two_escapes_is_accepted(catalogue_copy):
     name = sorted(path.name for path in catalogue_copy.iterdir())[0]
     (catalogue_copy / "metadata.jsonl").write_text(json.dumps({"object_id": name, "note": "\U0001f600"}) + "\n")
     assert list_catalogue(catalogue_copy).photos[0].metadata == {"note": "\U0001f600"}
-
-
-def test_a_lone_surrogate_in_an_archive_is_refused_with_its_member(tmp_path):
-    with tarfile.open(tmp_path / "photos.tar", "w") as archive:
-        for name, data in (("1.jpg", b"x"), ("1.json", rb'{"object_id": "mug\ud83d"}')):
-            member = tarfile.TarInfo(name)
-            member.size = len(data)
-            archive.addfile(member, io.BytesIO(data))
-    with pytest.raises(DatasetError, match=r"photos.tar, 1.json: contains a lone surrogate"):
-        list_photos(str(tmp_path / "photos.tar"))
-
-
-def test_members_of_an_archive_with_names_that_are_not_utf8_are_skipped(tmp_path):
-    with tarfile.open(tmp_path / "photos.tar", "w") as archive:
-        for name in (f"{NAME}/1.jpg", "cup/1.jpg"):
-            archive.addfile(tarfile.TarInfo(name))
-    found = list_photos(str(tmp_path / "photos.tar"))
-    assert found.photos.paths == ("cup/1.jpg",)
-    assert [(one.path, one.reason) for one in found.skipped] == [
-        (r"mug\xff/1.jpg", "the name is not valid UTF-8; rename it")
-    ]
 
 
 def test_a_lone_surrogate_in_a_recording_is_refused_with_its_line(recording, tmp_path):
