@@ -302,7 +302,7 @@ def test_an_index_is_not_written_among_the_photos(out, workplace, model, capsys)
     shutil.copy("a.png", workplace / "catalog" / "cup" / "deep.png")
     before = sorted(workplace.rglob("*"))
     assert main(["build-index", "catalog", "--model", str(model), "--out", out]) == 2
-    assert f"the index would be written among the photos in {out}" in capsys.readouterr().err
+    assert f"the index would be written among the photos in {Path(out)}" in capsys.readouterr().err
     assert sorted(workplace.rglob("*")) == before
 
 
