@@ -18,7 +18,6 @@ import numpy as np
 from benchmarks.common import ResultLine, duration
 from robot.devices import TactileSensor, read_together
 from robot.drivers.gels.opencv import OpencvTactile
-from robot.drivers.replay import VideoSensor
 from robot.drivers.video.rectify import Rectifier, to_rgb
 from tests.fake_video import FakeVideoDevice
 
@@ -28,12 +27,11 @@ QUICK: dict[str, Any] = {"warmup_s": 0.2, "timeout_s": 10.0}
 
 
 def measure(seconds: float = 3.0) -> Iterator[ResultLine]:
-    """Yield a line for each rate, for each way to match two fingers, for a video, and for the work on one frame."""
+    """Yield a line for each rate, for each way to match two fingers, and for the work on one frame."""
     for fps in (30.0, 60.0):
         yield _rate(fps, seconds)
     yield _skew("newest of each", 1, seconds)
     yield _skew("nearest in time", 4, seconds)
-    yield _video()
     yield from _work()
 
 
@@ -87,27 +85,6 @@ def _skew(way: str, keep: int, seconds: float) -> ResultLine:
     mean, largest = float(np.mean(skews)), float(np.max(skews))
     text = f"two fingers 10 ms out of step: mean difference {duration(mean)}, at most {duration(largest)}"
     return ResultLine("cameras", f"skew, {way}", text, {"mean_s": mean, "most_s": largest})
-
-
-def _video(pictures: int = 120) -> ResultLine:
-    """Read a video of 640 x 480 as a sensor, each frame as soon as the previous one has arrived."""
-    rng = np.random.default_rng(2)
-    now = [0.0]
-    with tempfile.TemporaryDirectory() as folder:
-        path = str(Path(folder) / "film.avi")
-        writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 30.0, SIZE)
-        for _ in range(pictures):
-            writer.write(cv2.resize(rng.integers(0, 255, (30, 40, 3), np.uint8), SIZE))
-        writer.release()
-        with VideoSensor(finger="a", path=path, clock=lambda: now[0]) as gel:
-            start = time.perf_counter()
-            for number in range(1, pictures):
-                now[0] = (number + 0.5) / 30.0
-                gel.read()
-            each = (time.perf_counter() - start) / (pictures - 1)
-    return ResultLine(
-        "cameras", "video, MJPG 640 x 480", f"{1 / each:.0f} frames per second decoded", {"per_s": 1 / each}
-    )
 
 
 def _work() -> Iterator[ResultLine]:

@@ -97,7 +97,7 @@ class Cue:
         self.lifted_from = None
 
     def gel(self, sensor):
-        return Frame(sensor._picture(3 * self.number + MOMENTS.index(self._moment())), sensor.clock())
+        return Frame(sensor.pictures[3 * self.number + MOMENTS.index(self._moment())], sensor.clock())
 
     def _moment(self):
         if self.emulator.grasping != HOLDING:

@@ -91,8 +91,6 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
         gelsight_mini="robot.drivers.gels.opencv:GelSightMini",
         digit="robot.drivers.gels.opencv:Digit",
         uvc="robot.drivers.gels.opencv:OpencvTactile",
-        video="robot.drivers.replay:VideoSensor",
-        images="robot.drivers.replay:ImageFolderSensor",
     ),
     "camera": _drivers(
         "camera",
@@ -100,7 +98,6 @@ DRIVERS: Mapping[str, Registry[type[Device]]] = {
         kinect2="robot.drivers.cameras.kinect2:Kinect2",
         realsense="robot.drivers.cameras.realsense:RealSense",
         uvc="robot.drivers.cameras.uvc:UvcCamera",
-        replay="robot.drivers.replay:ReplayCamera",
     ),
 }
 """Drivers by role and name, imported on first use.
@@ -191,20 +188,6 @@ class RealRig(Rig):
             object_fit=build(ObjectSettings, object, where="[object]").fit() if object else None,
             planner=load_planner(planner),
         )
-
-    def connect(self) -> None:
-        """Connect all devices, then check the planner again: a replay camera finds only now whether it has depth.
-
-        Raises:
-            DeviceError: A device cannot be connected.
-            RobotConfigError: The planner requires depth and the camera has none.
-        """
-        super().connect()
-        try:
-            self.planner.check(self)
-        except RobotConfigError:
-            self.close()
-            raise
 
 
 def load_driver(role: str, table: Mapping[str, Any], where: str, **arguments: Any) -> Any:

@@ -1,17 +1,23 @@
 """A rig from a file: a manual arm, an emulated gripper, recorded gels and recorded depth. It needs no person.
 
-Its pictures come from a recording of the fake rig in tests/fake_rig.py.
+Its pictures come from a recording of the fake rig in tests/fake_rig.py. `FolderSensor` and `RecordedCamera` show
+recorded pictures as a gel and as a camera.
 """
 
 import contextlib
+import math
 import shutil
 import tempfile
+import time
 from pathlib import Path
 from unittest.mock import patch
 
+import cv2
 import numpy as np
 
 from robot.collection import CollectSettings, collect
+from robot.devices import Camera, TactileSensor
+from robot.readings import RGBD, Frame, Intrinsics
 from robot.recording.folder import read_recording
 from robot.rig import load_rig
 from robot.sight import hand_eye
@@ -39,15 +45,15 @@ driver = "wsg50"
 port = "{port}"
 
 [sensors.a]
-driver = "images"
+driver = "tests.replay_rig:FolderSensor"
 path = "{folder}/a"
 
 [sensors.b]
-driver = "images"
+driver = "tests.replay_rig:FolderSensor"
 path = "{folder}/b"
 
 [camera]
-driver = "replay"
+driver = "tests.replay_rig:RecordedCamera"
 path = "{folder}/recording"
 hand_eye = "{folder}/hand_eye.json"
 fx = {lens.fx}
@@ -59,6 +65,49 @@ cy = {lens.cy}
 settle_s = 0.1
 hold_s = 0.1
 """
+
+
+class FolderSensor(TactileSensor):
+    """Shows the pictures of a folder in the order of their names, 30 in a second, again and again."""
+
+    def __init__(self, *, finger: str, path: str, clock=time.monotonic):
+        super().__init__(f"gel {finger}", finger, clock=clock)
+        self.path, self.pictures = Path(path), []
+
+    def _connect(self):
+        self.pictures = [cv2.imread(str(each))[..., ::-1].copy() for each in sorted(self.path.iterdir())]
+
+    def _close(self):
+        self.pictures = []
+
+    def _read(self):
+        number = math.floor(30 * self.clock())
+        return Frame(self.pictures[number % len(self.pictures)], number / 30)
+
+
+class RecordedCamera(Camera):
+    """Shows the next photo of a recording, with its depth, at each read; `seek` chooses one."""
+
+    def __init__(self, *, path: str, extrinsics, fx: float, fy: float, cx: float, cy: float, clock=time.monotonic):
+        super().__init__("recorded camera", extrinsics, clock=clock)
+        self.path, self.lens, self.grasps, self.next = Path(path), Intrinsics(fx, fy, cx, cy), [], 0
+
+    def seek(self, number):
+        self.next = number
+
+    def _connect(self):
+        self.grasps, self.next = read_recording(self.path).grasps, 0
+
+    def _close(self):
+        self.grasps = []
+
+    def _read(self, depth):
+        grasp = self.grasps[self.next % len(self.grasps)]
+        self.next += 1
+        colour = cv2.imread(str(self.path / grasp.photo))[..., ::-1].copy()
+        depth_mm = cv2.imread(str(self.path / grasp.depth), cv2.IMREAD_UNCHANGED)
+        depth_m = np.where(depth_mm > 0, depth_mm * np.float32(1e-3), np.float32(np.nan))
+        return RGBD(colour, depth_m if depth else None, self.lens, self.clock())
 
 
 @contextlib.contextmanager

@@ -66,19 +66,12 @@ def calibrate(
     require_ours(out, HAND_EYE)
     require_folder(out)
     found = fit_hand_eye(*read_pairs(points))
-    for name, errors in (("rigid", found.rigid_errors), ("affine", found.affine_errors)):
-        if errors is None:
-            say(f"{name}: {found.affine_problem}")
-            continue
-        say(
-            f"{name}: mean error {errors.mean_mm:.1f} mm (maximum {errors.max_mm:.1f}), leave-one-out "
-            f"{errors.loo_mean_mm:.1f} mm ({errors.loo_max_mm:.1f})"
-        )
-    if found.warning:
-        say(f"warning: {found.warning}")
-    if found.rigid_errors.loo_mean_mm > SUSPECT_MM:
+    mean_mm = float(found.residuals_mm.mean())
+    say(f"residuals: mean {mean_mm:.1f} mm, maximum {found.residuals_mm.max():.1f} mm")
+    if mean_mm > SUSPECT_MM:
         raise RetrievalError(
-            f"nothing was written: the leave-one-out error must be at most {SUSPECT_MM:g} mm; measure the points again"
+            f"nothing was written: the mean residual must be at most {SUSPECT_MM:g} mm; check that each camera point "
+            "has its rig point and that no axis is mirrored (x right, y down, z forward), then measure the points again"
         )
     found.save(out)
-    say(f"{out}: fitted to {len(found.rig_mm)} points; set hand_eye to this file under [camera]")
+    say(f"{out}: fitted to {len(found.residuals_mm)} points; set hand_eye to this file under [camera]")

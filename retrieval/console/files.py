@@ -118,7 +118,7 @@ CHECKPOINT = Kind("a checkpoint", _has_header)
 EXPORT = Kind("an export", _ends_with_seal)
 RESULTS = Kind("results", _has_keys("software"))
 TIMINGS = Kind("timings", _has_keys("machine", "methods"))
-HAND_EYE = Kind("a hand-eye calibration", _has_keys("rigid", "points"))
+HAND_EYE = Kind("a hand-eye calibration", _has_keys("rigid", "residuals_mm"))
 PREVIEW = Kind("a preview", _begins_with(GENERATOR))
 
 

@@ -1,11 +1,11 @@
-"""Arms and grippers that a user's own program moves: a Python object, or an HTTP endpoint.
+"""Arms and grippers that a user's own program moves: a Python object.
 
-    [arm]                                 [arm]
-    driver = "own"                        driver = "own"
-    robot = "ur_arm:URArm"                url = "http://192.168.1.20:8000/arm"
+    [arm]
+    driver = "own"
+    robot = "ur_arm:URArm"
     settings = {host = "192.168.1.10"}
 
-Both have the same methods, with values in mm, rad, mm/s and N:
+The object has these methods, with values in mm, rad, mm/s and N:
 
     arm       move_to(x_mm, y_mm, z_mm, yaw_rad, speed_mm_s)    return when the arm has arrived
               pose()          -> {"x_mm": ..., "y_mm": ..., "z_mm": ..., "yaw_rad": ...}
@@ -13,34 +13,26 @@ Both have the same methods, with values in mm, rad, mm/s and N:
               grasp(force_n, speed_mm_s)                        return when the force is reached or the jaws are closed
               state()         -> {"opening_mm": ..., "force_n": ..., "status": "idle"}
     both      stop()          stop now and stay usable
-              recover()       optional, Python object only: clear a fault where this is safe without a person, else
-                              raise an exception
-              disconnect()    optional, Python object only: end the connection
+              recover()       optional: clear a fault where this is safe without a person, else raise an exception
+              disconnect()    optional: end the connection
 
-A Python object is made when the rig connects: `settings` are its keyword arguments. An HTTP endpoint gets a POST
-request to `url`/`method` with the values as JSON; it answers with JSON, or with an error status and a text.
-
-Connecting asks for the pose or the state and moves nothing. The limits of the rig's file hold as for every arm and
-gripper: a pose outside the workspace, or a speed or a force above its limit, is refused before the program is called.
-Only `state_age_s` is not used. An arm that is not near its goal after `move_to` is an error.
+It is made when the rig connects; `settings` are its keyword arguments. Connecting asks for the pose or the state and
+moves nothing. The limits of the rig's file hold as for every arm and gripper: a pose outside the workspace, or a speed
+or a force above its limit, is refused before the program is called. Only `state_age_s` is not used. An arm that is not
+near its goal after `move_to` is an error.
 """
 
-import contextlib
-import json
 import math
 import time
-import urllib.error
-import urllib.request
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
-from http.client import HTTPException
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from _touch_retrieval.documents import typed
 from _touch_retrieval.registry import Registry
 from robot.devices import Actuator, Arm, Clock, Gripper
 from robot.drivers.vendor import vendor_errors
-from robot.errors import DeviceError, RobotConfigError, UnknownName
+from robot.errors import DeviceError, UnknownName
 from robot.readings import GripperState, Pose, Region
 from robot.settings import check_range
 
@@ -50,149 +42,67 @@ ROBOTS: "Registry[Callable[..., Any]]" = Registry("robot", "robots", {}, error=U
 ARRIVED_MM, ARRIVED_DEG = 5.0, 5.0
 """Largest distance and turn between the requested and the reported pose after a motion."""
 
-_STOP_S = 5.0
-"""Longest wait for the answer to `stop` and to questions over HTTP."""
-_MAX_ANSWER_BYTES = 1_000_000
 
-
-class RobotLink(Protocol):
-    """Calls the methods of a user's robot."""
-
-    def call(self, method: str, **values: float) -> Any:
-        """Call a method and return its answer; raise DeviceError or OSError if it fails."""
-
-    def call_optional(self, method: str) -> None:
-        """Call a method that a robot may lack."""
-
-
-class PythonLink:
-    """A robot that is a Python object.
+class OwnDevice(Actuator):
+    """The common part of an arm and a gripper that a user's program moves.
 
     Args:
         robot: Name in ROBOTS or "module:Class"; a class or a function that returns the object.
         settings: Its keyword arguments.
-        methods: Methods that the object must have.
-    """
-
-    def __init__(self, robot: str, settings: Mapping[str, Any], methods: tuple[str, ...]) -> None:
-        with vendor_errors(f"{robot} cannot be made"):
-            self._object = ROBOTS.resolve(robot)(**settings)
-        self._robot = robot
-        if lacking := [name for name in methods if not callable(getattr(self._object, name, None))]:
-            self.call_optional("disconnect")
-            raise DeviceError(f"{robot} must have the methods {', '.join(methods)}; it lacks {', '.join(lacking)}")
-
-    def call(self, method: str, **values: float) -> Any:
-        """Call the method of the object."""
-        with vendor_errors(f"{method} of {self._robot} failed"):
-            answer = getattr(self._object, method)(**values)
-        if isinstance(answer, Mapping):  # numbers of vendors' packages are often numpy scalars
-            return {key: value.item() if hasattr(value, "item") else value for key, value in answer.items()}
-        return answer
-
-    def call_optional(self, method: str) -> None:
-        """Call the method if the object has it."""
-        if callable(getattr(self._object, method, None)):
-            self.call(method)
-
-
-class HttpLink:
-    """A robot behind an HTTP endpoint, called directly, without the proxies of the environment.
-
-    Args:
-        url: Address; a method is called at `url`/`method`.
-        timeout_s: Longest wait for the end of a motion.
-    """
-
-    def __init__(self, url: str, timeout_s: float) -> None:
-        self._url, self._timeout_s = url.rstrip("/"), timeout_s
-        self._opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-
-    def call(self, method: str, **values: float) -> Any:
-        """Send a POST request and return the JSON of the answer; None for an empty answer."""
-        address = f"{self._url}/{method}"
-        head = {"Content-Type": "application/json"}
-        request = urllib.request.Request(address, json.dumps(values).encode(), head, method="POST")
-        timeout_s = self._timeout_s if values else min(_STOP_S, self._timeout_s)
-        try:
-            with self._opener.open(request, timeout=timeout_s) as answer:
-                content = answer.read(_MAX_ANSWER_BYTES)
-        except urllib.error.HTTPError as error:
-            with error, contextlib.suppress(OSError, HTTPException):
-                text = " ".join(error.read(500).decode("utf-8", "replace").split())
-            raise DeviceError(f"{address} answered {error.code}: {text or error.reason}") from error
-        except urllib.error.URLError as error:
-            raise DeviceError(f"{address} does not answer ({error.reason}); start it, or correct url") from error
-        except HTTPException as error:
-            raise DeviceError(f"{address} must answer in HTTP, got {error or type(error).__name__}") from error
-        try:
-            return json.loads(content) if content else None
-        except ValueError as error:
-            raise DeviceError(f"{address} must answer with JSON, got {content[:100]!r}") from error
-
-    def call_optional(self, method: str) -> None:
-        """Do nothing: an endpoint has no optional methods."""
-
-
-class LinkedDevice(Actuator):
-    """The common part of an arm and a gripper that a user's program moves.
-
-    Args:
-        robot: Name in ROBOTS or "module:Class"; empty for an HTTP endpoint.
-        settings: Keyword arguments of that class.
-        url: Address of the HTTP endpoint; empty for a Python object.
-        timeout_s: Longest wait for the end of a motion over HTTP.
         others: Arguments of the base class.
     """
 
     _methods: ClassVar[tuple[str, ...]]
-    _link: RobotLink | None = None
+    _program: Any = None
 
-    def __init__(self, *, robot: str, settings: Mapping[str, Any], url: str, timeout_s: float, **others: Any) -> None:
-        super().__init__(robot or url, **others)
-        self._robot, self._options, self._url, self._timeout_s = robot, settings, url, timeout_s
-        if bool(robot) == bool(url):
-            raise RobotConfigError(f"give robot or url, and not both; got robot {robot!r} and url {url!r}")
-        if robot:
-            ROBOTS.resolve(robot)
-        elif not url.startswith(("http://", "https://")):
-            raise RobotConfigError(f"url must begin with http:// or https://, got {url!r}")
-        check_range("timeout_s", timeout_s, 0.1, 3600, "s")
+    def __init__(self, *, robot: str, settings: Mapping[str, Any], **others: Any) -> None:
+        super().__init__(robot, **others)
+        self._make, self._options = ROBOTS.resolve(robot), settings
 
     def _connect(self) -> None:
-        if self._robot:
-            self._link = PythonLink(self._robot, self._options, self._methods)
-        else:
-            self._link = HttpLink(self._url, self._timeout_s)
+        with vendor_errors(f"{self.name} cannot be made"):
+            self._program = self._make(**self._options)
+        if lacking := [name for name in self._methods if not callable(getattr(self._program, name, None))]:
+            methods = ", ".join(self._methods)
+            raise DeviceError(f"{self.name} must have the methods {methods}; it lacks {', '.join(lacking)}")
         self._report()
 
     def _close(self) -> None:
-        link, self._link = self._link, None
-        if link is not None:
-            link.call_optional("disconnect")
+        try:
+            self._call_optional("disconnect")
+        finally:
+            self._program = None
 
     def _recover(self) -> None:
-        assert self._link is not None
-        self._link.call_optional("recover")
+        self._call_optional("recover")
 
     def _stop(self) -> None:
         self._call("stop")
 
     def _call(self, method: str, **values: float) -> Any:
-        assert self._link is not None
-        return self._link.call(method, **values)
+        """Call a method and return its answer; raise DeviceError or OSError if it fails."""
+        with vendor_errors(f"{method} of {self.name} failed"):
+            answer = getattr(self._program, method)(**values)
+        if isinstance(answer, Mapping):  # numbers of vendors' packages are often numpy scalars
+            return {key: value.item() if hasattr(value, "item") else value for key, value in answer.items()}
+        return answer
+
+    def _call_optional(self, method: str) -> None:
+        """Call a method if the program has it."""
+        if callable(getattr(self._program, method, None)):
+            self._call(method)
 
     @abstractmethod
     def _report(self) -> object:
         """Ask for the pose or the state."""
 
 
-class OwnArm(LinkedDevice, Arm):
+class OwnArm(OwnDevice, Arm):
     """An arm that a user's program moves.
 
     Args:
         workspace: Limits of the point between the fingertips.
-        robot, settings, url, timeout_s: See LinkedDevice.
+        robot, settings: See OwnDevice.
         max_speed_mm_s: Upper limit of the speed.
         clock: The rig's clock.
     """
@@ -203,16 +113,14 @@ class OwnArm(LinkedDevice, Arm):
         self,
         *,
         workspace: Region,
-        robot: str = "",
+        robot: str,
         settings: Mapping[str, Any] = {},
-        url: str = "",
-        timeout_s: float = 60.0,
         max_speed_mm_s: float = 1000.0,
         clock: Clock = time.monotonic,
     ) -> None:
-        """Check the settings; raise RobotConfigError, or UnknownName for a class that cannot be imported."""
+        """Raise UnknownName for a class that cannot be imported."""
         limits = {"workspace": workspace, "max_speed_mm_s": max_speed_mm_s}
-        super().__init__(robot=robot, settings=settings, url=url, timeout_s=timeout_s, clock=clock, **limits)
+        super().__init__(robot=robot, settings=settings, clock=clock, **limits)
 
     def _move_to(self, pose: Pose, speed_mm_s: float) -> Pose:
         """Move, then compare the reported pose with the requested one."""
@@ -236,13 +144,13 @@ class OwnArm(LinkedDevice, Arm):
         return self._pose()
 
 
-class OwnGripper(LinkedDevice, Gripper):
+class OwnGripper(OwnDevice, Gripper):
     """A gripper that a user's program moves. The jaws open at the largest allowed speed.
 
     Args:
         stroke_mm: Largest opening.
         min_force_n: Smallest force on each finger.
-        robot, settings, url, timeout_s: See LinkedDevice.
+        robot, settings: See OwnDevice.
         max_force_n: Upper limit of the force on each finger.
         max_speed_mm_s: Upper limit of the speed of the jaws.
         clock: The rig's clock.
@@ -255,10 +163,8 @@ class OwnGripper(LinkedDevice, Gripper):
         *,
         stroke_mm: float,
         min_force_n: float,
-        robot: str = "",
+        robot: str,
         settings: Mapping[str, Any] = {},
-        url: str = "",
-        timeout_s: float = 60.0,
         max_force_n: float = 1000.0,
         max_speed_mm_s: float = 420.0,
         clock: Clock = time.monotonic,
@@ -268,7 +174,7 @@ class OwnGripper(LinkedDevice, Gripper):
         check_range("min_force_n", min_force_n, 1e-3, max_force_n, "N")
         forces = {"min_force_n": min_force_n, "max_force_n": max_force_n}
         limits = {"stroke_mm": stroke_mm, "max_speed_mm_s": max_speed_mm_s, **forces}
-        super().__init__(robot=robot, settings=settings, url=url, timeout_s=timeout_s, clock=clock, **limits)
+        super().__init__(robot=robot, settings=settings, clock=clock, **limits)
 
     def _state(self) -> GripperState:
         return typed(self._call("state"), GripperState, f"state of {self.name}", error=DeviceError)

@@ -1,10 +1,12 @@
 """The examples of integrations/robots against stubs of the documented interfaces of their vendors."""
 
+import json
 import math
 import socketserver
 import sys
 import threading
 import types
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -27,7 +29,7 @@ def examples(monkeypatch):
     """The examples can be imported; vendor modules and examples are forgotten afterwards."""
     monkeypatch.syspath_prepend(str(FOLDER))
     yield
-    for name in ("ur_arm", "franka", "robotiq_2f85"):
+    for name in ("ur_arm", "franka", "robotiq_2f85", "remote"):
         sys.modules.pop(name, None)
 
 
@@ -279,6 +281,43 @@ def test_a_robotiq_gripper_that_is_not_active_does_not_move(robotiq):
     with pytest.raises(DeviceError, match="activate it on the teach pendant"):
         gripper.grasp(20.0, 85.0)
     assert not any("POS" in call for call in server.calls if call.startswith("SET"))
+
+
+class Endpoint(BaseHTTPRequestHandler):
+    """A robot program of another computer: it stores poses, and refuses those below the table."""
+
+    def do_POST(self):
+        values = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        content, status = b"", 200
+        if self.path == "/arm/pose":
+            content = json.dumps(self.server.at).encode()
+        elif values.pop("speed_mm_s", None) and values["z_mm"] < 50:
+            content, status = b"protective stop", 409
+        elif values:
+            self.server.at = values
+        self.server.calls.append(self.path)
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, *_): ...
+
+
+def test_a_robot_on_another_computer_moves_stops_and_its_errors_keep_their_text():
+    with ThreadingHTTPServer(("127.0.0.1", 0), Endpoint) as server:
+        server.at, server.calls = {"x_mm": 0.0, "y_mm": 0.0, "z_mm": 100.0, "yaw_rad": 0.0}, []
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        url = f"http://127.0.0.1:{server.server_address[1]}/arm"
+        with OwnArm(workspace=WORKSPACE, robot="remote:RemoteRobot", settings={"url": url}) as arm:
+            assert server.calls == ["/arm/pose"]
+            moves_and_reports(arm, Pose(30.0, -40.0, 100.0, 0.5), 150.0)
+            with pytest.raises(DeviceError, match=r"/arm/move_to answered 409: protective stop"):
+                arm.move_to(Pose(0.0, 0.0, 20.0, 0.0), 150.0)
+        assert server.calls[-1] == "/arm/stop"
+        server.shutdown()
+        thread.join(10)
 
 
 def test_collect_records_grasps_with_the_examples_in_a_rig_file(fake_ur, urcap, tmp_path):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from robot.drivers.cameras.uvc import UvcCamera
+from robot.drivers.gels.opencv import OpencvTactile
 from robot.drivers.manual_arm import ManualArm
-from robot.drivers.replay import ImageFolderSensor
 from robot.drivers.wsg50.driver import WSG50
 from robot.errors import RobotConfigError, UnknownName
 from robot.grasping.planner import CylinderPlanner, GraspPlan, GraspPlanner
@@ -23,7 +23,7 @@ TABLES = {
     "jaw_speed_mm_s = 40\narm_speed_mm_s = 90",
     "arm": 'driver = "manual"',
     "gripper": 'driver = "wsg50"\nport = "socket://127.0.0.1:1"',
-    "sensors.a": 'driver = "images"\npath = "frames"\nfps = 30',
+    "sensors.a": 'driver = "uvc"\ndevice = "/dev/v4l/by-id/usb-gel-video-index0"',
     "camera": 'driver = "uvc"\ndevice = "/dev/v4l/by-id/usb-cam-video-index0"',
     "object": "x_mm = 0\ny_mm = 5\nheight_mm = 100\nradius_mm = 30",
 }
@@ -41,7 +41,6 @@ def written(tmp_path, **changed):
 @pytest.fixture(autouse=True)
 def working_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "frames").mkdir()
 
 
 def points(tmp_path, days=0):
@@ -56,7 +55,7 @@ def test_a_file_becomes_a_rig_with_its_devices_under_its_limits(tmp_path):
     rig = load_rig(written(tmp_path), seed=0)
     assert isinstance(rig.arm, ManualArm)
     assert isinstance(rig.gripper, WSG50)
-    assert isinstance(rig.sensors["a"], ImageFolderSensor)
+    assert isinstance(rig.sensors["a"], OpencvTactile)
     assert isinstance(rig.camera, UvcCamera)
     assert rig.arm.workspace.upper == (100, 100, 300)
     assert rig.arm.max_speed_mm_s == 90
@@ -133,33 +132,18 @@ def test_a_camera_without_depth_is_connected_for_a_planner_that_needs_none(tmp_p
 
 
 def test_a_camera_with_depth_requires_a_recent_calibration(tmp_path):
-    replay = 'driver = "replay"\npath = "recording"\nfx = 300\nfy = 300\ncx = 127.5\ncy = 127.5\n'
+    depth = 'driver = "realsense"\n'
     with pytest.raises(RobotConfigError, match="a camera with depth requires hand_eye = FILE"):
-        load_rig(written(tmp_path, camera=replay), seed=0)
+        load_rig(written(tmp_path, camera=depth), seed=0)
     points(tmp_path)
-    found = load_rig(written(tmp_path, camera=replay + 'hand_eye = "hand_eye.json"', object=None), seed=0)
+    found = load_rig(written(tmp_path, camera=depth + 'hand_eye = "hand_eye.json"', object=None), seed=0)
     assert found.camera.extrinsics[:3, 3] == pytest.approx([0, 0, 800], abs=1e-6)
     assert found.object_fit is None
     points(tmp_path, days=40)
     with pytest.raises(RobotConfigError, match="must be at most 30 days old, got 40"):
-        load_rig(written(tmp_path, camera=replay + 'hand_eye = "hand_eye.json"'), seed=0)
-    longer = replay + 'hand_eye = "hand_eye.json"\nhand_eye_days = 60'
+        load_rig(written(tmp_path, camera=depth + 'hand_eye = "hand_eye.json"'), seed=0)
+    longer = depth + 'hand_eye = "hand_eye.json"\nhand_eye_days = 60'
     assert load_rig(written(tmp_path, camera=longer), seed=0).camera.has_depth
-
-
-def test_a_recorded_camera_without_depth_raises_when_it_is_connected(tmp_path, monkeypatch):
-    from robot.errors import RobotError
-
-    points(tmp_path)
-    camera = 'driver = "replay"\npath = "recording"\nhand_eye = "hand_eye.json"\nfx = 9\nfy = 9\ncx = 9\ncy = 9'
-    rig = load_rig(written(tmp_path, camera=camera, object=None), seed=0)
-    for device in rig.devices:
-        monkeypatch.setattr(device, "_connect", lambda: None)
-        monkeypatch.setattr(device, "_close", lambda: None)
-    rig.camera.has_depth = False
-    with pytest.raises(RobotError, match=r"size of every object in \[object\]"):
-        rig.connect()
-    assert not any(device.is_connected for device in rig.devices)
 
 
 BAD = {
@@ -169,7 +153,7 @@ BAD = {
     "a key too few": ({"gripper": 'driver = "wsg50"'}, r"\[gripper\] requires 'port'"),
     "an unknown table": ({"feet": "count = 2"}, "rig.toml has no setting 'feet'"),
     "a table too few": ({"arm": None}, "rig.toml requires 'arm'"),
-    "an unknown finger": ({"sensors.c": 'driver = "images"\npath = "frames"'}, r"\[sensors.a\] and .*; got 'c'"),
+    "an unknown finger": ({"sensors.c": 'driver = "uvc"'}, r"\[sensors.a\] and .*; got 'c'"),
     "an unknown limit": ({"limits": "force = 3"}, r"\[limits\] has no setting 'force'"),
     "a limit too few": ({"limits": "force_n = 3"}, r"\[limits\] requires 'workspace_lower_mm'"),
     "a workspace inside out": (

@@ -73,7 +73,7 @@ def test_missing_and_empty_files_are_written(tmp_path):
         (EXPORT, bytes(9000) + b"touch_retrieval.sha256" + bytes(68)),
         (RESULTS, b'{"software": "1", "rows": {}}'),
         (TIMINGS, b'{"machine": {}, "methods": {}}'),
-        (HAND_EYE, b'{"rigid": [], "points": []}'),
+        (HAND_EYE, b'{"rigid": [], "residuals_mm": []}'),
         (PREVIEW, PNG + b"tEXtSoftware\0touch-retrieval"),
     ],
 )

@@ -1,9 +1,6 @@
-"""Arms and grippers of a user's own program: a Python object, and an HTTP endpoint."""
+"""Arms and grippers of a user's own program."""
 
-import json
 import math
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
@@ -68,46 +65,11 @@ def python_arm(**settings):
     return OwnArm(workspace=WORKSPACE, robot=f"{HERE}Program", settings=settings, max_speed_mm_s=200.0)
 
 
-class Endpoint(BaseHTTPRequestHandler):
-    """A robot program behind HTTP."""
-
-    def do_POST(self):
-        values = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        status, content = 200, b""
-        try:
-            answer = getattr(self.server.program, self.path.removeprefix("/robot/"))(**values)
-            content = json.dumps(answer, default=float).encode() if answer is not None else b""
-        except RuntimeError as error:
-            status, content = 409, str(error).encode()
-        content = self.server.garbled or content
-        self.send_response(status)
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)
-
-    def log_message(self, *_): ...
+WORKING = {"robot": f"{HERE}Program"}
 
 
-@pytest.fixture
-def server():
-    with ThreadingHTTPServer(("127.0.0.1", 0), Endpoint) as server:
-        server.program, server.garbled = Program(), b""
-        server.url = f"http://127.0.0.1:{server.server_address[1]}/robot"
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        yield server
-        server.shutdown()
-        thread.join(10)
-
-
-@pytest.fixture(params=["python", "http"])
-def where(request, server):
-    """The settings of a driver that name a working program, in both ways."""
-    return {"robot": f"{HERE}Program"} if request.param == "python" else {"url": server.url}
-
-
-def test_an_arm_moves_as_requested_and_connecting_moves_nothing(where):
-    with OwnArm(workspace=WORKSPACE, **where) as arm:
+def test_an_arm_moves_as_requested_and_connecting_moves_nothing():
+    with OwnArm(workspace=WORKSPACE, **WORKING) as arm:
         assert Program.last.calls == []
         assert arm.pose() == Pose(0.0, 0.0, 100.0, 0.0)
         assert arm.move_to(GOAL, 50.0) == GOAL
@@ -116,8 +78,8 @@ def test_an_arm_moves_as_requested_and_connecting_moves_nothing(where):
         assert Program.last.calls[-1] == "stop"
 
 
-def test_a_gripper_opens_at_the_speed_limit_and_grasps_with_the_requested_force(where):
-    with OwnGripper(stroke_mm=80.0, min_force_n=5.0, max_force_n=20.0, max_speed_mm_s=60.0, **where) as gripper:
+def test_a_gripper_opens_at_the_speed_limit_and_grasps_with_the_requested_force():
+    with OwnGripper(stroke_mm=80.0, min_force_n=5.0, max_force_n=20.0, max_speed_mm_s=60.0, **WORKING) as gripper:
         assert Program.last.calls == []
         assert gripper.open(70.0).opening_mm == 70.0
         state = gripper.grasp(15.0, 40.0)
@@ -125,12 +87,12 @@ def test_a_gripper_opens_at_the_speed_limit_and_grasps_with_the_requested_force(
         assert Program.last.calls == [("open", 60.0), ("grasp", 15.0, 40.0)]
 
 
-def test_nothing_beyond_the_limits_reaches_the_program(where):
-    with OwnArm(workspace=WORKSPACE, max_speed_mm_s=200.0, **where) as arm:
+def test_nothing_beyond_the_limits_reaches_the_program():
+    with OwnArm(workspace=WORKSPACE, max_speed_mm_s=200.0, **WORKING) as arm:
         for pose, speed in ((Pose(0.0, 0.0, 5.0, 0.0), 50.0), (GOAL, 201.0), (GOAL, math.nan)):
             with pytest.raises(DeviceError, match="must be"):
                 arm.move_to(pose, speed)
-    with OwnGripper(stroke_mm=80.0, min_force_n=5.0, max_force_n=20.0, max_speed_mm_s=60.0, **where) as gripper:
+    with OwnGripper(stroke_mm=80.0, min_force_n=5.0, max_force_n=20.0, max_speed_mm_s=60.0, **WORKING) as gripper:
         for force, speed in ((21.0, 40.0), (4.0, 40.0), (15.0, 61.0)):
             with pytest.raises(DeviceError, match="must be"):
                 gripper.grasp(force, speed)
@@ -186,42 +148,9 @@ def test_a_pose_that_is_incomplete_is_an_error():
             arm.pose()
 
 
-def test_an_error_status_is_an_error_with_its_text(server):
-    server.program.fault = RuntimeError("protective stop")
-    with OwnArm(workspace=WORKSPACE, url=server.url) as arm:
-        with pytest.raises(DeviceError, match=r"/robot/move_to answered 409: protective stop"):
-            arm.move_to(GOAL, 50.0)
-        assert server.program.calls[-1] == "stop"
-
-
-def test_an_answer_that_is_not_json_is_an_error(server):
-    server.garbled = b"<html>"
-    with pytest.raises(DeviceError, match=r"must answer with JSON, got b'<html>'"):
-        OwnArm(workspace=WORKSPACE, url=server.url).connect()
-
-
-def test_an_endpoint_that_does_not_run_is_an_error_with_the_remedy():
-    with pytest.raises(DeviceError, match=r"127.0.0.1:9/pose does not answer \(.*\); start it, or correct url"):
-        OwnArm(workspace=WORKSPACE, url="http://127.0.0.1:9").connect()
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({}, "give robot or url"),
-        ({"robot": f"{HERE}Program", "url": "http://a"}, "give robot or url"),
-        ({"url": "ftp://a"}, "url must begin with http"),
-        ({"url": "http://a", "timeout_s": 0.0}, "timeout_s must be from 0.1"),
-    ],
-)
-def test_wrong_settings_are_refused_before_anything_connects(settings, message):
-    with pytest.raises(RobotConfigError, match=message):
-        OwnArm(workspace=WORKSPACE, **settings)
-
-
 def test_a_smallest_force_above_the_limit_of_the_rig_is_refused():
     with pytest.raises(RobotConfigError, match=r"min_force_n must be from 0.001 to 20 N, got 30"):
-        OwnGripper(stroke_mm=80.0, min_force_n=30.0, max_force_n=20.0, url="http://a")
+        OwnGripper(stroke_mm=80.0, min_force_n=30.0, max_force_n=20.0, **WORKING)
 
 
 def test_an_unknown_class_is_refused_with_the_remedy():
